@@ -1,0 +1,80 @@
+"""What a rig has seen: unlabelled blobs (`Detections`, ragged) and labelled fiducials (`Observations`, dense)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import IntFlag
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+
+class BlobFlag(IntFlag):
+    """Reasons to distrust the centre of a blob."""
+
+    NONE = 0
+    BORDER = 1  # touches the image border: part of the blob is outside
+    MERGED = 2  # two or more blobs in one
+    SATURATED = 4  # clipped grey values; the centre is less certain, its sigma says by how much
+    MASKED = 8  # inside a mask of known reflections
+
+
+UNUSABLE = BlobFlag.BORDER | BlobFlag.MERGED | BlobFlag.MASKED
+
+
+@dataclass(frozen=True)
+class Detections:
+    """Blobs of all cameras and snapshots as flat columns, one row a blob.
+
+    Convention: pixel (0, 0) is the centre of the top-left pixel; u right, v down.
+    """
+
+    uv: NDArray[np.float64]  # (M, 2) pixels
+    sigma: NDArray[np.float64]  # (M,) pixels, one standard deviation of each axis
+    camera: NDArray[np.int64]  # (M,) index into camera_names
+    snapshot: NDArray[np.int64]  # (M,) index into snapshot_names
+    fiducial: NDArray[np.int64]  # (M,) row of the object file, -1 = unlabelled
+    radius: NDArray[np.float64]  # (M,) pixels, radius of the disc of equal area; nan = unknown
+    flags: NDArray[np.uint8]  # (M,) BlobFlag bits
+    camera_names: tuple[str, ...]  # C
+    snapshot_names: tuple[str, ...]  # S
+
+    def __len__(self) -> int:
+        return len(self.uv)
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """Mark the blobs whose centres may be used: (M,) bool."""
+        return (self.flags & int(UNUSABLE)) == 0
+
+    def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Detections:
+        """Keep the given rows (mask or indices); names of cameras and snapshots stay."""
+        return replace(
+            self,
+            **{
+                column: getattr(self, column)[rows]
+                for column in ("uv", "sigma", "camera", "snapshot", "fiducial", "radius", "flags")
+            },
+        )
+
+    def of_snapshots(self, first: int, last: int) -> Detections:
+        """Keep snapshots `first` to `last` (excluded), renumbered from zero."""
+        kept = self.select((self.snapshot >= first) & (self.snapshot < last))
+        return replace(kept, snapshot=kept.snapshot - first, snapshot_names=self.snapshot_names[first:last])
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Labelled fiducials, dense: what each camera saw of each fiducial in each snapshot."""
+
+    uv: Tensor  # (*B, S, C, N, 2) pixels; any finite value where not seen
+    sigma: Tensor  # (*B, S, C, N) pixels, one standard deviation of each axis
+    seen: Tensor  # (*B, S, C, N) bool
+
+    def to(self, *args: torch.device | torch.dtype | str) -> Observations:
+        """Move to a device or change the floating-point type."""
+        device_only = [a for a in args if not isinstance(a, torch.dtype)]
+        seen = self.seen.to(*device_only) if device_only else self.seen
+        return Observations(self.uv.to(*args), self.sigma.to(*args), seen)
