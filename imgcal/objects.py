@@ -1,0 +1,128 @@
+"""`CalibrationObject`: known fiducials in the object's frame, and the motions that cannot be told apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.errors import InputError
+
+
+@dataclass(frozen=True)
+class SelfMotion:
+    """A rigid motion that maps fiducials of an object onto fiducials of the same object.
+
+    An estimator that gives fiducial `i` the label `permutation[i]` sees (almost) the same points.
+    """
+
+    rotation: NDArray[np.float64]  # (3, 3)
+    translation: NDArray[np.float64]  # (3,) mm: moved = rotation @ point + translation
+    permutation: NDArray[np.int64]  # (N,) fiducial onto which each one falls, -1 = onto none
+    residual: float  # mm, RMS distance of the fiducials that fall onto one
+
+
+@dataclass(frozen=True)
+class CalibrationObject:
+    """Fiducials on a rigid body."""
+
+    points: Tensor  # (N, 3) mm in the object's frame
+    colours: Tensor  # (N, 3) in [0, 1], for colour-coded rendering
+    radius: Tensor | None = None  # (N,) mm of spherical fiducials; None = points
+    name: str = "object"
+    fiducial_names: tuple[str, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        if self.points.ndim != 2 or self.points.shape[1] != 3 or len(self.points) < 4:
+            raise InputError(f"object {self.name}: found points of shape {tuple(self.points.shape)}, expected (N >= 4, 3)")
+
+    @property
+    def fiducials(self) -> int:
+        """Number of fiducials, N."""
+        return len(self.points)
+
+    @cached_property
+    def size(self) -> float:
+        """RMS distance of the fiducials from their centroid, mm."""
+        return float((self.points - self.points.mean(0)).square().sum(1).mean().sqrt())
+
+    @cached_property
+    def planar(self) -> bool:
+        """Tell whether all fiducials lie in one plane (to 1e-3 of the object's size)."""
+        singular = torch.linalg.svdvals((self.points - self.points.mean(0)).double())
+        return bool(singular[2] < 1e-3 * singular[0])
+
+    @cached_property
+    def symmetries(self) -> tuple[SelfMotion, ...]:
+        """Proper rotations that map the object onto itself, the identity first; found when first asked for.
+
+        With more than one, unlabelled blobs cannot decide between them, but the relations between cameras are the same
+        for all as long as every camera uses the same one.
+        """
+        return self.near_symmetries(tolerance=1e-3 * self.size)
+
+    def near_symmetries(self, tolerance: float) -> tuple[SelfMotion, ...]:
+        """Rotations about the centroid that map every fiducial to within `tolerance` (mm) of another of the same radius.
+
+        Returns:
+            Self-motions in order of residual, the identity first; `permutation` has no -1.
+
+        Source: every symmetry of a finite set fixes its centroid and is determined by the images of two points that are
+        not in line with it.
+        """
+        points = (self.points - self.points.mean(0)).double().cpu().numpy()
+        radius = np.zeros(len(points)) if self.radius is None else self.radius.double().cpu().numpy()
+        base = _base_pair(points)
+        rotations = _rotations_of_pairs(points, base, tolerance)
+        moved = points @ rotations.transpose(0, 2, 1)  # (R, N, 3)
+        found: dict[bytes, SelfMotion] = {}
+        centroid = self.points.mean(0).double().cpu().numpy()
+        for rotation, image in zip(rotations, moved, strict=True):
+            distance = np.linalg.norm(image[:, None] - points[None], axis=-1)
+            permutation = distance.argmin(1)
+            nearest = distance[np.arange(len(points)), permutation]
+            proper = len(np.unique(permutation)) == len(points) and np.allclose(radius[permutation], radius)
+            if nearest.max() > tolerance or not proper:
+                continue
+            residual = float(np.sqrt(np.mean(nearest**2)))
+            known = found.get(permutation.tobytes())
+            if known is None or residual < known.residual:
+                motion = SelfMotion(rotation, centroid - rotation @ centroid, permutation, residual)
+                found[permutation.tobytes()] = motion
+        identity = np.arange(len(points)).tobytes()
+        rest = sorted((m for key, m in found.items() if key != identity), key=lambda m: m.residual)
+        return (SelfMotion(np.eye(3), np.zeros(3), np.arange(len(points)), 0.0), *rest)
+
+
+def _base_pair(points: NDArray[np.float64]) -> tuple[int, int]:
+    """Two points far from the centroid (at the origin) and far from being in line with it."""
+    first = int(np.linalg.norm(points, axis=1).argmax())
+    second = int(np.linalg.norm(np.cross(points, points[first]), axis=1).argmax())
+    if np.linalg.norm(np.cross(points[second], points[first])) < 1e-6 * np.sum(points[first] ** 2):
+        raise InputError("object: all fiducials lie on one line; a pose cannot be found from them")
+    return first, second
+
+
+def _rotations_of_pairs(points: NDArray[np.float64], base: tuple[int, int], tolerance: float) -> NDArray[np.float64]:
+    """Rotations (R, 3, 3) about the origin that take the base pair to within `tolerance` of some pair of points."""
+    a, b = points[base[0]], points[base[1]]
+    norms = np.linalg.norm(points, axis=1)
+    like_a = np.flatnonzero(np.abs(norms - np.linalg.norm(a)) <= tolerance)
+    like_b = np.flatnonzero(np.abs(norms - np.linalg.norm(b)) <= tolerance)
+    gaps = np.linalg.norm(points[like_a][:, None] - points[like_b][None], axis=-1)
+    i, j = np.nonzero(np.abs(gaps - np.linalg.norm(a - b)) <= 2 * tolerance)
+    source = _frame(a[None], b[None])
+    target = _frame(points[like_a[i]], points[like_b[j]])
+    return target @ source.transpose(0, 2, 1)
+
+
+def _frame(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Orthonormal frames (R, 3, 3), columns spanned by two vectors (R, 3) each."""
+    x = first / np.linalg.norm(first, axis=1, keepdims=True)
+    z = np.cross(first, second)
+    z = z / np.maximum(np.linalg.norm(z, axis=1, keepdims=True), 1e-300)
+    return np.stack((x, np.cross(z, x), z), axis=-1)

@@ -1,0 +1,247 @@
+"""`CameraRig`: intrinsics and extrinsics of any number of cameras, with any leading batch axes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from imgcal.projection import Projection, project_components
+from imgcal.rotations import rotation_from_6d, rotation_from_vector, sixd_from_rotation, vector_from_rotation
+from imgcal.transforms import RigidTransform
+
+PARAMETERS = 15
+"""Free parameters of a camera, in this order: rotation (3, rad), position (3, mm), focal length (2), principal point (2,
+both pixels), distortion (5). Rotation: cam_from_rig = exp(w) cam_from_rig0. Position: of the camera in the rig."""
+
+PARAMETER_NAMES = (
+    "rotation_x", "rotation_y", "rotation_z", "position_x", "position_y", "position_z",
+    "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class RigPrior:
+    """One standard deviation of each factory value: how far a camera may have drifted."""
+
+    focal_length: float = 0.02  # relative
+    principal_point: float = 10.0  # pixels
+    distortion: float = 0.05  # absolute
+    rotation: float = 0.01  # rad, each axis
+    position: float = 10.0  # mm, each axis
+
+    def std(self, rig: CameraRig) -> Tensor:
+        """Spread over the parameters of each camera: (*B, C, 15), in the order of `PARAMETER_NAMES`."""
+        ones = torch.ones_like(rig.distortion)
+        return torch.cat(
+            (
+                ones[..., :3] * self.rotation,
+                ones[..., :3] * self.position,
+                rig.focal_length * self.focal_length,
+                ones[..., :2] * self.principal_point,
+                ones * self.distortion,
+            ),
+            dim=-1,
+        )
+
+
+@dataclass(frozen=True)
+class CameraRig:
+    """Cameras fixed to a common frame. The rig frame is whatever the factory says; only relations between cameras matter."""
+
+    focal_length: Tensor  # (*B, C, 2) pixels: fx, fy
+    principal_point: Tensor  # (*B, C, 2) pixels: cx, cy
+    distortion: Tensor  # (*B, C, 5): k1, k2, p1, p2, k3
+    cam_from_rig: RigidTransform  # (*B, C)
+    image_size: Tensor  # (C, 2) pixels: width, height
+    camera_names: tuple[str, ...]  # C
+    name: str = "rig"
+    working_distance: float | None = None  # mm, from the rig's origin to the object
+    prior: RigPrior | None = None
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """Leading batch axes."""
+        return self.focal_length.shape[:-2]
+
+    @property
+    def cameras(self) -> int:
+        """Number of cameras, C."""
+        return len(self.camera_names)
+
+    @property
+    def positions(self) -> Tensor:
+        """Camera centres in the rig frame: (*B, C, 3) mm."""
+        return -self.cam_from_rig.origin_image()
+
+    def project(self, points_rig: Tensor, radius: Tensor | None = None) -> Projection:
+        """Project points into every camera.
+
+        Args:
+            points_rig: (*B, N, 3) mm, points in the rig frame; batch axes broadcast against the rig's.
+            radius: (N,) mm of spherical fiducials, whose apparent centres are projected; None = points.
+
+        Returns:
+            uv (*B, C, N, 2), depth and visible (*B, C, N); differentiable.
+        """
+        rotation, translation = self.cam_from_rig.rotation, self.cam_from_rig.translation
+        # One product for all cameras of a rig: (3C, 3) @ (3, N).
+        stacked = rotation.flatten(-3, -2) @ points_rig.mT
+        points = stacked.unflatten(-2, (self.cameras, 3)) + translation[..., None]
+        return project_components(
+            points.unbind(-2), self.focal_length, self.principal_point, self.distortion, self.image_size, radius
+        )
+
+    def from_object(self, rig_from_object: RigidTransform) -> CameraRig:
+        """Express the rig in the frame of an object: `cam_from_rig` of the result is `cam_from_object`.
+
+        Args:
+            rig_from_object: (*B) transforms.
+
+        Returns:
+            The same cameras; batch axes broadcast.
+        """
+        expanded = RigidTransform(rig_from_object.rotation[..., None, :, :], rig_from_object.translation[..., None, :])
+        cam_from_object = self.cam_from_rig @ expanded
+        batch = cam_from_object.rotation.shape[:-3]
+        return replace(
+            self,
+            focal_length=self.focal_length.expand(*batch, -1, -1),
+            principal_point=self.principal_point.expand(*batch, -1, -1),
+            distortion=self.distortion.expand(*batch, -1, -1),
+            cam_from_rig=cam_from_object,
+        )
+
+    def moved(self, step: Tensor) -> CameraRig:
+        """Add a step to the parameters: (*B, C, 15), in the order of `PARAMETER_NAMES`."""
+        rotation = rotation_from_vector(step[..., 0:3]) @ self.cam_from_rig.rotation
+        positions = self.positions + step[..., 3:6]
+        return replace(
+            self,
+            focal_length=self.focal_length + step[..., 6:8],
+            principal_point=self.principal_point + step[..., 8:10],
+            distortion=self.distortion + step[..., 10:15],
+            cam_from_rig=RigidTransform(rotation, -(rotation @ positions[..., None]).squeeze(-1)),
+        )
+
+    def difference(self, reference: CameraRig) -> Tensor:
+        """Invert `moved`: the step (*B, C, 15) that takes `reference` to this rig."""
+        rotation = self.cam_from_rig.rotation @ reference.cam_from_rig.rotation.mT
+        parts = (
+            vector_from_rotation(rotation),
+            self.positions - reference.positions,
+            self.focal_length - reference.focal_length,
+            self.principal_point - reference.principal_point,
+            self.distortion - reference.distortion,
+        )
+        batch = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
+        return torch.cat([part.expand(*batch, -1) for part in parts], dim=-1)
+
+    def resized(self, image_size: Tensor) -> CameraRig:
+        """Scale the intrinsics to images of another size by the pixel-centre rule u' + 1/2 = s (u + 1/2).
+
+        Args:
+            image_size: (C, 2) or (2,) pixels: new width, height.
+        """
+        image_size = image_size.expand(self.cameras, 2)
+        scale = image_size.to(self.focal_length) / self.image_size.to(self.focal_length)
+        return replace(
+            self,
+            focal_length=self.focal_length * scale,
+            principal_point=(self.principal_point + 0.5) * scale - 0.5,
+            image_size=image_size,
+        )
+
+    def select(self, cameras: Sequence[int]) -> CameraRig:
+        """Keep the cameras of the given indices, in the given order."""
+        index = list(cameras)
+        return replace(
+            self,
+            focal_length=self.focal_length[..., index, :],
+            principal_point=self.principal_point[..., index, :],
+            distortion=self.distortion[..., index, :],
+            cam_from_rig=RigidTransform(
+                self.cam_from_rig.rotation[..., index, :, :], self.cam_from_rig.translation[..., index, :]
+            ),
+            image_size=self.image_size[index],
+            camera_names=tuple(self.camera_names[i] for i in index),
+        )
+
+    def __getitem__(self, index: object) -> CameraRig:
+        """Index the batch axes."""
+        return replace(
+            self,
+            focal_length=self.focal_length[index],  # type: ignore[index]
+            principal_point=self.principal_point[index],  # type: ignore[index]
+            distortion=self.distortion[index],  # type: ignore[index]
+            cam_from_rig=self.cam_from_rig[index],
+        )
+
+    def expand(self, *batch: int) -> CameraRig:
+        """Repeat the rig over leading batch axes without copying."""
+        return replace(
+            self,
+            focal_length=self.focal_length.expand(*batch, -1, -1),
+            principal_point=self.principal_point.expand(*batch, -1, -1),
+            distortion=self.distortion.expand(*batch, -1, -1),
+            cam_from_rig=RigidTransform(
+                self.cam_from_rig.rotation.expand(*batch, -1, -1, -1),
+                self.cam_from_rig.translation.expand(*batch, -1, -1),
+            ),
+        )
+
+    def to(self, *args: torch.device | torch.dtype | str) -> CameraRig:
+        """Move to a device or change the floating-point type."""
+        device_only = [a for a in args if not isinstance(a, torch.dtype)]
+        return replace(
+            self,
+            focal_length=self.focal_length.to(*args),
+            principal_point=self.principal_point.to(*args),
+            distortion=self.distortion.to(*args),
+            cam_from_rig=self.cam_from_rig.to(*args),
+            image_size=self.image_size.to(*device_only) if device_only else self.image_size,
+        )
+
+
+def pack21(rig: CameraRig) -> Tensor:
+    """The paper's 21 numbers a camera: rotation (9, row-major), translation (3), f (2), principal point (2), distortion (5).
+
+    Args:
+        rig: a rig in the object's frame (`CameraRig.from_object`).
+
+    Returns:
+        (*B, C, 21). Convention: distortion in our order k1, k2, p1, p2, k3; the paper lists k1, k2, k3, p1, p2.
+    """
+    return torch.cat((rig.cam_from_rig.rotation.flatten(-2), _pack_rest(rig)), dim=-1)
+
+
+def pack18(rig: CameraRig) -> Tensor:
+    """The paper's 18 network outputs a camera: like `pack21`, with the 6D rotation in place of the matrix; (*B, C, 18)."""
+    return torch.cat((sixd_from_rotation(rig.cam_from_rig.rotation), _pack_rest(rig)), dim=-1)
+
+
+def unpack21(packed: Tensor, like: CameraRig) -> CameraRig:
+    """Invert `pack21`; names and image sizes come from `like`."""
+    return _unpack(packed[..., :9].unflatten(-1, (3, 3)), packed[..., 9:], like)
+
+
+def unpack18(packed: Tensor, like: CameraRig) -> CameraRig:
+    """Invert `pack18`; the 6D rotation is orthogonalized; names and image sizes come from `like`."""
+    return _unpack(rotation_from_6d(packed[..., :6]), packed[..., 6:], like)
+
+
+def _pack_rest(rig: CameraRig) -> Tensor:
+    return torch.cat((rig.cam_from_rig.translation, rig.focal_length, rig.principal_point, rig.distortion), dim=-1)
+
+
+def _unpack(rotation: Tensor, rest: Tensor, like: CameraRig) -> CameraRig:
+    translation, focal_length, principal_point, distortion = rest.split((3, 2, 2, 5), dim=-1)
+    return replace(
+        like,
+        focal_length=focal_length,
+        principal_point=principal_point,
+        distortion=distortion,
+        cam_from_rig=RigidTransform(rotation, translation),
+    )

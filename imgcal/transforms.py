@@ -1,0 +1,49 @@
+"""Rigid transforms, named `destination_from_source`: `cam_from_object = cam_from_rig @ rig_from_object`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class RigidTransform:
+    """Rotation, then translation: `points_destination = rotation @ points_source + translation`."""
+
+    rotation: Tensor  # (*B, 3, 3)
+    translation: Tensor  # (*B, 3) mm
+
+    @classmethod
+    def identity(cls, *batch: int, dtype: torch.dtype | None = None, device: torch.device | None = None) -> RigidTransform:
+        """Make identity transforms of the given batch shape."""
+        eye = torch.eye(3, dtype=dtype, device=device).expand(*batch, 3, 3)
+        return cls(eye, torch.zeros(*batch, 3, dtype=dtype, device=device))
+
+    def __matmul__(self, other: RigidTransform) -> RigidTransform:
+        """Chain: `a_from_b @ b_from_c` is `a_from_c`; batch axes broadcast."""
+        return RigidTransform(
+            self.rotation @ other.rotation,
+            (self.rotation @ other.translation[..., None]).squeeze(-1) + self.translation,
+        )
+
+    def __getitem__(self, index: object) -> RigidTransform:
+        """Index the batch axes."""
+        return RigidTransform(self.rotation[index], self.translation[index])  # type: ignore[index]
+
+    def inverse(self) -> RigidTransform:
+        """Swap source and destination."""
+        return RigidTransform(self.rotation.mT, -self.origin_image())
+
+    def origin_image(self) -> Tensor:
+        """Return `rotation^T @ translation`: (*B, 3) mm, minus the destination's origin seen from the source."""
+        return (self.rotation.mT @ self.translation[..., None]).squeeze(-1)
+
+    def apply(self, points_source: Tensor) -> Tensor:
+        """Transform points (*B, N, 3) mm; the batch axes broadcast against the transform's."""
+        return points_source @ self.rotation.mT + self.translation[..., None, :]
+
+    def to(self, *args: torch.device | torch.dtype | str) -> RigidTransform:
+        """Move to a device or change the floating-point type."""
+        return RigidTransform(self.rotation.to(*args), self.translation.to(*args))
