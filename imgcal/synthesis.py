@@ -1,0 +1,262 @@
+"""Dynamic camera pose synthesis: random rig poses on a hemisphere, drifted parameters, visibility check.
+
+Source: paper section 4.1. Random numbers come from an explicit `torch.Generator`, whose device is where all runs.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from imgcal.errors import InputError, RefusedError
+from imgcal.objects import CalibrationObject
+from imgcal.projection import Projection
+from imgcal.rig import CameraRig, RigPrior
+from imgcal.rotations import euler_from_rotation, rotation_from_euler
+from imgcal.transforms import RigidTransform
+
+
+@dataclass(frozen=True)
+class PoseRange:
+    """Where the rig may be: on the hemisphere around the object, looking at it, rolled about its axis. All in rad."""
+
+    theta: tuple[float, float] = (0.0, 2 * math.pi)  # azimuth
+    phi: tuple[float, float] = (0.0, math.pi / 2)  # angle from the zenith
+    alpha: tuple[float, float] = (0.0, 2 * math.pi)  # roll
+
+    @classmethod
+    def overhead(cls) -> PoseRange:
+        """Stay at the zenith with any roll: the paper's "fixed overhead" rows."""
+        return cls(theta=(0.0, 0.0), phi=(0.0, 0.0))
+
+
+@dataclass(frozen=True)
+class RelativeDrift:
+    """The paper's perturbation: every value times 1 + delta, delta uniform in [-kappa, kappa]."""
+
+    kappa_intrinsics: float = 0.025
+    kappa_extrinsics: float = 0.025
+
+    def __post_init__(self) -> None:
+        for name in ("kappa_intrinsics", "kappa_extrinsics"):
+            value = getattr(self, name)
+            if not 0 <= value < 1:
+                raise InputError(f"{name}: found {value}, expected 0 <= kappa < 1 (0.025 is 2.5 %)")
+
+    def apply(self, rig: CameraRig, generator: torch.Generator) -> CameraRig:
+        """Disturb focal lengths, principal points, distortion; Euler angles and positions of the cameras in the rig."""
+
+        def drift(value: Tensor, kappa: float) -> Tensor:
+            return value * (1 + kappa * (2 * _uniform(value, generator) - 1))
+
+        rotation = rig.cam_from_rig.rotation
+        positions = rig.positions
+        if self.kappa_extrinsics > 0:
+            rotation = rotation_from_euler(drift(euler_from_rotation(rotation), self.kappa_extrinsics))
+            positions = drift(positions, self.kappa_extrinsics)
+        return replace(
+            rig,
+            focal_length=drift(rig.focal_length, self.kappa_intrinsics),
+            principal_point=drift(rig.principal_point, self.kappa_intrinsics),
+            distortion=drift(rig.distortion, self.kappa_intrinsics),
+            cam_from_rig=RigidTransform(rotation, -(rotation @ positions[..., None]).squeeze(-1)),
+        )
+
+    def std(self, rig: CameraRig) -> Tensor:
+        """Standard deviation of each parameter under this drift: (*B, C, 15), to first order in kappa."""
+        uniform = 1 / math.sqrt(3)
+        k_int, k_ext = self.kappa_intrinsics * uniform, self.kappa_extrinsics * uniform
+        a, b, c = euler_from_rotation(rig.cam_from_rig.rotation).unbind(-1)
+        # d(rotation)/d(angles) as rotation vectors on the left of Rz(c) Ry(b) Rx(a).
+        zero, one = torch.zeros_like(a), torch.ones_like(a)
+        about_x = torch.stack((c.cos() * b.cos(), c.sin() * b.cos(), -b.sin()), -1) * a[..., None]
+        about_y = torch.stack((-c.sin(), c.cos(), zero), -1) * b[..., None]
+        about_z = torch.stack((zero, zero, one), -1) * c[..., None]
+        rotation = (about_x.square() + about_y.square() + about_z.square()).sqrt()
+        return torch.cat(
+            (
+                rotation * k_ext,
+                rig.positions.abs() * k_ext,
+                rig.focal_length * k_int,
+                rig.principal_point * k_int,
+                rig.distortion.abs() * k_int,
+            ),
+            dim=-1,
+        )
+
+
+@dataclass(frozen=True)
+class PhysicalDrift:
+    """Gaussian drift in physical units, for real rigs; each number is one standard deviation."""
+
+    rotation_deg: float = 0.5  # each axis
+    position: float = 2.0  # mm, each axis
+    focal_length: float = 0.01  # relative
+    principal_point: float = 5.0  # pixels
+    distortion: float = 0.005  # absolute
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (math.isfinite(value) and value >= 0):
+                raise InputError(f"{name}: found {value}, expected a standard deviation >= 0")
+
+    def apply(self, rig: CameraRig, generator: torch.Generator) -> CameraRig:
+        """Disturb every parameter of every camera independently."""
+        std = self.std(rig)
+        noise = torch.randn(std.shape, generator=generator, dtype=std.dtype, device=std.device)
+        return rig.moved(noise * std)
+
+    def std(self, rig: CameraRig) -> Tensor:
+        """Standard deviation of each parameter: (*B, C, 15)."""
+        as_prior = RigPrior(
+            self.focal_length, self.principal_point, self.distortion, math.radians(self.rotation_deg), self.position
+        )
+        return as_prior.std(rig)
+
+
+Drift = RelativeDrift | PhysicalDrift
+
+
+@dataclass(frozen=True)
+class Snapshots:
+    """Synthetic rigs, each with one view of the object."""
+
+    rig: CameraRig  # (B,) drifted rigs
+    rig_from_object: RigidTransform  # (B,)
+    projection: Projection  # (B, C, N)
+
+
+def synthesize(
+    rig: CameraRig,
+    obj: CalibrationObject,
+    count: int,
+    generator: torch.Generator,
+    *,
+    drift: Drift | None = RelativeDrift(),
+    pose_range: PoseRange = PoseRange(),
+    max_rounds: int = 100,
+) -> Snapshots:
+    """Make exactly `count` random rigs that see every fiducial in every camera.
+
+    Args:
+        rig: the factory rig, without batch axes; device and dtype come from it.
+        obj: the calibration object; its centroid is put on the rig's axis at the working distance.
+        count: number of rigs, B.
+        generator: source of randomness, on the rig's device.
+        drift: how the parameters differ from the factory's; None = not at all.
+        pose_range: where the rig may be.
+        max_rounds: rounds of rejection before giving up.
+
+    Raises:
+        RefusedError: too few random rigs see everything; the message names the camera that fails most.
+
+    Source: paper section 4.1: hemisphere point, R_focus, R_random, perturbation, visibility check.
+    """
+    points, radius = obj.points.to(rig.focal_length), None if obj.radius is None else obj.radius.to(rig.focal_length)
+    kept: list[Snapshots] = []
+    missing, tried, failures = count, 0, torch.zeros(rig.cameras, device=points.device)
+    for _ in range(max_rounds):
+        accepted = max(tried - int(failures.amax()), 1) / max(tried, 1)
+        batch = count if not kept and not tried else min(math.ceil(1.2 * missing / accepted) + 8, 4 * count + 64)
+        trial = _sample(rig, points, radius, batch, generator, drift, pose_range)
+        seen = trial.projection.visible.all(-1)  # (B, C)
+        good = seen.all(-1)
+        found = int(good.sum())
+        if found == batch and not kept and batch == count:
+            return trial
+        tried, failures = tried + batch, failures + (~seen).sum(0)
+        kept.append(_take(trial, good.nonzero().squeeze(-1)[:missing]))
+        missing -= min(found, missing)
+        if missing == 0:
+            return _concatenate(kept)
+    worst = int(failures.argmax())
+    raise RefusedError(
+        f"synthesis: {count - missing} of {count} rigs after {tried} trials; camera {rig.camera_names[worst]} misses part "
+        f"of object {obj.name} in {100 * float(failures[worst]) / tried:.0f} % of them: reduce the drift, the pose range or "
+        "the object, or change the working distance"
+    )
+
+
+def sample_rig_from_object(
+    count: int, working_distance: float, centroid: Tensor, pose_range: PoseRange, generator: torch.Generator
+) -> RigidTransform:
+    """Sample poses of an object seen from a rig on a hemisphere around it.
+
+    Args:
+        count: number of poses, B.
+        working_distance: mm from the rig's origin to the object's centroid.
+        centroid: (3,) mm in the object's frame; gives dtype and device.
+        pose_range: where the rig may be.
+        generator: source of randomness.
+
+    Returns:
+        (B,) rig_from_object: the object's centroid at (0, 0, working_distance), R_focus, then the roll R_random.
+    """
+    draws = torch.rand((3, count), generator=generator, dtype=centroid.dtype, device=centroid.device)
+    theta, phi, alpha = (
+        low + (high - low) * draw
+        for (low, high), draw in zip((pose_range.theta, pose_range.phi, pose_range.alpha), draws, strict=True)
+    )
+    st, ct, sp, cp, sa, ca = theta.sin(), theta.cos(), phi.sin(), phi.cos(), alpha.sin(), alpha.cos()
+    # Rows of R_focus: the unit vectors of azimuth and zenith angle, and the viewing direction (towards the centre).
+    zero = torch.zeros_like(st)
+    x_axis, y_axis = (-st, ct, zero), (cp * ct, cp * st, -sp)
+    rows = (
+        *(ca * x - sa * y for x, y in zip(x_axis, y_axis, strict=True)),
+        *(sa * x + ca * y for x, y in zip(x_axis, y_axis, strict=True)),
+        -sp * ct, -sp * st, -cp,
+    )  # fmt: skip
+    rotation = torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+    target = centroid.new_tensor((0.0, 0.0, working_distance))
+    return RigidTransform(rotation, target - rotation @ centroid)
+
+
+def _sample(
+    rig: CameraRig,
+    points: Tensor,
+    radius: Tensor | None,
+    count: int,
+    generator: torch.Generator,
+    drift: Drift | None,
+    pose_range: PoseRange,
+) -> Snapshots:
+    if rig.working_distance is None:
+        raise InputError(f"rig {rig.name}: found no working_distance, expected one (mm) to place the rig by")
+    poses = sample_rig_from_object(count, rig.working_distance, points.mean(0), pose_range, generator)
+    rigs = rig.expand(count)
+    drifted = rigs if drift is None else drift.apply(rigs, generator)
+    return Snapshots(drifted, poses, drifted.project(poses.apply(points), radius))
+
+
+def _take(snapshots: Snapshots, rows: Tensor) -> Snapshots:
+    p = snapshots.projection
+    projection = Projection(p.uv[rows], p.depth[rows], p.visible[rows])
+    return Snapshots(snapshots.rig[rows], snapshots.rig_from_object[rows], projection)
+
+
+def _concatenate(parts: list[Snapshots]) -> Snapshots:
+    rigs = [part.rig for part in parts]
+    rig = replace(
+        rigs[0],
+        focal_length=torch.cat([r.focal_length for r in rigs]),
+        principal_point=torch.cat([r.principal_point for r in rigs]),
+        distortion=torch.cat([r.distortion for r in rigs]),
+        cam_from_rig=_concatenate_transforms([r.cam_from_rig for r in rigs]),
+    )
+    projection = Projection(
+        torch.cat([part.projection.uv for part in parts]),
+        torch.cat([part.projection.depth for part in parts]),
+        torch.cat([part.projection.visible for part in parts]),
+    )
+    return Snapshots(rig, _concatenate_transforms([part.rig_from_object for part in parts]), projection)
+
+
+def _concatenate_transforms(parts: list[RigidTransform]) -> RigidTransform:
+    return RigidTransform(torch.cat([p.rotation for p in parts]), torch.cat([p.translation for p in parts]))
+
+
+def _uniform(like: Tensor, generator: torch.Generator) -> Tensor:
+    return torch.rand(like.shape, generator=generator, dtype=like.dtype, device=like.device)
