@@ -1,0 +1,169 @@
+"""Draw fiducials as Gaussian splats: differentiable, anti-aliased, sub-pixel exact."""
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from renderers.compositing import composite_windows, window_starts
+
+# A window of 5 standard deviations cuts the profile off at 4e-6 of its peak.
+WINDOW_SIGMAS = 5.0
+# Images converted at a time when the buffer has a lower precision: the float32 images then stay in the processor's cache.
+IMAGES_PER_CONVERSION = 16
+
+
+def splat(
+    uv: Tensor,
+    colours: Tensor,
+    size: Tensor | float,
+    image_size: tuple[int, int],
+    *,
+    intensity: Tensor | None = None,
+    visible: Tensor | None = None,
+    depth: Tensor | None = None,
+    compositing: Literal["add", "over"] = "add",
+    out: Tensor | None = None,
+) -> Tensor:
+    """Draw every fiducial as a coloured Gaussian, integrated over the area of each pixel.
+
+    A pixel holds ``colour * intensity * integral of exp(-r^2 / (2 size^2))`` over its area: a wide splat peaks at its colour,
+    a narrow one dims but keeps its mass ``2 pi size^2``, wherever in the pixel it lies. Differentiable in ``uv``, ``colours``,
+    ``size`` and ``intensity``; a fiducial that is invisible, not finite or far outside the image draws nothing and
+    gets zero gradients.
+
+    Where splats overlap, ``"add"`` sums their light, in any order (values may exceed 1 and are not clamped). ``"over"``
+    composites front to back: a splat has the opacity ``intensity * profile``, clamped to [0, 1], and hides what lies deeper.
+    Where nothing overlaps both give the same image; ``"over"`` costs several times more, cuts profiles off beyond 5 sizes,
+    and needs memory for the images plus one window a fiducial.
+
+    On a CPU a fresh output spends most of its time in page faults. Rendering into a reused ``out`` under ``torch.no_grad()``
+    is about four times faster.
+
+    Args:
+        uv: (*B, N, 2) pixels of the output image.
+        colours: (N, K) or (*B, N, K) colours in [0, 1], K = 3 for RGB.
+        size: Standard deviation of the Gaussian in pixels, positive; a number or broadcastable to (*B, N).
+        image_size: Height and width of the images.
+        intensity: Broadcastable to (*B, N), default 1.
+        visible: Broadcastable to (*B, N), bool, default all.
+        depth: (*B, N), smaller is nearer; only for ``"over"``, default: the first fiducial is the nearest.
+        compositing: ``"add"`` or ``"over"``.
+        out: (*B, K, H, W) contiguous buffer that is overwritten and returned; not differentiable. May have a lower precision
+            (bfloat16, float16): the images are computed in float32 and rounded once.
+
+    Returns:
+        (*B, K, H, W) images on black, in the dtype of ``uv`` (at least float32) or of ``out``.
+
+    Raises:
+        ValueError: Shapes do not fit, a compositing mode is unknown, or ``out`` is used while gradients are recorded.
+
+    Convention: pixel (0, 0) is the centre of the top-left pixel, u right, v down.
+
+    """
+    batch, count = uv.shape[:-2], uv.shape[-2]
+    images = math.prod(batch)
+    _check(uv, colours, compositing, depth)
+    dtype = torch.promote_types(uv.dtype, torch.float32)
+    # Autocast would round the profiles to bfloat16, and the gradient of a coordinate with them.
+    with torch.autocast(uv.device.type, enabled=False):
+        drawn = uv.isfinite().all(-1)
+        if visible is not None:
+            drawn = drawn & visible.expand(*batch, count)
+        sizes = torch.as_tensor(size, dtype=dtype, device=uv.device).expand(*batch, count)
+        weight = torch.ones_like(sizes) if intensity is None else intensity.to(dtype).expand(*batch, count)
+        # Replaced, not multiplied by zero: a NaN times zero is still a NaN, in the image and in the gradient.
+        uv = torch.where(drawn[..., None], uv.to(dtype), 0.0).reshape(images, count, 2)
+        sizes = torch.where(drawn, sizes, 1.0).reshape(images, count)
+        weight = torch.where(drawn, weight, 0.0).reshape(images, count)
+        colours = torch.where(drawn[..., None], colours.to(dtype), 0.0).reshape(images, count, colours.shape[-1])
+        shape = (*batch, colours.shape[-1], *image_size)
+        if out is not None:
+            _check_out(out, shape, uv.device, (uv, colours, sizes, weight))
+        if compositing == "add":
+            return _add(uv, colours * weight[..., None], sizes, shape, out)
+        composed = _over(uv, colours, sizes, weight, image_size, depth).reshape(shape)
+        return composed if out is None else out.copy_(composed)
+
+
+def profile(centre: Tensor, size: Tensor, start: Tensor | int, length: int) -> Tensor:
+    """Integrate a Gaussian of peak 1 over each of ``length`` neighbouring pixels.
+
+    Args:
+        centre: (...) pixels.
+        size: (...) standard deviation in pixels.
+        start: First pixel, a number or (...).
+        length: Number of pixels.
+
+    Returns:
+        (..., length) integrals; they sum to ``sqrt(2 pi) size`` over an infinite line.
+
+    """
+    first_edge = start - 0.5 - centre
+    edges = first_edge[..., None] + torch.arange(length + 1, dtype=centre.dtype, device=centre.device)
+    cumulative = torch.erf(edges / (math.sqrt(2) * size[..., None]))
+    return (math.sqrt(math.pi / 2) * size[..., None]) * cumulative.diff(dim=-1)
+
+
+def _add(uv: Tensor, colours: Tensor, sizes: Tensor, shape: tuple[int, ...], out: Tensor | None) -> Tensor:
+    """Sum the splats: an outer product each, so one matrix product an image (uv (B, N, 2), colours (B, N, K))."""
+    height, width = shape[-2:]
+    along_u = profile(uv[..., 0], sizes, 0, width)  # (B, N, W)
+    along_v = profile(uv[..., 1], sizes, 0, height)  # (B, N, H)
+    left = (colours[..., None] * along_v[..., None, :]).flatten(2).mT  # (B, K*H, N)
+    if out is None:
+        return torch.bmm(left, along_u).view(shape)
+    flat = out.view(left.shape[0], left.shape[1], width)
+    if out.dtype == uv.dtype:
+        torch.bmm(left, along_u, out=flat)
+        return out
+    for target, some_left, some_u in zip(
+        flat.split(IMAGES_PER_CONVERSION),
+        left.split(IMAGES_PER_CONVERSION),
+        along_u.split(IMAGES_PER_CONVERSION),
+        strict=True,
+    ):
+        target.copy_(torch.bmm(some_left, some_u))
+    return out
+
+
+def _over(
+    uv: Tensor, colours: Tensor, sizes: Tensor, weight: Tensor, image_size: tuple[int, int], depth: Tensor | None
+) -> Tensor:
+    """Composite the splats front to back on local windows (uv (B, N, 2), colours (B, N, K)) -> (B, K, H, W)."""
+    if depth is not None:
+        order = depth.reshape(sizes.shape).argsort(dim=-1, stable=True)
+        uv, colours = (x.gather(1, order[..., None].expand_as(x)) for x in (uv, colours))
+        sizes, weight = sizes.gather(1, order), weight.gather(1, order)
+    reach = float(sizes.detach().max()) if sizes.numel() else 0.0
+    window = 2 * math.ceil(WINDOW_SIGMAS * reach) + 1
+    height, width = image_size
+    window_height, window_width = min(window, height), min(window, width)
+    rows = window_starts(uv[..., 1], window_height, height)
+    columns = window_starts(uv[..., 0], window_width, width)
+    along_v = weight[..., None] * profile(uv[..., 1], sizes, rows, window_height)
+    along_u = profile(uv[..., 0], sizes, columns, window_width)
+    alpha = (along_v[..., :, None] * along_u[..., None, :]).clamp(0, 1)  # (B, N, h, w)
+    return composite_windows(alpha, colours, rows, columns, image_size)[0]
+
+
+def _check(uv: Tensor, colours: Tensor, compositing: str, depth: Tensor | None) -> None:
+    if uv.ndim < 2 or uv.shape[-1] != 2 or not uv.is_floating_point():
+        raise ValueError(f"uv must be floating point of shape (*B, N, 2), found {uv.dtype} of shape {tuple(uv.shape)}")
+    if colours.ndim < 2 or colours.shape[-2] != uv.shape[-2]:
+        expected = f"({uv.shape[-2]}, K) or (*B, {uv.shape[-2]}, K)"
+        raise ValueError(f"colours must have shape {expected}, found {tuple(colours.shape)}")
+    if compositing not in ("add", "over"):
+        raise ValueError(f"compositing must be 'add' or 'over', found {compositing!r}")
+    if depth is not None and (compositing == "add" or depth.shape != uv.shape[:-1]):
+        expected = f"shape {tuple(uv.shape[:-1])} and compositing='over'"
+        raise ValueError(f"depth needs {expected}, found shape {tuple(depth.shape)} and {compositing!r}")
+
+
+def _check_out(out: Tensor, shape: tuple[int, ...], device: torch.device, inputs: tuple[Tensor, ...]) -> None:
+    if tuple(out.shape) != shape or out.device != device or not out.is_contiguous() or not out.is_floating_point():
+        found = f"{out.dtype} of shape {tuple(out.shape)} on {out.device}"
+        raise ValueError(f"out must be contiguous, floating point, of shape {shape} on {device}; found {found}")
+    if torch.is_grad_enabled() and any(x.requires_grad for x in inputs):
+        raise ValueError("out is not differentiable: render without it, or under torch.no_grad()")
