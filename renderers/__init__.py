@@ -1,7 +1,34 @@
-"""Renderers: pixels, colours and visibility in, images out."""
+"""Renderers: pixels, colours and visibility in, images out. A leaf package that knows no camera."""
 
+from renderers.infrared import (
+    BlobRange,
+    Blobs,
+    Clutter,
+    ClutterModel,
+    InfraredFrames,
+    SensorModel,
+    expose,
+    infrared_frames,
+    render_blobs,
+    sample_clutter,
+)
 from renderers.palette import palette
 from renderers.reference import ellipse_reference, splat_reference
 from renderers.splat import splat
 
-__all__ = ["ellipse_reference", "palette", "splat", "splat_reference"]
+__all__ = [
+    "BlobRange",
+    "Blobs",
+    "Clutter",
+    "ClutterModel",
+    "InfraredFrames",
+    "SensorModel",
+    "ellipse_reference",
+    "expose",
+    "infrared_frames",
+    "palette",
+    "render_blobs",
+    "sample_clutter",
+    "splat",
+    "splat_reference",
+]

@@ -1,5 +1,7 @@
 """Draw many small windows into images, nearest first, without a volume of fiducials times pixels."""
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -21,43 +23,47 @@ def window_starts(centre: Tensor, length: int, image_length: int) -> Tensor:
     return (centre.detach() - (length - 1) / 2).clamp(0, last).round().long()
 
 
-def composite_windows(
-    alpha: Tensor, colours: Tensor, rows: Tensor, columns: Tensor, image_size: tuple[int, int]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Composite windows front to back: every window adds ``transmittance * alpha * colour``.
+class Canvas(NamedTuple):
+    """Images being composited front to back."""
+
+    images: Tensor  # (B, K, H, W)
+    transmittance: Tensor  # (B, H, W) share of the light from behind that still passes
+
+    @classmethod
+    def blank(cls, batch: int, channels: int, image_size: tuple[int, int], like: Tensor) -> "Canvas":
+        """Start with black images and nothing in front."""
+        return cls(like.new_zeros(batch, channels, *image_size), like.new_ones(batch, *image_size))
+
+
+def composite_windows(canvas: Canvas, alpha: Tensor, colours: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+    """Composite windows front to back: every window adds ``transmittance * alpha * colour``. Changes ``canvas``.
 
     Memory is that of the windows plus the images; the loop runs over fiducials, the batch is vectorized.
 
     Args:
+        canvas: What lies in front.
         alpha: (B, N, h, w) opacity in [0, 1] on each window, nearest fiducial first.
         colours: (B, N, K) colour of each fiducial.
         rows: (B, N) first image row of each window.
         columns: (B, N) first image column of each window.
-        image_size: Height and width of the images, at least (h, w).
 
     Returns:
-        Images (B, K, H, W), transmittance (B, H, W) left for whatever lies behind, and the (B, N) sum of each fiducial's
-        opacity over the pixels, as far as nothing nearer hides it.
-
+        (B, N) sum of each fiducial's opacity over the pixels, as far as nothing nearer hides it.
     """
     (batch, count, window_height, window_width), channels = alpha.shape, colours.shape[-1]
-    height, width = image_size
-    pixels = height * width
+    height, width = canvas.images.shape[-2:]
+    images, transmittance = canvas.images.flatten(2), canvas.transmittance.flatten()  # views
     y = rows[..., None] + torch.arange(window_height, device=alpha.device)  # (B, N, h)
     x = columns[..., None] + torch.arange(window_width, device=alpha.device)  # (B, N, w)
     index = (y[..., :, None] * width + x[..., None, :]).flatten(2)  # (B, N, h*w)
-    image_of = torch.arange(batch, device=alpha.device)[:, None]
-
-    images = alpha.new_zeros(batch, channels, pixels)
-    transmittance = alpha.new_ones(batch * pixels)
+    first_pixel = height * width * torch.arange(batch, device=alpha.device)[:, None]
     seen = []
     for n in range(count):
-        at = image_of * pixels + index[:, n]
-        # Indexing and accumulation save indices only, so autograd keeps windows and never a copy of the images.
+        at = first_pixel + index[:, n]
+        # Indexing and accumulation save indices only: autograd keeps windows, never a copy of the images.
         visible = transmittance[at] * alpha[:, n].flatten(1)  # (B, h*w)
         transmittance.index_put_((at,), -visible, accumulate=True)
         window = index[:, None, n].expand(-1, channels, -1)
         images.scatter_add_(2, window, visible[:, None] * colours[:, n, :, None])
         seen.append(visible.sum(-1))
-    seen_sums = torch.stack(seen, dim=-1) if seen else alpha.new_zeros(batch, 0)
-    return images.view(batch, channels, height, width), transmittance.view(batch, height, width), seen_sums
+    return torch.stack(seen, dim=-1) if seen else alpha.new_zeros(batch, 0)

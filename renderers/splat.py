@@ -6,11 +6,11 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from renderers.compositing import composite_windows, window_starts
+from renderers.compositing import Canvas, composite_windows, window_starts
 
 # A window of 5 standard deviations cuts the profile off at 4e-6 of its peak.
 WINDOW_SIGMAS = 5.0
-# Images converted at a time when the buffer has a lower precision: the float32 images then stay in the processor's cache.
+# Images converted at a time when the buffer has a lower precision: the float32 images then stay in the cache.
 IMAGES_PER_CONVERSION = 16
 
 
@@ -28,18 +28,18 @@ def splat(
 ) -> Tensor:
     """Draw every fiducial as a coloured Gaussian, integrated over the area of each pixel.
 
-    A pixel holds ``colour * intensity * integral of exp(-r^2 / (2 size^2))`` over its area: a wide splat peaks at its colour,
-    a narrow one dims but keeps its mass ``2 pi size^2``, wherever in the pixel it lies. Differentiable in ``uv``, ``colours``,
-    ``size`` and ``intensity``; a fiducial that is invisible, not finite or far outside the image draws nothing and
-    gets zero gradients.
+    A pixel holds ``colour * intensity * integral of exp(-r^2 / (2 size^2))`` over its area: a wide splat peaks at its
+    colour, a narrow one dims but keeps its mass ``2 pi size^2``, wherever in the pixel it lies. Differentiable in
+    ``uv``, ``colours``, ``size`` and ``intensity``; a fiducial that is invisible, not finite or far outside the image
+    draws nothing and gets zero gradients.
 
     Where splats overlap, ``"add"`` sums their light, in any order (values may exceed 1 and are not clamped). ``"over"``
-    composites front to back: a splat has the opacity ``intensity * profile``, clamped to [0, 1], and hides what lies deeper.
-    Where nothing overlaps both give the same image; ``"over"`` costs several times more, cuts profiles off beyond 5 sizes,
-    and needs memory for the images plus one window a fiducial.
+    composites front to back: a splat has the opacity ``intensity * profile``, clamped to [0, 1], and hides what lies
+    deeper. Where nothing overlaps both give the same image; ``"over"`` costs several times more, cuts profiles off
+    beyond 5 sizes, and needs memory for the images plus one window a fiducial.
 
-    On a CPU a fresh output spends most of its time in page faults. Rendering into a reused ``out`` under ``torch.no_grad()``
-    is about four times faster.
+    On a CPU a fresh output spends most of its time in page faults. Rendering into a reused ``out`` under
+    ``torch.no_grad()`` is about four times faster.
 
     Args:
         uv: (*B, N, 2) pixels of the output image.
@@ -50,8 +50,8 @@ def splat(
         visible: Broadcastable to (*B, N), bool, default all.
         depth: (*B, N), smaller is nearer; only for ``"over"``, default: the first fiducial is the nearest.
         compositing: ``"add"`` or ``"over"``.
-        out: (*B, K, H, W) contiguous buffer that is overwritten and returned; not differentiable. May have a lower precision
-            (bfloat16, float16): the images are computed in float32 and rounded once.
+        out: (*B, K, H, W) contiguous buffer that is overwritten and returned; not differentiable. May have a lower
+            precision (bfloat16, float16): the images are computed in float32 and rounded once.
 
     Returns:
         (*B, K, H, W) images on black, in the dtype of ``uv`` (at least float32) or of ``out``.
@@ -145,7 +145,9 @@ def _over(
     along_v = weight[..., None] * profile(uv[..., 1], sizes, rows, window_height)
     along_u = profile(uv[..., 0], sizes, columns, window_width)
     alpha = (along_v[..., :, None] * along_u[..., None, :]).clamp(0, 1)  # (B, N, h, w)
-    return composite_windows(alpha, colours, rows, columns, image_size)[0]
+    canvas = Canvas.blank(len(uv), colours.shape[-1], image_size, like=alpha)
+    composite_windows(canvas, alpha, colours, rows, columns)
+    return canvas.images
 
 
 def _check(uv: Tensor, colours: Tensor, compositing: str, depth: Tensor | None) -> None:

@@ -6,6 +6,8 @@ from typing import Any, Literal
 import pytest
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 from renderers import palette, splat, splat_reference
 
@@ -97,10 +99,9 @@ def test_a_wide_splat_peaks_at_its_colour() -> None:
 
 def test_addition_does_not_depend_on_the_order() -> None:
     values = scene((2,))
-    del values["depth"]
     order = torch.tensor([3, 0, 4, 2, 1])
     permuted = {k: v[:, order] for k, v in values.items()}
-    torch.testing.assert_close(splat(image_size=SIZE, **permuted), splat(image_size=SIZE, **values))
+    torch.testing.assert_close(splat(**arguments(permuted, "add")), splat(**arguments(values, "add")))
 
 
 def test_the_nearer_splat_hides_the_deeper_one() -> None:
@@ -168,6 +169,26 @@ def test_a_buffer_is_overwritten_with_the_same_images(dtype: torch.dtype, tolera
     returned = splat(**values, out=out)
     assert returned is out
     torch.testing.assert_close(out.float(), splat(**values), rtol=tolerance, atol=1e-7)
+
+
+class LargestTensor(TorchDispatchMode):
+    """Record the number of values in the largest tensor that any operation returns."""
+
+    largest = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        self.largest = max([self.largest, *(x.numel() for x in tree_leaves(result) if isinstance(x, Tensor))])
+        return result
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_no_tensor_is_larger_than_the_images(mode: Mode) -> None:
+    uv = (20 * torch.rand(2, 60, 2, generator=torch.Generator().manual_seed(0))).requires_grad_()
+    with LargestTensor() as record:
+        image = splat(uv, palette(60), 0.6, (128, 96), compositing=mode)
+        image.square().sum().backward()
+    assert record.largest == image.numel()
 
 
 def test_no_fiducials_give_black_images() -> None:
