@@ -1,0 +1,28 @@
+"""Reading and writing files; every problem is an `InputError` of one line, and nothing is ever half-written."""
+
+from imgcal.formats.atomic import replacing, write_bytes, write_text
+from imgcal.formats.capture import Capture, open_capture, open_input, save_capture_settings
+from imgcal.formats.detections_csv import load_detections, save_detections
+from imgcal.formats.frames import Frame, read_frame, write_frame
+from imgcal.formats.object_csv import load_object
+from imgcal.formats.rig_yaml import RigCovariance, load_rig, load_rig_covariance, save_rig
+
+__all__ = [
+    "Capture",
+    "Frame",
+    "RigCovariance",
+    "load_detections",
+    "load_object",
+    "load_rig",
+    "load_rig_covariance",
+    "open_capture",
+    "open_input",
+    "read_frame",
+    "replacing",
+    "save_capture_settings",
+    "save_detections",
+    "save_rig",
+    "write_bytes",
+    "write_frame",
+    "write_text",
+]

@@ -1,0 +1,158 @@
+"""Reading CSV, plain or compressed by gzip, as text columns in chunks; every problem is one line with its line number."""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import io
+import itertools
+import reprlib
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imgcal.errors import InputError
+from imgcal.formats.names import nearest
+
+CHUNK = 1000  # rows: larger ones leave the processor cache and wake the garbage collector, half as fast
+GZIP_MAGIC = b"\x1f\x8b"
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Consecutive rows of a CSV file as text columns of equal length."""
+
+    path: Path
+    first_row: int  # data rows before this chunk
+    columns: dict[str, tuple[str, ...]]
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values())))
+
+    def fail(self, row: int, problem: str) -> NoReturn:
+        """Raise the error of a row of this chunk."""
+        fail_row(self.path, self.first_row + row, problem)
+
+    def numbers(
+        self, name: str, good: Callable[[NDArray[np.float64]], NDArray[np.bool_]], expected: str
+    ) -> NDArray[np.float64]:
+        """Convert a column to finite numbers.
+
+        Args:
+            name: of the column.
+            good: tells which values are acceptable.
+            expected: says so in words.
+
+        Raises:
+            InputError: with the line of the first value that is not.
+        """
+        column = self.columns[name]
+        try:
+            values = np.fromiter(map(float, column), dtype=np.float64, count=len(column))
+        except ValueError:
+            row = next(i for i, text in enumerate(column) if not _is_float(text))
+            self.fail(row, f"{name}: found {reprlib.repr(column[row])}, expected {expected}")
+        wrong = ~(np.isfinite(values) & good(values))
+        if wrong.any():
+            row = int(wrong.argmax())
+            self.fail(row, f"{name}: found {column[row]}, expected {expected}")
+        return values
+
+
+def read_chunks(path: Path, required: Sequence[str], optional: Sequence[str]) -> Iterator[Chunk]:
+    """Read a CSV file with a header; blank lines are skipped.
+
+    Args:
+        path: the file, with or without gzip compression.
+        required: columns that must be there, in any order.
+        optional: columns that may be there.
+
+    Yields:
+        Chunks of at most `CHUNK` rows; none when the file has only a header.
+
+    Raises:
+        InputError: unreadable, truncated or binary file, wrong header, a row of another length.
+    """
+    with _Text(path) as rows:
+        header = [cell.strip() for cell in next(rows, [])]
+        _check_header(path, header, required, optional)
+        for first in itertools.count(0, CHUNK):
+            chunk = list(itertools.islice(rows, CHUNK))
+            if not chunk:
+                return
+            lengths = np.fromiter(map(len, chunk), dtype=np.int64, count=len(chunk))
+            if (lengths != len(header)).any():
+                row = int((lengths != len(header)).argmax())
+                fail_row(path, first + row, f"found {lengths[row]} cells, expected {len(header)}: {','.join(header)}")
+            yield Chunk(path, first, dict(zip(header, zip(*chunk, strict=True), strict=True)))
+
+
+class _Text:
+    """Context manager that gives the non-blank rows of a CSV file and turns every reading failure into an `InputError`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __enter__(self) -> Iterator[list[str]]:
+        try:
+            self.file = open(self.path, "rb")  # noqa: SIM115
+            magic = self.file.read(2)
+            self.file.seek(0)
+        except OSError as error:
+            raise InputError(f"{self.path}: cannot be read: {error.strerror or error}") from error
+        binary = gzip.GzipFile(fileobj=self.file) if magic == GZIP_MAGIC else self.file
+        # utf-8-sig: spreadsheets put a byte order mark in front of the header.
+        self.reader = csv.reader(io.TextIOWrapper(binary, encoding="utf-8-sig", newline=""), strict=True)
+        return filter(None, self.reader)
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        self.file.close()
+        match error:
+            case UnicodeDecodeError():
+                problem = "not a text file in UTF-8"
+            case EOFError():
+                problem = "compressed file is truncated"
+            case gzip.BadGzipFile() | zlib.error():
+                problem = f"compressed file is damaged: {error}"
+            case csv.Error():
+                problem = f"line {self.reader.line_num}: not valid CSV: {error}"
+            case _:
+                return
+        raise InputError(f"{self.path}: {problem}, expected CSV with a header line") from error
+
+
+def _check_header(path: Path, header: list[str], required: Sequence[str], optional: Sequence[str]) -> None:
+    expected = f"expected the columns {','.join(required)}" + (f", optional {', '.join(optional)}" if optional else "")
+    if not header:
+        raise InputError(f"{path}: found an empty file, {expected}")
+    known = (*required, *optional)
+    for name in header:
+        if name not in known:
+            raise InputError(f"{path}: unknown column {reprlib.repr(name)}{nearest(name, known)}; {expected}")
+        if header.count(name) > 1:
+            raise InputError(f"{path}: found the column {name} more than once, {expected}")
+    missing = [name for name in required if name not in header]
+    if missing:
+        raise InputError(f"{path}: found no column {', '.join(missing)}; {expected}")
+
+
+def fail_row(path: Path, row: int, problem: str) -> NoReturn:
+    """Raise the error of a data row; its line number is found by reading again: blank lines and quoted breaks shift it."""
+    text = _Text(path)
+    with text as rows:
+        next(itertools.islice(rows, row + 1, None))
+        line = text.reader.line_num
+    raise InputError(f"{path}: line {line}: {problem}")
+
+
+def _is_float(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

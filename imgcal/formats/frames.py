@@ -1,0 +1,228 @@
+"""Reading and writing single grey frames: PNG, TIFF (several pages), other images, video."""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from imgcal.errors import InputError
+from imgcal.formats.atomic import write_bytes
+
+Frame = NDArray[np.uint8] | NDArray[np.uint16]  # (H, W) grey
+
+TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
+IMAGE_SUFFIXES = frozenset({".png", ".bmp", ".pgm", ".jpg", ".jpeg"}) | TIFF_SUFFIXES
+VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov"})
+
+LOSSY_SUFFIXES = frozenset({".jpg", ".jpeg"}) | VIDEO_SUFFIXES
+LOSSY_TOLERANCE = 4  # grey levels by which lossy compression may tear the channels of a grey frame apart
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
+
+def count_frames(path: Path) -> int:
+    """Count the pages of a TIFF or the frames of a video; any other image has one.
+
+    Raises:
+        InputError: the file cannot be read or is truncated.
+    """
+    suffix = path.suffix.lower()
+    if suffix in TIFF_SUFFIXES:
+        return _count_pages(path)
+    if suffix in VIDEO_SUFFIXES:
+        with Video(path) as video:
+            return video.count
+    return 1
+
+
+def read_frame(path: Path, page: int = 0) -> Frame:
+    """Read a grey image of 8 or 16 bit.
+
+    Args:
+        path: image file.
+        page: of a TIFF with several.
+
+    Returns:
+        (H, W) uint8 or uint16.
+
+    Raises:
+        InputError: unreadable or truncated file, true colours, transparency, or values that are not 8 or 16 bit.
+    """
+    image: Any = None
+    try:
+        if path.suffix.lower() in TIFF_SUFFIXES:
+            _count_pages(path)
+            with _quiet_opencv():
+                found, pages = cv2.imreadmulti(str(path), start=page, count=1, flags=cv2.IMREAD_UNCHANGED)
+            image = pages[0] if found and pages else None
+        else:
+            content = path.read_bytes()
+            _check_complete(path, content)
+            with _quiet_opencv():
+                image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except cv2.error as error:
+        raise InputError(f"{path}: cannot be decoded: {error.err or 'not an image'}") from error
+    if image is None:
+        raise InputError(f"{path}: found a damaged or truncated file, expected a {path.suffix[1:].upper()} image")
+    return _grey(image, path)
+
+
+def write_frame(path: str | Path, frame: Frame) -> None:
+    """Write a grey frame as PNG, without loss and in one step.
+
+    Args:
+        path: file name that ends in .png, in an existing folder.
+        frame: (H, W) uint8 or uint16.
+
+    Raises:
+        InputError: the file cannot be written, or the frame is of another kind.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".png":
+        raise InputError(f"{path}: found the suffix {path.suffix!r}, expected .png")
+    if frame.ndim != 2 or frame.dtype not in (np.uint8, np.uint16) or not frame.size:
+        raise InputError(f"{path}: found a frame {frame.shape} of {frame.dtype}, expected (H, W) of uint8 or uint16")
+    encoded, content = cv2.imencode(".png", frame)
+    if not encoded:
+        raise InputError(f"{path}: a frame {frame.shape} of {frame.dtype} cannot be encoded as PNG")
+    write_bytes(path, content.tobytes())
+
+
+class Video:
+    """A grey video that is read forwards; a context manager.
+
+    Raises:
+        InputError: on opening, when the file is no video; on reading, when it ends before its announced length.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with _quiet_opencv():
+            self._capture = cv2.VideoCapture(str(path))
+            self.count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)) if self._capture.isOpened() else 0
+        self._next = 0
+        if self.count <= 0:
+            self._capture.release()
+            raise InputError(f"{path}: found a damaged or empty file, expected a video")
+
+    def __enter__(self) -> Video:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._capture.release()
+
+    def read(self, index: int) -> Frame:
+        """Read a frame (H, W); indices must grow from call to call."""
+        if index < self._next:
+            raise ValueError(f"{self.path}: frame {index} after frame {self._next - 1}; a video is read forwards")
+        good, image = True, None
+        with _quiet_opencv():
+            while good and self._next < index:
+                good = self._capture.grab()
+                self._next += 1
+            if good:
+                good, image = self._capture.read()
+                self._next += 1
+        if not good or image is None:
+            raise InputError(
+                f"{self.path}: found {self._next - 1} readable frames, expected {self.count}: truncated video"
+            )
+        return _grey(image, self.path)
+
+
+def _grey(image: NDArray[Any], path: Path) -> Frame:
+    if image.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"{path}: found pixels of type {image.dtype}, expected 8 or 16 bit whole numbers")
+    if image.ndim == 2:
+        return image
+    if image.shape[2] == 4 and (image[..., 3] != np.iinfo(image.dtype).max).any():
+        raise InputError(f"{path}: found a transparent image, expected grey")
+    blue, green, red = cv2.split(image[..., :3])
+    apart = max(float(cv2.norm(green, other, cv2.NORM_INF)) for other in (blue, red))
+    if apart > (LOSSY_TOLERANCE if path.suffix.lower() in LOSSY_SUFFIXES else 0):
+        raise InputError(f"{path}: found a colour image (channels differ by up to {apart:.0f}), expected grey")
+    return np.asarray(green)
+
+
+def _check_complete(path: Path, content: bytes) -> None:
+    """Walk the chunks of a PNG: some decoders fill the missing part of a truncated one and say nothing."""
+    if not content:
+        raise InputError(f"{path}: found an empty file, expected an image")
+    if path.suffix.lower() != ".png":
+        return
+    if not content.startswith(PNG_SIGNATURE):
+        raise InputError(f"{path}: found a file of another kind, expected a PNG image")
+    position, kind = len(PNG_SIGNATURE), b""
+    while kind != b"IEND":
+        header = content[position : position + 8]
+        if len(header) < 8:
+            raise InputError(f"{path}: found a truncated PNG of {len(content)} bytes, expected an IEND chunk")
+        length, kind = struct.unpack(">I4s", header)
+        end = position + 8 + length
+        checksum = content[end : end + 4]
+        if len(checksum) < 4:
+            raise InputError(f"{path}: found a truncated PNG of {len(content)} bytes, expected {end + 4} or more")
+        if zlib.crc32(memoryview(content)[position + 4 : end]) != int.from_bytes(checksum, "big"):
+            raise InputError(f"{path}: found a damaged PNG (checksum of chunk {kind!r} is wrong)")
+        position = end + 4
+
+
+def _count_pages(path: Path) -> int:
+    """Walk the directories of a TIFF or BigTIFF: OpenCV counts only the pages before a truncation and says nothing.
+
+    Source: TIFF 6.0, section 2; BigTIFF has 8-byte offsets and 20-byte entries.
+    """
+    try:
+        with open(path, "rb") as file:
+            magic = file.read(4)
+            order = {b"II": "<", b"MM": ">"}.get(magic[:2], "")
+            version = struct.unpack(order + "H", magic[2:])[0] if order and len(magic) == 4 else 0
+            if version not in (42, 43):
+                raise InputError(
+                    f"{path}: found {'an empty file' if not magic else 'a file of another kind'}, expected TIFF"
+                )
+            big = version == 43
+            if big:
+                file.read(4)
+            offset_format, count_format, entry = (
+                (order + "Q", order + "Q", 20) if big else (order + "I", order + "H", 12)
+            )
+            offset, seen = _unpack(file, offset_format, path), set[int]()
+            while offset and offset not in seen:
+                seen.add(offset)
+                file.seek(offset)
+                file.seek(entry * _unpack(file, count_format, path), 1)
+                offset = _unpack(file, offset_format, path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    return len(seen)
+
+
+def _unpack(file: BinaryIO, number_format: str, path: Path) -> int:
+    content = file.read(struct.calcsize(number_format))
+    if len(content) < struct.calcsize(number_format):
+        raise InputError(
+            f"{path}: found a truncated TIFF of {path.stat().st_size} bytes, expected more pages or pixels"
+        )
+    return int(struct.unpack(number_format, content)[0])
+
+
+@contextlib.contextmanager
+def _quiet_opencv() -> Iterator[None]:
+    """Keep OpenCV from printing about a bad file: our error says it, in one line."""
+    level = cv2.getLogLevel()
+    cv2.setLogLevel(0)
+    try:
+        yield
+    finally:
+        cv2.setLogLevel(level)

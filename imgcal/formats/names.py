@@ -1,0 +1,47 @@
+"""Names that a user typed: near misses, sorting, and the bare names of shipped files."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+from imgcal.errors import InputError
+from imgcal.resources import data_path, shipped_names
+
+
+def natural_key(name: str) -> tuple[list[str | int], str]:
+    """Sort key that counts: "2" before "10"; equal numbers ("1", "01") stay apart."""
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)], name
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Say which known name was probably meant: `, nearest: cam01`, or nothing when none is near."""
+    names = {candidate.lower(): candidate for candidate in known}
+    matches = difflib.get_close_matches(name.lower(), names, n=1)
+    return f", nearest: {names[matches[0]]}" if matches else ""
+
+
+def find_file(path: str | Path, kind: str, suffix: str) -> Path:
+    """Find a file by its path or, when there is none, by the bare name of a shipped one.
+
+    Args:
+        path: a path, or a name such as "O10".
+        kind: the folder of the shipped data, "rigs" or "objects".
+        suffix: of the shipped files.
+
+    Raises:
+        InputError: neither exists.
+    """
+    path = Path(path)
+    if path.is_file():
+        return path
+    shipped = shipped_names(kind, suffix)
+    if str(path) in shipped:
+        return data_path(kind, str(path) + suffix)
+    if path.exists():
+        raise InputError(f"{path}: found a folder, expected a file")
+    raise InputError(
+        f"{path}: no such file, nor one of the shipped {kind} ({', '.join(shipped)}){nearest(path.stem, shipped)}"
+    )

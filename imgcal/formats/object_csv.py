@@ -1,0 +1,62 @@
+"""Calibration objects: CSV with the header `x,y,z` (mm), optional columns `name` and `radius` (mm)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from imgcal.errors import InputError
+from imgcal.formats.csv_file import Chunk, read_chunks
+from imgcal.formats.names import find_file
+from imgcal.objects import CalibrationObject
+from renderers.palette import palette
+
+# Nearer than this to one line, in units of the object's size, no pose can be found.
+COLLINEAR = 1e-6
+
+
+def load_object(path: str | Path) -> CalibrationObject:
+    """Read a calibration object.
+
+    Args:
+        path: a CSV file, or the bare name of a shipped object such as "cube8" when there is no such file.
+
+    Returns:
+        The object in float64; colours from `renderers.palette`.
+
+    Raises:
+        InputError: one line with the file, the line, what was found and what was expected.
+    """
+    path = find_file(path, "objects", ".csv")
+    chunks = list(read_chunks(path, ("x", "y", "z"), ("name", "radius")))
+    count = sum(map(len, chunks))
+    if count < 4 or len(chunks) > 1:
+        raise InputError(f"{path}: found {count} points, expected 4 to a few hundred")
+    chunk = chunks[0]
+    axes = [chunk.numbers(axis, lambda v: np.abs(v) < 1e9, "a finite coordinate in mm") for axis in "xyz"]
+    points = np.stack(axes, axis=1)
+    _check_points(chunk, points)
+    radius = None
+    if "radius" in chunk.columns:
+        radius = torch.from_numpy(chunk.numbers("radius", lambda v: v > 0, "a radius > 0 in mm"))
+    names = tuple(name.strip() for name in chunk.columns.get("name", ()))
+    for row, name in enumerate(names):
+        if not name or name in names[:row]:
+            chunk.fail(row, f"name: found {name!r}, expected a different name for every point")
+    return CalibrationObject(torch.from_numpy(points), palette(count).double(), radius, path.stem, names)
+
+
+def _check_points(chunk: Chunk, points: np.ndarray) -> None:
+    _, first, groups = np.unique(points, axis=0, return_index=True, return_inverse=True)
+    repeated = np.flatnonzero(first[groups.ravel()] != np.arange(len(points)))
+    if len(repeated):
+        row = int(repeated[0])
+        original = int(first[groups.ravel()][row])
+        chunk.fail(row, f"found the same point as in row {original + 1}, expected different points")
+    singular = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    if singular[1] < COLLINEAR * singular[0]:
+        raise InputError(
+            f"{chunk.path}: found all {len(points)} points on one line, expected points in a plane or in space"
+        )
