@@ -1,4 +1,4 @@
-"""Captured frames: a folder with `frames/<camera name>/<snapshot>.<png|tif|...>` or `frames/<camera name>.<png|tif|mp4|...>`.
+"""Captured frames: `frames/<camera name>/<snapshot>.<png|tif|...>` or `frames/<camera name>.<png|tif|mp4|...>`.
 
 One file a camera holds one snapshot a page (TIFF) or frame (video), named "0", "1", ...; an image is snapshot "0".
 Optional beside `frames/`: `capture.yaml` (format, bit_depth, note) and `masks/<camera name>.png` (not black = ignored).
@@ -68,7 +68,7 @@ class Capture:
                         frames[camera] = None
                         continue
                     if path.suffix.lower() not in VIDEO_SUFFIXES:
-                        frame = _read_image(path, index, alone=path.parent.name != "frames")
+                        frame = _read_image(path, index, alone=path.parent != self.folder / "frames")
                     else:
                         if path not in videos:
                             videos[path] = stack.enter_context(Video(path))
@@ -154,7 +154,7 @@ def open_capture(folder: str | Path, rig: CameraRig | None = None) -> Capture:
 
 
 def open_input(path: str | Path, rig: CameraRig | None = None, fiducials: int | None = None) -> Capture | Detections:
-    """Open what a user gives to a command: a capture folder or a detections file; arguments as for their own functions."""
+    """Open what a user gives to a command: a capture folder or a detections file; arguments as for their functions."""
     path = Path(path)
     if path.is_dir():
         return open_capture(path, rig)

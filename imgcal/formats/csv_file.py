@@ -1,4 +1,4 @@
-"""Reading CSV, plain or compressed by gzip, as text columns in chunks; every problem is one line with its line number."""
+"""Reading CSV, plain or compressed by gzip, as text columns in chunks; every problem names its line."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 from imgcal.errors import InputError
 from imgcal.formats.names import nearest
 
+Numbers = NDArray[np.float64]
+
 CHUNK = 1000  # rows: larger ones leave the processor cache and wake the garbage collector, half as fast
 GZIP_MAGIC = b"\x1f\x8b"
 
@@ -38,9 +40,7 @@ class Chunk:
         """Raise the error of a row of this chunk."""
         fail_row(self.path, self.first_row + row, problem)
 
-    def numbers(
-        self, name: str, good: Callable[[NDArray[np.float64]], NDArray[np.bool_]], expected: str
-    ) -> NDArray[np.float64]:
+    def numbers(self, name: str, good: Callable[[Numbers], NDArray[np.bool_]], expected: str) -> Numbers:
         """Convert a column to finite numbers.
 
         Args:
@@ -93,14 +93,14 @@ def read_chunks(path: Path, required: Sequence[str], optional: Sequence[str]) ->
 
 
 class _Text:
-    """Context manager that gives the non-blank rows of a CSV file and turns every reading failure into an `InputError`."""
+    """Context manager: the non-blank rows of a CSV file; every reading failure becomes an `InputError`."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def __enter__(self) -> Iterator[list[str]]:
         try:
-            self.file = open(self.path, "rb")  # noqa: SIM115
+            self.file = open(self.path, "rb")
             magic = self.file.read(2)
             self.file.seek(0)
         except OSError as error:
@@ -142,7 +142,7 @@ def _check_header(path: Path, header: list[str], required: Sequence[str], option
 
 
 def fail_row(path: Path, row: int, problem: str) -> NoReturn:
-    """Raise the error of a data row; its line number is found by reading again: blank lines and quoted breaks shift it."""
+    """Raise the error of a data row; blank lines and quoted line breaks shift its line, found by reading again."""
     text = _Text(path)
     with text as rows:
         next(itertools.islice(rows, row + 1, None))

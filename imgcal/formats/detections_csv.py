@@ -128,8 +128,8 @@ def _indices(chunk: Chunk, column: str, known: dict[str, int], allowed: tuple[st
         if unknown is not None:
             chunk.fail(
                 names.index(unknown),
-                f"camera: found {unknown!r}, expected a camera of the rig: {', '.join(allowed)}{nearest(unknown, allowed)}; "
-                f"cameras in these rows: {', '.join(sorted(set(names)))}",
+                f"camera: found {unknown!r} (here: {', '.join(sorted(set(names)))}), "
+                f"expected a camera of the rig: {', '.join(allowed)}{nearest(unknown, allowed)}",
             )
     return np.fromiter(map(known.__getitem__, names), dtype=np.int64, count=len(names))
 
@@ -179,10 +179,8 @@ def _check_inside(chunk: Chunk, part: dict[str, NDArray[Any]], rig: CameraRig) -
     if outside.any():
         row = int(outside.argmax())
         u, v = (chunk.columns[axis][row] for axis in "uv")
-        camera = chunk.columns["camera"][row]
-        chunk.fail(
-            row, f"found ({u}, {v}), expected a pixel in the image of camera {camera}, {size[row, 0]}x{size[row, 1]}"
-        )
+        camera, (width, height) = chunk.columns["camera"][row], size[row]
+        chunk.fail(row, f"found ({u}, {v}), expected a pixel of the {width}x{height} image of camera {camera}")
 
 
 def _check_unique(
@@ -196,6 +194,4 @@ def _check_unique(
     if len(repeated):
         snapshot, camera, fiducial = keys[:, repeated.min()]
         place = f"camera {cameras[camera]} in snapshot {snapshots[snapshot]}"
-        fail_row(
-            path, int(rows[repeated.min()]), f"found fiducial {fiducial} a second time for {place}, expected it once"
-        )
+        fail_row(path, int(rows[repeated.min()]), f"found fiducial {fiducial} again for {place}, expected it once")

@@ -134,17 +134,16 @@ class Video:
                 good, image = self._capture.read()
                 self._next += 1
         if not good or image is None:
-            raise InputError(
-                f"{self.path}: found {self._next - 1} readable frames, expected {self.count}: truncated video"
-            )
+            raise InputError(f"{self.path}: found {self._next - 1} readable frames, expected {self.count} (truncated)")
         return _grey(image, self.path)
 
 
-def _grey(image: NDArray[Any], path: Path) -> Frame:
+def _grey(image: Any, path: Path) -> Frame:
+    """Check the type of a decoded image and take the one channel that a grey image has."""
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"{path}: found pixels of type {image.dtype}, expected 8 or 16 bit whole numbers")
     if image.ndim == 2:
-        return image
+        return np.asarray(image)
     if image.shape[2] == 4 and (image[..., 3] != np.iinfo(image.dtype).max).any():
         raise InputError(f"{path}: found a transparent image, expected grey")
     blue, green, red = cv2.split(image[..., :3])
@@ -189,7 +188,7 @@ def _count_pages(path: Path) -> int:
             version = struct.unpack(order + "H", magic[2:])[0] if order and len(magic) == 4 else 0
             if version not in (42, 43):
                 raise InputError(
-                    f"{path}: found {'an empty file' if not magic else 'a file of another kind'}, expected TIFF"
+                    f"{path}: found {'a file of another kind' if magic else 'an empty file'}, expected TIFF"
                 )
             big = version == 43
             if big:
@@ -211,18 +210,16 @@ def _count_pages(path: Path) -> int:
 def _unpack(file: BinaryIO, number_format: str, path: Path) -> int:
     content = file.read(struct.calcsize(number_format))
     if len(content) < struct.calcsize(number_format):
-        raise InputError(
-            f"{path}: found a truncated TIFF of {path.stat().st_size} bytes, expected more pages or pixels"
-        )
+        raise InputError(f"{path}: found a truncated TIFF of {path.stat().st_size} bytes, expected more")
     return int(struct.unpack(number_format, content)[0])
 
 
 @contextlib.contextmanager
 def _quiet_opencv() -> Iterator[None]:
     """Keep OpenCV from printing about a bad file: our error says it, in one line."""
-    level = cv2.getLogLevel()
-    cv2.setLogLevel(0)
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         yield
     finally:
-        cv2.setLogLevel(level)
+        cv2.utils.logging.setLogLevel(level)

@@ -57,6 +57,4 @@ def _check_points(chunk: Chunk, points: np.ndarray) -> None:
         chunk.fail(row, f"found the same point as in row {original + 1}, expected different points")
     singular = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if singular[1] < COLLINEAR * singular[0]:
-        raise InputError(
-            f"{chunk.path}: found all {len(points)} points on one line, expected points in a plane or in space"
-        )
+        raise InputError(f"{chunk.path}: found all {len(points)} points on one line, expected a plane or a solid")

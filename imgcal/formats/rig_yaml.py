@@ -88,8 +88,8 @@ class _Camera(StrictModel):
         shift = k1 * radius**2 + k2 * radius**4 + k3 * radius**6 + 3 * (p1 + p2) * radius
         if shift > LARGEST_DISTORTION:
             raise ValueError(
-                f"distortion: found {self.distortion}, which moves the image corners by {shift:.0f} times their distance "
-                "from the centre; expected k1, k2, p1, p2, k3 on the z = 1 plane"
+                f"distortion: found {self.distortion}, which moves the image corners by {shift:.0f} times their "
+                "distance from the centre; expected k1, k2, p1, p2, k3 on the z = 1 plane"
             )
         return self
 

@@ -60,7 +60,7 @@ def read_yaml(path: Path, model: type[Model], file_format: str, entry_names: Map
 def validated(
     content: dict[str, Any], model: type[Model], where: str, entry_names: Mapping[str, str] | None = None
 ) -> Model:
-    """Validate plain values, read or about to be written; arguments and errors as for `read_yaml`, `where` begins them."""
+    """Validate plain values, read or about to be written; errors begin with `where`, the rest is as for `read_yaml`."""
     try:
         return model.model_validate(content)
     except ValidationError as error:
@@ -69,8 +69,8 @@ def validated(
 
 def yaml_text(content: dict[str, Any]) -> str:
     """Write plain values as YAML in the given order; floats in their shortest exact form."""
-    return str(
-        yaml.dump(content, Dumper=_Dumper, sort_keys=False, default_flow_style=False, width=2**30, allow_unicode=True)
+    return yaml.dump(
+        content, Dumper=_Dumper, sort_keys=False, default_flow_style=False, width=2**30, allow_unicode=True
     )
 
 
@@ -141,7 +141,8 @@ def _summary(error: ValidationError, content: Any, model: type[BaseModel], entry
 
 def _place(location: tuple[str | int, ...], content: Any, entry_names: Mapping[str, str]) -> str:
     """Name the place of a problem: `camera cam03: focal_length[1]: `."""
-    words, previous = [], ""
+    words: list[str] = []
+    previous = ""
     for step in location:
         try:
             content = content[step]
