@@ -172,7 +172,7 @@ def expose(light: Tensor, sensor: SensorModel, *, generator: torch.Generator | N
     hot = _hot_pixels(light.shape, sensor, light.device)
     # One frame at a time: the temporaries of a frame stay in the processor's cache.
     for i, (frame, target) in enumerate(
-        zip(light.detach().view(-1, height, width), frames.view(-1, height, width), strict=True)
+        zip(light.detach().reshape(-1, height, width), frames.view(-1, height, width), strict=True)
     ):
         level = ground + sensor.contrast * frame
         if sensor.polarity == "dark":
@@ -305,8 +305,9 @@ def _composite(canvas: Canvas, blobs: Blobs, batch: torch.Size, image_size: tupl
     half = torch.diagonal(blobs.shape, dim1=-2, dim2=-1).clamp(min=0).sqrt()  # (*B, N, 2) extent along u, v
     reach = half + REACH_SIGMAS * blur + 1
     size = torch.tensor([width, height], dtype=blobs.uv.dtype, device=blobs.uv.device)
-    # A comparison with NaN is false, so what is not finite is not drawn.
-    drawn = blobs.visible & ((blobs.uv > -reach) & (blobs.uv < size - 1 + reach)).all(-1) & (half > 0).all(-1)
+    # A comparison with NaN is false, so what is not finite, or no ellipse, is not drawn.
+    near = ((blobs.uv > -reach) & (blobs.uv < size - 1 + reach)).all(-1)
+    drawn = blobs.visible & near & (half > 0).all(-1) & (torch.linalg.det(blobs.shape) > 0)
     # What is not drawn comes last and is left out of the windows.
     depth = torch.where(drawn, blobs.depth.clamp(max=torch.finfo(blobs.depth.dtype).max), math.inf)
     most = int(drawn.sum(-1).max()) if drawn.numel() else 0

@@ -112,7 +112,15 @@ def test_markers_that_are_not_visible_or_not_finite_draw_nothing() -> None:
     markers = blobs(torch.tensor([[30.0, 30.0], [40.0, 30.0], [math.nan, 5.0], [1e30, 5.0], [-40.0, 5.0]]), 5.0)
     markers = dataclasses.replace(markers, visible=torch.tensor([True, False, True, True, True]))
     light, seen = render_blobs(markers, SIZE, 0.7)
-    torch.testing.assert_close(light, render_blobs(blobs(torch.tensor([[30.0, 30.0]]), 5.0), SIZE, 0.7)[0])
+    alone = render_blobs(blobs(torch.tensor([[30.0, 30.0]]), 5.0), SIZE, 0.7)[0]
+    torch.testing.assert_close(light, alone)
+    for bad in (math.nan, 0.0, 9.0, -9.0):  # on the diagonal 9: a line; not an ellipse
+        matrices = torch.tensor([[25.0, 0.0], [0.0, 25.0]]).repeat(5, 1, 1)
+        matrices[1:] = torch.tensor([[9.0, bad], [bad, 9.0]]) if bad else 0.0
+        other = dataclasses.replace(blobs(torch.full((5, 2), 30.0), matrices), uv=markers.uv)
+        torch.testing.assert_close(render_blobs(other, SIZE, 0.7)[0], alone)
+        clutter = sample_clutter(ClutterModel(occluded=1.0), other, SIZE)
+        assert render_blobs(other, SIZE, 0.7, clutter=clutter)[0].isfinite().all()
     torch.testing.assert_close(seen, torch.tensor([1.0, 0, 0, 0, 0]), atol=1e-4, rtol=0)
 
 
