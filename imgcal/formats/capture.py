@@ -20,7 +20,7 @@ from imgcal.formats.atomic import write_text
 from imgcal.formats.detections_csv import load_detections
 from imgcal.formats.frames import IMAGE_SUFFIXES, TIFF_SUFFIXES, VIDEO_SUFFIXES, Frame, Video, count_frames, read_frame
 from imgcal.formats.names import natural_key, nearest
-from imgcal.formats.yaml_file import StrictModel, read_yaml, yaml_text
+from imgcal.formats.yaml_file import StrictModel, read_yaml, validated, yaml_text
 from imgcal.observations import Detections
 from imgcal.rig import CameraRig
 
@@ -57,7 +57,7 @@ class Capture:
         Raises:
             InputError: a frame is unreadable, or of another size or bit depth than expected.
         """
-        expected: dict[str, Frame] = {}
+        before: dict[str, tuple[int, int, int]] = {}
         with contextlib.ExitStack() as stack:
             videos: dict[Path, Video] = {}
             for snapshot in self.snapshot_names[first:last]:
@@ -73,7 +73,7 @@ class Capture:
                         if path not in videos:
                             videos[path] = stack.enter_context(Video(path))
                         frame = videos[path].read(index)
-                    self._check(frame, camera, path, expected)
+                    self._check(frame, camera, path, before)
                     frames[camera] = frame
                 yield snapshot, frames
 
@@ -90,22 +90,17 @@ class Capture:
         _check_size(mask, path, camera, self.image_size.get(camera))
         return np.asarray(mask > 0)
 
-    def _check(self, frame: Frame, camera: str, path: Path, expected: dict[str, Frame]) -> None:
+    def _check(self, frame: Frame, camera: str, path: Path, before: dict[str, tuple[int, int, int]]) -> None:
         """Compare with the rig, with capture.yaml and with the first frame of the camera."""
-        size = self.image_size.get(camera)
-        first = expected.setdefault(camera, frame)
-        _check_size(frame, path, camera, size or (first.shape[1], first.shape[0]))
         bits = 8 * frame.itemsize
+        width, height, first_bits = before.setdefault(camera, (frame.shape[1], frame.shape[0], bits))
+        _check_size(frame, path, camera, self.image_size.get(camera, (width, height)))
         if self.bit_depth is not None and (self.bit_depth > 8) != (bits > 8):
             story = f"a {self.bit_depth}-bit frame saved as 8-bit" if bits == 8 else f"{bits}-bit pixels"
-            raise InputError(
-                f"{path}: found {story}, expected {self.bit_depth} bit as in {self.folder / 'capture.yaml'}"
-            )
-        if first.dtype != frame.dtype:
+            raise InputError(f"{path}: found {story}, expected {self.bit_depth} bit as stated in capture.yaml")
+        if first_bits != bits:
             story = "a 16-bit frame saved as 8-bit" if bits == 8 else f"{bits}-bit pixels"
-            raise InputError(
-                f"{path}: found {story}, expected {8 * first.itemsize} bit as in the first frame of {camera}"
-            )
+            raise InputError(f"{path}: found {story}, expected {first_bits} bit as in the first frame of {camera}")
         if self.bit_depth == 12 and frame.max(initial=0) > 4095:
             raise InputError(f"{path}: found the value {frame.max()}, expected at most 4095 (12 bit in the low bits)")
 
@@ -173,7 +168,9 @@ def save_capture_settings(folder: str | Path, bit_depth: int, note: str | None =
     content: dict[str, Any] = {"format": FORMAT, "bit_depth": bit_depth}
     if note is not None:
         content["note"] = note
-    write_text(Path(folder) / "capture.yaml", yaml_text(content))
+    path = Path(folder) / "capture.yaml"
+    validated(content, _Settings, f"{path}: not written")
+    write_text(path, yaml_text(content))
 
 
 def _listing(folder: Path) -> list[Path]:
