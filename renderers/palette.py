@@ -5,16 +5,18 @@ import torch
 from torch import Tensor
 
 GRID = 28  # candidate levels a channel
-BRIGHT = 0.5  # least value of a colour's brightest channel
+# Least value of a colour's brightest channel. A splat fades towards black, so colours that differ in brightness alone
+# can be mistaken for each other: with 0.5 a green and its dark shade would both be among the first eight.
+BRIGHT = 0.7
 
 
 def palette(count: int) -> Tensor:
     """Choose colours by farthest-point selection in OKLab, starting from the black background.
 
     Every colour is the one that lies farthest from black and from all chosen before it, so ``palette(n)[:k]`` equals
-    ``palette(k)``. The least CIEDE2000 difference of any two colours is 29, 12.6, 6.1 and 2.0 for 8, 27, 64 and 437
-    (about 1 is just noticeable), and 29 to black. OKLab was chosen over CIELAB, which leaves 15, 9.5, 5.8 and 2.5, and
-    over RGB (12, 5, 3.3 and 0.4).
+    ``palette(k)``. The least CIEDE2000 difference of any two colours is 22, 9, 5 and 2 for 8, 27, 64 and 437 (about 1
+    is just noticeable), and 34 to black. Seen from black, the first 8 lie in directions at least 18 degrees apart; with
+    more colours some differ in brightness alone.
 
     Args:
         count: Number of colours.
