@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -171,24 +171,25 @@ class CameraRig:
 
     def __getitem__(self, index: object) -> CameraRig:
         """Index the batch axes."""
-        return replace(
-            self,
-            focal_length=self.focal_length[index],  # type: ignore[index]
-            principal_point=self.principal_point[index],  # type: ignore[index]
-            distortion=self.distortion[index],  # type: ignore[index]
-            cam_from_rig=self.cam_from_rig[index],
-        )
+        return self.map_tensors(lambda tensor, _: tensor[index])  # type: ignore[index]
 
     def expand(self, *batch: int) -> CameraRig:
         """Repeat the rig over leading batch axes without copying."""
+        return self.map_tensors(lambda tensor, axes: tensor.expand(*batch, *tensor.shape[-axes:]))
+
+    def reshape(self, *batch: int) -> CameraRig:
+        """Change the batch axes to another shape with as many rigs."""
+        return self.map_tensors(lambda tensor, axes: tensor.reshape(*batch, *tensor.shape[-axes:]))
+
+    def map_tensors(self, function: Callable[[Tensor, int], Tensor]) -> CameraRig:
+        """Apply `function(tensor, number of its axes that are not batch)` to every tensor that has batch axes."""
         return replace(
             self,
-            focal_length=self.focal_length.expand(*batch, -1, -1),
-            principal_point=self.principal_point.expand(*batch, -1, -1),
-            distortion=self.distortion.expand(*batch, -1, -1),
+            focal_length=function(self.focal_length, 2),
+            principal_point=function(self.principal_point, 2),
+            distortion=function(self.distortion, 2),
             cam_from_rig=RigidTransform(
-                self.cam_from_rig.rotation.expand(*batch, -1, -1, -1),
-                self.cam_from_rig.translation.expand(*batch, -1, -1),
+                function(self.cam_from_rig.rotation, 3), function(self.cam_from_rig.translation, 2)
             ),
         )
 

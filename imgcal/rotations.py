@@ -58,6 +58,28 @@ def rotation_from_vector(vector: Tensor) -> Tensor:
     return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
 
 
+def left_jacobian(vector: Tensor) -> Tensor:
+    """Derivative of the exponential map: exp(w + dw) = exp(J dw) exp(w) to first order; (*B, 3) rad -> (*B, 3, 3).
+
+    Source: Barfoot, State Estimation for Robotics, section 7.1.
+    """
+    squared = vector.square().sum(-1, keepdim=True).unsqueeze(-1)
+    small = squared < 1e-8
+    safe = torch.where(small, torch.ones_like(squared), squared)
+    angle = safe.sqrt()
+    b = torch.where(small, 0.5 - squared / 24, 2 * (0.5 * angle).sin().square() / safe)
+    c = torch.where(small, 1 / 6 - squared / 120, (angle - angle.sin()) / (safe * angle))
+    cross = cross_matrix(vector)
+    return torch.eye(3, dtype=vector.dtype, device=vector.device) + b * cross + c * (cross @ cross)
+
+
+def cross_matrix(vector: Tensor) -> Tensor:
+    """Matrix of the cross product, `cross_matrix(a) @ b = a x b`: (*B, 3) -> (*B, 3, 3)."""
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), dim=-1).unflatten(-1, (3, 3))
+
+
 def vector_from_rotation(rotation: Tensor) -> Tensor:
     """Logarithm: rotation matrices to rotation vectors of angle at most pi.
 

@@ -32,6 +32,10 @@ class RigidTransform:
         """Index the batch axes."""
         return RigidTransform(self.rotation[index], self.translation[index])  # type: ignore[index]
 
+    def reshape(self, *batch: int) -> RigidTransform:
+        """Change the batch axes to another shape with as many transforms."""
+        return RigidTransform(self.rotation.reshape(*batch, 3, 3), self.translation.reshape(*batch, 3))
+
     def inverse(self) -> RigidTransform:
         """Swap source and destination."""
         return RigidTransform(self.rotation.mT, -self.origin_image())

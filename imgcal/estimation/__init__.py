@@ -1,0 +1,23 @@
+"""Batched maximum a posteriori estimation of rigs, with covariance and gradients."""
+
+from imgcal.estimation.covariance import (
+    camera_covariance,
+    camera_std,
+    pose_covariance,
+    relative_covariance,
+    relative_difference,
+)
+from imgcal.estimation.estimate import Estimate, EstimationOptions, estimate
+from imgcal.estimation.pose import initial_pose
+
+__all__ = [
+    "Estimate",
+    "EstimationOptions",
+    "camera_covariance",
+    "camera_std",
+    "estimate",
+    "initial_pose",
+    "pose_covariance",
+    "relative_covariance",
+    "relative_difference",
+]

@@ -1,0 +1,66 @@
+"""Block-arrow linear systems: many cameras, many snapshots, every camera coupled to every snapshot.
+
+    [ A_1            W_11 ... W_1S ]
+    [      ...                     ]      A: one block a camera, D: one block a snapshot, W: their couplings.
+    [          A_C   W_C1 ... W_CS ]
+    [                D_1           ]      One kind of block is eliminated (Schur complement), the other solved densely.
+    [ W^T                ...  D_S  ]
+
+Source: Triggs et al., "Bundle Adjustment - A Modern Synthesis", section 6.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Reduced:
+    """A Cholesky factorization of the arrow with one kind of block eliminated."""
+
+    eliminated: Tensor  # (B, P, p, p) lower factors of the eliminated blocks
+    whitened: Tensor  # (B, P, p, Q q) those factors' inverses times the couplings
+    kept: Tensor  # (B, Q q, Q q) lower factor of the Schur complement
+    failed: Tensor  # (B,) bool: not positive definite
+
+
+def reduce(blocks: Tensor, coupling: Tensor, kept: Tensor) -> Reduced:
+    """Eliminate `blocks` from the arrow.
+
+    Args:
+        blocks: (B, P, p, p) symmetric blocks to eliminate.
+        coupling: (B, P, Q, p, q).
+        kept: (B, Q, q, q) symmetric blocks to keep.
+    """
+    count, size = kept.shape[1], kept.shape[2]
+    factor, info = torch.linalg.cholesky_ex(blocks)
+    right = coupling.transpose(2, 3).flatten(3)  # (B, P, p, Q q)
+    whitened = torch.linalg.solve_triangular(factor, right, upper=False)
+    tall = whitened.flatten(1, 2)
+    schur = -(tall.mT @ tall)
+    diagonal = schur.unflatten(-1, (count, size)).unflatten(-3, (count, size)).diagonal(dim1=1, dim2=3)
+    diagonal += kept.permute(0, 2, 3, 1)
+    schur_factor, schur_info = torch.linalg.cholesky_ex(schur)
+    return Reduced(factor, whitened, schur_factor, (info != 0).any(-1) | (schur_info != 0))
+
+
+def solve(reduced: Reduced, right_eliminated: Tensor, right_kept: Tensor) -> tuple[Tensor, Tensor]:
+    """Solve the arrow for one right-hand side.
+
+    Args:
+        reduced: from `reduce`.
+        right_eliminated: (B, P, p).
+        right_kept: (B, Q, q).
+
+    Returns:
+        The solution in the same two shapes.
+    """
+    first = torch.linalg.solve_triangular(reduced.eliminated, right_eliminated[..., None], upper=False)
+    right = right_kept.flatten(1)[..., None] - (reduced.whitened.mT @ first).sum(1)
+    kept = torch.cholesky_solve(right, reduced.kept)
+    second = first - reduced.whitened @ kept.unsqueeze(1)
+    eliminated = torch.linalg.solve_triangular(reduced.eliminated.mT, second, upper=True)
+    return eliminated.squeeze(-1), kept.squeeze(-1).view_as(right_kept)

@@ -1,0 +1,164 @@
+"""MAP estimation of a rig from labelled fiducials: `estimate`, and what it returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from imgcal.errors import InputError
+from imgcal.estimation import fused, implicit, solver
+from imgcal.estimation.linearize import Problem, State, pose_at, rig_at
+from imgcal.estimation.pose import initial_pose
+from imgcal.estimation.robust import LOSSES, Loss
+from imgcal.objects import CalibrationObject
+from imgcal.observations import Observations
+from imgcal.rig import PARAMETERS, CameraRig, RigPrior
+from imgcal.transforms import RigidTransform
+
+
+@dataclass(frozen=True)
+class EstimationOptions:
+    """How to minimize."""
+
+    loss: Literal["squared", "huber", "cauchy", "geman_mcclure"] = "huber"
+    threshold: float = 3.0  # standard deviations, where the loss stops being quadratic
+    max_iterations: int = 50
+    tolerance: float = 1e-4  # expected decrease of the cost (half a squared standard deviation) at which to stop
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The most probable rig, the object's poses, and how well they are known. `covariance.py` reads the last part."""
+
+    rig: CameraRig  # (*B)
+    rig_from_object: RigidTransform  # (*B, S)
+    residual: Tensor  # (*B, S, C, N, 2) pixels, predicted minus observed; zero where not seen
+    chi2: Tensor  # (*B) sum of squared whitened residuals (robust), data and prior
+    dof: Tensor  # (*B) expected chi2: 2 observations - 6 snapshots (each prior pays for its parameter)
+    converged: Tensor  # (*B) bool
+    iterations: int
+    problem: Problem  # (B,) flattened, as solved
+    solution: solver.Solution  # (B,) flattened: state and normal equations at the minimum
+
+    @property
+    def chi2_per_dof(self) -> Tensor:
+        """About 1 where residuals fit the noise and the prior: (*B)."""
+        return self.chi2 / self.dof
+
+    @property
+    def rms(self) -> Tensor:
+        """RMS reprojection error of the seen fiducials, over both axes: (*B) pixels."""
+        count = (self.problem.root_weight > 0).flatten(1).sum(1).clamp_min(1).reshape(self.chi2.shape)
+        return (self.residual.square().flatten(len(self.chi2.shape)).sum(-1) / (2 * count)).sqrt()
+
+
+def estimate(
+    observations: Observations,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    rig_from_object: RigidTransform | None = None,
+    *,
+    spread: Tensor | None = None,
+    first_guess: CameraRig | None = None,
+    options: EstimationOptions = EstimationOptions(),
+) -> Estimate:
+    """Find the rig and the object's poses that best explain the observations and the factory calibration.
+
+    The rig is constant over the snapshots while the object moves. Differentiable: where an input requires a gradient, it
+    flows through the solution by the implicit function theorem, to uv, sigma, the factory rig and the spread.
+
+    Args:
+        observations: (*B, S, C, N).
+        rig: the factory rig, (*B) or without batch axes.
+        obj: N fiducials; a radius makes their images ellipses, whose centres are what is observed.
+        rig_from_object: (*B, S) first guess of the poses; None = `initial_pose`.
+        spread: (*B, C, 15) standard deviation of each factory value in the order of `rig.PARAMETER_NAMES`; zero keeps a
+            value fixed; None = the rig's own prior, or `RigPrior()`.
+        first_guess: (*B) where to start, a network's output for example; None = the factory rig.
+        options: how to minimize.
+
+    Returns:
+        The estimate. `converged` must be looked at: a rig that has not converged is returned where it ended.
+
+    Raises:
+        InputError: shapes that do not belong together.
+    """
+    batch = observations.seen.shape[:-3]
+    problem = make_problem(observations, rig, obj, spread)
+    if rig_from_object is None:
+        with torch.no_grad():
+            rig_from_object = initial_pose(observations, first_guess or rig, obj)
+    start = make_start(problem, rig_from_object, first_guess)
+    loss: Loss = LOSSES[options.loss]
+    if options.loss != "squared":
+        loss = partial(loss, threshold=options.threshold)  # type: ignore[call-arg]
+    with torch.no_grad():
+        if problem.uv.device.type == "cpu":
+            limits = (options.loss, options.threshold, options.max_iterations, options.tolerance)
+            solution = fused.minimize(problem, start, *limits)
+        else:
+            solution = solver.minimize(problem, start, loss, options.max_iterations, options.tolerance)
+    state = implicit.attach_gradient(problem, solution, loss)
+
+    seen = problem.root_weight > 0
+    rigs, poses = rig_at(problem, state.offset), pose_at(problem, state)
+    residual = torch.where(seen.unsqueeze(-2), solution.equations.residual, 0.0).mT
+    dof = 2 * seen.flatten(1).sum(1) - 6 * seen.shape[1]
+    return Estimate(
+        rig=rigs.reshape(*batch),
+        rig_from_object=poses.reshape(*batch, seen.shape[1]),
+        residual=residual.reshape(*batch, *residual.shape[1:]),
+        chi2=(2 * solution.equations.cost).reshape(batch),
+        dof=dof.reshape(batch),
+        converged=solution.converged.reshape(batch),
+        iterations=solution.iterations,
+        problem=problem,
+        solution=solution,
+    )
+
+
+def make_problem(observations: Observations, rig: CameraRig, obj: CalibrationObject, spread: Tensor | None) -> Problem:
+    """Flatten the batch axes and whiten: see `estimate`."""
+    cameras, fiducials = observations.seen.shape[-2:]
+    if cameras != rig.cameras or fiducials != obj.fiducials or observations.uv.shape != (*observations.seen.shape, 2):
+        raise InputError(
+            f"observations: found uv {tuple(observations.uv.shape)} and seen {tuple(observations.seen.shape)}, expected "
+            f"(..., snapshots, {rig.cameras} cameras, {obj.fiducials} fiducials) and the same with two coordinates"
+        )
+    batch = observations.seen.shape[:-3]
+    count = batch.numel()
+    uv, sigma = observations.uv, observations.sigma
+    rig = rig.to(uv.dtype)
+    if spread is None:
+        spread = (rig.prior or RigPrior()).std(rig)
+    seen = observations.seen.reshape(count, *observations.seen.shape[-3:])
+    uv = uv.reshape(count, *uv.shape[-4:])
+    sigma = sigma.expand(observations.seen.shape).reshape(seen.shape)
+    points = obj.points.to(uv)
+    centroid = points.mean(0)
+    return Problem(
+        uv=torch.where(seen[..., None], uv, 0.0).mT.contiguous(),
+        root_weight=torch.where(seen, 1 / torch.where(seen, sigma, 1.0), 0.0),
+        points=points - centroid,
+        centroid=centroid,
+        radius_squared=None if obj.radius is None else obj.radius.to(uv).square(),
+        factory=rig.expand(*batch).reshape(count),
+        spread=spread.to(uv).expand(*batch, cameras, PARAMETERS).reshape(count, cameras, PARAMETERS),
+    )
+
+
+def make_start(problem: Problem, rig_from_object: RigidTransform, first_guess: CameraRig | None) -> State:
+    """Turn a first guess into a state of the problem."""
+    count, snapshots = problem.uv.shape[:2]
+    rotation = rig_from_object.rotation.detach().to(problem.uv).reshape(count, snapshots, 3, 3)
+    translation = rig_from_object.translation.detach().to(problem.uv).reshape(count, snapshots, 3)
+    offset = torch.zeros_like(problem.spread)
+    if first_guess is not None:
+        guess = first_guess.to(problem.uv.dtype)
+        difference = guess.reshape(-1).difference(problem.factory).detach()
+        offset = torch.where(problem.spread > 0, difference / problem.spread.clamp_min(1e-30), 0.0)
+    return State(offset.detach(), rotation, translation + rotation @ problem.centroid)

@@ -1,0 +1,193 @@
+"""Reprojection residuals with analytic Jacobians, summed into the blocks of the normal equations.
+
+The unknowns are, for each camera, 15 offsets from the factory values, *whitened*: divided by the prior's standard
+deviation, so that the prior is the unit matrix and a parameter of zero spread stays fixed; and for each snapshot, 6
+local offsets of the object: a rotation (left, about its centroid) and a translation in units of the object's depth.
+
+Axes: B rigs, S snapshots, C cameras, N fiducials. Components stand before fiducials, so that every step works on long
+contiguous rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from imgcal.projection import NEAREST_DEPTH
+from imgcal.rig import PARAMETERS, CameraRig
+from imgcal.rotations import left_jacobian, rotation_from_vector
+from imgcal.transforms import RigidTransform
+
+POSE_PARAMETERS = 6
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is given: observations, the object, the factory rig and how far it may have drifted."""
+
+    uv: Tensor  # (B, S, C, 2, N) pixels, observed
+    root_weight: Tensor  # (B, S, C, N) 1 / sigma where seen, 0 elsewhere
+    points: Tensor  # (N, 3) mm, fiducials about their centroid
+    centroid: Tensor  # (3,) mm in the object's frame
+    radius_squared: Tensor | None  # (N,) mm^2
+    factory: CameraRig  # (B,)
+    spread: Tensor  # (B, C, 15) prior standard deviation of each parameter
+
+
+@dataclass(frozen=True)
+class State:
+    """What is sought."""
+
+    offset: Tensor  # (B, C, 15) whitened: (parameter - factory) / spread
+    rotation: Tensor  # (B, S, 3, 3) rig_from_object
+    centre: Tensor  # (B, S, 3) mm, the object's centroid in the rig frame
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """Gauss-Newton blocks at a state. `camera` includes the prior's unit matrix, `camera_gradient` its pull."""
+
+    cost: Tensor  # (B,) half the sum of robust squared residuals, data and prior
+    camera: Tensor  # (B, C, 15, 15)
+    coupling: Tensor  # (B, S, C, 15, 6)
+    pose: Tensor  # (B, S, 6, 6)
+    camera_gradient: Tensor  # (B, C, 15)
+    pose_gradient: Tensor  # (B, S, 6)
+    residual: Tensor  # (B, S, C, 2, N) pixels, predicted minus observed
+
+
+def rig_at(problem: Problem, offset: Tensor) -> CameraRig:
+    """Turn whitened offsets (B, C, 15) into a rig."""
+    return problem.factory.moved(offset * problem.spread)
+
+
+def pose_at(problem: Problem, state: State) -> RigidTransform:
+    """Turn the state's poses into transforms of the object's own frame: (B, S) rig_from_object."""
+    return RigidTransform(state.rotation, state.centre - state.rotation @ problem.centroid)
+
+
+def moved(problem: Problem, state: State, camera_step: Tensor, pose_step: Tensor) -> State:
+    """Add a step: camera_step (B, C, 15) whitened, pose_step (B, S, 6)."""
+    rotation = rotation_from_vector(pose_step[..., :3]) @ state.rotation
+    depth = _depth_unit(state)
+    return State(state.offset + camera_step, rotation, state.centre + pose_step[..., 3:] * depth)
+
+
+def linearize(problem: Problem, state: State, loss: Callable[[Tensor], tuple[Tensor, Tensor]]) -> NormalEquations:
+    """Evaluate residuals and Jacobians, and sum them up.
+
+    Args:
+        problem: what is given.
+        state: where to linearize.
+        loss: maps squared whitened residuals (B, S, C, N) to (robust loss, its derivative), both per observation.
+
+    Returns:
+        The blocks. The cost is infinite where a seen fiducial lies behind its camera.
+    """
+    jacobian, residual, behind = _jacobian(problem, state)
+    squared = (residual * problem.root_weight.unsqueeze(-2)).square().sum(-2)
+    value, slope = loss(squared)
+    cost = 0.5 * value.sum((1, 2, 3)) + 0.5 * state.offset.square().sum((1, 2))
+    cost = torch.where(behind, torch.inf, cost)
+
+    root_weight = (problem.root_weight * slope.sqrt())[..., None, None, :]
+    rows = (jacobian * root_weight).flatten(-2)  # (B, S, C, 22, 2N): 15 camera, 6 pose, 1 residual
+    products = rows @ rows.mT
+    k, last = PARAMETERS, PARAMETERS + POSE_PARAMETERS
+    over_snapshots = products[..., :k, :].sum(1)
+    over_cameras = products[..., k:, k:].sum(2)
+    eye = torch.eye(k, dtype=rows.dtype, device=rows.device)
+    return NormalEquations(
+        cost=cost,
+        camera=over_snapshots[..., :k] + eye,
+        coupling=products[..., :k, k:last],
+        pose=over_cameras[..., :POSE_PARAMETERS, :POSE_PARAMETERS],
+        camera_gradient=over_snapshots[..., last] + state.offset,
+        pose_gradient=over_cameras[..., :POSE_PARAMETERS, POSE_PARAMETERS],
+        residual=residual,
+    )
+
+
+def _depth_unit(state: State) -> Tensor:
+    """Length that makes a translation as large in the image as a rotation: (B, S, 1) mm."""
+    return state.centre.norm(dim=-1, keepdim=True).clamp_min(1.0)
+
+
+def _jacobian(problem: Problem, state: State) -> tuple[Tensor, Tensor, Tensor]:
+    """Jacobian and residual: (B, S, C, 22, 2, N) with the residual as last row, (B, S, C, 2, N), behind (B,) bool.
+
+    With p = R (q + centre - position) the point in the camera and q the rotated fiducial, the derivative of a pixel with
+    respect to a left rotation of the camera is p x d, with respect to the position -R^T d, with respect to a rotation of
+    the object q x R^T d, where d is the pixel's derivative with respect to p.
+    """
+    parameters = state.offset * problem.spread
+    turn = parameters[..., :3]
+    factory = problem.factory
+    rotation = (rotation_from_vector(turn) @ factory.cam_from_rig.rotation).unsqueeze(1)  # (B, 1, C, 3, 3)
+    position = (factory.positions + parameters[..., 3:6])[:, None, :, :, None]
+    focal = (factory.focal_length + parameters[..., 6:8])[:, None, :, :, None]
+    principal = (factory.principal_point + parameters[..., 8:10])[:, None, :, :, None]
+    distortion = (factory.distortion + parameters[..., 10:15])[:, None, :, :, None]
+
+    rotated = (state.rotation @ problem.points.mT).unsqueeze(2)  # (B, S, 1, 3, N)
+    points = rotation @ (rotated + state.centre[:, :, None, :, None] - position)  # (B, S, C, 3, N)
+    behind = ((points[..., 2, :] <= NEAREST_DEPTH) & (problem.root_weight > 0)).flatten(1).any(-1)
+
+    lens = _lens(points, problem.radius_squared, focal, distortion)
+    residual = lens.distorted * focal + principal - problem.uv
+    by_turn = torch.linalg.cross(points.unsqueeze(-2).expand_as(lens.by_point), lens.by_point, dim=-3)
+    by_centre = (rotation.mT @ lens.by_point.flatten(-2)).unflatten(-1, lens.by_point.shape[-2:])
+
+    jacobian = residual.new_zeros(*residual.shape[:3], PARAMETERS + POSE_PARAMETERS + 1, *residual.shape[3:])
+    jacobian[..., 0:3, :, :] = (left_jacobian(turn).mT.unsqueeze(1) @ by_turn.flatten(-2)).view_as(by_turn)
+    jacobian[..., 3:6, :, :] = -by_centre
+    jacobian[..., 6:8, :, :].diagonal(dim1=-3, dim2=-2).copy_(lens.distorted.mT)
+    jacobian[..., 8:10, :, :].diagonal(dim1=-3, dim2=-2).fill_(1)
+    jacobian[..., 10:15, :, :] = lens.by_distortion
+    jacobian[..., :15, :, :] *= problem.spread[:, None, :, :, None, None]
+    torch.linalg.cross(rotated.unsqueeze(-2).expand_as(by_centre), by_centre, dim=-3, out=jacobian[..., 15:18, :, :])
+    torch.mul(by_centre, _depth_unit(state)[:, :, None, :, None, None], out=jacobian[..., 18:21, :, :])
+    jacobian[..., 21, :, :] = residual
+    return jacobian, residual, behind
+
+
+@dataclass(frozen=True)
+class _Lens:
+    distorted: Tensor  # (B, S, C, 2, N) on the z = 1 plane
+    by_point: Tensor  # (B, S, C, 3, 2, N) pixels per mm: derivative with respect to the point in the camera
+    by_distortion: Tensor  # (B, S, C, 5, 2, N) pixels
+
+
+def _lens(points: Tensor, radius_squared: Tensor | None, focal: Tensor, distortion: Tensor) -> _Lens:
+    """Image of points (B, S, C, 3, N), with focal (B, 1, C, 2, 1) and distortion (B, 1, C, 5, 1), and its derivatives."""
+    depth = points[..., 2:, :].clamp_min(NEAREST_DEPTH)
+    if radius_squared is None:
+        per_depth = 1 / depth
+        log_slope = -per_depth
+    else:
+        # Spheres: x = X Z / (Z^2 - r^2), see projection.apparent_centre_scale.
+        squared = depth * depth
+        per_depth = depth / (squared - radius_squared)
+        log_slope = -(squared + radius_squared) / (depth * (squared - radius_squared))
+    xy = points[..., :2, :] * per_depth
+    x, y = xy[..., :1, :], xy[..., 1:, :]
+    k1, k2, p1, p2, k3 = distortion.split(1, dim=-2)
+    xx, yy, xy2 = x * x, y * y, 2 * x * y
+    rr = xx + yy
+    radial = 1 + rr * (k1 + rr * (k2 + rr * k3))
+    growth = 2 * (k1 + rr * (2 * k2 + 3 * rr * k3))
+    by_p1 = torch.cat((xy2, rr + 2 * yy), dim=-2)
+    by_p2 = torch.cat((rr + 2 * xx, xy2), dim=-2)
+    jxx = radial + growth * xx + 2 * p1 * y + 6 * p2 * x
+    jxy = 0.5 * growth * xy2 + 2 * (p1 * x + p2 * y)
+    jyy = radial + growth * yy + 6 * p1 * y + 2 * p2 * x
+    by_x = focal * per_depth * torch.cat((jxx, jxy), dim=-2)
+    by_y = focal * per_depth * torch.cat((jxy, jyy), dim=-2)
+    by_z = (by_x * x + by_y * y) * (log_slope / per_depth)
+    by_k1 = xy * rr
+    by_k2 = by_k1 * rr
+    by_distortion = focal.unsqueeze(-3) * torch.stack((by_k1, by_k2, by_p1, by_p2, by_k2 * rr), dim=-3)
+    return _Lens(xy * radial + p1 * by_p1 + p2 * by_p2, torch.stack((by_x, by_y, by_z), dim=-3), by_distortion)

@@ -1,0 +1,37 @@
+"""Robust losses on squared whitened residuals. Each maps d^2 to (loss, derivative of the loss by d^2)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+Loss = Callable[[Tensor], tuple[Tensor, Tensor]]
+
+
+def squared(d2: Tensor) -> tuple[Tensor, Tensor]:
+    """Plain least squares."""
+    return d2, torch.ones_like(d2)
+
+
+def huber(d2: Tensor, threshold: float = 3.0) -> tuple[Tensor, Tensor]:
+    """Quadratic up to `threshold` standard deviations, linear beyond (Huber 1964)."""
+    distance = d2.clamp_min(threshold**2).sqrt()
+    far = d2 > threshold**2
+    return torch.where(far, 2 * threshold * distance - threshold**2, d2), torch.where(far, threshold / distance, 1.0)
+
+
+def cauchy(d2: Tensor, threshold: float = 3.0) -> tuple[Tensor, Tensor]:
+    """Logarithmic beyond about `threshold` standard deviations: gross outliers lose their pull."""
+    ratio = d2 / threshold**2
+    return threshold**2 * torch.log1p(ratio), 1 / (1 + ratio)
+
+
+def geman_mcclure(d2: Tensor, threshold: float = 3.0) -> tuple[Tensor, Tensor]:
+    """Bounded loss: an outlier far beyond `threshold` standard deviations costs a constant."""
+    share = threshold**2 / (threshold**2 + d2)
+    return d2 * share, share.square()
+
+
+LOSSES: dict[str, Loss] = {"squared": squared, "huber": huber, "cauchy": cauchy, "geman_mcclure": geman_mcclure}

@@ -1,0 +1,119 @@
+"""Batched Levenberg-Marquardt on the arrow-shaped normal equations of `linearize`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+from imgcal.estimation import arrow
+from imgcal.estimation.linearize import POSE_PARAMETERS, NormalEquations, Problem, State, linearize, moved
+from imgcal.estimation.robust import Loss
+from imgcal.rig import PARAMETERS
+
+LEAST_DAMPING = 1e-9
+MOST_DAMPING = 1e12
+
+Record = TypeVar("Record", State, NormalEquations)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Where the iteration ended, rig by rig."""
+
+    state: State
+    equations: NormalEquations
+    converged: Tensor  # (B,) bool: the last accepted step was below the tolerance
+    iterations: int
+
+
+def minimize(problem: Problem, start: State, loss: Loss, max_iterations: int, tolerance: float) -> Solution:
+    """Minimize the MAP cost of every rig of a batch.
+
+    A step that does not lower the cost, or whose factorization fails, is rejected and retried with ten times the damping:
+    never taken, never replaced by nothing.
+
+    Args:
+        problem: what is given, with one batch axis B.
+        start: first guess.
+        loss: robust loss.
+        max_iterations: linearizations at most, for each rig.
+        tolerance: a rig has converged when a step is expected to lower its cost by less than this, absolute (the cost
+            is in units of squared standard deviations) or relative to the cost's rounding error.
+
+    Returns:
+        The best state found for each rig, with its normal equations.
+    """
+    state, equations = start, linearize(problem, start, loss)
+    batch, device = equations.cost.shape, equations.cost.device
+    damping = equations.cost.new_full(batch, LEAST_DAMPING)
+    converged = torch.zeros(batch, dtype=torch.bool, device=device)
+    rounding = 4 * torch.finfo(equations.cost.dtype).eps
+    iteration = 0
+    while iteration < max_iterations and not bool(converged.all()):
+        iteration += 1
+        camera_step, pose_step, gain, failed = damped_step(equations, damping)
+        small = (gain <= tolerance + rounding * equations.cost) & ~failed
+        trial_state = moved(problem, state, camera_step, pose_step)
+        trial = linearize(problem, trial_state, loss)
+        better = (trial.cost < equations.cost) & ~failed & ~converged
+        if bool(better.all()):
+            state, equations = trial_state, trial
+        else:
+            state, equations = _where(better, trial_state, state), _where(better, trial, equations)
+        # A tiny step that does not help has met the rounding error: this is the minimum. Damping alone also makes steps
+        # tiny, so only a lightly damped one counts.
+        converged = converged | (small & (damping <= 1e-3) & ~torch.isinf(equations.cost))
+        damping = torch.where(better | converged, damping * 0.1, damping * 10).clamp(LEAST_DAMPING, MOST_DAMPING)
+        damping = torch.where(better | converged, damping, damping.clamp_min(1e-4))
+    return Solution(state, equations, converged, iteration)
+
+
+def damped_step(equations: NormalEquations, damping: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Solve the damped normal equations.
+
+    Args:
+        equations: blocks and gradients.
+        damping: (B,) relative addition to the diagonals.
+
+    Returns:
+        camera_step (B, C, 15), pose_step (B, S, 6), predicted decrease of the cost (B,), failed factorization (B,).
+    """
+    reduced, cameras_first = factorize(equations, damping)
+    camera_right, pose_right = -equations.camera_gradient, -equations.pose_gradient
+    if cameras_first:
+        camera_step, pose_step = arrow.solve(reduced, camera_right, pose_right)
+    else:
+        pose_step, camera_step = arrow.solve(reduced, pose_right, camera_right)
+    gain = 0.5 * ((camera_right * camera_step).sum((1, 2)) + (pose_right * pose_step).sum((1, 2)))
+    return camera_step, pose_step, gain, reduced.failed | ~torch.isfinite(gain)
+
+
+def factorize(equations: NormalEquations, damping: Tensor | None = None) -> tuple[arrow.Reduced, bool]:
+    """Factorize the arrow, eliminating whichever kind of block leaves the smaller dense system.
+
+    Returns:
+        The factorization, and whether the cameras were eliminated (else the snapshots).
+    """
+    camera, pose = equations.camera, equations.pose
+    if damping is not None:
+        factor = 1 + damping[:, None, None]
+        camera = camera.clone()
+        camera.diagonal(dim1=-2, dim2=-1).mul_(factor)
+        pose = pose.clone()
+        pose.diagonal(dim1=-2, dim2=-1).mul_(factor)
+    coupling = equations.coupling  # (B, S, C, 15, 6)
+    if POSE_PARAMETERS * pose.shape[1] <= PARAMETERS * camera.shape[1]:
+        return arrow.reduce(camera, coupling.transpose(1, 2), pose), True
+    return arrow.reduce(pose, coupling.mT, camera), False
+
+
+def _where(choose: Tensor, first: Record, second: Record) -> Record:
+    """Choose rig by rig between two records of tensors with leading axis B."""
+    chosen = {}
+    for field in fields(first):
+        a, b = getattr(first, field.name), getattr(second, field.name)
+        chosen[field.name] = torch.where(choose.view(-1, *[1] * (a.ndim - 1)), a, b)
+    return replace(first, **chosen)
