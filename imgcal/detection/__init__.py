@@ -1,0 +1,7 @@
+"""Blobs in captured frames: OpenCV finds them, intensity-weighted centroids measure them."""
+
+from imgcal.detection.detector import detect, detect_frame, detect_snapshot
+from imgcal.detection.measuring import Blobs
+from imgcal.detection.options import DetectionOptions
+
+__all__ = ["Blobs", "DetectionOptions", "detect", "detect_frame", "detect_snapshot"]

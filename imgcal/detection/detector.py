@@ -1,0 +1,129 @@
+"""Frames in, `Detections` out."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imgcal.detection.finding import find_candidates
+from imgcal.detection.measuring import Blobs, Source, measure
+from imgcal.detection.options import DetectionOptions, Frame, checked_frame, checked_mask, full_scale
+from imgcal.errors import InputError
+from imgcal.observations import Detections
+
+Mask = NDArray[np.bool_] | NDArray[np.uint8]  # (H, W) non-zero inside known reflections
+
+
+def detect(
+    frames: Mapping[str, Frame | None | Sequence[Frame | None]],
+    options: DetectionOptions | None = None,
+    *,
+    masks: Mapping[str, Mask] | None = None,
+) -> Detections:
+    """Detect the blobs of all cameras in one or several snapshots.
+
+    Args:
+        frames: camera name -> frame (H, W) uint8 or uint16, or one frame a snapshot; None = the camera has no frame.
+        options: what counts as a blob.
+        masks: camera name -> (H, W), non-zero inside known reflections; blobs there are flagged.
+
+    Raises:
+        InputError: a frame is no grey image, or cameras have different numbers of snapshots.
+    """
+    options = options or DetectionOptions()
+    names = tuple(frames)
+    unknown = sorted(set(masks or ()) - set(names))
+    if unknown:
+        raise InputError(f"masks: found camera {unknown[0]}, expected one of {', '.join(names)}")
+    snapshots = _snapshots(frames)
+    with ThreadPoolExecutor(_workers(len(names))) as pool:
+        blobs = [detect_snapshot(snapshot, options, masks=masks, pool=pool) for snapshot in snapshots]
+    return _table(blobs, names)
+
+
+def detect_snapshot(
+    frames: Mapping[str, Frame | None],
+    options: DetectionOptions,
+    *,
+    masks: Mapping[str, Mask] | None = None,
+    pool: ThreadPoolExecutor | None = None,
+) -> Blobs:
+    """Detect the blobs of one snapshot; `Blobs.source` counts the cameras in the order of `frames`.
+
+    Args:
+        frames: camera name -> frame (H, W), None = missing.
+        options: what counts as a blob.
+        masks: camera name -> (H, W).
+        pool: threads that live on between snapshots; None = a pool for this call.
+    """
+    if pool is None:
+        with ThreadPoolExecutor(_workers(len(frames))) as own_pool:
+            return detect_snapshot(frames, options, masks=masks, pool=own_pool)
+    present = [(index, name) for index, (name, frame) in enumerate(frames.items()) if frame is not None]
+
+    def find(name: str) -> Source:
+        return _find(frames[name], options, (masks or {}).get(name), name)
+
+    # The full frames are read in parallel (OpenCV releases the interpreter); all blobs are then measured as one batch,
+    # because the cost of that is calls, not pixels.
+    blobs = measure(list(pool.map(find, [name for _, name in present])), options)
+    camera = np.array([index for index, _ in present], np.int64)
+    return Blobs(blobs.uv, blobs.sigma, blobs.radius, blobs.flags, camera[blobs.source])
+
+
+def detect_frame(frame: Frame, options: DetectionOptions, mask: Mask | None = None) -> Blobs:
+    """Detect the blobs of one frame (H, W)."""
+    return measure([_find(frame, options, mask, "of the frame")], options)
+
+
+def _find(frame: object, options: DetectionOptions, mask: Mask | None, camera: str) -> Source:
+    """Check a frame and find its candidates."""
+    checked = checked_frame(frame, camera)
+    scale = full_scale(checked, options.bit_depth, camera)
+    inside = None if mask is None else checked_mask(mask, checked, camera)
+    return Source(checked, find_candidates(checked, options, scale), scale, inside)
+
+
+def _workers(cameras: int) -> int:
+    return max(1, min(cameras, os.cpu_count() or 1))
+
+
+def _snapshots(frames: Mapping[str, Frame | None | Sequence[Frame | None]]) -> list[dict[str, Frame | None]]:
+    """Turn camera -> frames into one mapping camera -> frame a snapshot."""
+    series: dict[str, list[Frame | None]] = {}
+    for name, entry in frames.items():
+        if entry is None or isinstance(entry, np.ndarray):
+            series[name] = [entry]
+        elif isinstance(entry, Sequence) and not isinstance(entry, str | bytes):
+            series[name] = list(entry)
+        else:
+            raise InputError(f"camera {name}: found a {type(entry).__name__}, expected a frame or a sequence of frames")
+    count = max((len(series[name]) for name, entry in frames.items() if entry is not None), default=1)
+    for name, entries in series.items():
+        if frames[name] is None:  # a camera without any frame
+            series[name] = [None] * count
+        elif len(entries) != count:
+            raise InputError(f"camera {name}: found {len(entries)} snapshots, expected {count} as for other cameras")
+    return [{name: entries[index] for name, entries in series.items()} for index in range(count)]
+
+
+def _table(blobs: list[Blobs], names: tuple[str, ...]) -> Detections:
+    """Stack the blobs of all snapshots; rows run over snapshots, then cameras."""
+    counts = [len(shot.uv) for shot in blobs]
+    digits = len(str(max(len(blobs) - 1, 0)))
+    camera = np.concatenate([shot.source for shot in blobs])
+    return Detections(
+        uv=np.concatenate([shot.uv for shot in blobs]),
+        sigma=np.concatenate([shot.sigma for shot in blobs]),
+        camera=camera,
+        snapshot=np.repeat(np.arange(len(blobs)), counts),
+        fiducial=np.full(len(camera), -1, np.int64),
+        radius=np.concatenate([shot.radius for shot in blobs]),
+        flags=np.concatenate([shot.flags for shot in blobs]),
+        camera_names=names,
+        snapshot_names=tuple(f"{index:0{digits}d}" for index in range(len(blobs))),
+    )

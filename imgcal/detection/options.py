@@ -1,0 +1,80 @@
+"""Settings of the blob detector, and the checks of what it is given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imgcal.errors import InputError
+
+Polarity = Literal["bright", "dark"]
+Frame = NDArray[np.uint8] | NDArray[np.uint16]  # (H, W) grey values
+
+
+@dataclass(frozen=True)
+class DetectionOptions:
+    """What counts as a blob.
+
+    Radii are those of the disc of equal area: sqrt(integrated brightness / peak brightness / pi).
+    """
+
+    polarity: Polarity = "bright"
+    threshold: float | None = None  # least peak above the local background, grey levels; None = from the noise
+    min_radius: float = 0.9  # px; a single hot pixel measures 0.56
+    max_radius: float = 16.0  # px
+    max_elongation: float = 4.0  # ratio of the axes of the ellipse of equal moments
+    bit_depth: int | None = None  # None = 8 for uint8 frames; 10, 12 or 16 for uint16, by the brightest pixel
+    saturation: float | None = None  # first clipped grey value; None = 0.5 % below full scale
+
+    def __post_init__(self) -> None:
+        if self.polarity not in get_args(Polarity):
+            raise InputError(f"polarity: found {self.polarity!r}, expected one of {', '.join(get_args(Polarity))}")
+        if not 0 < self.min_radius < self.max_radius <= 500:
+            raise InputError(
+                f"radius limits: found {self.min_radius} to {self.max_radius}, expected 0 < min < max <= 500 px"
+            )
+        if self.threshold is not None and not 0 < self.threshold < 65536:
+            raise InputError(f"threshold: found {self.threshold}, expected grey levels above zero, or none")
+        if not self.max_elongation > 1:
+            raise InputError(f"max_elongation: found {self.max_elongation}, expected more than 1")
+        if self.bit_depth is not None and not 8 <= self.bit_depth <= 16:
+            raise InputError(f"bit_depth: found {self.bit_depth}, expected 8 to 16, or none")
+        if self.saturation is not None and not self.saturation > 0:
+            raise InputError(f"saturation: found {self.saturation}, expected a grey value above zero, or none")
+
+
+def checked_frame(frame: object, camera: str) -> Frame:
+    """Return `frame` if it is a grey (H, W) image of 8 or 16 bit, and explain otherwise."""
+    if not isinstance(frame, np.ndarray):
+        raise InputError(f"camera {camera}: found a {type(frame).__name__}, expected a NumPy array (H, W)")
+    if frame.ndim != 2:
+        raise InputError(f"camera {camera}: found a frame of shape {frame.shape}, expected grey (H, W)")
+    if frame.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"camera {camera}: found {frame.dtype} grey values, expected uint8 or uint16")
+    if min(frame.shape) < 16:
+        raise InputError(f"camera {camera}: found a frame of {frame.shape[1]} x {frame.shape[0]}, expected at least 16 x 16")
+    return frame
+
+
+def checked_mask(mask: object, frame: Frame, camera: str) -> NDArray[np.bool_]:
+    """Return `mask` as bool (H, W), true inside known reflections."""
+    if not isinstance(mask, np.ndarray) or mask.shape != frame.shape:
+        found = mask.shape if isinstance(mask, np.ndarray) else type(mask).__name__
+        raise InputError(f"camera {camera}: found a mask of shape {found}, expected that of the frame, {frame.shape}")
+    return mask if mask.dtype == np.bool_ else mask != 0
+
+
+def full_scale(frame: Frame, bit_depth: int | None, camera: str) -> int:
+    """Largest grey value that the frame can hold: 2 ** bit_depth - 1."""
+    if bit_depth is None:
+        if frame.dtype == np.uint8:
+            return 255
+        brightest = int(frame.max())
+        return next(2**bits - 1 for bits in (10, 12, 16) if brightest < 2**bits)
+    scale = 2**bit_depth - 1
+    if frame.dtype == np.uint16 and (brightest := int(frame.max())) > scale:
+        raise InputError(f"camera {camera}: found a grey value of {brightest}, expected at most {scale} ({bit_depth} bit)")
+    return scale

@@ -1,0 +1,59 @@
+"""Frames of blurred discs with known centres."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+FINE = 16  # samples a pixel and axis
+
+
+def draw_discs(
+    shape: tuple[int, int],
+    uv: NDArray[np.float64],
+    radius: NDArray[np.float64] | float,
+    *,
+    contrast: NDArray[np.float64] | float = 200.0,
+    background: NDArray[np.float64] | float = 20.0,
+    blur: float = 0.7,
+) -> NDArray[np.float64]:
+    """Draw discs at `uv` (M, 2), blurred by a Gaussian of `blur` px: (H, W) grey levels without noise."""
+    frame = np.zeros(shape) + background
+    radius = np.broadcast_to(radius, len(uv))
+    contrast = np.broadcast_to(contrast, len(uv))
+    for (u, v), r, height in zip(uv, radius, contrast, strict=True):
+        half = int(np.ceil(r + 5 * blur)) + 2
+        column, row = int(np.rint(u)), int(np.rint(v))
+        fine = (np.arange((2 * half + 1) * FINE) + 0.5) / FINE - 0.5 - half
+        disc = ((fine[None, :] - (u - column)) ** 2 + (fine[:, None] - (v - row)) ** 2 <= r * r).astype(np.float64)
+        if blur > 0:
+            disc = cv2.GaussianBlur(disc, (0, 0), blur * FINE)
+        patch = height * disc.reshape(2 * half + 1, FINE, 2 * half + 1, FINE).mean((1, 3))
+        top, left = max(row - half, 0), max(column - half, 0)
+        bottom, right = min(row + half + 1, shape[0]), min(column + half + 1, shape[1])
+        if top < bottom and left < right:
+            frame[top:bottom, left:right] += patch[top - row + half : bottom - row + half, left - column + half : right - column + half]
+    return frame
+
+
+def scattered(shape: tuple[int, int], pitch: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Spread centres (M, 2) on a lattice of `pitch` px, each at its own sub-pixel position."""
+    v, u = np.mgrid[pitch // 2 : shape[0] - pitch // 2 : pitch, pitch // 2 : shape[1] - pitch // 2 : pitch]
+    centres = np.stack([u.ravel(), v.ravel()], 1).astype(np.float64)
+    return centres + rng.uniform(-0.5, 0.5, centres.shape)
+
+
+def exposed(light: NDArray[np.float64], noise: float, rng: np.random.Generator, bits: int = 8) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    """Add read noise (grey levels), round and clip to `bits`."""
+    grey = np.clip(np.rint(light + rng.normal(0, noise, light.shape)), 0, 2**bits - 1)
+    return grey.astype(np.uint8 if bits == 8 else np.uint16)
+
+
+def nearest(found: NDArray[np.float64], truth: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Nearest found centre of each true one: rows (M,) and distances (M,) px."""
+    if not len(found):
+        return np.zeros(len(truth), np.int64), np.full(len(truth), np.inf)
+    distance = np.linalg.norm(truth[:, None] - found[None], axis=2)
+    rows = distance.argmin(1)
+    return rows, distance[np.arange(len(truth)), rows]
