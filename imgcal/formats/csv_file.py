@@ -6,7 +6,6 @@ import csv
 import gzip
 import io
 import itertools
-import reprlib
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.errors import InputError
-from imgcal.formats.names import nearest
+from imgcal.formats.names import nearest, shortened
 
 Numbers = NDArray[np.float64]
 
@@ -56,11 +55,11 @@ class Chunk:
             values = np.fromiter(map(float, column), dtype=np.float64, count=len(column))
         except ValueError:
             row = next(i for i, text in enumerate(column) if not _is_float(text))
-            self.fail(row, f"{name}: found {reprlib.repr(column[row])}, expected {expected}")
+            self.fail(row, f"{name}: found {shortened(column[row])!r}, expected {expected}")
         wrong = ~(np.isfinite(values) & good(values))
         if wrong.any():
             row = int(wrong.argmax())
-            self.fail(row, f"{name}: found {column[row]}, expected {expected}")
+            self.fail(row, f"{name}: found {shortened(column[row])}, expected {expected}")
         return values
 
 
@@ -133,7 +132,7 @@ def _check_header(path: Path, header: list[str], required: Sequence[str], option
     known = (*required, *optional)
     for name in header:
         if name not in known:
-            raise InputError(f"{path}: unknown column {reprlib.repr(name)}{nearest(name, known)}; {expected}")
+            raise InputError(f"{path}: unknown column {shortened(name)!r}{nearest(name, known)}; {expected}")
         if header.count(name) > 1:
             raise InputError(f"{path}: found the column {name} more than once, {expected}")
     missing = [name for name in required if name not in header]

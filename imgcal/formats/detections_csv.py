@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from imgcal.errors import InputError
 from imgcal.formats.atomic import replacing
 from imgcal.formats.csv_file import Chunk, fail_row, read_chunks
-from imgcal.formats.names import nearest
+from imgcal.formats.names import nearest, shortened
 from imgcal.observations import BlobFlag, Detections
 from imgcal.rig import CameraRig
 
@@ -128,7 +128,7 @@ def _indices(chunk: Chunk, column: str, known: dict[str, int], allowed: tuple[st
         if unknown is not None:
             chunk.fail(
                 names.index(unknown),
-                f"camera: found {unknown!r} (here: {', '.join(sorted(set(names)))}), "
+                f"camera: found {shortened(unknown)!r} (this file: {shortened(', '.join(dict.fromkeys(names)))}), "
                 f"expected a camera of the rig: {', '.join(allowed)}{nearest(unknown, allowed)}",
             )
     return np.fromiter(map(known.__getitem__, names), dtype=np.int64, count=len(names))
@@ -152,7 +152,9 @@ def _numbers(chunk: Chunk, fiducials: int | None) -> dict[str, NDArray[np.float6
             "a row of the object, 0 or more" if fiducials is None else f"a row of the object, 0 to {fiducials - 1}"
         )
         filled = _filled(chunk, "fiducial", "-1")
-        result["fiducial"] = filled.numbers("fiducial", lambda v: (v >= -1) & (v < limit) & (v % 1 == 0), expected)
+        result["fiducial"] = filled.numbers(
+            "fiducial", lambda v: (v >= -1) & (v < limit) & (v == np.trunc(v)), expected
+        )
     result["radius"] = np.full(count, np.nan)
     if "radius" in chunk.columns:
         radius = _filled(chunk, "radius", "0").numbers("radius", lambda v: v >= 0, "a radius >= 0 in pixels")
@@ -161,7 +163,7 @@ def _numbers(chunk: Chunk, fiducials: int | None) -> dict[str, NDArray[np.float6
     if "flags" in chunk.columns:
         limit = 2 * max(BlobFlag)
         result["flags"] = chunk.numbers(
-            "flags", lambda v: (v >= 0) & (v < limit) & (v % 1 == 0), f"a sum of flag bits, 0 to {limit - 1}"
+            "flags", lambda v: (v >= 0) & (v < limit) & (v == np.trunc(v)), f"a sum of flag bits, 0 to {limit - 1}"
         )
     return result
 
@@ -178,9 +180,12 @@ def _check_inside(chunk: Chunk, part: dict[str, NDArray[Any]], rig: CameraRig) -
     outside = ((uv < -0.5 - MARGIN) | (uv > size - 0.5 + MARGIN)).any(axis=1)
     if outside.any():
         row = int(outside.argmax())
-        u, v = (chunk.columns[axis][row] for axis in "uv")
+        u, v = (shortened(chunk.columns[axis][row]) for axis in "uv")
         camera, (width, height) = chunk.columns["camera"][row], size[row]
-        chunk.fail(row, f"found ({u}, {v}), expected a pixel of the {width}x{height} image of camera {camera}")
+        chunk.fail(
+            row,
+            f"found ({u}, {v}), expected a pixel of the {width}x{height} image of camera {camera}",
+        )
 
 
 def _check_unique(

@@ -9,7 +9,7 @@ import torch
 
 from imgcal.errors import InputError
 from imgcal.formats.csv_file import Chunk, read_chunks
-from imgcal.formats.names import find_file
+from imgcal.formats.names import find_file, shortened
 from imgcal.objects import CalibrationObject
 from renderers.palette import palette
 
@@ -44,7 +44,7 @@ def load_object(path: str | Path) -> CalibrationObject:
     names = tuple(name.strip() for name in chunk.columns.get("name", ()))
     for row, name in enumerate(names):
         if not name or name in names[:row]:
-            chunk.fail(row, f"name: found {name!r}, expected a different name for every point")
+            chunk.fail(row, f"name: found {shortened(name)!r}, expected a different name for every point")
     return CalibrationObject(torch.from_numpy(points), palette(count).double(), radius, path.stem, names)
 
 

@@ -159,7 +159,10 @@ def _write(name: str, text: str) -> Callable[[Path], None]:
         (_mixed, r"a/1\.png: found a 16-bit frame saved as 8-bit, expected 16 bit as in the first frame of a"),
         (_settings(16), r"a/0\.png: found a 16-bit frame saved as 8-bit, expected 16 bit as stated in capture\.yaml"),
         (_settings(12), r"a/0\.png: found a 12-bit frame saved as 8-bit"),
-        (_write("capture.yaml", "format: imgcal-capture/1\nbit_depth: 10\n"), r"capture\.yaml: bit_depth: found 10, expected 8, 12 or 16"),
+        (
+            _write("capture.yaml", "format: imgcal-capture/1\nbit_depth: 10\n"),
+            r"capture\.yaml: bit_depth: found 10, expected 8, 12 or 16",
+        ),
         (
             _write("capture.yaml", "format: imgcal-capture/1\nbit_depht: 8\n"),
             r"unknown key `bit_depht`, nearest: bit_depth",

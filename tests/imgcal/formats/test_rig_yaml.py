@@ -142,6 +142,7 @@ def test_covariance_round_trip(tmp_path: Path) -> None:
         (TEXT, "", r"found an empty file"),
         (TEXT, "- 1\n- 2\n", r"found list \[1, 2\]"),
         (TEXT, "\x00\x01\x02", r"not a YAML text file"),
+        ("name: pair", "[a, b]: pair", r"not valid YAML in line 2: found unhashable key"),
         ("[1627.0, 1627]", "[1627.0, 1627", r"not valid YAML in line \d+"),
         ("name: pair", "name: pair\nname: other", r"line 3: key `name` given twice"),
         ("focal_length: [800.0, 801.0]", "focal_lenght: [800.0, 801.0]",
