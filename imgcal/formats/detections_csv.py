@@ -116,7 +116,7 @@ def save_detections(detections: Detections, path: str | Path) -> None:
 
 
 def _indices(chunk: Chunk, column: str, known: dict[str, int], allowed: tuple[str, ...] | None) -> NDArray[np.int64]:
-    """Number the names of a column; new ones are added to `known` unless the names are given."""
+    """Replace the names of a column by numbers; new ones are added to `known` unless the names are given."""
     names = chunk.columns[column]
     if allowed is None:
         for name in dict.fromkeys(names):

@@ -43,7 +43,7 @@ def count_frames(path: Path) -> int:
     return 1
 
 
-def read_frame(path: Path, page: int = 0) -> Frame:
+def read_frame(path: str | Path, page: int = 0) -> Frame:
     """Read a grey image of 8 or 16 bit.
 
     Args:
@@ -56,6 +56,7 @@ def read_frame(path: Path, page: int = 0) -> Frame:
     Raises:
         InputError: unreadable or truncated file, true colours, transparency, or values that are not 8 or 16 bit.
     """
+    path = Path(path)
     image: Any = None
     try:
         if path.suffix.lower() in TIFF_SUFFIXES:

@@ -30,7 +30,7 @@ def write_video(path: Path, count: int, codec: str = "FFV1") -> None:
 def test_png_round_trip_is_exact(tmp_path_factory: pytest.TempPathFactory, frame: Any) -> None:
     path = tmp_path_factory.getbasetemp() / "f.png"
     write_frame(path, frame)
-    np.testing.assert_array_equal(read_frame(path), frame, strict=True)
+    np.testing.assert_array_equal(read_frame(str(path)), frame, strict=True)
 
 
 @pytest.mark.parametrize("frame", [GREY8, GREY16], ids=["8 bit", "16 bit"])
