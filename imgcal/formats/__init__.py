@@ -3,8 +3,8 @@
 from imgcal.formats.atomic import replacing, write_bytes, write_text
 from imgcal.formats.capture import Capture, open_capture, open_input, save_capture_settings
 from imgcal.formats.detections_csv import load_detections, save_detections
-from imgcal.formats.frames import Frame, read_frame, write_frame
-from imgcal.formats.object_csv import load_object
+from imgcal.formats.frames import Frame, read_frame, write_frame, write_image
+from imgcal.formats.object_csv import load_object, save_object
 from imgcal.formats.rig_yaml import RigCovariance, load_rig, load_rig_covariance, save_rig
 
 __all__ = [
@@ -21,8 +21,10 @@ __all__ = [
     "replacing",
     "save_capture_settings",
     "save_detections",
+    "save_object",
     "save_rig",
     "write_bytes",
     "write_frame",
+    "write_image",
     "write_text",
 ]

@@ -99,6 +99,14 @@ def write_frame(path: str | Path, frame: Frame) -> None:
     write_bytes(path, content.tobytes())
 
 
+def write_image(path: str | Path, image: NDArray[np.uint8]) -> None:
+    """Write a colour image (H, W, 3), red first, as PNG in one step."""
+    encoded, content = cv2.imencode(".png", image[..., ::-1])
+    if not encoded:
+        raise InputError(f"{path}: an image {image.shape} of {image.dtype} cannot be encoded as PNG")
+    write_bytes(path, content.tobytes())
+
+
 class Video:
     """A grey video that is read forwards; a context manager.
 

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from imgcal.errors import InputError
+from imgcal.formats.atomic import write_text
 from imgcal.formats.csv_file import Chunk, read_chunks
 from imgcal.formats.names import find_file, shortened
 from imgcal.objects import CalibrationObject
@@ -46,6 +47,21 @@ def load_object(path: str | Path) -> CalibrationObject:
         if not name or name in names[:row]:
             chunk.fail(row, f"name: found {shortened(name)!r}, expected a different name for every point")
     return CalibrationObject(torch.from_numpy(points), palette(count).double(), radius, path.stem, names)
+
+
+
+def save_object(obj: CalibrationObject, path: str | Path) -> None:
+    """Write a calibration object in one step; every number in its shortest exact form."""
+    columns: list[list[str]] = [[f"{value!r}" for value in axis] for axis in obj.points.double().T.tolist()]
+    header = ["x", "y", "z"]
+    if obj.fiducial_names:
+        header.append("name")
+        columns.append([f'"{name}"' if "," in name else name for name in obj.fiducial_names])
+    if obj.radius is not None:
+        header.append("radius")
+        columns.append([f"{value!r}" for value in obj.radius.double().tolist()])
+    rows = [",".join(row) for row in zip(*columns, strict=True)]
+    write_text(path, "\n".join([",".join(header), *rows]) + "\n")
 
 
 def _check_points(chunk: Chunk, points: np.ndarray) -> None:

@@ -1,0 +1,104 @@
+"""What several commands share: loading inputs, snapshot ranges, progress bars."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from imgcal.detection import DetectionOptions, detect_snapshot
+from imgcal.errors import InputError
+from imgcal.formats import Capture
+from imgcal.observations import Detections
+from imgcal.rig import CameraRig
+
+Item = TypeVar("Item")
+
+
+def parse_range(text: str | None) -> tuple[int, int | None]:
+    """Read `A:B` (either may be left out) as numbers of snapshots, B excluded."""
+    if text is None:
+        return 0, None
+    match = re.fullmatch(r"(\d*):(\d*)", text)
+    if not match:
+        raise InputError(f"--snapshots: found {text!r}, expected A:B, numbers in file order from 0, B excluded")
+    first, last = int(match[1] or 0), int(match[2]) if match[2] else None
+    if last is not None and last <= first:
+        raise InputError(f"--snapshots: found the empty range {text!r}, expected A < B")
+    return first, last
+
+
+def read_detections(
+    source: Capture | Detections, snapshots: str | None, options: DetectionOptions
+) -> tuple[Detections, dict[str, NDArray[np.generic] | None]]:
+    """Take detections from a file as they are, or find blobs in the frames of a capture.
+
+    Returns:
+        The detections of the chosen snapshots, and the frames of the first one, for pictures (empty without frames).
+
+    Raises:
+        InputError: the range of snapshots is empty.
+    """
+    first, last = parse_range(snapshots)
+    count = len(source.snapshot_names)
+    if first >= count:
+        raise InputError(f"--snapshots: found {snapshots}, expected a range within the {count} snapshots of the input")
+    if isinstance(source, Detections):
+        return source.of_snapshots(first, count if last is None else min(last, count)), {}
+    return _detect_capture(source, first, last, options)
+
+
+def _detect_capture(
+    capture: Capture, first: int, last: int | None, options: DetectionOptions
+) -> tuple[Detections, dict[str, NDArray[np.generic] | None]]:
+    names = capture.snapshot_names[first:last]
+    masks = {camera: mask for camera in capture.camera_names if (mask := capture.mask(camera)) is not None}
+    found, shown = [], {}
+    for index, (_, frames) in enumerate(progress(capture.snapshots(first, last), len(names), "detecting blobs")):
+        if index == 0:
+            shown = dict(frames)
+        present = {camera: masks[camera] for camera in masks if frames[camera] is not None}
+        found.append(detect_snapshot(frames, options, masks=present))
+    columns = {
+        name: np.concatenate([getattr(blobs, name) for blobs in found]) for name in ("uv", "sigma", "radius", "flags")
+    }
+    detections = Detections(
+        **columns,
+        camera=np.concatenate([blobs.source for blobs in found]).astype(np.int64),
+        snapshot=np.repeat(np.arange(len(found)), [len(blobs.uv) for blobs in found]),
+        fiducial=np.full(len(columns["uv"]), -1, dtype=np.int64),
+        camera_names=capture.camera_names,
+        snapshot_names=names,
+    )
+    return detections, shown
+
+
+def progress(items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
+    """Show a progress bar on standard error, if that is a terminal, while going through `items`."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    console = Console(file=sys.stderr)
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        yield from bar.track(items, total=total, description=label)
+
+
+def without_cameras(rig: CameraRig, names: tuple[str, ...]) -> CameraRig:
+    """Leave cameras out of a rig."""
+    unknown = [name for name in names if name not in rig.camera_names]
+    if unknown:
+        raise InputError(f"--without: found {', '.join(unknown)}, expected cameras of the rig: {', '.join(rig.camera_names)}")
+    return rig.select([i for i, name in enumerate(rig.camera_names) if name not in names])
+
+
+def make_folder(path: Path) -> Path:
+    """Make an output folder; a file in its place is an error."""
+    if path.exists() and not path.is_dir():
+        raise InputError(f"{path}: found a file, expected a folder to write to")
+    path.mkdir(parents=True, exist_ok=True)
+    return path

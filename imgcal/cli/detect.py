@@ -1,0 +1,40 @@
+"""`imgcal detect`: frames in, a table of blobs out."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from imgcal.cli.common import read_detections
+from imgcal.detection import DetectionOptions
+from imgcal.formats import load_rig, open_capture, save_detections
+
+
+@dataclass(frozen=True)
+class Detect:
+    """Find blobs in captured frames and measure their centres.
+
+    Writes one row a blob: snapshot, camera, u, v, sigma (pixels), radius, flags (1 touches the border, 2 merged,
+    4 saturated, 8 masked). Example: imgcal detect my_capture --out detections.csv
+    """
+
+    capture: Annotated[Path, tyro.conf.Positional]  #: folder with frames/<camera>/<snapshot>.png
+    out: Path  #: CSV or CSV.gz to write
+    rig: str | None = None  #: rig file or name, to check camera names and image sizes against
+    snapshots: str | None = None  #: A:B, numbers in file order from 0, B excluded
+    detection: Annotated[DetectionOptions, tyro.conf.arg(name="")] = field(default_factory=DetectionOptions)
+
+    def run(self) -> None:
+        """Detect and write."""
+        capture = open_capture(self.capture, None if self.rig is None else load_rig(self.rig))
+        detections, _ = read_detections(capture, self.snapshots, self.detection)
+        save_detections(detections, self.out)
+        print(
+            f"{len(detections)} blobs in {len(detections.snapshot_names)} snapshots of "
+            f"{len(detections.camera_names)} cameras written to {self.out}",
+            file=sys.stderr,
+        )

@@ -1,0 +1,66 @@
+"""`imgcal render`: captured frames in, colour-coded images for the image networks out."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+import tyro
+
+from imgcal.cli.common import make_folder, progress, read_detections
+from imgcal.detection import DetectionOptions
+from imgcal.errors import InputError
+from imgcal.formats import load_object, load_rig, open_input, write_image
+from imgcal.pipeline import label, matched_to_rig, to_observations
+from renderers import splat
+
+
+@dataclass(frozen=True)
+class Render:
+    """Redraw captured frames as colour-coded images: every fiducial a soft dot in its own colour, nothing else.
+
+    Blobs are found and identified first; what has no certain identity is not drawn. Writes OUT/<camera>/<snapshot>.png.
+    Example: imgcal render my_capture --rig O10 --object asymmetric8 --out coded --size 224
+    """
+
+    input: Annotated[Path, tyro.conf.Positional]  #: capture folder or detections file
+    rig: str  #: rig file, or the name of a shipped rig
+    object: str  #: object file, or the name of a shipped object
+    out: Path  #: folder to write
+    size: int = 224  #: width and height of the images, pixels
+    dot: float = 1.5  #: standard deviation of a dot, pixels of the output
+    snapshots: str | None = None  #: A:B, numbers in file order from 0, B excluded
+    detection: Annotated[DetectionOptions, tyro.conf.arg(name="")] = field(default_factory=DetectionOptions)
+
+    def run(self) -> None:
+        """Render and write."""
+        if self.size < 8 or self.dot <= 0:
+            raise InputError(f"--size, --dot: found {self.size} and {self.dot}, expected at least 8 pixels and more than 0")
+        rig, obj = load_rig(self.rig), load_object(self.object)
+        detections, _ = read_detections(open_input(self.input, rig, obj.fiducials), self.snapshots, self.detection)
+
+        def bar(snapshots: Iterable[int], total: int) -> Iterable[int]:
+            return progress(snapshots, total, "identifying")
+
+        labelled = label(matched_to_rig(detections, rig), rig, obj, progress=bar)
+        kept = labelled.detections.select(np.isin(labelled.detections.snapshot, labelled.used))
+        observations = to_observations(kept, rig, obj)
+        scale = self.size / rig.image_size.to(observations.uv)
+        uv = (observations.uv + 0.5) * scale[:, None] - 0.5
+        for camera in rig.camera_names:
+            make_folder(self.out / camera)
+        for row, snapshot in enumerate(progress(labelled.used, len(labelled.used), "rendering")):
+            name = labelled.snapshots[snapshot].name
+            images = splat(
+                uv[row].float(), obj.colours.float(), self.dot, (self.size, self.size), visible=observations.seen[row]
+            )
+            pixels = (images.clamp(0, 1) * 255).round().to(torch.uint8).permute(0, 2, 3, 1).numpy()
+            for camera, image in zip(rig.camera_names, pixels, strict=True):
+                write_image(self.out / camera / f"{name}.png", image)
+        refused = len(labelled.snapshots) - len(labelled.used)
+        print(f"{len(labelled.used)} snapshots written to {self.out}, {refused} left out (identity refused)", file=sys.stderr)

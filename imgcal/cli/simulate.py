@@ -1,0 +1,99 @@
+"""`imgcal simulate`: a synthetic capture with its truth."""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import torch
+import tyro
+
+from imgcal.cli.common import make_folder, progress
+from imgcal.errors import InputError
+from imgcal.formats import (
+    load_object,
+    load_rig,
+    save_capture_settings,
+    save_detections,
+    save_object,
+    save_rig,
+    write_frame,
+    write_text,
+)
+from imgcal.rotations import vector_from_rotation
+from imgcal.simulation import FrameModel, Truth, simulate_frames, simulate_truth, true_detections
+from imgcal.synthesis import Drift, PhysicalDrift, PoseRange, RelativeDrift
+from renderers import ClutterModel, SensorModel
+
+
+@dataclass(frozen=True)
+class Simulate:
+    """Make a capture: one rig that has drifted from its factory calibration, seen through realistic infrared frames.
+
+    Writes OUT/frames/<camera>/<snapshot>.png, the factory rig and the object beside them, and OUT/truth/ with the drifted
+    rig, the exact image points (labelled) and the object's poses.
+    Example: imgcal simulate --rig O10 --object asymmetric8 --out my_capture --snapshots 20 --kappa 0.05
+    """
+
+    rig: str  #: factory rig: file, or the name of a shipped one (O10, O6, U7, T4)
+    object: str  #: object: file, or the name of a shipped one (asymmetric8, cube8, cube27, sphere64)
+    out: Path  #: folder to write; must not hold a capture yet
+    snapshots: int = 10  #: number of poses of the object
+    seed: int = 0  #: the same seed gives the same capture
+    drift: Literal["relative", "physical", "none"] = "relative"  #: relative = the paper's value * (1 + delta)
+    kappa: float = 0.025  #: largest relative drift of intrinsics and extrinsics
+    physical: PhysicalDrift = field(default_factory=PhysicalDrift)  # standard deviations for --drift physical
+    theta_deg: tuple[float, float] = (0.0, 360.0)  #: azimuth of the rig around the object
+    phi_deg: tuple[float, float] = (0.0, 90.0)  #: angle of the rig from the object's z axis
+    alpha_deg: tuple[float, float] = (0.0, 360.0)  #: roll of the rig
+    marker_radius: float = 6.0  #: mm, for objects whose file gives no radius
+    clutter: bool = True  #: reflections, false blobs, partly hidden markers
+    sensor: SensorModel = field(default_factory=SensorModel)
+    clutter_model: ClutterModel = field(default_factory=ClutterModel)
+
+    def run(self) -> None:
+        """Simulate and write."""
+        if self.snapshots < 1:
+            raise InputError(f"--snapshots: found {self.snapshots}, expected at least 1")
+        if (self.out / "frames").exists():
+            raise InputError(f"{self.out}: found a capture there already, expected a new folder")
+        rig, obj = load_rig(self.rig), load_object(self.object)
+        generator = torch.Generator().manual_seed(self.seed)
+        truth = simulate_truth(rig, obj, self.snapshots, generator, self._drift(), self._pose_range())
+        out = make_folder(self.out)
+        save_capture_settings(out, self.sensor.bit_depth, note=f"simulated, seed {self.seed}")
+        save_rig(rig, out / "rig.yaml")
+        save_object(obj, out / "object.csv")
+        _write_truth(truth, out / "truth")
+        model = FrameModel(self.sensor, self.clutter_model if self.clutter else None, self.marker_radius)
+        for camera in rig.camera_names:
+            make_folder(out / "frames" / camera)
+        frames = simulate_frames(truth, obj, model, generator)
+        for snapshot, images in enumerate(progress(frames, self.snapshots, "rendering frames")):
+            for camera, image in images.items():
+                write_frame(out / "frames" / camera / f"{snapshot:05d}.png", image)
+        print(f"{self.snapshots} snapshots of {rig.cameras} cameras written to {out}", file=sys.stderr)
+
+    def _drift(self) -> Drift | None:
+        kinds: dict[str, Drift | None] = {
+            "relative": RelativeDrift(self.kappa, self.kappa),
+            "physical": self.physical,
+            "none": None,
+        }
+        return kinds[self.drift]
+
+    def _pose_range(self) -> PoseRange:
+        theta, phi, alpha = ((math.radians(a), math.radians(b)) for a, b in (self.theta_deg, self.phi_deg, self.alpha_deg))
+        return PoseRange(theta, phi, alpha)
+
+
+def _write_truth(truth: Truth, folder: Path) -> None:
+    make_folder(folder)
+    save_rig(replace(truth.rig, name=f"{truth.rig.name} drifted", prior=None), folder / "rig.yaml")
+    save_detections(true_detections(truth), folder / "detections.csv")
+    poses = torch.cat((vector_from_rotation(truth.rig_from_object.rotation), truth.rig_from_object.translation), dim=-1)
+    rows = [f"{s:05d}," + ",".join(repr(value) for value in row) for s, row in enumerate(poses.tolist())]
+    write_text(folder / "rig_from_object.csv", "\n".join(["snapshot,rx,ry,rz,tx,ty,tz", *rows]) + "\n")

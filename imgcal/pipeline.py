@@ -1,0 +1,390 @@
+"""From blobs to a recalibrated rig: identity snapshot by snapshot, then one estimate over all of them.
+
+`calibrate` and `score` are what the commands of the same names do, on values in memory. Neither reads nor writes files.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.detection import DetectionOptions, detect
+from imgcal.errors import InputError, RefusedError
+from imgcal.estimation import Estimate, EstimationOptions, camera_std, estimate
+from imgcal.identity import Identity, IdentityOptions, identify
+from imgcal.objects import CalibrationObject
+from imgcal.observations import Detections, Observations
+from imgcal.rig import CameraRig, RigPrior
+from imgcal.transforms import RigidTransform
+
+Frames = Mapping[str, NDArray[np.generic] | Sequence[NDArray[np.generic] | None] | None]
+Progress = Callable[[Iterable[int], int], Iterable[int]]
+
+
+@dataclass(frozen=True)
+class PipelineOptions:
+    """How sure the pipeline must be before it gives an answer."""
+
+    identity: IdentityOptions = IdentityOptions()
+    estimation: EstimationOptions = EstimationOptions()
+    least_fiducials: int = 4  # different fiducials that a snapshot must show, all cameras together
+    outlier: float = 5.0  # standard deviations beyond which a labelled blob is left out
+    most_outliers: float = 0.25  # share of left-out blobs above which the data do not fit the object
+    largest_model_error: float = 1.0  # px: unexplained residual above which the data do not fit the camera model
+    blind_cameras: bool = False  # accept cameras that saw nothing; they keep their factory values
+
+
+@dataclass(frozen=True)
+class SnapshotIdentity:
+    """What was decided about one snapshot."""
+
+    name: str
+    status: str  # coded | unique | by_prior | by_tracking | ambiguous | refused
+    reason: str
+    alternatives: int
+    rig_from_object: RigidTransform | None
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """Detections with a fiducial for every blob that has one, and how that was decided."""
+
+    detections: Detections  # `fiducial` filled in, -1 = not used
+    snapshots: tuple[SnapshotIdentity, ...]  # S
+
+    @property
+    def used(self) -> list[int]:
+        """Numbers of the snapshots that are not refused."""
+        return [i for i, snapshot in enumerate(self.snapshots) if snapshot.status != "refused"]
+
+    @property
+    def identity(self) -> str:
+        """How identity was decided as a whole: that of the first snapshot, which the others follow."""
+        used = self.used
+        return self.snapshots[used[0]].status if used else "refused"
+
+
+@dataclass(frozen=True)
+class Calibration(Estimate):
+    """An `Estimate`, with what it was made from. Snapshots are those used, in order."""
+
+    labelled: Labelled
+    observations: Observations  # (S, C, N) as used: outliers not seen, sigma with the model error
+    before: Estimate  # the factory rig, only the poses fitted
+    model_error: float  # px, what the residuals hold beyond the blobs' own sigma
+    outliers: int  # labelled blobs left out
+    seconds: Mapping[str, float] = field(default_factory=dict)  # by stage
+
+    @property
+    def identity(self) -> str:
+        """coded | unique | by_prior | by_tracking | ambiguous."""
+        return self.labelled.identity
+
+
+def calibrate(
+    source: Detections | Frames,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    options: PipelineOptions = PipelineOptions(),
+    *,
+    detection: DetectionOptions = DetectionOptions(),
+    progress: Progress | None = None,
+) -> Calibration:
+    """Recalibrate a rig from what its cameras saw.
+
+    Args:
+        source: blobs, labelled or not, or frames in memory (see `imgcal.detect`).
+        rig: the factory calibration, without batch axes.
+        obj: the calibration object.
+        options: how sure the result must be.
+        detection: how blobs are found in frames.
+        progress: wraps the loop over snapshots, for a progress bar.
+
+    Raises:
+        RefusedError: the data cannot decide; the message says why.
+        InputError: the data do not belong to this rig or object.
+    """
+    started = time.perf_counter()
+    detections = source if isinstance(source, Detections) else detect(source, detection)
+    detections = matched_to_rig(detections, rig)
+    found = time.perf_counter()
+    labelled = label(detections, rig, obj, options, progress)
+    identified = time.perf_counter()
+    fit = _fit(labelled, rig, obj, options)
+    seconds = {
+        "detection": found - started,
+        "identity": identified - found,
+        "estimation": time.perf_counter() - identified,
+    }
+    return replace(fit, seconds=seconds)
+
+
+def label(
+    detections: Detections,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    options: PipelineOptions = PipelineOptions(),
+    progress: Progress | None = None,
+) -> Labelled:
+    """Decide which blob is which fiducial, snapshot by snapshot.
+
+    Each accepted snapshot predicts the next one. What the accepted ones say about the rig narrows the search in the
+    following; refused ones are tried once more at the end, with the rig that all the others gave.
+
+    Raises:
+        RefusedError: no snapshot could be decided.
+    """
+    count = len(detections.snapshot_names)
+    coded = _coded_snapshots(detections, count)
+    follower = _Follower(rig, obj, options)
+    results: dict[int, tuple[SnapshotIdentity, NDArray[np.int64]]] = {}
+    rows = [np.flatnonzero((detections.snapshot == s) & detections.usable) for s in range(count)]
+
+    def decide(s: int) -> None:
+        labels = detections.fiducial[rows[s]] if coded[s] else None
+        results[s] = follower.decide(detections.select(rows[s]), detections.snapshot_names[s], labels)
+
+    order: Iterable[int] = range(count)
+    for s in progress(order, count) if progress else order:
+        decide(s)
+    refused = [s for s in range(count) if results[s][0].status == "refused" and not coded[s]]
+    if refused and len(refused) < count:
+        for s in refused:
+            decide(s)
+    fiducial = np.full(len(detections), -1, dtype=np.int64)
+    for s in range(count):
+        if results[s][0].status != "refused":
+            fiducial[rows[s]] = results[s][1]
+    labelled = Labelled(replace(detections, fiducial=fiducial), tuple(results[s][0] for s in range(count)))
+    if not labelled.used:
+        reasons = Counter(snapshot.reason for snapshot in labelled.snapshots).most_common(1)
+        why = f"{reasons[0][0]} ({reasons[0][1]} of {count} snapshots)" if count else "found no snapshot"
+        raise RefusedError(f"identity: {why}")
+    return labelled
+
+
+class _Follower:
+    """Carries what earlier snapshots say, the pose and the rig, to the next one."""
+
+    def __init__(self, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions) -> None:
+        self.factory, self.obj, self.options = rig, obj, options
+        self.rig = rig
+        self.spread = (rig.prior or RigPrior()).std(rig)
+        # Many captures are taken with the object at the origin of the rig's frame; it costs little to look there first.
+        self.pose = RigidTransform.identity(dtype=rig.focal_length.dtype)
+        self.accepted: list[tuple[Detections, NDArray[np.int64], RigidTransform]] = []
+
+    def decide(
+        self, blobs: Detections, name: str, labels: NDArray[np.int64] | None
+    ) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
+        """Label the blobs of one snapshot; `labels` are given when they are coded."""
+        identity, status = None, "coded"
+        if labels is None:
+            identity = self._identify(blobs)
+            labels, status = identity.labels, identity.status
+        shown = len(np.unique(labels[labels >= 0]))
+        if identity is not None and not identity.accepted:
+            return SnapshotIdentity(name, "refused", identity.reason, identity.alternatives, None), labels
+        if shown < self.options.least_fiducials:
+            reason = f"too few fiducials: found {shown}, expected at least {self.options.least_fiducials}"
+            return SnapshotIdentity(name, "refused", reason, 1, None), labels
+        if identity is None:
+            return SnapshotIdentity(name, status, "labelled in the input", 1, None), labels
+        assert identity.rig_from_object is not None  # an accepted identity has a pose
+        self._remember(blobs, labels, identity.rig_from_object)
+        return SnapshotIdentity(name, status, identity.reason, identity.alternatives, identity.rig_from_object), labels
+
+    def _identify(self, blobs: Detections) -> Identity:
+        return identify(blobs, self.rig, self.obj, self.spread, [self.pose], self.options.identity)
+
+    def _remember(self, blobs: Detections, labels: NDArray[np.int64], pose: RigidTransform) -> None:
+        """Keep the pose; refit the rig after 1, 2, 4, 8, ... accepted snapshots."""
+        self.pose = pose
+        self.accepted.append((blobs, labels, pose))
+        count = len(self.accepted)
+        if count & (count - 1) or count > 64:
+            return
+        parts = [to_observations(replace(b, fiducial=label), self.factory, self.obj) for b, label, _ in self.accepted]
+        observations = Observations(
+            torch.cat([p.uv for p in parts]), torch.cat([p.sigma for p in parts]), torch.cat([p.seen for p in parts])
+        )
+        poses = _stack([p for _, _, p in self.accepted])
+        fit = estimate(observations, self.factory, self.obj, poses, options=self.options.estimation)
+        scale = float(_data_chi2_per_dof(fit).clamp_min(1.0).sqrt())
+        if bool(fit.converged):
+            prior = (self.factory.prior or RigPrior()).std(self.factory)
+            self.rig, self.spread = fit.rig, torch.minimum(camera_std(fit) * scale * 2, prior)
+
+
+def matched_to_rig(detections: Detections, rig: CameraRig) -> Detections:
+    """Renumber the cameras of detections in the order of the rig.
+
+    Raises:
+        InputError: a camera that the rig does not have.
+    """
+    unknown = [name for name in detections.camera_names if name not in rig.camera_names]
+    if unknown:
+        raise InputError(
+            f"detections: found camera {', '.join(unknown)}, expected cameras of rig {rig.name}: {', '.join(rig.camera_names)}"
+        )
+    index = np.array([rig.camera_names.index(name) for name in detections.camera_names], dtype=np.int64)
+    camera = index[detections.camera] if len(detections) else detections.camera
+    return replace(detections, camera=camera, camera_names=rig.camera_names)
+
+
+def to_observations(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> Observations:
+    """Arrange labelled blobs densely: (S, C, N). Of two blobs with one label in a camera the last one counts."""
+    snapshots = np.unique(detections.snapshot) if len(detections) else np.empty(0, dtype=np.int64)
+    shape = (max(len(snapshots), 1), rig.cameras, obj.fiducials)
+    rows = np.flatnonzero(detections.fiducial >= 0)
+    where = (np.searchsorted(snapshots, detections.snapshot[rows]), detections.camera[rows], detections.fiducial[rows])
+    uv, sigma, seen = np.zeros((*shape, 2)), np.ones(shape), np.zeros(shape, dtype=bool)
+    uv[where], sigma[where], seen[where] = detections.uv[rows], detections.sigma[rows], True
+    dtype = rig.focal_length.dtype
+    return Observations(torch.from_numpy(uv).to(dtype), torch.from_numpy(sigma).to(dtype), torch.from_numpy(seen))
+
+
+def _coded_snapshots(detections: Detections, count: int) -> NDArray[np.bool_]:
+    """Tell which snapshots come with labels."""
+    coded = np.zeros(count, dtype=bool)
+    coded[detections.snapshot[detections.fiducial >= 0]] = True
+    return coded
+
+
+def _fit(labelled: Labelled, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions) -> Calibration:
+    """Estimate the rig from all labelled snapshots, leaving out what does not fit, and check that the rest does."""
+    observations, poses = _used(labelled, rig, obj)
+    _require_cameras(observations, rig, options)
+    labelled_count = int(observations.seen.sum())
+    raw_sigma, model_error = observations.sigma, 0.0
+    for _ in range(4):
+        fit = estimate(observations, rig, obj, poses, options=options.estimation)
+        if not bool(fit.converged):
+            raise RefusedError(f"estimation: no minimum after {fit.iterations} iterations (RMS {float(fit.rms):.3g} px)")
+        excess = float(_data_chi2_per_dof(fit))
+        keep = _inliers(fit, observations, options.outlier * max(1.0, excess**0.5))
+        # 6 standard deviations of chi2 per degree of freedom: below, the residuals fit the sigmas that the blobs have.
+        significant = 1 + 6 * (2 / max(float(fit.dof), 1.0)) ** 0.5
+        if excess <= significant and bool((keep == observations.seen).all()):
+            break
+        typical = float(observations.sigma[observations.seen].square().median())
+        if excess > significant:
+            model_error = (model_error**2 + (excess - 1) * typical) ** 0.5
+        observations = Observations(observations.uv, (raw_sigma.square() + model_error**2).sqrt(), keep)
+        poses = fit.rig_from_object
+    outliers = labelled_count - int(observations.seen.sum())
+    _require_fit(model_error, outliers / max(labelled_count, 1), float(fit.rms), options)
+    before = estimate(observations, rig, obj, poses, spread=torch.zeros_like(fit.problem.spread[0]))
+    values = {name: getattr(fit, name) for name in Estimate.__dataclass_fields__}
+    return Calibration(
+        **values, labelled=labelled, observations=observations, before=before, model_error=model_error, outliers=outliers
+    )
+
+
+def _used(labelled: Labelled, rig: CameraRig, obj: CalibrationObject) -> tuple[Observations, RigidTransform | None]:
+    """Observations of the accepted snapshots, and their poses where identity found all of them."""
+    used = labelled.used
+    detections = labelled.detections
+    observations = to_observations(detections.select(np.isin(detections.snapshot, used) & (detections.fiducial >= 0)), rig, obj)
+    poses = [labelled.snapshots[s].rig_from_object for s in used]
+    known = [pose for pose in poses if pose is not None]
+    return observations, _stack(known) if len(known) == len(used) else None
+
+
+def _stack(poses: Sequence[RigidTransform]) -> RigidTransform:
+    return RigidTransform(torch.stack([p.rotation for p in poses]), torch.stack([p.translation for p in poses]))
+
+
+def _require_cameras(observations: Observations, rig: CameraRig, options: PipelineOptions) -> None:
+    seen = observations.seen.any(-1).any(0)
+    blind = [name for name, sees in zip(rig.camera_names, seen.tolist(), strict=True) if not sees]
+    if blind and (not options.blind_cameras or len(blind) == rig.cameras):
+        raise RefusedError(
+            f"camera {', '.join(blind)}: found no fiducial in any snapshot, expected some; nothing can be said about it "
+            "(blind cameras can be accepted: they keep their factory values)"
+        )
+
+
+def _require_fit(model_error: float, outlier_share: float, rms: float, options: PipelineOptions) -> None:
+    if model_error > options.largest_model_error:
+        raise RefusedError(
+            f"estimation: residuals of {rms:.2f} px RMS do not fit the noise: found an unexplained error of "
+            f"{model_error:.2f} px, expected at most {options.largest_model_error:g}; the object, the labels or the camera "
+            "model are not what they are said to be"
+        )
+    if outlier_share > options.most_outliers:
+        raise RefusedError(
+            f"estimation: {100 * outlier_share:.0f} % of the labelled blobs do not fit, expected at most "
+            f"{100 * options.most_outliers:.0f} %"
+        )
+
+
+def _inliers(fit: Estimate, observations: Observations, threshold: float) -> Tensor:
+    """Seen fiducials whose residual is within `threshold` standard deviations: (S, C, N) bool."""
+    distance = fit.residual.norm(dim=-1) / observations.sigma
+    return observations.seen & (distance <= threshold)
+
+
+def _data_chi2_per_dof(fit: Estimate) -> Tensor:
+    """Squared whitened residuals of the data alone, over the observations left after the parameters took their share.
+
+    A parameter takes the share of one observation that its prior leaves: 1 - (posterior / prior variance).
+    """
+    root_weight = fit.problem.root_weight
+    squared = (fit.residual * root_weight.reshape(*fit.residual.shape[:-1], 1)).square().sum(-1)
+    seen = root_weight.reshape(squared.shape) > 0
+    count = seen.sum()
+    # The median of squared distances of two axes is 1.386 for unit noise: blind to outliers.
+    typical = squared[seen].median() / 1.386
+    spread = fit.problem.spread.reshape(fit.rig.distortion.shape[:-1] + (-1,))
+    known = (camera_std(fit) / spread.clamp_min(1e-30)).square().clamp_max(1).where(spread > 0, 1.0)
+    free = (2 * count - 6 * squared.shape[0] - (1 - known).sum()).clamp_min(1)
+    return typical * 2 * count / free
+
+
+@dataclass(frozen=True)
+class Score:
+    """Reprojection errors of a rig that is held fixed; only the object's poses are fitted."""
+
+    labelled: Labelled
+    residual: Tensor  # (S, C, N, 2) pixels
+    seen: Tensor  # (S, C, N) bool
+
+    @property
+    def distances(self) -> Tensor:
+        """Length of each residual: (M,) pixels."""
+        return self.residual.norm(dim=-1)[self.seen]
+
+
+def score(
+    detections: Detections,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    options: PipelineOptions = PipelineOptions(),
+    progress: Progress | None = None,
+) -> Score:
+    """Measure how well a rig explains what its cameras saw.
+
+    Args:
+        detections: blobs, labelled or not.
+        rig: the rig to be scored; its prior is used for identity only.
+        obj: the calibration object.
+        options: how sure identity must be.
+        progress: wraps the loop over snapshots.
+
+    Raises:
+        RefusedError: no snapshot could be decided.
+    """
+    detections = matched_to_rig(detections, rig)
+    labelled = label(detections, rig, obj, options, progress)
+    observations, poses = _used(labelled, rig, obj)
+    fixed = torch.zeros(*rig.distortion.shape[:-1], 15, dtype=rig.distortion.dtype)
+    fit = estimate(observations, rig, obj, poses, spread=fixed, options=options.estimation)
+    return Score(labelled, fit.residual, observations.seen)

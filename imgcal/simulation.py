@@ -1,0 +1,116 @@
+"""Synthetic captures with known truth: one drifted rig, an object that moves, realistic infrared frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.markers import sphere_images
+from imgcal.objects import CalibrationObject
+from imgcal.observations import BlobFlag, Detections
+from imgcal.rig import CameraRig
+from imgcal.synthesis import Drift, PoseRange, Snapshots, synthesize
+from imgcal.transforms import RigidTransform
+from renderers import Blobs, ClutterModel, SensorModel, infrared_frames, sample_clutter
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What a capture was made from."""
+
+    rig: CameraRig  # the drifted rig
+    rig_from_object: RigidTransform  # (S,)
+    uv: Tensor  # (S, C, N, 2) pixels, exact image points
+
+
+@dataclass(frozen=True)
+class FrameModel:
+    """How markers become frames."""
+
+    sensor: SensorModel = SensorModel()
+    clutter: ClutterModel | None = None
+    marker_radius: float = 6.0  # mm, where the object's fiducials have no radius of their own
+
+
+def simulate_truth(
+    rig: CameraRig,
+    obj: CalibrationObject,
+    snapshots: int,
+    generator: torch.Generator,
+    drift: Drift | None,
+    pose_range: PoseRange = PoseRange(),
+) -> Truth:
+    """Disturb the rig once, then move the object: every fiducial is in view of every camera in every snapshot.
+
+    Raises:
+        RefusedError: the drifted rig cannot see the object.
+    """
+    # The first snapshot decides about the drift too, so that the rig is one that sees the object at all.
+    first = synthesize(rig, obj, 1, generator, drift=drift, pose_range=pose_range)
+    true_rig = first.rig[0]
+    parts: list[Snapshots] = [first]
+    if snapshots > 1:
+        parts.append(synthesize(true_rig, obj, snapshots - 1, generator, drift=None, pose_range=pose_range))
+    poses = RigidTransform(
+        torch.cat([part.rig_from_object.rotation for part in parts]),
+        torch.cat([part.rig_from_object.translation for part in parts]),
+    )
+    return Truth(true_rig, poses, torch.cat([part.projection.uv for part in parts]))
+
+
+def simulate_frames(
+    truth: Truth, obj: CalibrationObject, model: FrameModel, generator: torch.Generator
+) -> Iterator[dict[str, NDArray[np.uint8] | NDArray[np.uint16]]]:
+    """Render the frames of one snapshot after another: camera name -> (H, W)."""
+    rig = truth.rig
+    radius = torch.full_like(obj.points[:, 0], model.marker_radius) if obj.radius is None else obj.radius
+    for pose in range(len(truth.uv)):
+        points = truth.rig_from_object[pose].apply(obj.points)
+        projection = rig.project(points, obj.radius)
+        markers = Blobs(
+            uv=projection.uv,
+            shape=sphere_images(rig, points, radius),
+            intensity=torch.ones_like(projection.depth),
+            visible=projection.visible,
+            depth=projection.depth,
+        )
+        yield {
+            name: _frame(markers, camera, rig, model, generator) for camera, name in enumerate(rig.camera_names)
+        }
+
+
+def true_detections(truth: Truth) -> Detections:
+    """The exact image points as labelled detections, without noise."""
+    snapshots, cameras, fiducials = truth.uv.shape[:3]
+    snapshot, camera, fiducial = (a.reshape(-1) for a in np.indices((snapshots, cameras, fiducials)))
+    count = len(snapshot)
+    return Detections(
+        uv=truth.uv.reshape(-1, 2).double().numpy(),
+        sigma=np.full(count, 0.1),
+        camera=camera,
+        snapshot=snapshot,
+        fiducial=fiducial,
+        radius=np.full(count, np.nan),
+        flags=np.full(count, int(BlobFlag.NONE), dtype=np.uint8),
+        camera_names=truth.rig.camera_names,
+        snapshot_names=tuple(f"{s:05d}" for s in range(snapshots)),
+    )
+
+
+def _frame(
+    markers: Blobs, camera: int, rig: CameraRig, model: FrameModel, generator: torch.Generator
+) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    one = Blobs(*(getattr(markers, name)[camera : camera + 1].float() if name != "visible" else
+                  markers.visible[camera : camera + 1] for name in Blobs.__dataclass_fields__))  # fmt: skip
+    width, height = rig.image_size[camera].tolist()
+    clutter = None
+    if model.clutter is not None:
+        clutter = sample_clutter(model.clutter, one, (height, width), generator=generator)
+    rendered = infrared_frames(one, (height, width), model.sensor, clutter=clutter, generator=generator)
+    frame: NDArray[np.uint8] | NDArray[np.uint16] = rendered.frames[0].numpy()
+    return frame
