@@ -1,0 +1,94 @@
+"""One snapshot's blobs as dense arrays, and how far the prior lets predictions be off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.errors import InputError
+from imgcal.observations import Detections
+from imgcal.projection import undistort
+from imgcal.rig import CameraRig
+
+FAR = 1e6
+"""Pixel coordinate of padding: no gate reaches it."""
+
+
+@dataclass(frozen=True)
+class Blobs:
+    """Usable blobs of one snapshot, padded to the same number in every camera."""
+
+    uv: NDArray[np.float64]  # (C, M, 2) pixels, FAR where padded
+    ideal: NDArray[np.float32]  # (C, M, 2) pixels from the principal point, distortion removed, FAR where padded
+    sigma: NDArray[np.float64]  # (C, M) pixels
+    row: NDArray[np.int64]  # (C, M) row of the detections, -1 where padded
+    count: NDArray[np.int64]  # (C,)
+    rows: int  # rows of the detections, usable or not
+
+    def to_rows(self, labels: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Turn blob indices of fiducials (C, N) into fiducials of detection rows (rows,)."""
+        result = np.full(self.rows, -1, dtype=np.int64)
+        camera, fiducial = np.nonzero(labels >= 0)
+        result[self.row[camera, labels[camera, fiducial]]] = fiducial
+        return result
+
+
+def gather(detections: Detections, rig: CameraRig) -> Blobs:
+    """Collect the usable blobs of one snapshot.
+
+    Args:
+        detections: blobs of one snapshot; its cameras are the rig's, in the rig's order.
+        rig: factory rig without batch axes.
+
+    Raises:
+        InputError: more than one snapshot, or cameras that are not the rig's.
+    """
+    if tuple(detections.camera_names) != tuple(rig.camera_names):
+        raise InputError(f"detections of cameras {detections.camera_names}: expected {rig.camera_names} of rig {rig.name}")
+    if len(np.unique(detections.snapshot)) > 1:
+        raise InputError("identity: found blobs of several snapshots, expected those of one")
+    rows = np.flatnonzero(detections.usable)
+    camera = detections.camera[rows]
+    order = np.argsort(camera, kind="stable")
+    rows, camera = rows[order], camera[order]
+    count = np.bincount(camera, minlength=rig.cameras)
+    slot = np.arange(len(rows)) - (np.cumsum(count) - count)[camera]
+    shape = (rig.cameras, max(int(count.max()), 1))
+    uv, row, sigma = np.full((*shape, 2), FAR), np.full(shape, -1), np.ones(shape)
+    uv[camera, slot], row[camera, slot], sigma[camera, slot] = detections.uv[rows], rows, detections.sigma[rows]
+    return Blobs(uv, _ideal(uv, row >= 0, rig), sigma, row, count, len(detections))
+
+
+def _ideal(uv: NDArray[np.float64], valid: NDArray[np.bool_], rig: CameraRig) -> NDArray[np.float32]:
+    on_plane = (torch.from_numpy(uv) - rig.principal_point[:, None]) / rig.focal_length[:, None]
+    straight, _ = undistort(on_plane.where(torch.from_numpy(valid)[..., None], 0.0), rig.distortion, iterations=3)
+    pixels = straight * rig.focal_length.mean(-1)[:, None, None]
+    return np.where(valid[..., None], pixels.numpy(), FAR).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How far the factory values may be off, boiled down to what moves a pattern and what bends it."""
+
+    shift: NDArray[np.float64]  # (C,) pixels, one standard deviation of a pattern's place in the image
+    shape: float  # relative: one standard deviation of distances within a pattern
+
+
+def spread_of(std: Tensor, rig: CameraRig, distance: float) -> Spread:
+    """Boil the prior down.
+
+    Args:
+        std: (C, 15) prior standard deviation of each camera's parameters.
+        rig: factory rig.
+        distance: mm, from the cameras to the object, roughly.
+    """
+    s, focal = std.numpy(), rig.focal_length.mean(-1).numpy()
+    turn, travel = np.sqrt((s[:, :3] ** 2).mean(1)), np.sqrt((s[:, 3:6] ** 2).mean(1)) / distance
+    principal, scale = np.sqrt((s[:, 8:10] ** 2).mean(1)), np.sqrt((s[:, 6:8] ** 2).mean(1)) / focal
+    shift = np.sqrt(principal**2 + (focal * turn) ** 2 + (focal * travel) ** 2)
+    shape = np.sqrt(scale**2 + turn**2 + travel**2 + (principal / focal) ** 2)
+    return Spread(shift, float(shape.max()))

@@ -1,0 +1,210 @@
+"""Decide which blob is which fiducial: by prediction where a pose is known, else by hypotheses that the whole rig votes on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.identity.blobs import Spread, gather, spread_of
+from imgcal.identity.hypotheses import (
+    FiducialTriples,
+    Poses,
+    blob_triples,
+    fiducial_triples,
+    single_camera_poses,
+)
+from imgcal.identity.rivals import conflicts, moved_along
+from imgcal.identity.types import Identity, IdentityOptions, Status
+from imgcal.identity.verify import Fits, Scene, certain, evidence, join, refine, rig_and_pose, start
+from imgcal.identity.voting import Votes, match, predict_ideal, vote
+from imgcal.objects import CalibrationObject
+from imgcal.observations import Detections
+from imgcal.rig import CameraRig
+from imgcal.transforms import RigidTransform
+
+TRIPLES = 20  # of blobs in a round, over all cameras
+KEPT = 8  # poses of each
+VERIFIED = 3  # different labellings that are fitted, the best of a round
+
+
+def identify(
+    detections: Detections,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    std: Tensor,
+    candidates: Sequence[RigidTransform] = (),
+    options: IdentityOptions = IdentityOptions(),
+) -> Identity:
+    """Label the blobs of one snapshot: try the candidate poses first, then look for others.
+
+    Args:
+        detections: blobs of one snapshot; only usable ones count.
+        rig: factory rig without batch axes, float64.
+        obj: the calibration object.
+        std: (C, 15) prior standard deviation of each camera's parameters: how far the factory values may be off.
+        candidates: rig_from_object that may hold, the likeliest first: last snapshot's, or one known from the set-up.
+        options: how sure to be.
+
+    Returns:
+        The decision; `Identity.accepted` tells whether the labels may be used.
+
+    Raises:
+        InputError: blobs of several snapshots, or cameras that are not the rig's.
+    """
+    for pose in candidates:
+        tracked = track(detections, rig, obj, std, pose, options)
+        if tracked.accepted:
+            return tracked
+    return bootstrap(detections, rig, obj, std, options)
+
+
+def track(
+    detections: Detections,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    std: Tensor,
+    rig_from_object: RigidTransform,
+    options: IdentityOptions = IdentityOptions(),
+) -> Identity:
+    """Label the blobs of one snapshot near a known pose; arguments as in `identify`."""
+    scene = Scene(gather(detections, rig), obj, rig, std)
+    poses = Poses(rig_from_object.rotation.numpy()[None], rig_from_object.translation.numpy()[None])
+    predicted = predict_ideal(rig, scene.obj.points.numpy(), poses)
+    tolerance, gate = _bounds(scene, float(np.median(_distances(rig, poses, obj))), pose_known=True)
+    votes = vote(scene.blobs, predicted, tolerance, gate)
+    labels = match(scene.blobs, predicted, votes.shift, 1.25 * tolerance)
+    fits = refine(scene, start(scene, poses, labels))
+    return _decide(scene, fits, options, known_pose=True)
+
+
+def bootstrap(
+    detections: Detections,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    std: Tensor,
+    options: IdentityOptions = IdentityOptions(),
+) -> Identity:
+    """Label the blobs of one snapshot with no pose known; arguments as in `identify`."""
+    scene = Scene(gather(detections, rig), obj, rig, std)
+    cameras = np.flatnonzero(scene.blobs.count >= 4)
+    if len(cameras) == 0:
+        return _refused(scene, f"too few blobs: at most {scene.blobs.count.max()} in a camera, expected at least 4 in one")
+    tolerance, gate = _bounds(scene, rig.working_distance or _guess_distance(scene), pose_known=False)
+    generator = np.random.default_rng(options.seed)
+    triples = fiducial_triples(obj, generator)
+    fits: Fits | None = None
+    result = _refused(scene, "no pose of the object explains the blobs")
+    for _ in range(options.rounds):
+        fresh = _round(scene, cameras, triples, tolerance, gate, generator)
+        if fresh is None:
+            continue
+        fits = fresh if fits is None else _best(scene, join(fits, fresh), 2 * VERIFIED)
+        result = _decide(scene, fits, options, known_pose=False)
+        if result.accepted:
+            break
+    return result
+
+
+def _round(
+    scene: Scene,
+    cameras: NDArray[np.int64],
+    triples: FiducialTriples,
+    tolerance: float,
+    gate: float,
+    generator: np.random.Generator,
+) -> Fits | None:
+    """Make hypotheses, let the rig vote, fit the best."""
+    per_camera = max(1, TRIPLES // len(cameras))
+    chosen = [blob_triples(scene.blobs, camera, per_camera, generator) for camera in cameras]
+    camera = np.repeat(cameras, [len(rows) for rows in chosen])
+    poses = single_camera_poses(scene.blobs, scene.rig, camera, np.concatenate(chosen), triples, tolerance, KEPT)
+    if len(poses) == 0:
+        return None
+    predicted = predict_ideal(scene.rig, triples.points, poses)
+    votes = vote(scene.blobs, predicted, tolerance, gate)
+    best = np.argsort(-votes.count.sum(1), kind="stable")[: 4 * VERIFIED]
+    labels = match(scene.blobs, predicted[best], votes.shift[best], 1.25 * tolerance)
+    best, labels = _different(scene.obj, best, labels)
+    return refine(scene, start(scene, poses.select(best), labels))
+
+
+def _different(
+    obj: CalibrationObject, rows: NDArray[np.int64], labels: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Keep the fullest of labellings (K, C, N) that differ in most labels, `VERIFIED` at most."""
+    order = np.argsort(-(labels >= 0).sum((1, 2)), kind="stable")
+    kept: list[int] = []
+    for k in order:
+        if all(conflicts(obj, labels[other], labels[k]) > 0.5 for other in kept):
+            kept.append(int(k))
+        if len(kept) == VERIFIED:
+            break
+    return rows[kept], labels[kept]
+
+
+def _best(scene: Scene, fits: Fits, count: int) -> Fits:
+    """Keep the labellings with the most evidence."""
+    return fits.select(np.argsort(-evidence(scene, fits), kind="stable")[:count])
+
+
+def _decide(scene: Scene, fits: Fits, options: IdentityOptions, known_pose: bool) -> Identity:
+    """Accept the best labelling or say why not."""
+    odds = options.tracking_label_odds if known_pose else options.label_odds
+    fits = _best(scene, fits, len(fits.labels))
+    chosen = certain(scene, fits.select(np.array([0])), odds)
+    labels = chosen.labels[0]
+    share = float((labels >= 0).sum() / max(np.minimum(scene.blobs.count, scene.obj.fiducials).sum(), 1))
+    weight = evidence(scene, fits)
+    rival = [w for w, other in zip(weight[1:], fits.labels[1:], strict=True) if conflicts(scene.obj, labels, other) > 0]
+    margin = float(weight[0] - max([0.0, *rival]))
+    refusal = None
+    if not np.isfinite(margin) or share < options.least_share:
+        refusal = f"the best pose explains {100 * share:.0f} % of what could be seen, expected {100 * options.least_share:.0f} %"
+    elif margin < options.least_margin:
+        refusal = f"another labelling explains the blobs nearly as well (margin {margin:.1f}, expected {options.least_margin})"
+    rig, pose = rig_and_pose(scene, chosen, 0)
+    if refusal is not None:
+        return replace(_refused(scene, refusal), rig_from_object=pose, rig=rig, margin=margin)
+    order = len(scene.obj.symmetries)
+    status: Status = "by_tracking" if known_pose else "ambiguous" if order > 1 else "unique"
+    reason = f"explains {100 * share:.0f} % of what could be seen, margin {margin:.0f}"
+    return Identity(scene.blobs.to_rows(labels), pose, rig, status, 1 if known_pose else order, margin, reason)
+
+
+def _refused(scene: Scene, reason: str) -> Identity:
+    labels = np.full(scene.blobs.rows, -1, dtype=np.int64)
+    return Identity(labels, None, None, "refused", 0, 0.0, reason)
+
+
+def _bounds(scene: Scene, distance: float, pose_known: bool) -> tuple[float, float]:
+    """How far (px) a fiducial may be from its place in the pattern, and how far the pattern from its own.
+
+    Both follow from the prior. A pose from one camera is off as much as that camera, and its depth as much as its focal
+    length, which shifts the images of cameras at other places.
+    """
+    spread: Spread = spread_of(scene.std, scene.rig, distance)
+    focal = float(scene.rig.focal_length.mean())
+    positions = scene.rig.positions.numpy()
+    baseline = float(np.linalg.norm(positions - positions.mean(0), axis=1).max())
+    parallax = 2 * spread.shape * focal * baseline / distance
+    shift = float(np.hypot(spread.shift.max() * (1.0 if pose_known else np.sqrt(2)), 0.0 if pose_known else parallax))
+    return max(3.0, 2.5 * spread.shape * focal * scene.obj.size / distance), max(10.0, 4 * shift)
+
+
+def _guess_distance(scene: Scene) -> float:
+    """Distance at which the object looks about as large as the cloud of blobs, mm."""
+    focal = scene.rig.focal_length.mean(-1).numpy()
+    guesses = []
+    for camera in np.flatnonzero(scene.blobs.count >= 4):
+        uv = scene.blobs.ideal[camera, : scene.blobs.count[camera]]
+        guesses.append(focal[camera] * scene.obj.size / max(float(np.linalg.norm(uv - np.median(uv, axis=0), axis=1).mean()), 1.0))
+    return float(np.median(guesses))
+
+
+def _distances(rig: CameraRig, poses: Poses, obj: CalibrationObject) -> NDArray[np.float64]:
+    centre = poses.rotation[0] @ obj.points.mean(0).numpy() + poses.translation[0]
+    return np.linalg.norm(rig.positions.numpy() - centre, axis=1)

@@ -1,0 +1,197 @@
+"""Predict every fiducial with its uncertainty from a fit, and compare it with every blob."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from numba import njit
+from numpy.typing import NDArray
+
+from imgcal.estimation.linearize import Problem, rig_at
+from imgcal.estimation.solver import Solution, factorize
+from imgcal.identity.blobs import Blobs
+
+FAST = {"contract", "reassoc", "nsz"}
+THRESHOLD = 3.0
+"""Of the Cauchy loss of the fits, in standard deviations."""
+
+
+@dataclass(frozen=True)
+class Innovations:
+    """How well each blob fits each fiducial, given all labels but the fiducial's own."""
+
+    squared: NDArray[np.float64]  # (K, C, N, M) squared distance from the prediction, normalized by its covariance
+    log_det: NDArray[np.float64]  # (K, C, N) of that covariance, which includes the blob's noise, px^4
+    own: NDArray[np.float64]  # (K, C, N) `squared` of the fiducial's own blob, inf = no label
+    residual: NDArray[np.float64]  # (K, C, N) squared distance px^2 from the fit that includes the label
+    freedom: NDArray[np.float64]  # (K, C, N) degrees of freedom that the label leaves to its residual: 0 to 2
+    uv: NDArray[np.float64]  # (K, C, N, 2) px, predictions
+    complexity: NDArray[np.float64]  # (K,) log of det of posterior precision over prior precision
+
+    def select(self, rows: NDArray[np.int64]) -> Innovations:
+        """Keep the given labellings."""
+        return Innovations(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+
+def innovations(
+    blobs: Blobs, labels: NDArray[np.int64], sigma: NDArray[np.float64], problem: Problem, solution: Solution
+) -> Innovations:
+    """Compare predictions with blobs.
+
+    Args:
+        blobs: the snapshot.
+        labels: (K, C, N) blob of each fiducial, -1 = none: those of the fit.
+        sigma: (K,) px, noise of blob centres beyond their own.
+        problem: the fit's.
+        solution: the fit.
+    """
+    count, cameras, fiducials = labels.shape
+    rig = rig_at(problem, solution.state.offset)
+    reduced, _ = factorize(solution.equations)
+    radius_squared = np.zeros(fiducials) if problem.radius_squared is None else problem.radius_squared.numpy()
+    valid = blobs.row >= 0
+    noise = blobs.sigma**2
+    typical = float(np.median(noise[valid])) if valid.any() else 0.0
+    shape = (count, cameras, fiducials)
+    squared, log_det, own = np.full((*shape, blobs.uv.shape[1]), np.inf), np.zeros(shape), np.full(shape, np.inf)
+    residual, freedom, uv = np.zeros(shape), np.zeros(shape), np.zeros((*shape, 2))
+    failed = (reduced.failed | ~torch.isfinite(solution.equations.cost)).numpy()
+    lower = reduced.eliminated.numpy(), reduced.whitened.numpy(), reduced.kept.numpy()
+    for k in np.flatnonzero(~failed):
+        _compare(
+            rig.cam_from_rig.rotation[k].numpy(), rig.positions[k].numpy(), rig.focal_length[k].numpy(),
+            rig.principal_point[k].numpy(), rig.distortion[k].numpy(), problem.spread[k].numpy(),
+            solution.state.rotation[k, 0].numpy(), solution.state.centre[k, 0].numpy(),
+            problem.points.numpy(), radius_squared, lower[0][k], lower[1][k], lower[2][k],
+            blobs.uv, noise, typical, blobs.count, labels[k], sigma[k] ** 2,
+            squared[k], log_det[k], own[k], residual[k], freedom[k], uv[k],
+        )  # fmt: skip
+    diagonals = (reduced.eliminated.diagonal(dim1=-2, dim2=-1).flatten(1), reduced.kept.diagonal(dim1=-2, dim2=-1))
+    complexity = np.sum([2 * diagonal.log().sum(-1).numpy() for diagonal in diagonals], axis=0)
+    complexity[failed] = np.inf
+    return Innovations(squared, log_det, own, residual, freedom, uv, complexity)
+
+
+@njit(cache=True, fastmath=FAST)
+def _compare(
+    rotation, position, focal, principal, distortion, spread, turn, centre, points, radius_squared,
+    eliminated, whitened, kept, blob_uv, blob_noise, typical_noise, blob_count, labels, extra,
+    squared, log_det, own, residual, freedom, uv,
+):  # fmt: skip
+    """Fill the outputs for one labelling."""
+    rows, parts = np.empty((2, 21)), np.empty((2, 21))
+    unit = max(1.0, np.sqrt(centre[0] ** 2 + centre[1] ** 2 + centre[2] ** 2))
+    for c in range(len(rotation)):
+        for n in range(len(points)):
+            rotated = turn @ points[n]
+            _rows(
+                rotated, rotation[c], rotated + centre - position[c], focal[c], principal[c], distortion[c], spread[c],
+                radius_squared[n], unit, rows, uv[c, n],
+            )  # fmt: skip
+            _whiten(rows, eliminated[c], whitened[c], kept, parts)
+            uu, uv_, vv = (parts[0] * parts[0]).sum(), (parts[0] * parts[1]).sum(), (parts[1] * parts[1]).sum()
+            label = labels[c, n]
+            noise = (blob_noise[c, label] if label >= 0 else typical_noise) + extra
+            at_u, at_v = uv[c, n, 0], uv[c, n, 1]
+            residual[c, n], freedom[c, n], own[c, n] = 0.0, 0.0, np.inf
+            if label >= 0:
+                # Leaving the label out turns the prediction's covariance H into (W - H)^-1 W H and its error e into
+                # (W - H)^-1 W e, with W the noise over the weight that the robust loss gave the label.
+                eu, ev = at_u - blob_uv[c, label, 0], at_v - blob_uv[c, label, 1]
+                residual[c, n] = eu * eu + ev * ev
+                weighted = noise + residual[c, n] / THRESHOLD**2
+                freedom[c, n] = max(2 - (uu + vv) / weighted, 0.0)
+                a, b, d = weighted - uu, -uv_, weighted - vv
+                det = a * d - b * b
+                if not (a > 0 and d > 0 and det > 1e-9 * weighted * weighted):
+                    # Nothing but the label itself says where the fiducial is.
+                    a, b, d, det = 1e-4 * weighted, 0.0, 1e-4 * weighted, 1e-8 * weighted * weighted
+                scale = weighted / det
+                at_u = blob_uv[c, label, 0] + scale * (d * eu - b * ev)
+                at_v = blob_uv[c, label, 1] + scale * (a * ev - b * eu)
+                uu, uv_, vv = scale * d - 1, -scale * b, scale * a - 1
+                uu, uv_, vv = weighted * uu + noise, weighted * uv_, weighted * vv + noise
+            else:
+                uu, vv = uu + noise, vv + noise
+            det = max(uu * vv - uv_ * uv_, 1e-12 * uu * vv)
+            log_det[c, n] = np.log(det)
+            for m in range(squared.shape[2]):
+                if m >= blob_count[c]:
+                    squared[c, n, m] = np.inf
+                    continue
+                x, y = blob_uv[c, m, 0] - at_u, blob_uv[c, m, 1] - at_v
+                squared[c, n, m] = (vv * x * x - 2 * uv_ * x * y + uu * y * y) / det
+            if label >= 0:
+                own[c, n] = squared[c, n, label]
+
+
+@njit(cache=True, fastmath=FAST)
+def _rows(rotated, rotation, arm, focal, principal, distortion, spread, radius_squared, unit, rows, uv):
+    """Fill the Jacobian (2, 21) of a pixel with respect to 15 whitened camera and 6 pose parameters, and the pixel.
+
+    The lens is differentiated numerically: it is smooth, linear in its coefficients, and only uncertainties depend on it.
+    """
+    point = rotation @ arm
+    ideal_u, ideal_v = _lens(point[0], point[1], point[2], distortion, radius_squared)
+    uv[0], uv[1] = focal[0] * ideal_u + principal[0], focal[1] * ideal_v + principal[1]
+    slope = np.empty((2, 3))
+    step = 1e-5 * abs(point[2])
+    for i in range(3):
+        near = point.copy()
+        near[i] += step
+        u, v = _lens(near[0], near[1], near[2], distortion, radius_squared)
+        slope[0, i], slope[1, i] = focal[0] * (u - ideal_u) / step, focal[1] * (v - ideal_v) / step
+    back = slope @ rotation
+    for r in range(2):
+        rows[r, :3] = _cross(point, slope[r])
+        rows[r, 3:6] = -back[r]
+        rows[r, 6:10] = 0
+        rows[r, 15:18] = _cross(rotated, back[r])
+        rows[r, 18:21] = back[r] * unit
+    rows[0, 6], rows[1, 7], rows[0, 8], rows[1, 9] = ideal_u, ideal_v, 1.0, 1.0
+    for i in range(5):
+        other = distortion.copy()
+        other[i] += 1
+        u, v = _lens(point[0], point[1], point[2], other, radius_squared)
+        rows[0, 10 + i], rows[1, 10 + i] = focal[0] * (u - ideal_u), focal[1] * (v - ideal_v)
+    for r in range(2):
+        rows[r, :15] *= spread
+
+
+@njit(cache=True, fastmath=FAST)
+def _lens(px, py, pz, distortion, radius_squared):
+    """Distorted coordinates on the z = 1 plane."""
+    depth = max(pz, 1e-3)
+    per_depth = depth / (depth * depth - min(radius_squared, 0.5 * depth * depth))
+    x, y = px * per_depth, py * per_depth
+    rr = x * x + y * y
+    radial = 1 + rr * (distortion[0] + rr * (distortion[1] + rr * distortion[4]))
+    return (
+        x * radial + 2 * distortion[2] * x * y + distortion[3] * (rr + 2 * x * x),
+        y * radial + distortion[2] * (rr + 2 * y * y) + 2 * distortion[3] * x * y,
+    )
+
+
+@njit(cache=True, fastmath=FAST)
+def _whiten(rows, eliminated, whitened, kept, parts):
+    """Apply the inverse of the arrow's triangular factor: covariance = parts @ parts.T."""
+    for r in range(2):
+        for i in range(15):
+            value = rows[r, i]
+            for j in range(i):
+                value -= eliminated[i, j] * parts[r, j]
+            parts[r, i] = value / eliminated[i, i]
+        for i in range(6):
+            value = rows[r, 15 + i]
+            for j in range(15):
+                value -= whitened[j, i] * parts[r, j]
+            for j in range(i):
+                value -= kept[i, j] * parts[r, 15 + j]
+            parts[r, 15 + i] = value / kept[i, i]
+
+
+@njit(cache=True, fastmath=FAST)
+def _cross(a, b):
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

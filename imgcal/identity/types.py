@@ -1,0 +1,44 @@
+"""What identity gives back, and the few numbers that decide how sure it must be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imgcal.rig import CameraRig
+from imgcal.transforms import RigidTransform
+
+Status = Literal["unique", "by_prior", "by_tracking", "ambiguous", "refused"]
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Which blob is which fiducial, in one snapshot."""
+
+    labels: NDArray[np.int64]  # (M,) fiducial of each blob, -1 = none or not certain; all -1 when refused
+    rig_from_object: RigidTransform | None  # pose of the best fit; None when nothing could be fitted
+    rig: CameraRig | None  # drifted rig of the best fit, a start for estimation
+    status: Status
+    alternatives: int  # labellings that explain the blobs equally well: the object's symmetry order, 1 = unique
+    margin: float  # natural logarithm of the odds against the best different labelling; inf = none is left
+    reason: str  # one line: why it was refused, or what decided
+
+    @property
+    def accepted(self) -> bool:
+        """Tell whether the labels may be used."""
+        return self.status != "refused"
+
+
+@dataclass(frozen=True)
+class IdentityOptions:
+    """How sure is sure."""
+
+    label_odds: float = 1e4  # of a single label, against a false blob or another fiducial
+    tracking_label_odds: float = 1e2  # the same where a known pose predicts the blobs
+    least_margin: float = 20.0  # of the whole labelling against the best different one, natural logarithm
+    least_share: float = 0.45  # explained part of what could be seen: the smaller of blobs and fiducials, camera by camera
+    rounds: int = 24  # of hypotheses before giving up
+    seed: int = 0  # of the random choice of blob triples

@@ -1,0 +1,217 @@
+"""From a rough labelling to a certain one: fit rig and pose, predict with uncertainty, label again, finer each time.
+
+Only after such a fit can a label be judged: the factory rig alone is off by tens of pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.estimation import fused
+from imgcal.estimation.linearize import Problem, State, pose_at, rig_at
+from imgcal.identity.assignment import assign
+from imgcal.identity.blobs import Blobs
+from imgcal.identity.hypotheses import Poses
+from imgcal.identity.innovation import THRESHOLD, Innovations, innovations
+from imgcal.objects import CalibrationObject
+from imgcal.rig import CameraRig
+from imgcal.transforms import RigidTransform
+
+STAGES = (3.0, 0.7)
+"""Standard deviations (px) that the first fits allow, beyond the blobs' own; the last fits take it from their residuals."""
+GATE = 25.0
+"""Squared normalized innovation of a label; two degrees of freedom exceed it once in 270,000."""
+UNDECIDED = 2 * np.log(1e3)
+"""Two pairings whose squared normalized innovations differ by less cannot be told apart."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is given: the blobs, the object, the factory rig and how far it may have drifted."""
+
+    blobs: Blobs
+    obj: CalibrationObject
+    rig: CameraRig
+    std: Tensor  # (C, 15)
+
+
+@dataclass(frozen=True)
+class Fits:
+    """K labellings, each with the rig and pose that fit it best."""
+
+    labels: NDArray[np.int64]  # (K, C, N) blob of each fiducial, -1 = none
+    state: State
+    sigma: NDArray[np.float64]  # (K,) px, error of a blob centre beyond its own
+    cost: NDArray[np.float64]  # (K,) half of chi2, data and prior
+    innovations: Innovations | None = None  # of these labels at this state
+
+
+    def select(self, rows: NDArray[np.int64]) -> Fits:
+        """Keep the given labellings."""
+        state = State(self.state.offset[rows], self.state.rotation[rows], self.state.centre[rows])
+        found = None if self.innovations is None else self.innovations.select(rows)
+        return Fits(self.labels[rows], state, self.sigma[rows], self.cost[rows], found)
+
+
+def join(first: Fits, second: Fits) -> Fits:
+    """Put fitted labellings of one snapshot together."""
+    a, b = first.state, second.state
+    state = State(torch.cat((a.offset, b.offset)), torch.cat((a.rotation, b.rotation)), torch.cat((a.centre, b.centre)))
+    found = Innovations(
+        *(np.concatenate((getattr(_found(first), f.name), getattr(_found(second), f.name))) for f in fields(Innovations))
+    )
+    joined = (np.concatenate(pair) for pair in zip((first.labels, first.sigma, first.cost), (second.labels, second.sigma, second.cost), strict=True))
+    labels, sigma, cost = joined
+    return Fits(labels, state, sigma, cost, found)
+
+
+def start(scene: Scene, poses: Poses, labels: NDArray[np.int64]) -> Fits:
+    """Put the factory rig at poses (K,) with rough labels (K, C, N)."""
+    u, _, vh = np.linalg.svd(poses.rotation)
+    rotation = torch.from_numpy(u @ vh)
+    centre = torch.from_numpy(np.ascontiguousarray(poses.translation)) + rotation @ scene.obj.points.mean(0).to(rotation)
+    offset = rotation.new_zeros(len(poses), *scene.std.shape)
+    return Fits(labels, State(offset, rotation[:, None], centre[:, None]), np.zeros(len(poses)), np.zeros(len(poses)))
+
+
+def refine(scene: Scene, fits: Fits, stages: tuple[float, ...] = STAGES) -> Fits:
+    """Fit and label again, through all stages and then until the labels stay."""
+    for sigma in stages:
+        fits = _fit(scene, replace(fits, sigma=np.full(len(fits.labels), sigma)))
+        fits = replace(fits, sigma=_residual_sigma(scene, fits), labels=_assign(fits))
+    for _ in range(3):
+        labels = fits.labels
+        fits = _fit(scene, fits)
+        fits = replace(fits, labels=_assign(fits))
+        if np.array_equal(labels, fits.labels):
+            break
+        fits = replace(fits, sigma=_residual_sigma(scene, fits))
+    else:
+        fits = _fit(scene, fits)
+    return fits
+
+
+def certain(scene: Scene, fits: Fits, odds: float) -> Fits:
+    """Drop labels that are not certain: neither a false blob nor another fiducial may explain the blob nearly as well.
+
+    Args:
+        scene: what is given.
+        fits: refined labellings.
+        odds: least odds of a label against a false blob.
+    """
+    for _ in range(3):
+        found = _found(fits)
+        good = (found.own < GATE) & (_log_odds(scene, fits) > np.log(odds)) & ~_contested(fits.labels, found)
+        if np.array_equal(good, fits.labels >= 0):
+            break
+        fits = _fit(scene, replace(fits, labels=np.where(good, fits.labels, -1)))
+    return fits
+
+
+def evidence(scene: Scene, fits: Fits) -> NDArray[np.float64]:
+    """Log of the odds of each labelling against "all blobs are clutter" (Laplace's approximation): (K,)."""
+    labelled = fits.labels >= 0
+    noise = _blob_noise(scene, fits) + fits.sigma[:, None, None] ** 2
+    found = _found(fits)
+    gain = -np.log(2 * np.pi * noise) - np.log(_clutter(scene, fits)) + _detection_odds(scene, fits)
+    return np.where(labelled, gain, 0).sum((1, 2)) - fits.cost - 0.5 * found.complexity
+
+
+def rig_and_pose(scene: Scene, fits: Fits, row: int) -> tuple[CameraRig, RigidTransform]:
+    """Give the rig and rig_from_object of one labelling, without batch axes."""
+    problem = _problem(scene, fits)
+    return rig_at(problem, fits.state.offset)[row], pose_at(problem, fits.state)[row, 0]
+
+
+def _found(fits: Fits) -> Innovations:
+    if fits.innovations is None:
+        raise RuntimeError("labellings were not fitted")
+    return fits.innovations
+
+
+def _assign(fits: Fits) -> NDArray[np.int64]:
+    return assign(_found(fits).squared, GATE)
+
+
+def _blob_noise(scene: Scene, fits: Fits) -> NDArray[np.float64]:
+    """Variance of each label's blob by its own account: (K, C, N) px^2."""
+    return scene.blobs.sigma[np.arange(fits.labels.shape[1])[:, None], np.maximum(fits.labels, 0)] ** 2
+
+
+def _problem(scene: Scene, fits: Fits) -> Problem:
+    count, cameras, _ = fits.labels.shape
+    seen = fits.labels >= 0
+    uv = np.where(seen[..., None], scene.blobs.uv[np.arange(cameras)[:, None], np.maximum(fits.labels, 0)], 0.0)
+    sigma = np.sqrt(_blob_noise(scene, fits) + fits.sigma[:, None, None] ** 2)
+    points, radius = scene.obj.points.double(), scene.obj.radius
+    centroid = points.mean(0)
+    return Problem(
+        torch.from_numpy(np.ascontiguousarray(uv.swapaxes(-1, -2)))[:, None],
+        torch.from_numpy(seen / sigma)[:, None],
+        points - centroid,
+        centroid,
+        None if radius is None else radius.double().square(),
+        scene.rig.expand(count),
+        scene.std.expand(count, -1, -1),
+    )
+
+
+def _fit(scene: Scene, fits: Fits) -> Fits:
+    problem = _problem(scene, fits)
+    solution = fused.minimize(problem, fits.state, "cauchy", THRESHOLD, 8, 1e-3)
+    found = innovations(scene.blobs, fits.labels, fits.sigma, problem, solution)
+    return replace(fits, state=solution.state, cost=solution.equations.cost.numpy(), innovations=found)
+
+
+def _residual_sigma(scene: Scene, fits: Fits) -> NDArray[np.float64]:
+    """Error of blob centres beyond their own, as far as the residuals show it: (K,) px."""
+    found = _found(fits)
+    inlier = (fits.labels >= 0) & (found.own < GATE)
+    freedom = np.where(inlier, found.freedom, 0).sum((1, 2))
+    variance = np.where(inlier, found.residual, 0).sum((1, 2)) / np.maximum(freedom, 1e-3)
+    own = np.where(inlier, _blob_noise(scene, fits), 0).sum((1, 2)) / np.maximum(inlier.sum((1, 2)), 1)
+    return np.minimum(np.sqrt(np.maximum(variance - own, 0)), fits.sigma)
+
+
+def _clutter(scene: Scene, fits: Fits) -> NDArray[np.float64]:
+    """False blobs per square pixel, near the object's image or overall, whichever is more: (K, 1, 1)."""
+    uv = _found(fits).uv
+    low, high = uv.min(2), uv.max(2)
+    middle, half = (low + high) / 2, 0.75 * (high - low) + 10
+    inside = (np.abs(scene.blobs.uv[None] - middle[:, :, None]) < half[:, :, None]).all(-1).sum((1, 2))
+    labelled = (fits.labels >= 0).sum((1, 2))
+    local = (np.maximum(inside - labelled, 0) + 1) / (4 * half.prod(-1)).sum(1)
+    overall = (scene.blobs.count.sum() - labelled + 1) / scene.rig.image_size.prod(1).sum().item()
+    return np.maximum(local, overall)[:, None, None]
+
+
+def _detection_odds(scene: Scene, fits: Fits) -> NDArray[np.float64]:
+    """Log odds that a fiducial in view gives a blob: (K, 1, 1)."""
+    uv = _found(fits).uv
+    in_view = ((uv > 0) & (uv < scene.rig.image_size.numpy()[:, None])).all(-1).sum((1, 2))
+    share = np.clip(((fits.labels >= 0).sum((1, 2)) + 1) / (in_view + 2), 0.05, 0.95)
+    return np.log(share / (1 - share))[:, None, None]
+
+
+def _log_odds(scene: Scene, fits: Fits) -> NDArray[np.float64]:
+    """Log odds of each label (K, C, N) against a false blob at the same place; -inf = no label."""
+    found = _found(fits)
+    density = -np.log(2 * np.pi) - 0.5 * found.log_det - 0.5 * found.own
+    return density - np.log(_clutter(scene, fits)) + _detection_odds(scene, fits)
+
+
+def _contested(labels: NDArray[np.int64], found: Innovations) -> NDArray[np.bool_]:
+    """Mark labels (K, C, N) whose blob may as well belong to another fiducial, alone or in exchange for its own blob."""
+    labelled = labels >= 0
+    cost = found.squared + found.log_det[..., None]
+    # of_other[i, j]: cost of giving the blob of fiducial i to fiducial j.
+    of_other = np.take_along_axis(cost, np.maximum(labels, 0)[:, :, None, :], -1).swapaxes(-1, -2)
+    alone = of_other - np.where(labelled, found.own + found.log_det, 0)[..., None]
+    change = np.where(labelled[:, :, None, :], alone + alone.swapaxes(-1, -2), alone)
+    other = ~np.eye(labels.shape[-1], dtype=bool) & labelled[..., None]
+    return (other & (change < UNDECIDED)).any(-1)

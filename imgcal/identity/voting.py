@@ -1,0 +1,105 @@
+"""The whole rig votes: how many blobs a pose explains when each camera's image may be shifted as a whole.
+
+Drift of a few percent moves a camera's pattern by tens of pixels but bends it by few, so the shift is free within the
+prior's bounds and everything else is not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from imgcal.identity.assignment import mutual_nearest
+from imgcal.identity.blobs import Blobs
+from imgcal.identity.hypotheses import Poses
+from imgcal.rig import CameraRig
+
+MOST_BINS = 200  # across a camera's range of shifts; the tolerance grows where it asks for more
+
+
+@dataclass(frozen=True)
+class Votes:
+    """Explained fiducials of K poses, and where each camera's image was found."""
+
+    count: NDArray[np.int64]  # (K, C)
+    shift: NDArray[np.float64]  # (K, C, 2) pixels, blob minus prediction
+
+
+def predict_ideal(rig: CameraRig, points: NDArray[np.float64], poses: Poses) -> NDArray[np.float64]:
+    """Project fiducials (N, 3) without distortion, from the principal point: (K, C, N, 2) pixels, inf behind a camera."""
+    rotation, translation = rig.cam_from_rig.rotation.numpy(), rig.cam_from_rig.translation.numpy()
+    turn = rotation @ poses.rotation[:, None]
+    at = points @ turn.mT + ((rotation @ poses.translation[:, None, :, None])[..., 0] + translation)[:, :, None]
+    depth = at[..., 2:]
+    focal = rig.focal_length.mean(-1).numpy()[:, None, None]
+    return np.where(depth > 1, at[..., :2] * (focal / np.maximum(depth, 1)), np.inf)
+
+
+def vote(blobs: Blobs, predicted: NDArray[np.float64], tolerance: float, gate: float) -> Votes:
+    """Find each camera's most popular shift.
+
+    Args:
+        blobs: the snapshot.
+        predicted: (K, C, N, 2) from `predict_ideal`.
+        tolerance: pixels, how far a fiducial may be from its place in the pattern.
+        gate: pixels, the largest shift.
+
+    Returns:
+        The votes; counts stop at N.
+    """
+    width = max(tolerance, 2 * gate / MOST_BINS)
+    count = np.zeros(predicted.shape[:2], dtype=np.int64)
+    shift = np.zeros((*predicted.shape[:2], 2))
+    _vote(predicted, blobs.ideal, blobs.count, width, gate, count, shift)
+    return Votes(count, shift)
+
+
+@njit(parallel=True, cache=True)
+def _vote(predicted, ideal, number, width, gate, count, shift):
+    poses, cameras, fiducials = predicted.shape[:3]
+    bins = int(np.ceil(2 * gate / width))
+    for k in prange(poses):
+        # Every vote counts in two by two overlapping windows, so that no peak is split by a border.
+        windows = np.zeros((bins + 1, bins + 1), dtype=np.int32)
+        for c in range(cameras):
+            windows[:] = 0
+            for n in range(fiducials):
+                for m in range(number[c]):
+                    u, v = ideal[c, m, 0] - predicted[k, c, n, 0] + gate, ideal[c, m, 1] - predicted[k, c, n, 1] + gate
+                    if u >= 0 and v >= 0 and u < 2 * gate and v < 2 * gate:
+                        i, j = int(u / width), int(v / width)
+                        windows[i, j] += 1
+                        windows[i + 1, j] += 1
+                        windows[i, j + 1] += 1
+                        windows[i + 1, j + 1] += 1
+            best = windows.argmax()
+            i, j = best // (bins + 1), best % (bins + 1)
+            count[k, c] = min(windows[i, j], fiducials)
+            shift[k, c, 0], shift[k, c, 1] = i * width - gate, j * width - gate
+
+
+def match(blobs: Blobs, predicted: NDArray[np.float64], shift: NDArray[np.float64], tolerance: float) -> NDArray[np.int64]:
+    """Pair fiducials with blobs under given shifts, which are refined on the way.
+
+    Args:
+        blobs: the snapshot.
+        predicted: (K, C, N, 2).
+        shift: (K, C, 2).
+        tolerance: pixels.
+
+    Returns:
+        (K, C, N) blob of each fiducial, -1 = none.
+    """
+    gaps = blobs.ideal[None, :, None] - np.where(np.isfinite(predicted), predicted, -1e6)[:, :, :, None]  # (K, C, N, M, 2)
+    for reach in (1.5, 1.2):
+        residual = gaps - shift[:, :, None, None]
+        squared = (residual * residual).sum(-1)
+        nearest = squared.argmin(-1)[..., None]
+        weight = np.maximum(0, 1 - np.take_along_axis(squared, nearest, -1) / (reach * tolerance) ** 2)
+        step = np.take_along_axis(residual, nearest[..., None], -2)[..., 0, :]
+        shift = shift + (weight * step).sum(2) / np.maximum(weight.sum(2), 1e-6)
+    residual = gaps - shift[:, :, None, None]
+    return mutual_nearest((residual * residual).sum(-1), tolerance**2)
