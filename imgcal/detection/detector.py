@@ -5,15 +5,16 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imgcal.detection.finding import find_candidates
-from imgcal.detection.measuring import Blobs, Source, measure
+from imgcal.detection.finding import outline, screen
+from imgcal.detection.measuring import Blobs, measure
 from imgcal.detection.options import DetectionOptions, Frame, checked_frame, checked_mask, full_scale
 from imgcal.errors import InputError
-from imgcal.observations import Detections
+from imgcal.observations import BlobFlag, Detections
 
 Mask = NDArray[np.bool_] | NDArray[np.uint8]  # (H, W) non-zero inside known reflections
 
@@ -52,7 +53,7 @@ def detect_snapshot(
     masks: Mapping[str, Mask] | None = None,
     pool: ThreadPoolExecutor | None = None,
 ) -> Blobs:
-    """Detect the blobs of one snapshot; `Blobs.source` counts the cameras in the order of `frames`.
+    """Detect the blobs of one snapshot; `Blobs.camera` counts the cameras in the order of `frames`.
 
     Args:
         frames: camera name -> frame (H, W), None = missing.
@@ -63,29 +64,30 @@ def detect_snapshot(
     if pool is None:
         with ThreadPoolExecutor(_workers(len(frames))) as own_pool:
             return detect_snapshot(frames, options, masks=masks, pool=own_pool)
-    present = [(index, name) for index, (name, frame) in enumerate(frames.items()) if frame is not None]
-
-    def find(name: str) -> Source:
-        return _find(frames[name], options, (masks or {}).get(name), name)
-
-    # The full frames are read in parallel (OpenCV releases the interpreter); all blobs are then measured as one batch,
-    # because the cost of that is calls, not pixels.
-    blobs = measure(list(pool.map(find, [name for _, name in present])), options)
-    camera = np.array([index for index, _ in present], np.int64)
-    return Blobs(blobs.uv, blobs.sigma, blobs.radius, blobs.flags, camera[blobs.source])
+    present = [(camera, name) for camera, name in enumerate(frames) if frames[name] is not None]
+    images = [checked_frame(frames[name], name) for _, name in present]
+    scales = [full_scale(image, options.bit_depth, name) for image, (_, name) in zip(images, present, strict=True)]
+    if not images:
+        return Blobs(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0, np.uint8), np.zeros(0, np.int64))
+    # Whole frames are read in parallel (OpenCV releases the interpreter), what stands out is handled as one batch.
+    screenings = list(pool.map(screen, images, [options] * len(images), scales))
+    blobs = measure(images, outline(images, screenings, options, scales), options, scales)
+    for index, (image, (_, name)) in enumerate(zip(images, present, strict=True)):
+        if masks is not None and name in masks:
+            rows = np.flatnonzero(blobs.camera == index)
+            blobs.flags[rows[_inside(checked_mask(masks[name], image, name), blobs.uv[rows])]] |= np.uint8(BlobFlag.MASKED)
+    return replace(blobs, camera=np.array([camera for camera, _ in present])[blobs.camera])
 
 
 def detect_frame(frame: Frame, options: DetectionOptions, mask: Mask | None = None) -> Blobs:
     """Detect the blobs of one frame (H, W)."""
-    return measure([_find(frame, options, mask, "of the frame")], options)
+    return detect_snapshot({"frame": frame}, options, masks=None if mask is None else {"frame": mask})
 
 
-def _find(frame: object, options: DetectionOptions, mask: Mask | None, camera: str) -> Source:
-    """Check a frame and find its candidates."""
-    checked = checked_frame(frame, camera)
-    scale = full_scale(checked, options.bit_depth, camera)
-    inside = None if mask is None else checked_mask(mask, checked, camera)
-    return Source(checked, find_candidates(checked, options, scale), scale, inside)
+def _inside(mask: NDArray[np.bool_], uv: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell which centres (K, 2) lie inside a mask (H, W)."""
+    pixel = np.clip(np.rint(uv).astype(np.int64), 0, np.array(mask.shape[::-1]) - 1)
+    return mask[pixel[:, 1], pixel[:, 0]]
 
 
 def _workers(cameras: int) -> int:
@@ -115,7 +117,7 @@ def _table(blobs: list[Blobs], names: tuple[str, ...]) -> Detections:
     """Stack the blobs of all snapshots; rows run over snapshots, then cameras."""
     counts = [len(shot.uv) for shot in blobs]
     digits = len(str(max(len(blobs) - 1, 0)))
-    camera = np.concatenate([shot.source for shot in blobs])
+    camera = np.concatenate([shot.camera for shot in blobs])
     return Detections(
         uv=np.concatenate([shot.uv for shot in blobs]),
         sigma=np.concatenate([shot.sigma for shot in blobs]),

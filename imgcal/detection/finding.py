@@ -1,4 +1,4 @@
-"""Where the blobs are: candidate components of a frame, found on block means so that the full frame is read once."""
+"""Where the blobs are: candidate components, found on block means so that each frame is read once."""
 
 from __future__ import annotations
 
@@ -15,20 +15,33 @@ BLOCK = 4  # px, side of a block; a 4 x 4 mean is close to the matched filter of
 NOISE_FACTOR = 5.0  # candidates stand out of the block means by this many standard deviations
 LEAST_CONTRAST = 0.006  # of full scale: below this, block means tell quantization steps rather than blobs
 LEVELS = 5  # components that are too large are tried again at higher levels
+EDGE = 0.3  # of the level: what the blocks at the edge of a blob hold
 PEAK_FRACTION = 0.3  # of the local peak: keeps the skirts of neighbours apart
 
 
 @dataclass(frozen=True)
-class Candidates:
-    """Connected bright components of one frame."""
+class Screening:
+    """Blocks of one frame that stand out of its background."""
 
-    mask: NDArray[np.uint8]  # (H', W') 255 on the components; padded to whole blocks
+    blocks: NDArray[np.int64]  # (K,) flat indices of blocks
+    base: NDArray[np.float64]  # (K,) grey levels of the background
+    excess: NDArray[np.float64]  # (K,) grey levels above the base that a pixel of a blob exceeds
+    shape: tuple[int, int]  # blocks in a column and in a row of the frame
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Connected bright components of several frames."""
+
+    mask: NDArray[np.uint8]  # (R, W) 255 on the components: the rows that hold any, of all frames below each other
+    rows: list[NDArray[np.int64]]  # (H,) of each frame: row of the mask that stands for a row of the frame, 0 = empty
+    frame: NDArray[np.int64]  # (K,) which frame
     boxes: NDArray[np.int64]  # (K, 4) left, top, right, bottom pixel (included)
     seeds: NDArray[np.int64]  # (K, 2) one pixel (u, v) of each component
 
 
-def find_candidates(frame: Frame, options: DetectionOptions, scale: int) -> Candidates:
-    """Find the components of `frame` that are brighter (darker) than their surroundings.
+def screen(frame: Frame, options: DetectionOptions, scale: int) -> Screening:
+    """Find the blocks of `frame` that are brighter (darker) than their surroundings.
 
     Args:
         frame: (H, W) grey values.
@@ -43,22 +56,40 @@ def find_candidates(frame: Frame, options: DetectionOptions, scale: int) -> Cand
     background = cv2.morphologyEx(means, cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
     contrast = cv2.subtract(means, background)
     floor, level = _levels(contrast, options, scale)
-    hits = cv2.threshold(contrast, floor + level, 255, cv2.THRESH_BINARY)[1].astype(np.uint8, copy=False)
-    mask = np.zeros((means.shape[0] * BLOCK, means.shape[1] * BLOCK), np.uint8)
-    blocks = np.flatnonzero(cv2.dilate(hits, np.ones((3, 3), np.uint8)).view(np.bool_))
-    local_peak = cv2.dilate(contrast, np.ones((3, 3), np.uint8)).ravel()[blocks] - floor
+    local_peak = cv2.dilate(contrast, np.ones((3, 3), np.uint8))
+    # Blocks that stand out, and those next to them that hold something.
+    blocks = np.flatnonzero((local_peak > int(floor + level)) & (contrast > int(floor + EDGE * level)))
+    local_peak = local_peak.ravel()[blocks] - floor
     # The mean of the 3 x 3 pixels around a pixel has 4/3 of the noise of a block mean.
     excess = np.maximum(level * 4 / 3, PEAK_FRACTION * local_peak)
+    return Screening(blocks, background.ravel()[blocks] + floor, excess, (means.shape[0], means.shape[1]))
+
+
+def outline(frames: list[Frame], screenings: list[Screening], options: DetectionOptions, scales: list[int]) -> Candidates:
+    """Outline the components of several frames at once; those too large are tried again at higher levels."""
+    heights = np.array([screening.shape[0] + 1 for screening in screenings])  # an empty row between frames
+    first = np.cumsum(heights) - heights
+    columns = max(screening.shape[1] for screening in screenings)
+    blocks = np.concatenate([screening.blocks for screening in screenings])
+    counts = [len(screening.blocks) for screening in screenings]
+    row, column = np.divmod(blocks, np.repeat([screening.shape[1] for screening in screenings], counts))
+    row += np.repeat(first, counts)
+    mask_rows = _mask_rows(row, int(heights.sum()))
+    row = mask_rows[row]
+    mask = np.zeros(((mask_rows.max() + 2) * BLOCK, columns * BLOCK), np.uint8)
+    tiles = mask.reshape(-1, BLOCK, columns, BLOCK)
+    base = np.concatenate([screening.base for screening in screenings])
+    excess = np.concatenate([screening.excess for screening in screenings])
+    smooth = _smooth_pixels(frames, screenings, scales if options.polarity == "dark" else None)
     contours: list[NDArray[np.int32]] = []
-    invert = scale if options.polarity == "dark" else None
     for _ in range(LEVELS):
-        if not blocks.size:
-            break
-        _mark_pixels(frame, blocks, background.ravel()[blocks] + floor + excess, mask, invert)
+        tiles[row, :, column, :] = np.where(smooth > (base + excess)[:, None, None], 255, 0)
         contours, oversize = _components(mask, 4 * options.max_radius + 8)  # merged blobs pass: they are to be reported
-        raised = _blocks_under(oversize, blocks)
-        blocks, excess = blocks[raised], 1.6 * excess[raised]
-    return _candidates(mask, contours, frame.shape)
+        if oversize is None:
+            break
+        raised = oversize.reshape(tiles.shape)[row, :, column, :].any((1, 2))
+        row, column, base, smooth, excess = row[raised], column[raised], base[raised], smooth[raised], 1.6 * excess[raised]
+    return _candidates(mask, mask_rows, first, contours, [frame.shape for frame in frames])
 
 
 def _block_means(frame: Frame) -> Frame:
@@ -73,7 +104,7 @@ def _block_means(frame: Frame) -> Frame:
 
 def _levels(contrast: Frame, options: DetectionOptions, scale: int) -> tuple[float, float]:
     """Estimate what the opening leaves of an empty background, and how far above it a candidate must stand."""
-    sample = np.sort(contrast[::4, ::4], axis=None)
+    sample = np.sort(contrast[::8, ::8], axis=None)
     lower = sample[: max(1, int(0.6 * sample.size))]  # without the blobs and most of the texture
     noise = 1.54 * float(lower.std())  # the standard deviation of a normal variable below its 60th percentile
     level = max(NOISE_FACTOR * noise, LEAST_CONTRAST * scale)
@@ -82,27 +113,38 @@ def _levels(contrast: Frame, options: DetectionOptions, scale: int) -> tuple[flo
     return float(sample[sample.size // 2]), level
 
 
-def _mark_pixels(
-    frame: Frame, blocks: NDArray[np.int64], least: NDArray[np.float64], mask: NDArray[np.uint8], invert: int | None
-) -> None:
-    """Set `mask` where the mean of the 3 x 3 pixels around a pixel of the given blocks exceeds `least` of its block."""
-    rows, columns = np.divmod(blocks, mask.shape[1] // BLOCK)
+def _mask_rows(used: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """Number the rows of blocks that are in use from 1, with an empty one between bands: (count,), 0 = not in use.
+
+    A sparse frame then needs a mask of a fraction of its size, and outlining the components costs as much less.
+    """
+    in_use = np.zeros(count, np.bool_)
+    in_use[used] = True
+    starts = in_use & ~np.concatenate([[False], in_use[:-1]])
+    return np.where(in_use, np.cumsum(in_use) + np.cumsum(starts) - 1, 0)
+
+
+def _smooth_pixels(frames: list[Frame], screenings: list[Screening], invert: list[int] | None) -> NDArray[np.float32]:
+    """Average the 3 x 3 pixels around each pixel of the screened blocks: (K, 4, 4), bright polarity."""
     reach = np.arange(-1, BLOCK + 1)
-    v = np.clip(rows[:, None] * BLOCK + reach, 0, frame.shape[0] - 1)
-    u = np.clip(columns[:, None] * BLOCK + reach, 0, frame.shape[1] - 1)
-    pixels = frame[v[:, :, None], u[:, None, :]].astype(np.int32)  # (K, 6, 6)
+    parts = []
+    for frame, screening in zip(frames, screenings, strict=True):
+        row, column = np.divmod(screening.blocks, screening.shape[1])
+        v = np.clip(row[:, None] * BLOCK + reach, 0, frame.shape[0] - 1) * frame.shape[1]
+        u = np.clip(column[:, None] * BLOCK + reach, 0, frame.shape[1] - 1)
+        parts.append(frame.take(v[:, :, None] + u[:, None, :]))  # (K, 6, 6)
+    pixels = np.concatenate(parts).astype(np.float32)
     pixels = pixels[:, :-2] + pixels[:, 1:-1] + pixels[:, 2:]
-    pixels = pixels[:, :, :-2] + pixels[:, :, 1:-1] + pixels[:, :, 2:]  # (K, 4, 4) sums of nine
+    pixels = (pixels[:, :, :-2] + pixels[:, :, 1:-1] + pixels[:, :, 2:]) / 9
     if invert is not None:
-        pixels = 9 * invert - pixels
-    tiles = mask.reshape(mask.shape[0] // BLOCK, BLOCK, mask.shape[1] // BLOCK, BLOCK)
-    tiles[rows, :, columns, :] = np.where(pixels > 9 * least[:, None, None], 255, 0)
+        pixels = np.repeat(np.array(invert, np.float32), [len(part) for part in parts])[:, None, None] - pixels
+    return pixels
 
 
 def _components(
     mask: NDArray[np.uint8], largest: float
 ) -> tuple[list[NDArray[np.int32]], NDArray[np.uint8] | None]:
-    """Outline the components of the mask up to the size `largest`, and draw those beyond: (H', W'), None without any."""
+    """Outline the components of the mask up to the size `largest`, and draw those beyond: (R, W'), None without any."""
     contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
     kept, oversize = [], None
     for index, contour in enumerate(contours):
@@ -116,21 +158,26 @@ def _components(
     return kept, oversize
 
 
-def _blocks_under(drawn: NDArray[np.uint8] | None, blocks: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Tell which of the blocks hold a drawn pixel: (K,)."""
-    if drawn is None:
-        return np.zeros(len(blocks), np.bool_)
-    rows, columns = np.divmod(blocks, drawn.shape[1] // BLOCK)
-    tiles = drawn.reshape(drawn.shape[0] // BLOCK, BLOCK, drawn.shape[1] // BLOCK, BLOCK)
-    held: NDArray[np.bool_] = tiles[rows, :, columns, :].any((1, 2))
-    return held
-
-
-def _candidates(mask: NDArray[np.uint8], contours: list[NDArray[np.int32]], shape: tuple[int, ...]) -> Candidates:
-    """Bound the outlined components; those wholly inside the padding are dropped."""
+def _candidates(
+    mask: NDArray[np.uint8],
+    mask_rows: NDArray[np.int64],
+    first: NDArray[np.int64],
+    contours: list[NDArray[np.int32]],
+    shapes: list[tuple[int, ...]],
+) -> Candidates:
+    """Bound the outlined components in pixels of their frames; those wholly inside the padding of a frame are dropped."""
+    used = np.flatnonzero(mask_rows)
+    block_row = np.zeros(mask.shape[0] // BLOCK, np.int64)
+    block_row[mask_rows[used]] = used
     rectangles = np.array([cv2.boundingRect(contour) for contour in contours], np.int64).reshape(-1, 4)
     seeds = np.array([contour[0, 0] for contour in contours], np.int64).reshape(-1, 2)
-    limit = np.array([shape[1], shape[0]]) - 1
-    last = np.minimum(rectangles[:, :2] + rectangles[:, 2:] - 1, limit)
-    inside = (rectangles[:, :2] <= limit).all(1)
-    return Candidates(mask, np.hstack([rectangles[:, :2], last])[inside], np.minimum(seeds, limit)[inside])
+    points = np.stack([rectangles[:, :2], rectangles[:, :2] + rectangles[:, 2:] - 1, seeds])  # (3, K, 2)
+    block = block_row[points[..., 1] // BLOCK]
+    frame = np.searchsorted(first, block[0], side="right") - 1
+    points[..., 1] = (block - first[frame]) * BLOCK + points[..., 1] % BLOCK
+    limit = np.array([(width, height) for height, width in shapes])[frame]
+    inside = (points[0] < limit).all(1)
+    points = np.minimum(points, limit - 1)[:, inside]
+    pixel_rows = (mask_rows[:, None] * BLOCK + np.arange(BLOCK)).ravel()
+    rows = [pixel_rows[start * BLOCK :][: shape[0]] for start, shape in zip(first.tolist(), shapes, strict=True)]
+    return Candidates(mask, rows, frame[inside], np.hstack([points[0], points[1]]), points[2])
