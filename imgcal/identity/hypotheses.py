@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import combinations, permutations
+from itertools import permutations
 
 import numpy as np
 from numba import njit, prange
@@ -15,7 +15,7 @@ from imgcal.objects import CalibrationObject
 from imgcal.rig import CameraRig
 
 MOST_FIDUCIAL_TRIPLES = 300_000
-MOST_BLOB_TRIPLES = 2_000
+DRAWS = 3  # blob triples of which the widest is taken
 PROBES = 8  # fiducials that every hypothesis is tested on; only promising ones are tested on all
 CELLS = 4  # raster cells to a tolerance
 
@@ -75,21 +75,16 @@ def fiducial_triples(obj: CalibrationObject, generator: np.random.Generator) -> 
 
 
 def blob_triples(blobs: Blobs, camera: int, count: int, generator: np.random.Generator) -> NDArray[np.int64]:
-    """Choose triples of blobs (count, 3) that are likely to be fiducials: close to other blobs, and not too narrow."""
-    number = int(blobs.count[camera])
-    uv = blobs.ideal[camera, :number]
-    gaps = np.sort(np.hypot(*(uv[:, None] - uv[None]).transpose(2, 0, 1)), axis=1)[:, min(3, number - 1)]
-    dense = np.flatnonzero(gaps <= 2 * np.sort(gaps)[number // 4])
+    """Draw triples of blobs (count, 3) that are likely to be fiducials: close to other blobs, and not too narrow."""
+    uv = blobs.ideal[camera, : blobs.count[camera]].astype(np.float64)
+    gaps = np.sort(np.hypot(*(uv[:, None] - uv[None]).transpose(2, 0, 1)), axis=1)[:, min(3, len(uv) - 1)]
+    dense = np.flatnonzero(gaps <= 2 * np.sort(gaps)[len(uv) // 4])
     if len(dense) < 4:
         dense = np.argsort(gaps)[:4]
-    if len(dense) <= 24:
-        triples = np.array(list(combinations(dense, 3)))
-    else:
-        triples = generator.choice(dense, (MOST_BLOB_TRIPLES, 3))
-    a, b = uv[triples[:, 1]] - uv[triples[:, 0]], uv[triples[:, 2]] - uv[triples[:, 0]]
-    area = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-    wide = triples[area >= np.quantile(area, 0.4)]
-    return wide[generator.permutation(len(wide))[:count]]
+    drawn = dense[generator.random((DRAWS * count, len(dense))).argpartition(2, axis=1)[:, :3]]
+    a, b = uv[drawn[:, 1]] - uv[drawn[:, 0]], uv[drawn[:, 2]] - uv[drawn[:, 0]]
+    area = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).reshape(DRAWS, count)
+    return drawn.reshape(DRAWS, count, 3)[area.argmax(0), np.arange(count)]
 
 
 def single_camera_poses(

@@ -17,10 +17,10 @@ from imgcal.identity.hypotheses import (
     fiducial_triples,
     single_camera_poses,
 )
-from imgcal.identity.rivals import conflicts, moved_along
+from imgcal.identity.rivals import conflicts
 from imgcal.identity.types import Identity, IdentityOptions, Status
-from imgcal.identity.verify import Fits, Scene, certain, evidence, join, refine, rig_and_pose, start
-from imgcal.identity.voting import Votes, match, predict_ideal, vote
+from imgcal.identity.verify import Fits, Scene, certain, evidence, join, refine, rig_and_pose, settle, start
+from imgcal.identity.voting import match, predict_ideal, vote
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections
 from imgcal.rig import CameraRig
@@ -155,7 +155,7 @@ def _decide(scene: Scene, fits: Fits, options: IdentityOptions, known_pose: bool
     """Accept the best labelling or say why not."""
     odds = options.tracking_label_odds if known_pose else options.label_odds
     fits = _best(scene, fits, len(fits.labels))
-    chosen = certain(scene, fits.select(np.array([0])), odds)
+    chosen = certain(scene, settle(scene, fits.select(np.array([0]))), odds)
     labels = chosen.labels[0]
     share = float((labels >= 0).sum() / max(np.minimum(scene.blobs.count, scene.obj.fiducials).sum(), 1))
     weight = evidence(scene, fits)

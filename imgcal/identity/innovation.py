@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
-import torch
 from numba import njit
 from numpy.typing import NDArray
 
 from imgcal.estimation.linearize import Problem, rig_at
-from imgcal.estimation.solver import Solution, factorize
+from imgcal.estimation.solver import Solution
 from imgcal.identity.blobs import Blobs
 
 FAST = {"contract", "reassoc", "nsz"}
@@ -49,7 +48,6 @@ def innovations(
     """
     count, cameras, fiducials = labels.shape
     rig = rig_at(problem, solution.state.offset)
-    reduced, _ = factorize(solution.equations)
     radius_squared = np.zeros(fiducials) if problem.radius_squared is None else problem.radius_squared.numpy()
     valid = blobs.row >= 0
     noise = blobs.sigma**2
@@ -57,21 +55,62 @@ def innovations(
     shape = (count, cameras, fiducials)
     squared, log_det, own = np.full((*shape, blobs.uv.shape[1]), np.inf), np.zeros(shape), np.full(shape, np.inf)
     residual, freedom, uv = np.zeros(shape), np.zeros(shape), np.zeros((*shape, 2))
-    failed = (reduced.failed | ~torch.isfinite(solution.equations.cost)).numpy()
-    lower = reduced.eliminated.numpy(), reduced.whitened.numpy(), reduced.kept.numpy()
-    for k in np.flatnonzero(~failed):
-        _compare(
-            rig.cam_from_rig.rotation[k].numpy(), rig.positions[k].numpy(), rig.focal_length[k].numpy(),
-            rig.principal_point[k].numpy(), rig.distortion[k].numpy(), problem.spread[k].numpy(),
-            solution.state.rotation[k, 0].numpy(), solution.state.centre[k, 0].numpy(),
-            problem.points.numpy(), radius_squared, lower[0][k], lower[1][k], lower[2][k],
-            blobs.uv, noise, typical, blobs.count, labels[k], sigma[k] ** 2,
-            squared[k], log_det[k], own[k], residual[k], freedom[k], uv[k],
-        )  # fmt: skip
-    diagonals = (reduced.eliminated.diagonal(dim1=-2, dim2=-1).flatten(1), reduced.kept.diagonal(dim1=-2, dim2=-1))
-    complexity = np.sum([2 * diagonal.log().sum(-1).numpy() for diagonal in diagonals], axis=0)
-    complexity[failed] = np.inf
+    complexity = np.full(count, np.inf)
+    equations, state = solution.equations, solution.state
+    for k in np.flatnonzero(np.isfinite(equations.cost.numpy())):
+        # Lower factors of the cameras' blocks, of the couplings' and of the pose's: see arrow.reduce.
+        eliminated = equations.camera[k].numpy().copy()
+        whitened = equations.coupling[k, 0].numpy().copy()
+        kept = equations.pose[k, 0].numpy().copy()
+        complexity[k] = _factorize(eliminated, whitened, kept)
+        if np.isfinite(complexity[k]):
+            _compare(
+                rig.cam_from_rig.rotation[k].numpy(), rig.positions[k].numpy(), rig.focal_length[k].numpy(),
+                rig.principal_point[k].numpy(), rig.distortion[k].numpy(), problem.spread[k].numpy(),
+                state.rotation[k, 0].numpy(), state.centre[k, 0].numpy(),
+                problem.points.numpy(), radius_squared, eliminated, whitened, kept,
+                blobs.uv, noise, typical, blobs.count, labels[k], sigma[k] ** 2,
+                squared[k], log_det[k], own[k], residual[k], freedom[k], uv[k],
+            )  # fmt: skip
     return Innovations(squared, log_det, own, residual, freedom, uv, complexity)
+
+
+@njit(cache=True, fastmath=FAST)
+def _factorize(blocks, coupling, kept):
+    """Factorize the arrow in place; return the logarithm of its determinant, inf where it is not positive definite."""
+    log_det = 0.0
+    for c in range(len(blocks)):
+        part = _cholesky(blocks[c])
+        if part == np.inf:
+            return np.inf
+        log_det += part
+        for i in range(15):
+            for k in range(i):
+                coupling[c, i] -= blocks[c, i, k] * coupling[c, k]
+            coupling[c, i] /= blocks[c, i, i]
+        for i in range(6):
+            for j in range(6):
+                for k in range(15):
+                    kept[i, j] -= coupling[c, k, i] * coupling[c, k, j]
+    return log_det + _cholesky(kept)
+
+
+@njit(cache=True, fastmath=FAST)
+def _cholesky(matrix):
+    """Factorize the lower triangle in place; return the logarithm of the determinant, inf if not positive definite."""
+    log_det = 0.0
+    for j in range(len(matrix)):
+        for k in range(j):
+            matrix[j, j] -= matrix[j, k] * matrix[j, k]
+        if not matrix[j, j] > 0:
+            return np.inf
+        log_det += np.log(matrix[j, j])
+        matrix[j, j] = np.sqrt(matrix[j, j])
+        for i in range(j + 1, len(matrix)):
+            for k in range(j):
+                matrix[i, j] -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] /= matrix[j, j]
+    return log_det
 
 
 @njit(cache=True, fastmath=FAST)

@@ -25,7 +25,10 @@ def conflicts(obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[
 
 def _common(first: NDArray[np.int64], second: NDArray[np.int64]) -> int:
     """Number of blobs that both labellings name."""
-    return sum(len(np.intersect1d(a[a >= 0], b[b >= 0])) for a, b in zip(first, second, strict=True))
+    named = np.zeros((2, len(first), max(first.max(), second.max()) + 2), dtype=bool)
+    cameras = np.arange(len(first))[:, None]
+    named[0, cameras, first], named[1, cameras, second] = True, True  # label -1 lands in the last column
+    return int(named[..., :-1].all(0).sum())
 
 
 def moved_along(obj: CalibrationObject) -> None:

@@ -80,20 +80,22 @@ def start(scene: Scene, poses: Poses, labels: NDArray[np.int64]) -> Fits:
 
 
 def refine(scene: Scene, fits: Fits, stages: tuple[float, ...] = STAGES) -> Fits:
-    """Fit and label again, through all stages and then until the labels stay."""
+    """Fit and label again through all stages; the last labels are fitted too."""
     for sigma in stages:
         fits = _fit(scene, replace(fits, sigma=np.full(len(fits.labels), sigma)))
         fits = replace(fits, sigma=_residual_sigma(scene, fits), labels=_assign(fits))
-    for _ in range(3):
-        labels = fits.labels
+    return settle(scene, fits, rounds=1)
+
+
+def settle(scene: Scene, fits: Fits, rounds: int = 4) -> Fits:
+    """Fit and label again until the labels stay, or for so many rounds."""
+    for _ in range(rounds):
         fits = _fit(scene, fits)
-        fits = replace(fits, labels=_assign(fits))
+        labels = _assign(fits)
         if np.array_equal(labels, fits.labels):
-            break
-        fits = replace(fits, sigma=_residual_sigma(scene, fits))
-    else:
-        fits = _fit(scene, fits)
-    return fits
+            return fits
+        fits = replace(fits, sigma=_residual_sigma(scene, fits), labels=labels)
+    return _fit(scene, fits)
 
 
 def certain(scene: Scene, fits: Fits, odds: float) -> Fits:
@@ -104,7 +106,7 @@ def certain(scene: Scene, fits: Fits, odds: float) -> Fits:
         fits: refined labellings.
         odds: least odds of a label against a false blob.
     """
-    for _ in range(3):
+    for _ in range(4):
         found = _found(fits)
         good = (found.own < GATE) & (_log_odds(scene, fits) > np.log(odds)) & ~_contested(fits.labels, found)
         if np.array_equal(good, fits.labels >= 0):

@@ -29,13 +29,27 @@ class Votes:
 
 
 def predict_ideal(rig: CameraRig, points: NDArray[np.float64], poses: Poses) -> NDArray[np.float64]:
-    """Project fiducials (N, 3) without distortion, from the principal point: (K, C, N, 2) pixels, inf behind a camera."""
-    rotation, translation = rig.cam_from_rig.rotation.numpy(), rig.cam_from_rig.translation.numpy()
-    turn = rotation @ poses.rotation[:, None]
-    at = points @ turn.mT + ((rotation @ poses.translation[:, None, :, None])[..., 0] + translation)[:, :, None]
-    depth = at[..., 2:]
-    focal = rig.focal_length.mean(-1).numpy()[:, None, None]
-    return np.where(depth > 1, at[..., :2] * (focal / np.maximum(depth, 1)), np.inf)
+    """Project fiducials (N, 3) without distortion, from the principal point: (K, C, N, 2) pixels, -1e7 behind a camera."""
+    transform = rig.cam_from_rig
+    focal = rig.focal_length.mean(-1).numpy()
+    return _predict(
+        transform.rotation.numpy(), transform.translation.numpy(), focal, points, poses.rotation, poses.translation
+    )
+
+
+@njit(cache=True)
+def _predict(rotation, translation, focal, points, turn, offset):
+    uv = np.full((len(turn), len(rotation), len(points), 2), -1e7)
+    for k in range(len(turn)):
+        for n in range(len(points)):
+            at = turn[k] @ points[n] + offset[k]
+            for c in range(len(rotation)):
+                r, t = rotation[c], translation[c]
+                depth = r[2, 0] * at[0] + r[2, 1] * at[1] + r[2, 2] * at[2] + t[2]
+                if depth > 1:
+                    uv[k, c, n, 0] = focal[c] * (r[0, 0] * at[0] + r[0, 1] * at[1] + r[0, 2] * at[2] + t[0]) / depth
+                    uv[k, c, n, 1] = focal[c] * (r[1, 0] * at[0] + r[1, 1] * at[1] + r[1, 2] * at[2] + t[1]) / depth
+    return uv
 
 
 def vote(blobs: Blobs, predicted: NDArray[np.float64], tolerance: float, gate: float) -> Votes:
@@ -93,7 +107,7 @@ def match(blobs: Blobs, predicted: NDArray[np.float64], shift: NDArray[np.float6
     Returns:
         (K, C, N) blob of each fiducial, -1 = none.
     """
-    gaps = blobs.ideal[None, :, None] - np.where(np.isfinite(predicted), predicted, -1e6)[:, :, :, None]  # (K, C, N, M, 2)
+    gaps = blobs.ideal[None, :, None] - predicted[:, :, :, None]  # (K, C, N, M, 2)
     for reach in (1.5, 1.2):
         residual = gaps - shift[:, :, None, None]
         squared = (residual * residual).sum(-1)
