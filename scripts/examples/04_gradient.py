@@ -1,0 +1,21 @@
+"""Differentiate through the estimate: how does one pixel of one camera move the recalibrated rig?"""
+
+import torch
+
+import imgcal
+from imgcal.observations import Observations
+from imgcal.simulation import simulate_truth
+from imgcal.synthesis import PhysicalDrift
+
+generator = torch.Generator().manual_seed(3)
+factory, obj = imgcal.load_rig("O6"), imgcal.load_object("asymmetric8")
+truth = simulate_truth(factory, obj, 2, generator, PhysicalDrift())
+
+uv = truth.uv.clone().requires_grad_()
+seen = torch.ones(uv.shape[:-1], dtype=torch.bool)
+result = imgcal.estimate(Observations(uv, torch.full(uv.shape[:-1], 0.05, dtype=uv.dtype), seen), factory, obj)
+
+result.rig.focal_length[0, 0].backward()  # fx of the first camera
+print("d fx / d u of each fiducial in the first snapshot of the first camera:")
+print(uv.grad[0, 0, :, 0])
+print("largest influence through another camera:", f"{uv.grad[0, 1:].abs().max():.3f}")
