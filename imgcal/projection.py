@@ -88,7 +88,7 @@ def project_components(
     u = fx * (x * radial + p1 * xy2 + p2 * (rr + 2 * xx)) + cx
     v = fy * (y * radial + p1 * (rr + 2 * yy) + p2 * xy2) + cy
     visible = is_inside(u, v, image_size) & (depth > NEAREST_DEPTH) & is_before_fold(rr, distortion)
-    return Projection(torch.stack((u, v), dim=-1), depth, visible)
+    return Projection(torch.stack((u, v)).movedim(0, -1), depth, visible)
 
 
 def project_kornia(
@@ -121,7 +121,10 @@ def project_kornia(
 def is_inside(u: Tensor, v: Tensor, image_size: Tensor) -> Tensor:
     """Tell which pixels (*B, C, N) lie inside the image, image_size (C, 2): borders at -0.5 and size - 0.5."""
     limit = (image_size - 0.5).to(u.dtype)
-    return (u >= -0.5) & (v >= -0.5) & (u <= limit[:, :1]) & (v <= limit[:, 1:])
+    # Distances to the nearest border: a comparison costs several times as much as a minimum.
+    across = torch.minimum(u + 0.5, limit[:, :1] - u)
+    down = torch.minimum(v + 0.5, limit[:, 1:] - v)
+    return torch.minimum(across, down) >= 0
 
 
 def is_before_fold(rr: Tensor, distortion: Tensor) -> Tensor:
@@ -133,7 +136,7 @@ def is_before_fold(rr: Tensor, distortion: Tensor) -> Tensor:
 
     Returns:
         (*B, C, N) bool: the derivative 1 + 3 k1 s + 5 k2 s^2 + 7 k3 s^3 of the distorted radius is positive for every
-        s in [0, rr]. The smallest value of a cubic on an interval is at its end or at a root of its derivative.
+        s in [0, rr]. The smallest value of a cubic on an interval is at an end or at its one local minimum.
     """
     k1, k2, _, _, k3 = distortion.detach().unsqueeze(-2).unbind(-1)
     rr = rr.detach()
@@ -142,12 +145,12 @@ def is_before_fold(rr: Tensor, distortion: Tensor) -> Tensor:
     def slope(s: Tensor) -> Tensor:
         return 1 + s * (a + s * (b + s * c))
 
-    # Roots of a + 2 b s + 3 c s^2 in the form that stays accurate as c goes to zero; a missing root becomes nan or inf.
+    # The local minimum, (root - b) / (3 c), in forms that stay accurate as c goes to zero; nan or infinite without one.
     root = (b * b - 3 * a * c).sqrt()
-    q = -(b + torch.where(b < 0, -root, root))
-    stationary = torch.stack((a / q, q / (3 * c)), dim=0).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0).clamp_min(0)
-    lowest_inside = torch.minimum(stationary, rr)
-    return (slope(rr) > 0) & (slope(lowest_inside) > 0).all(0)
+    lowest = torch.where(b > 0, -a / (b + root), (root - b) / (3 * c))
+    # Where the slope dips below zero, a camera is blind from there on, though the slope may recover farther out.
+    blind_from = torch.where((lowest > 0) & (slope(lowest) <= 0), lowest, torch.inf)
+    return torch.minimum(slope(rr), blind_from - rr) > 0
 
 
 def undistort(xy_distorted: Tensor, distortion: Tensor, iterations: int = 8) -> tuple[Tensor, Tensor]:

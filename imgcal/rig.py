@@ -10,7 +10,7 @@ from torch import Tensor
 
 from imgcal.projection import Projection, project_components
 from imgcal.rotations import rotation_from_6d, rotation_from_vector, sixd_from_rotation, vector_from_rotation
-from imgcal.transforms import RigidTransform
+from imgcal.transforms import RigidTransform, rotate
 
 PARAMETERS = 15
 """Free parameters of a camera, in this order: rotation (3, rad), position (3, mm), focal length (2), principal point (2,
@@ -86,12 +86,17 @@ class CameraRig:
         Returns:
             uv (*B, C, N, 2), depth and visible (*B, C, N); differentiable.
         """
-        rotation, translation = self.cam_from_rig.rotation, self.cam_from_rig.translation
-        # One product for all cameras of a rig: (3C, 3) @ (3, N).
-        stacked = rotation.flatten(-3, -2) @ points_rig.mT
-        points = stacked.unflatten(-2, (self.cameras, 3)) + translation[..., None]
+        # Components apart, and fiducials first in memory: each step then runs over one long row of all cameras.
+        components = points_rig.movedim((-1, -2), (0, 1)).contiguous().unsqueeze(-1)  # (3, N, *B, 1)
+        x, y, z = components.expand(*components.shape[:-1], self.cameras).contiguous().movedim(1, -1)  # (*B, C, N)
+        rows = self.cam_from_rig.rotation.unsqueeze(-3).unbind(-2)
+        shifts = self.cam_from_rig.translation.unsqueeze(-2).unbind(-1)
+        points_cam = []
+        for row, shift in zip(rows, shifts, strict=True):
+            by_x, by_y, by_z = row.unbind(-1)  # (*B, C, 1)
+            points_cam.append(torch.addcmul(torch.addcmul(torch.addcmul(shift, x, by_x), y, by_y), z, by_z))
         return project_components(
-            points.unbind(-2), self.focal_length, self.principal_point, self.distortion, self.image_size, radius
+            tuple(points_cam), self.focal_length, self.principal_point, self.distortion, self.image_size, radius
         )
 
     def from_object(self, rig_from_object: RigidTransform) -> CameraRig:
@@ -123,7 +128,7 @@ class CameraRig:
             focal_length=self.focal_length + step[..., 6:8],
             principal_point=self.principal_point + step[..., 8:10],
             distortion=self.distortion + step[..., 10:15],
-            cam_from_rig=RigidTransform(rotation, -(rotation @ positions[..., None]).squeeze(-1)),
+            cam_from_rig=RigidTransform(rotation, -rotate(rotation, positions)),
         )
 
     def difference(self, reference: CameraRig) -> Tensor:

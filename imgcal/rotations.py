@@ -55,7 +55,7 @@ def rotation_from_vector(vector: Tensor) -> Tensor:
         bx * y + az, c + by * y, by * z - ax,
         bx * z - ay, by * z + ax, c + bz * z,
     )  # fmt: skip
-    return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
+    return _matrices(entries)
 
 
 def left_jacobian(vector: Tensor) -> Tensor:
@@ -130,7 +130,7 @@ def rotation_from_euler(angles: Tensor) -> Tensor:
         sc * cb, sc * sb * sa + cc * ca, sc * sb * ca - cc * sa,
         -sb, cb * sa, cb * ca,
     )  # fmt: skip
-    return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
+    return _matrices(entries)
 
 
 def euler_from_rotation(rotation: Tensor) -> Tensor:
@@ -138,13 +138,18 @@ def euler_from_rotation(rotation: Tensor) -> Tensor:
 
     Convention: at the gimbal lock (second angle = +-pi/2) the third angle is set to zero.
     """
-    m = rotation
-    cosine = torch.hypot(m[..., 0, 0], m[..., 1, 0])
+    m00, _, _, m10, m11, m12, m20, m21, m22 = rotation.flatten(-2).unbind(-1)
+    cosine = torch.hypot(m00, m10)
     locked = cosine < 1e-6
-    a = torch.where(locked, torch.atan2(-m[..., 1, 2], m[..., 1, 1]), torch.atan2(m[..., 2, 1], m[..., 2, 2]))
-    b = torch.atan2(-m[..., 2, 0], cosine)
-    c = torch.where(locked, torch.zeros_like(a), torch.atan2(m[..., 1, 0], m[..., 0, 0]))
+    a = torch.where(locked, torch.atan2(-m12, m11), torch.atan2(m21, m22))
+    b = torch.atan2(-m20, cosine)
+    c = torch.where(locked, 0.0, torch.atan2(m10, m00))
     return torch.stack((a, b, c), dim=-1)
+
+
+def _matrices(entries: tuple[Tensor, ...]) -> Tensor:
+    """Nine entries (*B), row by row, to matrices (*B, 3, 3): entries stay apart in memory, as component arithmetic wants."""
+    return torch.stack(entries).unflatten(0, (3, 3)).movedim((0, 1), (-2, -1))
 
 
 def geodesic_angle(first: Tensor, second: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ Source: paper section 4.1. Random numbers come from an explicit `torch.Generator
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -14,9 +15,10 @@ from torch import Tensor
 from imgcal.errors import InputError, RefusedError
 from imgcal.objects import CalibrationObject
 from imgcal.projection import Projection
-from imgcal.rig import CameraRig, RigPrior
+from imgcal.projection_compiled import project
+from imgcal.rig import PARAMETERS, CameraRig, RigPrior
 from imgcal.rotations import euler_from_rotation, rotation_from_euler
-from imgcal.transforms import RigidTransform
+from imgcal.transforms import RigidTransform, rotate
 
 
 @dataclass(frozen=True)
@@ -46,23 +48,24 @@ class RelativeDrift:
             if not 0 <= value < 1:
                 raise InputError(f"{name}: found {value}, expected 0 <= kappa < 1 (0.025 is 2.5 %)")
 
-    def apply(self, rig: CameraRig, generator: torch.Generator) -> CameraRig:
-        """Disturb focal lengths, principal points, distortion; Euler angles and positions of the cameras in the rig."""
+    def apply(self, rig: CameraRig, generator: torch.Generator, *batch: int) -> CameraRig:
+        """Disturb focal lengths, principal points, distortion; Euler angles and positions of the cameras in the rig.
 
-        def drift(value: Tensor, kappa: float) -> Tensor:
-            return value * (1 + kappa * (2 * _uniform(value, generator) - 1))
-
-        rotation = rig.cam_from_rig.rotation
-        positions = rig.positions
-        if self.kappa_extrinsics > 0:
-            rotation = rotation_from_euler(drift(euler_from_rotation(rotation), self.kappa_extrinsics))
-            positions = drift(positions, self.kappa_extrinsics)
+        Returns:
+            (*batch, *B) rigs, each disturbed on its own.
+        """
+        draws = _parameters_first(torch.rand, rig, generator, batch)
+        extrinsics = draws[..., :6] * (2 * self.kappa_extrinsics) + (1 - self.kappa_extrinsics)
+        intrinsics = draws[..., 6:] * (2 * self.kappa_intrinsics) + (1 - self.kappa_intrinsics)
+        angles = extrinsics[..., 0:3] * euler_from_rotation(rig.cam_from_rig.rotation)
+        positions = extrinsics[..., 3:6] * rig.positions
+        rotation = rotation_from_euler(angles)
         return replace(
             rig,
-            focal_length=drift(rig.focal_length, self.kappa_intrinsics),
-            principal_point=drift(rig.principal_point, self.kappa_intrinsics),
-            distortion=drift(rig.distortion, self.kappa_intrinsics),
-            cam_from_rig=RigidTransform(rotation, -(rotation @ positions[..., None]).squeeze(-1)),
+            focal_length=intrinsics[..., 0:2] * rig.focal_length,
+            principal_point=intrinsics[..., 2:4] * rig.principal_point,
+            distortion=intrinsics[..., 4:9] * rig.distortion,
+            cam_from_rig=RigidTransform(rotation, -rotate(rotation, positions)),
         )
 
     def std(self, rig: CameraRig) -> Tensor:
@@ -103,11 +106,9 @@ class PhysicalDrift:
             if not (math.isfinite(value) and value >= 0):
                 raise InputError(f"{name}: found {value}, expected a standard deviation >= 0")
 
-    def apply(self, rig: CameraRig, generator: torch.Generator) -> CameraRig:
-        """Disturb every parameter of every camera independently."""
-        std = self.std(rig)
-        noise = torch.randn(std.shape, generator=generator, dtype=std.dtype, device=std.device)
-        return rig.moved(noise * std)
+    def apply(self, rig: CameraRig, generator: torch.Generator, *batch: int) -> CameraRig:
+        """Disturb every parameter of every camera independently: (*batch, *B) rigs."""
+        return rig.moved(_parameters_first(torch.randn, rig, generator, batch) * self.std(rig))
 
     def std(self, rig: CameraRig) -> Tensor:
         """Standard deviation of each parameter: (*B, C, 15)."""
@@ -129,6 +130,7 @@ class Snapshots:
     projection: Projection  # (B, C, N)
 
 
+@torch.no_grad()
 def synthesize(
     rig: CameraRig,
     obj: CalibrationObject,
@@ -196,20 +198,18 @@ def sample_rig_from_object(
         (B,) rig_from_object: the object's centroid at (0, 0, working_distance), R_focus, then the roll R_random.
     """
     draws = torch.rand((3, count), generator=generator, dtype=centroid.dtype, device=centroid.device)
-    theta, phi, alpha = (
-        low + (high - low) * draw
-        for (low, high), draw in zip((pose_range.theta, pose_range.phi, pose_range.alpha), draws, strict=True)
-    )
-    st, ct, sp, cp, sa, ca = theta.sin(), theta.cos(), phi.sin(), phi.cos(), alpha.sin(), alpha.cos()
-    # Rows of R_focus: the unit vectors of azimuth and zenith angle, and the viewing direction (towards the centre).
-    zero = torch.zeros_like(st)
-    x_axis, y_axis = (-st, ct, zero), (cp * ct, cp * st, -sp)
-    rows = (
-        *(ca * x - sa * y for x, y in zip(x_axis, y_axis, strict=True)),
-        *(sa * x + ca * y for x, y in zip(x_axis, y_axis, strict=True)),
-        -sp * ct, -sp * st, -cp,
+    low, high = centroid.new_tensor((pose_range.theta, pose_range.phi, pose_range.alpha)).unsqueeze(-2).unbind(-1)
+    angles = torch.lerp(low, high, draws)
+    (st, sp, sa), (ct, cp, ca) = angles.sin(), angles.cos()
+    # R_random times R_focus, whose rows are the unit vectors of azimuth and zenith angle and the viewing direction.
+    inward_x, inward_y = -sp * ct, -sp * st
+    along_x, along_y = cp * ct, cp * st
+    entries = (
+        -ca * st - sa * along_x, ca * ct - sa * along_y, sa * sp,
+        ca * along_x - sa * st, sa * ct + ca * along_y, -ca * sp,
+        inward_x, inward_y, -cp,
     )  # fmt: skip
-    rotation = torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+    rotation = torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
     target = centroid.new_tensor((0.0, 0.0, working_distance))
     return RigidTransform(rotation, target - rotation @ centroid)
 
@@ -226,9 +226,8 @@ def _sample(
     if rig.working_distance is None:
         raise InputError(f"rig {rig.name}: found no working_distance, expected one (mm) to place the rig by")
     poses = sample_rig_from_object(count, rig.working_distance, points.mean(0), pose_range, generator)
-    rigs = rig.expand(count)
-    drifted = rigs if drift is None else drift.apply(rigs, generator)
-    return Snapshots(drifted, poses, drifted.project(poses.apply(points), radius))
+    drifted = rig.expand(count) if drift is None else drift.apply(rig, generator, count)
+    return Snapshots(drifted, poses, project(drifted, poses.apply(points), radius))
 
 
 def _take(snapshots: Snapshots, rows: Tensor) -> Snapshots:
@@ -258,5 +257,13 @@ def _concatenate_transforms(parts: list[RigidTransform]) -> RigidTransform:
     return RigidTransform(torch.cat([p.rotation for p in parts]), torch.cat([p.translation for p in parts]))
 
 
-def _uniform(like: Tensor, generator: torch.Generator) -> Tensor:
-    return torch.rand(like.shape, generator=generator, dtype=like.dtype, device=like.device)
+def _parameters_first(
+    draw: Callable[..., Tensor], rig: CameraRig, generator: torch.Generator, batch: tuple[int, ...]
+) -> Tensor:
+    """Draw a number for every parameter: (*batch, *B, C, 15), with parameters first in memory, for long contiguous rows.
+
+    Elementwise operations keep the memory order of their first operand.
+    """
+    like = rig.focal_length
+    shape = (PARAMETERS, *batch, *like.shape[:-1])
+    return draw(shape, generator=generator, dtype=like.dtype, device=like.device).movedim(0, -1)

@@ -1,0 +1,82 @@
+"""Projection without gradients on CPUs: `CameraRig.project` compiled to one loop, without temporaries.
+
+`projection.py` says the same in tensors, runs on any device, and is what this is tested against.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numba import njit
+from torch import Tensor
+
+from imgcal.projection import NEAREST_DEPTH, Projection
+from imgcal.rig import CameraRig
+
+
+def project(rig: CameraRig, points_rig: Tensor, radius: Tensor | None = None) -> Projection:
+    """Do the work of `rig.project(points_rig, radius)`: without gradients, and several times faster on the CPU.
+
+    Args:
+        rig: (B,) rigs; device and floating-point type are those of `points_rig`.
+        points_rig: (B, N, 3) mm.
+        radius: (N,) mm of spherical fiducials; None = points.
+    """
+    if points_rig.device.type != "cpu":
+        with torch.no_grad():
+            return rig.project(points_rig, radius)
+    count, fiducials, _ = points_rig.shape
+    image = points_rig.new_empty(count, rig.cameras, 4, fiducials)  # u, v, depth, visible
+    radius_squared = points_rig.new_zeros(fiducials) if radius is None else radius.square()
+    transform, lens = rig.cam_from_rig, (rig.focal_length, rig.principal_point, rig.distortion)
+    given = (points_rig.mT, radius_squared, transform.rotation, transform.translation, *lens, rig.image_size.to(image.dtype))
+    _project(*(tensor.detach().contiguous().numpy() for tensor in given), image.numpy())
+    return Projection(image[..., :2, :].mT, image[..., 2, :], image[..., 3, :] > 0)
+
+
+@njit(cache=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
+def _project(points, radius_squared, rotation, translation, focal_length, principal_point, distortion, image_size, image):
+    # One output array and constants of the points' own type: with more of either, the inner loop is not vectorized.
+    kind = points.dtype.type
+    nearest, zero, half, one, two = kind(NEAREST_DEPTH), kind(0), kind(0.5), kind(1), kind(2)
+    for b in range(rotation.shape[0]):
+        for c in range(rotation.shape[1]):
+            r, t = rotation[b, c], translation[b, c]
+            r00, r01, r02, tx = r[0, 0], r[0, 1], r[0, 2], t[0]
+            r10, r11, r12, ty = r[1, 0], r[1, 1], r[1, 2], t[1]
+            r20, r21, r22, tz = r[2, 0], r[2, 1], r[2, 2], t[2]
+            fx, fy = focal_length[b, c]
+            cx, cy = principal_point[b, c]
+            k1, k2, p1, p2, k3 = distortion[b, c]
+            width, height = image_size[c, 0] - half, image_size[c, 1] - half
+            slope1, slope2, slope3 = kind(3) * k1, kind(5) * k2, kind(7) * k3
+            blind_from = kind(_blind_from(slope1, slope2, slope3))
+            for n in range(points.shape[2]):
+                x, y, z = points[b, 0, n], points[b, 1, n], points[b, 2, n]
+                px = r00 * x + r01 * y + r02 * z + tx
+                py = r10 * x + r11 * y + r12 * z + ty
+                pz = r20 * x + r21 * y + r22 * z + tz
+                clamped = pz if pz > nearest else nearest
+                sphere = clamped * clamped - radius_squared[n]
+                per_depth = clamped / (sphere if sphere > half * clamped * clamped else half * clamped * clamped)
+                x, y = px * per_depth, py * per_depth
+                xx, yy, xy2 = x * x, y * y, two * x * y
+                rr = xx + yy
+                radial = one + rr * (k1 + rr * (k2 + rr * k3))
+                u = fx * (x * radial + p1 * xy2 + p2 * (rr + two * xx)) + cx
+                v = fy * (y * radial + p1 * (rr + two * yy) + p2 * xy2) + cy
+                slope = one + rr * (slope1 + rr * (slope2 + rr * slope3))
+                inside = (u >= -half) & (v >= -half) & (u <= width) & (v <= height)
+                visible = inside & (pz > nearest) & (slope > zero) & (rr < blind_from)
+                image[b, c, 0, n], image[b, c, 1, n], image[b, c, 2, n] = u, v, pz
+                image[b, c, 3, n] = one if visible else zero
+
+
+@njit(cache=True, error_model="numpy")
+def _blind_from(a, b, c):
+    """Squared radius at which 1 + a s + b s^2 + c s^3 has dipped to zero or below, like projection.is_before_fold."""
+    root = np.sqrt(b * b - 3 * a * c)
+    lowest = -a / (b + root) if b > 0 else (root - b) / (3 * c)
+    if lowest > 0 and 1 + lowest * (a + lowest * (b + lowest * c)) <= 0:
+        return lowest
+    return np.inf
