@@ -1,0 +1,188 @@
+"""What the report shows: `ReportContent`, filled by the pipeline, and the numbers that several sections share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.estimation.covariance import relative_difference, relative_jacobian
+from imgcal.observations import Detections
+from imgcal.rig import PARAMETERS, CameraRig, RigPrior
+from imgcal.transforms import RigidTransform
+
+Array = NDArray[np.float64]
+
+MOVED = 3.0
+"""A value has moved when its change from the factory is larger than this many standard deviations."""
+
+UNDETERMINED = 0.8
+"""A value is not determined by the data when its standard deviation is still this share of the prior's."""
+
+
+@dataclass(frozen=True)
+class SnapshotSummary:
+    """What became of one snapshot."""
+
+    name: str
+    found: int  # blobs, all cameras together
+    used: int  # blobs that took part in the estimate
+    reason: str = ""  # why it was rejected; empty = used
+
+
+@dataclass(frozen=True)
+class ReportContent:
+    """Everything on the page. A field that a refused run cannot fill keeps its default.
+
+    Convention: extrinsics in `std` and `prior_std` are relative to the reference camera, as in
+    `estimation.relative_covariance`; parameters in the order of `rig.PARAMETER_NAMES`.
+    """
+
+    title: str
+    status: Literal["ok", "refused"]
+    reason: str  # why it was refused, or what the run wants to say; may be empty
+    identity: str  # coded | unique | by_prior | by_tracking | ambiguous, or what the run says when refused
+    factory: CameraRig  # no batch axes, C cameras
+    detections: Detections  # M blobs of S snapshots
+    labels: NDArray[np.int64]  # (M,) fiducial of each blob, -1 = unlabelled
+    snapshots: tuple[SnapshotSummary, ...] = ()  # S
+    recalibrated: CameraRig | None = None
+    predicted_before: Array | None = None  # (M, 2) pixels by the factory rig, pose refitted; nan where a blob is not used
+    predicted_after: Array | None = None  # (M, 2) pixels by the recalibrated rig; nan where a blob is not used
+    sigma: Array | None = None  # (M,) pixels, as weighted in the estimate; None = as detected
+    std: Array | None = None  # (C, 15) posterior standard deviation
+    prior_std: Array | None = None  # (C, 15) standard deviation before the data; see `relative_prior_std`
+    reference: int = 0  # index of the reference camera
+    object_points: Array | None = None  # (N, 3) mm
+    rig_from_object: RigidTransform | None = None  # (S) in the recalibrated rig's frame; nan for rejected snapshots
+    frames: tuple[NDArray[np.uint8] | NDArray[np.uint16] | None, ...] = ()  # C grey images (H, W) of one snapshot
+    frame_snapshot: int = 0  # index of that snapshot
+    chi2_per_dof: float = float("nan")
+    rms_before: float = float("nan")  # pixels, over both axes
+    rms_after: float = float("nan")
+    seconds: Mapping[str, float] = field(default_factory=dict)  # by stage, in the order in which they ran
+    command: str = ""
+    versions: Mapping[str, str] = field(default_factory=dict)
+    seeds: Mapping[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        blobs, cameras = len(self.detections), self.factory.cameras
+        expected = {
+            "labels": (blobs,),
+            "predicted_before": (blobs, 2),
+            "predicted_after": (blobs, 2),
+            "sigma": (blobs,),
+            "std": (cameras, PARAMETERS),
+            "prior_std": (cameras, PARAMETERS),
+        }
+        for name, shape in expected.items():
+            value = getattr(self, name)
+            if value is not None and value.shape != shape:
+                raise ValueError(f"report: {name} has shape {value.shape}, expected {shape}")
+        if self.frames and len(self.frames) != cameras:
+            raise ValueError(f"report: found {len(self.frames)} frames, expected one (or None) for each of {cameras} cameras")
+        if self.detections.camera_names != self.factory.camera_names:
+            raise ValueError("report: cameras of the detections differ from those of the rig")
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras, C."""
+        return self.factory.camera_names
+
+    @cached_property
+    def image_size(self) -> NDArray[np.int64]:
+        """Width and height of each camera's image: (C, 2) pixels."""
+        return self.factory.image_size.cpu().numpy().astype(np.int64)
+
+    @cached_property
+    def used(self) -> NDArray[np.bool_]:
+        """Mark the blobs that took part in the estimate: (M,) bool."""
+        if self.predicted_after is None:
+            return np.zeros(len(self.detections), dtype=bool)
+        return np.isfinite(self.predicted_after).all(axis=1) & (self.labels >= 0)
+
+    @cached_property
+    def residual_before(self) -> Array:
+        """Predicted by the factory rig minus observed: (M, 2) pixels, nan where there is none."""
+        return self._residual(self.predicted_before)
+
+    @cached_property
+    def residual_after(self) -> Array:
+        """Predicted by the recalibrated rig minus observed: (M, 2) pixels, nan where there is none."""
+        return self._residual(self.predicted_after)
+
+    @cached_property
+    def whitened(self) -> Array:
+        """Residuals after, of the used blobs, in standard deviations: (K, 2)."""
+        sigma = self.detections.sigma if self.sigma is None else self.sigma
+        return self.residual_after[self.used] / sigma[self.used, None]
+
+    @cached_property
+    def observations(self) -> NDArray[np.int64]:
+        """Used blobs of each camera: (C,)."""
+        return np.bincount(self.detections.camera[self.used], minlength=len(self.cameras))
+
+    @cached_property
+    def change(self) -> Array | None:
+        """Recalibrated minus factory, extrinsics relative to the reference camera: (C, 15)."""
+        if self.recalibrated is None:
+            return None
+        factory, recalibrated = self.factory.to(torch.float64), self.recalibrated.to(torch.float64)
+        return relative_difference(recalibrated, factory, self.reference).detach().cpu().numpy()
+
+    @cached_property
+    def moved(self) -> NDArray[np.bool_]:
+        """Mark changes larger than `MOVED` standard deviations: (C, 15) bool."""
+        if self.change is None or self.std is None:
+            return np.zeros((len(self.cameras), PARAMETERS), dtype=bool)
+        return (np.abs(self.change) > MOVED * self.std) & (self.std > 0)
+
+    @cached_property
+    def undetermined(self) -> NDArray[np.bool_]:
+        """Mark values of which the data say little that the prior did not: (C, 15) bool."""
+        if self.std is None or self.prior_std is None:
+            return np.zeros((len(self.cameras), PARAMETERS), dtype=bool)
+        return (self.std > UNDETERMINED * self.prior_std) & (self.prior_std > 0)
+
+    def rms_by(self, group: NDArray[np.int64], residual: Array, count: int) -> Array:
+        """RMS of the used blobs' residuals over both axes, by group.
+
+        Args:
+            group: (M,) index of the group of each blob, below `count`.
+            residual: (M, 2) pixels.
+            count: number of groups, G.
+
+        Returns:
+            (G,) pixels, nan for a group without residuals.
+        """
+        rows = self.used & np.isfinite(residual).all(axis=1)
+        squares = np.bincount(group[rows], weights=(residual[rows] ** 2).sum(axis=1), minlength=count)
+        number = np.bincount(group[rows], minlength=count)
+        return np.sqrt(np.divide(squares, 2 * number, out=np.full(count, np.nan), where=number > 0))
+
+    def _residual(self, predicted: Array | None) -> Array:
+        return np.full((len(self.detections), 2), np.nan) if predicted is None else predicted - self.detections.uv
+
+
+def relative_prior_std(factory: CameraRig, reference: int = 0, spread: Tensor | None = None) -> Array:
+    """Standard deviation of each factory value before the data, extrinsics relative to the reference camera.
+
+    Args:
+        factory: the factory rig, without batch axes.
+        reference: index of the reference camera.
+        spread: (C, 15) standard deviations in the rig's frame; None = the rig's own prior, or `RigPrior()`.
+
+    Returns:
+        (C, 15), comparable with the diagonal of `estimation.relative_covariance`.
+    """
+    factory = factory.to(torch.float64)
+    spread = (factory.prior or RigPrior()).std(factory) if spread is None else spread.to(torch.float64)
+    jacobian = relative_jacobian(factory, reference)
+    variance = jacobian.square() @ spread.flatten().square()
+    return variance.sqrt().unflatten(0, (factory.cameras, PARAMETERS)).cpu().numpy()

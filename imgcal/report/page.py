@@ -1,0 +1,198 @@
+"""The page: everything in one HTML file that opens without a network."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+from collections import Counter
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+
+import jinja2
+import numpy as np
+from markupsafe import Markup
+from plotly.offline import get_plotlyjs
+
+from imgcal.formats.atomic import write_text
+from imgcal.report import charts, overlay, scene, tables
+from imgcal.report.content import MOVED, UNDETERMINED, ReportContent
+from imgcal.report.verdict import judge
+from imgcal.rig import PARAMETER_NAMES
+
+LARGEST_SNAPSHOT_TABLE = 400
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One camera's picture with its caption."""
+
+    name: str
+    figure: Markup
+    note: str
+
+
+def write_report(content: ReportContent, path: str | Path) -> None:
+    """Write the report as one HTML page; the file at `path` is replaced in one step.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    write_text(path, render(content))
+
+
+def render(content: ReportContent) -> str:
+    """Build the page; the same content gives the same text."""
+    script = _resource("report.js")
+    parts = dict(
+        content=content,
+        verdict=judge(content),
+        style=Markup(_resource("report.css")),
+        script=Markup(script),
+        plotly=Markup(get_plotlyjs()),
+        policy=_policy(script),
+        snapshots=_snapshots(content),
+        residuals=_residuals(content),
+        coverage=_coverage(content),
+        rig=_rig(content),
+        overlays=_overlays(content),
+        rows=tables.camera_rows(content),
+        groups=tables.GROUPS,
+        knowledge=list(zip(content.cameras, tables.knowledge(content), strict=False)),
+        parameters=PARAMETER_NAMES,
+        limits={"moved": MOVED, "undetermined": round(100 * UNDETERMINED)},
+        times=charts.time_bars(content.seconds) if content.seconds else None,
+        total=charts.duration(sum(content.seconds.values())),
+        subsampling=_subsampling(content),
+    )
+    return _template().render(parts)
+
+
+@cache
+def _template() -> jinja2.Template:
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    return environment.from_string(_resource("report.html.j2"))
+
+
+def _resource(name: str) -> str:
+    return files("imgcal.report").joinpath("templates", name).read_text(encoding="utf-8")
+
+
+def _policy(script: str) -> str:
+    """Forbid the page every connection, and every script but the two that it carries."""
+    hashes = " ".join(
+        f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'" for text in (get_plotlyjs(), script)
+    )
+    return (
+        f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data: blob:; "
+        "base-uri 'none'; form-action 'none'"
+    )
+
+
+def _figure(figure: scene.Figure) -> Markup:
+    """JSON that stands safely inside `<script>`."""
+    text = json.dumps(figure, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+    return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))
+
+
+def _snapshots(content: ReportContent) -> dict[str, object]:
+    rejected = [s for s in content.snapshots if s.reason]
+    return {
+        "strip": charts.snapshot_strip(content) if content.snapshots else None,
+        "reasons": Counter(s.reason for s in rejected).most_common(8),
+        "rejected": len(rejected),
+        "table": content.snapshots[:LARGEST_SNAPSHOT_TABLE],
+        "left_out": max(len(content.snapshots) - LARGEST_SNAPSHOT_TABLE, 0),
+    }
+
+
+def _residuals(content: ReportContent) -> dict[str, object] | None:
+    """Charts of the residuals; None when there is no fit."""
+    if not content.used.any():
+        return None
+    rows = charts.sample(np.flatnonzero(content.used), charts.LARGEST_SCATTER)
+    after, before = content.residual_after[rows], content.residual_before[rows]
+    before = before[np.isfinite(before).all(axis=1)]
+    own = charts.scatter_limit(after)
+    common = max(own, charts.scatter_limit(before)) if len(before) else own
+    beyond = float(np.mean(np.abs(content.whitened) > 3))
+    return {
+        "before": charts.residual_scatter(before, common, "before") if len(before) else None,
+        "after_common": charts.residual_scatter(after, common, "after"),
+        "after_own": charts.residual_scatter(after, own, "after"),
+        "histogram": charts.whitened_histogram(content.whitened),
+        "spread": f"{float(np.sqrt(np.mean(content.whitened**2))):.2f}",
+        "beyond": f"{100 * beyond:.2g} %",
+        "cameras": charts.rms_by_camera(content),
+        "fiducials": charts.rms_by_fiducial(content),
+        "shown": len(rows),
+        "total": int(content.used.sum()),
+    }
+
+
+def _coverage(content: ReportContent) -> dict[str, object]:
+    limits = charts.coverage_limits(content)
+    counts = content.observations if content.used.any() else np.bincount(
+        content.detections.camera, minlength=len(content.cameras)
+    )  # fmt: skip
+    panels = [
+        Panel(
+            name,
+            charts.coverage_panel(content, i, limits),
+            f"{counts[i]} {'used' if content.used.any() else 'found'}, {100 * charts.covered_share(content, i):.0f} % of the image",
+        )
+        for i, name in enumerate(content.cameras)
+    ]
+    return {"panels": panels, "limits": [f"{x:.2g}" for x in limits]}
+
+
+def _rig(content: ReportContent) -> dict[str, object]:
+    figure = scene.rig_figure(content)
+    snapshots, fiducials = scene.drawn_fiducials(content)
+    return {
+        "figure": _figure(figure),
+        "factors": figure["layout"]["meta"]["factors"],
+        "start": figure["layout"]["meta"]["start"],
+        "snapshots": len(snapshots),
+        "fiducials": len(fiducials),
+    }
+
+
+def _overlays(content: ReportContent) -> dict[str, object]:
+    names = content.detections.snapshot_names
+    panels = []
+    for i, figure in enumerate(overlay.overlay_figures(content)):
+        pictured = bool(content.frames) and content.frames[i] is not None
+        panels.append(Panel(content.cameras[i], _figure(figure), "" if pictured else "no frame"))
+    return {
+        "panels": panels,
+        "aspects": [round(float(h / w), 4) for w, h in content.image_size],
+        "layers": [(layer, overlay.SYMBOLS[layer]) for layer in overlay.LAYERS],
+        "snapshot": names[content.frame_snapshot] if content.frame_snapshot < len(names) else "",
+        "stretched": any(frame is not None for frame in content.frames),
+    }
+
+
+def _subsampling(content: ReportContent) -> list[str]:
+    """Say what is not drawn in full. All numbers and the histogram use everything."""
+    notes = []
+    used = int(content.used.sum())
+    if used > charts.LARGEST_SCATTER:
+        notes.append(f"The scatter shows {charts.LARGEST_SCATTER} of {used} residuals.")
+    panel = charts.panel_size(content)
+    if len(content.detections) and int(np.bincount(content.detections.camera).max()) > panel:
+        notes.append(f"The coverage shows at most {panel} observations of each camera.")
+    snapshots, fiducials = scene.drawn_fiducials(content)
+    total = 0 if content.object_points is None else len(content.object_points)
+    known = sum(not s.reason for s in content.snapshots)
+    if len(snapshots) and (len(snapshots) < known or len(fiducials) < total):
+        notes.append(f"The rig in 3D shows {len(snapshots)} snapshots and {len(fiducials)} of {total} fiducials in each.")
+    d = content.detections
+    in_frame = np.bincount(d.camera[d.snapshot == content.frame_snapshot], minlength=1)
+    if int(in_frame.max()) > overlay.blobs_drawn(content):
+        notes.append(f"The overlays show at most {overlay.blobs_drawn(content)} blobs of each camera.")
+    return notes

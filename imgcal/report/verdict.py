@@ -1,0 +1,201 @@
+"""The result in plain words: what was found, whether to trust it, what to do next."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from imgcal.report.charts import duration
+from imgcal.report.content import MOVED, ReportContent
+
+GOOD_CHI2 = 1.5  # above, the residuals are larger than the stated noise
+SMALL_CHI2 = 0.5  # below, the noise was overstated
+FEW_OBSERVATIONS = 15  # of a camera: fewer than its parameters
+
+IDENTITY = {
+    "coded": "The fiducials came labelled with the input.",
+    "unique": "Every fiducial was recognized, and only one labelling explains what the cameras saw.",
+    "by_prior": "The object can be turned into itself; the factory calibration and the pose decided which way round it is.",
+    "by_tracking": "The labels were carried from snapshot to snapshot; a look-alike position was excluded by the motion.",
+    "ambiguous": (
+        "The object can be turned into itself, so its absolute orientation is not known. All cameras use the same "
+        "choice, so the rig is valid."
+    ),
+}
+
+
+@dataclass(frozen=True)
+class KeyFigure:
+    """One number at the top of the page."""
+
+    value: str
+    name: str
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The top of the page."""
+
+    level: Literal["good", "caution", "refused"]
+    headline: str
+    found: tuple[str, ...]
+    reservations: tuple[str, ...]
+    next_steps: tuple[str, ...]
+    figures: tuple[KeyFigure, ...]
+
+
+def judge(content: ReportContent) -> Verdict:
+    """Put the result into words."""
+    if content.status == "refused" or content.recalibrated is None:
+        return _refused(content)
+    reservations = _reservations(content)
+    found = (_improvement(content), *_movement(content), IDENTITY.get(content.identity, f"Identity: {content.identity}."))
+    if content.reason:
+        found = (*found, content.reason)
+    if reservations:
+        return Verdict(
+            "caution", "Recalibrated, with reservations", found, tuple(r for r, _ in reservations),
+            (*dict.fromkeys(step for _, step in reservations if step), _CHECK), _figures(content),
+        )  # fmt: skip
+    headline = "Recalibrated: the result explains the images as well as the measurement noise allows"
+    return Verdict("good", headline, found, (), (_CHECK, _KEEP), _figures(content))
+
+
+_CHECK = "Check the new rig on snapshots that took no part here: imgcal score NEW_CAPTURE --rig rig.yaml --object OBJECT."
+_KEEP = "Then use rig.yaml in place of the factory file; keep the factory file for the next recalibration."
+
+
+def _improvement(content: ReportContent) -> str:
+    after = f"{content.rms_after:.3g} px"
+    if not math.isfinite(content.rms_before):
+        return f"The reprojection error is {after} (RMS over both axes)."
+    return f"The reprojection error fell from {content.rms_before:.3g} px to {after} (RMS over both axes)."
+
+
+def _movement(content: ReportContent) -> tuple[str, ...]:
+    """Say which cameras moved most."""
+    if content.change is None or content.std is None:
+        return ()
+    if len(content.cameras) == 1:
+        return ("One camera: only its own lens and sensor values can have changed.",)
+    angle = np.degrees(np.linalg.norm(content.change[:, :3], axis=1))
+    shift = np.linalg.norm(content.change[:, 3:6], axis=1)
+    moved = content.moved[:, :6].any(axis=1)
+    reference = content.cameras[content.reference]
+    if not moved.any():
+        return (f"No camera moved measurably relative to {reference} (within {MOVED:g} standard deviations).",)
+    by_size = np.argsort(-np.where(moved, angle + shift / 10, -1))[: min(3, int(moved.sum()))]
+    parts = [f"{content.cameras[i]} ({angle[i]:.2f}°, {shift[i]:.1f} mm)" for i in by_size]
+    others = len(content.cameras) - 1
+    words = f"{int(moved.sum())} of {others} cameras moved relative to {reference}"
+    return (f"{words}, most of all {', '.join(parts)}.",)
+
+
+def _reservations(content: ReportContent) -> list[tuple[str, str]]:
+    """What speaks against the result, each with what helps against it."""
+    notes = []
+    if content.chi2_per_dof > GOOD_CHI2:
+        larger = math.sqrt(content.chi2_per_dof)
+        notes.append((
+            f"The errors are about {larger:.1f} times as large as the noise of the detections (chi² per degree of freedom "
+            f"{content.chi2_per_dof:.2f}): something is not in the model, or some labels are wrong, and the true "
+            "uncertainties are larger than those stated below.",
+            "Look at the residuals and overlays below: one bad camera, fiducial or snapshot stands out. Check the "
+            "object's measurements and the factory file.",
+        ))  # fmt: skip
+    elif content.chi2_per_dof < SMALL_CHI2:
+        notes.append((
+            f"The errors are smaller than the stated noise (chi² per degree of freedom {content.chi2_per_dof:.2f}): the "
+            "uncertainties below are too cautious.",
+            "",
+        ))  # fmt: skip
+    if content.rms_after > content.rms_before:
+        notes.append(("The error did not fall.", "Check that factory file, object file and capture belong together."))
+    blind = [name for name, n in zip(content.cameras, content.observations, strict=True) if n == 0]
+    if blind:
+        notes.append((
+            f"No usable observations in {_listed(blind)}: not recalibrated, still at the factory's values.",
+            f"Bring the object into the view of {_listed(blind)} and check exposure and cabling.",
+        ))  # fmt: skip
+    few = [name for name, n in zip(content.cameras, content.observations, strict=True) if 0 < n < FEW_OBSERVATIONS]
+    if few:
+        notes.append((f"Few observations in {_listed(few)}.", "Capture more snapshots, with the object seen by all cameras."))
+    rejected = sum(bool(s.reason) for s in content.snapshots)
+    if rejected > 0.2 * max(len(content.snapshots), 1):
+        notes.append((
+            f"{rejected} of {len(content.snapshots)} snapshots were rejected.",
+            "Read the reasons under “Snapshots”; often reflections, blur or an object half out of view.",
+        ))  # fmt: skip
+    share = _undetermined_share(content)
+    if share > 0.25:
+        notes.append((
+            f"{100 * share:.0f} % of the parameters are not determined by these data (see “How well known”): there, "
+            "the result is the factory's value.",
+            "Capture more snapshots, with the object near the image corners, tilted, and at several distances.",
+        ))  # fmt: skip
+    return notes
+
+
+def _undetermined_share(content: ReportContent) -> float:
+    if content.prior_std is None or not (content.prior_std > 0).any():
+        return 0.0
+    return float(content.undetermined.sum() / (content.prior_std > 0).sum())
+
+
+def _figures(content: ReportContent) -> tuple[KeyFigure, ...]:
+    total, used = len(content.snapshots), sum(not s.reason for s in content.snapshots)
+    moved = int(content.moved[:, :6].any(axis=1).sum())
+    before = f"{content.rms_before:.3g} → " if math.isfinite(content.rms_before) else ""
+    figures = [
+        KeyFigure(f"{before}{content.rms_after:.3g} px", "reprojection error", "RMS, before → after" if before else "RMS"),
+        KeyFigure(f"{content.chi2_per_dof:.2f}", "chi² per degree of freedom", "1 = as the noise says"),
+        KeyFigure(f"{used} / {total}", "snapshots used"),
+        KeyFigure(f"{int(content.used.sum()):,} / {len(content.detections):,}".replace(",", " "), "blobs used"),
+    ]
+    if len(content.cameras) > 1:
+        figures.append(KeyFigure(f"{moved} / {len(content.cameras) - 1}", "cameras moved", f"more than {MOVED:g} standard deviations"))
+    if content.seconds:
+        figures.append(KeyFigure(duration(sum(content.seconds.values())), "computing time"))
+    return tuple(figures)
+
+
+def _refused(content: ReportContent) -> Verdict:
+    d = content.detections
+    blobs = np.bincount(d.camera, minlength=len(content.cameras))
+    labelled = int((content.labels >= 0).sum())
+    found = [content.reason or "The data do not decide between several answers.", "No calibration was written; keep the one in use."]
+    help_with = []
+    if not len(d):
+        help_with.append("No blob was found: check exposure, the infrared light, and the polarity (bright or dark markers).")
+    blind = [name for name, n in zip(content.cameras, blobs, strict=True) if n == 0]
+    if blind and len(d):
+        help_with.append(f"Nothing was found in {_listed(blind)}: check exposure and cabling, or that the object is in view.")
+    if len(d) and labelled < 0.5 * len(d):
+        help_with.append(
+            f"{len(d) - labelled} of {len(d)} blobs could not be labelled: cover reflections or mask them, and check that the "
+            "object file is that of the object in the images."
+        )
+    help_with.append("Check that the factory file belongs to this rig and that no camera was exchanged.")
+    help_with.append("Capture more snapshots, with the whole object in view of as many cameras as possible and in varied poses.")
+    total = len(content.snapshots)
+    used = sum(not s.reason for s in content.snapshots)
+    figures = [
+        KeyFigure(f"{used} / {total}", "snapshots accepted"),
+        KeyFigure(f"{len(d):,}".replace(",", " "), "blobs found"),
+        KeyFigure(f"{labelled:,}".replace(",", " "), "blobs labelled"),
+        KeyFigure(f"{int((blobs > 0).sum())} / {len(blobs)}", "cameras with blobs"),
+    ]
+    if content.seconds:
+        figures.append(KeyFigure(duration(sum(content.seconds.values())), "computing time"))
+    headline = "Refused: the data cannot decide the calibration"
+    return Verdict("refused", headline, tuple(found), (), tuple(help_with), tuple(figures))
+
+
+def _listed(names: list[str]) -> str:
+    shown = names[:4]
+    rest = len(names) - len(shown)
+    return ", ".join(shown) + (f" and {rest} more" if rest else "")
