@@ -17,12 +17,12 @@ RING = 2  # px, width of the frame of a window from which the background is take
 CLIP = (4.0, 9.0)  # standard deviations of a 3 x 3 mean below which a pixel is background: weak blob, bright blob
 CLIP_PEAK = 0.1  # of the peak: where the clip lies between the two
 SIGNIFICANT = 6.0  # standard deviations of a 3 x 3 mean that the brightest one of a blob must reach
-CROWDED = 0.2  # of the peak: a border this bright with a neighbour lets too much of its light in
+CROWDED = 0.6  # of the peak: a border this bright with a neighbour is no border
 SMALLEST_SIGMA = 0.001  # px, what sampling by pixels leaves without any noise
 # px * sqrt(px): sub-pixel position lost where clipping turns a soft edge into a step, over sqrt(radius); the worst case of
 # the exposures (2 to 15 times full scale) in the tests.
 CLIPPED_SIGMA = 0.045
-TWO_PEAKED = 0.55  # bimodality coefficient
+TWO_PEAKED = 0.507  # bimodality coefficient
 REACH = 4  # px from a component to the end of its window: the skirt and a ring that is clear of it
 SKIRT = 3.5  # px, how far the blurred edge reaches beyond the component that was found
 
@@ -202,7 +202,7 @@ def _judge(
     peak = np.maximum((inside * windows.grey).max((1, 2)), 1e-6)
     top = (inside * windows.smooth).max((1, 2))
     radius = np.sqrt(brightness / peak / np.pi)
-    elongation, two_peaked = _shape(np.minimum(windows.weight * windows.smooth, top[:, None, None] / 2), x, y)
+    elongation, two_peaked = _shape(np.clip(mass, 0, top[:, None, None] / 2), x, y)
     # Each pixel's noise moves the centroid by its lever arm over the brightness; mean of both axes.
     lever = (windows.gain * windows.gain * square).sum((1, 2)) / 2
     tilt = (windows.weight * square).sum((1, 2)) / 2
@@ -222,8 +222,8 @@ def _shape(
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Tell the elongation (K,) of a mass distribution (K, P, P), and whether it has two parts along its major axis (K,).
 
-    Source: Sarle's bimodality coefficient, (skewness ** 2 + 1) / kurtosis: 0.50 for any filled ellipse, 0.56 for a uniform
-    rod, 0.60 for two discs that touch.
+    Source: Sarle's bimodality coefficient, (skewness ** 2 + 1) / kurtosis: 0.50 for any filled ellipse and less when it is
+    blurred, 0.60 for two discs that touch and 0.51 to 0.57 when they are blurred, 0.56 for a uniform rod.
     """
     mass = mass / np.maximum(mass.sum((1, 2), keepdims=True), 1e-6)
     mean_x, mean_y = (mass * x).sum((1, 2)), (mass * y).sum((1, 2))

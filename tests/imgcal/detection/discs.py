@@ -17,8 +17,13 @@ def draw_discs(
     contrast: NDArray[np.float64] | float = 200.0,
     background: NDArray[np.float64] | float = 20.0,
     blur: float = 0.7,
+    squeeze: float = 1.0,
 ) -> NDArray[np.float64]:
-    """Draw discs at `uv` (M, 2), blurred by a Gaussian of `blur` px: (H, W) grey levels without noise."""
+    """Draw discs at `uv` (M, 2), blurred by a Gaussian of `blur` px: (H, W) grey levels without noise.
+
+    `squeeze` < 1 flattens them to ellipses.
+    """
+    covered = np.zeros(shape)  # discs that overlap hide each other: their light does not add
     frame = np.zeros(shape) + background
     radius = np.broadcast_to(radius, len(uv))
     contrast = np.broadcast_to(contrast, len(uv))
@@ -26,14 +31,18 @@ def draw_discs(
         half = int(np.ceil(r + 5 * blur)) + 2
         column, row = int(np.rint(u)), int(np.rint(v))
         fine = (np.arange((2 * half + 1) * FINE) + 0.5) / FINE - 0.5 - half
-        disc = ((fine[None, :] - (u - column)) ** 2 + (fine[:, None] - (v - row)) ** 2 <= r * r).astype(np.float64)
+        disc = ((fine[None, :] - (u - column)) ** 2 + ((fine[:, None] - (v - row)) / squeeze) ** 2 <= r * r).astype(np.float64)
         if blur > 0:
             disc = cv2.GaussianBlur(disc, (0, 0), blur * FINE)
-        patch = height * disc.reshape(2 * half + 1, FINE, 2 * half + 1, FINE).mean((1, 3))
+        patch = disc.reshape(2 * half + 1, FINE, 2 * half + 1, FINE).mean((1, 3))
         top, left = max(row - half, 0), max(column - half, 0)
         bottom, right = min(row + half + 1, shape[0]), min(column + half + 1, shape[1])
         if top < bottom and left < right:
-            frame[top:bottom, left:right] += patch[top - row + half : bottom - row + half, left - column + half : right - column + half]
+            place = slice(top, bottom), slice(left, right)
+            part = patch[top - row + half : bottom - row + half, left - column + half : right - column + half]
+            part = part * (1 - covered[place])
+            frame[place] += height * part
+            covered[place] += part
     return frame
 
 
