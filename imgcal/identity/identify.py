@@ -17,7 +17,7 @@ from imgcal.identity.hypotheses import (
     fiducial_triples,
     single_camera_poses,
 )
-from imgcal.identity.rivals import conflicts
+from imgcal.identity.rivals import conflicts, lattice_shifts, moved, near_turns
 from imgcal.identity.types import Identity, IdentityOptions, Status
 from imgcal.identity.verify import Fits, Scene, certain, evidence, join, refine, rig_and_pose, settle, start
 from imgcal.identity.voting import match, predict_ideal, vote
@@ -27,7 +27,9 @@ from imgcal.rig import CameraRig
 from imgcal.transforms import RigidTransform
 
 TRIPLES = 20  # of blobs in a round, over all cameras
+MOST_HYPOTHESES = 400_000  # in a round: large objects get fewer triples of blobs
 KEPT = 8  # poses of each
+MOST_STEPS = 6  # from one labelling to a better one of the moved object
 VERIFIED = 3  # different labellings that are fitted, the best of a round
 
 
@@ -118,7 +120,9 @@ def _round(
     generator: np.random.Generator,
 ) -> Fits | None:
     """Make hypotheses, let the rig vote, fit the best."""
-    per_camera = max(1, TRIPLES // len(cameras))
+    number = int(np.clip(MOST_HYPOTHESES // len(triples.triples), 1, TRIPLES))
+    per_camera = -(-number // len(cameras))
+    cameras = generator.permutation(cameras)[:number]
     chosen = [blob_triples(scene.blobs, camera, per_camera, generator) for camera in cameras]
     camera = np.repeat(cameras, [len(rows) for rows in chosen])
     poses = single_camera_poses(scene.blobs, scene.rig, camera, np.concatenate(chosen), triples, tolerance, KEPT)
@@ -153,26 +157,62 @@ def _best(scene: Scene, fits: Fits, count: int) -> Fits:
 
 def _decide(scene: Scene, fits: Fits, options: IdentityOptions, known_pose: bool) -> Identity:
     """Accept the best labelling or say why not."""
-    odds = options.tracking_label_odds if known_pose else options.label_odds
     fits = _best(scene, fits, len(fits.labels))
-    chosen = certain(scene, settle(scene, fits.select(np.array([0]))), odds)
-    labels = chosen.labels[0]
-    share = float((labels >= 0).sum() / max(np.minimum(scene.blobs.count, scene.obj.fiducials).sum(), 1))
-    weight = evidence(scene, fits)
-    rival = [w for w, other in zip(weight[1:], fits.labels[1:], strict=True) if conflicts(scene.obj, labels, other) > 0]
-    margin = float(weight[0] - max([0.0, *rival]))
+    best = settle(scene, fits.select(np.array([0])))
+    margin = _margin(scene, best, fits.select(np.arange(1, len(fits.labels))))
+    chosen = certain(scene, best, options.tracking_label_odds if known_pose else options.label_odds)
+    share = float((chosen.labels >= 0).sum() / max(np.minimum(scene.blobs.count, scene.obj.fiducials).sum(), 1))
     refusal = None
     if not np.isfinite(margin) or share < options.least_share:
         refusal = f"the best pose explains {100 * share:.0f} % of what could be seen, expected {100 * options.least_share:.0f} %"
-    elif margin < options.least_margin:
-        refusal = f"another labelling explains the blobs nearly as well (margin {margin:.1f}, expected {options.least_margin})"
+    elif margin >= options.least_margin:
+        best, margin = _against_motions(scene, best, margin, known_pose)
+        chosen = certain(scene, best, options.tracking_label_odds if known_pose else options.label_odds)
+    if refusal is None and margin < options.least_margin:
+        refusal = f"another labelling explains the blobs nearly as well: margin {margin:.1f}, expected {options.least_margin:.0f}"
     rig, pose = rig_and_pose(scene, chosen, 0)
     if refusal is not None:
         return replace(_refused(scene, refusal), rig_from_object=pose, rig=rig, margin=margin)
-    order = len(scene.obj.symmetries)
+    order = 1 if known_pose else len(scene.obj.symmetries)
     status: Status = "by_tracking" if known_pose else "ambiguous" if order > 1 else "unique"
     reason = f"explains {100 * share:.0f} % of what could be seen, margin {margin:.0f}"
-    return Identity(scene.blobs.to_rows(labels), pose, rig, status, 1 if known_pose else order, margin, reason)
+    return Identity(scene.blobs.to_rows(chosen.labels[0]), pose, rig, status, order, margin, reason)
+
+
+def _margin(scene: Scene, best: Fits, others: Fits) -> float:
+    """Log odds of a labelling against the best different one, and against all blobs being clutter."""
+    weights = evidence(scene, others)
+    rivals = [
+        weight
+        for weight, labels in zip(weights, others.labels, strict=True)
+        if conflicts(scene.obj, best.labels[0], labels) > 0
+    ]
+    return float(evidence(scene, best)[0] - max([0.0, *rivals]))
+
+
+def _against_motions(scene: Scene, best: Fits, margin: float, known_pose: bool) -> tuple[Fits, float]:
+    """Compare a labelling with those of an object shifted or turned onto itself; change to a better one where there is one.
+
+    Returns:
+        The best labelling found, and its margin over the best of its neighbours, at most the given one.
+    """
+    motions = lattice_shifts(scene.obj)
+    if not known_pose:
+        spread = spread_of(scene.std, scene.rig, scene.rig.working_distance or _guess_distance(scene))
+        motions = motions + near_turns(scene.obj, 2 * spread.shape * scene.obj.size)
+    for _ in range(MOST_STEPS):
+        if not motions:
+            break
+        _, pose = rig_and_pose(scene, best, 0)
+        poses, labels = moved(pose, best.labels[0], motions)
+        rows = [np.array([k]) for k in range(len(motions))]
+        rivals = [refine(scene, start(scene, poses.select(row), labels[row])) for row in rows]
+        margins = [_margin(scene, best, rival) for rival in rivals]
+        nearest = int(np.argmin(margins))
+        if margins[nearest] >= 0:
+            return best, min(margin, margins[nearest])
+        best = settle(scene, rivals[nearest])
+    return best, margin
 
 
 def _refused(scene: Scene, reason: str) -> Identity:

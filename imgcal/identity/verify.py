@@ -213,7 +213,7 @@ def _contested(labels: NDArray[np.int64], found: Innovations) -> NDArray[np.bool
     cost = found.squared + found.log_det[..., None]
     # of_other[i, j]: cost of giving the blob of fiducial i to fiducial j.
     of_other = np.take_along_axis(cost, np.maximum(labels, 0)[:, :, None, :], -1).swapaxes(-1, -2)
-    alone = of_other - np.where(labelled, found.own + found.log_det, 0)[..., None]
+    alone = of_other - np.where(np.isfinite(found.own), found.own + found.log_det, 0)[..., None]
     change = np.where(labelled[:, :, None, :], alone + alone.swapaxes(-1, -2), alone)
     other = ~np.eye(labels.shape[-1], dtype=bool) & labelled[..., None]
     return (other & (change < UNDECIDED)).any(-1)
