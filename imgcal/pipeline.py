@@ -34,6 +34,7 @@ class PipelineOptions:
 
     identity: IdentityOptions = IdentityOptions()
     estimation: EstimationOptions = EstimationOptions()
+    identity_error: float = 0.3  # px: what a centre may be off beyond its own sigma (partly hidden markers) while blobs are told apart
     least_fiducials: int = 4  # different fiducials that a snapshot must show, all cameras together
     outlier: float = 5.0  # standard deviations beyond which a labelled blob is left out
     most_outliers: float = 0.25  # share of left-out blobs above which the data do not fit the object
@@ -202,6 +203,7 @@ class _Follower:
         return SnapshotIdentity(name, status, identity.reason, identity.alternatives, identity.rig_from_object), labels
 
     def _identify(self, blobs: Detections) -> Identity:
+        blobs = replace(blobs, sigma=np.hypot(blobs.sigma, self.options.identity_error))
         return identify(blobs, self.rig, self.obj, self.spread, [self.pose], self.options.identity)
 
     def _remember(self, blobs: Detections, labels: NDArray[np.int64], pose: RigidTransform) -> None:

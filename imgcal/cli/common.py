@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TypeVar
 
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from imgcal.detection import DetectionOptions, detect_snapshot
+from imgcal.detection import Blobs, DetectionOptions, detect_snapshot
 from imgcal.errors import InputError
 from imgcal.formats import Capture
 from imgcal.observations import Detections
@@ -60,18 +61,18 @@ def _detect_capture(
 ) -> tuple[Detections, dict[str, NDArray[np.generic] | None]]:
     names = capture.snapshot_names[first:last]
     masks = {camera: mask for camera in capture.camera_names if (mask := capture.mask(camera)) is not None}
-    found, shown = [], {}
-    for index, (_, frames) in enumerate(progress(capture.snapshots(first, last), len(names), "detecting blobs")):
-        if index == 0:
-            shown = dict(frames)
-        present = {camera: masks[camera] for camera in masks if frames[camera] is not None}
-        found.append(detect_snapshot(frames, options, masks=present))
+    found: list[Blobs] = []
+    shown: dict[str, NDArray[np.generic] | None] = {}
+    with ThreadPoolExecutor() as pool:
+        for _, frames in progress(capture.snapshots(first, last), len(names), "detecting blobs"):
+            shown = shown or dict(frames)
+            found.append(detect_snapshot(frames, options, masks=masks, pool=pool))
     columns = {
         name: np.concatenate([getattr(blobs, name) for blobs in found]) for name in ("uv", "sigma", "radius", "flags")
     }
     detections = Detections(
         **columns,
-        camera=np.concatenate([blobs.source for blobs in found]).astype(np.int64),
+        camera=np.concatenate([blobs.camera for blobs in found]).astype(np.int64),
         snapshot=np.repeat(np.arange(len(found)), [len(blobs.uv) for blobs in found]),
         fiducial=np.full(len(columns["uv"]), -1, dtype=np.int64),
         camera_names=capture.camera_names,

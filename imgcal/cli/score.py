@@ -23,8 +23,8 @@ from imgcal.rig import CameraRig
 class Score:
     """Measure the reprojection error of a rig that is held fixed; only the object's pose is fitted in each snapshot.
 
-    Prints JSON: rms_px, median_px, p95_px, snapshots_used, snapshots_rejected, per_camera. RMS is over both axes; median
-    and 95th percentile are of distances. Example: imgcal score my_capture --rig out/rig.yaml --object object.csv
+    Prints JSON: rms_px, median_px, p95_px, snapshots_used, snapshots_rejected, per_camera. All three are of
+    distances in the image; the RMS is that of OpenCV's calibrateCamera, sqrt(2) times the paper's RE. Example: imgcal score my_capture --rig out/rig.yaml --object object.csv
     """
 
     input: Annotated[Path, tyro.conf.Positional]  #: capture folder or detections file
@@ -51,12 +51,12 @@ def summary(scored: Scored, rig: CameraRig) -> dict[str, object]:
     for camera, name in enumerate(rig.camera_names):
         squared = scored.residual[:, camera].square().sum(-1)[scored.seen[:, camera]]
         per_camera[name] = {
-            "rms_px": float((squared.mean() / 2).sqrt()) if len(squared) else None,
+            "rms_px": float(squared.mean().sqrt()) if len(squared) else None,
             "points": len(squared),
         }
     used = len(scored.labelled.used)
     return {
-        "rms_px": float((distances.square().mean() / 2).sqrt()),
+        "rms_px": float(distances.square().mean().sqrt()),
         "median_px": float(distances.median()),
         "p95_px": float(torch.quantile(distances, 0.95)),
         "snapshots_used": used,

@@ -89,6 +89,7 @@ def relative_jacobian(rig: CameraRig, reference: int) -> Tensor:
         blocks[..., i, 0:3, reference, 0:3] -= relative[..., i, :, :]
         blocks[..., i, 3:6, reference, 3:6] -= to_reference.squeeze(-3)
         blocks[..., i, 3:6, reference, 0:3] -= cross_matrix(place[..., i, :])
+    blocks[..., reference, :6, :, :] = 0  # exactly, not up to the rounding of R_r R_r^T
     return blocks.flatten(-2).flatten(-3, -2)
 
 

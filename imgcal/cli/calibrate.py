@@ -1,0 +1,160 @@
+"""`imgcal calibrate`: the main job. Frames or blobs and a factory calibration in, a recalibrated rig out."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import torch
+import tyro
+
+from imgcal.cli.common import make_folder, progress, read_detections, without_cameras
+from imgcal.cli.describe import describe, describe_refusal
+from imgcal.detection import DetectionOptions
+from imgcal.errors import InputError, RefusedError
+from imgcal.estimation import relative_covariance
+from imgcal.formats import RigCovariance, load_object, load_rig, open_input, save_rig, write_text
+from imgcal.pipeline import Calibration, PipelineOptions, calibrate
+from imgcal.rig import CameraRig
+from imgcal.report import write_report
+
+
+@dataclass(frozen=True)
+class Calibrate:
+    """Recalibrate a rig from captured frames (or a table of blobs) of a known object.
+
+    Writes OUT/rig.yaml (the recalibrated rig, with the standard deviation of every parameter), OUT/result.json and
+    OUT/report.html. If the data cannot decide, the reason is in result.json and report.html, no rig.yaml is written and the
+    exit code is 3. Example: imgcal calibrate my_capture --rig factory.yaml --object object.csv --out result
+    """
+
+    input: Annotated[Path, tyro.conf.Positional]  #: capture folder or detections file
+    rig: str  #: factory rig: file, or the name of a shipped one
+    object: str  #: object: file, or the name of a shipped one
+    out: Path  #: folder to write
+    snapshots: str | None = None  #: A:B, numbers in file order from 0, B excluded
+    first_guess: Literal["none"] = "none"  #: where to start from; "none" = the factory rig
+    without: tuple[str, ...] = ()  #: cameras to leave out
+    blind_cameras: bool = False  #: accept cameras that see nothing; they keep their factory values
+    full_covariance: bool = False  #: write the whole covariance matrix to rig.yaml, too
+    report: bool = True  #: write report.html
+    reference: str | None = None  #: camera that the uncertainty of positions and rotations refers to; default: the first
+    detection: Annotated[DetectionOptions, tyro.conf.arg(name="")] = field(default_factory=DetectionOptions)
+
+    def run(self) -> None:
+        """Calibrate and write."""
+        started = time.perf_counter()
+        rig, obj = without_cameras(load_rig(self.rig), self.without), load_object(self.object)
+        reference = self._reference(rig)
+        source = open_input(self.input, rig, obj.fiducials)
+        loaded = time.perf_counter()
+        detections, frames = read_detections(source, self.snapshots, self.detection)
+        seconds = {"loading": loaded - started, "reading and detection": time.perf_counter() - loaded}
+        out = make_folder(self.out)
+
+        def bar(snapshots: Iterable[int], total: int) -> Iterable[int]:
+            return progress(snapshots, total, "identifying")
+
+        refusal: RefusedError | None = None
+        calibration: Calibration | None = None
+        try:
+            calibration = calibrate(detections, rig, obj, PipelineOptions(blind_cameras=self.blind_cameras), progress=bar)
+        except RefusedError as error:
+            refusal = error
+        seconds |= {} if calibration is None else {k: v for k, v in calibration.seconds.items() if k != "detection"}
+        if calibration is None:
+            # A rig of an earlier run beside a refusal would be taken for the result of this one.
+            (out / "rig.yaml").unlink(missing_ok=True)
+            result = refused_summary(str(refusal), detections.snapshot_names, seconds)
+        else:
+            covariance = RigCovariance.from_matrix(relative_covariance(calibration, reference), rig.camera_names[reference])
+            save_rig(calibration.rig, out / "rig.yaml", covariance, full=self.full_covariance)
+            result = summary(calibration, seconds)
+        if self.report:
+            content = (
+                describe_refusal(str(refusal), detections, rig, obj, frames, seconds)
+                if calibration is None
+                else describe(calibration, rig, obj, frames, reference, seconds)
+            )
+            write_report(content, out / "report.html")
+        write_text(out / "result.json", json.dumps(result, indent=2) + "\n")
+        if refusal is not None:
+            raise refusal
+        _print(result, out, self.report)
+
+    def _reference(self, rig: CameraRig) -> int:
+        if self.reference is None:
+            return 0
+        if self.reference not in rig.camera_names:
+            raise InputError(f"--reference: found {self.reference}, expected one of {', '.join(rig.camera_names)}")
+        return rig.camera_names.index(self.reference)
+
+
+def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, Any]:
+    """Put a calibration into the form that scripts read."""
+    used, snapshots = calibration.labelled.used, calibration.labelled.snapshots
+    seen = calibration.observations.seen
+    per_camera = {}
+    for camera, name in enumerate(calibration.rig.camera_names):
+        points = int(seen[:, camera].sum())
+        per_camera[name] = {
+            "points": points,
+            "rms_px_before": _rms(calibration.before.residual[:, camera], seen[:, camera]),
+            "rms_px_after": _rms(calibration.residual[:, camera], seen[:, camera]),
+        }
+    alternatives = max(snapshots[s].alternatives for s in used)
+    return {
+        "status": "ok",
+        "reason": "",
+        "identity": calibration.identity,
+        "identity_alternatives": alternatives,
+        "rms_px_before": _rms(calibration.before.residual, seen),
+        "rms_px_after": _rms(calibration.residual, seen),
+        "chi2_per_dof": float(calibration.chi2_per_dof),
+        "model_error_px": calibration.model_error,
+        "outliers": calibration.outliers,
+        "snapshots_used": len(used),
+        "snapshots_rejected": len(snapshots) - len(used),
+        "rejected": {s.name: s.reason for s in snapshots if s.status == "refused"},
+        "per_camera": per_camera,
+        "seconds": seconds,
+    }
+
+
+def refused_summary(reason: str, snapshot_names: tuple[str, ...], seconds: dict[str, float]) -> dict[str, Any]:
+    """Say why there is no result, with the same keys."""
+    return {
+        "status": "refused",
+        "reason": reason,
+        "identity": None,
+        "identity_alternatives": None,
+        "rms_px_before": None,
+        "rms_px_after": None,
+        "chi2_per_dof": None,
+        "model_error_px": None,
+        "outliers": None,
+        "snapshots_used": 0,
+        "snapshots_rejected": len(snapshot_names),
+        "rejected": {},
+        "per_camera": {},
+        "seconds": seconds,
+    }
+
+
+def _rms(residual: torch.Tensor, seen: torch.Tensor) -> float | None:
+    """RMS length of the seen residuals, pixels, as OpenCV's calibrateCamera defines it."""
+    return float(residual[seen].square().sum(-1).mean().sqrt()) if bool(seen.any()) else None
+
+
+def _print(result: dict[str, Any], out: Path, report: bool) -> None:
+    print(f"reprojection error before {result['rms_px_before']:.3f} px, after {result['rms_px_after']:.4f} px (RMS)")
+    print(f"identity {result['identity']}, {result['snapshots_used']} snapshots used, {result['snapshots_rejected']} rejected")
+    print(f"rig     {out / 'rig.yaml'}")
+    print(f"result  {out / 'result.json'}")
+    if report:
+        print(f"report  {out / 'report.html'}")

@@ -1,0 +1,125 @@
+"""Turns a calibration, or a refusal, into what the report shows."""
+
+from __future__ import annotations
+
+import platform
+import sys
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+import imgcal
+from imgcal.estimation import relative_covariance
+from imgcal.observations import Detections
+from imgcal.objects import CalibrationObject
+from imgcal.pipeline import Calibration, matched_to_rig
+from imgcal.report import ReportContent, SnapshotSummary, relative_prior_std
+from imgcal.rig import PARAMETERS, CameraRig
+from imgcal.transforms import RigidTransform
+
+Pictures = Mapping[str, NDArray[np.uint8] | NDArray[np.uint16] | None]
+
+
+def describe_refusal(
+    reason: str, detections: Detections, rig: CameraRig, obj: CalibrationObject, pictures: Pictures, seconds: dict[str, float]
+) -> ReportContent:
+    """Say why there is no calibration, beside what was seen."""
+    detections = matched_to_rig(detections, rig)
+    found = np.bincount(detections.snapshot, minlength=len(detections.snapshot_names))
+    return ReportContent(
+        title=f"Recalibration of {rig.name}",
+        status="refused",
+        reason=reason,
+        identity="refused",
+        factory=rig,
+        detections=detections,
+        labels=detections.fiducial,
+        snapshots=tuple(
+            SnapshotSummary(name, int(blobs), 0, reason) for name, blobs in zip(detections.snapshot_names, found, strict=True)
+        ),
+        object_points=obj.points.double().numpy(),
+        frames=tuple(pictures.get(name) for name in rig.camera_names) if pictures else (),
+        seconds=seconds,
+        **_provenance(),
+    )
+
+
+def describe(
+    calibration: Calibration,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    pictures: Pictures,
+    reference: int,
+    seconds: dict[str, float],
+) -> ReportContent:
+    """Lay a calibration out blob by blob."""
+    labelled, detections = calibration.labelled, calibration.labelled.detections
+    before, sigma = _by_blob(calibration, calibration.before.residual)
+    after, _ = _by_blob(calibration, calibration.residual)
+    used = np.isfinite(after).all(1)
+    found = np.bincount(detections.snapshot, minlength=len(labelled.snapshots))
+    taken = np.bincount(detections.snapshot[used], minlength=len(labelled.snapshots))
+    std = relative_covariance(calibration, reference).diagonal().clamp_min(0).sqrt().view(rig.cameras, PARAMETERS)
+    seen = calibration.observations.seen
+    return ReportContent(
+        title=f"Recalibration of {rig.name}",
+        status="ok",
+        reason="",
+        identity=calibration.identity,
+        factory=rig,
+        detections=detections,
+        labels=detections.fiducial,
+        snapshots=tuple(
+            SnapshotSummary(s.name, int(f), int(t), s.reason if s.status == "refused" else "")
+            for s, f, t in zip(labelled.snapshots, found, taken, strict=True)
+        ),
+        recalibrated=calibration.rig,
+        predicted_before=before + detections.uv,
+        predicted_after=after + detections.uv,
+        sigma=sigma,
+        std=std.numpy(),
+        prior_std=relative_prior_std(rig, reference),
+        reference=reference,
+        object_points=obj.points.double().numpy(),
+        rig_from_object=_poses(calibration),
+        frames=tuple(pictures.get(name) for name in rig.camera_names) if pictures else (),
+        chi2_per_dof=float(calibration.chi2_per_dof),
+        rms_before=_rms(calibration.before.residual, seen),
+        rms_after=_rms(calibration.residual, seen),
+        seconds=seconds,
+        **_provenance(),
+    )
+
+
+def _by_blob(calibration: Calibration, residual: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Residual (M, 2) and sigma (M,) of each blob, nan where it was not used; residual is (S, C, N, 2)."""
+    detections, used = calibration.labelled.detections, calibration.labelled.used
+    row = np.full(len(calibration.labelled.snapshots), -1)
+    row[used] = np.arange(len(used))
+    s, c, n = row[detections.snapshot], detections.camera, detections.fiducial
+    valid = (s >= 0) & (n >= 0)
+    valid[valid] = calibration.observations.seen.numpy()[s[valid], c[valid], n[valid]]
+    by_blob, sigma = np.full((len(detections), 2), np.nan), detections.sigma.copy()
+    by_blob[valid] = residual.numpy()[s[valid], c[valid], n[valid]]
+    sigma[valid] = calibration.observations.sigma.numpy()[s[valid], c[valid], n[valid]]
+    return by_blob, sigma
+
+
+def _poses(calibration: Calibration) -> RigidTransform:
+    count, used = len(calibration.labelled.snapshots), calibration.labelled.used
+    rotation, translation = torch.full((count, 3, 3), torch.nan), torch.full((count, 3), torch.nan)
+    rotation[used] = calibration.rig_from_object.rotation.float()
+    translation[used] = calibration.rig_from_object.translation.float()
+    return RigidTransform(rotation.double(), translation.double())
+
+
+def _rms(residual: Tensor, seen: Tensor) -> float:
+    return float(residual[seen].square().sum(-1).mean().sqrt())
+
+
+def _provenance() -> dict[str, str | dict[str, str]]:
+    versions = {"imgcal": imgcal.__version__, "PyTorch": torch.__version__, "Python": platform.python_version()}
+    return {"command": " ".join(["imgcal", *sys.argv[1:]]), "versions": versions}
