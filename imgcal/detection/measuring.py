@@ -22,7 +22,7 @@ SMALLEST_SIGMA = 0.001  # px, what sampling by pixels leaves without any noise
 # px * sqrt(px): sub-pixel position lost where clipping turns a soft edge into a step, over sqrt(radius); the worst case of
 # the exposures (2 to 15 times full scale) in the tests.
 CLIPPED_SIGMA = 0.045
-TWO_PEAKED = 0.507  # bimodality coefficient
+TWO_PEAKED = 0.515  # bimodality coefficient
 REACH = 4  # px from a component to the end of its window: the skirt and a ring that is clear of it
 SKIRT = 3.5  # px, how far the blurred edge reaches beyond the component that was found
 
