@@ -17,9 +17,9 @@ from imgcal.identity.hypotheses import (
     fiducial_triples,
     single_camera_poses,
 )
-from imgcal.identity.rivals import conflicts, lattice_shifts, moved, near_turns
+from imgcal.identity.rivals import conflicts, displacement, lattice_shifts, moved, near_turns
 from imgcal.identity.types import Identity, IdentityOptions, Status
-from imgcal.identity.verify import Fits, Scene, certain, evidence, join, refine, rig_and_pose, settle, start
+from imgcal.identity.verify import STAGES, Fits, Scene, certain, evidence, join, predictions, refine, rig_and_pose, settle, start
 from imgcal.identity.voting import match, predict_ideal, vote
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections
@@ -76,10 +76,14 @@ def track(
     scene = Scene(gather(detections, rig), obj, rig, std)
     poses = Poses(rig_from_object.rotation.numpy()[None], rig_from_object.translation.numpy()[None])
     predicted = predict_ideal(rig, scene.obj.points.numpy(), poses)
-    tolerance, gate = _bounds(scene, float(np.median(_distances(rig, poses, obj))), pose_known=True)
-    votes = vote(scene.blobs, predicted, tolerance, gate)
-    labels = match(scene.blobs, predicted, votes.shift, 1.25 * tolerance)
-    fits = refine(scene, start(scene, poses, labels))
+    distance = float(np.median(_distances(rig, poses, obj)))
+    tolerance, gate = _bounds(scene, distance, pose_known=True)
+    # Where the fiducials are dense, a wide tolerance pairs them with anything: also try a narrow one.
+    tolerances = {tolerance, min(tolerance, max(3.0, 0.2 * _spacing(predicted)))}
+    attempts = [
+        match(scene.blobs, predicted, vote(scene.blobs, predicted, reach, gate).shift, 1.25 * reach) for reach in tolerances
+    ]
+    fits = refine(scene, start(scene, poses.select(np.zeros(len(attempts), dtype=int)), np.concatenate(attempts)))
     return _decide(scene, fits, options, known_pose=True)
 
 
@@ -193,26 +197,29 @@ def _margin(scene: Scene, best: Fits, others: Fits) -> float:
 def _against_motions(scene: Scene, best: Fits, margin: float, known_pose: bool) -> tuple[Fits, float]:
     """Compare a labelling with those of an object shifted or turned onto itself; change to a better one where there is one.
 
+    A lattice may be shifted in all cameras together, or in a single one as far as its prior allows.
+
     Returns:
         The best labelling found, and its margin over the best of its neighbours, at most the given one.
     """
-    motions = lattice_shifts(scene.obj)
-    if not known_pose:
-        spread = spread_of(scene.std, scene.rig, scene.rig.working_distance or _guess_distance(scene))
-        motions = motions + near_turns(scene.obj, 2 * spread.shape * scene.obj.size)
+    shifts = lattice_shifts(scene.obj)
+    spread = spread_of(scene.std, scene.rig, scene.rig.working_distance or _guess_distance(scene))
+    turns = [] if known_pose else near_turns(scene.obj, 2 * spread.shape * scene.obj.size)
     for _ in range(MOST_STEPS):
-        if not motions:
-            break
         _, pose = rig_and_pose(scene, best, 0)
-        poses, labels = moved(pose, best.labels[0], motions)
-        rows = [np.array([k]) for k in range(len(motions))]
-        rivals = [refine(scene, start(scene, poses.select(row), labels[row])) for row in rows]
-        margins = [_margin(scene, best, rival) for rival in rivals]
-        nearest = int(np.argmin(margins))
-        if margins[nearest] >= 0:
-            return best, min(margin, margins[nearest])
-        best = settle(scene, rivals[nearest])
-    return best, margin
+        labels = best.labels[0]
+        rivals = [moved(pose, labels, [motion]) for motion in shifts + turns]
+        for motion in shifts:
+            for camera in np.flatnonzero(displacement(predictions(best), motion) < 6 * spread.shift):
+                alone = labels[None].copy()
+                alone[:, camera] = moved(pose, labels, [motion])[1][:, camera]
+                rivals.append((Poses(pose.rotation.numpy()[None], pose.translation.numpy()[None]), alone))
+        fits = [refine(scene, start(scene, *rival), stages=STAGES[:1]) for rival in rivals]
+        margins = [_margin(scene, best, rival) for rival in fits]
+        if not margins or min(margins) >= 0:
+            return best, min([margin, *margins])
+        best = settle(scene, fits[int(np.argmin(margins))])
+    return best, 0.0
 
 
 def _refused(scene: Scene, reason: str) -> Identity:
@@ -248,3 +255,10 @@ def _guess_distance(scene: Scene) -> float:
 def _distances(rig: CameraRig, poses: Poses, obj: CalibrationObject) -> NDArray[np.float64]:
     centre = poses.rotation[0] @ obj.points.mean(0).numpy() + poses.translation[0]
     return np.linalg.norm(rig.positions.numpy() - centre, axis=1)
+
+
+def _spacing(predicted: NDArray[np.float64]) -> float:
+    """Median distance (px) from a fiducial's image to the nearest other, predictions (1, C, N, 2)."""
+    gaps = np.linalg.norm(predicted[0, :, :, None] - predicted[0, :, None], axis=-1)
+    gaps[:, np.arange(gaps.shape[1]), np.arange(gaps.shape[1])] = np.inf
+    return float(np.median(gaps.min(-1)))

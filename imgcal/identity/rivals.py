@@ -75,6 +75,12 @@ def moved(pose: RigidTransform, labels: NDArray[np.int64], motions: list[Motion]
     return Poses(turns, shifts), changed
 
 
+def displacement(uv: NDArray[np.float64], motion: Motion) -> NDArray[np.float64]:
+    """Median distance (C,) px that a motion moves fiducials in the images (C, N, 2)."""
+    falls = motion.permutation >= 0
+    return np.median(np.linalg.norm(uv[:, motion.permutation[falls]] - uv[:, falls], axis=-1), axis=1)
+
+
 def conflicts(obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[np.int64]) -> float:
     """Share of commonly labelled blobs that two labellings (C, N) call differently, up to the object's symmetry.
 

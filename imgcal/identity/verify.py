@@ -124,6 +124,11 @@ def evidence(scene: Scene, fits: Fits) -> NDArray[np.float64]:
     return np.where(labelled, gain, 0).sum((1, 2)) - fits.cost - 0.5 * found.complexity
 
 
+def predictions(fits: Fits) -> NDArray[np.float64]:
+    """Pixels of all fiducials under the first labelling: (C, N, 2)."""
+    return _found(fits).uv[0]
+
+
 def rig_and_pose(scene: Scene, fits: Fits, row: int) -> tuple[CameraRig, RigidTransform]:
     """Give the rig and rig_from_object of one labelling, without batch axes."""
     problem = _problem(scene, fits)
