@@ -38,7 +38,9 @@ class CalibrationObject:
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3 or len(self.points) < 4:
-            raise InputError(f"object {self.name}: found points of shape {tuple(self.points.shape)}, expected (N >= 4, 3)")
+            raise InputError(
+                f"object {self.name}: found points of shape {tuple(self.points.shape)}, expected (N >= 4, 3)"
+            )
 
     @property
     def fiducials(self) -> int:

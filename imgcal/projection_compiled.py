@@ -5,13 +5,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from numba import njit
+from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.projection import NEAREST_DEPTH, Projection
 from imgcal.rig import CameraRig
+
+Array = NDArray[np.floating[Any]]
 
 
 def project(rig: CameraRig, points_rig: Tensor, radius: Tensor | None = None) -> Projection:
@@ -29,13 +34,17 @@ def project(rig: CameraRig, points_rig: Tensor, radius: Tensor | None = None) ->
     image = points_rig.new_empty(count, rig.cameras, 4, fiducials)  # u, v, depth, visible
     radius_squared = points_rig.new_zeros(fiducials) if radius is None else radius.square()
     transform, lens = rig.cam_from_rig, (rig.focal_length, rig.principal_point, rig.distortion)
-    given = (points_rig.mT, radius_squared, transform.rotation, transform.translation, *lens, rig.image_size.to(image.dtype))
+    size = rig.image_size.to(image.dtype)
+    given = (points_rig.mT, radius_squared, transform.rotation, transform.translation, *lens, size)
     _project(*(tensor.detach().contiguous().numpy() for tensor in given), image.numpy())
     return Projection(image[..., :2, :].mT, image[..., 2, :], image[..., 3, :] > 0)
 
 
 @njit(cache=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
-def _project(points, radius_squared, rotation, translation, focal_length, principal_point, distortion, image_size, image):
+def _project(
+    points: Array, radius_squared: Array, rotation: Array, translation: Array,
+    focal_length: Array, principal_point: Array, distortion: Array, image_size: Array, image: Array,
+) -> None:  # fmt: skip
     # One output array and constants of the points' own type: with more of either, the inner loop is not vectorized.
     kind = points.dtype.type
     nearest, zero, half, one, two = kind(NEAREST_DEPTH), kind(0), kind(0.5), kind(1), kind(2)
@@ -73,7 +82,7 @@ def _project(points, radius_squared, rotation, translation, focal_length, princi
 
 
 @njit(cache=True, error_model="numpy")
-def _blind_from(a, b, c):
+def _blind_from(a: float, b: float, c: float) -> float:
     """Squared radius at which 1 + a s + b s^2 + c s^3 has dipped to zero or below, like projection.is_before_fold."""
     root = np.sqrt(b * b - 3 * a * c)
     lowest = -a / (b + root) if b > 0 else (root - b) / (3 * c)

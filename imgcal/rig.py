@@ -13,8 +13,8 @@ from imgcal.rotations import rotation_from_6d, rotation_from_vector, sixd_from_r
 from imgcal.transforms import RigidTransform, rotate
 
 PARAMETERS = 15
-"""Free parameters of a camera, in this order: rotation (3, rad), position (3, mm), focal length (2), principal point (2,
-both pixels), distortion (5). Rotation: cam_from_rig = exp(w) cam_from_rig0. Position: of the camera in the rig."""
+"""Free parameters of a camera, in this order: rotation (3, rad), position (3, mm), focal length (2, pixels), principal
+point (2, pixels), distortion (5). Rotation: cam_from_rig = exp(w) cam_from_rig0. Position: of the camera in the rig."""
 
 PARAMETER_NAMES = (
     "rotation_x", "rotation_y", "rotation_z", "position_x", "position_y", "position_z",
@@ -49,7 +49,7 @@ class RigPrior:
 
 @dataclass(frozen=True)
 class CameraRig:
-    """Cameras fixed to a common frame. The rig frame is whatever the factory says; only relations between cameras matter."""
+    """Cameras fixed to a common frame: whatever the factory says it is; only relations between cameras matter."""
 
     focal_length: Tensor  # (*B, C, 2) pixels: fx, fy
     principal_point: Tensor  # (*B, C, 2) pixels: cx, cy
@@ -212,7 +212,7 @@ class CameraRig:
 
 
 def pack21(rig: CameraRig) -> Tensor:
-    """The paper's 21 numbers a camera: rotation (9, row-major), translation (3), f (2), principal point (2), distortion (5).
+    """Pack the paper's 21 numbers a camera: rotation (9, row-major), translation, f, principal point, distortion (5).
 
     Args:
         rig: a rig in the object's frame (`CameraRig.from_object`).
@@ -224,7 +224,7 @@ def pack21(rig: CameraRig) -> Tensor:
 
 
 def pack18(rig: CameraRig) -> Tensor:
-    """The paper's 18 network outputs a camera: like `pack21`, with the 6D rotation in place of the matrix; (*B, C, 18)."""
+    """Pack the paper's 18 network outputs a camera: `pack21` with the 6D rotation for the matrix; (*B, C, 18)."""
     return torch.cat((sixd_from_rotation(rig.cam_from_rig.rotation), _pack_rest(rig)), dim=-1)
 
 

@@ -123,7 +123,7 @@ def _quaternion_from_rotation(rotation: Tensor) -> Tensor:
 
 
 def rotation_from_euler(angles: Tensor) -> Tensor:
-    """Rotation Rz(c) Ry(b) Rx(a) from Euler angles (a, b, c) about the fixed x, y, z axes: (*B, 3) rad -> (*B, 3, 3)."""
+    """Rotate by Euler angles (a, b, c) about the fixed x, y, z axes, Rz(c) Ry(b) Rx(a): (*B, 3) rad -> (*B, 3, 3)."""
     (sa, sb, sc), (ca, cb, cc) = angles.sin().unbind(-1), angles.cos().unbind(-1)
     entries = (
         cc * cb, cc * sb * sa - sc * ca, cc * sb * ca + sc * sa,
@@ -148,7 +148,7 @@ def euler_from_rotation(rotation: Tensor) -> Tensor:
 
 
 def _matrices(entries: tuple[Tensor, ...]) -> Tensor:
-    """Nine entries (*B), row by row, to matrices (*B, 3, 3): entries stay apart in memory, as component arithmetic wants."""
+    """Nine entries (*B), row by row, to matrices (*B, 3, 3); the entries stay apart in memory, in long rows."""
     return torch.stack(entries).unflatten(0, (3, 3)).movedim((0, 1), (-2, -1))
 
 

@@ -176,9 +176,9 @@ def synthesize(
             return _concatenate(kept)
     worst = int(failures.argmax())
     raise RefusedError(
-        f"synthesis: {count - missing} of {count} rigs after {tried} trials; camera {rig.camera_names[worst]} misses part "
-        f"of object {obj.name} in {100 * float(failures[worst]) / tried:.0f} % of them: reduce the drift, the pose range or "
-        "the object, or change the working distance"
+        f"synthesis: {count - missing} of {count} rigs after {tried} trials; camera {rig.camera_names[worst]} misses "
+        f"part of object {obj.name} in {100 * float(failures[worst]) / tried:.0f} % of them: reduce the drift, the pose "
+        "range or the object, or change the working distance"
     )
 
 
@@ -260,7 +260,7 @@ def _concatenate_transforms(parts: list[RigidTransform]) -> RigidTransform:
 def _parameters_first(
     draw: Callable[..., Tensor], rig: CameraRig, generator: torch.Generator, batch: tuple[int, ...]
 ) -> Tensor:
-    """Draw a number for every parameter: (*batch, *B, C, 15), with parameters first in memory, for long contiguous rows.
+    """Draw a number for every parameter: (*batch, *B, C, 15), parameters first in memory, for long contiguous rows.
 
     Elementwise operations keep the memory order of their first operand.
     """

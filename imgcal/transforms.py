@@ -16,7 +16,9 @@ class RigidTransform:
     translation: Tensor  # (*B, 3) mm
 
     @classmethod
-    def identity(cls, *batch: int, dtype: torch.dtype | None = None, device: torch.device | None = None) -> RigidTransform:
+    def identity(
+        cls, *batch: int, dtype: torch.dtype | None = None, device: torch.device | None = None
+    ) -> RigidTransform:
         """Make identity transforms of the given batch shape."""
         eye = torch.eye(3, dtype=dtype, device=device).expand(*batch, 3, 3)
         return cls(eye, torch.zeros(*batch, 3, dtype=dtype, device=device))

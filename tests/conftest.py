@@ -5,6 +5,10 @@ from pathlib import Path
 
 import pytest
 
+from imgcal.formats import load_object, load_rig
+from imgcal.objects import CalibrationObject
+from imgcal.rig import CameraRig
+
 
 @pytest.fixture(scope="session")
 def captures() -> Path:
@@ -13,3 +17,15 @@ def captures() -> Path:
     if not folder:
         pytest.skip("IMGCAL_CAPTURES is not set: real frames are not at hand")
     return Path(folder)
+
+
+@pytest.fixture(scope="session")
+def o10() -> CameraRig:
+    """The reference rig of ten cameras, float64."""
+    return load_rig("O10")
+
+
+@pytest.fixture(scope="session")
+def asymmetric8() -> CalibrationObject:
+    """The default object, float64."""
+    return load_object("asymmetric8")
