@@ -213,16 +213,14 @@ class _Follower:
         count = len(self.accepted)
         if count & (count - 1) or count > 64:
             return
-        parts = [to_observations(replace(b, fiducial=label), self.factory, self.obj) for b, label, _ in self.accepted]
-        observations = Observations(
-            torch.cat([p.uv for p in parts]), torch.cat([p.sigma for p in parts]), torch.cat([p.seen for p in parts])
-        )
+        parts = [to_observations(replace(b, fiducial=given), self.factory, self.obj) for b, given, _ in self.accepted]
+        sigma = (torch.cat([p.sigma for p in parts]).square() + self.options.identity_error**2).sqrt()
+        observations = Observations(torch.cat([p.uv for p in parts]), sigma, torch.cat([p.seen for p in parts]))
         poses = _stack([p for _, _, p in self.accepted])
         fit = estimate(observations, self.factory, self.obj, poses, options=self.options.estimation)
-        scale = float(_data_chi2_per_dof(fit).clamp_min(1.0).sqrt())
         if bool(fit.converged):
             prior = (self.factory.prior or RigPrior()).std(self.factory)
-            self.rig, self.spread = fit.rig, torch.minimum(camera_std(fit) * scale * 2, prior)
+            self.rig, self.spread = fit.rig, torch.minimum(2 * camera_std(fit), prior)
 
 
 def matched_to_rig(detections: Detections, rig: CameraRig) -> Detections:
@@ -264,25 +262,24 @@ def _fit(labelled: Labelled, rig: CameraRig, obj: CalibrationObject, options: Pi
     """Estimate the rig from all labelled snapshots, leaving out what does not fit, and check that the rest does."""
     observations, poses = _used(labelled, rig, obj)
     _require_cameras(observations, rig, options)
-    labelled_count = int(observations.seen.sum())
-    raw_sigma, model_error = observations.sigma, 0.0
-    for _ in range(4):
-        fit = estimate(observations, rig, obj, poses, options=options.estimation)
+    raw, model_error = observations, options.identity_error
+    for _ in range(6):
+        previous = model_error
+        weighted = replace(observations, sigma=(raw.sigma.square() + model_error**2).sqrt())
+        fit = estimate(weighted, rig, obj, poses, options=options.estimation)
         if not bool(fit.converged):
             raise RefusedError(f"estimation: no minimum after {fit.iterations} iterations (RMS {float(fit.rms):.3g} px)")
-        excess = float(_data_chi2_per_dof(fit))
-        keep = _inliers(fit, observations, options.outlier * max(1.0, excess**0.5))
-        # 6 standard deviations of chi2 per degree of freedom: below, the residuals fit the sigmas that the blobs have.
-        significant = 1 + 6 * (2 / max(float(fit.dof), 1.0)) ** 0.5
-        if excess <= significant and bool((keep == observations.seen).all()):
+        model_error, poses = _model_error(fit, raw.sigma), fit.rig_from_object
+        distance = fit.residual.norm(dim=-1) / (raw.sigma.square() + model_error**2).sqrt()
+        # Where a fiducial was left out there is no residual: it stays out.
+        keep = observations.seen & (distance <= options.outlier)
+        settled = abs(model_error - previous) <= 0.02 * previous and bool((keep == observations.seen).all())
+        observations = replace(observations, seen=keep)
+        if settled:
             break
-        typical = float(observations.sigma[observations.seen].square().median())
-        if excess > significant:
-            model_error = (model_error**2 + (excess - 1) * typical) ** 0.5
-        observations = Observations(observations.uv, (raw_sigma.square() + model_error**2).sqrt(), keep)
-        poses = fit.rig_from_object
-    outliers = labelled_count - int(observations.seen.sum())
-    _require_fit(model_error, outliers / max(labelled_count, 1), float(fit.rms), options)
+    observations = weighted
+    outliers = int(raw.seen.sum()) - int(observations.seen.sum())
+    _require_fit(model_error, outliers / max(int(raw.seen.sum()), 1), float(fit.rms), options)
     before = estimate(observations, rig, obj, poses, spread=torch.zeros_like(fit.problem.spread[0]))
     values = {name: getattr(fit, name) for name in Estimate.__dataclass_fields__}
     return Calibration(
@@ -328,27 +325,31 @@ def _require_fit(model_error: float, outlier_share: float, rms: float, options: 
         )
 
 
-def _inliers(fit: Estimate, observations: Observations, threshold: float) -> Tensor:
-    """Seen fiducials whose residual is within `threshold` standard deviations: (S, C, N) bool."""
-    distance = fit.residual.norm(dim=-1) / observations.sigma
-    return observations.seen & (distance <= threshold)
+def _model_error(fit: Estimate, sigma: Tensor) -> float:
+    """Standard deviation (px, each axis) that residuals hold beyond the blobs' own sigma (S, C, N); 0 = nothing significant.
 
-
-def _data_chi2_per_dof(fit: Estimate) -> Tensor:
-    """Squared whitened residuals of the data alone, over the observations left after the parameters took their share.
-
-    A parameter takes the share of one observation that its prior leaves: 1 - (posterior / prior variance).
+    The median of squared distances over two axes is 1.386 for unit noise, whatever a minority of outliers does. Residuals
+    are smaller than the noise by what the parameters took: each takes the share of one observation that its prior left.
     """
-    root_weight = fit.problem.root_weight
-    squared = (fit.residual * root_weight.reshape(*fit.residual.shape[:-1], 1)).square().sum(-1)
-    seen = root_weight.reshape(squared.shape) > 0
-    count = seen.sum()
-    # The median of squared distances of two axes is 1.386 for unit noise: blind to outliers.
-    typical = squared[seen].median() / 1.386
-    spread = fit.problem.spread.reshape(fit.rig.distortion.shape[:-1] + (-1,))
-    known = (camera_std(fit) / spread.clamp_min(1e-30)).square().clamp_max(1).where(spread > 0, 1.0)
-    free = (2 * count - 6 * squared.shape[0] - (1 - known).sum()).clamp_min(1)
-    return typical * 2 * count / free
+    seen = fit.problem.root_weight.reshape(sigma.shape) > 0
+    spread = fit.problem.spread.reshape(fit.rig.distortion.shape[0], -1)
+    known = torch.where(spread > 0, (camera_std(fit) / spread.clamp_min(1e-30)).square().clamp_max(1), 1.0)
+    count = 2 * int(seen.sum())
+    free = max(count - 6 * sigma.shape[0] - float((1 - known).sum()), 1.0)
+    squared = fit.residual.square().sum(-1)[seen] * (count / free)
+    variance = sigma[seen].square()
+
+    def excess(error: float) -> float:
+        return float((squared / (variance + error**2)).median()) / 1.386
+
+    # Six standard deviations of a chi-squared mean: below, the residuals fit the sigmas that the blobs have.
+    if excess(0.0) <= 1 + 6 * (2 / free) ** 0.5:
+        return 0.0
+    low, high = 0.0, float(squared.max().sqrt())
+    for _ in range(30):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if excess(middle) > 1 else (low, middle)
+    return high
 
 
 @dataclass(frozen=True)
