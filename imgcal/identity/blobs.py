@@ -24,6 +24,7 @@ class Blobs:
     uv: NDArray[np.float64]  # (C, M, 2) pixels, FAR where padded
     ideal: NDArray[np.float32]  # (C, M, 2) pixels from the principal point, distortion removed, FAR where padded
     sigma: NDArray[np.float64]  # (C, M) pixels
+    radius: NDArray[np.float64]  # (C, M) pixels, nan = unknown
     row: NDArray[np.int64]  # (C, M) row of the detections, -1 where padded
     count: NDArray[np.int64]  # (C,)
     rows: int  # rows of the detections, usable or not
@@ -57,10 +58,11 @@ def gather(detections: Detections, rig: CameraRig) -> Blobs:
     count = np.bincount(camera, minlength=rig.cameras)
     slot = np.arange(len(rows)) - (np.cumsum(count) - count)[camera]
     shape = (rig.cameras, max(int(count.max()), 1))
-    uv, row, sigma = np.full((*shape, 2), FAR), np.full(shape, -1), np.ones(shape)
+    uv, row, sigma, radius = np.full((*shape, 2), FAR), np.full(shape, -1), np.ones(shape), np.full(shape, np.nan)
     uv[camera, slot], row[camera, slot], sigma[camera, slot] = detections.uv[rows], rows, detections.sigma[rows]
+    radius[camera, slot] = detections.radius[rows]
     lens = (rig.focal_length.numpy(), rig.principal_point.numpy(), rig.distortion.numpy())
-    return Blobs(uv, _ideal(uv, count, *lens), sigma, row, count, len(detections))
+    return Blobs(uv, _ideal(uv, count, *lens), sigma, radius, row, count, len(detections))
 
 
 @njit(cache=True)

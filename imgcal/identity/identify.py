@@ -17,6 +17,7 @@ from imgcal.identity.hypotheses import (
     fiducial_triples,
     single_camera_poses,
 )
+from imgcal.identity.planar import planar_poses
 from imgcal.identity.rivals import conflicts, displacement, lattice_shifts, moved, near_turns
 from imgcal.identity.types import Identity, IdentityOptions, Status
 from imgcal.identity.verify import STAGES, Fits, Scene, certain, evidence, join, predictions, refine, rig_and_pose, settle, start
@@ -29,6 +30,7 @@ from imgcal.transforms import RigidTransform
 TRIPLES = 20  # of blobs in a round, over all cameras
 MOST_HYPOTHESES = 400_000  # in a round: large objects get fewer triples of blobs
 KEPT = 8  # poses of each
+MANY = 40  # fiducials of a planar object, above which triples are too many
 MOST_STEPS = 6  # from one labelling to a better one of the moved object
 VERIFIED = 3  # different labellings that are fitted, the best of a round
 
@@ -124,12 +126,17 @@ def _round(
     generator: np.random.Generator,
 ) -> Fits | None:
     """Make hypotheses, let the rig vote, fit the best."""
-    number = int(np.clip(MOST_HYPOTHESES // len(triples.triples), 1, TRIPLES))
-    per_camera = -(-number // len(cameras))
-    cameras = generator.permutation(cameras)[:number]
-    chosen = [blob_triples(scene.blobs, camera, per_camera, generator) for camera in cameras]
-    camera = np.repeat(cameras, [len(rows) for rows in chosen])
-    poses = single_camera_poses(scene.blobs, scene.rig, camera, np.concatenate(chosen), triples, tolerance, KEPT)
+    if scene.obj.planar and scene.obj.fiducials > MANY:
+        cameras = generator.permutation(cameras)[:2]
+        poses = planar_poses(scene.blobs, scene.rig, cameras[0], scene.obj)
+        for camera in cameras[1:]:
+            poses = poses + planar_poses(scene.blobs, scene.rig, camera, scene.obj)
+    else:
+        number = int(np.clip(MOST_HYPOTHESES // len(triples.triples), 1, TRIPLES))
+        cameras = generator.permutation(cameras)[:number]
+        chosen = [blob_triples(scene.blobs, camera, -(-number // len(cameras)), generator) for camera in cameras]
+        camera = np.repeat(cameras, [len(rows) for rows in chosen])
+        poses = single_camera_poses(scene.blobs, scene.rig, camera, np.concatenate(chosen), triples, tolerance, KEPT)
     if len(poses) == 0:
         return None
     predicted = predict_ideal(scene.rig, triples.points, poses)

@@ -26,6 +26,8 @@ STAGES = (3.0, 0.7)
 """Standard deviations (px) that the first fits allow, beyond the blobs' own; the last fits take it from their residuals."""
 GATE = 25.0
 """Squared normalized innovation of a label; two degrees of freedom exceed it once in 270,000."""
+SIZE_SPREAD = 0.15
+"""Relative standard deviation of a blob's radius within its camera: depth, tilt and exposure vary."""
 UNDECIDED = 2 * np.log(1e3)
 """Two pairings whose squared normalized innovations differ by less cannot be told apart."""
 
@@ -121,7 +123,8 @@ def evidence(scene: Scene, fits: Fits) -> NDArray[np.float64]:
     noise = _blob_noise(scene, fits) + fits.sigma[:, None, None] ** 2
     found = _found(fits)
     gain = -np.log(2 * np.pi * noise) - np.log(_clutter(scene, fits)) + _detection_odds(scene, fits)
-    return np.where(labelled, gain, 0).sum((1, 2)) - fits.cost - 0.5 * found.complexity
+    sizes = _size_misfit(scene, fits)
+    return np.where(labelled, gain, 0).sum((1, 2)) - fits.cost - 0.5 * (found.complexity + sizes)
 
 
 def predictions(fits: Fits) -> NDArray[np.float64]:
@@ -183,6 +186,19 @@ def _residual_sigma(scene: Scene, fits: Fits) -> NDArray[np.float64]:
     variance = np.where(inlier, found.residual, 0).sum((1, 2)) / np.maximum(freedom, 1e-3)
     own = np.where(inlier, _blob_noise(scene, fits), 0).sum((1, 2)) / np.maximum(inlier.sum((1, 2)), 1)
     return np.minimum(np.sqrt(np.maximum(variance - own, 0)), fits.sigma)
+
+
+def _size_misfit(scene: Scene, fits: Fits) -> NDArray[np.float64]:
+    """Chi2 of the blobs' radii where fiducials differ in theirs: (K,). One unknown factor a camera takes up all else."""
+    radius = scene.obj.radius
+    if radius is None or not bool((radius > 1.05 * radius.min()).any()):
+        return np.zeros(len(fits.labels))
+    seen = scene.blobs.radius[np.arange(fits.labels.shape[1])[:, None], np.maximum(fits.labels, 0)]
+    with np.errstate(all="ignore"):
+        ratio = np.log(np.where(fits.labels >= 0, seen, np.nan) / radius.numpy())
+        ratio = np.where(np.isfinite(ratio).any(-1, keepdims=True), ratio, 0.0)
+        misfit = (ratio - np.nanmedian(ratio, axis=-1, keepdims=True)) / SIZE_SPREAD
+    return np.nansum(np.minimum(misfit**2, 9.0), axis=(1, 2))
 
 
 def _clutter(scene: Scene, fits: Fits) -> NDArray[np.float64]:
