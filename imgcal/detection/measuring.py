@@ -232,7 +232,7 @@ def _shape(
     angle = 0.5 * np.arctan2(2 * xy, xx - yy)
     swing = np.hypot(xx - yy, 2 * xy)
     major, minor = (xx + yy + swing) / 2, (xx + yy - swing) / 2
-    elongation = np.sqrt(major / np.maximum(minor, 1e-3))
+    elongation = np.sqrt(major / np.maximum(minor, 1 / 12))  # no narrower than a pixel
     along = x * np.cos(angle)[:, None, None] + y * np.sin(angle)[:, None, None]
     square = along * along
     third, fourth = ((mass * square * power).sum((1, 2)) for power in (along, square))
