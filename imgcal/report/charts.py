@@ -15,6 +15,7 @@ from imgcal.report.svg import Array, Axes
 
 LARGEST_SCATTER = 6000  # residuals in one scatter
 LARGEST_PANEL = 1200  # observations in one camera's panel of the coverage, less with more than ten cameras
+FEW = 500  # residuals: fewer are drawn as larger dots
 RESIDUAL_CLASSES = 6  # colours of the residual's size: classes c0 to c5 of the style sheet
 COVERAGE_FIELDS = 8  # an image is divided into 8 x 8 fields to count how much of it was reached
 
@@ -36,7 +37,8 @@ def residual_scatter(residual: Array, limit: float, kind: str) -> Markup:
     axes = Axes(48, 348, 10, 310, (-limit, limit), (limit, -limit))
     inside = np.abs(residual).max(axis=1) <= limit
     centre = svg.line(axes.left, 160, axes.right, 160, "zero") + svg.line(198, axes.top, 198, axes.bottom, "zero")
-    points = svg.dots(axes.x(residual[inside, 0]), axes.y(residual[inside, 1]), f"dot {kind}")
+    style = f"dot {kind}" + (" few" if len(residual) < FEW else "")
+    points = svg.dots(axes.x(residual[inside, 0]), axes.y(residual[inside, 1]), style)
     outside = int((~inside).sum())
     note = svg.text(axes.right - 6, axes.bottom - 7, f"{outside} outside", anchor="end") if outside else ""
     frame = svg.box(axes.left, axes.top, 300, 300, "frame")
@@ -53,10 +55,9 @@ def whitened_histogram(whitened: Array) -> Markup:
     normal_x = np.linspace(-5, 5, 101)
     normal = np.exp(-0.5 * normal_x**2) / math.sqrt(2 * math.pi)
     axes = Axes(42, 348, 10, 310, (-5, 5), (0, 1.12 * max(float(density.max()), float(normal.max()))))
-    bars = [
-        svg.box(float(axes.x(a)) + 0.5, float(axes.y(d)), float(axes.x(b) - axes.x(a)) - 1, float(axes.y(0) - axes.y(d)), "bar after")
-        for a, b, d in zip(edges[:-1], edges[1:], density, strict=True)
-    ]  # fmt: skip
+    left, top = axes.x(edges), axes.y(density)
+    width = float(left[1] - left[0]) - 1
+    bars = [svg.box(x + 0.5, y, width, axes.bottom - y, "bar after") for x, y in zip(left[:-1], top, strict=True)]
     curve = svg.polyline(axes.x(normal_x), axes.y(normal), "curve")
     return svg.drawing(
         360, 350, "Histogram of residuals in standard deviations against the unit normal",
@@ -71,46 +72,53 @@ def rms_by_camera(content: ReportContent) -> Markup:
     after = content.rms_by(content.detections.camera, content.residual_after, count)
     both = np.concatenate((before, after))
     both = np.log10(np.maximum(both[np.isfinite(both)], 1e-6))
-    axes = Axes(112, 430, 6, 12 + 22 * count, (float(both.min()) - 0.1, float(both.max()) + 0.1), (0, 1))
+    names = [svg.shortened(name) for name in content.cameras]
+    margin = 24 + 6.5 * max(len(name) for name in names)
+    limits = (float(both.min()) - 0.1, float(both.max()) + 0.1)
+    axes = Axes(margin, 430, 6, 12 + 22 * count, limits, (0, 1))
     parts = [svg.grid(axes, "RMS error (px), logarithmic", log_x=True)]
-    for i, name in enumerate(content.cameras):
+    for i, name in enumerate(names):
         y = 20 + 22 * i
-        parts.append(svg.text(axes.left - 8, y + 4, svg.shortened(name), kind="label", anchor="end"))
+        parts.append(svg.text(axes.left - 8, y + 4, name, kind="label", anchor="end"))
         if np.isnan(after[i]):
             parts.append(svg.text(axes.left + 8, y + 4, "no observations", anchor="start"))
             continue
         right = float(axes.x(math.log10(max(after[i], 1e-6))))
-        words = f"{after[i]:.3g} px"
+        words = f"{svg.pixels(after[i])} px"
         if np.isfinite(before[i]):
-            left, right = float(axes.x(math.log10(max(before[i], 1e-6)))), right
+            left = float(axes.x(math.log10(max(before[i], 1e-6))))
             parts.append(svg.line(left, y, right, y, "link"))
             parts.append(svg.dots(np.array([left]), np.array([y]), "mark before"))
-            words = f"{before[i]:.3g} → {words}"
+            words = f"{svg.pixels(before[i])} → {words}"
         parts.append(svg.dots(np.array([right]), np.array([y]), "mark after"))
         parts.append(svg.text(axes.right + 8, y + 4, words, anchor="start"))
     return svg.drawing(560, 50 + 22 * count, "RMS error of each camera before and after recalibration", *parts)
 
 
-def rms_by_fiducial(content: ReportContent) -> Markup:
-    """Draw the RMS after recalibration of each fiducial; those far above the median stand out."""
+def fiducial_rms(content: ReportContent) -> Array:
+    """RMS after recalibration of each fiducial: (N,) pixels, nan where it was not seen."""
     count = int(content.labels[content.used].max()) + 1
     if content.object_points is not None:
         count = max(count, len(content.object_points))
-    label = np.maximum(content.labels, 0)
-    rms = content.rms_by(label, content.residual_after, count)
-    number = np.bincount(content.labels[content.used], minlength=count)
+    return content.rms_by(np.maximum(content.labels, 0), content.residual_after, count)
+
+
+def rms_by_fiducial(content: ReportContent) -> Markup:
+    """Draw the RMS after recalibration of each fiducial; those far above the median stand out."""
+    rms = fiducial_rms(content)
+    number = np.bincount(content.labels[content.used], minlength=len(rms))
     median = float(np.nanmedian(rms))
-    axes = Axes(48, 550, 10, 220, (-0.5, count - 0.5), (0, 1.1 * max(float(np.nanmax(rms)), 1e-9)))
-    width = 502 / count
-    gap = min(0.25 * width, 6)
+    axes = Axes(48, 550, 10, 220, (-0.5, len(rms) - 0.5), (0, 1.1 * max(float(np.nanmax(rms)), 1e-9)))
+    width = 502 / len(rms)
+    gap = max(min(0.25 * width, 6), width - 36)
     parts = [svg.grid(axes, "fiducial (row of the object file, from 0)", "RMS error after (px)")]
     for i in np.flatnonzero(number):
         top, left = float(axes.y(rms[i])), float(axes.x(i - 0.5))
         kind = "bar high" if rms[i] > 2 * median else "bar after"
-        tip = f"fiducial {i}: {rms[i]:.3g} px, {number[i]} observations"
+        tip = f"fiducial {i}: {svg.pixels(rms[i])} px, {number[i]} observations"
         parts.append(svg.box(left + gap / 2, top, width - gap, axes.bottom - top, kind, tip))
     y = float(axes.y(median))
-    parts += [svg.line(axes.left, y, axes.right, y, "median"), svg.text(axes.right, y - 5, f"median {median:.3g}", anchor="end")]
+    parts.append(svg.line(axes.left, y, axes.right, y, "median"))
     return svg.drawing(560, 260, "RMS error of each fiducial after recalibration", *parts)
 
 
@@ -169,9 +177,10 @@ def snapshot_strip(content: ReportContent) -> Markup:
         if snapshot.reason:
             tip += f"; rejected: {snapshot.reason}"
         thick = max(step * 0.75, step - 3)
-        parts.append(svg.box(i * step, 46 - found, thick, found, "bar rejected" if snapshot.reason else "bar found", tip))
+        whole, foot = ("bar rejected", "bar rejected") if snapshot.reason else ("bar found", "bar after")
+        parts.append(svg.box(i * step, 46 - found, thick, found, whole, tip))
         parts.append(svg.box(i * step, 46 - used, thick, used, "bar after", tip))
-        parts.append(svg.box(i * step, 47.5, thick, 3, "bar rejected" if snapshot.reason else "bar after", tip))
+        parts.append(svg.box(i * step, 47.5, thick, 3, foot, tip))
     return svg.drawing(1080, 52, "Blobs found and used in each snapshot", *parts)
 
 

@@ -53,8 +53,8 @@ class ReportContent:
     labels: NDArray[np.int64]  # (M,) fiducial of each blob, -1 = unlabelled
     snapshots: tuple[SnapshotSummary, ...] = ()  # S
     recalibrated: CameraRig | None = None
-    predicted_before: Array | None = None  # (M, 2) pixels by the factory rig, pose refitted; nan where a blob is not used
-    predicted_after: Array | None = None  # (M, 2) pixels by the recalibrated rig; nan where a blob is not used
+    predicted_before: Array | None = None  # (M, 2) pixels by the factory rig, pose refitted; nan where not used
+    predicted_after: Array | None = None  # (M, 2) pixels by the recalibrated rig; nan where not used
     sigma: Array | None = None  # (M,) pixels, as weighted in the estimate; None = as detected
     std: Array | None = None  # (C, 15) posterior standard deviation
     prior_std: Array | None = None  # (C, 15) standard deviation before the data; see `relative_prior_std`
@@ -86,7 +86,7 @@ class ReportContent:
             if value is not None and value.shape != shape:
                 raise ValueError(f"report: {name} has shape {value.shape}, expected {shape}")
         if self.frames and len(self.frames) != cameras:
-            raise ValueError(f"report: found {len(self.frames)} frames, expected one (or None) for each of {cameras} cameras")
+            raise ValueError(f"report: found {len(self.frames)} frames, expected {cameras}, None where there is none")
         if self.detections.camera_names != self.factory.camera_names:
             raise ValueError("report: cameras of the detections differ from those of the rig")
 
@@ -137,18 +137,25 @@ class ReportContent:
         return relative_difference(recalibrated, factory, self.reference).detach().cpu().numpy()
 
     @cached_property
+    def fixed(self) -> NDArray[np.bool_]:
+        """Mark values that could not change, the extrinsics of the reference camera among them: (C, 15) bool."""
+        fixed = np.zeros((len(self.cameras), PARAMETERS), dtype=bool) if self.std is None else self.std <= 0
+        fixed[self.reference, :6] = True
+        return fixed
+
+    @cached_property
     def moved(self) -> NDArray[np.bool_]:
         """Mark changes larger than `MOVED` standard deviations: (C, 15) bool."""
         if self.change is None or self.std is None:
             return np.zeros((len(self.cameras), PARAMETERS), dtype=bool)
-        return (np.abs(self.change) > MOVED * self.std) & (self.std > 0)
+        return (np.abs(self.change) > MOVED * self.std) & ~self.fixed
 
     @cached_property
     def undetermined(self) -> NDArray[np.bool_]:
         """Mark values of which the data say little that the prior did not: (C, 15) bool."""
         if self.std is None or self.prior_std is None:
             return np.zeros((len(self.cameras), PARAMETERS), dtype=bool)
-        return (self.std > UNDETERMINED * self.prior_std) & (self.prior_std > 0)
+        return (self.std > UNDETERMINED * self.prior_std) & ~self.fixed
 
     def rms_by(self, group: NDArray[np.int64], residual: Array, count: int) -> Array:
         """RMS of the used blobs' residuals over both axes, by group.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-from html import escape
 
 import cv2
 import numpy as np
@@ -14,6 +13,8 @@ from imgcal.report.scene import Figure
 
 WIDTHS = (1000, 800, 640, 480, 320, 200)  # px, of a frame in the page: the first whose frames fit together
 LARGEST_FRAMES = 4_000_000  # bytes of all frames in the page
+GAMMA = 0.6  # below 1 lifts the dark ground of infrared frames
+BRIGHT_PIXELS = 20  # may be white in a stretched frame
 LARGEST_OVERLAY = 600  # blobs drawn in one camera
 OVERLAYS_WITH_ALL = 16  # with more cameras, blobs drawn in one camera become fewer in proportion
 
@@ -50,11 +51,14 @@ def blobs_drawn(content: ReportContent) -> int:
 
 def _jpeg(frame: NDArray[np.uint8] | NDArray[np.uint16], width: int) -> bytes:
     height = max(round(frame.shape[0] * width / frame.shape[1]), 1)
-    grey = frame.astype(np.float32)
+    grey: NDArray[np.floating] = frame.astype(np.float32)
     if width < frame.shape[1]:
-        grey = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
-    low, high = np.quantile(grey, (0.01, 0.9995))
-    stretched = np.clip((grey - low) / max(high - low, 1e-6), 0, 1) * 255
+        grey = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
+    # A few blobs of some pixels each are all that is bright: a quantile would clip them or drown them in noise.
+    low = float(np.quantile(grey, 0.02))
+    high = float(np.sort(grey, axis=None)[-BRIGHT_PIXELS:].min())
+    share = np.clip((grey - low) / max(high - low, 0.15 * high, 1.0), 0, 1)
+    stretched = 255 * share**GAMMA
     return cv2.imencode(".jpg", stretched.astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 82])[1].tobytes()
 
 
@@ -63,9 +67,10 @@ def _overlay(content: ReportContent, camera: int, picture: str | None) -> Figure
     d = content.detections
     rows = np.flatnonzero((d.camera == camera) & (d.snapshot == content.frame_snapshot))[: blobs_drawn(content)]
     used = content.used[rows] if content.used.any() else content.labels[rows] >= 0
+    scale = min(max((60 / max(len(rows), 1)) ** 0.5, 0.45), 1.0)
     data = [
-        _marks("labelled", d.uv[rows[used]], _words(content, rows[used])),
-        _marks("unlabelled", d.uv[rows[~used]], _words(content, rows[~used])),
+        _marks("labelled", d.uv[rows[used]], _words(content, rows[used]), scale),
+        _marks("unlabelled", d.uv[rows[~used]], _words(content, rows[~used]), scale),
     ]
     for layer, predicted in (("before", content.predicted_before), ("after", content.predicted_after)):
         if predicted is None:
@@ -75,7 +80,7 @@ def _overlay(content: ReportContent, camera: int, picture: str | None) -> Figure
         words = [f"fiducial {content.labels[r]}, {layer}: {s:.2f} px off" for r, s in zip(shown, size, strict=True)]
         if layer == "before":
             data.append(_links(d.uv[shown], predicted[shown]))
-        data.append(_marks(layer, predicted[shown], words))
+        data.append(_marks(layer, predicted[shown], words, scale))
     return {"data": data, "layout": _layout(width, height, picture, d.uv[rows[used]])}
 
 
@@ -84,9 +89,10 @@ def _words(content: ReportContent, rows: NDArray[np.int64]) -> list[str]:
     return [f"fiducial {f}" if f >= 0 else "unlabelled" for f in label]
 
 
-def _marks(layer: str, uv: Array, words: list[str]) -> Figure:
+def _marks(layer: str, uv: Array, words: list[str], scale: float) -> Figure:
     symbol, colour, size, name = SYMBOLS[layer]
-    marker = {"symbol": symbol, "size": size, "color": colour, "line": {"color": colour, "width": 1.8}}
+    line = {"color": colour, "width": 1.8}
+    marker = {"symbol": symbol, "size": round(size * scale, 1), "color": colour, "line": line}
     return {
         "type": "scatter", "mode": "markers", "name": name, "meta": layer, "marker": marker, "text": words,
         "hoverinfo": "text+x+y", "x": uv[:, 0].round(2).tolist(), "y": uv[:, 1].round(2).tolist(),
@@ -109,12 +115,17 @@ def _layout(width: int, height: int, picture: str | None, uv: Array) -> Figure:
     """Axes in full-resolution pixels; `meta.near` is the part around the object, for looking closer."""
     near = [-0.5, width - 0.5, -0.5, height - 0.5]
     if len(uv):
-        low, high = uv.min(axis=0), uv.max(axis=0)
-        half = 0.6 * max(*(high - low), 60.0 * height / width, (high - low)[1] * width / height) + 10
-        centre = (low + high) / 2
-        near = [centre[0] - half, centre[0] + half, centre[1] - half * height / width, centre[1] + half * height / width]
-    axis = {"showgrid": False, "zeroline": False, "color": "var(--muted)", "tickfont": {"size": 10}, "ticks": "outside", "ticklen": 3}
-    outline = {"type": "rect", "x0": -0.5, "y0": -0.5, "x1": width - 0.5, "y1": height - 0.5, "line": {"color": "var(--line)", "width": 1}}
+        (left, top), (right, bottom) = uv.min(axis=0), uv.max(axis=0)
+        half_width = 0.6 * max(right - left, (bottom - top) * width / height) + 20
+        half_height = half_width * height / width
+        u, v = (left + right) / 2, (top + bottom) / 2
+        near = [u - half_width, u + half_width, v - half_height, v + half_height]
+    axis = {
+        "showgrid": False, "zeroline": False, "color": "var(--muted)", "tickfont": {"size": 10}, "ticks": "outside",
+        "ticklen": 3,
+    }  # fmt: skip
+    edge = {"color": "var(--line)", "width": 1}
+    outline = {"type": "rect", "x0": -0.5, "y0": -0.5, "x1": width - 0.5, "y1": height - 0.5, "line": edge}
     layout: Figure = {
         "margin": {"l": 34, "r": 4, "t": 4, "b": 22}, "showlegend": False, "hovermode": "closest", "dragmode": "zoom",
         "xaxis": {**axis, "range": [-0.5, width - 0.5], "constrain": "domain"},
@@ -128,8 +139,3 @@ def _layout(width: int, height: int, picture: str | None, uv: Array) -> Figure:
             "sizing": "stretch", "layer": "below", "yanchor": "top", "xanchor": "left",
         }]  # fmt: skip
     return layout
-
-
-def legend_name(layer: str) -> str:
-    """Words for a layer, escaped."""
-    return escape(SYMBOLS[layer][3])

@@ -17,7 +17,7 @@ from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
 from imgcal.formats.atomic import write_text
-from imgcal.report import charts, overlay, scene, tables
+from imgcal.report import charts, overlay, scene, svg, tables
 from imgcal.report.content import MOVED, UNDETERMINED, ReportContent
 from imgcal.report.verdict import judge
 from imgcal.rig import PARAMETER_NAMES
@@ -84,9 +84,8 @@ def _resource(name: str) -> str:
 
 def _policy(script: str) -> str:
     """Forbid the page every connection, and every script but the two that it carries."""
-    hashes = " ".join(
-        f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'" for text in (get_plotlyjs(), script)
-    )
+    digests = (hashlib.sha256(text.encode()).digest() for text in (get_plotlyjs(), script))
+    hashes = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
     return (
         f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data: blob:; "
         "base-uri 'none'; form-action 'none'"
@@ -129,6 +128,7 @@ def _residuals(content: ReportContent) -> dict[str, object] | None:
         "beyond": f"{100 * beyond:.2g} %",
         "cameras": charts.rms_by_camera(content),
         "fiducials": charts.rms_by_fiducial(content),
+        "median": svg.pixels(float(np.nanmedian(charts.fiducial_rms(content)))),
         "shown": len(rows),
         "total": int(content.used.sum()),
     }
@@ -143,7 +143,7 @@ def _coverage(content: ReportContent) -> dict[str, object]:
         Panel(
             name,
             charts.coverage_panel(content, i, limits),
-            f"{counts[i]} {'used' if content.used.any() else 'found'}, {100 * charts.covered_share(content, i):.0f} % of the image",
+            f"{svg.grouped(int(counts[i]))} blobs, {100 * charts.covered_share(content, i):.0f} %",
         )
         for i, name in enumerate(content.cameras)
     ]
@@ -182,7 +182,7 @@ def _subsampling(content: ReportContent) -> list[str]:
     notes = []
     used = int(content.used.sum())
     if used > charts.LARGEST_SCATTER:
-        notes.append(f"The scatter shows {charts.LARGEST_SCATTER} of {used} residuals.")
+        notes.append(f"The scatter shows {svg.grouped(charts.LARGEST_SCATTER)} of {svg.grouped(used)} residuals.")
     panel = charts.panel_size(content)
     if len(content.detections) and int(np.bincount(content.detections.camera).max()) > panel:
         notes.append(f"The coverage shows at most {panel} observations of each camera.")
@@ -190,7 +190,7 @@ def _subsampling(content: ReportContent) -> list[str]:
     total = 0 if content.object_points is None else len(content.object_points)
     known = sum(not s.reason for s in content.snapshots)
     if len(snapshots) and (len(snapshots) < known or len(fiducials) < total):
-        notes.append(f"The rig in 3D shows {len(snapshots)} snapshots and {len(fiducials)} of {total} fiducials in each.")
+        notes.append(f"The rig shows {len(snapshots)} snapshots and {len(fiducials)} of {total} fiducials in each.")
     d = content.detections
     in_frame = np.bincount(d.camera[d.snapshot == content.frame_snapshot], minlength=1)
     if int(in_frame.max()) > overlay.blobs_drawn(content):

@@ -16,13 +16,14 @@ from imgcal.rig import CameraRig
 Figure = dict[str, Any]  # {"data": [...], "layout": {...}} of plotly; colours may be "var(--name)" of the style sheet
 
 EXAGGERATIONS = (1, 2, 5, 10, 20, 50, 100)
+CLOUD_COLOURS = [[0, "#4f83e8"], [0.5, "#b860c4"], [1, "#f0a030"]]  # first to last snapshot, on light and on dark
 LARGEST_CLOUD = 6000  # fiducials drawn, of all snapshots together
 
 
 def rig_figure(content: ReportContent) -> Figure:
-    """Build the figure of the rig. The recalibrated cameras' coordinates for each exaggeration stand in `layout.meta`.
+    """Build the figure of the rig; `layout.meta` holds the recalibrated cameras for each exaggeration.
 
-    Convention: drawn in the factory's rig frame, with the recalibrated rig placed so that the reference cameras coincide.
+    Convention: drawn in the factory's rig frame; the recalibrated rig lies so that the reference cameras coincide.
     """
     factory = content.factory.to(torch.float64)
     poses = _object_points(content, factory)
@@ -37,7 +38,8 @@ def rig_figure(content: ReportContent) -> Figure:
         frustums = [_frustums(rig, length) for rig in drawn]
         arrows = [_joined(np.stack((centres, rig.positions.cpu().numpy()), axis=1)) for rig in drawn]
         moving = [[_columns(points) for points in steps] for steps in (frustums, arrows)]
-        meta = {"factors": factors, "start": start, "moving": [{"trace": 1 + i, "steps": s} for i, s in enumerate(moving)]}
+        traces = [{"trace": 1 + i, "steps": steps} for i, steps in enumerate(moving)]
+        meta = {"factors": factors, "start": start, "moving": traces}
         data.append(_lines("recalibrated", frustums[start], "var(--after)", 4))
         data.append(_lines("shift of the centre", arrows[start], "var(--before)", 5))
     data.append(_labels(centres, names, length))
@@ -58,7 +60,7 @@ def drawn_fiducials(content: ReportContent) -> tuple[NDArray[np.int64], NDArray[
 
 
 def _spread(count: int, largest: int) -> NDArray[np.int64]:
-    return np.unique(np.linspace(0, count - 1, min(count, largest)).round().astype(np.int64)) if count else np.zeros(0, np.int64)
+    return np.linspace(0, max(count - 1, 0), min(count, largest)).round().astype(np.int64)
 
 
 def _object_points(content: ReportContent, factory: CameraRig) -> Array | None:
@@ -89,7 +91,7 @@ def _exaggerated(content: ReportContent, factor: float) -> CameraRig:
 
 def _exaggerations(content: ReportContent, length: float) -> tuple[list[int], int]:
     """Factors to choose from, and the one to start with: changes that can be seen but do not tear the rig apart."""
-    if content.change is None:
+    if content.change is None or len(content.cameras) == 1:
         return [1], 0
     angle = float(np.linalg.norm(content.change[:, :3], axis=1).max())
     shift = float(np.linalg.norm(content.change[:, 3:6], axis=1).max())
@@ -155,7 +157,7 @@ def _labels(centres: Array, names: list[str], length: float) -> Figure:
     font = {"size": 11, "color": "var(--ink)"}
     return {
         "type": "scatter3d", "mode": "text", "name": "camera names", "text": names, "textfont": font,
-        "hoverinfo": "skip", **_xyz(away),
+        "showlegend": False, "hoverinfo": "skip", **_xyz(away),
     }  # fmt: skip
 
 
@@ -164,7 +166,7 @@ def _cloud(content: ReportContent, points: Array) -> Figure:
     names = [escape(content.detections.snapshot_names[s], quote=False) for s in snapshots]
     hover = [f"fiducial {f}, snapshot {name}" for name in names for f in fiducials]
     colour = np.repeat(np.arange(len(snapshots)), len(fiducials)).tolist()
-    marker = {"size": 2.6 if len(hover) < 1500 else 1.6, "color": colour, "colorscale": "Viridis", "opacity": 0.9}
+    marker = {"size": 2.6 if len(hover) < 1500 else 1.6, "color": colour, "colorscale": CLOUD_COLOURS, "opacity": 0.9}
     return {
         "type": "scatter3d", "mode": "markers", "name": "fiducials, by snapshot", "marker": marker, "hovertext": hover,
         "hoverinfo": "text", **_xyz(points.reshape(-1, 3)),
@@ -177,7 +179,8 @@ def _axes(length: float) -> Figure:
     ends[np.arange(3), 1, np.arange(3)] = length
     trace = _lines("rig axes", _joined(ends), "var(--muted)", 3)
     label = [text for axis in ("x", "y", "z") for text in ("", axis, "")]
-    return {**trace, "mode": "lines+text", "text": label, "textfont": {"size": 11, "color": "var(--muted)"}}
+    font = {"size": 11, "color": "var(--muted)"}
+    return {**trace, "showlegend": False, "mode": "lines+text", "text": label, "textfont": font}
 
 
 def _layout(meta: Figure, *, has_object: bool) -> Figure:
@@ -185,12 +188,13 @@ def _layout(meta: Figure, *, has_object: bool) -> Figure:
         "color": "var(--muted)", "gridcolor": "var(--line)", "zerolinecolor": "var(--line)", "showbackground": False,
         "showspikes": False, "tickfont": {"size": 10},
     }  # fmt: skip
-    eye = {"x": -1.35, "y": -0.75, "z": -0.55} if has_object else {"x": -0.9, "y": -0.9, "z": -1.3}
+    eye = {"x": -1.45, "y": -0.7, "z": -0.75} if has_object else {"x": -1.2, "y": -1.1, "z": -1.7}
     return {
         "height": 560, "margin": {"l": 0, "r": 0, "t": 0, "b": 0}, "meta": meta,
         "legend": {"orientation": "h", "x": 0, "y": 1, "font": {"size": 12}, "bgcolor": "rgba(0,0,0,0)"},
         "scene": {
-            "aspectmode": "data", "camera": {"eye": eye, "up": {"x": 0, "y": -1, "z": 0}}, "dragmode": "orbit",
+            "domain": {"y": [0, 0.94]}, "aspectmode": "data", "dragmode": "orbit",
+            "camera": {"eye": eye, "up": {"x": 0, "y": -1, "z": 0}},
             **{f"{name}axis": {**axis, "title": {"text": f"{name} (mm)", "font": {"size": 11}}} for name in "xyz"},
         },
     }  # fmt: skip

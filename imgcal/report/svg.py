@@ -75,7 +75,8 @@ def dots(x: Array, y: Array, kind: str, per_path: int = DOTS_PER_PATH) -> str:
 
 def polyline(x: Array, y: Array, kind: str) -> str:
     """Draw a line through points."""
-    return f'<path class="{kind}" d="M' + "L".join(f"{number(a)} {number(b)}" for a, b in zip(x, y, strict=True)) + '"/>'
+    steps = "L".join(f"{number(a)} {number(b)}" for a, b in zip(x, y, strict=True))
+    return f'<path class="{kind}" d="M{steps}"/>'
 
 
 def grid(axes: Axes, x_title: str = "", y_title: str = "", *, count: int = 5, log_x: bool = False) -> str:
@@ -103,7 +104,7 @@ def grid(axes: Axes, x_title: str = "", y_title: str = "", *, count: int = 5, lo
 def ticks(low: float, high: float, count: int = 5) -> list[float]:
     """Choose round numbers between two limits, in either order."""
     low, high = min(low, high), max(low, high)
-    raw = max((high - low) / count, 1e-12)
+    raw = 0.7 * max((high - low) / count, 1e-12)
     power = 10.0 ** math.floor(math.log10(raw))
     step = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= raw * 0.999)
     return [round(i * step, 12) for i in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
@@ -118,6 +119,17 @@ def number(value: float) -> str:
     """Write a coordinate, to a tenth of a unit."""
     rounded = f"{value:.1f}".removesuffix(".0")
     return "0" if rounded == "-0" else rounded
+
+
+def grouped(count: int) -> str:
+    """Write a large number with narrow spaces between thousands."""
+    return f"{count:,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+
+
+def pixels(value: float) -> str:
+    """Write an error in pixels, to about three digits."""
+    digits = 0 if value >= 100 else 1 if value >= 10 else 2 if value >= 1 else 3
+    return f"{value:.{digits}f}" if value >= 0.01 or value == 0 else f"{value:.2g}"
 
 
 def shortened(name: str, length: int = 16) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from imgcal.report import svg
 from imgcal.report.content import ReportContent
 from imgcal.rig import PARAMETER_NAMES
 
@@ -87,7 +88,7 @@ def knowledge(content: ReportContent) -> list[list[Knowledge]]:
     for camera, name in enumerate(content.cameras):
         cells = []
         for i, parameter in enumerate(PARAMETER_NAMES):
-            if prior[camera, i] <= 0:
+            if content.fixed[camera, i]:
                 fixed = "reference" if camera == content.reference and i < 6 else "fixed"
                 cells.append(Knowledge("·", 0, False, f"{name} {parameter}: {fixed}"))
                 continue
@@ -121,7 +122,7 @@ def _changes(
         spread = math.nan if content.std is None else content.std[camera, i]
         change, std = signed(content.change[camera, i] * factor, spread * factor)
         kind = "moved" if content.moved[camera, i] else "unknown" if content.undetermined[camera, i] else ""
-        if spread == 0:
+        if content.fixed[camera, i]:
             kind = "fixed"
         value = "" if absolute is None else f"{name} = {float(absolute[k]):.6g}"
         cells.append(Change(name, change, std, kind, value))
@@ -129,8 +130,9 @@ def _changes(
 
 
 def _sign(text: str) -> str:
-    return text.replace("-", MINUS)
+    zero = not any(digit in text for digit in "123456789")
+    return text.replace("-", "+" if zero else MINUS)
 
 
 def _pixels(value: float) -> str:
-    return "" if math.isnan(value) else f"{value:.3g}"
+    return "" if math.isnan(value) else svg.pixels(value)

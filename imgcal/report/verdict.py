@@ -10,6 +10,7 @@ import numpy as np
 
 from imgcal.report.charts import duration
 from imgcal.report.content import MOVED, ReportContent
+from imgcal.report.svg import grouped, pixels
 
 GOOD_CHI2 = 1.5  # above, the residuals are larger than the stated noise
 SMALL_CHI2 = 0.5  # below, the noise was overstated
@@ -18,8 +19,8 @@ FEW_OBSERVATIONS = 15  # of a camera: fewer than its parameters
 IDENTITY = {
     "coded": "The fiducials came labelled with the input.",
     "unique": "Every fiducial was recognized, and only one labelling explains what the cameras saw.",
-    "by_prior": "The object can be turned into itself; the factory calibration and the pose decided which way round it is.",
-    "by_tracking": "The labels were carried from snapshot to snapshot; a look-alike position was excluded by the motion.",
+    "by_prior": "The object can be turned into itself; the known pose decided which way round it is.",
+    "by_tracking": "The labels were carried from snapshot to snapshot; the motion excluded look-alike positions.",
     "ambiguous": (
         "The object can be turned into itself, so its absolute orientation is not known. All cameras use the same "
         "choice, so the rig is valid."
@@ -53,7 +54,8 @@ def judge(content: ReportContent) -> Verdict:
     if content.status == "refused" or content.recalibrated is None:
         return _refused(content)
     reservations = _reservations(content)
-    found = (_improvement(content), *_movement(content), IDENTITY.get(content.identity, f"Identity: {content.identity}."))
+    identity = IDENTITY.get(content.identity, f"Identity: {content.identity}.")
+    found = (_improvement(content), *_movement(content), identity)
     if content.reason:
         found = (*found, content.reason)
     if reservations:
@@ -65,15 +67,15 @@ def judge(content: ReportContent) -> Verdict:
     return Verdict("good", headline, found, (), (_CHECK, _KEEP), _figures(content))
 
 
-_CHECK = "Check the new rig on snapshots that took no part here: imgcal score NEW_CAPTURE --rig rig.yaml --object OBJECT."
+_CHECK = "Check the new rig on snapshots that took no part here: imgcal score CAPTURE --rig rig.yaml --object OBJECT."
 _KEEP = "Then use rig.yaml in place of the factory file; keep the factory file for the next recalibration."
 
 
 def _improvement(content: ReportContent) -> str:
-    after = f"{content.rms_after:.3g} px"
+    after = f"{pixels(content.rms_after)} px"
     if not math.isfinite(content.rms_before):
         return f"The reprojection error is {after} (RMS over both axes)."
-    return f"The reprojection error fell from {content.rms_before:.3g} px to {after} (RMS over both axes)."
+    return f"The reprojection error went from {pixels(content.rms_before)} px to {after} (RMS over both axes)."
 
 
 def _movement(content: ReportContent) -> tuple[str, ...]:
@@ -101,16 +103,16 @@ def _reservations(content: ReportContent) -> list[tuple[str, str]]:
     if content.chi2_per_dof > GOOD_CHI2:
         larger = math.sqrt(content.chi2_per_dof)
         notes.append((
-            f"The errors are about {larger:.1f} times as large as the noise of the detections (chi² per degree of freedom "
-            f"{content.chi2_per_dof:.2f}): something is not in the model, or some labels are wrong, and the true "
+            f"The errors are about {larger:.1f} times as large as the noise of the detections (chi² per degree of "
+            f"freedom {content.chi2_per_dof:.2f}): the model lacks something, or some labels are wrong, and the true "
             "uncertainties are larger than those stated below.",
             "Look at the residuals and overlays below: one bad camera, fiducial or snapshot stands out. Check the "
             "object's measurements and the factory file.",
         ))  # fmt: skip
     elif content.chi2_per_dof < SMALL_CHI2:
         notes.append((
-            f"The errors are smaller than the stated noise (chi² per degree of freedom {content.chi2_per_dof:.2f}): the "
-            "uncertainties below are too cautious.",
+            f"The errors are smaller than the stated noise (chi² per degree of freedom {content.chi2_per_dof:.2f}): "
+            "the uncertainties below are too cautious.",
             "",
         ))  # fmt: skip
     if content.rms_after > content.rms_before:
@@ -123,7 +125,7 @@ def _reservations(content: ReportContent) -> list[tuple[str, str]]:
         ))  # fmt: skip
     few = [name for name, n in zip(content.cameras, content.observations, strict=True) if 0 < n < FEW_OBSERVATIONS]
     if few:
-        notes.append((f"Few observations in {_listed(few)}.", "Capture more snapshots, with the object seen by all cameras."))
+        notes.append((f"Few observations in {_listed(few)}.", "Capture more snapshots, seen by all cameras."))
     rejected = sum(bool(s.reason) for s in content.snapshots)
     if rejected > 0.2 * max(len(content.snapshots), 1):
         notes.append((
@@ -141,23 +143,23 @@ def _reservations(content: ReportContent) -> list[tuple[str, str]]:
 
 
 def _undetermined_share(content: ReportContent) -> float:
-    if content.prior_std is None or not (content.prior_std > 0).any():
-        return 0.0
-    return float(content.undetermined.sum() / (content.prior_std > 0).sum())
+    free = int((~content.fixed).sum())
+    return int(content.undetermined.sum()) / free if free else 0.0
 
 
 def _figures(content: ReportContent) -> tuple[KeyFigure, ...]:
     total, used = len(content.snapshots), sum(not s.reason for s in content.snapshots)
     moved = int(content.moved[:, :6].any(axis=1).sum())
-    before = f"{content.rms_before:.3g} → " if math.isfinite(content.rms_before) else ""
+    before = f"{pixels(content.rms_before)} → " if math.isfinite(content.rms_before) else ""
+    note = "RMS, before → after" if before else "RMS"
     figures = [
-        KeyFigure(f"{before}{content.rms_after:.3g} px", "reprojection error", "RMS, before → after" if before else "RMS"),
-        KeyFigure(f"{content.chi2_per_dof:.2f}", "chi² per degree of freedom", "1 = as the noise says"),
+        KeyFigure(f"{before}{pixels(content.rms_after)} px", "reprojection error", note),
+        KeyFigure(f"{content.chi2_per_dof:.2f}", "chi² per dof", "1: as the noise says"),
         KeyFigure(f"{used} / {total}", "snapshots used"),
-        KeyFigure(f"{int(content.used.sum()):,} / {len(content.detections):,}".replace(",", " "), "blobs used"),
+        KeyFigure(f"{grouped(int(content.used.sum()))} / {grouped(len(content.detections))}", "blobs used"),
     ]
     if len(content.cameras) > 1:
-        figures.append(KeyFigure(f"{moved} / {len(content.cameras) - 1}", "cameras moved", f"more than {MOVED:g} standard deviations"))
+        figures.append(KeyFigure(f"{moved} / {len(content.cameras) - 1}", "cameras moved", f"beyond {MOVED:g} std"))
     if content.seconds:
         figures.append(KeyFigure(duration(sum(content.seconds.values())), "computing time"))
     return tuple(figures)
@@ -167,32 +169,42 @@ def _refused(content: ReportContent) -> Verdict:
     d = content.detections
     blobs = np.bincount(d.camera, minlength=len(content.cameras))
     labelled = int((content.labels >= 0).sum())
-    found = [content.reason or "The data do not decide between several answers.", "No calibration was written; keep the one in use."]
-    help_with = []
-    if not len(d):
-        help_with.append("No blob was found: check exposure, the infrared light, and the polarity (bright or dark markers).")
-    blind = [name for name, n in zip(content.cameras, blobs, strict=True) if n == 0]
-    if blind and len(d):
-        help_with.append(f"Nothing was found in {_listed(blind)}: check exposure and cabling, or that the object is in view.")
-    if len(d) and labelled < 0.5 * len(d):
-        help_with.append(
-            f"{len(d) - labelled} of {len(d)} blobs could not be labelled: cover reflections or mask them, and check that the "
-            "object file is that of the object in the images."
-        )
-    help_with.append("Check that the factory file belongs to this rig and that no camera was exchanged.")
-    help_with.append("Capture more snapshots, with the whole object in view of as many cameras as possible and in varied poses.")
     total = len(content.snapshots)
     used = sum(not s.reason for s in content.snapshots)
     figures = [
         KeyFigure(f"{used} / {total}", "snapshots accepted"),
-        KeyFigure(f"{len(d):,}".replace(",", " "), "blobs found"),
-        KeyFigure(f"{labelled:,}".replace(",", " "), "blobs labelled"),
+        KeyFigure(grouped(len(d)), "blobs found"),
+        KeyFigure(grouped(labelled), "blobs labelled"),
         KeyFigure(f"{int((blobs > 0).sum())} / {len(blobs)}", "cameras with blobs"),
     ]
     if content.seconds:
         figures.append(KeyFigure(duration(sum(content.seconds.values())), "computing time"))
     headline = "Refused: the data cannot decide the calibration"
-    return Verdict("refused", headline, tuple(found), (), tuple(help_with), tuple(figures))
+    reason = content.reason or "The data do not decide between several answers."
+    found = (reason, "No calibration was written; keep the one in use.")
+    return Verdict("refused", headline, found, (), tuple(_helpful(content)), tuple(figures))
+
+
+def _helpful(content: ReportContent) -> list[str]:
+    """What would help a refused run, as far as the detections show."""
+    blobs = np.bincount(content.detections.camera, minlength=len(content.cameras))
+    total, labelled = len(content.detections), int((content.labels >= 0).sum())
+    blind = [name for name, n in zip(content.cameras, blobs, strict=True) if n == 0]
+    steps = []
+    if total == 0:
+        steps.append("No blob was found: check exposure, infrared light, and the polarity (bright or dark markers).")
+    elif blind:
+        steps.append(
+            f"Nothing was found in {_listed(blind)}: check exposure and cabling, and bring the object into view."
+        )
+    if labelled < 0.5 * total:
+        steps.append(
+            f"{grouped(total - labelled)} of {grouped(total)} blobs could not be labelled: cover or mask reflections, and "
+            "check that the object file is that of the object in the images."
+        )
+    steps.append("Check that the factory file belongs to this rig and that no camera was exchanged.")
+    steps.append("Capture more snapshots, the whole object in view of as many cameras as possible, in varied poses.")
+    return steps
 
 
 def _listed(names: list[str]) -> str:

@@ -1,7 +1,12 @@
 "use strict";
 (function () {
   const root = document.documentElement;
-  const config = {displaylogo: false, responsive: true, showTips: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"]};
+  // Named buttons only: plotly's own choice has one that sends the figure to its makers' server.
+  const config = {displaylogo: false, responsive: true, showTips: false, showSendToCloud: false, plotlyServerURL: ""};
+  const buttons = {
+    flat: [["toImage"], ["zoom2d", "pan2d"], ["zoomIn2d", "zoomOut2d", "resetScale2d"]],
+    scene: [["toImage"], ["zoom3d", "pan3d", "orbitRotation"], ["resetCameraDefault3d"]],
+  };
   const drawn = new Set();
   const view = {eye: null, revision: 0};
   const probe = document.body.appendChild(document.createElement("span"));
@@ -30,7 +35,7 @@
       paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", uirevision: "kept", autosize: true,
       font: {family: getComputedStyle(document.body).fontFamily, color: colour("var(--ink)")},
       hoverlabel: {bgcolor: colour("var(--page)"), bordercolor: colour("var(--line)"), font: {color: colour("var(--ink)"), size: 12}},
-      modebar: {bgcolor: "rgba(0,0,0,0)", color: colour("var(--muted)"), activecolor: colour("var(--ink)")},
+      modebar: {bgcolor: colour("var(--panel)"), color: colour("var(--muted)"), activecolor: colour("var(--ink)")},
     });
     if (layout.scene) {
       const factor = box("#factor");
@@ -51,7 +56,7 @@
       layout.uirevision = near ? "near" : "whole";
     }
     drawn.add(div);
-    Plotly.react(div, figure.data, layout, config);
+    Plotly.react(div, figure.data, layout, {...config, modeBarButtons: layout.scene ? buttons.scene : buttons.flat});
   }
   function redraw(filter) {
     drawn.forEach((div) => { if (!filter || filter(div)) draw(div); });

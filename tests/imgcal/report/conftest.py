@@ -1,10 +1,11 @@
-"""Contents of reports as the pipeline would fill them."""
+"""Contents of reports as the pipeline would fill them, and fixtures of the usual ones."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
 from imgcal.estimation import EstimationOptions, estimate, relative_covariance
@@ -14,13 +15,57 @@ from imgcal.report import ReportContent, SnapshotSummary, relative_prior_std
 from imgcal.resources import data_path
 from imgcal.rig import PARAMETERS, CameraRig
 from imgcal.synthesis import PhysicalDrift, PoseRange, sample_rig_from_object, synthesize
-from imgcal.transforms import RigidTransform
 
 SIGMA = 0.05
 
 
+@pytest.fixture(scope="session")
+def content() -> ReportContent:
+    """A sound recalibration of ten cameras, with frames and clutter."""
+    return calibrated()
+
+
+@pytest.fixture(scope="session")
+def refused_content(content: ReportContent) -> ReportContent:
+    """The same images, refused."""
+    return refused(content)
+
+
+@pytest.fixture(scope="session")
+def single_content() -> ReportContent:
+    """One camera, without clutter."""
+    return calibrated(3, cameras=1, clutter=0)
+
+
+@pytest.fixture(scope="session")
+def plain_content() -> ReportContent:
+    """Detections alone, without frames."""
+    return calibrated(4, frames=False)
+
+
+@pytest.fixture(scope="session")
+def large_content(content: ReportContent) -> ReportContent:
+    """300 snapshots of 10 cameras and 400 fiducials."""
+    return enlarged(content, 300, 400)
+
+
+@pytest.fixture(scope="session")
+def empty_content(refused_content: ReportContent) -> ReportContent:
+    """Refused because nothing at all was found."""
+    none = np.zeros(len(refused_content.labels), dtype=bool)
+    return replace(
+        refused_content, detections=refused_content.detections.select(none), labels=refused_content.labels[none],
+        frames=(), snapshots=(), seconds={}, command="", versions={}, seeds={},
+    )  # fmt: skip
+
+
 def calibrated(
-    snapshots: int = 6, *, cameras: int = 10, frames: bool = True, clutter: int = 3, object_name: str = "asymmetric8",
+    snapshots: int = 6,
+    *,
+    cameras: int = 10,
+    frames: bool = True,
+    clutter: int = 3,
+    object_name: str = "asymmetric8",
     seed: int = 1,
 ) -> ReportContent:
     """Recalibrate a drifted O10 from noisy detections with false blobs, and fill the content."""
@@ -93,9 +138,10 @@ def refused(content: ReportContent) -> ReportContent:
     )  # fmt: skip
 
 
-def enlarged(content: ReportContent, snapshots: int, fiducials: int, cameras: int) -> ReportContent:
+def enlarged(content: ReportContent, snapshots: int, fiducials: int) -> ReportContent:
     """Fake a capture of many blobs out of random numbers around the content's rig."""
     rng = np.random.default_rng(0)
+    cameras = len(content.cameras)
     shape = (snapshots, cameras, fiducials)
     count = int(np.prod(shape))
     snapshot, camera, fiducial = (index.ravel() for index in np.indices(shape))
@@ -110,8 +156,8 @@ def enlarged(content: ReportContent, snapshots: int, fiducials: int, cameras: in
     return replace(
         content, detections=detections, labels=fiducial,
         predicted_before=uv + rng.normal(0, 5, uv.shape), predicted_after=uv + rng.normal(0, SIGMA, uv.shape),
-        snapshots=tuple(SnapshotSummary(n, cameras * fiducials, cameras * fiducials) for n in detections.snapshot_names),
-        object_points=rng.uniform(-80, 80, (fiducials, 3)), rig_from_object=RigidTransform(poses.rotation[repeat], poses.translation[repeat]),
+        snapshots=tuple(SnapshotSummary(n, count // snapshots, count // snapshots) for n in detections.snapshot_names),
+        object_points=rng.uniform(-80, 80, (fiducials, 3)), rig_from_object=poses[repeat],
     )  # fmt: skip
 
 
@@ -122,7 +168,8 @@ def _detections(
     snapshots, cameras, _ = observations.seen.shape
     cell = observations.seen.nonzero().numpy()
     uv = observations.uv[observations.seen].numpy()
-    false = torch.rand((snapshots, cameras, clutter, 2), generator=generator).numpy() * rig.image_size.numpy()[None, :, None]
+    false = torch.rand((snapshots, cameras, clutter, 2), generator=generator).numpy()
+    false = false * rig.image_size.numpy()[None, :, None]
     false_cell = np.stack(np.indices((snapshots, cameras, clutter)), -1).reshape(-1, 3)
     false_cell[:, 2] = -1
     cell = np.concatenate((cell, false_cell))

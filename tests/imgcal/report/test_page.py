@@ -1,0 +1,190 @@
+"""The page as a whole: valid, self-contained, safe, complete, of bounded size."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from collections import Counter
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import plotly.graph_objects as go
+import pytest
+from plotly.offline import get_plotlyjs
+
+from imgcal.errors import InputError
+from imgcal.report import ReportContent, SnapshotSummary, overlay, render, write_report
+
+KINDS = ("content", "refused_content", "single_content", "plain_content", "empty_content")
+SECTIONS = ["status", "residuals", "coverage", "rig", "overlays", "cameras", "knowledge", "run"]
+VOID = {"meta", "input", "br", "hr", "img", "link"}
+HOSTILE = "<img src=x onerror=alert(1)></script>&amp;\"'{{7*7}}"
+
+
+class Page(HTMLParser):
+    """Parse strictly: every element is closed by its own end tag."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.elements: list[tuple[str, dict[str, str]]] = []
+        self.scripts: list[str] = []
+        self.figures: dict[str, dict[str, object]] = {}
+        self.text = ""
+        self.feed(html)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, {name: value or "" for name, value in attrs}))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, {name: value or "" for name, value in attrs}))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] == "script":
+            attributes = self.elements[-1][1]
+            if attributes.get("type") == "application/json":
+                self.figures[attributes["id"]] = json.loads(data)
+            else:
+                self.scripts.append(data)
+        elif not self.open or self.open[-1] != "style":
+            self.text += data
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def page(request: pytest.FixtureRequest) -> Page:
+    """Each kind of report, parsed."""
+    return Page(render(request.getfixturevalue(request.param)))
+
+
+def test_ids_are_unique_and_links_lead_somewhere(page: Page) -> None:
+    ids = Counter(attributes["id"] for _, attributes in page.elements if "id" in attributes)
+    assert max(ids.values()) == 1
+    targets = [a["href"].removeprefix("#") for tag, a in page.elements if tag == "a"]
+    targets += [a["for"] for _, a in page.elements if "for" in a]
+    targets += [a["aria-labelledby"] for _, a in page.elements if "aria-labelledby" in a]
+    targets += [a["data-figure"] for _, a in page.elements if "data-figure" in a]
+    assert targets
+    assert set(targets) <= set(ids)
+
+
+def test_all_sections_in_order(page: Page) -> None:
+    assert [a["id"] for tag, a in page.elements if tag == "section"] == SECTIONS
+
+
+def test_pictures_have_names_and_controls_have_labels(page: Page) -> None:
+    for _, attributes in page.elements:
+        if attributes.get("role") == "img":
+            assert attributes["aria-label"]
+    buttons = [a for tag, a in page.elements if tag == "button"]
+    assert all(a["type"] == "button" for a in buttons)
+
+
+def test_nothing_is_fetched(page: Page) -> None:
+    for tag, attributes in page.elements:
+        assert tag not in {"link", "iframe", "object", "embed", "img", "base"}
+        assert "src" not in attributes
+        assert attributes.get("href", "#").startswith("#")
+        assert not any(name.startswith("on") for name in attributes)
+    assert "url(" not in "".join(str(a) for _, a in page.elements)
+
+
+def test_policy_forbids_connections_and_allows_exactly_the_scripts(page: Page) -> None:
+    policy = next(a["content"] for tag, a in page.elements if a.get("http-equiv") == "Content-Security-Policy")
+    assert policy.startswith("default-src 'none'; ")
+    hashes = {base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in page.scripts}
+    assert len(page.scripts) == 2
+    assert set(re.findall(r"'sha256-([^']+)'", policy)) == hashes
+
+
+def test_figures_are_valid_plotly(page: Page) -> None:
+    for name, figure in page.figures.items():
+        concrete = json.loads(re.sub(r"var\(--\w+\)", "#123456", json.dumps(figure)))
+        built = go.Figure(concrete)
+        for trace in built.data:
+            assert len(trace.x) == len(trace.y)
+        assert name == "rig-figure" or built.layout.yaxis.range[0] > built.layout.yaxis.range[1]
+
+
+def test_plotly_cannot_send_the_data(content: ReportContent) -> None:
+    html = render(content)
+    assert "showSendToCloud: false" in html
+    assert "modeBarButtons:" in html
+
+
+def test_wart_plotly_offers_to_send_the_data_by_default() -> None:
+    assert re.search(r"showSendToCloud:\{valType:\"boolean\",dflt:!0\}", get_plotlyjs())
+
+
+@pytest.mark.parametrize("kind", ["content", "refused_content"])
+def test_strings_of_users_stay_strings(kind: str, request: pytest.FixtureRequest) -> None:
+    content: ReportContent = request.getfixturevalue(kind)
+    names = (HOSTILE, *content.cameras[1:])
+    snapshots = tuple(HOSTILE for _ in content.detections.snapshot_names)
+    hostile = replace(
+        content,
+        title=HOSTILE,
+        reason=HOSTILE,
+        identity=HOSTILE,
+        factory=replace(content.factory, camera_names=names),
+        recalibrated=content.recalibrated and replace(content.recalibrated, camera_names=names),
+        detections=replace(content.detections, camera_names=names, snapshot_names=snapshots),
+        snapshots=tuple(SnapshotSummary(HOSTILE, 1, 0, HOSTILE) for _ in snapshots),
+        seconds={HOSTILE: 1.0},
+        command=HOSTILE,
+        versions={HOSTILE: HOSTILE},
+        seeds={HOSTILE: 1},
+    )
+    calm, page = Page(render(content)), Page(render(hostile))
+    assert {tag for tag, _ in page.elements} == {tag for tag, _ in calm.elements}
+    assert len(page.scripts) == 2
+    assert page.text.count(HOSTILE) >= 10
+    plots = json.dumps(page.figures)
+    assert "<img" not in plots
+    assert "&lt;img" in plots
+
+
+def test_same_content_gives_the_same_page(content: ReportContent) -> None:
+    assert render(content) == render(replace(content))
+
+
+def test_usual_page_is_small(content: ReportContent) -> None:
+    assert len(render(content).encode()) < 8_000_000
+
+
+def test_large_capture_is_thinned_and_says_so(large_content: ReportContent) -> None:
+    html = render(large_content)
+    assert len(html.encode()) < 15_000_000
+    page = Page(html)
+    assert "drawings show a random or even selection" in page.text
+    assert "60 snapshots and 100 of 400 fiducials" in page.text
+
+
+def test_small_capture_is_drawn_in_full(content: ReportContent) -> None:
+    assert "selection" not in Page(render(content)).text
+
+
+def test_frames_of_many_cameras_stay_within_the_size(content: ReportContent) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (1088, 2048)).astype(np.uint8)
+    uris = overlay.picture_uris((noise,) * 40)
+    assert sum(len(uri) for uri in uris if uri) < 1.4 * overlay.LARGEST_FRAMES
+
+
+def test_file_is_written_whole_or_not_at_all(plain_content: ReportContent, tmp_path: Path) -> None:
+    path = tmp_path / "report.html"
+    path.write_text("old")
+    write_report(plain_content, path)
+    assert path.read_text(encoding="utf-8") == render(plain_content)
+    assert list(tmp_path.iterdir()) == [path]
+    with pytest.raises(InputError, match="missing"):
+        write_report(plain_content, tmp_path / "missing" / "report.html")

@@ -1,0 +1,74 @@
+"""Plain words: what makes a result trusted, doubted or refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from imgcal.report import ReportContent, SnapshotSummary
+from imgcal.report.verdict import judge
+
+
+def test_sound_result_is_trusted(content: ReportContent) -> None:
+    verdict = judge(content)
+    assert verdict.level == "good"
+    assert verdict.reservations == ()
+    assert 4 <= len(verdict.figures) <= 6
+    assert "9 of 9 cameras moved relative to cam01" in " ".join(verdict.found)
+
+
+@pytest.mark.parametrize(
+    ("chi2", "words"), [(9.0, "3.0 times as large as the noise"), (0.2, "smaller than the stated noise")]
+)
+def test_residuals_that_do_not_fit_the_noise(content: ReportContent, chi2: float, words: str) -> None:
+    verdict = judge(replace(content, chi2_per_dof=chi2))
+    assert verdict.level == "caution"
+    assert words in verdict.reservations[0]
+
+
+def test_camera_that_saw_nothing_is_named(content: ReportContent) -> None:
+    assert content.predicted_after is not None
+    blind = content.predicted_after.copy()
+    blind[content.detections.camera == 6] = np.nan
+    verdict = judge(replace(content, predicted_after=blind))
+    assert verdict.level == "caution"
+    assert any("No usable observations in cam07" in line for line in verdict.reservations)
+
+
+def test_rejected_snapshots_and_weak_data_are_said(content: ReportContent) -> None:
+    snapshots = tuple(SnapshotSummary(str(i), 80, 0, "blurred" if i < 2 else "") for i in range(6))
+    assert any("2 of 6 snapshots" in line for line in judge(replace(content, snapshots=snapshots)).reservations)
+    weak = replace(content, prior_std=content.std)
+    assert any("100 % of the parameters are not determined" in line for line in judge(weak).reservations)
+
+
+def test_error_that_rose_is_said(content: ReportContent) -> None:
+    verdict = judge(replace(content, rms_before=0.01))
+    assert "The error did not fall." in verdict.reservations
+
+
+def test_no_motion_is_said(content: ReportContent) -> None:
+    assert content.std is not None
+    still = replace(content, recalibrated=content.factory)
+    assert "No camera moved measurably" in judge(still).found[1]
+
+
+def test_ambiguous_identity_is_explained(content: ReportContent) -> None:
+    assert "absolute orientation is not known" in " ".join(judge(replace(content, identity="ambiguous")).found)
+
+
+def test_refusal_says_why_and_what_helps(refused_content: ReportContent, empty_content: ReportContent) -> None:
+    verdict = judge(refused_content)
+    assert verdict.level == "refused"
+    assert verdict.found[0] == refused_content.reason
+    assert any("could not be labelled" in step for step in verdict.next_steps)
+    assert 4 <= len(verdict.figures) <= 6
+    assert any("No blob was found" in step for step in judge(empty_content).next_steps)
+
+
+def test_single_camera_has_no_neighbours(single_content: ReportContent) -> None:
+    verdict = judge(single_content)
+    assert "One camera" in " ".join(verdict.found)
+    assert "cameras moved" not in {figure.name for figure in verdict.figures}
