@@ -1,0 +1,199 @@
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+
+from imgcal.cli.main import main
+from imgcal.estimation import relative_difference
+from imgcal.formats import load_detections, load_rig, load_rig_covariance, read_frame, save_detections, write_frame
+
+KEYS = {
+    "status", "reason", "identity", "rms_px_before", "rms_px_after", "chi2_per_dof", "snapshots_used",
+    "snapshots_rejected", "per_camera", "seconds",
+}  # fmt: skip
+
+
+def calibrate(workplace, source, out, *more):
+    arguments = ["calibrate", str(source), "--rig", str(workplace.rig), "--object", str(workplace.object)]
+    return main([*arguments, "--out", str(out), *more])
+
+
+def one_line(capsys):
+    error = capsys.readouterr().err
+    assert "Traceback" not in error
+    lines = [line for line in error.splitlines() if line.startswith("imgcal: ")]
+    assert len(lines) == 1, error
+    return lines[0]
+
+
+def test_frames_to_recalibrated_rig(workplace, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert calibrate(workplace, workplace.capture, out) == 0
+    result = json.loads((out / "result.json").read_text())
+    assert KEYS <= set(result)
+    assert result["status"] == "ok"
+    assert result["identity"] == "unique"
+    assert result["snapshots_used"] == 3
+    assert result["rms_px_after"] < 0.05 < result["rms_px_before"]
+    assert (out / "report.html").stat().st_size > 100_000
+    printed = capsys.readouterr().out
+    assert f"before {result['rms_px_before']:.3f} px" in printed and str(out / "report.html") in printed
+
+    truth, factory = load_rig(workplace.capture / "truth" / "rig.yaml"), load_rig(workplace.rig)
+    found = load_rig(out / "rig.yaml")
+    std = load_rig_covariance(out / "rig.yaml").std
+    error = relative_difference(found, truth)
+    assert found.prior == factory.prior
+    # Focal lengths: nearer to the truth than the factory's, and within 4.5 predicted standard deviations.
+    focal = error[:, 6:8]
+    assert focal.abs().mean() < relative_difference(factory, truth)[:, 6:8].abs().mean() / 2
+    assert (focal / std[:, 6:8]).abs().max() < 4.5
+
+
+def test_a_chosen_range_of_snapshots(workplace, tmp_path):
+    out = tmp_path / "out"
+    assert calibrate(workplace, workplace.capture, out, "--snapshots", "1:3", "--no-report") == 0
+    assert json.loads((out / "result.json").read_text())["snapshots_used"] == 2
+    assert not (out / "report.html").exists()
+
+
+def test_coded_detections(workplace, tmp_path):
+    out = tmp_path / "out"
+    assert calibrate(workplace, workplace.capture / "truth" / "detections.csv", out, "--no-report") == 0
+    result = json.loads((out / "result.json").read_text())
+    assert result["identity"] == "coded"
+    assert result["rms_px_after"] < 0.02
+
+
+def test_blobs_found_by_detect_give_the_same_rig(workplace, tmp_path):
+    table = tmp_path / "blobs.csv.gz"
+    assert main(["detect", str(workplace.capture), "--out", str(table), "--rig", str(workplace.rig)]) == 0
+    assert calibrate(workplace, table, tmp_path / "a", "--no-report") == 0
+    assert calibrate(workplace, workplace.capture, tmp_path / "b", "--no-report") == 0
+    first, second = load_rig(tmp_path / "a" / "rig.yaml"), load_rig(tmp_path / "b" / "rig.yaml")
+    assert first.difference(second).abs().max() < 1e-6
+
+
+def test_a_camera_that_sees_nothing_is_refused_unless_allowed(workplace, tmp_path, capsys):
+    blobs = load_detections(workplace.capture / "truth" / "detections.csv")
+    table = tmp_path / "blobs.csv"
+    save_detections(blobs.select(blobs.camera != 1), table)
+    out = tmp_path / "out"
+    (out).mkdir()
+    (out / "rig.yaml").write_text("of an earlier run")
+    assert calibrate(workplace, table, out) == 3
+    assert "cam02" in one_line(capsys)
+    result = json.loads((out / "result.json").read_text())
+    assert result["status"] == "refused" and "cam02" in result["reason"]
+    assert not (out / "rig.yaml").exists()
+    assert (out / "report.html").exists()
+    assert calibrate(workplace, table, out, "--blind-cameras", "--no-report") == 0
+    factory, found = load_rig(workplace.rig), load_rig(out / "rig.yaml")
+    assert np.allclose(found.focal_length[1], factory.focal_length[1])
+    assert calibrate(workplace, table, tmp_path / "less", "--without", "cam02", "--no-report") == 0
+    assert load_rig(tmp_path / "less" / "rig.yaml").camera_names == ("cam01", "cam03", "cam04")
+
+
+def test_too_few_fiducials_are_refused(workplace, tmp_path, capsys):
+    blobs = load_detections(workplace.capture / "truth" / "detections.csv")
+    table = tmp_path / "blobs.csv"
+    save_detections(blobs.select(blobs.fiducial < 3), table)
+    assert calibrate(workplace, table, tmp_path / "out", "--no-report") == 3
+    assert re.search("too few fiducials: found 3, expected at least 4", one_line(capsys))
+
+
+def test_residuals_that_do_not_fit_are_refused(workplace, tmp_path, capsys):
+    blobs = load_detections(workplace.capture / "truth" / "detections.csv")
+    noise = np.random.default_rng(0).normal(scale=6.0, size=blobs.uv.shape)
+    table = tmp_path / "blobs.csv"
+    blobs.uv[:] += noise
+    save_detections(blobs, table)
+    assert calibrate(workplace, table, tmp_path / "out", "--no-report") == 3
+    assert "do not fit" in one_line(capsys)
+
+
+@pytest.fixture
+def broken(workplace, tmp_path):
+    """A copy of the capture to damage."""
+    copy = tmp_path / "capture"
+    shutil.copytree(workplace.capture, copy)
+    return copy
+
+
+def test_empty_frames_are_refused(workplace, broken, tmp_path, capsys):
+    for path in broken.glob("frames/*/*.png"):
+        write_frame(path, np.full_like(read_frame(path), 15))
+    assert calibrate(workplace, broken, tmp_path / "out") == 3
+    assert "blobs" in one_line(capsys)
+    assert not (tmp_path / "out" / "rig.yaml").exists()
+
+
+def test_a_missing_camera_is_named(workplace, broken, tmp_path, capsys):
+    shutil.rmtree(broken / "frames" / "cam03")
+    assert calibrate(workplace, broken, tmp_path / "out", "--no-report") == 3
+    assert "cam03" in one_line(capsys)
+
+
+def test_a_missing_frame_is_no_problem(workplace, broken, tmp_path):
+    (broken / "frames" / "cam03" / "00001.png").unlink()
+    assert calibrate(workplace, broken, tmp_path / "out", "--no-report") == 0
+
+
+BAD_INPUT = {
+    "truncated frame": (
+        lambda c: (c / "frames/cam02/00001.png").write_bytes((c / "frames/cam02/00001.png").read_bytes()[:-200]),
+        "cam02/00001.png",
+    ),
+    "wrong camera name": (lambda c: (c / "frames/cam02").rename(c / "frames/kamera2"), "kamera2"),
+    "wrong size": (lambda c: write_frame(c / "frames/cam01/00000.png", np.zeros((100, 100), np.uint8)), "512"),
+    "a deep frame in a shallow capture": (
+        lambda c: write_frame(c / "frames/cam01/00001.png", np.zeros((272, 512), np.uint16)),
+        "8",
+    ),
+    "a 16-bit capture saved as 8 bit": (
+        lambda c: (c / "capture.yaml").write_text("format: imgcal-capture/1\nbit_depth: 16\n"),
+        "16-bit frame saved as 8-bit",
+    ),
+    "no frames": (lambda c: shutil.rmtree(c / "frames"), "frames"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_INPUT)
+def test_bad_captures_are_named_in_one_line_and_nothing_is_written(case, workplace, broken, tmp_path, capsys):
+    damage, expected = BAD_INPUT[case]
+    damage(broken)
+    assert calibrate(workplace, broken, tmp_path / "out") == 2
+    assert expected in one_line(capsys)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["nowhere", "--rig", "O10", "--object", "cube8"], "nowhere"),
+        (["{capture}", "--rig", "O11", "--object", "cube8"], "O10"),
+        (["{capture}", "--rig", "{rig}", "--object", "cube9"], "cube8"),
+        (["{capture}", "--rig", "{rig}", "--object", "{object}", "--snapshots", "7:9"], "7:9"),
+        (["{capture}", "--rig", "{rig}", "--object", "{object}", "--snapshots", "2:1"], "2:1"),
+        (["{capture}", "--rig", "{rig}", "--object", "{object}", "--snapshots", "all"], "A:B"),
+        (["{capture}", "--rig", "{rig}", "--object", "{object}", "--without", "cam9"], "cam9"),
+        (["{capture}", "--rig", "{rig}", "--object", "{object}", "--reference", "cam9"], "cam9"),
+        (["{capture}", "--rig", "{object}", "--object", "{object}"], "object.csv"),
+        (["{capture}", "--rig", "{rig}", "--object", "{rig}"], "factory.yaml"),
+    ],
+)
+def test_bad_arguments_are_one_line(arguments, expected, workplace, tmp_path, capsys):
+    values = {"capture": workplace.capture, "rig": workplace.rig, "object": workplace.object}
+    filled = [argument.format(**values) for argument in arguments]
+    assert main(["calibrate", *filled, "--out", str(tmp_path / "out")]) == 2
+    assert expected in one_line(capsys)
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_output_that_is_a_file(workplace, tmp_path, capsys):
+    (tmp_path / "out").write_text("mine")
+    assert calibrate(workplace, workplace.capture, tmp_path / "out") == 2
+    assert "expected a folder" in one_line(capsys)
+    assert (tmp_path / "out").read_text() == "mine"

@@ -1,0 +1,62 @@
+import numpy as np
+import pytest
+
+from imgcal.cli.main import main
+from imgcal.formats import load_detections, load_rig, read_frame
+
+
+def simulate(out, *more):
+    return main(["simulate", "--rig", "T4", "--object", "asymmetric8", "--out", str(out), "--snapshots", "1", *more])
+
+
+def test_frames_show_the_markers_where_the_truth_says(workplace):
+    truth = load_detections(workplace.capture / "truth" / "detections.csv")
+    frame = read_frame(workplace.capture / "frames" / "cam01" / "00002.png")
+    assert frame.shape == (272, 512)
+    rows = (truth.snapshot == 2) & (truth.camera == 0)
+    columns, lines = np.rint(truth.uv[rows]).astype(int).T
+    assert (frame[lines, columns] > frame.mean() + 50).all()
+
+
+def test_the_same_seed_gives_the_same_capture(tmp_path):
+    for name, seed in (("a", "1"), ("b", "1"), ("c", "2")):
+        assert simulate(tmp_path / name, "--seed", seed) == 0
+    a, b, c = (read_frame(tmp_path / name / "frames" / "cam01" / "00000.png") for name in "abc")
+    assert (a == b).all() and (a != c).any()
+
+
+def test_twelve_bit_dark_markers(tmp_path):
+    assert simulate(tmp_path / "a", "--sensor.bit-depth", "12", "--sensor.polarity", "dark") == 0
+    frame = read_frame(tmp_path / "a" / "frames" / "cam01" / "00000.png")
+    assert frame.dtype == np.uint16
+    assert 1000 < np.median(frame) <= 4095
+    assert "bit_depth: 12" in (tmp_path / "a" / "capture.yaml").read_text()
+
+
+def test_no_drift_keeps_the_factory_rig(tmp_path):
+    assert simulate(tmp_path / "a", "--drift", "none") == 0
+    truth, factory = load_rig(tmp_path / "a" / "truth" / "rig.yaml"), load_rig("T4")
+    assert truth.difference(factory).abs().max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--kappa", "3"], "kappa"),
+        (["--snapshots", "0"], "--snapshots"),
+        (["--physical.rotation-deg", "-1", "--drift", "physical"], "rotation_deg"),
+    ],
+)
+def test_impossible_values(arguments, expected, tmp_path, capsys):
+    try:
+        code = simulate(tmp_path / "a", *arguments)
+    except SystemExit as stop:  # found while the command line was parsed
+        code = stop.code
+    assert code == 2
+    assert expected in capsys.readouterr().err
+    assert not (tmp_path / "a").exists()
+
+
+def test_an_existing_capture_is_not_overwritten(workplace, capsys):
+    assert simulate(workplace.capture) == 2
+    assert "expected a new folder" in capsys.readouterr().err
