@@ -194,13 +194,11 @@ def _helpful(content: ReportContent) -> list[str]:
     if total == 0:
         steps.append("No blob was found: check exposure, infrared light, and the polarity (bright or dark markers).")
     elif blind:
-        steps.append(
-            f"Nothing was found in {_listed(blind)}: check exposure and cabling, and bring the object into view."
-        )
+        steps.append(f"Nothing was found in {_listed(blind)}: check exposure, cabling and the view.")
     if labelled < 0.5 * total:
         steps.append(
-            f"{grouped(total - labelled)} of {grouped(total)} blobs could not be labelled: cover or mask reflections, and "
-            "check that the object file is that of the object in the images."
+            f"{grouped(total - labelled)} of {grouped(total)} blobs could not be labelled: cover or mask reflections, "
+            "and check that the object file is that of the object in the images."
         )
     steps.append("Check that the factory file belongs to this rig and that no camera was exchanged.")
     steps.append("Capture more snapshots, the whole object in view of as many cameras as possible, in varied poses.")

@@ -110,11 +110,13 @@
   let before = "";
   addEventListener("beforeprint", () => {
     before = root.style.colorScheme;
+    root.classList.add("printing");
     root.style.colorScheme = "light";
     all.forEach(draw);
   });
   addEventListener("afterprint", () => {
     root.style.colorScheme = before;
+    root.classList.remove("printing");
     redraw();
   });
 })();
