@@ -20,7 +20,7 @@ Mask = NDArray[np.bool_] | NDArray[np.uint8]  # (H, W) non-zero inside known ref
 
 
 def detect(
-    frames: Mapping[str, Frame | None | Sequence[Frame | None]],
+    frames: Mapping[str, Frame | Sequence[Frame | None] | None],
     options: DetectionOptions | None = None,
     *,
     masks: Mapping[str, Mask] | None = None,
@@ -75,7 +75,9 @@ def detect_snapshot(
     for index, (image, (_, name)) in enumerate(zip(images, present, strict=True)):
         if masks is not None and name in masks:
             rows = np.flatnonzero(blobs.camera == index)
-            blobs.flags[rows[_inside(checked_mask(masks[name], image, name), blobs.uv[rows])]] |= np.uint8(BlobFlag.MASKED)
+            blobs.flags[rows[_inside(checked_mask(masks[name], image, name), blobs.uv[rows])]] |= np.uint8(
+                BlobFlag.MASKED
+            )
     return replace(blobs, camera=np.array([camera for camera, _ in present])[blobs.camera])
 
 
@@ -94,7 +96,7 @@ def _workers(cameras: int) -> int:
     return max(1, min(cameras, os.cpu_count() or 1))
 
 
-def _snapshots(frames: Mapping[str, Frame | None | Sequence[Frame | None]]) -> list[dict[str, Frame | None]]:
+def _snapshots(frames: Mapping[str, Frame | Sequence[Frame | None] | None]) -> list[dict[str, Frame | None]]:
     """Turn camera -> frames into one mapping camera -> frame a snapshot."""
     series: dict[str, list[Frame | None]] = {}
     for name, entry in frames.items():

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from cv2.typing import MatLike
 from numpy.typing import NDArray
 
 from imgcal.detection.options import DetectionOptions, Frame
@@ -24,8 +25,8 @@ class Screening:
     """Blocks of one frame that stand out of its background."""
 
     blocks: NDArray[np.int64]  # (K,) flat indices of blocks
-    base: NDArray[np.float64]  # (K,) grey levels of the background
-    excess: NDArray[np.float64]  # (K,) grey levels above the base that a pixel of a blob exceeds
+    base: NDArray[np.floating]  # (K,) grey levels of the background
+    excess: NDArray[np.floating]  # (K,) grey levels above the base that a pixel of a blob exceeds
     shape: tuple[int, int]  # blocks in a column and in a row of the frame
 
 
@@ -39,6 +40,11 @@ class Candidates:
     boxes: NDArray[np.int64]  # (K, 4) left, top, right, bottom pixel (included)
     seeds: NDArray[np.int64]  # (K, 2) one pixel (u, v) of each component
 
+    @property
+    def centres(self) -> NDArray[np.int64]:
+        """Middle pixels of the boxes: (K, 2)."""
+        return (self.boxes[:, :2] + self.boxes[:, 2:]) // 2
+
 
 def screen(frame: Frame, options: DetectionOptions, scale: int) -> Screening:
     """Find the blocks of `frame` that are brighter (darker) than their surroundings.
@@ -51,7 +57,7 @@ def screen(frame: Frame, options: DetectionOptions, scale: int) -> Screening:
     means = _block_means(frame)
     if options.polarity == "dark":
         means = scale - means
-    # An opening follows steps of the background (paper on a table) that a median would smear; blobs are smaller than it.
+    # An opening follows steps of the background (paper on a table), which a median would smear; blobs are smaller.
     side = math.ceil((2 * options.max_radius + 6) / BLOCK) + 1
     background = cv2.morphologyEx(means, cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
     contrast = cv2.subtract(means, background)
@@ -65,7 +71,9 @@ def screen(frame: Frame, options: DetectionOptions, scale: int) -> Screening:
     return Screening(blocks, background.ravel()[blocks] + floor, excess, (means.shape[0], means.shape[1]))
 
 
-def outline(frames: list[Frame], screenings: list[Screening], options: DetectionOptions, scales: list[int]) -> Candidates:
+def outline(
+    frames: list[Frame], screenings: list[Screening], options: DetectionOptions, scales: list[int]
+) -> Candidates:
     """Outline the components of several frames at once; those too large are tried again at higher levels."""
     heights = np.array([screening.shape[0] + 1 for screening in screenings])  # an empty row between frames
     first = np.cumsum(heights) - heights
@@ -81,28 +89,36 @@ def outline(frames: list[Frame], screenings: list[Screening], options: Detection
     base = np.concatenate([screening.base for screening in screenings])
     excess = np.concatenate([screening.excess for screening in screenings])
     smooth = _smooth_pixels(frames, screenings, scales if options.polarity == "dark" else None)
-    contours: list[NDArray[np.int32]] = []
+    contours: list[MatLike] = []
     for _ in range(LEVELS):
         tiles[row, :, column, :] = np.where(smooth > (base + excess)[:, None, None], 255, 0)
         contours, oversize = _components(mask, 4 * options.max_radius + 8)  # merged blobs pass: they are to be reported
         if oversize is None:
             break
         raised = oversize.reshape(tiles.shape)[row, :, column, :].any((1, 2))
-        row, column, base, smooth, excess = row[raised], column[raised], base[raised], smooth[raised], 1.6 * excess[raised]
+        row, column, base, smooth, excess = (
+            row[raised],
+            column[raised],
+            base[raised],
+            smooth[raised],
+            1.6 * excess[raised],
+        )
     return _candidates(mask, mask_rows, first, contours, [frame.shape for frame in frames])
 
 
-def _block_means(frame: Frame) -> Frame:
+def _block_means(frame: Frame) -> MatLike:
     """Average blocks of 4 x 4: (ceil(H / 4), ceil(W / 4)). Two halvings are much faster than one resize by four."""
     height, width = (-(-n // BLOCK) * BLOCK for n in frame.shape)
     if (height, width) != frame.shape:
         pad = (0, height - frame.shape[0], 0, width - frame.shape[1])
-        frame = cv2.copyMakeBorder(frame, *pad, cv2.BORDER_REPLICATE)
-    half = cv2.resize(frame, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
+        padded = cv2.copyMakeBorder(frame, *pad, cv2.BORDER_REPLICATE)
+    else:
+        padded = frame
+    half = cv2.resize(padded, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
     return cv2.resize(half, (width // 4, height // 4), interpolation=cv2.INTER_AREA)
 
 
-def _levels(contrast: Frame, options: DetectionOptions, scale: int) -> tuple[float, float]:
+def _levels(contrast: MatLike, options: DetectionOptions, scale: int) -> tuple[float, float]:
     """Estimate what the opening leaves of an empty background, and how far above it a candidate must stand."""
     sample = np.sort(contrast[::8, ::8], axis=None)
     lower = sample[: max(1, int(0.6 * sample.size))]  # without the blobs and most of the texture
@@ -124,7 +140,7 @@ def _mask_rows(used: NDArray[np.int64], count: int) -> NDArray[np.int64]:
     return np.where(in_use, np.cumsum(in_use) + np.cumsum(starts) - 1, 0)
 
 
-def _smooth_pixels(frames: list[Frame], screenings: list[Screening], invert: list[int] | None) -> NDArray[np.float32]:
+def _smooth_pixels(frames: list[Frame], screenings: list[Screening], invert: list[int] | None) -> NDArray[np.floating]:
     """Average the 3 x 3 pixels around each pixel of the screened blocks: (K, 4, 4), bright polarity."""
     reach = np.arange(-1, BLOCK + 1)
     parts = []
@@ -133,7 +149,7 @@ def _smooth_pixels(frames: list[Frame], screenings: list[Screening], invert: lis
         v = np.clip(row[:, None] * BLOCK + reach, 0, frame.shape[0] - 1) * frame.shape[1]
         u = np.clip(column[:, None] * BLOCK + reach, 0, frame.shape[1] - 1)
         parts.append(frame.take(v[:, :, None] + u[:, None, :]))  # (K, 6, 6)
-    pixels = np.concatenate(parts).astype(np.float32)
+    pixels: NDArray[np.floating] = np.concatenate(parts).astype(np.float32)
     pixels = pixels[:, :-2] + pixels[:, 1:-1] + pixels[:, 2:]
     pixels = (pixels[:, :, :-2] + pixels[:, :, 1:-1] + pixels[:, :, 2:]) / 9
     if invert is not None:
@@ -141,9 +157,7 @@ def _smooth_pixels(frames: list[Frame], screenings: list[Screening], invert: lis
     return pixels
 
 
-def _components(
-    mask: NDArray[np.uint8], largest: float
-) -> tuple[list[NDArray[np.int32]], NDArray[np.uint8] | None]:
+def _components(mask: NDArray[np.uint8], largest: float) -> tuple[list[MatLike], NDArray[np.uint8] | None]:
     """Outline the components of the mask up to the size `largest`, and draw those beyond: (R, W'), None without any."""
     contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
     kept, oversize = [], None
@@ -162,10 +176,10 @@ def _candidates(
     mask: NDArray[np.uint8],
     mask_rows: NDArray[np.int64],
     first: NDArray[np.int64],
-    contours: list[NDArray[np.int32]],
+    contours: list[MatLike],
     shapes: list[tuple[int, ...]],
 ) -> Candidates:
-    """Bound the outlined components in pixels of their frames; those wholly inside the padding of a frame are dropped."""
+    """Bound the outlined components in pixels of their frames; those inside the padding of a frame are dropped."""
     used = np.flatnonzero(mask_rows)
     block_row = np.zeros(mask.shape[0] // BLOCK, np.int64)
     block_row[mask_rows[used]] = used

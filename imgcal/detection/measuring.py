@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from cv2.typing import MatLike
 from numpy.typing import NDArray
 
 from imgcal.detection.finding import Candidates
@@ -19,8 +20,8 @@ CLIP_PEAK = 0.1  # of the peak: where the clip lies between the two
 SIGNIFICANT = 6.0  # standard deviations of a 3 x 3 mean that the brightest one of a blob must reach
 CROWDED = 0.6  # of the peak: a border this bright with a neighbour is no border
 SMALLEST_SIGMA = 0.001  # px, what sampling by pixels leaves without any noise
-# px * sqrt(px): sub-pixel position lost where clipping turns a soft edge into a step, over sqrt(radius); the worst case of
-# the exposures (2 to 15 times full scale) in the tests.
+# px * sqrt(px): position lost where clipping turns a soft edge into a step, over sqrt(radius); the worst case of the
+# exposures (2 to 15 times full scale) in the tests.
 CLIPPED_SIGMA = 0.045
 TWO_PEAKED = 0.515  # bimodality coefficient
 REACH = 4  # px from a component to the end of its window: the skirt and a ring that is clear of it
@@ -43,7 +44,7 @@ class _Windows:
     """Windows of equal size around K blobs, with the background removed."""
 
     grey: NDArray[np.float32]  # (K, P, P) above the local background; polarity bright
-    smooth: NDArray[np.float32]  # (K, P, P) mean of the 3 x 3 pixels
+    smooth: MatLike  # (K, P, P) mean of the 3 x 3 pixels
     weight: NDArray[np.float32]  # (K, P, P) in [0, 1]: how much a pixel belongs to the blob
     gain: NDArray[np.float32]  # (K, P, P) how much a pixel's noise moves the blob's brightness
     noise: NDArray[np.float32]  # (K,) grey levels, standard deviation of a background pixel
@@ -55,22 +56,21 @@ class _Windows:
 def measure(frames: list[Frame], candidates: Candidates, options: DetectionOptions, scales: list[int]) -> Blobs:
     """Measure the candidates of several frames together, and keep those that are blobs.
 
-    Windows around all blobs of a similar size are one array, whatever frame they come from: the cost is calls, not pixels.
+    Windows around all blobs of a similar size are one array, whatever their frame: the cost is calls, not pixels.
     """
     boxes = candidates.boxes
-    centres = (boxes[:, :2] + boxes[:, 2:]) // 2
-    blobs = Blobs(
-        np.zeros(centres.shape), *np.zeros((2, len(boxes))), np.zeros(len(boxes), np.uint8), candidates.frame
-    )
-    kept = np.zeros(len(boxes), np.bool_)
+    centres = candidates.centres
+    count = len(boxes)
+    blobs = Blobs(np.zeros((count, 2)), np.zeros(count), np.zeros(count), np.zeros(count, np.uint8), candidates.frame)
+    kept = np.zeros(count, np.bool_)
     for half, rows in _by_size((boxes[:, 2:] - centres).max(1, initial=0) + REACH):
-        windows = _cut(frames, candidates, rows, centres[rows], half, options, scales)
+        windows = _cut(frames, candidates, rows, half, options, scales)
         offset, blobs.sigma[rows], blobs.radius[rows], blobs.flags[rows], kept[rows] = _judge(windows, options)
         blobs.uv[rows] = centres[rows] + offset
     last = np.array([frame.shape[::-1] for frame in frames]).reshape(-1, 2)[blobs.camera] - 1
     blobs.flags[((boxes[:, :2] <= 1) | (boxes[:, 2:] >= last - 1)).any(1)] |= np.uint8(BlobFlag.BORDER)
     kept &= ~_repeated(blobs)
-    return Blobs(*(column[kept] for column in (blobs.uv, blobs.sigma, blobs.radius, blobs.flags, blobs.camera)))
+    return Blobs(blobs.uv[kept], blobs.sigma[kept], blobs.radius[kept], blobs.flags[kept], blobs.camera[kept])
 
 
 def _by_size(reach: NDArray[np.float64]) -> list[tuple[int, NDArray[np.int64]]]:
@@ -83,12 +83,12 @@ def _cut(
     frames: list[Frame],
     candidates: Candidates,
     rows: NDArray[np.int64],
-    centres: NDArray[np.int64],
     half: int,
     options: DetectionOptions,
     scales: list[int],
 ) -> _Windows:
-    """Cut windows of half size `half` around `centres` (K, 2), remove the background and tell blob from surroundings."""
+    """Cut windows of half size `half` around candidates `rows` (K,), remove the background and mark the blobs."""
+    centres = candidates.centres[rows]
     raw, found = _copy(frames, candidates, candidates.frame[rows], centres, half)
     level = np.array(scales, np.float32)[candidates.frame[rows]][:, None, None]
     grey = raw.astype(np.float32)
@@ -141,12 +141,12 @@ def _background(ring: NDArray[np.float32], basis: NDArray[np.float32]) -> tuple[
         basis: (R, 3) 1, x, y at the ring's pixels.
 
     Returns:
-        Plane (K, 3); noise (K,), one standard deviation of a pixel, not less than that of rounding to whole grey levels;
+        Plane (K, 3); noise (K,), one standard deviation of a pixel, not less than that of rounding to grey levels;
         standard deviation of the plane's slopes (K,).
     """
     quartile = np.partition(ring, (ring.shape[1] // 4, ring.shape[1] // 2), axis=1)
     middle = quartile[:, ring.shape[1] // 2, None]
-    # The lower half tells the spread: clutter in the ring is bright. One grey level is the quantization of that estimate.
+    # The lower half tells the spread: clutter in the ring is bright. One grey level is the estimate's quantization.
     spread = 1.4826 * (middle - quartile[:, ring.shape[1] // 4, None]) + 1
     inlier = (abs(ring - middle) < 4 * spread).astype(np.float32)
     normal = (inlier @ (basis[:, :, None] * basis[:, None, :]).reshape(-1, 9)).reshape(-1, 3, 3)
@@ -161,7 +161,7 @@ def _background(ring: NDArray[np.float32], basis: NDArray[np.float32]) -> tuple[
 
 
 def _territory(
-    found: NDArray[np.uint8], smooth: NDArray[np.float32], seeds: NDArray[np.int64]
+    found: NDArray[np.uint8], smooth: MatLike, seeds: NDArray[np.int64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
     """Give each blob the pixels that are nearer to it than to other components, up to its skirt.
 
@@ -179,7 +179,9 @@ def _territory(
     own = labels == labels[np.arange(len(labels)), seeds[:, 1], seeds[:, 0]][:, None, None]
     inner = np.zeros_like(own)
     inner[:, RING:-RING, RING:-RING] = True
-    foreign = cv2.dilate((~own & inner).astype(np.uint8).reshape(strip.shape), np.ones((3, 3), np.uint8)).reshape(own.shape)
+    foreign = cv2.dilate((~own & inner).astype(np.uint8).reshape(strip.shape), np.ones((3, 3), np.uint8)).reshape(
+        own.shape
+    )
     own &= inner
     saddle = np.where((foreign > 0) & own & (distance <= SKIRT), smooth, 0).max((1, 2))
     own &= distance <= SKIRT
@@ -220,10 +222,10 @@ def _judge(
 def _shape(
     mass: NDArray[np.float32], x: NDArray[np.float32], y: NDArray[np.float32]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Tell the elongation (K,) of a mass distribution (K, P, P), and whether it has two parts along its major axis (K,).
+    """Tell the elongation (K,) of masses (K, P, P), and whether they have two parts along their major axes (K,).
 
-    Source: Sarle's bimodality coefficient, (skewness ** 2 + 1) / kurtosis: 0.50 for any filled ellipse and less when it is
-    blurred, 0.60 for two discs that touch and 0.51 to 0.57 when they are blurred, 0.56 for a uniform rod.
+    Source: Sarle's bimodality coefficient, (skewness ** 2 + 1) / kurtosis: 0.50 for any filled ellipse and less when it
+    is blurred, 0.60 for two discs that touch and 0.51 to 0.57 when they are blurred, 0.56 for a uniform rod.
     """
     mass = mass / np.maximum(mass.sum((1, 2), keepdims=True), 1e-6)
     mean_x, mean_y = (mass * x).sum((1, 2)), (mass * y).sum((1, 2))

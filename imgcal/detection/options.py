@@ -55,7 +55,9 @@ def checked_frame(frame: object, camera: str) -> Frame:
     if frame.dtype not in (np.uint8, np.uint16):
         raise InputError(f"camera {camera}: found {frame.dtype} grey values, expected uint8 or uint16")
     if min(frame.shape) < 16:
-        raise InputError(f"camera {camera}: found a frame of {frame.shape[1]} x {frame.shape[0]}, expected at least 16 x 16")
+        raise InputError(
+            f"camera {camera}: found a frame of {frame.shape[1]} x {frame.shape[0]}, expected at least 16 x 16"
+        )
     return frame
 
 
@@ -76,5 +78,7 @@ def full_scale(frame: Frame, bit_depth: int | None, camera: str) -> int:
         return next(2**bits - 1 for bits in (10, 12, 16) if brightest < 2**bits)
     scale = 2**bit_depth - 1
     if frame.dtype == np.uint16 and (brightest := int(frame.max())) > scale:
-        raise InputError(f"camera {camera}: found a grey value of {brightest}, expected at most {scale} ({bit_depth} bit)")
+        raise InputError(
+            f"camera {camera}: found a grey value of {brightest}, expected at most {scale} ({bit_depth} bit)"
+        )
     return scale

@@ -22,8 +22,8 @@ from skimage.feature import blob_log
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from imgcal.detection import DetectionOptions, detect_frame, detect_snapshot  # noqa: E402
-from tests.imgcal.detection.discs import draw_discs, exposed, nearest, scattered  # noqa: E402
+from imgcal.detection import DetectionOptions, detect_frame, detect_snapshot
+from tests.imgcal.detection.discs import draw_discs, exposed, nearest, scattered
 
 Detector = Callable[[NDArray[np.uint8], float], NDArray[np.float64]]  # frame, radius -> centres (K, 2)
 

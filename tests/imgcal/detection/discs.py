@@ -54,7 +54,9 @@ def scattered(shape: tuple[int, int], pitch: int, rng: np.random.Generator) -> N
     return centres + rng.uniform(-0.5, 0.5, centres.shape)
 
 
-def exposed(light: NDArray[np.float64], noise: float, rng: np.random.Generator, bits: int = 8) -> NDArray[np.uint8] | NDArray[np.uint16]:
+def exposed(
+    light: NDArray[np.float64], noise: float, rng: np.random.Generator, bits: int = 8
+) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """Add read noise (grey levels), round and clip to `bits`."""
     grey = np.clip(np.rint(light + rng.normal(0, noise, light.shape)), 0, 2**bits - 1)
     return grey.astype(np.uint8 if bits == 8 else np.uint16)

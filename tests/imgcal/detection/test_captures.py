@@ -5,10 +5,10 @@ import csv
 import cv2
 import numpy as np
 import pytest
-from tests.imgcal.detection.discs import nearest
 
 from imgcal.detection import DetectionOptions, detect_frame
 from imgcal.observations import UNUSABLE, BlobFlag
+from tests.imgcal.detection.discs import nearest
 
 
 def published(folder, camera, columns=("u", "v")):

@@ -4,11 +4,11 @@ import itertools
 
 import numpy as np
 import pytest
-from tests.imgcal.detection.discs import draw_discs, exposed, nearest, scattered
 
 from imgcal.detection import DetectionOptions, detect, detect_frame
 from imgcal.errors import InputError
 from imgcal.observations import BlobFlag
+from tests.imgcal.detection.discs import draw_discs, exposed, nearest, scattered
 
 SHAPE = (480, 640)
 GRADIENT = np.linspace(15, 40, SHAPE[1])[None, :] + np.linspace(0, 10, SHAPE[0])[:, None]
@@ -40,7 +40,9 @@ def test_centres_beat_the_reference(radius, limit):
 
 
 @pytest.mark.parametrize("radius", [1.5, 3.0, 6.0])
-@pytest.mark.parametrize(("noise", "contrast", "bits"), [(2, 200, 8), (0.5, 200, 8), (6, 200, 8), (2, 40, 8), (20, 2500, 12)])
+@pytest.mark.parametrize(
+    ("noise", "contrast", "bits"), [(2, 200, 8), (0.5, 200, 8), (6, 200, 8), (2, 40, 8), (20, 2500, 12)]
+)
 def test_sigma_is_the_spread_of_the_centres(radius, noise, contrast, bits):
     error, sigma, _, _, false = measured(
         radius, noise=noise, contrast=contrast, bits=bits, background=GRADIENT * 2 ** (bits - 8), frames=2
@@ -104,7 +106,7 @@ def test_shifted_frame_gives_shifted_blobs():
     reference = detect_frame(frame, DetectionOptions())
     for right, down in ((4, 0), (0, 8), (1, 0), (2, 3)):
         moved = detect_frame(np.roll(frame, (down, right), (0, 1)), DetectionOptions())
-        rows, distance = nearest(moved.uv, reference.uv + (right, down))
+        rows, distance = nearest(moved.uv, reference.uv + np.array([right, down]))
         assert len(moved.uv) == len(reference.uv)
         assert_same_within_noise(distance, reference.sigma)
         assert right % 4 or down % 4 or distance.max() < 1e-9
