@@ -18,7 +18,7 @@ from imgcal.identity.hypotheses import (
     single_camera_poses,
 )
 from imgcal.identity.planar import planar_poses
-from imgcal.identity.rivals import conflicts, displacement, lattice_shifts, moved, near_turns
+from imgcal.identity.rivals import conflicts, differ, displacement, lattice_shifts, moved, near_turns
 from imgcal.identity.types import Identity, IdentityOptions, Status
 from imgcal.identity.verify import STAGES, Fits, Scene, certain, evidence, join, predictions, refine, rig_and_pose, settle, start
 from imgcal.identity.voting import match, predict_ideal, vote
@@ -31,6 +31,7 @@ TRIPLES = 20  # of blobs in a round, over all cameras
 MOST_HYPOTHESES = 400_000  # in a round: large objects get fewer triples of blobs
 KEPT = 8  # poses of each
 MANY = 40  # fiducials of a planar object, above which triples are too many
+PATIENCE = 3  # rounds that end with two good labellings
 MOST_STEPS = 6  # from one labelling to a better one of the moved object
 VERIFIED = 3  # different labellings that are fitted, the best of a round
 
@@ -106,13 +107,16 @@ def bootstrap(
     triples = fiducial_triples(obj, generator)
     fits: Fits | None = None
     result = _refused(scene, "no pose of the object explains the blobs")
+    undecided = 0
     for _ in range(options.rounds):
         fresh = _round(scene, cameras, triples, tolerance, gate, generator)
         if fresh is None:
             continue
         fits = fresh if fits is None else _best(scene, join(fits, fresh), 2 * VERIFIED)
         result = _decide(scene, fits, options, known_pose=False)
-        if result.accepted:
+        # Where two labellings explain enough, more hypotheses will not tell them apart.
+        undecided += result.undecided
+        if result.accepted or undecided == PATIENCE:
             break
     return result
 
@@ -168,26 +172,33 @@ def _best(scene: Scene, fits: Fits, count: int) -> Fits:
 
 def _decide(scene: Scene, fits: Fits, options: IdentityOptions, known_pose: bool) -> Identity:
     """Accept the best labelling or say why not."""
+    odds = options.tracking_label_odds if known_pose else options.label_odds
     fits = _best(scene, fits, len(fits.labels))
     best = settle(scene, fits.select(np.array([0])))
-    margin = _margin(scene, best, fits.select(np.arange(1, len(fits.labels))))
-    chosen = certain(scene, best, options.tracking_label_odds if known_pose else options.label_odds)
-    share = float((chosen.labels >= 0).sum() / max(np.minimum(scene.blobs.count, scene.obj.fiducials).sum(), 1))
-    refusal = None
-    if not np.isfinite(margin) or share < options.least_share:
+    chosen = certain(scene, best, odds)
+    share, refusal, margin = _share(scene, chosen), None, -np.inf
+    if share >= options.least_share:
+        best, margin = _against_motions(scene, best, known_pose)
+        margin = min(margin, _margin(scene, best, fits))
+        chosen = certain(scene, best, odds)
+        share = _share(scene, chosen)
+        if margin < options.least_margin:
+            refusal = f"another labelling explains the blobs nearly as well: margin {margin:.1f}, expected {options.least_margin:.0f}"
+    if share < options.least_share:
         refusal = f"the best pose explains {100 * share:.0f} % of what could be seen, expected {100 * options.least_share:.0f} %"
-    elif margin >= options.least_margin:
-        best, margin = _against_motions(scene, best, margin, known_pose)
-        chosen = certain(scene, best, options.tracking_label_odds if known_pose else options.label_odds)
-    if refusal is None and margin < options.least_margin:
-        refusal = f"another labelling explains the blobs nearly as well: margin {margin:.1f}, expected {options.least_margin:.0f}"
     rig, pose = rig_and_pose(scene, chosen, 0)
     if refusal is not None:
-        return replace(_refused(scene, refusal), rig_from_object=pose, rig=rig, margin=margin)
+        undecided = share >= options.least_share
+        return replace(_refused(scene, refusal), rig_from_object=pose, rig=rig, margin=margin, undecided=undecided)
     order = 1 if known_pose else len(scene.obj.symmetries)
     status: Status = "by_tracking" if known_pose else "ambiguous" if order > 1 else "unique"
     reason = f"explains {100 * share:.0f} % of what could be seen, margin {margin:.0f}"
     return Identity(scene.blobs.to_rows(chosen.labels[0]), pose, rig, status, order, margin, reason)
+
+
+def _share(scene: Scene, fits: Fits) -> float:
+    """Labelled part of what could be seen: in each camera, the smaller of blobs and fiducials."""
+    return float((fits.labels >= 0).sum() / max(np.minimum(scene.blobs.count, scene.obj.fiducials).sum(), 1))
 
 
 def _margin(scene: Scene, best: Fits, others: Fits) -> float:
@@ -196,18 +207,18 @@ def _margin(scene: Scene, best: Fits, others: Fits) -> float:
     rivals = [
         weight
         for weight, labels in zip(weights, others.labels, strict=True)
-        if conflicts(scene.obj, best.labels[0], labels) > 0
+        if differ(scene.obj, best.labels[0], labels)
     ]
     return float(evidence(scene, best)[0] - max([0.0, *rivals]))
 
 
-def _against_motions(scene: Scene, best: Fits, margin: float, known_pose: bool) -> tuple[Fits, float]:
+def _against_motions(scene: Scene, best: Fits, known_pose: bool) -> tuple[Fits, float]:
     """Compare a labelling with those of an object shifted or turned onto itself; change to a better one where there is one.
 
     A lattice may be shifted in all cameras together, or in a single one as far as its prior allows.
 
     Returns:
-        The best labelling found, and its margin over the best of its neighbours, at most the given one.
+        The best labelling found, and its margin over the best of its neighbours.
     """
     shifts = lattice_shifts(scene.obj)
     spread = spread_of(scene.std, scene.rig, scene.rig.working_distance or _guess_distance(scene))
@@ -224,7 +235,7 @@ def _against_motions(scene: Scene, best: Fits, margin: float, known_pose: bool) 
         fits = [refine(scene, start(scene, *rival), stages=STAGES[:1]) for rival in rivals]
         margins = [_margin(scene, best, rival) for rival in fits]
         if not margins or min(margins) >= 0:
-            return best, min([margin, *margins])
+            return best, min([np.inf, *margins])
         best = settle(scene, fits[int(np.argmin(margins))])
     return best, 0.0
 

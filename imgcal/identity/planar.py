@@ -34,7 +34,9 @@ def planar_poses(blobs: Blobs, rig: CameraRig, camera: int, obj: CalibrationObje
         Poses that explain different sets of blobs, possibly none; a lattice has several.
     """
     focal = float(rig.focal_length[camera].mean())
-    seen = _without_strays(blobs.ideal[camera, : blobs.count[camera]].astype(np.float64) / focal)
+    count = blobs.count[camera]
+    ordinary = _ordinary(blobs.radius[camera, :count])
+    seen = _without_strays(blobs.ideal[camera, :count][ordinary].astype(np.float64) / focal)
     points = obj.points.double().cpu().numpy()
     centroid = points.mean(0)
     axes = np.linalg.svd(points - centroid)[2]
@@ -54,11 +56,19 @@ def planar_poses(blobs: Blobs, rig: CameraRig, camera: int, obj: CalibrationObje
     return Poses(rotation, centre - rotation @ centroid)
 
 
+def _ordinary(radius: Floats) -> NDArray[np.bool_]:
+    """Mark blobs of about the usual radius, or of an unknown one."""
+    if np.isnan(radius).all():
+        return np.ones(len(radius), dtype=bool)
+    ratio = radius / np.nanmedian(radius)
+    return np.isnan(radius) | ((ratio > 0.6) & (ratio < 1.7))
+
+
 def _without_strays(points: Floats) -> Floats:
-    """Leave out points far from the bulk, again and again."""
-    for _ in range(3):
+    """Leave out points far from the bulk, again and again: a whitened square reaches to the square root of 6."""
+    for _ in range(5):
         white = _whiten(points)[0]
-        points = points[(white * white).sum(1) < 9]
+        points = points[(white * white).sum(1) < 2.7**2]
     return points
 
 

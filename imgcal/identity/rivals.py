@@ -86,9 +86,27 @@ def conflicts(obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[
 
     Labellings without a common blob conflict entirely.
     """
-    used = first >= 0
-    common = max(_common(first, second), 1)
-    return min(1 - int((used & (first == second[:, motion.permutation])).sum()) / common for motion in obj.symmetries)
+    common = max(int(_common(first, second).sum()), 1)
+    return min(1 - int(agreed.sum()) / common for agreed in _agreed(obj, first, second))
+
+
+def differ(obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[np.int64]) -> bool:
+    """Tell whether two labellings (C, N) are different answers, up to the object's symmetry, and not one with odd labels.
+
+    They are when a third of all common blobs, or of one camera's (three at least), are called differently.
+    """
+    common = _common(first, second)
+    if not common.any():
+        return True
+    return all(
+        3 * (common - agreed).sum() > common.sum() or bool(((common - agreed) >= np.maximum(3, common / 3)).any())
+        for agreed in _agreed(obj, first, second)
+    )
+
+
+def _agreed(obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Number of blobs that two labellings call the same, for each camera (C,) and symmetry."""
+    return [((first >= 0) & (first == second[:, motion.permutation])).sum(1) for motion in obj.symmetries]
 
 
 def _onto(points: NDArray[np.float64], images: NDArray[np.float64], tolerance: float) -> NDArray[np.int64]:
@@ -96,9 +114,9 @@ def _onto(points: NDArray[np.float64], images: NDArray[np.float64], tolerance: f
     return np.where(distance <= tolerance, index, -1)
 
 
-def _common(first: NDArray[np.int64], second: NDArray[np.int64]) -> int:
-    """Number of blobs that both labellings name."""
+def _common(first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Number of blobs that both labellings name, for each camera: (C,)."""
     named = np.zeros((2, len(first), max(first.max(), second.max()) + 2), dtype=bool)
     cameras = np.arange(len(first))[:, None]
     named[0, cameras, first], named[1, cameras, second] = True, True  # label -1 lands in the last column
-    return int(named[..., :-1].all(0).sum())
+    return named[..., :-1].all(0).sum(-1)

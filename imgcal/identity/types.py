@@ -25,6 +25,7 @@ class Identity:
     alternatives: int  # labellings that explain the blobs equally well: the object's symmetry order, 1 = unique
     margin: float  # natural logarithm of the odds against the best different labelling; inf = none is left
     reason: str  # one line: why it was refused, or what decided
+    undecided: bool = False  # refused because a different labelling explains the blobs nearly as well
 
     @property
     def accepted(self) -> bool:

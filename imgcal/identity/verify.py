@@ -26,8 +26,10 @@ STAGES = (3.0, 0.7)
 """Standard deviations (px) that the first fits allow, beyond the blobs' own; the last fits take it from their residuals."""
 GATE = 25.0
 """Squared normalized innovation of a label; two degrees of freedom exceed it once in 270,000."""
-SIZE_SPREAD = 0.15
-"""Relative standard deviation of a blob's radius within its camera: depth, tilt and exposure vary."""
+LEAST_SIZE_SPREAD = 0.05
+"""Relative standard deviation of a blob's radius within its camera, at least: depth, tilt and exposure vary."""
+MOST_SIZE_MISFIT = 36.0
+"""Of one blob: a single odd radius decides no more than this."""
 UNDECIDED = 2 * np.log(1e3)
 """Two pairings whose squared normalized innovations differ by less cannot be told apart."""
 
@@ -197,8 +199,9 @@ def _size_misfit(scene: Scene, fits: Fits) -> NDArray[np.float64]:
     with np.errstate(all="ignore"):
         ratio = np.log(np.where(fits.labels >= 0, seen, np.nan) / radius.numpy())
         ratio = np.where(np.isfinite(ratio).any(-1, keepdims=True), ratio, 0.0)
-        misfit = (ratio - np.nanmedian(ratio, axis=-1, keepdims=True)) / SIZE_SPREAD
-    return np.nansum(np.minimum(misfit**2, 9.0), axis=(1, 2))
+        misfit = np.abs(ratio - np.nanmedian(ratio, axis=-1, keepdims=True))
+        spread = np.maximum(1.5 * np.nanmedian(misfit, axis=-1, keepdims=True), LEAST_SIZE_SPREAD)
+    return np.nansum(np.minimum((misfit / spread) ** 2, MOST_SIZE_MISFIT), axis=(1, 2))
 
 
 def _clutter(scene: Scene, fits: Fits) -> NDArray[np.float64]:
