@@ -12,7 +12,7 @@ from numba import njit, prange
 from torch import Tensor
 
 from imgcal.estimation.linearize import NormalEquations, Problem, State
-from imgcal.estimation.solver import LEAST_DAMPING, MOST_DAMPING, Solution
+from imgcal.estimation.solver import LEAST_DAMPING, MOST_DAMPING, Solution, pixel_rounding
 from imgcal.projection import NEAREST_DEPTH
 
 LOSS_CODES = {"squared": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3}
@@ -46,12 +46,15 @@ def minimize(problem: Problem, start: State, loss: str, threshold: float, max_it
     block_tensors = (camera, coupling, pose, camera_gradient, pose_gradient, residual)
     rig = (factory.cam_from_rig.rotation, factory.positions, factory.focal_length, factory.principal_point, factory.distortion)
     arrays = _arrays((problem.uv, problem.root_weight, *rig, problem.spread, *state_tensors, *block_tensors, cost))
-    limits = (cameras_first, LOSS_CODES[loss], threshold, max_iterations, tolerance)
+    limits = (cameras_first, LOSS_CODES[loss], threshold, max_iterations)
+    tolerances = (tolerance + pixel_rounding(problem)).numpy()
     shared = _arrays((problem.points, radius_squared))
     if batch == 1:
-        _minimize_rig(*shared, *(array[0] for array in arrays[:-1]), arrays[-1], converged, iterations, *limits)
+        _minimize_rig(
+            *shared, *(array[0] for array in arrays[:-1]), arrays[-1], converged, iterations, *limits, tolerances[0]
+        )
     else:
-        _minimize_all(*shared, *arrays, converged, iterations, *limits)
+        _minimize_all(*shared, *arrays, converged, iterations, *limits, tolerances)
     if cameras_first:
         blocks = coupling.unflatten(-1, (snapshots, 6)).permute(0, 3, 1, 2, 4)
     else:
@@ -69,7 +72,7 @@ def _arrays(tensors: tuple[Tensor, ...]) -> list[np.ndarray]:
 def _minimize_all(
     points, radius_squared, uv, root_weight, rotation0, position0, focal0, principal0, distortion0, spread,
     offset, rotation, centre, camera, coupling, pose, camera_gradient, pose_gradient, residual,
-    cost, converged, iterations, cameras_first, loss, threshold, max_iterations, tolerance,
+    cost, converged, iterations, cameras_first, loss, threshold, max_iterations, tolerances,
 ):  # fmt: skip
     for b in prange(uv.shape[0]):
         _minimize_rig(
@@ -77,7 +80,7 @@ def _minimize_all(
             rotation0[b], position0[b], focal0[b], principal0[b], distortion0[b], spread[b],
             offset[b], rotation[b], centre[b], camera[b], coupling[b], pose[b], camera_gradient[b], pose_gradient[b],
             residual[b], cost[b : b + 1], converged[b : b + 1], iterations[b : b + 1],
-            cameras_first, loss, threshold, max_iterations, tolerance,
+            cameras_first, loss, threshold, max_iterations, tolerances[b],
         )  # fmt: skip
 
 

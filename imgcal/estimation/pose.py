@@ -119,15 +119,17 @@ def _cost(form: _QuadraticForm, rotation: Tensor) -> Tensor:
 
 def _minimize_on_rotations(form: _QuadraticForm, rotation: Tensor, iterations: int) -> Tensor:
     """Damped Gauss-Newton from many starts at once: (P, M, 3, 3) -> (P, M, 3, 3)."""
-    matrix, vector = form.matrix[:, None], form.vector[:, None, :, None]
+    vector = form.vector[:, None, :, None]
     generators = _generators(rotation)
     trace = form.matrix.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None, None]
     damping = 1e-6 * trace * torch.eye(3, dtype=rotation.dtype, device=rotation.device)
     for _ in range(iterations):
         tangent = torch.einsum("gij,pmjk->pmikg", generators, rotation).flatten(-3, -2)  # (P, M, 9, 3)
-        weighted = matrix @ tangent
-        right = tangent.mT @ (matrix @ rotation.flatten(-2)[..., None] + vector)
-        step = _solve_symmetric(tangent.mT @ weighted + damping, right.squeeze(-1))
+        # One product for the tangents and the rotation of all starts: (9, 9) @ (9, 4 M).
+        both = torch.cat((tangent, rotation.flatten(-2)[..., None]), dim=-1)
+        weighted = torch.einsum("pij,pmjk->pmik", form.matrix, both)
+        right = tangent.mT @ (weighted[..., 3:] + vector)
+        step = _solve_symmetric(tangent.mT @ weighted[..., :3] + damping, right.squeeze(-1))
         length = step.norm(dim=-1, keepdim=True)
         step = step * (0.7 / length.clamp_min(0.7))
         rotation = rotation_from_vector(-step) @ rotation

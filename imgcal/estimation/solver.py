@@ -41,7 +41,7 @@ def minimize(problem: Problem, start: State, loss: Loss, max_iterations: int, to
         loss: robust loss.
         max_iterations: linearizations at most, for each rig.
         tolerance: a rig has converged when a step is expected to lower its cost by less than this, absolute (the cost
-            is in units of squared standard deviations) or relative to the cost's rounding error.
+            is in units of squared standard deviations) or than the rounding errors of cost and pixels.
 
     Returns:
         The best state found for each rig, with its normal equations.
@@ -50,12 +50,12 @@ def minimize(problem: Problem, start: State, loss: Loss, max_iterations: int, to
     batch, device = equations.cost.shape, equations.cost.device
     damping = equations.cost.new_full(batch, LEAST_DAMPING)
     converged = torch.zeros(batch, dtype=torch.bool, device=device)
-    rounding = 4 * torch.finfo(equations.cost.dtype).eps
+    rounding, tolerances = 4 * torch.finfo(equations.cost.dtype).eps, tolerance + pixel_rounding(problem)
     iteration = 0
     while iteration < max_iterations and not bool(converged.all()):
         iteration += 1
         camera_step, pose_step, gain, failed = damped_step(equations, damping)
-        small = (gain <= tolerance + rounding * equations.cost) & ~failed
+        small = (gain <= tolerances + rounding * equations.cost) & ~failed
         trial_state = moved(problem, state, camera_step, pose_step)
         trial = linearize(problem, trial_state, loss)
         better = (trial.cost < equations.cost) & ~failed & ~converged
@@ -69,6 +69,12 @@ def minimize(problem: Problem, start: State, loss: Loss, max_iterations: int, to
         damping = torch.where(better | converged, damping * 0.1, damping * 10).clamp(LEAST_DAMPING, MOST_DAMPING)
         damping = torch.where(better | converged, damping, damping.clamp_min(1e-4))
     return Solution(state, equations, converged, iteration)
+
+
+def pixel_rounding(problem: Problem) -> Tensor:
+    """Decrease of the cost that the rounding of pixels can feign: (B,); it matters in single precision alone."""
+    whitened = problem.uv * problem.root_weight.unsqueeze(-2)
+    return (4 * torch.finfo(whitened.dtype).eps) ** 2 * whitened.square().flatten(1).sum(1)
 
 
 def damped_step(equations: NormalEquations, damping: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

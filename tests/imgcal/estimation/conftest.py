@@ -1,0 +1,79 @@
+"""Simulated observations for the tests of estimation."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from imgcal.estimation.estimate import make_problem, make_start
+from imgcal.estimation.linearize import Problem, State
+from imgcal.objects import CalibrationObject
+from imgcal.observations import Observations
+from imgcal.rig import CameraRig
+from imgcal.synthesis import Drift, PhysicalDrift, PoseRange, sample_rig_from_object
+from imgcal.transforms import RigidTransform
+
+
+@dataclass(frozen=True)
+class Case:
+    """Simulated observations and the truth behind them."""
+
+    factory: CameraRig
+    obj: CalibrationObject
+    truth: CameraRig  # (*B)
+    poses: RigidTransform  # (*B, S)
+    observations: Observations  # (*B, S, C, N)
+    spread: Tensor  # (C, 15)
+
+    def problem(self) -> Problem:
+        """Flatten and whiten."""
+        return make_problem(self.observations, self.factory, self.obj, self.spread)
+
+    def start(self, problem: Problem, shift: float = 2.0, first_guess: CameraRig | None = None) -> State:
+        """Start at the factory values, or a guess, and `shift` mm from the true poses."""
+        return make_start(problem, RigidTransform(self.poses.rotation, self.poses.translation + shift), first_guess)
+
+
+Simulate = Callable[..., Case]
+
+
+@pytest.fixture(scope="session")
+def simulate(o10: CameraRig, asymmetric8: CalibrationObject) -> Simulate:
+    """Return a function that simulates observations of drifted rigs."""
+
+    def make(
+        *batch: int,
+        snapshots: int = 2,
+        cameras: int = 10,
+        fiducials: int = 8,
+        noise: float = 0.05,
+        sigma: float = 0.05,
+        drift: Drift = PhysicalDrift(),
+        missing: float = 0.0,
+        radius: float | None = None,
+        seed: int = 0,
+    ) -> Case:
+        generator = torch.Generator().manual_seed(seed)
+        factory = o10.select(range(cameras))
+        radii = None if radius is None else torch.full((fiducials,), radius, dtype=torch.float64)
+        obj = replace(
+            asymmetric8, points=asymmetric8.points[:fiducials], colours=asymmetric8.colours[:fiducials], radius=radii
+        )
+        truth = drift.apply(factory, generator, *batch)
+        count = torch.Size((*batch, snapshots)).numel()
+        centroid, distance = obj.points.mean(0), factory.working_distance
+        assert distance is not None
+        poses = sample_rig_from_object(count, distance, centroid, PoseRange(), generator).reshape(*batch, snapshots)
+        points = poses.apply(obj.points)  # (*B, S, N, 3)
+        repeated = None if radii is None else radii.repeat(snapshots)
+        uv = truth.project(points.flatten(-3, -2), repeated).uv
+        uv = uv.unflatten(-2, (snapshots, fiducials)).movedim(-3, -4).contiguous()  # (*B, S, C, N, 2)
+        uv = uv + noise * torch.randn(uv.shape, generator=generator, dtype=uv.dtype)
+        seen = torch.rand(uv.shape[:-1], generator=generator) >= missing
+        uv = torch.where(seen[..., None], uv, -1e6)
+        observations = Observations(uv, torch.full_like(uv[..., 0], sigma), seen)
+        return Case(factory, obj, truth, poses, observations, drift.std(factory))
+
+    return make
