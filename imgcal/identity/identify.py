@@ -82,7 +82,8 @@ def track(
     distance = float(np.median(_distances(rig, poses, obj)))
     tolerance, gate = _bounds(scene, distance, pose_known=True)
     # Where the fiducials are dense, a wide tolerance pairs them with anything: also try a narrow one.
-    tolerances = {tolerance, min(tolerance, max(3.0, 0.2 * _spacing(predicted)))}
+    spacing = _spacing(predicted)
+    tolerances = [tolerance, max(3.0, 0.2 * spacing)] if tolerance > 0.4 * spacing else [tolerance]
     attempts = [
         match(scene.blobs, predicted, vote(scene.blobs, predicted, reach, gate).shift, 1.25 * reach) for reach in tolerances
     ]
@@ -172,15 +173,15 @@ def _best(scene: Scene, fits: Fits, count: int) -> Fits:
 
 def _decide(scene: Scene, fits: Fits, options: IdentityOptions, known_pose: bool) -> Identity:
     """Accept the best labelling or say why not."""
-    odds = options.tracking_label_odds if known_pose else options.label_odds
+    odds = (options.label_odds, options.least_label_odds)
     fits = _best(scene, fits, len(fits.labels))
     best = settle(scene, fits.select(np.array([0])))
-    chosen = certain(scene, best, odds)
+    chosen = certain(scene, best, *odds)
     share, refusal, margin = _share(scene, chosen), None, -np.inf
     if share >= options.least_share:
         best, margin = _against_motions(scene, best, known_pose)
         margin = min(margin, _margin(scene, best, fits))
-        chosen = certain(scene, best, odds)
+        chosen = certain(scene, best, *odds)
         share = _share(scene, chosen)
         if margin < options.least_margin:
             refusal = f"another labelling explains the blobs nearly as well: margin {margin:.1f}, expected {options.least_margin:.0f}"

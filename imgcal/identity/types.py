@@ -38,7 +38,7 @@ class IdentityOptions:
     """How sure is sure."""
 
     label_odds: float = 1e4  # of a single label, against a false blob or another fiducial
-    tracking_label_odds: float = 1e2  # the same where a known pose predicts the blobs
+    least_label_odds: float = 1e2  # the same where false blobs are so dense that few labels could be that certain
     least_margin: float = 20.0  # of the whole labelling against the best different one, natural logarithm
     least_share: float = 0.45  # explained part of what could be seen: the smaller of blobs and fiducials, camera by camera
     rounds: int = 24  # of hypotheses before giving up

@@ -88,31 +88,34 @@ def refine(scene: Scene, fits: Fits, stages: tuple[float, ...] = STAGES) -> Fits
     for sigma in stages:
         fits = _fit(scene, replace(fits, sigma=np.full(len(fits.labels), sigma)))
         fits = replace(fits, sigma=_residual_sigma(scene, fits), labels=_assign(fits))
-    return settle(scene, fits, rounds=1)
+    return settle(scene, _fit(scene, fits), rounds=1)
 
 
 def settle(scene: Scene, fits: Fits, rounds: int = 4) -> Fits:
-    """Fit and label again until the labels stay, or for so many rounds."""
+    """Label fitted labellings again, and fit, until the labels stay or for so many rounds."""
     for _ in range(rounds):
-        fits = _fit(scene, fits)
         labels = _assign(fits)
         if np.array_equal(labels, fits.labels):
-            return fits
-        fits = replace(fits, sigma=_residual_sigma(scene, fits), labels=labels)
-    return _fit(scene, fits)
+            break
+        fits = _fit(scene, replace(fits, sigma=_residual_sigma(scene, fits), labels=labels))
+    return fits
 
 
-def certain(scene: Scene, fits: Fits, odds: float) -> Fits:
+def certain(scene: Scene, fits: Fits, odds: float, least_odds: float) -> Fits:
     """Drop labels that are not certain: neither a false blob nor another fiducial may explain the blob nearly as well.
 
     Args:
         scene: what is given.
         fits: refined labellings.
-        odds: least odds of a label against a false blob.
+        odds: odds of a label against a false blob, to be exceeded.
+        least_odds: the same where false blobs are so dense that hardly any label reaches `odds`.
     """
+    log_odds = _log_odds(scene, fits)
+    usual = np.median(log_odds[np.isfinite(log_odds)]) if np.isfinite(log_odds).any() else 0.0
+    demanded = np.clip(usual - np.log(100), np.log(least_odds), np.log(odds))
     for _ in range(4):
         found = _found(fits)
-        good = (found.own < GATE) & (_log_odds(scene, fits) > np.log(odds)) & ~_contested(fits.labels, found)
+        good = (found.own < GATE) & (_log_odds(scene, fits) > demanded) & ~_contested(fits.labels, found)
         if np.array_equal(good, fits.labels >= 0):
             break
         fits = _fit(scene, replace(fits, labels=np.where(good, fits.labels, -1)))

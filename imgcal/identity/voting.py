@@ -67,32 +67,43 @@ def vote(blobs: Blobs, predicted: NDArray[np.float64], tolerance: float, gate: f
     width = max(tolerance, 2 * gate / MOST_BINS)
     count = np.zeros(predicted.shape[:2], dtype=np.int64)
     shift = np.zeros((*predicted.shape[:2], 2))
-    _vote(predicted, blobs.ideal, blobs.count, width, gate, count, shift)
+    cast = _vote if len(predicted) > 4 else _vote_few  # threads cost more than a few votes
+    cast(predicted, blobs.ideal, blobs.count, width, gate, count, shift)
     return Votes(count, shift)
 
 
 @njit(parallel=True, cache=True)
 def _vote(predicted, ideal, number, width, gate, count, shift):
-    poses, cameras, fiducials = predicted.shape[:3]
+    for k in prange(len(predicted)):
+        _vote_one(predicted[k], ideal, number, width, gate, count[k], shift[k])
+
+
+@njit(cache=True)
+def _vote_few(predicted, ideal, number, width, gate, count, shift):
+    for k in range(len(predicted)):
+        _vote_one(predicted[k], ideal, number, width, gate, count[k], shift[k])
+
+
+@njit(cache=True)
+def _vote_one(predicted, ideal, number, width, gate, count, shift):
     bins = int(np.ceil(2 * gate / width))
-    for k in prange(poses):
-        # Every vote counts in two by two overlapping windows, so that no peak is split by a border.
-        windows = np.zeros((bins + 1, bins + 1), dtype=np.int32)
-        for c in range(cameras):
-            windows[:] = 0
-            for n in range(fiducials):
-                for m in range(number[c]):
-                    u, v = ideal[c, m, 0] - predicted[k, c, n, 0] + gate, ideal[c, m, 1] - predicted[k, c, n, 1] + gate
-                    if u >= 0 and v >= 0 and u < 2 * gate and v < 2 * gate:
-                        i, j = int(u / width), int(v / width)
-                        windows[i, j] += 1
-                        windows[i + 1, j] += 1
-                        windows[i, j + 1] += 1
-                        windows[i + 1, j + 1] += 1
-            best = windows.argmax()
-            i, j = best // (bins + 1), best % (bins + 1)
-            count[k, c] = min(windows[i, j], fiducials)
-            shift[k, c, 0], shift[k, c, 1] = i * width - gate, j * width - gate
+    # Every vote counts in two by two overlapping windows, so that no peak is split by a border.
+    windows = np.zeros((bins + 1, bins + 1), dtype=np.int32)
+    for c in range(len(predicted)):
+        windows[:] = 0
+        for n in range(predicted.shape[1]):
+            for m in range(number[c]):
+                u, v = ideal[c, m, 0] - predicted[c, n, 0] + gate, ideal[c, m, 1] - predicted[c, n, 1] + gate
+                if u >= 0 and v >= 0 and u < 2 * gate and v < 2 * gate:
+                    i, j = int(u / width), int(v / width)
+                    windows[i, j] += 1
+                    windows[i + 1, j] += 1
+                    windows[i, j + 1] += 1
+                    windows[i + 1, j + 1] += 1
+        best = windows.argmax()
+        i, j = best // (bins + 1), best % (bins + 1)
+        count[c] = min(windows[i, j], predicted.shape[1])
+        shift[c, 0], shift[c, 1] = i * width - gate, j * width - gate
 
 
 def match(blobs: Blobs, predicted: NDArray[np.float64], shift: NDArray[np.float64], tolerance: float) -> NDArray[np.int64]:
