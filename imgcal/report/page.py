@@ -100,9 +100,11 @@ def _figure(figure: scene.Figure) -> Markup:
 
 def _snapshots(content: ReportContent) -> dict[str, object]:
     rejected = [s for s in content.snapshots if s.reason]
+    # What comes after a colon are the numbers of one snapshot.
+    kinds = Counter(s.reason.split(": ")[0] for s in rejected if s.reason != content.reason)
     return {
         "strip": charts.snapshot_strip(content) if content.snapshots else None,
-        "reasons": Counter(s.reason for s in rejected if s.reason != content.reason).most_common(8),
+        "reasons": kinds.most_common(8),
         "rejected": len(rejected),
         "table": content.snapshots[:LARGEST_SNAPSHOT_TABLE],
         "left_out": max(len(content.snapshots) - LARGEST_SNAPSHOT_TABLE, 0),

@@ -166,12 +166,20 @@ def test_large_capture_is_thinned_and_says_so(large_content: ReportContent) -> N
     html = render(large_content)
     assert len(html.encode()) < 15_000_000
     page = Page(html)
-    assert "drawings show a random or even selection" in page.text
+    assert "Drawings show a random or even selection" in page.text
     assert "60 snapshots and 100 of 400 fiducials" in page.text
 
 
 def test_small_capture_is_drawn_in_full(content: ReportContent) -> None:
     assert "selection" not in Page(render(content)).text
+
+
+def test_like_reasons_are_counted_together(content: ReportContent) -> None:
+    reasons = ("no clear winner: margin 17.6", "no clear winner: margin 3.1", "", "", "", "blurred")
+    snapshots = tuple(replace(s, reason=reason) for s, reason in zip(content.snapshots, reasons, strict=True))
+    text = " ".join(Page(render(replace(content, snapshots=snapshots))).text.split())
+    assert "rejected (3). 2 × no clear winner; 1 × blurred." in text
+    assert "no clear winner: margin 3.1" in text
 
 
 def test_frames_of_many_cameras_stay_within_the_size(content: ReportContent) -> None:
