@@ -154,6 +154,13 @@ def test_strings_of_users_stay_strings(kind: str, request: pytest.FixtureRequest
     assert "&lt;img" in plots
 
 
+def test_one_of_the_two_scales_is_hidden(content: ReportContent) -> None:
+    rule = ".scatter:has(#same-scale:checked) .own, .scatter:has(#same-scale:not(:checked)) .same { display: none; }"
+    html = render(content)
+    assert rule in html
+    assert html.count('class="own"') == html.count('class="same"') == html.count('id="same-scale"') == 1
+
+
 def test_same_content_gives_the_same_page(content: ReportContent) -> None:
     assert render(content) == render(replace(content))
 
