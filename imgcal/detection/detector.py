@@ -78,7 +78,9 @@ def detect_snapshot(
             blobs.flags[rows[_inside(checked_mask(masks[name], image, name), blobs.uv[rows])]] |= np.uint8(
                 BlobFlag.MASKED
             )
-    return replace(blobs, camera=np.array([camera for camera, _ in present])[blobs.camera])
+    order = np.argsort(blobs.camera, kind="stable")
+    camera = np.array([camera for camera, _ in present])[blobs.camera[order]]
+    return Blobs(blobs.uv[order], blobs.sigma[order], blobs.radius[order], blobs.flags[order], camera)
 
 
 def detect_frame(frame: Frame, options: DetectionOptions, mask: Mask | None = None) -> Blobs:
