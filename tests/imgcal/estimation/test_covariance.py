@@ -1,0 +1,148 @@
+"""Posterior covariance: against dense inverses, under a change of reference, and against the spread of samples."""
+
+import pytest
+import torch
+
+from imgcal.errors import RefusedError
+from imgcal.estimation import (
+    Estimate,
+    EstimationOptions,
+    camera_covariance,
+    camera_std,
+    estimate,
+    pose_covariance,
+    relative_covariance,
+    relative_difference,
+)
+from imgcal.estimation.covariance import relative_jacobian
+from imgcal.estimation.linearize import moved, rig_at
+from imgcal.rotations import rotation_from_vector
+from imgcal.synthesis import PhysicalDrift
+from imgcal.transforms import RigidTransform
+
+SQUARED = EstimationOptions(loss="squared", tolerance=1e-8)
+
+
+def run(case) -> Estimate:
+    return estimate(case.observations, case.factory, case.obj, spread=case.spread, options=SQUARED)
+
+
+def dense_inverse(found: Estimate) -> torch.Tensor:
+    """Inverse of the whole information in whitened units: (B, 15 C + 6 S, .)."""
+    equations = found.solution.equations
+    count, snapshots, cameras = equations.coupling.shape[:3]
+    split = 15 * cameras
+    dense = torch.zeros(count, split + 6 * snapshots, split + 6 * snapshots, dtype=torch.float64)
+    for c in range(cameras):
+        dense[:, 15 * c : 15 * c + 15, 15 * c : 15 * c + 15] = equations.camera[:, c]
+        for s in range(snapshots):
+            rows, columns = slice(15 * c, 15 * c + 15), slice(split + 6 * s, split + 6 * s + 6)
+            dense[:, columns, columns] = equations.pose[:, s]
+            dense[:, rows, columns] = equations.coupling[:, s, c]
+            dense[:, columns, rows] = equations.coupling[:, s, c].mT
+    return torch.linalg.inv(dense)
+
+
+@pytest.mark.parametrize("snapshots", [1, 3, 12])  # twelve snapshots of three cameras: snapshots are eliminated
+def test_equals_the_dense_inverse(simulate, snapshots: int) -> None:
+    case = simulate(2, snapshots=snapshots, cameras=3, missing=0.1)
+    found = run(case)
+    inverse = dense_inverse(found)
+    # From whitened offsets to small left rotations about the estimate, and to physical units.
+    state, problem = found.solution.state, found.problem
+    zero = torch.zeros(2, 3, 15, dtype=torch.float64)
+    here = rig_at(problem, state.offset)
+
+    def physical(step: torch.Tensor) -> torch.Tensor:
+        still = torch.zeros(2, snapshots, 6, dtype=torch.float64)
+        return rig_at(problem, moved(problem, state, step, still).offset).difference(here).sum(0).flatten()
+
+    jacobian = torch.autograd.functional.jacobian(physical, zero).movedim(1, 0).flatten(2)  # (B, 45, 45)
+    expected = jacobian @ inverse[:, :45, :45] @ jacobian.mT
+    scale = expected.diagonal(dim1=-2, dim2=-1).sqrt()
+    difference = (camera_covariance(found) - expected) / (scale[..., None] * scale[:, None])
+    assert difference.abs().max() < 1e-6
+    torch.testing.assert_close(camera_std(found), scale.unflatten(1, (3, 15)), rtol=1e-6, atol=0)
+
+    depth = state.centre.norm(dim=-1, keepdim=True)
+    unit = torch.cat((torch.ones_like(depth).expand(-1, -1, 3), depth.expand(-1, -1, 3)), -1)
+    for s in range(snapshots):
+        block = inverse[:, 45 + 6 * s : 51 + 6 * s, 45 + 6 * s : 51 + 6 * s] * unit[:, s, :, None] * unit[:, s, None]
+        scale = block.diagonal(dim1=-2, dim2=-1).sqrt()
+        difference = (pose_covariance(found)[:, s] - block) / (scale[..., None] * scale[:, None])
+        assert difference.abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (2, 3)])
+def test_shapes_and_definiteness(simulate, batch: tuple[int, ...]) -> None:
+    found = run(simulate(*batch, cameras=3))
+    covariance = camera_covariance(found)
+    assert covariance.shape == relative_covariance(found).shape == (*batch, 45, 45)
+    assert camera_std(found).shape == (*batch, 3, 15)
+    assert pose_covariance(found).shape == (*batch, 2, 6, 6)
+    torch.testing.assert_close(covariance, covariance.mT)
+    scale = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    assert (torch.linalg.eigvalsh(covariance / (scale[..., None] * scale[..., None, :])) > 0).all()
+
+
+def test_posterior_is_never_wider_than_the_prior(simulate) -> None:
+    case = simulate(3, snapshots=4)
+    assert (camera_std(run(case)) <= case.spread * (1 + 1e-3)).all()
+
+
+def test_camera_that_sees_nothing_keeps_its_prior(simulate) -> None:
+    case = simulate(1, cameras=4, snapshots=3)
+    case.observations.seen[..., 2, :] = False
+    torch.testing.assert_close(camera_std(run(case))[0, 2], case.spread[2])
+
+
+@pytest.mark.parametrize("reference", [0, 2])
+def test_relative_jacobian_is_the_derivative(simulate, reference: int) -> None:
+    rig = simulate(cameras=3).truth
+
+    def relative(step: torch.Tensor) -> torch.Tensor:
+        return relative_difference(rig.moved(step), rig, reference).flatten()
+
+    expected = torch.autograd.functional.jacobian(relative, torch.zeros(3, 15, dtype=torch.float64)).flatten(1)
+    torch.testing.assert_close(relative_jacobian(rig, reference), expected, rtol=1e-8, atol=1e-8)
+
+
+def test_relative_quantities_do_not_know_the_gauge(simulate) -> None:
+    case = simulate(2, cameras=4, snapshots=5)
+    found = run(case)
+    turn = rotation_from_vector(torch.tensor([0.1, -0.2, 0.05], dtype=torch.float64))
+    elsewhere = RigidTransform(turn.expand(2, 3, 3), torch.tensor([50.0, -20.0, 30.0]).double().expand(2, 3))
+    torch.testing.assert_close(
+        relative_difference(found.rig.from_object(elsewhere), case.truth),
+        relative_difference(found.rig, case.truth),
+        rtol=1e-9,
+        atol=1e-9,
+    )
+    covariance = relative_covariance(found, reference=1)
+    assert covariance[:, 15:21].abs().max() < 1e-12
+    # A position relative to another camera is known far better than one in a frame that only the prior knows.
+    relative, absolute = (c.diagonal(dim1=-2, dim2=-1)[:, 3:6].sum(-1).sqrt() for c in (covariance, camera_covariance(found)))
+    assert (relative < absolute).all()
+
+
+def test_matches_the_spread_of_samples(simulate) -> None:
+    """Monte Carlo over noise alone, with the prior wide open where it would hold the answer back."""
+    drift = PhysicalDrift(rotation_deg=0.05, position=0.5, focal_length=0.002, principal_point=2.0, distortion=0.002)
+    case = simulate(400, snapshots=6, cameras=4, drift=drift, noise=0.2, sigma=0.2, seed=3)
+    found = run(case)
+    assert found.converged.all()
+    error, std = found.rig.difference(case.truth), camera_std(found)
+    normalized = (error / std).square().mean((0, 1))
+    assert ((normalized > 0.85) & (normalized < 1.15)).all()
+    relative, variance = relative_difference(found.rig, case.truth), relative_covariance(found).diagonal(dim1=-2, dim2=-1)
+    normalized = relative[:, 1:].flatten(1).square() / variance[:, 15:]
+    assert normalized.mean() == pytest.approx(1, abs=0.05)
+
+
+def test_undetermined_pose_is_refused(simulate) -> None:
+    case = simulate(1, cameras=3, snapshots=2)
+    case.observations.seen[:, 1] = False
+    found = estimate(case.observations, case.factory, case.obj, case.poses, spread=case.spread)
+    for function in (camera_covariance, pose_covariance):
+        with pytest.raises(RefusedError, match="every snapshot"):
+            function(found)

@@ -1,0 +1,64 @@
+"""What the estimation must reach: exactness, efficiency, honesty of the covariance, convergence."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from imgcal.estimation import (
+    EstimationOptions,
+    camera_covariance,
+    camera_std,
+    estimate,
+    relative_covariance,
+    relative_difference,
+)
+from imgcal.estimation.estimate import make_start
+from imgcal.estimation.implicit import map_cost
+from imgcal.estimation.robust import LOSSES
+from imgcal.synthesis import Drift, PhysicalDrift, RelativeDrift
+
+SQUARED = EstimationOptions(loss="squared")
+
+
+def test_noise_free_snapshot_is_met_exactly(simulate) -> None:
+    case = simulate(100, snapshots=1, noise=0.0, sigma=0.001, drift=RelativeDrift())
+    found = estimate(case.observations, case.factory, case.obj, spread=case.spread, options=SQUARED)
+    assert found.converged.all()
+    assert found.rms.max() <= 0.001
+
+
+def normalized_square(error: Tensor, covariance: Tensor) -> Tensor:
+    """Squared Mahalanobis distance for each degree of freedom: (B,). Directions without any variance do not count."""
+    std = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    free = (std > 1e-12).all(0)
+    error, std, covariance = error[:, free], std[:, free], covariance[:, free][:, :, free]
+    values, vectors = torch.linalg.eigh(covariance / (std[:, :, None] * std[:, None]))
+    along = (vectors.mT @ (error / std)[..., None]).squeeze(-1)
+    kept = values > 1e-8
+    return torch.where(kept, along.square() / values, 0.0).sum(-1) / kept.sum(-1)
+
+
+@pytest.mark.parametrize("drift", [RelativeDrift(0.025, 0.025), PhysicalDrift()])
+def test_efficient_and_honest(simulate, drift: Drift) -> None:
+    case = simulate(200, snapshots=20, noise=0.05, sigma=0.05, drift=drift)
+    found = estimate(case.observations, case.factory, case.obj, spread=case.spread, options=SQUARED)
+    assert found.converged.all()
+    error = found.rig.difference(case.truth)
+    bound = camera_std(found)[..., 6:8].square().mean().sqrt()
+    assert error[..., 6:8].square().mean().sqrt() <= 1.1 * bound
+    full = normalized_square(error.flatten(1), camera_covariance(found))
+    relative = normalized_square(
+        relative_difference(found.rig, case.truth).flatten(1), relative_covariance(found)
+    )
+    for ratio in (full, relative, found.chi2_per_dof):
+        assert 0.9 <= float(ratio.mean()) <= 1.1
+
+
+@pytest.mark.parametrize("options", [EstimationOptions(), SQUARED])
+def test_converges_from_ten_percent(simulate, options: EstimationOptions) -> None:
+    case = simulate(2000, snapshots=1, noise=0.05, drift=RelativeDrift(0.1, 0.1))
+    found = estimate(case.observations, case.factory, case.obj, spread=case.spread, options=options)
+    problem = case.problem()
+    at_truth = map_cost(problem, make_start(problem, case.poses, case.truth), LOSSES[options.loss])
+    right = found.converged & (0.5 * found.chi2 <= at_truth)
+    assert float(right.double().mean()) >= 0.999
