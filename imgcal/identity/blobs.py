@@ -1,5 +1,9 @@
 """One snapshot's blobs as dense arrays, and how far the prior lets predictions be off."""
 
+# Compiled functions take their types from their arguments.
+# ruff: noqa: ANN001, ANN202
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -48,7 +52,9 @@ def gather(detections: Detections, rig: CameraRig) -> Blobs:
         InputError: more than one snapshot, or cameras that are not the rig's.
     """
     if tuple(detections.camera_names) != tuple(rig.camera_names):
-        raise InputError(f"detections of cameras {detections.camera_names}: expected {rig.camera_names} of rig {rig.name}")
+        raise InputError(
+            f"detections of cameras {detections.camera_names}: expected {rig.camera_names} of rig {rig.name}"
+        )
     if len(np.unique(detections.snapshot)) > 1:
         raise InputError("identity: found blobs of several snapshots, expected those of one")
     rows = np.flatnonzero(detections.usable)

@@ -1,4 +1,8 @@
-"""Candidate poses: blob triples of single cameras against all fiducial triples, filtered by the camera's other blobs."""
+"""Candidate poses: blob triples of one camera against all fiducial triples, tested on the camera's other blobs."""
+
+# Compiled functions take their types from their arguments.
+# ruff: noqa: ANN001, ANN202
+# mypy: allow-untyped-defs
 
 from __future__ import annotations
 
@@ -138,7 +142,9 @@ def _search(
                 for i in range(3):
                     for j in range(3):
                         turn[i, j] = (
-                            frame[i, 0] * frames[t, j, 0] + frame[i, 1] * frames[t, j, 1] + frame[i, 2] * frames[t, j, 2]
+                            frame[i, 0] * frames[t, j, 0]
+                            + frame[i, 1] * frames[t, j, 1]
+                            + frame[i, 2] * frames[t, j, 2]
                         )
                 p = points[triples[t, 0]]
                 x = rays[q, 0, 0] * depths[0] - turn[0, 0] * p[0] - turn[0, 1] * p[1] - turn[0, 2] * p[2]

@@ -1,4 +1,4 @@
-"""Decide which blob is which fiducial: by prediction where a pose is known, else by hypotheses that the whole rig votes on."""
+"""Decide which blob is which fiducial: by prediction where a pose is known, else by votes of the whole rig."""
 
 from __future__ import annotations
 
@@ -18,9 +18,21 @@ from imgcal.identity.hypotheses import (
     single_camera_poses,
 )
 from imgcal.identity.planar import planar_poses
+from imgcal.identity.result import Identity, IdentityOptions, Status
 from imgcal.identity.rivals import conflicts, differ, displacement, lattice_shifts, moved, near_turns
-from imgcal.identity.types import Identity, IdentityOptions, Status
-from imgcal.identity.verify import STAGES, Fits, Scene, certain, evidence, join, predictions, refine, rig_and_pose, settle, start
+from imgcal.identity.verify import (
+    STAGES,
+    Fits,
+    Scene,
+    certain,
+    evidence,
+    join,
+    predictions,
+    refine,
+    rig_and_pose,
+    settle,
+    start,
+)
 from imgcal.identity.voting import match, predict_ideal, vote
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections
@@ -85,7 +97,8 @@ def track(
     spacing = _spacing(predicted)
     tolerances = [tolerance, max(3.0, 0.2 * spacing)] if tolerance > 0.4 * spacing else [tolerance]
     attempts = [
-        match(scene.blobs, predicted, vote(scene.blobs, predicted, reach, gate).shift, 1.25 * reach) for reach in tolerances
+        match(scene.blobs, predicted, vote(scene.blobs, predicted, reach, gate).shift, 1.25 * reach)
+        for reach in tolerances
     ]
     fits = refine(scene, start(scene, poses.select(np.zeros(len(attempts), dtype=int)), np.concatenate(attempts)))
     return _decide(scene, fits, options, known_pose=True)
@@ -102,7 +115,9 @@ def bootstrap(
     scene = Scene(gather(detections, rig), obj, rig, std)
     cameras = np.flatnonzero(scene.blobs.count >= 4)
     if len(cameras) == 0:
-        return _refused(scene, f"too few blobs: at most {scene.blobs.count.max()} in a camera, expected at least 4 in one")
+        return _refused(
+            scene, f"too few blobs: at most {scene.blobs.count.max()} in a camera, expected at least 4 in one"
+        )
     tolerance, gate = _bounds(scene, rig.working_distance or _guess_distance(scene), pose_known=False)
     generator = np.random.default_rng(options.seed)
     triples = fiducial_triples(obj, generator)
@@ -184,9 +199,15 @@ def _decide(scene: Scene, fits: Fits, options: IdentityOptions, known_pose: bool
         chosen = certain(scene, best, *odds)
         share = _share(scene, chosen)
         if margin < options.least_margin:
-            refusal = f"another labelling explains the blobs nearly as well: margin {margin:.1f}, expected {options.least_margin:.0f}"
+            refusal = (
+                f"another labelling explains the blobs nearly as well: margin {margin:.1f}, "
+                f"expected {options.least_margin:.0f}"
+            )
     if share < options.least_share:
-        refusal = f"the best pose explains {100 * share:.0f} % of what could be seen, expected {100 * options.least_share:.0f} %"
+        refusal = (
+            f"the best pose explains {100 * share:.0f} % of what could be seen, "
+            f"expected {100 * options.least_share:.0f} %"
+        )
     rig, pose = rig_and_pose(scene, chosen, 0)
     if refusal is not None:
         undecided = share >= options.least_share
@@ -214,7 +235,7 @@ def _margin(scene: Scene, best: Fits, others: Fits) -> float:
 
 
 def _against_motions(scene: Scene, best: Fits, known_pose: bool) -> tuple[Fits, float]:
-    """Compare a labelling with those of an object shifted or turned onto itself; change to a better one where there is one.
+    """Compare a labelling with those of an object shifted or turned onto itself; change to a better one.
 
     A lattice may be shifted in all cameras together, or in a single one as far as its prior allows.
 
@@ -267,7 +288,9 @@ def _guess_distance(scene: Scene) -> float:
     guesses = []
     for camera in np.flatnonzero(scene.blobs.count >= 4):
         uv = scene.blobs.ideal[camera, : scene.blobs.count[camera]]
-        guesses.append(focal[camera] * scene.obj.size / max(float(np.linalg.norm(uv - np.median(uv, axis=0), axis=1).mean()), 1.0))
+        guesses.append(
+            focal[camera] * scene.obj.size / max(float(np.linalg.norm(uv - np.median(uv, axis=0), axis=1).mean()), 1.0)
+        )
     return float(np.median(guesses))
 
 

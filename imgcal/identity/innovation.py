@@ -1,5 +1,9 @@
 """Predict every fiducial with its uncertainty from a fit, and compare it with every blob."""
 
+# Compiled functions take their types from their arguments.
+# ruff: noqa: ANN001, ANN202
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
@@ -170,7 +174,7 @@ def _compare(
 def _rows(rotated, rotation, arm, focal, principal, distortion, spread, radius_squared, unit, rows, uv):
     """Fill the Jacobian (2, 21) of a pixel with respect to 15 whitened camera and 6 pose parameters, and the pixel.
 
-    The lens is differentiated numerically: it is smooth, linear in its coefficients, and only uncertainties depend on it.
+    The lens is differentiated numerically: it is smooth, linear in its coefficients, and only uncertainties need it.
     """
     point = rotation @ arm
     ideal_u, ideal_v = _lens(point[0], point[1], point[2], distortion, radius_squared)

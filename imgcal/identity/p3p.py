@@ -1,5 +1,9 @@
 """Poses from three points in one camera, thousands at once."""
 
+# Compiled functions take their types from their arguments.
+# ruff: noqa: ANN001, ANN201, ANN202
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import numpy as np
@@ -12,17 +16,17 @@ FAST = {"contract", "reassoc", "nsz", "arcp"}
 def three_point_pose(rays, sides, mirror, rotation_frame, depths):
     """Find the pose of a triangle of known sides seen along three rays.
 
-    Scaled orthography has exactly two solutions, mirror images of each other, in closed form; the image is then corrected
-    for the depths found, once. Where perspective P3P has no real solution because the camera is not quite what it is
-    thought to be, this still gives the nearest sensible one. The correction leaves about a degree where the object's
-    depth is a fifth of its distance.
+    Scaled orthography has exactly two solutions, mirror images of each other, in closed form; the image is then
+    corrected for the depths found, once. Where perspective P3P has no real solution because the camera is not quite
+    what it is thought to be, this still gives the nearest sensible one. The correction leaves about a degree where the
+    object's depth is a fifth of its distance.
 
     Args:
         rays: (3, 2) coordinates on the z = 1 plane.
         sides: (3,) mm^2, squared distances of the points 0-1, 0-2 and 1-2.
         mirror: +1 or -1: which of the two solutions.
-        rotation_frame: (3, 3) filled with the triangle's frame in the camera: columns along the first side, in the plane,
-            normal to it.
+        rotation_frame: (3, 3) filled with the triangle's frame in the camera: columns along the first side, in the
+            plane, normal to it.
         depths: (3,) mm, filled with the depths of the points.
 
     Returns:

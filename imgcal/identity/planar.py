@@ -1,7 +1,7 @@
 """Candidate poses of planar objects with many fiducials, where triples are too many to try.
 
-Seen from a distance, a plane's image is an affine image. Whitened (shifted and stretched to zero mean and unit covariance)
-blobs and fiducials therefore differ by a rotation only, and one angle is all there is to search.
+Seen from a distance, a plane's image is an affine image. Whitened (shifted and stretched to zero mean and unit
+covariance) blobs and fiducials therefore differ by a rotation only, and one angle is all there is to search.
 """
 
 from __future__ import annotations
@@ -86,10 +86,11 @@ def _rotation(angle: float) -> Floats:
 
 def _best_angles(pattern: Floats, seen: Floats) -> Floats:
     """Angles that bring the whitened pattern nearest to the whitened blobs."""
-    angles = np.arange(ANGLES) * (2 * np.pi / ANGLES)
+    angles: Floats = np.linspace(0, 2 * np.pi, ANGLES, endpoint=False, dtype=np.float64)
     turned = np.concatenate([pattern @ _rotation(angle).T for angle in angles])
     distance = cKDTree(seen).query(turned)[0].reshape(ANGLES, -1)
-    return angles[np.argsort(np.minimum(distance, 0.3).mean(1))[:GROWN]]
+    misfit = np.minimum(distance, 0.3).mean(1)
+    return angles[np.argsort(misfit)[:GROWN]]
 
 
 def _affinity(pattern: Floats, seen: Floats, angle: float) -> Floats:

@@ -91,7 +91,7 @@ def conflicts(obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[
 
 
 def differ(obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[np.int64]) -> bool:
-    """Tell whether two labellings (C, N) are different answers, up to the object's symmetry, and not one with odd labels.
+    """Tell whether two labellings (C, N) are different answers, up to the object's symmetry, not one with odd labels.
 
     They are when a third of all common blobs, or of one camera's (three at least), are called differently.
     """

@@ -23,7 +23,7 @@ from imgcal.rig import CameraRig
 from imgcal.transforms import RigidTransform
 
 STAGES = (3.0, 0.7)
-"""Standard deviations (px) that the first fits allow, beyond the blobs' own; the last fits take it from their residuals."""
+"""Standard deviations (px) that the first fits allow, beyond the blobs' own; the last ones ask the residuals."""
 GATE = 25.0
 """Squared normalized innovation of a label; two degrees of freedom exceed it once in 270,000."""
 LEAST_SIZE_SPREAD = 0.05
@@ -54,7 +54,6 @@ class Fits:
     cost: NDArray[np.float64]  # (K,) half of chi2, data and prior
     innovations: Innovations | None = None  # of these labels at this state
 
-
     def select(self, rows: NDArray[np.int64]) -> Fits:
         """Keep the given labellings."""
         state = State(self.state.offset[rows], self.state.rotation[rows], self.state.centre[rows])
@@ -67,9 +66,17 @@ def join(first: Fits, second: Fits) -> Fits:
     a, b = first.state, second.state
     state = State(torch.cat((a.offset, b.offset)), torch.cat((a.rotation, b.rotation)), torch.cat((a.centre, b.centre)))
     found = Innovations(
-        *(np.concatenate((getattr(_found(first), f.name), getattr(_found(second), f.name))) for f in fields(Innovations))
+        *(
+            np.concatenate((getattr(_found(first), f.name), getattr(_found(second), f.name)))
+            for f in fields(Innovations)
+        )
     )
-    joined = (np.concatenate(pair) for pair in zip((first.labels, first.sigma, first.cost), (second.labels, second.sigma, second.cost), strict=True))
+    joined = (
+        np.concatenate(pair)
+        for pair in zip(
+            (first.labels, first.sigma, first.cost), (second.labels, second.sigma, second.cost), strict=True
+        )
+    )
     labels, sigma, cost = joined
     return Fits(labels, state, sigma, cost, found)
 
@@ -78,7 +85,9 @@ def start(scene: Scene, poses: Poses, labels: NDArray[np.int64]) -> Fits:
     """Put the factory rig at poses (K,) with rough labels (K, C, N)."""
     u, _, vh = np.linalg.svd(poses.rotation)
     rotation = torch.from_numpy(u @ vh)
-    centre = torch.from_numpy(np.ascontiguousarray(poses.translation)) + rotation @ scene.obj.points.mean(0).to(rotation)
+    centre = torch.from_numpy(np.ascontiguousarray(poses.translation)) + rotation @ scene.obj.points.mean(0).to(
+        rotation
+    )
     offset = rotation.new_zeros(len(poses), *scene.std.shape)
     return Fits(labels, State(offset, rotation[:, None], centre[:, None]), np.zeros(len(poses)), np.zeros(len(poses)))
 
@@ -194,7 +203,7 @@ def _residual_sigma(scene: Scene, fits: Fits) -> NDArray[np.float64]:
 
 
 def _size_misfit(scene: Scene, fits: Fits) -> NDArray[np.float64]:
-    """Chi2 of the blobs' radii where fiducials differ in theirs: (K,). One unknown factor a camera takes up all else."""
+    """Chi2 of the blobs' radii where fiducials differ in theirs: (K,). One unknown factor a camera takes the rest."""
     radius = scene.obj.radius
     if radius is None or not bool((radius > 1.05 * radius.min()).any()):
         return np.zeros(len(fits.labels))
@@ -235,7 +244,7 @@ def _log_odds(scene: Scene, fits: Fits) -> NDArray[np.float64]:
 
 
 def _contested(labels: NDArray[np.int64], found: Innovations) -> NDArray[np.bool_]:
-    """Mark labels (K, C, N) whose blob may as well belong to another fiducial, alone or in exchange for its own blob."""
+    """Mark labels (K, C, N) whose blob may as well belong to another fiducial, alone or in exchange for its blob."""
     labelled = labels >= 0
     cost = found.squared + found.log_det[..., None]
     # of_other[i, j]: cost of giving the blob of fiducial i to fiducial j.

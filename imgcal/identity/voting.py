@@ -4,6 +4,10 @@ Drift of a few percent moves a camera's pattern by tens of pixels but bends it b
 prior's bounds and everything else is not.
 """
 
+# Compiled functions take their types from their arguments.
+# ruff: noqa: ANN001, ANN202
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -29,7 +33,7 @@ class Votes:
 
 
 def predict_ideal(rig: CameraRig, points: NDArray[np.float64], poses: Poses) -> NDArray[np.float64]:
-    """Project fiducials (N, 3) without distortion, from the principal point: (K, C, N, 2) pixels, -1e7 behind a camera."""
+    """Project fiducials (N, 3) without distortion, from the principal point: (K, C, N, 2) px, -1e7 behind a camera."""
     transform = rig.cam_from_rig
     focal = rig.focal_length.mean(-1).numpy()
     return _predict(
@@ -100,13 +104,15 @@ def _vote_one(predicted, ideal, number, width, gate, count, shift):
                     windows[i + 1, j] += 1
                     windows[i, j + 1] += 1
                     windows[i + 1, j + 1] += 1
-        best = windows.argmax()
+        best = int(windows.argmax())
         i, j = best // (bins + 1), best % (bins + 1)
         count[c] = min(windows[i, j], predicted.shape[1])
         shift[c, 0], shift[c, 1] = i * width - gate, j * width - gate
 
 
-def match(blobs: Blobs, predicted: NDArray[np.float64], shift: NDArray[np.float64], tolerance: float) -> NDArray[np.int64]:
+def match(
+    blobs: Blobs, predicted: NDArray[np.float64], shift: NDArray[np.float64], tolerance: float
+) -> NDArray[np.int64]:
     """Pair fiducials with blobs under given shifts, which are refined on the way.
 
     Args:

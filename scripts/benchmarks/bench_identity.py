@@ -85,7 +85,8 @@ def blobs_of(
 def wrong_labels(found: Identity, truth: NDArray[np.int64], obj: CalibrationObject) -> tuple[int, int]:
     """Count wrong and right labels, under the symmetry element that fits best: one for all cameras."""
     named = found.labels >= 0
-    right = max(int((named & (np.append(motion.permutation, -1)[truth] == found.labels)).sum()) for motion in obj.symmetries)
+    moved = [np.append(motion.permutation, -1)[truth] for motion in obj.symmetries]
+    right = max(int((named & (labels == found.labels)).sum()) for labels in moved)
     return int(named.sum()) - right, right
 
 
@@ -146,7 +147,8 @@ def main() -> None:
         for key in (f"cold start: {title}", f"tracking: {title}"):
             print(key, json.dumps({k: round(v, 2) for k, v in results[key].items()}), flush=True)
     machine = {"processor": platform.machine(), "cores": os.cpu_count(), "python": platform.python_version()}
-    arguments.out.write_text(json.dumps({"machine": machine, "seed": arguments.seed, "results": results}, indent=2) + "\n")
+    content = {"machine": machine, "seed": arguments.seed, "results": results}
+    arguments.out.write_text(json.dumps(content, indent=2) + "\n")
 
 
 if __name__ == "__main__":

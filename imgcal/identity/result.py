@@ -40,6 +40,8 @@ class IdentityOptions:
     label_odds: float = 1e4  # of a single label, against a false blob or another fiducial
     least_label_odds: float = 1e2  # the same where false blobs are so dense that few labels could be that certain
     least_margin: float = 20.0  # of the whole labelling against the best different one, natural logarithm
-    least_share: float = 0.45  # explained part of what could be seen: the smaller of blobs and fiducials, camera by camera
+    least_share: float = (
+        0.45  # explained part of what could be seen: the smaller of blobs and fiducials, camera by camera
+    )
     rounds: int = 24  # of hypotheses before giving up
     seed: int = 0  # of the random choice of blob triples
