@@ -183,6 +183,8 @@ def _different(
 
 def _best(scene: Scene, fits: Fits, count: int) -> Fits:
     """Keep the labellings with the most evidence."""
+    if len(fits.labels) == 1:
+        return fits
     return fits.select(np.argsort(-evidence(scene, fits), kind="stable")[:count])
 
 
@@ -245,6 +247,8 @@ def _against_motions(scene: Scene, best: Fits, known_pose: bool) -> tuple[Fits, 
     shifts = lattice_shifts(scene.obj)
     spread = spread_of(scene.std, scene.rig, scene.rig.working_distance or _guess_distance(scene))
     turns = [] if known_pose else near_turns(scene.obj, 2 * spread.shape * scene.obj.size)
+    if not shifts and not turns:
+        return best, np.inf
     for _ in range(MOST_STEPS):
         _, pose = rig_and_pose(scene, best, 0)
         labels = best.labels[0]

@@ -124,10 +124,11 @@ def certain(scene: Scene, fits: Fits, odds: float, least_odds: float) -> Fits:
     demanded = np.clip(usual - np.log(100), np.log(least_odds), np.log(odds))
     for _ in range(4):
         found = _found(fits)
-        good = (found.own < GATE) & (_log_odds(scene, fits) > demanded) & ~_contested(fits.labels, found)
+        good = (found.own < GATE) & (log_odds > demanded) & ~_contested(fits.labels, found)
         if np.array_equal(good, fits.labels >= 0):
             break
         fits = _fit(scene, replace(fits, labels=np.where(good, fits.labels, -1)))
+        log_odds = _log_odds(scene, fits)
     return fits
 
 
