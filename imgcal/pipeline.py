@@ -389,5 +389,7 @@ def score(
     labelled = label(detections, rig, obj, options, progress)
     observations, poses = _used(labelled, rig, obj)
     fixed = torch.zeros(*rig.distortion.shape[:-1], 15, dtype=rig.distortion.dtype)
-    fit = estimate(observations, rig, obj, poses, spread=fixed, options=options.estimation)
+    # What is reported is an RMS in pixels: centres count alike, however well each was measured.
+    even = replace(observations, sigma=torch.full_like(observations.sigma, options.identity_error))
+    fit = estimate(even, rig, obj, poses, spread=fixed, options=options.estimation)
     return Score(labelled, fit.residual, observations.seen)

@@ -79,9 +79,7 @@ def simulate_frames(
             visible=projection.visible,
             depth=projection.depth,
         )
-        yield {
-            name: _frame(markers, camera, rig, model, generator) for camera, name in enumerate(rig.camera_names)
-        }
+        yield _frames(markers, rig, model, generator)
 
 
 def true_detections(truth: Truth) -> Detections:
@@ -102,15 +100,24 @@ def true_detections(truth: Truth) -> Detections:
     )
 
 
-def _frame(
-    markers: Blobs, camera: int, rig: CameraRig, model: FrameModel, generator: torch.Generator
-) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    one = Blobs(*(getattr(markers, name)[camera : camera + 1].float() if name != "visible" else
-                  markers.visible[camera : camera + 1] for name in Blobs.__dataclass_fields__))  # fmt: skip
-    width, height = rig.image_size[camera].tolist()
-    clutter = None
-    if model.clutter is not None:
-        clutter = sample_clutter(model.clutter, one, (height, width), generator=generator)
-    rendered = infrared_frames(one, (height, width), model.sensor, clutter=clutter, generator=generator)
-    frame: NDArray[np.uint8] | NDArray[np.uint16] = rendered.frames[0].numpy()
-    return frame
+def _frames(
+    markers: Blobs, rig: CameraRig, model: FrameModel, generator: torch.Generator
+) -> dict[str, NDArray[np.uint8] | NDArray[np.uint16]]:
+    """Render one snapshot: cameras with images of the same size together."""
+    frames: dict[str, NDArray[np.uint8] | NDArray[np.uint16]] = {}
+    sizes = [tuple(size) for size in rig.image_size.tolist()]
+    for width, height in sorted(set(sizes)):
+        cameras = [camera for camera, size in enumerate(sizes) if size == (width, height)]
+        some = Blobs(
+            markers.uv[cameras].float(),
+            markers.shape[cameras].float(),
+            markers.intensity[cameras].float(),
+            markers.visible[cameras],
+            markers.depth[cameras].float(),
+        )
+        clutter = None
+        if model.clutter is not None:
+            clutter = sample_clutter(model.clutter, some, (height, width), generator=generator)
+        rendered = infrared_frames(some, (height, width), model.sensor, clutter=clutter, generator=generator)
+        frames |= {rig.camera_names[c]: frame for c, frame in zip(cameras, rendered.frames.numpy(), strict=True)}
+    return {name: frames[name] for name in rig.camera_names}

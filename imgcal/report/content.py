@@ -64,7 +64,7 @@ class ReportContent:
     frames: tuple[NDArray[np.uint8] | NDArray[np.uint16] | None, ...] = ()  # C grey images (H, W) of one snapshot
     frame_snapshot: int = 0  # index of that snapshot
     chi2_per_dof: float = float("nan")
-    rms_before: float = float("nan")  # pixels, over both axes
+    rms_before: float = float("nan")  # pixels, RMS length of the residuals
     rms_after: float = float("nan")
     seconds: Mapping[str, float] = field(default_factory=dict)  # by stage, in the order in which they ran
     command: str = ""
@@ -158,7 +158,7 @@ class ReportContent:
         return (self.std > UNDETERMINED * self.prior_std) & ~self.fixed
 
     def rms_by(self, group: NDArray[np.int64], residual: Array, count: int) -> Array:
-        """RMS of the used blobs' residuals over both axes, by group.
+        """RMS length of the used blobs' residuals, by group.
 
         Args:
             group: (M,) index of the group of each blob, below `count`.
@@ -171,7 +171,7 @@ class ReportContent:
         rows = self.used & np.isfinite(residual).all(axis=1)
         squares = np.bincount(group[rows], weights=(residual[rows] ** 2).sum(axis=1), minlength=count)
         number = np.bincount(group[rows], minlength=count)
-        return np.sqrt(np.divide(squares, 2 * number, out=np.full(count, np.nan), where=number > 0))
+        return np.sqrt(np.divide(squares, number, out=np.full(count, np.nan), where=number > 0))
 
     def _residual(self, predicted: Array | None) -> Array:
         return np.full((len(self.detections), 2), np.nan) if predicted is None else predicted - self.detections.uv

@@ -74,8 +74,8 @@ _KEEP = "Then use rig.yaml in place of the factory file; keep the factory file f
 def _improvement(content: ReportContent) -> str:
     after = f"{pixels(content.rms_after)} px"
     if not math.isfinite(content.rms_before):
-        return f"The reprojection error is {after} (RMS over both axes)."
-    return f"The reprojection error went from {pixels(content.rms_before)} px to {after} (RMS over both axes)."
+        return f"The reprojection error is {after} (RMS)."
+    return f"The reprojection error went from {pixels(content.rms_before)} px to {after} (RMS)."
 
 
 def _movement(content: ReportContent) -> tuple[str, ...]:

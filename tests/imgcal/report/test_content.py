@@ -28,7 +28,7 @@ def test_rms_by_group(content: ReportContent) -> None:
     rms = content.rms_by(content.detections.camera, content.residual_after, len(content.cameras) + 1)
     for camera in range(len(content.cameras)):
         rows = content.used & (content.detections.camera == camera)
-        assert rms[camera] == pytest.approx(np.sqrt(np.mean(content.residual_after[rows] ** 2)))
+        assert rms[camera] == pytest.approx(np.sqrt(np.mean((content.residual_after[rows] ** 2).sum(1))))
     assert np.isnan(rms[-1])
 
 

@@ -1,0 +1,56 @@
+"""One camera, 15 views of a grid of 10 x 10 dark dots, from nominal intrinsics that are 2 % off."""
+
+import shutil
+
+import pytest
+import torch
+
+import imgcal
+from imgcal.formats import read_frame, write_text
+from imgcal.rig import CameraRig
+from imgcal.transforms import RigidTransform
+
+HELD_OUT_LIMIT = 0.25  # px RMS, from the captures' README
+
+
+@pytest.fixture(scope="module")
+def grid(captures, tmp_path_factory):
+    """The frames in the layout of a capture, and the grid as an object file."""
+    folder = tmp_path_factory.mktemp("grid")
+    (folder / "frames" / "cam").mkdir(parents=True)
+    for path in sorted((captures / "dot-grid-10x10" / "frames").glob("*.png")):
+        shutil.copy(path, folder / "frames" / "cam")
+    rows = [f"{25.4 * column},{25.4 * row},0" for row in range(10) for column in range(10)]
+    write_text(folder / "object.csv", "\n".join(["x,y,z", *rows]) + "\n")
+    assert read_frame(folder / "frames" / "cam" / "00.png").shape == (480, 640)
+    return folder
+
+
+def nominal():
+    return CameraRig(
+        torch.tensor([[550.0, 550.0]], dtype=torch.float64), torch.tensor([[320.0, 240.0]], dtype=torch.float64),
+        torch.zeros(1, 5, dtype=torch.float64), RigidTransform.identity(1, dtype=torch.float64),
+        torch.tensor([[640, 480]]), ("cam",),
+    )  # fmt: skip
+
+
+def test_the_first_half_of_the_views_predicts_the_second(grid, calibrate, score):
+    dark = ("--polarity", "dark")
+    outcome = calibrate(grid, nominal(), grid / "object.csv", "--snapshots", "0:8", *dark)
+    assert outcome.code == 0, outcome.result["reason"]
+    # The dots are alike: eight labellings explain a view, and the intrinsics are the same for all.
+    assert outcome.result["identity"] == "ambiguous"
+    assert outcome.result["snapshots_used"] == 8
+    scored = score(grid, outcome.rig, grid / "object.csv", "--snapshots", "8:15", *dark)
+    assert scored["rms_px"] <= HELD_OUT_LIMIT
+    assert scored["snapshots_used"] == 7
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_every_other_view_predicts_the_rest(first, grid):
+    obj = imgcal.load_object(grid / "object.csv")
+    frames = [read_frame(path) for path in sorted((grid / "frames" / "cam").glob("*.png"))]
+    dark = imgcal.DetectionOptions(polarity="dark")
+    found = imgcal.calibrate({"cam": frames[first::2]}, nominal(), obj, detection=dark)
+    scored = imgcal.score(imgcal.detect({"cam": frames[1 - first :: 2]}, dark), found.rig, obj)
+    assert scored.distances.square().mean().sqrt() <= HELD_OUT_LIMIT
