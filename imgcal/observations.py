@@ -73,8 +73,10 @@ class Observations:
     sigma: Tensor  # (*B, S, C, N) pixels, one standard deviation of each axis
     seen: Tensor  # (*B, S, C, N) bool
 
-    def to(self, *args: torch.device | torch.dtype | str) -> Observations:
-        """Move to a device or change the floating-point type."""
-        device_only = [a for a in args if not isinstance(a, torch.dtype)]
-        seen = self.seen.to(*device_only) if device_only else self.seen
-        return Observations(self.uv.to(*args), self.sigma.to(*args), seen)
+    def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Observations:
+        """Change the floating-point type, move to a device, or both."""
+        return Observations(
+            self.uv.to(dtype=dtype, device=device),
+            self.sigma.to(dtype=dtype, device=device),
+            self.seen.to(device=device),
+        )

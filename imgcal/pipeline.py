@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.detection import DetectionOptions, detect
+from imgcal.detection.options import Frame
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import Estimate, EstimationOptions, camera_std, estimate
 from imgcal.identity import Identity, IdentityOptions, identify
@@ -24,7 +25,7 @@ from imgcal.observations import Detections, Observations
 from imgcal.rig import CameraRig, RigPrior
 from imgcal.transforms import RigidTransform
 
-Frames = Mapping[str, NDArray[np.generic] | Sequence[NDArray[np.generic] | None] | None]
+Frames = Mapping[str, Frame | Sequence[Frame | None] | None]
 Progress = Callable[[Iterable[int], int], Iterable[int]]
 
 
@@ -34,7 +35,9 @@ class PipelineOptions:
 
     identity: IdentityOptions = IdentityOptions()
     estimation: EstimationOptions = EstimationOptions()
-    identity_error: float = 0.3  # px: what a centre may be off beyond its own sigma (partly hidden markers) while blobs are told apart
+    identity_error: float = (
+        0.3  # px: what a centre may be off beyond its own sigma (partly hidden markers) while blobs are told apart
+    )
     least_fiducials: int = 4  # different fiducials that a snapshot must show, all cameras together
     outlier: float = 5.0  # standard deviations beyond which a labelled blob is left out
     most_outliers: float = 0.25  # share of left-out blobs above which the data do not fit the object
@@ -232,7 +235,8 @@ def matched_to_rig(detections: Detections, rig: CameraRig) -> Detections:
     unknown = [name for name in detections.camera_names if name not in rig.camera_names]
     if unknown:
         raise InputError(
-            f"detections: found camera {', '.join(unknown)}, expected cameras of rig {rig.name}: {', '.join(rig.camera_names)}"
+            f"detections: found camera {', '.join(unknown)}, expected cameras of rig {rig.name}: "
+            f"{', '.join(rig.camera_names)}"
         )
     index = np.array([rig.camera_names.index(name) for name in detections.camera_names], dtype=np.int64)
     camera = index[detections.camera] if len(detections) else detections.camera
@@ -268,7 +272,9 @@ def _fit(labelled: Labelled, rig: CameraRig, obj: CalibrationObject, options: Pi
         weighted = replace(observations, sigma=(raw.sigma.square() + model_error**2).sqrt())
         fit = estimate(weighted, rig, obj, poses, options=options.estimation)
         if not bool(fit.converged):
-            raise RefusedError(f"estimation: no minimum after {fit.iterations} iterations (RMS {float(fit.rms):.3g} px)")
+            raise RefusedError(
+                f"estimation: no minimum after {fit.iterations} iterations (RMS {float(fit.rms):.3g} px)"
+            )
         model_error, poses = _model_error(fit, raw.sigma), fit.rig_from_object
         distance = fit.residual.norm(dim=-1) / (raw.sigma.square() + model_error**2).sqrt()
         # Where a fiducial was left out there is no residual: it stays out.
@@ -283,7 +289,12 @@ def _fit(labelled: Labelled, rig: CameraRig, obj: CalibrationObject, options: Pi
     before = estimate(observations, rig, obj, poses, spread=torch.zeros_like(fit.problem.spread[0]))
     values = {name: getattr(fit, name) for name in Estimate.__dataclass_fields__}
     return Calibration(
-        **values, labelled=labelled, observations=observations, before=before, model_error=model_error, outliers=outliers
+        **values,
+        labelled=labelled,
+        observations=observations,
+        before=before,
+        model_error=model_error,
+        outliers=outliers,
     )
 
 
@@ -291,7 +302,9 @@ def _used(labelled: Labelled, rig: CameraRig, obj: CalibrationObject) -> tuple[O
     """Observations of the accepted snapshots, and their poses where identity found all of them."""
     used = labelled.used
     detections = labelled.detections
-    observations = to_observations(detections.select(np.isin(detections.snapshot, used) & (detections.fiducial >= 0)), rig, obj)
+    observations = to_observations(
+        detections.select(np.isin(detections.snapshot, used) & (detections.fiducial >= 0)), rig, obj
+    )
     poses = [labelled.snapshots[s].rig_from_object for s in used]
     known = [pose for pose in poses if pose is not None]
     return observations, _stack(known) if len(known) == len(used) else None
@@ -315,8 +328,8 @@ def _require_fit(model_error: float, outlier_share: float, rms: float, options: 
     if model_error > options.largest_model_error:
         raise RefusedError(
             f"estimation: residuals of {rms:.2f} px RMS do not fit the noise: found an unexplained error of "
-            f"{model_error:.2f} px, expected at most {options.largest_model_error:g}; the object, the labels or the camera "
-            "model are not what they are said to be"
+            f"{model_error:.2f} px, expected at most {options.largest_model_error:g}; the object, the labels or the "
+            "camera model are not what they are said to be"
         )
     if outlier_share > options.most_outliers:
         raise RefusedError(

@@ -198,16 +198,15 @@ class CameraRig:
             ),
         )
 
-    def to(self, *args: torch.device | torch.dtype | str) -> CameraRig:
-        """Move to a device or change the floating-point type."""
-        device_only = [a for a in args if not isinstance(a, torch.dtype)]
+    def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> CameraRig:
+        """Change the floating-point type, move to a device, or both."""
         return replace(
             self,
-            focal_length=self.focal_length.to(*args),
-            principal_point=self.principal_point.to(*args),
-            distortion=self.distortion.to(*args),
-            cam_from_rig=self.cam_from_rig.to(*args),
-            image_size=self.image_size.to(*device_only) if device_only else self.image_size,
+            focal_length=self.focal_length.to(dtype=dtype, device=device),
+            principal_point=self.principal_point.to(dtype=dtype, device=device),
+            distortion=self.distortion.to(dtype=dtype, device=device),
+            cam_from_rig=self.cam_from_rig.to(dtype=dtype, device=device),
+            image_size=self.image_size.to(device=device),
         )
 
 

@@ -50,9 +50,11 @@ class RigidTransform:
         """Transform points (*B, N, 3) mm; the batch axes broadcast against the transform's."""
         return (self.rotation @ points_source.mT).mT + self.translation[..., None, :]
 
-    def to(self, *args: torch.device | torch.dtype | str) -> RigidTransform:
-        """Move to a device or change the floating-point type."""
-        return RigidTransform(self.rotation.to(*args), self.translation.to(*args))
+    def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> RigidTransform:
+        """Change the floating-point type, move to a device, or both."""
+        return RigidTransform(
+            self.rotation.to(dtype=dtype, device=device), self.translation.to(dtype=dtype, device=device)
+        )
 
 
 def rotate(rotation: Tensor, vector: Tensor) -> Tensor:

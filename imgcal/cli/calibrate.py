@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -20,8 +19,8 @@ from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import relative_covariance
 from imgcal.formats import RigCovariance, load_object, load_rig, open_input, save_rig, write_text
 from imgcal.pipeline import Calibration, PipelineOptions, calibrate
-from imgcal.rig import CameraRig
 from imgcal.report import write_report
+from imgcal.rig import CameraRig
 
 
 @dataclass(frozen=True)
@@ -29,8 +28,8 @@ class Calibrate:
     """Recalibrate a rig from captured frames (or a table of blobs) of a known object.
 
     Writes OUT/rig.yaml (the recalibrated rig, with the standard deviation of every parameter), OUT/result.json and
-    OUT/report.html. If the data cannot decide, the reason is in result.json and report.html, no rig.yaml is written and the
-    exit code is 3. Example: imgcal calibrate my_capture --rig factory.yaml --object object.csv --out result
+    OUT/report.html. If the data cannot decide, the reason is in result.json and report.html, no rig.yaml is written
+    and the exit code is 3. Example: imgcal calibrate my_capture --rig factory.yaml --object object.csv --out result
     """
 
     input: Annotated[Path, tyro.conf.Positional]  #: capture folder or detections file
@@ -43,7 +42,9 @@ class Calibrate:
     blind_cameras: bool = False  #: accept cameras that see nothing; they keep their factory values
     full_covariance: bool = False  #: write the whole covariance matrix to rig.yaml, too
     report: bool = True  #: write report.html
-    reference: str | None = None  #: camera that the uncertainty of positions and rotations refers to; default: the first
+    reference: str | None = (
+        None  #: camera that the uncertainty of positions and rotations refers to; default: the first
+    )
     detection: Annotated[DetectionOptions, tyro.conf.arg(name="")] = field(default_factory=DetectionOptions)
 
     def run(self) -> None:
@@ -63,7 +64,9 @@ class Calibrate:
         refusal: RefusedError | None = None
         calibration: Calibration | None = None
         try:
-            calibration = calibrate(detections, rig, obj, PipelineOptions(blind_cameras=self.blind_cameras), progress=bar)
+            calibration = calibrate(
+                detections, rig, obj, PipelineOptions(blind_cameras=self.blind_cameras), progress=bar
+            )
         except RefusedError as error:
             refusal = error
         seconds |= {} if calibration is None else {k: v for k, v in calibration.seconds.items() if k != "detection"}
@@ -72,7 +75,9 @@ class Calibrate:
             (out / "rig.yaml").unlink(missing_ok=True)
             result = refused_summary(str(refusal), detections.snapshot_names, seconds)
         else:
-            covariance = RigCovariance.from_matrix(relative_covariance(calibration, reference), rig.camera_names[reference])
+            covariance = RigCovariance.from_matrix(
+                relative_covariance(calibration, reference), rig.camera_names[reference]
+            )
             save_rig(calibration.rig, out / "rig.yaml", covariance, full=self.full_covariance)
             result = summary(calibration, seconds)
         if self.report:
@@ -153,7 +158,10 @@ def _rms(residual: torch.Tensor, seen: torch.Tensor) -> float | None:
 
 def _print(result: dict[str, Any], out: Path, report: bool) -> None:
     print(f"reprojection error before {result['rms_px_before']:.3f} px, after {result['rms_px_after']:.4f} px (RMS)")
-    print(f"identity {result['identity']}, {result['snapshots_used']} snapshots used, {result['snapshots_rejected']} rejected")
+    print(
+        f"identity {result['identity']}, {result['snapshots_used']} snapshots used, "
+        f"{result['snapshots_rejected']} rejected"
+    )
     print(f"rig     {out / 'rig.yaml'}")
     print(f"result  {out / 'result.json'}")
     if report:

@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from imgcal.detection import Blobs, DetectionOptions, detect_snapshot
 from imgcal.errors import InputError
-from imgcal.formats import Capture
+from imgcal.formats import Capture, Frame
 from imgcal.observations import Detections
 from imgcal.rig import CameraRig
 
@@ -38,7 +37,7 @@ def parse_range(text: str | None) -> tuple[int, int | None]:
 
 def read_detections(
     source: Capture | Detections, snapshots: str | None, options: DetectionOptions
-) -> tuple[Detections, dict[str, NDArray[np.generic] | None]]:
+) -> tuple[Detections, dict[str, Frame | None]]:
     """Take detections from a file as they are, or find blobs in the frames of a capture.
 
     Returns:
@@ -58,11 +57,11 @@ def read_detections(
 
 def _detect_capture(
     capture: Capture, first: int, last: int | None, options: DetectionOptions
-) -> tuple[Detections, dict[str, NDArray[np.generic] | None]]:
+) -> tuple[Detections, dict[str, Frame | None]]:
     names = capture.snapshot_names[first:last]
     masks = {camera: mask for camera in capture.camera_names if (mask := capture.mask(camera)) is not None}
     found: list[Blobs] = []
-    shown: dict[str, NDArray[np.generic] | None] = {}
+    shown: dict[str, Frame | None] = {}
     with ThreadPoolExecutor() as pool:
         for _, frames in progress(capture.snapshots(first, last), len(names), "detecting blobs"):
             shown = shown or dict(frames)
@@ -93,7 +92,9 @@ def without_cameras(rig: CameraRig, names: tuple[str, ...]) -> CameraRig:
     """Leave cameras out of a rig."""
     unknown = [name for name in names if name not in rig.camera_names]
     if unknown:
-        raise InputError(f"--without: found {', '.join(unknown)}, expected cameras of the rig: {', '.join(rig.camera_names)}")
+        raise InputError(
+            f"--without: found {', '.join(unknown)}, expected cameras of the rig: {', '.join(rig.camera_names)}"
+        )
     return rig.select([i for i, name in enumerate(rig.camera_names) if name not in names])
 
 

@@ -13,18 +13,24 @@ from torch import Tensor
 
 import imgcal
 from imgcal.estimation import relative_covariance
-from imgcal.observations import Detections
+from imgcal.formats import Frame
 from imgcal.objects import CalibrationObject
+from imgcal.observations import Detections
 from imgcal.pipeline import Calibration, matched_to_rig
 from imgcal.report import ReportContent, SnapshotSummary, relative_prior_std
 from imgcal.rig import PARAMETERS, CameraRig
 from imgcal.transforms import RigidTransform
 
-Pictures = Mapping[str, NDArray[np.uint8] | NDArray[np.uint16] | None]
+Pictures = Mapping[str, Frame | None]
 
 
 def describe_refusal(
-    reason: str, detections: Detections, rig: CameraRig, obj: CalibrationObject, pictures: Pictures, seconds: dict[str, float]
+    reason: str,
+    detections: Detections,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    pictures: Pictures,
+    seconds: dict[str, float],
 ) -> ReportContent:
     """Say why there is no calibration, beside what was seen."""
     detections = matched_to_rig(detections, rig)
@@ -38,12 +44,14 @@ def describe_refusal(
         detections=detections,
         labels=detections.fiducial,
         snapshots=tuple(
-            SnapshotSummary(name, int(blobs), 0, reason) for name, blobs in zip(detections.snapshot_names, found, strict=True)
+            SnapshotSummary(name, int(blobs), 0, reason)
+            for name, blobs in zip(detections.snapshot_names, found, strict=True)
         ),
         object_points=obj.points.double().numpy(),
         frames=tuple(pictures.get(name) for name in rig.camera_names) if pictures else (),
         seconds=seconds,
-        **_provenance(),
+        command=_command(),
+        versions=_versions(),
     )
 
 
@@ -90,7 +98,8 @@ def describe(
         rms_before=_rms(calibration.before.residual, seen),
         rms_after=_rms(calibration.residual, seen),
         seconds=seconds,
-        **_provenance(),
+        command=_command(),
+        versions=_versions(),
     )
 
 
@@ -120,6 +129,9 @@ def _rms(residual: Tensor, seen: Tensor) -> float:
     return float(residual[seen].square().sum(-1).mean().sqrt())
 
 
-def _provenance() -> dict[str, str | dict[str, str]]:
-    versions = {"imgcal": imgcal.__version__, "PyTorch": torch.__version__, "Python": platform.python_version()}
-    return {"command": " ".join(["imgcal", *sys.argv[1:]]), "versions": versions}
+def _command() -> str:
+    return " ".join(["imgcal", *sys.argv[1:]])
+
+
+def _versions() -> dict[str, str]:
+    return {"imgcal": imgcal.__version__, "PyTorch": torch.__version__, "Python": platform.python_version()}

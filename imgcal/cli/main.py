@@ -39,14 +39,14 @@ class Runnable(Protocol):
 def main(arguments: list[str] | None = None) -> int:
     """Run a command line; returns the exit code."""
     try:
-        command: Runnable = tyro.cli(Command, prog="imgcal", description=DESCRIPTION, args=arguments)  # type: ignore[call-overload]
+        command: Runnable = tyro.cli(Command, prog="imgcal", description=DESCRIPTION, args=arguments)
         command.run()
     except InputError as error:
         return _fail(error, UNUSABLE)
     except RefusedError as error:
         return _fail(error, REFUSED)
     except BrokenPipeError:  # the reader of our output has seen enough
-        sys.stdout = None  # type: ignore[assignment]
+        sys.stdout = None
         return DONE
     except OSError as error:
         return _fail(error, UNUSABLE)

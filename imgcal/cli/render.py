@@ -40,7 +40,9 @@ class Render:
     def run(self) -> None:
         """Render and write."""
         if self.size < 8 or self.dot <= 0:
-            raise InputError(f"--size, --dot: found {self.size} and {self.dot}, expected at least 8 pixels and more than 0")
+            raise InputError(
+                f"--size, --dot: found {self.size} and {self.dot}, expected at least 8 pixels and more than 0"
+            )
         rig, obj = load_rig(self.rig), load_object(self.object)
         detections, _ = read_detections(open_input(self.input, rig, obj.fiducials), self.snapshots, self.detection)
 
@@ -63,4 +65,7 @@ class Render:
             for camera, image in zip(rig.camera_names, pixels, strict=True):
                 write_image(self.out / camera / f"{name}.png", image)
         refused = len(labelled.snapshots) - len(labelled.used)
-        print(f"{len(labelled.used)} snapshots written to {self.out}, {refused} left out (identity refused)", file=sys.stderr)
+        print(
+            f"{len(labelled.used)} snapshots written to {self.out}, {refused} left out (identity refused)",
+            file=sys.stderr,
+        )

@@ -24,7 +24,8 @@ class Score:
     """Measure the reprojection error of a rig that is held fixed; only the object's pose is fitted in each snapshot.
 
     Prints JSON: rms_px, median_px, p95_px, snapshots_used, snapshots_rejected, per_camera. All three are of
-    distances in the image; the RMS is that of OpenCV's calibrateCamera, sqrt(2) times the paper's RE. Example: imgcal score my_capture --rig out/rig.yaml --object object.csv
+    distances in the image; the RMS is that of OpenCV's calibrateCamera, sqrt(2) times the paper's RE.
+    Example: imgcal score my_capture --rig out/rig.yaml --object object.csv
     """
 
     input: Annotated[Path, tyro.conf.Positional]  #: capture folder or detections file

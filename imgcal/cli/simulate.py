@@ -6,10 +6,9 @@ import math
 import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import torch
-import tyro
 
 from imgcal.cli.common import make_folder, progress
 from imgcal.errors import InputError
@@ -33,8 +32,8 @@ from renderers import ClutterModel, SensorModel
 class Simulate:
     """Make a capture: one rig that has drifted from its factory calibration, seen through realistic infrared frames.
 
-    Writes OUT/frames/<camera>/<snapshot>.png, the factory rig and the object beside them, and OUT/truth/ with the drifted
-    rig, the exact image points (labelled) and the object's poses.
+    Writes OUT/frames/<camera>/<snapshot>.png, the factory rig and the object beside them, and OUT/truth/ with the
+    drifted rig, the exact image points (labelled) and the object's poses.
     Example: imgcal simulate --rig O10 --object asymmetric8 --out my_capture --snapshots 20 --kappa 0.05
     """
 
@@ -86,7 +85,9 @@ class Simulate:
         return kinds[self.drift]
 
     def _pose_range(self) -> PoseRange:
-        theta, phi, alpha = ((math.radians(a), math.radians(b)) for a, b in (self.theta_deg, self.phi_deg, self.alpha_deg))
+        theta, phi, alpha = (
+            (math.radians(a), math.radians(b)) for a, b in (self.theta_deg, self.phi_deg, self.alpha_deg)
+        )
         return PoseRange(theta, phi, alpha)
 
 

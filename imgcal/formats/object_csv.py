@@ -49,7 +49,6 @@ def load_object(path: str | Path) -> CalibrationObject:
     return CalibrationObject(torch.from_numpy(points), palette(count).double(), radius, path.stem, names)
 
 
-
 def save_object(obj: CalibrationObject, path: str | Path) -> None:
     """Write a calibration object in one step; every number in its shortest exact form."""
     columns: list[list[str]] = [[f"{value!r}" for value in axis] for axis in obj.points.double().T.tolist()]

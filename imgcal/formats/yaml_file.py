@@ -74,7 +74,7 @@ def yaml_text(content: dict[str, Any]) -> str:
     )
 
 
-class _Loader(_BaseLoader):  # type: ignore[misc]
+class _Loader(_BaseLoader):
     """YAML 1.2 numbers (1e-5 is one), and no silent overwriting of a key by a second one."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
@@ -87,7 +87,7 @@ class _Loader(_BaseLoader):  # type: ignore[misc]
         return mapping
 
 
-class _Dumper(_BaseDumper):  # type: ignore[misc]
+class _Dumper(_BaseDumper):
     """Flow style for `Flow` and `FlowMap`, block style for the rest."""
 
 

@@ -19,5 +19,6 @@ result = imgcal.estimate(observations, factory, obj)
 
 before = factory.difference(truth.rig)[:, 6:8].abs().mean()
 after = result.rig.difference(truth.rig)[:, 6:8].abs().mean()
-print(f"focal length error: {before:.2f} px -> {after:.2f} px, predicted spread {camera_std(result)[:, 6:8].mean():.2f} px")
+spread = camera_std(result)[:, 6:8].mean()
+print(f"focal length error: {before:.2f} px -> {after:.2f} px, predicted spread {spread:.2f} px")
 print(f"chi2 per degree of freedom: {result.chi2_per_dof:.2f}")

@@ -1,4 +1,4 @@
-"""How the real frames are used: fit on one half, take that as the factory calibration, disturb it, recover, score the other half."""
+"""How the real frames are used: fit one half, take that as the factory calibration, disturb it, recover, score the rest."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def read_points(path: Path, object_points: np.ndarray, cameras: tuple[str, ...])
 
 
 def fit_camera(xyz: np.ndarray, uv: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
-    """Pinhole and five coefficients by SciPy, from several principal points: refraction puts it far outside the image."""
+    """Pinhole and five coefficients by SciPy, from several principal points: refraction puts it far outside."""
     width, height = image_size
     start = np.array([[5000.0, 0, width / 2], [0, 5000, height / 2], [0, 0, 1]])
     fixed = (
@@ -55,7 +55,9 @@ def fit_camera(xyz: np.ndarray, uv: np.ndarray, image_size: tuple[int, int]) -> 
         | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
     )  # fmt: skip
     points = (xyz.astype(np.float32), uv.astype(np.float32))
-    _, matrix, _, rotation, translation = cv2.calibrateCamera([points[0]], [points[1]], image_size, start, None, flags=fixed)
+    _, matrix, _, rotation, translation = cv2.calibrateCamera(
+        [points[0]], [points[1]], image_size, start, None, flags=fixed
+    )
 
     def residuals(x: np.ndarray) -> np.ndarray:
         p = np.r_[x, np.zeros(15 - len(x))] * SCALE
@@ -89,7 +91,9 @@ def disturbed(rig: CameraRig, points: Points, pixels: float, seed: int, common: 
     draw = torch.randn(rig.cameras, 15, generator=generator, dtype=torch.float64)
     if common:
         draw = draw[:1].expand(rig.cameras, -1)
-    size = torch.cat((torch.full((3,), 0.001), torch.full((3,), 1.0), torch.full((2,), 20.0), torch.full((2,), 5.0), torch.zeros(5)))
+    size = torch.cat(
+        (torch.full((3,), 0.001), torch.full((3,), 1.0), torch.full((2,), 20.0), torch.full((2,), 5.0), torch.zeros(5))
+    )
     step = draw * size
     for _ in range(20):
         moved = rig.moved(step)

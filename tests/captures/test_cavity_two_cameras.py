@@ -56,7 +56,11 @@ def published_dots(folder, object_points):
 
 def residuals(rig, points):
     seen = project(
-        rig.cam_from_rig.apply(torch.from_numpy(points.xyz)), rig.focal_length, rig.principal_point, rig.distortion, rig.image_size
+        rig.cam_from_rig.apply(torch.from_numpy(points.xyz)),
+        rig.focal_length,
+        rig.principal_point,
+        rig.distortion,
+        rig.image_size,
     )
     return np.linalg.norm(seen.uv.numpy()[points.camera, np.arange(len(points.uv))] - points.uv, axis=1)
 

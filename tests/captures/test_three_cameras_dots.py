@@ -51,11 +51,12 @@ def test_recovers_a_disturbed_calibration(pixels, seed, dots, calibrate, score):
 
 
 @pytest.mark.parametrize(
-    ("cameras", "pixels"), [((0,), (22, 0)), ((0,), (-35, 0)), ((0, 2), (0, 22)), ((1,), (30, 10)), ((0, 1, 2), (-25, 0))]
+    ("cameras", "pixels"),
+    [((0,), (22, 0)), ((0,), (-35, 0)), ((0, 2), (0, 22)), ((1,), (30, 10)), ((0, 1, 2), (-25, 0))],
 )
 def test_more_than_half_a_pitch_is_never_taken_for_the_next_dot(cameras, pixels, dots, calibrate, score):
     """Some cameras see the pattern more than half a pitch of 35 px away: right or refused, never shifted by one dot."""
-    folder, factory, points, held_out = dots
+    folder, factory, _, held_out = dots
     step = torch.zeros(3, 15, dtype=torch.float64)
     step[list(cameras), 8:10] = torch.tensor(pixels, dtype=torch.float64)
     outcome = calibrate(folder, factory.moved(step), folder / "object.csv")

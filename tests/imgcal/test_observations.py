@@ -46,6 +46,6 @@ def test_of_snapshots_renumbers() -> None:
 def test_observations_change_type_but_not_their_mask() -> None:
     seen = torch.ones(1, 2, 3, dtype=torch.bool)
     observations = Observations(torch.zeros(1, 2, 3, 2).double(), torch.ones(1, 2, 3).double(), seen)
-    changed = observations.to(torch.float32).to("cpu")
+    changed = observations.to(torch.float32).to(device="cpu")
     assert changed.uv.dtype == changed.sigma.dtype == torch.float32
     assert changed.seen.dtype == torch.bool
