@@ -327,8 +327,8 @@ def _require_cameras(observations: Observations, rig: CameraRig, options: Pipeli
 def _require_fit(model_error: float, outlier_share: float, rms: float, options: PipelineOptions) -> None:
     if model_error > options.largest_model_error:
         raise RefusedError(
-            f"estimation: residuals of {rms:.2f} px RMS do not fit the noise: found an unexplained error of "
-            f"{model_error:.2f} px, expected at most {options.largest_model_error:g}; the object, the labels or the "
+            f"estimation: residuals of {rms:.2f} px RMS do not fit the noise: found an unexplained error "
+            f"of {model_error:.2f} px, expected at most {options.largest_model_error:g}; the object, the labels or the "
             "camera model are not what they are said to be"
         )
     if outlier_share > options.most_outliers:
@@ -339,10 +339,11 @@ def _require_fit(model_error: float, outlier_share: float, rms: float, options: 
 
 
 def _model_error(fit: Estimate, sigma: Tensor) -> float:
-    """Standard deviation (px, each axis) that residuals hold beyond the blobs' own sigma (S, C, N); 0 = nothing significant.
+    """Standard deviation (px, each axis) that residuals hold beyond the blobs' own sigma (S, C, N); 0 = insignificant.
 
-    The median of squared distances over two axes is 1.386 for unit noise, whatever a minority of outliers does. Residuals
-    are smaller than the noise by what the parameters took: each takes the share of one observation that its prior left.
+    The median of squared distances over two axes is 1.386 for unit noise, whatever a minority of outliers does.
+    Residuals are smaller than the noise by what the parameters took: each takes the share of one observation that its
+    prior left.
     """
     seen = fit.problem.root_weight.reshape(sigma.shape) > 0
     spread = fit.problem.spread.reshape(fit.rig.distortion.shape[0], -1)

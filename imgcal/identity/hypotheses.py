@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from itertools import permutations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from imgcal.identity.blobs import Blobs
@@ -127,12 +127,12 @@ def single_camera_poses(
     return Poses(back @ rotation[found], (back @ (translation[found] - offset)[..., None])[..., 0])
 
 
-@njit(parallel=True, cache=True, fastmath=FAST)
+@njit(cache=True, fastmath=FAST)
 def _search(
     rays, cameras, triples, sides, frames, points, order, focal, raster, origin, per_pixel, score, rotation, translation
 ):  # fmt: skip
     """Fill the best poses (in the camera's frame) of each triple of blobs."""
-    for q in prange(len(rays)):
+    for q in range(len(rays)):
         camera = cameras[q]
         frame, depths, turn = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
         for t in range(len(triples)):

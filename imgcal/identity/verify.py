@@ -6,6 +6,7 @@ Only after such a fit can a label be judged: the factory rig alone is off by ten
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from functools import reduce
 
 import numpy as np
 import torch
@@ -187,6 +188,12 @@ def _problem(scene: Scene, fits: Fits) -> Problem:
 
 
 def _fit(scene: Scene, fits: Fits) -> Fits:
+    # One after the other: starting threads for a few small fits takes longer than the fits, most of all on a busy machine.
+    single = [_fit_one(scene, fits.select(np.array([k]))) for k in range(len(fits.labels))]
+    return reduce(join, single)
+
+
+def _fit_one(scene: Scene, fits: Fits) -> Fits:
     problem = _problem(scene, fits)
     solution = fused.minimize(problem, fits.state, "cauchy", THRESHOLD, 8, 1e-3)
     found = innovations(scene.blobs, fits.labels, fits.sigma, problem, solution)

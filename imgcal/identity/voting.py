@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from imgcal.identity.assignment import mutual_nearest
@@ -71,19 +71,12 @@ def vote(blobs: Blobs, predicted: NDArray[np.float64], tolerance: float, gate: f
     width = max(tolerance, 2 * gate / MOST_BINS)
     count = np.zeros(predicted.shape[:2], dtype=np.int64)
     shift = np.zeros((*predicted.shape[:2], 2))
-    cast = _vote if len(predicted) > 4 else _vote_few  # threads cost more than a few votes
-    cast(predicted, blobs.ideal, blobs.count, width, gate, count, shift)
+    _vote(predicted, blobs.ideal, blobs.count, width, gate, count, shift)
     return Votes(count, shift)
 
 
-@njit(parallel=True, cache=True)
-def _vote(predicted, ideal, number, width, gate, count, shift):
-    for k in prange(len(predicted)):
-        _vote_one(predicted[k], ideal, number, width, gate, count[k], shift[k])
-
-
 @njit(cache=True)
-def _vote_few(predicted, ideal, number, width, gate, count, shift):
+def _vote(predicted, ideal, number, width, gate, count, shift):
     for k in range(len(predicted)):
         _vote_one(predicted[k], ideal, number, width, gate, count[k], shift[k])
 

@@ -1,4 +1,4 @@
-"""How the real frames are used: fit one half, take that as the factory calibration, disturb it, recover, score the rest."""
+"""How real frames are used: fit one half, call that the factory calibration, disturb it, recover, score the rest."""
 
 from __future__ import annotations
 
