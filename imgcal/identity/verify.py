@@ -188,9 +188,9 @@ def _problem(scene: Scene, fits: Fits) -> Problem:
 
 
 def _fit(scene: Scene, fits: Fits) -> Fits:
-    # One after the other: starting threads for a few small fits takes longer than the fits, most of all on a busy machine.
-    single = [_fit_one(scene, fits.select(np.array([k]))) for k in range(len(fits.labels))]
-    return reduce(join, single)
+    # One after the other: starting threads for a few small fits takes longer than the fits on a busy machine.
+    bare = replace(fits, innovations=None)
+    return reduce(join, [_fit_one(scene, bare.select(np.array([k]))) for k in range(len(fits.labels))])
 
 
 def _fit_one(scene: Scene, fits: Fits) -> Fits:
