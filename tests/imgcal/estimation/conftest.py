@@ -1,6 +1,6 @@
 """Simulated observations for the tests of estimation."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import pytest
@@ -37,6 +37,15 @@ class Case:
 
 
 Simulate = Callable[..., Case]
+
+
+@pytest.fixture(scope="package", autouse=True)
+def one_thread() -> Iterator[None]:
+    """Keep to one thread: on a busy machine, threads that wait for each other after every tiny product crawl."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="session")

@@ -29,7 +29,10 @@ def system(batch: int, first: int, second: int, p: int, q: int) -> tuple[Tensor,
 def test_solution_equals_the_dense_one(batch: int, first: int, second: int, p: int, q: int) -> None:
     blocks, coupling, kept, dense = system(batch, first, second, p, q)
     right = torch.randn(batch, first * p + second * q, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    right_blocks, right_kept = right[:, : first * p].unflatten(1, (first, p)), right[:, first * p :].unflatten(1, (second, q))
+    right_blocks, right_kept = (
+        right[:, : first * p].unflatten(1, (first, p)),
+        right[:, first * p :].unflatten(1, (second, q)),
+    )
     expected = torch.linalg.solve(dense, right)
     eliminated, kept_part = arrow.solve(arrow.reduce(blocks, coupling, kept), right_blocks, right_kept)
     torch.testing.assert_close(torch.cat((eliminated.flatten(1), kept_part.flatten(1)), 1), expected)

@@ -1,5 +1,6 @@
 """Posterior covariance: against dense inverses, under a change of reference, and against the spread of samples."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -40,7 +41,7 @@ def dense_inverse(found: Estimate) -> torch.Tensor:
             dense[:, columns, columns] = equations.pose[:, s]
             dense[:, rows, columns] = equations.coupling[:, s, c]
             dense[:, columns, rows] = equations.coupling[:, s, c].mT
-    return torch.linalg.inv(dense)
+    return torch.from_numpy(np.linalg.inv(dense.numpy()))
 
 
 @pytest.mark.parametrize("snapshots", [1, 3, 12])  # twelve snapshots of three cameras: snapshots are eliminated
@@ -121,20 +122,25 @@ def test_relative_quantities_do_not_know_the_gauge(simulate) -> None:
     covariance = relative_covariance(found, reference=1)
     assert covariance[:, 15:21].abs().max() < 1e-12
     # A position relative to another camera is known far better than one in a frame that only the prior knows.
-    relative, absolute = (c.diagonal(dim1=-2, dim2=-1)[:, 3:6].sum(-1).sqrt() for c in (covariance, camera_covariance(found)))
+    relative, absolute = (
+        c.diagonal(dim1=-2, dim2=-1)[:, 3:6].sum(-1).sqrt() for c in (covariance, camera_covariance(found))
+    )
     assert (relative < absolute).all()
 
 
 def test_matches_the_spread_of_samples(simulate) -> None:
     """Monte Carlo over noise alone, with the prior wide open where it would hold the answer back."""
     drift = PhysicalDrift(rotation_deg=0.05, position=0.5, focal_length=0.002, principal_point=2.0, distortion=0.002)
-    case = simulate(400, snapshots=6, cameras=4, drift=drift, noise=0.2, sigma=0.2, seed=3)
+    case = simulate(250, snapshots=6, cameras=4, drift=drift, noise=0.2, sigma=0.2, seed=3)
     found = run(case)
     assert found.converged.all()
     error, std = found.rig.difference(case.truth), camera_std(found)
     normalized = (error / std).square().mean((0, 1))
-    assert ((normalized > 0.85) & (normalized < 1.15)).all()
-    relative, variance = relative_difference(found.rig, case.truth), relative_covariance(found).diagonal(dim1=-2, dim2=-1)
+    assert ((normalized > 0.8) & (normalized < 1.2)).all()
+    relative, variance = (
+        relative_difference(found.rig, case.truth),
+        relative_covariance(found).diagonal(dim1=-2, dim2=-1),
+    )
     normalized = relative[:, 1:].flatten(1).square() / variance[:, 15:]
     assert normalized.mean() == pytest.approx(1, abs=0.05)
 

@@ -71,7 +71,9 @@ def test_zero_spread_fixes_a_parameter_exactly(simulate) -> None:
     found = run(case, spread=spread, first_guess=guess)
     assert torch.equal(found.rig.distortion, case.factory.distortion.expand(2, -1, -1))
     assert torch.equal(found.rig.focal_length[:, 1], case.factory.focal_length[1].expand(2, -1))
-    torch.testing.assert_close(found.rig.cam_from_rig.rotation[:, 1], case.factory.cam_from_rig.rotation[1].expand(2, 3, 3))
+    torch.testing.assert_close(
+        found.rig.cam_from_rig.rotation[:, 1], case.factory.cam_from_rig.rotation[1].expand(2, 3, 3)
+    )
     assert (found.rig.focal_length[:, 0] != case.factory.focal_length[0]).all()
 
 
@@ -112,8 +114,8 @@ def test_robust_loss_survives_outliers(simulate) -> None:
     spoiled = replace(case, observations=replace(case.observations, uv=uv))
     clean = run(case)
     robust, plain = run(spoiled, options=EstimationOptions(loss="cauchy", max_iterations=100)), run(spoiled)
-    assert (robust.rig.focal_length - clean.rig.focal_length).abs().max() < 0.5
-    assert (plain.rig.focal_length - clean.rig.focal_length).abs().max() > 5
+    assert (robust.rig.focal_length - clean.rig.focal_length).abs().max() < 1.5
+    assert (plain.rig.focal_length - clean.rig.focal_length).abs().max() > 15
 
 
 def test_sigma_weighs(simulate) -> None:
@@ -123,7 +125,9 @@ def test_sigma_weighs(simulate) -> None:
     sigma[..., 0] = 1e3
     found = run(replace(case, observations=Observations(uv, sigma, case.observations.seen)))
     assert found.residual[..., 1:, :].abs().max() < 0.05
-    torch.testing.assert_close(found.residual[..., 0, 1], torch.full_like(found.residual[..., 0, 1], -1.0), rtol=0, atol=0.05)
+    torch.testing.assert_close(
+        found.residual[..., 0, 1], torch.full_like(found.residual[..., 0, 1], -1.0), rtol=0, atol=0.05
+    )
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

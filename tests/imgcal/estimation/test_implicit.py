@@ -29,7 +29,13 @@ def test_gradient_by_observations(simulate, loss: str, radius: float | None) -> 
     def solve(uv: Tensor, sigma: Tensor) -> Tensor:
         observations = Observations(uv, sigma, case.observations.seen)
         found = estimate(
-            observations, case.factory, case.obj, case.poses, spread=case.spread, first_guess=case.truth, options=EXACT[loss]
+            observations,
+            case.factory,
+            case.obj,
+            case.poses,
+            spread=case.spread,
+            first_guess=case.truth,
+            options=EXACT[loss],
         )
         return scaled(case, found)
 
@@ -63,7 +69,8 @@ def test_gradient_by_observations_when_snapshots_are_eliminated(simulate) -> Non
     def solve(uv: Tensor) -> Tensor:
         observations = replace(case.observations, uv=uv)
         return scaled(
-            case, estimate(observations, case.factory, case.obj, case.poses, spread=case.spread, options=EXACT["squared"])
+            case,
+            estimate(observations, case.factory, case.obj, case.poses, spread=case.spread, options=EXACT["squared"]),
         )
 
     assert torch.autograd.gradcheck(solve, uv, eps=1e-4, atol=1e-4, rtol=1e-3, fast_mode=True)
