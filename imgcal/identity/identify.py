@@ -39,13 +39,13 @@ from imgcal.observations import Detections
 from imgcal.rig import CameraRig
 from imgcal.transforms import RigidTransform
 
-TRIPLES = 20  # of blobs in a round, over all cameras
+TRIPLES = 10  # of blobs in a round, over all cameras
 MOST_HYPOTHESES = 400_000  # in a round: large objects get fewer triples of blobs
 KEPT = 8  # poses of each
 MANY = 40  # fiducials of a planar object, above which triples are too many
 PATIENCE = 3  # rounds that end with two good labellings
 MOST_STEPS = 6  # from one labelling to a better one of the moved object
-VERIFIED = 3  # different labellings that are fitted, the best of a round
+VERIFIED = 2  # different labellings that are fitted, the best of a round
 
 
 def identify(

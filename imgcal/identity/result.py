@@ -37,7 +37,7 @@ class Identity:
 class IdentityOptions:
     """How sure is sure."""
 
-    label_odds: float = 1e4  # of a single label, against a false blob or another fiducial
+    label_odds: float = 1e5  # of a single label, against a false blob or another fiducial
     least_label_odds: float = 1e2  # the same where false blobs are so dense that few labels could be that certain
     least_margin: float = 20.0  # of the whole labelling against the best different one, natural logarithm
     least_share: float = (

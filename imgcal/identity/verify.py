@@ -122,10 +122,13 @@ def certain(scene: Scene, fits: Fits, odds: float, least_odds: float) -> Fits:
     """
     log_odds = _log_odds(scene, fits)
     usual = np.median(log_odds[np.isfinite(log_odds)]) if np.isfinite(log_odds).any() else 0.0
+    # Two or three labels of one camera can support each other in the wrong place: most of what it sees must fit.
+    enough = np.maximum(3, 0.5 * np.minimum(scene.blobs.count, scene.obj.fiducials))
     demanded = np.clip(usual - np.log(100), np.log(least_odds), np.log(odds))
     for _ in range(4):
         found = _found(fits)
         good = (found.own < GATE) & (log_odds > demanded) & ~_contested(fits.labels, found)
+        good &= (good.sum(-1) >= enough)[..., None]
         if np.array_equal(good, fits.labels >= 0):
             break
         fits = _fit(scene, replace(fits, labels=np.where(good, fits.labels, -1)))
