@@ -68,7 +68,7 @@ class CalibrationObject:
         return self.near_symmetries(tolerance=1e-3 * self.size)
 
     def near_symmetries(self, tolerance: float) -> tuple[SelfMotion, ...]:
-        """Rotations about the centroid that map every fiducial to within `tolerance` (mm) of another of the same radius.
+        """Find rotations about the centroid that map every fiducial to within `tolerance` (mm) of one of its radius.
 
         Returns:
             Self-motions in order of residual, the identity first; `permutation` has no -1.

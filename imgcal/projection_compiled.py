@@ -36,7 +36,8 @@ def project(rig: CameraRig, points_rig: Tensor, radius: Tensor | None = None) ->
     transform, lens = rig.cam_from_rig, (rig.focal_length, rig.principal_point, rig.distortion)
     size = rig.image_size.to(image.dtype)
     given = (points_rig.mT, radius_squared, transform.rotation, transform.translation, *lens, size)
-    _project(*(tensor.detach().contiguous().numpy() for tensor in given), image.numpy())
+    arrays = [tensor.detach().contiguous().numpy() for tensor in given]
+    _project(*arrays, image.numpy())  # type: ignore[call-arg]
     return Projection(image[..., :2, :].mT, image[..., 2, :], image[..., 3, :] > 0)
 
 

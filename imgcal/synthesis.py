@@ -177,8 +177,8 @@ def synthesize(
     worst = int(failures.argmax())
     raise RefusedError(
         f"synthesis: {count - missing} of {count} rigs after {tried} trials; camera {rig.camera_names[worst]} misses "
-        f"part of object {obj.name} in {100 * float(failures[worst]) / tried:.0f} % of them: reduce the drift, the pose "
-        "range or the object, or change the working distance"
+        f"part of object {obj.name} in {100 * float(failures[worst]) / tried:.0f} % of them: reduce the drift, the "
+        "pose range or the object, or change the working distance"
     )
 
 

@@ -1,4 +1,4 @@
-"""Posterior covariance of an estimate: what is known of each camera, of the cameras relative to one another, of the poses.
+"""Posterior covariance of an estimate: of each camera, of the cameras relative to one another, of the poses.
 
 All are Laplace approximations: the inverse of the Gauss-Newton information at the minimum, prior included.
 """
@@ -10,11 +10,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from imgcal.errors import RefusedError
 from imgcal.estimation import arrow
 from imgcal.estimation.estimate import Estimate
 from imgcal.estimation.linearize import POSE_PARAMETERS
 from imgcal.estimation.solver import factorize
-from imgcal.errors import RefusedError
 from imgcal.rig import PARAMETERS, CameraRig
 from imgcal.rotations import cross_matrix, left_jacobian
 from imgcal.transforms import RigidTransform
@@ -25,8 +25,8 @@ def camera_covariance(estimate: Estimate) -> Tensor:
 
     Returns:
         (*B, 15 C, 15 C) in the units and order of `rig.PARAMETER_NAMES`, camera after camera; rotations are small left
-        rotations about the estimated orientation. Includes the gauge: a motion of the whole rig is known only as well as
-        the prior knows it; see `relative_covariance`.
+        rotations about the estimated orientation. Includes the gauge: a motion of the whole rig is known only as well
+        as the prior knows it; see `relative_covariance`.
 
     Raises:
         RefusedError: the information is singular (a snapshot with too few fiducials).
@@ -35,7 +35,7 @@ def camera_covariance(estimate: Estimate) -> Tensor:
     reduced, cameras_first = factorize(equations)
     if bool(reduced.failed.any()):
         raise RefusedError("covariance: the observations do not determine the object's pose in every snapshot")
-    count, cameras = equations.camera.shape[:2]
+    cameras = equations.camera.shape[1]
     if cameras_first:
         inverse = torch.cholesky_inverse(reduced.eliminated)
         half = torch.linalg.solve_triangular(reduced.eliminated.mT, reduced.whitened, upper=True).flatten(1, 2)

@@ -68,8 +68,8 @@ def estimate(
 ) -> Estimate:
     """Find the rig and the object's poses that best explain the observations and the factory calibration.
 
-    The rig is constant over the snapshots while the object moves. Differentiable: where an input requires a gradient, it
-    flows through the solution by the implicit function theorem, to uv, sigma, the factory rig and the spread.
+    The rig is constant over the snapshots while the object moves. Differentiable: where an input requires a gradient,
+    it flows through the solution by the implicit function theorem, to uv, sigma, the factory rig and the spread.
 
     Args:
         observations: (*B, S, C, N).
@@ -126,8 +126,8 @@ def make_problem(observations: Observations, rig: CameraRig, obj: CalibrationObj
     cameras, fiducials = observations.seen.shape[-2:]
     if cameras != rig.cameras or fiducials != obj.fiducials or observations.uv.shape != (*observations.seen.shape, 2):
         raise InputError(
-            f"observations: found uv {tuple(observations.uv.shape)} and seen {tuple(observations.seen.shape)}, expected "
-            f"(..., snapshots, {rig.cameras} cameras, {obj.fiducials} fiducials) and the same with two coordinates"
+            f"observations: found uv {tuple(observations.uv.shape)} and seen {tuple(observations.seen.shape)}, "
+            f"expected (..., snapshots, {rig.cameras} cameras, {obj.fiducials} fiducials) and the same with coordinates"
         )
     batch = observations.seen.shape[:-3]
     count = batch.numel()
@@ -146,7 +146,9 @@ def make_problem(observations: Observations, rig: CameraRig, obj: CalibrationObj
         points=points - centroid,
         centroid=centroid,
         radius_squared=None if obj.radius is None else obj.radius.to(uv).square(),
-        factory=rig.expand(*batch).reshape(count),
+        factory=rig.map_tensors(
+            lambda tensor, axes: tensor.expand(*batch, *tensor.shape[-axes:]).reshape(count, *tensor.shape[-axes:])
+        ),
         spread=spread.to(uv).expand(*batch, cameras, PARAMETERS).reshape(count, cameras, PARAMETERS),
     )
 

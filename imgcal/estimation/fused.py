@@ -6,6 +6,7 @@ against. Names, units and layouts are theirs. Rigs of a batch run in parallel.
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 import torch
 from numba import njit, prange
@@ -19,7 +20,9 @@ LOSS_CODES = {"squared": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3}
 _FAST = {"contract", "reassoc", "nsz"}  # nan and inf keep their meaning: a bad step must show
 
 
-def minimize(problem: Problem, start: State, loss: str, threshold: float, max_iterations: int, tolerance: float) -> Solution:
+def minimize(
+    problem: Problem, start: State, loss: str, threshold: float, max_iterations: int, tolerance: float
+) -> Solution:
     """Do the work of `solver.minimize` for tensors on the CPU.
 
     Args:
@@ -44,17 +47,27 @@ def minimize(problem: Problem, start: State, loss: str, threshold: float, max_it
     factory = problem.factory
     state_tensors = (state.offset, state.rotation, state.centre)
     block_tensors = (camera, coupling, pose, camera_gradient, pose_gradient, residual)
-    rig = (factory.cam_from_rig.rotation, factory.positions, factory.focal_length, factory.principal_point, factory.distortion)
+    rig = (
+        factory.cam_from_rig.rotation,
+        factory.positions,
+        factory.focal_length,
+        factory.principal_point,
+        factory.distortion,
+    )
     arrays = _arrays((problem.uv, problem.root_weight, *rig, problem.spread, *state_tensors, *block_tensors, cost))
     limits = (cameras_first, LOSS_CODES[loss], threshold, max_iterations)
     tolerances = (tolerance + pixel_rounding(problem)).numpy()
     shared = _arrays((problem.points, radius_squared))
     if batch == 1:
-        _minimize_rig(
+        _minimize_rig(  # type: ignore[call-arg]
             *shared, *(array[0] for array in arrays[:-1]), arrays[-1], converged, iterations, *limits, tolerances[0]
         )
     else:
-        _minimize_all(*shared, *arrays, converged, iterations, *limits, tolerances)
+        # Both use OpenMP: the compiled loop obeys torch's number of threads, and must not leave its own behind.
+        threads = torch.get_num_threads()
+        numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
+        _minimize_all(*shared, *arrays, converged, iterations, *limits, tolerances)  # type: ignore[call-arg]
+        torch.set_num_threads(threads)
     if cameras_first:
         blocks = coupling.unflatten(-1, (snapshots, 6)).permute(0, 3, 1, 2, 4)
     else:
@@ -145,7 +158,7 @@ def _linearize(given, state, blocks, cameras_first, loss, threshold):
     """Fill the blocks of the normal equations and return the cost."""
     points, radius_squared, uv, root_weight, rotation0, position0, focal0, principal0, distortion0, spread = given
     offset, rotation, centre = state
-    camera, coupling, pose, camera_gradient, pose_gradient, residual = blocks
+    camera, _, pose, camera_gradient, pose_gradient, residual = blocks
     snapshots, cameras, fiducials = root_weight.shape
     kind = uv.dtype
     pose[:] = 0
@@ -153,7 +166,11 @@ def _linearize(given, state, blocks, cameras_first, loss, threshold):
     rows = np.zeros((2, 21), dtype=kind)
     products = np.empty((21, 21), dtype=kind)
     gradient = np.empty(21, dtype=kind)
-    turned, left, rotation_cam = np.empty((3, 3), dtype=kind), np.empty((3, 3), dtype=kind), np.empty((3, 3), dtype=kind)
+    turned, left, rotation_cam = (
+        np.empty((3, 3), dtype=kind),
+        np.empty((3, 3), dtype=kind),
+        np.empty((3, 3), dtype=kind),
+    )
     parameters = np.empty(15, dtype=kind)
     rotated, point = np.empty(3, dtype=kind), np.empty(3, dtype=kind)
     derivative, back = np.empty((2, 3), dtype=kind), np.empty(3, dtype=kind)
@@ -169,7 +186,11 @@ def _linearize(given, state, blocks, cameras_first, loss, threshold):
         _multiply(turned, rotation0[c], rotation_cam)
         fx, fy = focal0[c, 0] + parameters[6], focal0[c, 1] + parameters[7]
         cx, cy = principal0[c, 0] + parameters[8], principal0[c, 1] + parameters[9]
-        k1, k2, p1 = distortion0[c, 0] + parameters[10], distortion0[c, 1] + parameters[11], distortion0[c, 2] + parameters[12]
+        k1, k2, p1 = (
+            distortion0[c, 0] + parameters[10],
+            distortion0[c, 1] + parameters[11],
+            distortion0[c, 2] + parameters[12],
+        )
         p2, k3 = distortion0[c, 3] + parameters[13], distortion0[c, 4] + parameters[14]
         for s in range(snapshots):
             products[:] = 0
@@ -178,7 +199,9 @@ def _linearize(given, state, blocks, cameras_first, loss, threshold):
             for n in range(fiducials):
                 for i in range(3):
                     rotated[i] = (
-                        rotation[s, i, 0] * points[n, 0] + rotation[s, i, 1] * points[n, 1] + rotation[s, i, 2] * points[n, 2]
+                        rotation[s, i, 0] * points[n, 0]
+                        + rotation[s, i, 1] * points[n, 1]
+                        + rotation[s, i, 2] * points[n, 2]
                     )
                 rx = rotated[0] + centre[s, 0] - position0[c, 0] - parameters[3]
                 ry = rotated[1] + centre[s, 1] - position0[c, 1] - parameters[4]
@@ -273,7 +296,7 @@ def _distribute(products, gradient, c, s, blocks, cameras_first):
 
 @njit(cache=True, fastmath=_FAST)
 def _solve(blocks, coupling, kept, right_blocks, right_kept, damping, factor, whitened, schur, step_blocks, step_kept):
-    """Solve the damped arrow for minus the gradients; return the predicted decrease, or nan if a factorization fails."""
+    """Solve the damped arrow for minus the gradients; return the predicted decrease, nan if a factorization fails."""
     count, size, wide = coupling.shape
     size_kept = kept.shape[1]
     _copy(factor, blocks)

@@ -53,7 +53,7 @@ def _gradient(problem: Problem, state: State, loss: Loss, create_graph: bool) ->
     with torch.enable_grad():
         step = _zero_step(state)
         cost = map_cost(problem, moved(problem, state, *step), loss).sum()
-        return torch.autograd.grad(cost, step, create_graph=create_graph)
+        return _pair(torch.autograd.grad(cost, step, create_graph=create_graph))
 
 
 def _zero_step(state: State) -> Pair:
@@ -80,9 +80,8 @@ def _inverse_hessian(problem: Problem, solution: Solution, loss: Loss) -> Callab
         with torch.enable_grad():
             step = _zero_step(solution.state)
             cost = map_cost(problem, moved(problem, solution.state, *step), loss).sum()
-            gradient = torch.autograd.grad(cost, step, create_graph=True)
-            inner = sum((g * part.detach()).sum() for g, part in zip(gradient, v, strict=True))
-            return torch.autograd.grad(inner, step)
+            gradient = _pair(torch.autograd.grad(cost, step, create_graph=True))
+            return _pair(torch.autograd.grad(_dot(gradient, (v[0].detach(), v[1].detach())).sum(), step))
 
     def solve(v: Pair) -> Pair:
         return _conjugate_gradients(product, precondition, v)
@@ -112,6 +111,10 @@ def _conjugate_gradients(product: Callable[[Pair], Pair], precondition: Callable
     return x[0], x[1]
 
 
+def _pair(both: tuple[Tensor, ...]) -> Pair:
+    return both[0], both[1]
+
+
 def _dot(first: Pair, second: Pair) -> Tensor:
     return (first[0] * second[0]).sum((1, 2)) + (first[1] * second[1]).sum((1, 2))
 
@@ -125,13 +128,13 @@ class _NewtonStep(torch.autograd.Function):
     """-H^-1 g, with H symmetric and held constant."""
 
     @staticmethod
-    def forward(ctx: Any, camera: Tensor, pose: Tensor, inverse_hessian: Callable[[Pair], Pair]) -> Pair:  # noqa: ANN401
+    def forward(ctx: Any, camera: Tensor, pose: Tensor, inverse_hessian: Callable[[Pair], Pair]) -> Pair:
         ctx.inverse_hessian = inverse_hessian
         # At the minimum the step itself is zero up to rounding; taking it as zero keeps the solver's answer to the bit.
         return torch.zeros_like(camera), torch.zeros_like(pose)
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None]:  # noqa: ANN401
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None]:
         camera, pose = ctx.inverse_hessian((gradients[0], gradients[1]))
         return -camera, -pose, None
 

@@ -119,9 +119,9 @@ def _depth_unit(state: State) -> Tensor:
 def _jacobian(problem: Problem, state: State) -> tuple[Tensor, Tensor, Tensor]:
     """Jacobian and residual: (B, S, C, 22, 2, N) with the residual as last row, (B, S, C, 2, N), behind (B,) bool.
 
-    With p = R (q + centre - position) the point in the camera and q the rotated fiducial, the derivative of a pixel with
-    respect to a left rotation of the camera is p x d, with respect to the position -R^T d, with respect to a rotation of
-    the object q x R^T d, where d is the pixel's derivative with respect to p.
+    With p = R (q + centre - position) the point in the camera and q the rotated fiducial, the derivative of a pixel
+    with respect to a left rotation of the camera is p x d, with respect to the position -R^T d, with respect to a
+    rotation of the object q x R^T d, where d is the pixel's derivative with respect to p.
     """
     parameters = state.offset * problem.spread
     turn = parameters[..., :3]
@@ -162,7 +162,7 @@ class _Lens:
 
 
 def _lens(points: Tensor, radius_squared: Tensor | None, focal: Tensor, distortion: Tensor) -> _Lens:
-    """Image of points (B, S, C, 3, N), with focal (B, 1, C, 2, 1) and distortion (B, 1, C, 5, 1), and its derivatives."""
+    """Image of points (B, S, C, 3, N), for focal (B, 1, C, 2, 1), distortion (B, 1, C, 5, 1), and its derivatives."""
     depth = points[..., 2:, :].clamp_min(NEAREST_DEPTH)
     if radius_squared is None:
         per_depth = 1 / depth

@@ -23,7 +23,6 @@ from imgcal.rig import CameraRig
 from imgcal.rotations import rotation_from_vector
 from imgcal.transforms import RigidTransform
 
-
 STARTS = 8
 
 
@@ -37,7 +36,9 @@ class _QuadraticForm:
     translation_constant: Tensor  # (P, 3)
 
 
-def initial_pose(observations: Observations, rig: CameraRig, obj: CalibrationObject, iterations: int = 10) -> RigidTransform:
+def initial_pose(
+    observations: Observations, rig: CameraRig, obj: CalibrationObject, iterations: int = 10
+) -> RigidTransform:
     """Estimate where the object is, with the rig taken as it stands.
 
     Args:
@@ -74,7 +75,7 @@ def initial_pose(observations: Observations, rig: CameraRig, obj: CalibrationObj
 
 
 def _rays(observations: Observations, rig: CameraRig) -> tuple[Tensor, Tensor]:
-    """Viewing rays in the rig frame, flattened over rigs and snapshots: unit directions (P, C, N, 3), origins (P, C, 3)."""
+    """Viewing rays in the rig frame, rigs and snapshots flattened: unit directions (P, C, N, 3), origins (P, C, 3)."""
     dtype = observations.uv.dtype
     rig = rig.to(dtype)
     uv = torch.where(observations.seen[..., None], observations.uv, rig.principal_point.unsqueeze(-2).unsqueeze(-4))

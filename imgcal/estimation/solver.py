@@ -32,8 +32,8 @@ class Solution:
 def minimize(problem: Problem, start: State, loss: Loss, max_iterations: int, tolerance: float) -> Solution:
     """Minimize the MAP cost of every rig of a batch.
 
-    A step that does not lower the cost, or whose factorization fails, is rejected and retried with ten times the damping:
-    never taken, never replaced by nothing.
+    A step that does not lower the cost, or whose factorization fails, is rejected and retried with ten times the
+    damping: never taken, never replaced by nothing.
 
     Args:
         problem: what is given, with one batch axis B.

@@ -97,3 +97,10 @@ def test_zero_iterations_evaluate_the_start(simulate) -> None:
     torch.testing.assert_close(compiled.equations.cost, tensors.equations.cost)
     assert not compiled.converged.any()
     assert torch.equal(compiled.state.offset, start.offset)
+
+
+def test_number_of_threads_is_left_alone(simulate) -> None:
+    case = simulate(4, cameras=3, fiducials=5)
+    problem = case.problem()
+    fused.minimize(problem, case.start(problem), "squared", 3.0, 20, 1e-4)
+    assert torch.get_num_threads() == 1  # as set for these tests

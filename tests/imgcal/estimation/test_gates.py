@@ -36,7 +36,7 @@ def normalized_square(error: Tensor, covariance: Tensor) -> Tensor:
     if not failed.any() and factor.diagonal(dim1=-2, dim2=-1).min() > 1e-4:
         whitened = torch.linalg.solve_triangular(factor, error[..., None], upper=False)
         return whitened.square().mean((1, 2))
-    # Relative to a reference camera, fixed parameters of all cameras tie others together: those directions do not count.
+    # Relative to a reference camera, parameters that are fixed tie others together: those directions do not count.
     values, vectors = torch.linalg.eigh(correlation)
     along = (vectors.mT @ error[..., None]).squeeze(-1)
     kept = values > 1e-8
