@@ -9,6 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -26,6 +27,9 @@ from imgcal.rig import CameraRig, RigPrior
 from imgcal.transforms import RigidTransform
 
 Frames = Mapping[str, Frame | Sequence[Frame | None] | None]
+MOST_REMEMBERED = 64
+"""Snapshots that take part in refits of the rig while identity goes on: later ones add little to it."""
+
 Progress = Callable[[Iterable[int], int], Iterable[int]]
 
 
@@ -81,10 +85,22 @@ class Calibration(Estimate):
 
     labelled: Labelled
     observations: Observations  # (S, C, N) as used: outliers not seen, sigma with the model error
-    before: Estimate  # the factory rig, only the poses fitted
     model_error: float  # px, what the residuals hold beyond the blobs' own sigma
     outliers: int  # labelled blobs left out
+    factory: CameraRig
+    obj: CalibrationObject
     seconds: Mapping[str, float] = field(default_factory=dict)  # by stage
+
+    @cached_property
+    def before(self) -> Estimate:
+        """The factory rig as it stands on the same observations: only the poses are fitted."""
+        return estimate(
+            self.observations,
+            self.factory,
+            self.obj,
+            self.rig_from_object,
+            spread=torch.zeros_like(self.problem.spread[0]),
+        )
 
     @property
     def identity(self) -> str:
@@ -121,7 +137,7 @@ def calibrate(
     found = time.perf_counter()
     labelled = label(detections, rig, obj, options, progress)
     identified = time.perf_counter()
-    fit = _fit(labelled, rig, obj, options)
+    fit = fit_labelled(labelled, rig, obj, options)
     seconds = {
         "detection": found - started,
         "identity": identified - found,
@@ -147,7 +163,7 @@ def label(
     """
     count = len(detections.snapshot_names)
     coded = _coded_snapshots(detections, count)
-    follower = _Follower(rig, obj, options)
+    follower = Follower(rig, obj, options)
     results: dict[int, tuple[SnapshotIdentity, NDArray[np.int64]]] = {}
     rows = [np.flatnonzero((detections.snapshot == s) & detections.usable) for s in range(count)]
 
@@ -174,7 +190,7 @@ def label(
     return labelled
 
 
-class _Follower:
+class Follower:
     """Carries what earlier snapshots say, the pose and the rig, to the next one."""
 
     def __init__(self, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions) -> None:
@@ -212,9 +228,11 @@ class _Follower:
     def _remember(self, blobs: Detections, labels: NDArray[np.int64], pose: RigidTransform) -> None:
         """Keep the pose; refit the rig after 1, 2, 4, 8, ... accepted snapshots."""
         self.pose = pose
+        if len(self.accepted) == MOST_REMEMBERED:
+            return
         self.accepted.append((blobs, labels, pose))
         count = len(self.accepted)
-        if count & (count - 1) or count > 64:
+        if count & (count - 1):
             return
         parts = [to_observations(replace(b, fiducial=given), self.factory, self.obj) for b, given, _ in self.accepted]
         sigma = (torch.cat([p.sigma for p in parts]).square() + self.options.identity_error**2).sqrt()
@@ -262,20 +280,35 @@ def _coded_snapshots(detections: Detections, count: int) -> NDArray[np.bool_]:
     return coded
 
 
-def _fit(labelled: Labelled, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions) -> Calibration:
-    """Estimate the rig from all labelled snapshots, leaving out what does not fit, and check that the rest does."""
+def fit_labelled(
+    labelled: Labelled,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    options: PipelineOptions = PipelineOptions(),
+) -> Calibration:
+    """Estimate the rig from all labelled snapshots, leaving out what does not fit, and check that the rest does.
+
+    Args:
+        labelled: from `label`.
+        rig: the factory calibration.
+        obj: the calibration object.
+        options: how sure the result must be.
+
+    Raises:
+        RefusedError: a camera saw nothing, the estimate has no minimum, or the residuals do not fit.
+    """
     observations, poses = _used(labelled, rig, obj)
     _require_cameras(observations, rig, options)
-    raw, model_error = observations, options.identity_error
+    raw, model_error, guess = observations, options.identity_error, None
     for _ in range(6):
         previous = model_error
         weighted = replace(observations, sigma=(raw.sigma.square() + model_error**2).sqrt())
-        fit = estimate(weighted, rig, obj, poses, options=options.estimation)
+        fit = estimate(weighted, rig, obj, poses, first_guess=guess, options=options.estimation)
         if not bool(fit.converged):
             raise RefusedError(
                 f"estimation: no minimum after {fit.iterations} iterations (RMS {float(fit.rms):.3g} px)"
             )
-        model_error, poses = _model_error(fit, raw.sigma), fit.rig_from_object
+        model_error, poses, guess = _model_error(fit, raw.sigma), fit.rig_from_object, fit.rig
         distance = fit.residual.norm(dim=-1) / (raw.sigma.square() + model_error**2).sqrt()
         # Where a fiducial was left out there is no residual: it stays out.
         keep = observations.seen & (distance <= options.outlier)
@@ -286,15 +319,15 @@ def _fit(labelled: Labelled, rig: CameraRig, obj: CalibrationObject, options: Pi
     observations = weighted
     outliers = int(raw.seen.sum()) - int(observations.seen.sum())
     _require_fit(model_error, outliers / max(int(raw.seen.sum()), 1), float(fit.rms), options)
-    before = estimate(observations, rig, obj, poses, spread=torch.zeros_like(fit.problem.spread[0]))
     values = {name: getattr(fit, name) for name in Estimate.__dataclass_fields__}
     return Calibration(
         **values,
         labelled=labelled,
         observations=observations,
-        before=before,
         model_error=model_error,
         outliers=outliers,
+        factory=rig,
+        obj=obj,
     )
 
 

@@ -1,0 +1,107 @@
+"""Recalibration while a rig runs: frames of one snapshot after another, a calibration for each."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from types import TracebackType
+
+import numpy as np
+
+from imgcal.detection import Blobs, DetectionOptions, detect_snapshot
+from imgcal.detection.options import Frame
+from imgcal.errors import RefusedError
+from imgcal.objects import CalibrationObject
+from imgcal.observations import Detections
+from imgcal.pipeline import Calibration, Follower, Labelled, PipelineOptions, SnapshotIdentity, fit_labelled
+from imgcal.rig import CameraRig
+
+
+class Recalibrator:
+    """Keeps what the next snapshot needs: the last pose, what the rig has shown itself to be, a pool of threads.
+
+    Memory does not grow with the number of snapshots. A context manager: leaving it ends the threads.
+    """
+
+    def __init__(
+        self,
+        rig: CameraRig,
+        obj: CalibrationObject,
+        options: PipelineOptions = PipelineOptions(),
+        *,
+        detection: DetectionOptions = DetectionOptions(),
+        window: int = 1,
+    ) -> None:
+        """Start from a factory calibration.
+
+        Args:
+            rig: the factory calibration, without batch axes.
+            obj: the calibration object.
+            options: how sure each result must be.
+            detection: how blobs are found.
+            window: number of latest snapshots that a calibration is made from; more know the rig better and follow it
+                more slowly.
+        """
+        self.rig, self.obj, self.options, self.detection = rig, obj, options, detection
+        self._follower = Follower(rig, obj, options)
+        self._recent: deque[tuple[Detections, SnapshotIdentity]] = deque(maxlen=window)
+        self._count = 0
+        self._pool = ThreadPoolExecutor(min(rig.cameras, os.cpu_count() or 1))
+
+    def __enter__(self) -> Recalibrator:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the threads."""
+        self._pool.shutdown()
+
+    def update(self, frames: Mapping[str, Frame | None]) -> Calibration:
+        """Recalibrate from the frames of a new snapshot: camera name -> (H, W), None = no frame.
+
+        Raises:
+            RefusedError: this snapshot cannot decide; the next one is tried afresh.
+            InputError: a frame is no grey image, or is of a camera that the rig does not have.
+        """
+        ordered = {name: frames.get(name) for name in self.rig.camera_names}
+        blobs = detect_snapshot(ordered, self.detection, pool=self._pool)
+        name = f"{self._count:05d}"
+        self._count += 1
+        detections = _table(blobs, name, self.rig)
+        usable = detections.select(detections.usable)
+        snapshot, labels = self._follower.decide(usable, name, None)
+        if snapshot.status == "refused":
+            raise RefusedError(f"identity: {snapshot.reason}")
+        usable.fiducial[:] = labels
+        self._recent.append((usable, snapshot))
+        return fit_labelled(self._labelled(), self.rig, self.obj, self.options)
+
+    def _labelled(self) -> Labelled:
+        tables = [table for table, _ in self._recent]
+        columns = {
+            name: np.concatenate([getattr(table, name) for table in tables])
+            for name in ("uv", "sigma", "camera", "fiducial", "radius", "flags")
+        }
+        snapshot = np.repeat(np.arange(len(tables)), [len(table) for table in tables])
+        names = tuple(snapshot.name for _, snapshot in self._recent)
+        joined = Detections(**columns, snapshot=snapshot, camera_names=self.rig.camera_names, snapshot_names=names)
+        return Labelled(joined, tuple(snapshot for _, snapshot in self._recent))
+
+
+def _table(blobs: Blobs, name: str, rig: CameraRig) -> Detections:
+    count = len(blobs.uv)
+    return Detections(
+        uv=blobs.uv,
+        sigma=blobs.sigma,
+        camera=blobs.camera,
+        snapshot=np.zeros(count, dtype=np.int64),
+        fiducial=np.full(count, -1, dtype=np.int64),
+        radius=blobs.radius,
+        flags=blobs.flags,
+        camera_names=rig.camera_names,
+        snapshot_names=(name,),
+    )
