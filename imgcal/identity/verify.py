@@ -120,19 +120,21 @@ def certain(scene: Scene, fits: Fits, odds: float, least_odds: float) -> Fits:
         odds: odds of a label against a false blob, to be exceeded.
         least_odds: the same where false blobs are so dense that hardly any label reaches `odds`.
     """
-    log_odds = _log_odds(scene, fits)
+    # How dense false blobs are is asked once: a dropped label must not count as a false blob against the others.
+    surroundings = _detection_odds(scene, fits) - np.log(_clutter(scene, fits))
+    log_odds = _log_density(_found(fits)) + surroundings
     usual = np.median(log_odds[np.isfinite(log_odds)]) if np.isfinite(log_odds).any() else 0.0
+    demanded = np.clip(usual - np.log(100), np.log(least_odds), np.log(odds))
     # Two or three labels of one camera can support each other in the wrong place: most of what it sees must fit.
     enough = np.maximum(3, 0.5 * np.minimum(scene.blobs.count, scene.obj.fiducials))
-    demanded = np.clip(usual - np.log(100), np.log(least_odds), np.log(odds))
     for _ in range(4):
         found = _found(fits)
+        log_odds = _log_density(found) + surroundings
         good = (found.own < GATE) & (log_odds > demanded) & ~_contested(fits.labels, found)
         good &= (good.sum(-1) >= enough)[..., None]
         if np.array_equal(good, fits.labels >= 0):
             break
         fits = _fit(scene, replace(fits, labels=np.where(good, fits.labels, -1)))
-        log_odds = _log_odds(scene, fits)
     return fits
 
 
@@ -247,11 +249,9 @@ def _detection_odds(scene: Scene, fits: Fits) -> NDArray[np.float64]:
     return np.log(share / (1 - share))[:, None, None]
 
 
-def _log_odds(scene: Scene, fits: Fits) -> NDArray[np.float64]:
-    """Log odds of each label (K, C, N) against a false blob at the same place; -inf = no label."""
-    found = _found(fits)
-    density = -np.log(2 * np.pi) - 0.5 * found.log_det - 0.5 * found.own
-    return density - np.log(_clutter(scene, fits)) + _detection_odds(scene, fits)
+def _log_density(found: Innovations) -> NDArray[np.float64]:
+    """Log density (per px^2) of each label's blob where it is (K, C, N); -inf = no label."""
+    return -np.log(2 * np.pi) - 0.5 * found.log_det - 0.5 * found.own
 
 
 def _contested(labels: NDArray[np.int64], found: Innovations) -> NDArray[np.bool_]:

@@ -200,3 +200,15 @@ def test_blobs_of_other_cameras_or_of_two_snapshots_are_an_error(o10: CameraRig,
     two = replace(blobs, snapshot=np.arange(len(blobs)) % 2, snapshot_names=("0", "1"))
     with pytest.raises(InputError, match="snapshots"):
         identify(two, o10, asymmetric, DRIFT.std(o10))
+
+
+def test_noise_beyond_the_stated_sigma_costs_few_labels(o10: CameraRig) -> None:
+    # Dropping a label must not make the others look like false blobs one after the other.
+    lattice = np.stack(np.meshgrid(np.arange(12) * 12.0, np.arange(9) * 12.0, [0.0, 30.0]), axis=-1).reshape(-1, 3)
+    rig, obj = o10.select([0, 3, 6]), make_object(lattice - lattice.mean(0))
+    made, [(blobs, truth)] = snapshots(rig, obj, 1, 216, 0)
+    noisy = replace(blobs, uv=blobs.uv + 0.4 * np.random.default_rng(0).standard_t(4, blobs.uv.shape))
+    found = track(noisy, rig, obj, DRIFT.std(rig), made.rig_from_object[0])
+    named = found.labels >= 0
+    assert (found.labels == truth)[named].all()
+    assert named.mean() > 0.85
