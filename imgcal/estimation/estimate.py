@@ -105,7 +105,8 @@ def estimate(
     state = implicit.attach_gradient(problem, solution, loss)
 
     seen = problem.root_weight > 0
-    rigs, poses = rig_at(problem, state.offset), pose_at(problem, state)
+    plain = state is solution.state and state.offset.device.type == "cpu"  # no gradient to carry
+    rigs, poses = (fused.rig_at if plain else rig_at)(problem, state.offset), pose_at(problem, state)
     residual = torch.where(seen.unsqueeze(-2), solution.equations.residual, 0.0).mT
     dof = 2 * seen.flatten(1).sum(1) - 6 * seen.shape[1]
     return Estimate(

@@ -6,6 +6,8 @@ against. Names, units and layouts are theirs. Rigs of a batch run in parallel.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numba
 import numpy as np
 import torch
@@ -15,6 +17,8 @@ from torch import Tensor
 from imgcal.estimation.linearize import NormalEquations, Problem, State
 from imgcal.estimation.solver import LEAST_DAMPING, MOST_DAMPING, Solution, pixel_rounding
 from imgcal.projection import NEAREST_DEPTH
+from imgcal.rig import CameraRig
+from imgcal.transforms import RigidTransform
 
 LOSS_CODES = {"squared": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3}
 _FAST = {"contract", "reassoc", "nsz"}  # nan and inf keep their meaning: a bad step must show
@@ -74,6 +78,22 @@ def minimize(
         blocks = coupling.unflatten(-1, (cameras, 15)).permute(0, 1, 3, 4, 2)
     equations = NormalEquations(cost, camera, blocks, pose, camera_gradient, pose_gradient, residual)
     return Solution(state, equations, torch.from_numpy(converged), int(iterations.max()))
+
+
+def rig_at(problem: Problem, offset: Tensor) -> CameraRig:
+    """Do the work of `linearize.rig_at` for tensors on the CPU, without gradients."""
+    factory = problem.factory
+    given = (factory.cam_from_rig.rotation, factory.cam_from_rig.translation)
+    rotation, translation = (torch.empty_like(tensor, memory_format=torch.contiguous_format) for tensor in given)
+    parameters = offset * problem.spread
+    _turn_all(*_arrays((parameters, *given, rotation, translation)))
+    return replace(
+        factory,
+        focal_length=factory.focal_length + parameters[..., 6:8],
+        principal_point=factory.principal_point + parameters[..., 8:10],
+        distortion=factory.distortion + parameters[..., 10:15],
+        cam_from_rig=RigidTransform(rotation, translation),
+    )
 
 
 def _arrays(tensors: tuple[Tensor, ...]) -> list[np.ndarray]:
@@ -414,6 +434,22 @@ def _move(state, camera_step, pose_step, new):
             new_centre[s, i] = centre[s, i] + pose_step[s, 3 + i] * unit
         _exponential(pose_step[s, :3], turned, left)
         _multiply(turned, rotation[s], new_rotation[s])
+
+
+@njit(cache=True, fastmath=_FAST)
+def _turn_all(parameters, rotation0, translation0, rotation, translation):
+    """Write cam_from_rig after steps of its rotation and position: with c = -R0' t0 + dc, t = -R c = E (t0 - R0 dc)."""
+    turned, left = np.empty((3, 3), dtype=parameters.dtype), np.empty((3, 3), dtype=parameters.dtype)
+    for b in range(parameters.shape[0]):
+        for c in range(parameters.shape[1]):
+            step = parameters[b, c]
+            _exponential(step[:3], turned, left)
+            _multiply(turned, rotation0[b, c], rotation[b, c])
+            for i in range(3):
+                value = 0.0
+                for j in range(3):
+                    value += turned[i, j] * translation0[b, c, j] - rotation[b, c, i, j] * step[3 + j]
+                translation[b, c, i] = value
 
 
 @njit(cache=True, fastmath=_FAST)

@@ -6,7 +6,7 @@ from functools import partial
 import pytest
 import torch
 
-from imgcal.estimation import fused, solver
+from imgcal.estimation import fused, linearize, solver
 from imgcal.estimation.robust import LOSSES
 from imgcal.estimation.solver import NormalEquations, Solution
 
@@ -104,3 +104,17 @@ def test_number_of_threads_is_left_alone(simulate) -> None:
     problem = case.problem()
     fused.minimize(problem, case.start(problem), "squared", 3.0, 20, 1e-4)
     assert torch.get_num_threads() == 1  # as set for these tests
+
+
+@pytest.mark.parametrize("batch", [(), (3,)])
+def test_rig_at_equals_the_one_in_tensors(simulate, batch: tuple[int, ...]) -> None:
+    case = simulate(*batch, cameras=3, fiducials=5)
+    problem = case.problem()
+    offset = torch.randn(problem.spread.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    offset[0, 1, :3] = 0
+    compiled, tensors = fused.rig_at(problem, offset), linearize.rig_at(problem, offset)
+    torch.testing.assert_close(compiled.cam_from_rig.rotation, tensors.cam_from_rig.rotation, rtol=0, atol=1e-14)
+    torch.testing.assert_close(compiled.cam_from_rig.translation, tensors.cam_from_rig.translation, rtol=0, atol=1e-11)
+    assert torch.equal(compiled.focal_length, tensors.focal_length)
+    assert torch.equal(compiled.principal_point, tensors.principal_point)
+    assert torch.equal(compiled.distortion, tensors.distortion)
