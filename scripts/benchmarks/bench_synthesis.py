@@ -19,7 +19,8 @@ from imgcal.formats import load_object, load_rig
 from imgcal.projection import project_kornia
 from imgcal.synthesis import synthesize
 
-BATCH, REPEATS, TARGET = 512, 61, 200_000
+BATCH, TARGET = 512, 200_000
+ROUNDS, WARM, REPEATS = 5, 5, 20
 Case = tuple[int, Callable[[], object]]  # number of rigs, what to run
 
 
@@ -51,16 +52,16 @@ def cases() -> dict[str, Case]:
 
 
 def measure(work: dict[str, Case], threads: int) -> dict[str, dict[str, float]]:
-    """Time all cases in turn, several rounds, so that a busy moment of the machine hits all of them."""
+    """Time all cases in turn, in several rounds of blocks: a busy moment hits all, none cools another's cache."""
     torch.set_num_threads(threads)
     seconds: dict[str, list[float]] = {name: [] for name in work}
-    for _, run in work.values():
-        run()
-    for _ in range(REPEATS):
+    for _ in range(ROUNDS):
         for name, (_, run) in work.items():
-            start = time.perf_counter()
-            run()
-            seconds[name].append(time.perf_counter() - start)
+            for repeat in range(-WARM, REPEATS):
+                start = time.perf_counter()
+                run()
+                if repeat >= 0:
+                    seconds[name].append(time.perf_counter() - start)
     rows = {}
     for name, (rigs, _) in work.items():
         low, median, high = statistics.quantiles(seconds[name], n=4)
