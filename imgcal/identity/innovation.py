@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from imgcal.estimation.linearize import Problem, rig_at
 from imgcal.estimation.solver import Solution
 from imgcal.identity.blobs import Blobs
+from imgcal.rotations import left_jacobian
 
 FAST = {"contract", "reassoc", "nsz"}
 THRESHOLD = 3.0
@@ -61,6 +62,7 @@ def innovations(
     residual, freedom, uv = np.zeros(shape), np.zeros(shape), np.zeros((*shape, 2))
     complexity = np.full(count, np.inf)
     equations, state = solution.equations, solution.state
+    left = left_jacobian(state.offset[..., :3] * problem.spread[..., :3]).numpy()
     for k in np.flatnonzero(np.isfinite(equations.cost.numpy())):
         # Lower factors of the cameras' blocks, of the couplings' and of the pose's: see arrow.reduce.
         eliminated = equations.camera[k].numpy().copy()
@@ -69,7 +71,7 @@ def innovations(
         complexity[k] = _factorize(eliminated, whitened, kept)
         if np.isfinite(complexity[k]):
             _compare(
-                rig.cam_from_rig.rotation[k].numpy(), rig.positions[k].numpy(), rig.focal_length[k].numpy(),
+                rig.cam_from_rig.rotation[k].numpy(), left[k], rig.positions[k].numpy(), rig.focal_length[k].numpy(),
                 rig.principal_point[k].numpy(), rig.distortion[k].numpy(), problem.spread[k].numpy(),
                 state.rotation[k, 0].numpy(), state.centre[k, 0].numpy(),
                 problem.points.numpy(), radius_squared, eliminated, whitened, kept,
@@ -119,7 +121,7 @@ def _cholesky(matrix):
 
 @njit(cache=True, fastmath=FAST)
 def _compare(
-    rotation, position, focal, principal, distortion, spread, turn, centre, points, radius_squared,
+    rotation, left, position, focal, principal, distortion, spread, turn, centre, points, radius_squared,
     eliminated, whitened, kept, blob_uv, blob_noise, typical_noise, blob_count, labels, extra,
     squared, log_det, own, residual, freedom, uv,
 ):  # fmt: skip
@@ -130,7 +132,7 @@ def _compare(
         for n in range(len(points)):
             rotated = turn @ points[n]
             _rows(
-                rotated, rotation[c], rotated + centre - position[c], focal[c], principal[c], distortion[c], spread[c],
+                rotated, rotation[c], left[c], rotated + centre - position[c], focal[c], principal[c], distortion[c], spread[c],
                 radius_squared[n], unit, rows, uv[c, n],
             )  # fmt: skip
             _whiten(rows, eliminated[c], whitened[c], kept, parts)
@@ -171,50 +173,49 @@ def _compare(
 
 
 @njit(cache=True, fastmath=FAST)
-def _rows(rotated, rotation, arm, focal, principal, distortion, spread, radius_squared, unit, rows, uv):
-    """Fill the Jacobian (2, 21) of a pixel with respect to 15 whitened camera and 6 pose parameters, and the pixel.
+def _rows(rotated, rotation, left, arm, focal, principal, distortion, spread, radius_squared, unit, rows, uv):
+    """Fill the Jacobian (2, 21) of a pixel by 15 whitened camera and 6 pose parameters, and the pixel.
 
-    The lens is differentiated numerically: it is smooth, linear in its coefficients, and only uncertainties need it.
+    To the last digit that of the fit (`fused._linearize`): where a label alone decides a parameter, nothing is left of
+    it but the difference of two almost equal numbers.
     """
     point = rotation @ arm
-    ideal_u, ideal_v = _lens(point[0], point[1], point[2], distortion, radius_squared)
-    uv[0], uv[1] = focal[0] * ideal_u + principal[0], focal[1] * ideal_v + principal[1]
+    depth = max(point[2], 1e-3)
+    squared = depth * depth
+    per_depth = depth / (squared - radius_squared)
+    log_slope = -(squared + radius_squared) / (depth * (squared - radius_squared))
+    x, y = point[0] * per_depth, point[1] * per_depth
+    k1, k2, p1, p2, k3 = distortion[0], distortion[1], distortion[2], distortion[3], distortion[4]
+    xx, yy, xy2 = x * x, y * y, 2 * x * y
+    rr = xx + yy
+    radial = 1 + rr * (k1 + rr * (k2 + rr * k3))
+    growth = 2 * (k1 + rr * (2 * k2 + 3 * rr * k3))
+    xd = x * radial + p1 * xy2 + p2 * (rr + 2 * xx)
+    yd = y * radial + p1 * (rr + 2 * yy) + p2 * xy2
+    uv[0], uv[1] = focal[0] * xd + principal[0], focal[1] * yd + principal[1]
+    jxx = radial + growth * xx + 2 * p1 * y + 6 * p2 * x
+    jxy = 0.5 * growth * xy2 + 2 * (p1 * x + p2 * y)
+    jyy = radial + growth * yy + 6 * p1 * y + 2 * p2 * x
     slope = np.empty((2, 3))
-    step = 1e-5 * abs(point[2])
-    for i in range(3):
-        near = point.copy()
-        near[i] += step
-        u, v = _lens(near[0], near[1], near[2], distortion, radius_squared)
-        slope[0, i], slope[1, i] = focal[0] * (u - ideal_u) / step, focal[1] * (v - ideal_v) / step
+    slope[0, 0], slope[0, 1], slope[0, 2] = per_depth * jxx, per_depth * jxy, log_slope * (jxx * x + jxy * y)
+    slope[1, 0], slope[1, 1], slope[1, 2] = per_depth * jxy, per_depth * jyy, log_slope * (jxy * x + jyy * y)
+    slope[0] *= focal[0]
+    slope[1] *= focal[1]
     back = slope @ rotation
     for r in range(2):
-        rows[r, :3] = _cross(point, slope[r])
+        rows[r, :3] = _cross(point, slope[r]) @ left
         rows[r, 3:6] = -back[r]
         rows[r, 6:10] = 0
         rows[r, 15:18] = _cross(rotated, back[r])
         rows[r, 18:21] = back[r] * unit
-    rows[0, 6], rows[1, 7], rows[0, 8], rows[1, 9] = ideal_u, ideal_v, 1.0, 1.0
-    for i in range(5):
-        other = distortion.copy()
-        other[i] += 1
-        u, v = _lens(point[0], point[1], point[2], other, radius_squared)
-        rows[0, 10 + i], rows[1, 10 + i] = focal[0] * (u - ideal_u), focal[1] * (v - ideal_v)
+    rows[0, 6], rows[1, 7], rows[0, 8], rows[1, 9] = xd, yd, 1.0, 1.0
+    rows[0, 10], rows[1, 10] = focal[0] * x * rr, focal[1] * y * rr
+    rows[0, 11], rows[1, 11] = rows[0, 10] * rr, rows[1, 10] * rr
+    rows[0, 12], rows[1, 12] = focal[0] * xy2, focal[1] * (rr + 2 * yy)
+    rows[0, 13], rows[1, 13] = focal[0] * (rr + 2 * xx), focal[1] * xy2
+    rows[0, 14], rows[1, 14] = rows[0, 11] * rr, rows[1, 11] * rr
     for r in range(2):
         rows[r, :15] *= spread
-
-
-@njit(cache=True, fastmath=FAST)
-def _lens(px, py, pz, distortion, radius_squared):
-    """Distorted coordinates on the z = 1 plane."""
-    depth = max(pz, 1e-3)
-    per_depth = depth / (depth * depth - min(radius_squared, 0.5 * depth * depth))
-    x, y = px * per_depth, py * per_depth
-    rr = x * x + y * y
-    radial = 1 + rr * (distortion[0] + rr * (distortion[1] + rr * distortion[4]))
-    return (
-        x * radial + 2 * distortion[2] * x * y + distortion[3] * (rr + 2 * x * x),
-        y * radial + distortion[2] * (rr + 2 * y * y) + 2 * distortion[3] * x * y,
-    )
 
 
 @njit(cache=True, fastmath=FAST)

@@ -11,7 +11,8 @@ from imgcal.objects import CalibrationObject
 from imgcal.observations import BlobFlag, Detections
 from imgcal.resources import data_path
 from imgcal.rig import CameraRig
-from imgcal.synthesis import RelativeDrift, Snapshots, synthesize
+from imgcal.simulation import simulate_truth, true_detections
+from imgcal.synthesis import PhysicalDrift, RelativeDrift, Snapshots, synthesize
 from imgcal.transforms import RigidTransform
 
 DRIFT = RelativeDrift(0.05, 0.05)
@@ -212,3 +213,31 @@ def test_noise_beyond_the_stated_sigma_costs_few_labels(o10: CameraRig) -> None:
     named = found.labels >= 0
     assert (found.labels == truth)[named].all()
     assert named.mean() > 0.85
+
+
+def test_sharp_centres_and_a_wide_prior_lose_no_labels(o10, asymmetric):
+    """Where a label alone decides most of a camera, only exact derivatives tell what is left of it."""
+    std = o10.prior.std(o10)
+    for seed in range(3):
+        generator = torch.Generator().manual_seed(seed)
+        truth = simulate_truth(o10, asymmetric, 1, generator, PhysicalDrift())
+        noise = 0.004 * torch.randn(truth.uv.shape, generator=generator, dtype=torch.float64)
+        blobs = true_detections(truth)
+        blobs.uv[:] += noise.reshape(-1, 2).numpy()
+        unlabelled = replace(blobs, fiducial=np.full(len(blobs), -1), sigma=np.full(len(blobs), 0.004))
+        identity = bootstrap(unlabelled, o10, asymmetric, std)
+        assert identity.status == "unique"
+        assert np.array_equal(identity.labels, blobs.fiducial)
+
+
+def test_a_centre_that_is_off_costs_its_own_label_only(o10, asymmetric):
+    """A partly hidden marker: its centre is pixels off, its camera's other blobs are good."""
+    std = o10.prior.std(o10)
+    truth = simulate_truth(o10, asymmetric, 1, torch.Generator().manual_seed(3), PhysicalDrift())
+    blobs = true_detections(truth)
+    blobs.uv[[3, 21, 47]] += (4.0, -3.0)
+    unlabelled = replace(blobs, fiducial=np.full(len(blobs), -1), sigma=np.full(len(blobs), 0.3))
+    identity = bootstrap(unlabelled, o10, asymmetric, std)
+    good = identity.labels == blobs.fiducial
+    assert ((identity.labels == -1) | good).all()
+    assert good.sum() >= len(blobs) - 3 - 3
