@@ -352,7 +352,7 @@ def _require_cameras(observations: Observations, rig: CameraRig, options: Pipeli
     blind = [name for name, sees in zip(rig.camera_names, seen.tolist(), strict=True) if not sees]
     if blind and (not options.blind_cameras or len(blind) == rig.cameras):
         raise RefusedError(
-            f"camera {', '.join(blind)}: found no fiducial in any snapshot, expected some; nothing can be said about it "
+            f"camera {', '.join(blind)}: found no fiducial in any snapshot, expected some; nothing can be said of it "
             "(blind cameras can be accepted: they keep their factory values)"
         )
 

@@ -26,7 +26,7 @@ class EstimationOptions:
 
     loss: Literal["squared", "huber", "cauchy", "geman_mcclure"] = "huber"
     threshold: float = 3.0  # standard deviations, where the loss stops being quadratic
-    max_iterations: int = 50
+    max_iterations: int = 100
     tolerance: float = 1e-4  # expected decrease of the cost (half a squared standard deviation) at which to stop
 
 

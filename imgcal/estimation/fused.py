@@ -15,7 +15,7 @@ from numba import njit, prange
 from torch import Tensor
 
 from imgcal.estimation.linearize import NormalEquations, Problem, State
-from imgcal.estimation.solver import LEAST_DAMPING, MOST_DAMPING, Solution, pixel_rounding
+from imgcal.estimation.solver import FIRST_GROWTH, LEAST_DAMPING, MOST_DAMPING, RELAX, Solution, pixel_rounding
 from imgcal.projection import NEAREST_DEPTH
 from imgcal.rig import CameraRig
 from imgcal.transforms import RigidTransform
@@ -137,7 +137,7 @@ def _minimize_rig(
     whitened, size = np.empty_like(coupling), coupling.shape[2]
     schur = np.empty((size, size), dtype=uv.dtype)
     rounding = 4 * np.finfo(uv.dtype).eps
-    damping = LEAST_DAMPING
+    damping, growth = LEAST_DAMPING, FIRST_GROWTH
     cost[0] = _linearize(given, best, best_blocks, cameras_first, loss, threshold)
     swapped = False
     for iteration in range(max_iterations):
@@ -160,7 +160,8 @@ def _minimize_rig(
         if small and damping <= 1e-3 and np.isfinite(cost[0]):
             converged[0] = True
             break
-        damping = max(damping * 0.1, LEAST_DAMPING) if better else min(max(damping * 10, 1e-4), MOST_DAMPING)
+        damping = max(damping * RELAX, LEAST_DAMPING) if better else min(damping * growth, MOST_DAMPING)
+        growth = FIRST_GROWTH if better else 2 * growth
     if swapped:
         _copy(offset, best[0])
         _copy(rotation, best[1])

@@ -15,6 +15,10 @@ from imgcal.rig import PARAMETERS
 
 LEAST_DAMPING = 1e-9
 MOST_DAMPING = 1e12
+RELAX = 0.2
+"""Of the damping, after a step that was taken."""
+FIRST_GROWTH = 4.0
+"""Of the damping, after the first of a series of rejected steps; doubled with each further one."""
 
 Record = TypeVar("Record", State, NormalEquations)
 
@@ -32,8 +36,8 @@ class Solution:
 def minimize(problem: Problem, start: State, loss: Loss, max_iterations: int, tolerance: float) -> Solution:
     """Minimize the MAP cost of every rig of a batch.
 
-    A step that does not lower the cost, or whose factorization fails, is rejected and retried with ten times the
-    damping: never taken, never replaced by nothing.
+    A step that does not lower the cost, or whose factorization fails, is rejected and retried with more damping, each
+    time twice as much more (Nielsen 1999): never taken, never replaced by nothing.
 
     Args:
         problem: what is given, with one batch axis B.
@@ -48,7 +52,7 @@ def minimize(problem: Problem, start: State, loss: Loss, max_iterations: int, to
     """
     state, equations = start, linearize(problem, start, loss)
     batch, device = equations.cost.shape, equations.cost.device
-    damping = equations.cost.new_full(batch, LEAST_DAMPING)
+    damping, growth = equations.cost.new_full(batch, LEAST_DAMPING), equations.cost.new_full(batch, FIRST_GROWTH)
     converged = torch.zeros(batch, dtype=torch.bool, device=device)
     rounding, tolerances = 4 * torch.finfo(equations.cost.dtype).eps, tolerance + pixel_rounding(problem)
     iteration = 0
@@ -66,8 +70,8 @@ def minimize(problem: Problem, start: State, loss: Loss, max_iterations: int, to
         # A tiny step that does not help has met the rounding error: this is the minimum. Damping alone also makes steps
         # tiny, so only a lightly damped one counts.
         converged = converged | (small & (damping <= 1e-3) & ~torch.isinf(equations.cost))
-        damping = torch.where(better | converged, damping * 0.1, damping * 10).clamp(LEAST_DAMPING, MOST_DAMPING)
-        damping = torch.where(better | converged, damping, damping.clamp_min(1e-4))
+        damping = torch.where(better, damping * RELAX, damping * growth).clamp(LEAST_DAMPING, MOST_DAMPING)
+        growth = torch.where(better, FIRST_GROWTH, 2 * growth)
     return Solution(state, equations, converged, iteration)
 
 

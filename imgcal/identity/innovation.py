@@ -132,8 +132,8 @@ def _compare(
         for n in range(len(points)):
             rotated = turn @ points[n]
             _rows(
-                rotated, rotation[c], left[c], rotated + centre - position[c], focal[c], principal[c], distortion[c], spread[c],
-                radius_squared[n], unit, rows, uv[c, n],
+                rotated, rotation[c], left[c], rotated + centre - position[c],
+                focal[c], principal[c], distortion[c], spread[c], radius_squared[n], unit, rows, uv[c, n],
             )  # fmt: skip
             _whiten(rows, eliminated[c], whitened[c], kept, parts)
             uu, uv_, vv = (parts[0] * parts[0]).sum(), (parts[0] * parts[1]).sum(), (parts[1] * parts[1]).sum()
