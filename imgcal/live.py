@@ -6,9 +6,11 @@ import os
 from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from types import TracebackType
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imgcal.detection import Blobs, DetectionOptions, detect_snapshot
 from imgcal.detection.options import Frame
@@ -17,6 +19,12 @@ from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections
 from imgcal.pipeline import Calibration, Follower, Labelled, PipelineOptions, SnapshotIdentity, fit_labelled
 from imgcal.rig import CameraRig
+
+MOST_FOLLOWED = 64
+"""Fiducials up to which a snapshot may be labelled by the last prediction alone; a larger lattice could have slipped by
+a pitch unnoticed."""
+LEAST_FOLLOWED = 0.9
+"""Share of the last snapshot's labels that must be found again, and fit."""
 
 
 class Recalibrator:
@@ -47,6 +55,7 @@ class Recalibrator:
         self.rig, self.obj, self.options, self.detection = rig, obj, options, detection
         self._follower = Follower(rig, obj, options)
         self._recent: deque[tuple[Detections, SnapshotIdentity]] = deque(maxlen=window)
+        self._latest: Calibration | None = None
         self._count = 0
         self._pool = ThreadPoolExecutor(min(rig.cameras, os.cpu_count() or 1))
 
@@ -73,12 +82,47 @@ class Recalibrator:
         self._count += 1
         detections = _table(blobs, name, self.rig)
         usable = detections.select(detections.usable)
+        followed = self._follow(usable, name)
+        if followed is not None:
+            return followed
+        self._latest = None
         snapshot, labels = self._follower.decide(usable, name, None)
         if snapshot.status == "refused":
             raise RefusedError(f"identity: {snapshot.reason}")
         usable.fiducial[:] = labels
-        self._recent.append((usable, snapshot))
-        return fit_labelled(self._labelled(), self.rig, self.obj, self.options)
+        return self._fit(usable, snapshot)
+
+    def _follow(self, blobs: Detections, name: str) -> Calibration | None:
+        """Label blobs by the last result's prediction, where the object has moved little; None = not to be trusted.
+
+        What is accepted here has been fitted: as many labels as before, hardly any of them an outlier.
+        """
+        latest = self._latest
+        if latest is None or self.obj.fiducials > MOST_FOLLOWED:
+            return None
+        pose = latest.rig_from_object[-1]
+        predicted = latest.rig.project(pose.apply(self.obj.points), self.obj.radius).uv.numpy()  # (C, N, 2)
+        labels = _nearest(blobs, predicted)
+        before = int(latest.observations.seen[-1].sum())
+        if (labels >= 0).sum() < LEAST_FOLLOWED * before:
+            return None
+        blobs = replace(blobs, fiducial=labels)
+        kept = list(self._recent)
+        try:
+            result = self._fit(blobs, SnapshotIdentity(name, "by_tracking", "near the last prediction", 1, pose))
+        except RefusedError:
+            result = None
+        if result is None or int(result.observations.seen[-1].sum()) < LEAST_FOLLOWED * before:
+            self._recent.clear()
+            self._recent.extend(kept)
+            return None
+        self._follower.pose = result.rig_from_object[-1]
+        return result
+
+    def _fit(self, blobs: Detections, snapshot: SnapshotIdentity) -> Calibration:
+        self._recent.append((blobs, snapshot))
+        self._latest = fit_labelled(self._labelled(), self.rig, self.obj, self.options)
+        return self._latest
 
     def _labelled(self) -> Labelled:
         tables = [table for table, _ in self._recent]
@@ -90,6 +134,26 @@ class Recalibrator:
         names = tuple(snapshot.name for _, snapshot in self._recent)
         joined = Detections(**columns, snapshot=snapshot, camera_names=self.rig.camera_names, snapshot_names=names)
         return Labelled(joined, tuple(snapshot for _, snapshot in self._recent))
+
+
+def _nearest(blobs: Detections, predicted: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Fiducial (M,) whose prediction (C, N, 2) is nearest to each blob, -1 where that is not mutual or not near enough.
+
+    Near is a quarter of the distance between predictions: a pattern that has moved less keeps its labels.
+    """
+    labels = np.full(len(blobs), -1, dtype=np.int64)
+    between = np.linalg.norm(predicted[:, :, None] - predicted[:, None], axis=-1)  # (C, N, N)
+    between[:, np.arange(between.shape[1]), np.arange(between.shape[1])] = np.inf
+    gate = 0.25 * np.median(between.min(2))
+    for camera in range(len(predicted)):
+        rows = np.flatnonzero(blobs.camera == camera)
+        if len(rows):
+            distance = np.linalg.norm(blobs.uv[rows][:, None] - predicted[camera], axis=-1)  # (M, N)
+            nearest = distance.argmin(1)
+            mutual = distance.argmin(0)[nearest] == np.arange(len(rows))
+            good = mutual & (distance[np.arange(len(rows)), nearest] < gate)
+            labels[rows[good]] = nearest[good]
+    return labels
 
 
 def _table(blobs: Blobs, name: str, rig: CameraRig) -> Detections:

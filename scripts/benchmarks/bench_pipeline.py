@@ -1,4 +1,4 @@
-"""End to end: `python scripts/benchmarks/bench_pipeline.py` times frames in memory to a recalibrated rig, stage by stage.
+"""End to end: `python scripts/benchmarks/bench_pipeline.py` times frames in memory to a rig, stage by stage.
 
 Writes results/pipeline.json. Running state: the object moves smoothly, the pose of the last snapshot is known.
 """

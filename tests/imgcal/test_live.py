@@ -1,0 +1,57 @@
+import numpy as np
+import pytest
+import torch
+
+from imgcal.errors import RefusedError
+from imgcal.formats import load_object, load_rig
+from imgcal.live import Recalibrator
+from imgcal.rotations import rotation_from_vector
+from imgcal.simulation import FrameModel, Truth, simulate_frames, simulate_truth
+from imgcal.synthesis import PhysicalDrift
+from imgcal.transforms import RigidTransform
+
+
+@pytest.fixture(scope="module")
+def small():
+    """A small rig, an object, and what the rig sees while the object moves smoothly and then jumps."""
+    rig, obj = load_rig("T4").resized(torch.tensor([1024, 544])), load_object("asymmetric8")
+    generator = torch.Generator().manual_seed(4)
+    start = simulate_truth(rig, obj, 1, generator, PhysicalDrift())
+    pose, times = start.rig_from_object[0], torch.tensor([0.0, 1, 2, 3, 4, 400])[:, None].double()
+    turn = rotation_from_vector(times * torch.tensor([0.004, 0.006, -0.003], dtype=torch.float64))
+    poses = RigidTransform(turn @ pose.rotation, pose.translation + 0.1 * times)
+    truth = Truth(start.rig, poses, start.rig.expand(6).project(poses.apply(obj.points)).uv)
+    return rig, obj, truth, list(simulate_frames(truth, obj, FrameModel(), generator))
+
+
+def test_every_snapshot_gives_a_rig_with_right_labels(small):
+    rig, obj, truth, frames = small
+    with Recalibrator(rig, obj) as recalibrator:
+        for s, snapshot in enumerate(frames):
+            result = recalibrator.update(snapshot)
+            seen = result.observations.seen[0]
+            assert seen.sum() >= 26
+            distance = (result.observations.uv[0] - truth.uv[s]).norm(dim=-1)
+            assert distance[seen].max() < 0.5
+            assert result.identity == ("unique" if s in (0, 5) else "by_tracking")
+
+
+def test_a_window_of_snapshots_knows_the_rig_better(small):
+    rig, obj, truth, frames = small
+    errors = []
+    for window in (1, 5):
+        with Recalibrator(rig, obj, window=window) as recalibrator:
+            for snapshot in frames:
+                result = recalibrator.update(snapshot)
+        assert len(result.labelled.snapshots) == window
+        errors.append(float(result.rig.difference(truth.rig)[:, 6:10].square().mean().sqrt()))
+    assert errors[1] < errors[0]
+
+
+def test_a_dark_snapshot_is_refused_and_the_next_one_is_not(small):
+    rig, obj, _, frames = small
+    with Recalibrator(rig, obj) as recalibrator:
+        recalibrator.update(frames[0])
+        with pytest.raises(RefusedError):
+            recalibrator.update({name: np.full_like(frame, 12) for name, frame in frames[0].items()})
+        assert recalibrator.update(frames[1]).rms < 0.1
