@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from imgcal.detection import Blobs, DetectionOptions, detect_snapshot
 from imgcal.detection.options import Frame
-from imgcal.errors import RefusedError
+from imgcal.errors import InputError, RefusedError
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections
 from imgcal.pipeline import Calibration, Follower, Labelled, PipelineOptions, SnapshotIdentity, fit_labelled
@@ -52,6 +52,8 @@ class Recalibrator:
             window: number of latest snapshots that a calibration is made from; more know the rig better and follow it
                 more slowly.
         """
+        if window < 1:
+            raise InputError(f"window: found {window}, expected at least 1 snapshot")
         self.rig, self.obj, self.options, self.detection = rig, obj, options, detection
         self._follower = Follower(rig, obj, options)
         self._recent: deque[tuple[Detections, SnapshotIdentity]] = deque(maxlen=window)
@@ -76,6 +78,9 @@ class Recalibrator:
             RefusedError: this snapshot cannot decide; the next one is tried afresh.
             InputError: a frame is no grey image, or is of a camera that the rig does not have.
         """
+        unknown = [name for name in frames if name not in self.rig.camera_names]
+        if unknown:
+            raise InputError(f"frames: found camera {unknown[0]}, expected one of {', '.join(self.rig.camera_names)}")
         ordered = {name: frames.get(name) for name in self.rig.camera_names}
         blobs = detect_snapshot(ordered, self.detection, pool=self._pool)
         name = f"{self._count:05d}"
@@ -120,8 +125,15 @@ class Recalibrator:
         return result
 
     def _fit(self, blobs: Detections, snapshot: SnapshotIdentity) -> Calibration:
+        kept = list(self._recent)
         self._recent.append((blobs, snapshot))
-        self._latest = fit_labelled(self._labelled(), self.rig, self.obj, self.options)
+        try:
+            self._latest = fit_labelled(self._labelled(), self.rig, self.obj, self.options)
+        except RefusedError:
+            # What could not be fitted must not spoil the fits of the following snapshots.
+            self._recent.clear()
+            self._recent.extend(kept)
+            raise
         return self._latest
 
     def _labelled(self) -> Labelled:

@@ -23,7 +23,7 @@ from imgcal.estimation import Estimate, EstimationOptions, camera_std, estimate
 from imgcal.identity import Identity, IdentityOptions, identify
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections, Observations
-from imgcal.rig import CameraRig, RigPrior
+from imgcal.rig import PARAMETER_NAMES, CameraRig, RigPrior
 from imgcal.transforms import RigidTransform
 
 Frames = Mapping[str, Frame | Sequence[Frame | None] | None]
@@ -46,6 +46,8 @@ class PipelineOptions:
     outlier: float = 5.0  # standard deviations beyond which a labelled blob is left out
     most_outliers: float = 0.25  # share of left-out blobs above which the data do not fit the object
     largest_model_error: float = 1.0  # px: unexplained residual above which the data do not fit the camera model
+    largest_drift: float = 10.0  # prior standard deviations that one factory value may be off
+    widest_prior: float = 4.0  # factor by which a kind of factory values may have drifted more than the prior says
     blind_cameras: bool = False  # accept cameras that saw nothing; they keep their factory values
 
 
@@ -87,6 +89,7 @@ class Calibration(Estimate):
     observations: Observations  # (S, C, N) as used: outliers not seen, sigma with the model error
     model_error: float  # px, what the residuals hold beyond the blobs' own sigma
     outliers: int  # labelled blobs left out
+    widened: Mapping[str, float]  # by kind of value: factor by which the prior was too narrow, where it was
     factory: CameraRig
     obj: CalibrationObject
     seconds: Mapping[str, float] = field(default_factory=dict)  # by stage
@@ -174,9 +177,9 @@ def label(
     order: Iterable[int] = range(count)
     for s in progress(order, count) if progress else order:
         decide(s)
-    refused = [s for s in range(count) if results[s][0].status == "refused" and not coded[s]]
-    if refused and len(refused) < count:
-        for s in refused:
+    again = [s for s in range(count) if not coded[s] and _incomplete(*results[s], detections.camera[rows[s]])]
+    if again and any(results[s][0].status != "refused" for s in range(count)):
+        for s in again:
             decide(s)
     fiducial = np.full(len(detections), -1, dtype=np.int64)
     for s in range(count):
@@ -188,6 +191,11 @@ def label(
         why = f"{reasons[0][0]} ({reasons[0][1]} of {count} snapshots)" if count else "found no snapshot"
         raise RefusedError(f"identity: {why}")
     return labelled
+
+
+def _incomplete(snapshot: SnapshotIdentity, labels: NDArray[np.int64], camera: NDArray[np.int64]) -> bool:
+    """Tell whether another try may help: the snapshot was refused, or no blob of some camera (M,) has a label."""
+    return snapshot.status == "refused" or not np.isin(camera, camera[labels >= 0]).all()
 
 
 class Follower:
@@ -300,25 +308,37 @@ def fit_labelled(
     observations, poses = _used(labelled, rig, obj)
     _require_cameras(observations, rig, options)
     raw, model_error, guess = observations, options.identity_error, None
-    for _ in range(6):
+    spread = (rig.prior or RigPrior()).std(rig)
+    widened: dict[str, float] = {}
+    for _ in range(8):
         previous = model_error
         weighted = replace(observations, sigma=(raw.sigma.square() + model_error**2).sqrt())
-        fit = estimate(weighted, rig, obj, poses, first_guess=guess, options=options.estimation)
+        fit = estimate(weighted, rig, obj, poses, spread=spread, first_guess=guess, options=options.estimation)
         if not bool(fit.converged):
             raise RefusedError(
-                f"estimation: no minimum after {fit.iterations} iterations (RMS {float(fit.rms):.3g} px)"
+                f"estimation: no minimum after {fit.iterations} iterations (RMS {2**0.5 * float(fit.rms):.3g} px)"
             )
         model_error, poses, guess = _model_error(fit, raw.sigma), fit.rig_from_object, fit.rig
         distance = fit.residual.norm(dim=-1) / (raw.sigma.square() + model_error**2).sqrt()
         # Where a fiducial was left out there is no residual: it stays out.
         keep = observations.seen & (distance <= options.outlier)
         settled = abs(model_error - previous) <= 0.02 * previous and bool((keep == observations.seen).all())
+        if settled:
+            too_narrow = _too_narrow(fit)
+            widened = {kind: widened.get(kind, 1.0) * factor for kind, factor in too_narrow.items()} | {
+                kind: factor for kind, factor in widened.items() if kind not in too_narrow
+            }
+            spread = _widen(spread, too_narrow)
+            settled = not too_narrow or max(widened.values()) > options.widest_prior
         observations = replace(observations, seen=keep)
         if settled:
             break
     observations = weighted
     outliers = int(raw.seen.sum()) - int(observations.seen.sum())
-    _require_fit(model_error, outliers / max(int(raw.seen.sum()), 1), float(fit.rms), options)
+    _require_cameras(observations, rig, options)
+    _require_near_prior(fit, rig, widened, options)
+    _require_most_labels(raw, observations, rig)
+    _require_fit(model_error, outliers / max(int(raw.seen.sum()), 1), 2**0.5 * float(fit.rms), options)
     values = {name: getattr(fit, name) for name in Estimate.__dataclass_fields__}
     return Calibration(
         **values,
@@ -326,6 +346,7 @@ def fit_labelled(
         observations=observations,
         model_error=model_error,
         outliers=outliers,
+        widened=widened,
         factory=rig,
         obj=obj,
     )
@@ -353,7 +374,7 @@ def _require_cameras(observations: Observations, rig: CameraRig, options: Pipeli
     if blind and (not options.blind_cameras or len(blind) == rig.cameras):
         raise RefusedError(
             f"camera {', '.join(blind)}: found no fiducial in any snapshot, expected some; nothing can be said of it "
-            "(blind cameras can be accepted: they keep their factory values)"
+            "(--without leaves a camera out, --blind-cameras keeps its factory values)"
         )
 
 
@@ -399,6 +420,68 @@ def _model_error(fit: Estimate, sigma: Tensor) -> float:
     return high
 
 
+KINDS = {
+    "rotation": slice(0, 3),
+    "position": slice(3, 6),
+    "focal_length": slice(6, 8),
+    "principal_point": slice(8, 10),
+    "distortion": slice(10, 15),
+}
+
+
+def _too_narrow(fit: Estimate) -> dict[str, float]:
+    """Kinds of values that have drifted more than their prior allows: factor by which the prior is too narrow.
+
+    The whitened offsets of a kind should have a mean square of one, over as many values as the data determine.
+    """
+    offset, spread = fit.solution.state.offset[0], fit.problem.spread[0]
+    determined = 1 - (camera_std(fit) / spread.clamp_min(1e-30)).square().clamp_max(1)
+    determined = torch.where(spread > 0, determined, 0.0)
+    factors = {}
+    for kind, part in KINDS.items():
+        freedom = float(determined[:, part].sum())
+        if freedom > 1:
+            excess = float(offset[:, part].square().sum()) / freedom
+            if excess > 1 + 4 * (2 / freedom) ** 0.5:
+                factors[kind] = excess**0.5
+    return factors
+
+
+def _widen(spread: Tensor, factors: Mapping[str, float]) -> Tensor:
+    spread = spread.clone()
+    for kind, factor in factors.items():
+        spread[:, KINDS[kind]] *= factor
+    return spread
+
+
+def _require_near_prior(fit: Estimate, rig: CameraRig, widened: Mapping[str, float], options: PipelineOptions) -> None:
+    prior = (rig.prior or RigPrior()).std(rig)
+    drift = (fit.solution.state.offset[0] * fit.problem.spread[0] / prior.clamp_min(1e-30)).abs()
+    drift = torch.where(prior > 0, drift, 0.0)
+    camera, parameter = divmod(int(drift.argmax()), drift.shape[1])
+    largest = float(drift[camera, parameter])
+    wide = max(widened.values(), default=1.0)
+    if largest > options.largest_drift or wide > options.widest_prior:
+        raise RefusedError(
+            f"estimation: camera {rig.camera_names[camera]}: {PARAMETER_NAMES[parameter]} is {largest:.1f} prior "
+            f"standard deviations from its factory value, expected at most {options.largest_drift:g} (and all of a kind "
+            f"within {options.widest_prior:g}); cameras may be swapped, labels wrong, or the prior in the rig file too narrow"
+        )
+
+
+def _require_most_labels(raw: Observations, kept: Observations, rig: CameraRig) -> None:
+    """Refuse where most labels of one camera or one fiducial do not fit: they are not what they are said to be."""
+    for name, axes, names in (("camera", (0, 2), rig.camera_names), ("fiducial", (0, 1), None)):
+        before, after = raw.seen.sum(axes), kept.seen.sum(axes)
+        bad = torch.nonzero((before >= 6) & (after < 0.5 * before)).flatten().tolist()
+        if bad:
+            which = ", ".join(str(i) if names is None else names[i] for i in bad)
+            raise RefusedError(
+                f"estimation: {name} {which}: most labels do not fit the rest (frames of another moment, swapped "
+                "labels, or a fiducial that has moved)"
+            )
+
+
 @dataclass(frozen=True)
 class Score:
     """Reprojection errors of a rig that is held fixed; only the object's poses are fitted."""
@@ -439,4 +522,6 @@ def score(
     # What is reported is an RMS in pixels: centres count alike, however well each was measured.
     even = replace(observations, sigma=torch.full_like(observations.sigma, options.identity_error))
     fit = estimate(even, rig, obj, poses, spread=fixed, options=options.estimation)
+    if not bool(fit.converged):
+        raise RefusedError(f"score: no pose of the object fits (RMS {2**0.5 * float(fit.rms):.3g} px)")
     return Score(labelled, fit.residual, observations.seen)

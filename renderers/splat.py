@@ -63,6 +63,8 @@ def splat(
     Convention: pixel (0, 0) is the centre of the top-left pixel, u right, v down.
 
     """
+    if isinstance(size, int | float) and not 0 < size < math.inf:
+        raise ValueError(f"size must be positive and finite, found {size}")
     batch, count = uv.shape[:-2], uv.shape[-2]
     images = math.prod(batch)
     _check(uv, colours, compositing, depth)

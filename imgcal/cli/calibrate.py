@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -12,7 +13,14 @@ from typing import Annotated, Any, Literal
 import torch
 import tyro
 
-from imgcal.cli.common import make_folder, progress, read_detections, without_cameras
+from imgcal.cli.common import (
+    check_folder,
+    make_folder,
+    only_cameras,
+    progress,
+    read_detections,
+    without_cameras,
+)
 from imgcal.cli.describe import describe, describe_refusal
 from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError, RefusedError
@@ -50,11 +58,14 @@ class Calibrate:
     def run(self) -> None:
         """Calibrate and write."""
         started = time.perf_counter()
-        rig, obj = without_cameras(load_rig(self.rig), self.without), load_object(self.object)
+        check_folder(self.out)
+        complete, obj = load_rig(self.rig), load_object(self.object)
+        rig = without_cameras(complete, self.without)
         reference = self._reference(rig)
-        source = open_input(self.input, rig, obj.fiducials)
+        source = open_input(self.input, complete, obj.fiducials)
         loaded = time.perf_counter()
         detections, frames = read_detections(source, self.snapshots, self.detection)
+        detections = only_cameras(detections, rig)
         seconds = {"loading": loaded - started, "reading and detection": time.perf_counter() - loaded}
         out = make_folder(self.out)
 
@@ -123,6 +134,7 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         "chi2_per_dof": float(calibration.chi2_per_dof),
         "model_error_px": calibration.model_error,
         "outliers": calibration.outliers,
+        "prior_too_narrow": dict(calibration.widened),
         "snapshots_used": len(used),
         "snapshots_rejected": len(snapshots) - len(used),
         "rejected": {s.name: s.reason for s in snapshots if s.status == "refused"},
@@ -143,6 +155,7 @@ def refused_summary(reason: str, snapshot_names: tuple[str, ...], seconds: dict[
         "chi2_per_dof": None,
         "model_error_px": None,
         "outliers": None,
+        "prior_too_narrow": {},
         "snapshots_used": 0,
         "snapshots_rejected": len(snapshot_names),
         "rejected": {},
@@ -162,6 +175,9 @@ def _print(result: dict[str, Any], out: Path, report: bool) -> None:
         f"identity {result['identity']}, {result['snapshots_used']} snapshots used, "
         f"{result['snapshots_rejected']} rejected"
     )
+    for kind, factor in result["prior_too_narrow"].items():
+        kind = kind.replace("_", " ")
+        print(f"note: {kind} drifted {factor:.1f} times as far as the rig's prior allows: widened", file=sys.stderr)
     print(f"rig     {out / 'rig.yaml'}")
     print(f"result  {out / 'result.json'}")
     if report:

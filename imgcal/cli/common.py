@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -98,9 +100,32 @@ def without_cameras(rig: CameraRig, names: tuple[str, ...]) -> CameraRig:
     return rig.select([i for i, name in enumerate(rig.camera_names) if name not in names])
 
 
+def only_cameras(detections: Detections, rig: CameraRig) -> Detections:
+    """Leave out the blobs of cameras that a reduced rig does not have."""
+    kept = [name in rig.camera_names for name in detections.camera_names]
+    number = np.cumsum(kept) - 1
+    rows = np.array(kept, dtype=bool)[detections.camera] if len(detections) else np.zeros(0, dtype=bool)
+    some = detections.select(rows)
+    names = tuple(name for name, keep in zip(detections.camera_names, kept, strict=True) if keep)
+    return replace(some, camera=number[some.camera].astype(np.int64), camera_names=names)
+
+
+def check_folder(path: Path) -> None:
+    """Make sure, before any work, that an output folder exists or can be made."""
+    existing = path
+    while not existing.exists() and existing != existing.parent:
+        existing = existing.parent
+    if not existing.is_dir():
+        raise InputError(f"{path}: found a file at {existing}, expected a folder to write to")
+    if not os.access(existing, os.W_OK):
+        raise InputError(f"{path}: found {existing} without the right to write, expected a folder to write to")
+
+
 def make_folder(path: Path) -> Path:
     """Make an output folder; a file in its place is an error."""
-    if path.exists() and not path.is_dir():
-        raise InputError(f"{path}: found a file, expected a folder to write to")
-    path.mkdir(parents=True, exist_ok=True)
+    check_folder(path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be made: {error.strerror or error}") from error
     return path

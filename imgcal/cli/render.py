@@ -12,7 +12,7 @@ import numpy as np
 import torch
 import tyro
 
-from imgcal.cli.common import make_folder, progress, read_detections
+from imgcal.cli.common import check_folder, make_folder, progress, read_detections
 from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError
 from imgcal.formats import load_object, load_rig, open_input, write_image
@@ -39,10 +39,11 @@ class Render:
 
     def run(self) -> None:
         """Render and write."""
-        if self.size < 8 or self.dot <= 0:
+        if self.size < 8 or not 0 < self.dot < self.size:
             raise InputError(
                 f"--size, --dot: found {self.size} and {self.dot}, expected at least 8 pixels and more than 0"
             )
+        check_folder(self.out)
         rig, obj = load_rig(self.rig), load_object(self.object)
         detections, _ = read_detections(open_input(self.input, rig, obj.fiducials), self.snapshots, self.detection)
 

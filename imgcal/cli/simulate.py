@@ -10,7 +10,7 @@ from typing import Literal
 
 import torch
 
-from imgcal.cli.common import make_folder, progress
+from imgcal.cli.common import check_folder, make_folder, progress
 from imgcal.errors import InputError
 from imgcal.formats import (
     load_object,
@@ -57,6 +57,13 @@ class Simulate:
         """Simulate and write."""
         if self.snapshots < 1:
             raise InputError(f"--snapshots: found {self.snapshots}, expected at least 1")
+        if not 0 < self.marker_radius < math.inf:
+            raise InputError(f"--marker-radius: found {self.marker_radius}, expected mm, more than 0")
+        for name in ("theta_deg", "phi_deg", "alpha_deg"):
+            low, high = getattr(self, name)
+            if not low <= high:
+                raise InputError(f"--{name.replace('_', '-')}: found {low} {high}, expected the smaller angle first")
+        check_folder(self.out)
         if (self.out / "frames").exists():
             raise InputError(f"{self.out}: found a capture there already, expected a new folder")
         rig, obj = load_rig(self.rig), load_object(self.object)

@@ -40,6 +40,8 @@ def detect(
     if unknown:
         raise InputError(f"masks: found camera {unknown[0]}, expected one of {', '.join(names)}")
     snapshots = _snapshots(frames)
+    if not snapshots:
+        raise InputError("frames: found no snapshot, expected at least one frame for each camera")
     with ThreadPoolExecutor(_workers(len(names))) as pool:
         blobs = [detect_snapshot(snapshot, options, masks=masks, pool=pool) for snapshot in snapshots]
     return _table(blobs, names)

@@ -21,7 +21,7 @@ class DetectionOptions:
     Radii are those of the disc of equal area: sqrt(integrated brightness / peak brightness / pi).
     """
 
-    polarity: Polarity = "bright"
+    polarity: Polarity = "bright"  # markers brighter or darker than what is around them
     threshold: float | None = None  # least peak above the local background, grey levels; None = from the noise
     min_radius: float = 0.9  # px; a single hot pixel measures 0.56
     max_radius: float = 16.0  # px

@@ -1,13 +1,26 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from imgcal.cli.main import main
 from imgcal.estimation import relative_difference
-from imgcal.formats import load_detections, load_rig, load_rig_covariance, read_frame, save_detections, write_frame
+from imgcal.formats import (
+    load_detections,
+    load_object,
+    load_rig,
+    load_rig_covariance,
+    read_frame,
+    save_detections,
+    write_frame,
+)
+from imgcal.observations import Detections
+from imgcal.simulation import simulate_truth, true_detections
+from imgcal.synthesis import RelativeDrift
 
 KEYS = {
     "status", "reason", "identity", "rms_px_before", "rms_px_after", "chi2_per_dof", "snapshots_used",
@@ -197,3 +210,60 @@ def test_an_output_that_is_a_file(workplace, tmp_path, capsys):
     assert calibrate(workplace, workplace.capture, tmp_path / "out") == 2
     assert "expected a folder" in one_line(capsys)
     assert (tmp_path / "out").read_text() == "mine"
+
+
+def relabelled(workplace, tmp_path, **columns):
+    """The true detections of six snapshots with some columns changed."""
+    blobs = load_detections(workplace.capture / "truth" / "detections.csv")
+    parts = [replace(blobs, snapshot=blobs.snapshot + 3 * k) for k in range(2)]
+    joined = {
+        name: np.concatenate([getattr(p, name) for p in parts])
+        for name in ("uv", "sigma", "camera", "snapshot", "fiducial", "radius", "flags")
+    }
+    names = tuple(f"{s:05d}" for s in range(6))
+    table = Detections(**joined, camera_names=blobs.camera_names, snapshot_names=names)
+    table = replace(table, **{name: change(getattr(table, name)) for name, change in columns.items()})
+    save_detections(table, tmp_path / "blobs.csv")
+    return tmp_path / "blobs.csv"
+
+
+def exchanged(first, second):
+    def change(values):
+        return np.where(values == first, second, np.where(values == second, first, values))
+
+    return change
+
+
+def test_swapped_cameras_are_refused(workplace, tmp_path, capsys):
+    table = relabelled(workplace, tmp_path, camera=exchanged(0, 2))
+    assert calibrate(workplace, table, tmp_path / "out", "--no-report") == 3
+    assert "factory value" in one_line(capsys) or "fit" in one_line(capsys)
+
+
+def test_swapped_labels_are_refused(workplace, tmp_path, capsys):
+    table = relabelled(workplace, tmp_path, fiducial=exchanged(0, 1))
+    assert calibrate(workplace, table, tmp_path / "out", "--no-report") == 3
+    assert "estimation" in one_line(capsys)
+
+
+def test_the_untouched_table_is_accepted(workplace, tmp_path):
+    assert calibrate(workplace, relabelled(workplace, tmp_path), tmp_path / "out", "--no-report") == 0
+
+
+def test_a_drift_beyond_the_prior_is_said_and_its_spread_is_honest(workplace, tmp_path, capsys):
+    truth = simulate_truth(
+        load_rig(workplace.rig),
+        load_object(workplace.object),
+        6,
+        torch.Generator().manual_seed(0),
+        RelativeDrift(0.1, 0.1),
+    )
+    table = true_detections(truth)
+    table.uv[:] += 0.1 * np.random.default_rng(0).standard_normal(table.uv.shape)
+    save_detections(table, tmp_path / "blobs.csv")
+    assert calibrate(workplace, tmp_path / "blobs.csv", tmp_path / "out", "--no-report") == 0
+    assert "than the rig's prior" in capsys.readouterr().err.replace("as far as", "than")
+    assert json.loads((tmp_path / "out" / "result.json").read_text())["prior_too_narrow"]
+    found, std = load_rig(tmp_path / "out" / "rig.yaml"), load_rig_covariance(tmp_path / "out" / "rig.yaml").std
+    error = relative_difference(found, truth.rig)[:, 6:10] / std[:, 6:10]
+    assert error.square().mean().sqrt() < 1.6
