@@ -319,8 +319,9 @@ def fit_labelled(
                 f"estimation: no minimum after {fit.iterations} iterations (RMS {2**0.5 * float(fit.rms):.3g} px)"
             )
         model_error, poses, guess = _model_error(fit, raw.sigma), fit.rig_from_object, fit.rig
-        distance = fit.residual.norm(dim=-1) / (raw.sigma.square() + model_error**2).sqrt()
-        # Where a fiducial was left out there is no residual: it stays out.
+        # Judged by the sigma of this fit: what a coarse fit leaves says little about fine outliers. Where a fiducial
+        # was left out there is no residual: it stays out.
+        distance = fit.residual.norm(dim=-1) / weighted.sigma
         keep = observations.seen & (distance <= options.outlier)
         settled = abs(model_error - previous) <= 0.02 * previous and bool((keep == observations.seen).all())
         if settled:
@@ -464,8 +465,9 @@ def _require_near_prior(fit: Estimate, rig: CameraRig, widened: Mapping[str, flo
     if largest > options.largest_drift or wide > options.widest_prior:
         raise RefusedError(
             f"estimation: camera {rig.camera_names[camera]}: {PARAMETER_NAMES[parameter]} is {largest:.1f} prior "
-            f"standard deviations from its factory value, expected at most {options.largest_drift:g} (and all of a kind "
-            f"within {options.widest_prior:g}); cameras may be swapped, labels wrong, or the prior in the rig file too narrow"
+            f"standard deviations off its factory value, expected at most {options.largest_drift:g}, and "
+            f"{options.widest_prior:g} for all of a kind; cameras may be swapped, labels wrong, or the prior in the rig "
+            "file too narrow"
         )
 
 
