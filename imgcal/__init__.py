@@ -6,6 +6,7 @@ from imgcal.detection import DetectionOptions, detect
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import Estimate, EstimationOptions, estimate
 from imgcal.formats import load_detections, load_object, load_rig, save_detections, save_rig
+from imgcal.live import Recalibrator
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections, Observations
 from imgcal.pipeline import Calibration, PipelineOptions, calibrate, score
@@ -30,6 +31,7 @@ __all__ = [
     "Observations",
     "PipelineOptions",
     "Projection",
+    "Recalibrator",
     "RefusedError",
     "RigPrior",
     "RigidTransform",

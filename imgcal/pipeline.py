@@ -466,8 +466,8 @@ def _require_near_prior(fit: Estimate, rig: CameraRig, widened: Mapping[str, flo
         raise RefusedError(
             f"estimation: camera {rig.camera_names[camera]}: {PARAMETER_NAMES[parameter]} is {largest:.1f} prior "
             f"standard deviations off its factory value, expected at most {options.largest_drift:g}, and "
-            f"{options.widest_prior:g} for all of a kind; cameras may be swapped, labels wrong, or the prior in the rig "
-            "file too narrow"
+            f"{options.widest_prior:g} for all of a kind; cameras may be swapped, labels wrong, or the prior in the "
+            "rig file too narrow"
         )
 
 
