@@ -6,10 +6,11 @@ from imgcal.detection import DetectionOptions, detect
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import Estimate, EstimationOptions, estimate
 from imgcal.formats import load_detections, load_object, load_rig, save_detections, save_rig
+from imgcal.labelling import PipelineOptions
 from imgcal.live import Recalibrator
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections, Observations
-from imgcal.pipeline import Calibration, PipelineOptions, calibrate, score
+from imgcal.pipeline import Calibration, calibrate, score
 from imgcal.projection import Projection
 from imgcal.rig import CameraRig, RigPrior
 from imgcal.transforms import RigidTransform

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from imgcal.detection import Blobs, DetectionOptions, detect_snapshot
 from imgcal.detection.options import Frame
 from imgcal.errors import InputError, RefusedError
+from imgcal.labelling import Follower, Labelled, PipelineOptions, SnapshotIdentity
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections
-from imgcal.pipeline import Calibration, Follower, Labelled, PipelineOptions, SnapshotIdentity, fit_labelled
+from imgcal.pipeline import Calibration, fit_labelled
 from imgcal.rig import CameraRig
 
 MOST_FOLLOWED = 64

@@ -26,7 +26,8 @@ from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import relative_covariance
 from imgcal.formats import RigCovariance, load_object, load_rig, open_input, save_rig, write_text
-from imgcal.pipeline import Calibration, PipelineOptions, calibrate
+from imgcal.labelling import PipelineOptions
+from imgcal.pipeline import Calibration, calibrate
 from imgcal.report import write_report
 from imgcal.rig import CameraRig
 

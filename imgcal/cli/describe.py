@@ -14,9 +14,10 @@ from torch import Tensor
 import imgcal
 from imgcal.estimation import relative_covariance
 from imgcal.formats import Frame
+from imgcal.labelling import matched_to_rig
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections
-from imgcal.pipeline import Calibration, matched_to_rig
+from imgcal.pipeline import Calibration
 from imgcal.report import ReportContent, SnapshotSummary, relative_prior_std
 from imgcal.rig import PARAMETERS, CameraRig
 from imgcal.transforms import RigidTransform

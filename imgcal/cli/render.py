@@ -16,7 +16,7 @@ from imgcal.cli.common import check_folder, make_folder, progress, read_detectio
 from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError
 from imgcal.formats import load_object, load_rig, open_input, write_image
-from imgcal.pipeline import label, matched_to_rig, to_observations
+from imgcal.labelling import label, matched_to_rig, to_observations
 from renderers import splat
 
 

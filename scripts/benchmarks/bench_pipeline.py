@@ -17,8 +17,9 @@ import torch
 import imgcal
 from imgcal.detection import detect_snapshot
 from imgcal.identity import bootstrap, track
+from imgcal.labelling import Labelled, SnapshotIdentity
 from imgcal.live import Recalibrator
-from imgcal.pipeline import Labelled, SnapshotIdentity, fit_labelled
+from imgcal.pipeline import fit_labelled
 from imgcal.rotations import rotation_from_vector
 from imgcal.simulation import FrameModel, Truth, simulate_frames, simulate_truth
 from imgcal.synthesis import PhysicalDrift

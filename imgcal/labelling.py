@@ -1,0 +1,216 @@
+"""Which blob is which fiducial, snapshot by snapshot: each accepted one helps with the next."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from imgcal.errors import InputError, RefusedError
+from imgcal.estimation import EstimationOptions, camera_std, estimate
+from imgcal.identity import Identity, IdentityOptions, identify
+from imgcal.objects import CalibrationObject
+from imgcal.observations import Detections, Observations
+from imgcal.rig import CameraRig, RigPrior
+from imgcal.transforms import RigidTransform
+
+MOST_REMEMBERED = 64
+"""Snapshots that take part in refits of the rig while identity goes on: later ones add little to it."""
+
+Progress = Callable[[Iterable[int], int], Iterable[int]]
+
+
+@dataclass(frozen=True)
+class PipelineOptions:
+    """How sure the pipeline must be before it gives an answer."""
+
+    identity: IdentityOptions = IdentityOptions()
+    estimation: EstimationOptions = EstimationOptions()
+    identity_error: float = (
+        0.3  # px: what a centre may be off beyond its own sigma (partly hidden markers) while blobs are told apart
+    )
+    least_fiducials: int = 4  # different fiducials that a snapshot must show, all cameras together
+    outlier: float = 5.0  # standard deviations beyond which a labelled blob is left out
+    most_outliers: float = 0.25  # share of left-out blobs above which the data do not fit the object
+    largest_model_error: float = 1.0  # px: unexplained residual above which the data do not fit the camera model
+    largest_drift: float = 10.0  # prior standard deviations that one factory value may be off
+    widest_prior: float = 4.0  # factor by which a kind of factory values may have drifted more than the prior says
+    blind_cameras: bool = False  # accept cameras that saw nothing; they keep their factory values
+
+
+@dataclass(frozen=True)
+class SnapshotIdentity:
+    """What was decided about one snapshot."""
+
+    name: str
+    status: str  # coded | unique | by_prior | by_tracking | ambiguous | refused
+    reason: str
+    alternatives: int
+    rig_from_object: RigidTransform | None
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """Detections with a fiducial for every blob that has one, and how that was decided."""
+
+    detections: Detections  # `fiducial` filled in, -1 = not used
+    snapshots: tuple[SnapshotIdentity, ...]  # S
+
+    @property
+    def used(self) -> list[int]:
+        """Numbers of the snapshots that are not refused."""
+        return [i for i, snapshot in enumerate(self.snapshots) if snapshot.status != "refused"]
+
+    @property
+    def identity(self) -> str:
+        """How identity was decided as a whole: that of the first snapshot, which the others follow."""
+        used = self.used
+        return self.snapshots[used[0]].status if used else "refused"
+
+
+def label(
+    detections: Detections,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    options: PipelineOptions = PipelineOptions(),
+    progress: Progress | None = None,
+) -> Labelled:
+    """Decide which blob is which fiducial, snapshot by snapshot.
+
+    Each accepted snapshot predicts the next one. What the accepted ones say about the rig narrows the search in the
+    following; refused ones are tried once more at the end, with the rig that all the others gave.
+
+    Raises:
+        RefusedError: no snapshot could be decided.
+    """
+    count = len(detections.snapshot_names)
+    coded = _coded_snapshots(detections, count)
+    follower = Follower(rig, obj, options)
+    results: dict[int, tuple[SnapshotIdentity, NDArray[np.int64]]] = {}
+    rows = [np.flatnonzero((detections.snapshot == s) & detections.usable) for s in range(count)]
+
+    def decide(s: int) -> None:
+        labels = detections.fiducial[rows[s]] if coded[s] else None
+        results[s] = follower.decide(detections.select(rows[s]), detections.snapshot_names[s], labels)
+
+    order: Iterable[int] = range(count)
+    for s in progress(order, count) if progress else order:
+        decide(s)
+    again = [s for s in range(count) if not coded[s] and _incomplete(*results[s], detections.camera[rows[s]])]
+    if again and any(results[s][0].status != "refused" for s in range(count)):
+        for s in again:
+            decide(s)
+    fiducial = np.full(len(detections), -1, dtype=np.int64)
+    for s in range(count):
+        if results[s][0].status != "refused":
+            fiducial[rows[s]] = results[s][1]
+    labelled = Labelled(replace(detections, fiducial=fiducial), tuple(results[s][0] for s in range(count)))
+    if not labelled.used:
+        reasons = Counter(snapshot.reason for snapshot in labelled.snapshots).most_common(1)
+        why = f"{reasons[0][0]} ({reasons[0][1]} of {count} snapshots)" if count else "found no snapshot"
+        raise RefusedError(f"identity: {why}")
+    return labelled
+
+
+def _incomplete(snapshot: SnapshotIdentity, labels: NDArray[np.int64], camera: NDArray[np.int64]) -> bool:
+    """Tell whether another try may help: the snapshot was refused, or no blob of some camera (M,) has a label."""
+    return snapshot.status == "refused" or not np.isin(camera, camera[labels >= 0]).all()
+
+
+class Follower:
+    """Carries what earlier snapshots say, the pose and the rig, to the next one."""
+
+    def __init__(self, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions) -> None:
+        self.factory, self.obj, self.options = rig, obj, options
+        self.rig = rig
+        self.spread = (rig.prior or RigPrior()).std(rig)
+        # Many captures are taken with the object at the origin of the rig's frame; it costs little to look there first.
+        self.pose = RigidTransform.identity(dtype=rig.focal_length.dtype)
+        self.accepted: list[tuple[Detections, NDArray[np.int64], RigidTransform]] = []
+
+    def decide(
+        self, blobs: Detections, name: str, labels: NDArray[np.int64] | None
+    ) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
+        """Label the blobs of one snapshot; `labels` are given when they are coded."""
+        identity, status = None, "coded"
+        if labels is None:
+            identity = self._identify(blobs)
+            labels, status = identity.labels, identity.status
+        shown = len(np.unique(labels[labels >= 0]))
+        if identity is not None and not identity.accepted:
+            return SnapshotIdentity(name, "refused", identity.reason, identity.alternatives, None), labels
+        if shown < self.options.least_fiducials:
+            reason = f"too few fiducials: found {shown}, expected at least {self.options.least_fiducials}"
+            return SnapshotIdentity(name, "refused", reason, 1, None), labels
+        if identity is None:
+            return SnapshotIdentity(name, status, "labelled in the input", 1, None), labels
+        assert identity.rig_from_object is not None  # an accepted identity has a pose
+        self._remember(blobs, labels, identity.rig_from_object)
+        return SnapshotIdentity(name, status, identity.reason, identity.alternatives, identity.rig_from_object), labels
+
+    def _identify(self, blobs: Detections) -> Identity:
+        blobs = replace(blobs, sigma=np.hypot(blobs.sigma, self.options.identity_error))
+        return identify(blobs, self.rig, self.obj, self.spread, [self.pose], self.options.identity)
+
+    def _remember(self, blobs: Detections, labels: NDArray[np.int64], pose: RigidTransform) -> None:
+        """Keep the pose; refit the rig after 1, 2, 4, 8, ... accepted snapshots."""
+        self.pose = pose
+        if len(self.accepted) == MOST_REMEMBERED:
+            return
+        self.accepted.append((blobs, labels, pose))
+        count = len(self.accepted)
+        if count & (count - 1):
+            return
+        parts = [to_observations(replace(b, fiducial=given), self.factory, self.obj) for b, given, _ in self.accepted]
+        sigma = (torch.cat([p.sigma for p in parts]).square() + self.options.identity_error**2).sqrt()
+        observations = Observations(torch.cat([p.uv for p in parts]), sigma, torch.cat([p.seen for p in parts]))
+        poses = stack_poses([p for _, _, p in self.accepted])
+        fit = estimate(observations, self.factory, self.obj, poses, options=self.options.estimation)
+        if bool(fit.converged):
+            prior = (self.factory.prior or RigPrior()).std(self.factory)
+            self.rig, self.spread = fit.rig, torch.minimum(2 * camera_std(fit), prior)
+
+
+def matched_to_rig(detections: Detections, rig: CameraRig) -> Detections:
+    """Renumber the cameras of detections in the order of the rig.
+
+    Raises:
+        InputError: a camera that the rig does not have.
+    """
+    unknown = [name for name in detections.camera_names if name not in rig.camera_names]
+    if unknown:
+        raise InputError(
+            f"detections: found camera {', '.join(unknown)}, expected cameras of rig {rig.name}: "
+            f"{', '.join(rig.camera_names)}"
+        )
+    index = np.array([rig.camera_names.index(name) for name in detections.camera_names], dtype=np.int64)
+    camera = index[detections.camera] if len(detections) else detections.camera
+    return replace(detections, camera=camera, camera_names=rig.camera_names)
+
+
+def to_observations(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> Observations:
+    """Arrange labelled blobs densely: (S, C, N). Of two blobs with one label in a camera the last one counts."""
+    snapshots = np.unique(detections.snapshot) if len(detections) else np.empty(0, dtype=np.int64)
+    shape = (max(len(snapshots), 1), rig.cameras, obj.fiducials)
+    rows = np.flatnonzero(detections.fiducial >= 0)
+    where = (np.searchsorted(snapshots, detections.snapshot[rows]), detections.camera[rows], detections.fiducial[rows])
+    uv, sigma, seen = np.zeros((*shape, 2)), np.ones(shape), np.zeros(shape, dtype=bool)
+    uv[where], sigma[where], seen[where] = detections.uv[rows], detections.sigma[rows], True
+    dtype = rig.focal_length.dtype
+    return Observations(torch.from_numpy(uv).to(dtype), torch.from_numpy(sigma).to(dtype), torch.from_numpy(seen))
+
+
+def _coded_snapshots(detections: Detections, count: int) -> NDArray[np.bool_]:
+    """Tell which snapshots come with labels."""
+    coded = np.zeros(count, dtype=bool)
+    coded[detections.snapshot[detections.fiducial >= 0]] = True
+    return coded
+
+
+def stack_poses(poses: Sequence[RigidTransform]) -> RigidTransform:
+    """Put single transforms into one batch: (S,)."""
+    return RigidTransform(torch.stack([p.rotation for p in poses]), torch.stack([p.translation for p in poses]))
