@@ -96,7 +96,7 @@ class Recalibrator:
         if snapshot.status == "refused":
             raise RefusedError(f"identity: {snapshot.reason}")
         usable.fiducial[:] = labels
-        return self._fit(usable, snapshot)
+        return self._keep(usable, snapshot, self._fit(usable, snapshot))
 
     def _follow(self, blobs: Detections, name: str) -> Calibration | None:
         """Label blobs by the last result's prediction, where the object has moved little; None = not to be trusted.
@@ -113,40 +113,39 @@ class Recalibrator:
         if (labels >= 0).sum() < LEAST_FOLLOWED * before:
             return None
         blobs = replace(blobs, fiducial=labels)
-        kept = list(self._recent)
+        snapshot = SnapshotIdentity(name, "by_tracking", "near the last prediction", 1, pose)
         try:
-            result = self._fit(blobs, SnapshotIdentity(name, "by_tracking", "near the last prediction", 1, pose))
+            result = self._fit(blobs, snapshot)
         except RefusedError:
-            result = None
-        if result is None or int(result.observations.seen[-1].sum()) < LEAST_FOLLOWED * before:
-            self._recent.clear()
-            self._recent.extend(kept)
+            return None
+        if int(result.observations.seen[-1].sum()) < LEAST_FOLLOWED * before:
             return None
         self._follower.pose = result.rig_from_object[-1]
-        return result
+        return self._keep(blobs, snapshot, result)
 
     def _fit(self, blobs: Detections, snapshot: SnapshotIdentity) -> Calibration:
-        kept = list(self._recent)
-        self._recent.append((blobs, snapshot))
-        try:
-            self._latest = fit_labelled(self._labelled(), self.rig, self.obj, self.options)
-        except RefusedError:
-            # What could not be fitted must not spoil the fits of the following snapshots.
-            self._recent.clear()
-            self._recent.extend(kept)
-            raise
-        return self._latest
+        """Fit the latest snapshots and a new one, which is not kept yet: it may be what spoils the fit."""
+        window = self._recent.maxlen or 1
+        recent = [*self._recent, (blobs, snapshot)][-window:]
+        return fit_labelled(_joined(recent, self.rig), self.rig, self.obj, self.options)
 
-    def _labelled(self) -> Labelled:
-        tables = [table for table, _ in self._recent]
-        columns = {
-            name: np.concatenate([getattr(table, name) for table in tables])
-            for name in ("uv", "sigma", "camera", "fiducial", "radius", "flags")
-        }
-        snapshot = np.repeat(np.arange(len(tables)), [len(table) for table in tables])
-        names = tuple(snapshot.name for _, snapshot in self._recent)
-        joined = Detections(**columns, snapshot=snapshot, camera_names=self.rig.camera_names, snapshot_names=names)
-        return Labelled(joined, tuple(snapshot for _, snapshot in self._recent))
+    def _keep(self, blobs: Detections, snapshot: SnapshotIdentity, result: Calibration) -> Calibration:
+        self._recent.append((blobs, snapshot))
+        self._latest = result
+        return result
+
+
+def _joined(recent: list[tuple[Detections, SnapshotIdentity]], rig: CameraRig) -> Labelled:
+    """Put labelled snapshots into one table."""
+    tables, snapshots = zip(*recent, strict=True)
+    columns = {
+        name: np.concatenate([getattr(table, name) for table in tables])
+        for name in ("uv", "sigma", "camera", "fiducial", "radius", "flags")
+    }
+    number = np.repeat(np.arange(len(tables)), [len(table) for table in tables])
+    names = tuple(snapshot.name for snapshot in snapshots)
+    joined = Detections(**columns, snapshot=number, camera_names=rig.camera_names, snapshot_names=names)
+    return Labelled(joined, snapshots)
 
 
 def _nearest(blobs: Detections, predicted: NDArray[np.float64]) -> NDArray[np.int64]:

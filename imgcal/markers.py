@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from imgcal.projection import NEAREST_DEPTH, _distortion_newton
+from imgcal.projection import NEAREST_DEPTH, distort_with_jacobian
 from imgcal.rig import CameraRig
 
 
@@ -33,7 +33,7 @@ def sphere_images(rig: CameraRig, points_rig: Tensor, radius: Tensor) -> Tensor:
     aa, ab, bb = scale * (gap + x * x), scale * x * y, scale * (gap + y * y)
     k1, k2, p1, p2, k3 = rig.distortion.unsqueeze(-2).unbind(-1)
     cx, cy = x * z / gap, y * z / gap
-    _, _, jxx, jxy, jyy, _ = _distortion_newton(cx, cy, k1, k2, p1, p2, k3)
+    _, _, jxx, jxy, jyy, _ = distort_with_jacobian(cx, cy, k1, k2, p1, p2, k3)
     fx, fy = rig.focal_length.unsqueeze(-2).unbind(-1)
     uu = fx * fx * (jxx * jxx * aa + 2 * jxx * jxy * ab + jxy * jxy * bb)
     uv = fx * fy * (jxx * jxy * aa + (jxx * jyy + jxy * jxy) * ab + jxy * jyy * bb)

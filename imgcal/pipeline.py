@@ -287,6 +287,16 @@ def _require_most_labels(raw: Observations, kept: Observations, rig: CameraRig) 
             )
 
 
+def rms_length(residual: Tensor, seen: Tensor) -> float | None:
+    """RMS length (px) of the seen residuals, as OpenCV's calibrateCamera defines it; None where nothing was seen.
+
+    Args:
+        residual: (..., 2) pixels.
+        seen: (...) bool.
+    """
+    return float(residual[seen].square().sum(-1).mean().sqrt()) if bool(seen.any()) else None
+
+
 @dataclass(frozen=True)
 class Score:
     """Reprojection errors of a rig that is held fixed; only the object's poses are fitted."""

@@ -169,17 +169,17 @@ def undistort(xy_distorted: Tensor, distortion: Tensor, iterations: int = 8) -> 
     xd, yd = xy_distorted.unbind(-1)
     x, y = xd, yd
     for _ in range(iterations):
-        ex, ey, jxx, jxy, jyy, _ = _distortion_newton(x, y, k1, k2, p1, p2, k3)
+        ex, ey, jxx, jxy, jyy, _ = distort_with_jacobian(x, y, k1, k2, p1, p2, k3)
         ex, ey = ex - xd, ey - yd
         determinant = jxx * jyy - jxy * jxy
         x, y = x - (jyy * ex - jxy * ey) / determinant, y - (jxx * ey - jxy * ex) / determinant
-    ex, ey, _, _, _, rr = _distortion_newton(x, y, k1, k2, p1, p2, k3)
+    ex, ey, _, _, _, rr = distort_with_jacobian(x, y, k1, k2, p1, p2, k3)
     error = torch.maximum((ex - xd).abs(), (ey - yd).abs())
     good = (error < 64 * torch.finfo(xd.dtype).eps) & is_before_fold(rr, distortion)
     return torch.where(good[..., None], torch.stack((x, y), dim=-1), xy_distorted), good
 
 
-def _distortion_newton(
+def distort_with_jacobian(
     x: Tensor, y: Tensor, k1: Tensor, k2: Tensor, p1: Tensor, p2: Tensor, k3: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Distorted point, its symmetric Jacobian (xx, xy, yy) and the squared radius."""

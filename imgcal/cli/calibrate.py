@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import torch
 import tyro
 
 from imgcal.cli.common import (
@@ -27,7 +26,7 @@ from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import relative_covariance
 from imgcal.formats import RigCovariance, load_object, load_rig, open_input, save_rig, write_text
 from imgcal.labelling import PipelineOptions
-from imgcal.pipeline import Calibration, calibrate
+from imgcal.pipeline import Calibration, calibrate, rms_length
 from imgcal.report import write_report
 from imgcal.rig import CameraRig
 
@@ -121,8 +120,8 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         points = int(seen[:, camera].sum())
         per_camera[name] = {
             "points": points,
-            "rms_px_before": _rms(calibration.before.residual[:, camera], seen[:, camera]),
-            "rms_px_after": _rms(calibration.residual[:, camera], seen[:, camera]),
+            "rms_px_before": rms_length(calibration.before.residual[:, camera], seen[:, camera]),
+            "rms_px_after": rms_length(calibration.residual[:, camera], seen[:, camera]),
         }
     alternatives = max(snapshots[s].alternatives for s in used)
     return {
@@ -130,8 +129,8 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         "reason": "",
         "identity": calibration.identity,
         "identity_alternatives": alternatives,
-        "rms_px_before": _rms(calibration.before.residual, seen),
-        "rms_px_after": _rms(calibration.residual, seen),
+        "rms_px_before": rms_length(calibration.before.residual, seen),
+        "rms_px_after": rms_length(calibration.residual, seen),
         "chi2_per_dof": float(calibration.chi2_per_dof),
         "model_error_px": calibration.model_error,
         "outliers": calibration.outliers,
@@ -163,11 +162,6 @@ def refused_summary(reason: str, snapshot_names: tuple[str, ...], seconds: dict[
         "per_camera": {},
         "seconds": seconds,
     }
-
-
-def _rms(residual: torch.Tensor, seen: torch.Tensor) -> float | None:
-    """RMS length of the seen residuals, pixels, as OpenCV's calibrateCamera defines it."""
-    return float(residual[seen].square().sum(-1).mean().sqrt()) if bool(seen.any()) else None
 
 
 def _print(result: dict[str, Any], out: Path, report: bool) -> None:

@@ -17,7 +17,7 @@ from imgcal.formats import Frame
 from imgcal.labelling import matched_to_rig
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections
-from imgcal.pipeline import Calibration
+from imgcal.pipeline import Calibration, rms_length
 from imgcal.report import ReportContent, SnapshotSummary, relative_prior_std
 from imgcal.rig import PARAMETERS, CameraRig
 from imgcal.transforms import RigidTransform
@@ -96,8 +96,8 @@ def describe(
         rig_from_object=_poses(calibration),
         frames=tuple(pictures.get(name) for name in rig.camera_names) if pictures else (),
         chi2_per_dof=float(calibration.chi2_per_dof),
-        rms_before=_rms(calibration.before.residual, seen),
-        rms_after=_rms(calibration.residual, seen),
+        rms_before=rms_length(calibration.before.residual, seen) or float("nan"),
+        rms_after=rms_length(calibration.residual, seen) or float("nan"),
         seconds=seconds,
         command=_command(),
         versions=_versions(),
@@ -124,10 +124,6 @@ def _poses(calibration: Calibration) -> RigidTransform:
     rotation[used] = calibration.rig_from_object.rotation.float()
     translation[used] = calibration.rig_from_object.translation.float()
     return RigidTransform(rotation.double(), translation.double())
-
-
-def _rms(residual: Tensor, seen: Tensor) -> float:
-    return float(residual[seen].square().sum(-1).mean().sqrt())
 
 
 def _command() -> str:

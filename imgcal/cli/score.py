@@ -15,7 +15,7 @@ from imgcal.cli.common import progress, read_detections
 from imgcal.detection import DetectionOptions
 from imgcal.formats import load_object, load_rig, open_input
 from imgcal.pipeline import Score as Scored
-from imgcal.pipeline import score
+from imgcal.pipeline import rms_length, score
 from imgcal.rig import CameraRig
 
 
@@ -50,14 +50,14 @@ def summary(scored: Scored, rig: CameraRig) -> dict[str, object]:
     distances = scored.distances
     per_camera = {}
     for camera, name in enumerate(rig.camera_names):
-        squared = scored.residual[:, camera].square().sum(-1)[scored.seen[:, camera]]
+        seen = scored.seen[:, camera]
         per_camera[name] = {
-            "rms_px": float(squared.mean().sqrt()) if len(squared) else None,
-            "points": len(squared),
+            "rms_px": rms_length(scored.residual[:, camera], seen),
+            "points": int(seen.sum()),
         }
     used = len(scored.labelled.used)
     return {
-        "rms_px": float(distances.square().mean().sqrt()),
+        "rms_px": rms_length(scored.residual, scored.seen),
         "median_px": float(distances.median()),
         "p95_px": float(torch.quantile(distances, 0.95)),
         "snapshots_used": used,

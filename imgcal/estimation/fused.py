@@ -234,25 +234,13 @@ def _linearize(given, state, blocks, cameras_first, loss, threshold):
                     cost = np.inf
                 depth = max(point[2], NEAREST_DEPTH)
 
-                # Lens: image and derivative with respect to the point in the camera; see linearize._lens.
-                squared = depth * depth
-                per_depth = depth / (squared - radius_squared[n])
-                log_slope = -(squared + radius_squared[n]) / (depth * (squared - radius_squared[n]))
-                x, y = point[0] * per_depth, point[1] * per_depth
-                xx, yy, xy2 = x * x, y * y, 2 * x * y
-                rr = xx + yy
-                radial = 1 + rr * (k1 + rr * (k2 + rr * k3))
-                growth = 2 * (k1 + rr * (2 * k2 + 3 * rr * k3))
-                xd = x * radial + p1 * xy2 + p2 * (rr + 2 * xx)
-                yd = y * radial + p1 * (rr + 2 * yy) + p2 * xy2
+                per_depth, log_slope, x, y, rr, xd, yd, jxx, jxy, jyy = lens(
+                    point[0], point[1], depth, radius_squared[n], k1, k2, p1, p2, k3
+                )
                 ru, rv = fx * xd + cx - uv[s, c, 0, n], fy * yd + cy - uv[s, c, 1, n]
                 residual[s, c, 0, n], residual[s, c, 1, n] = ru, rv
                 if weight == 0:
                     continue
-                jxx = radial + growth * xx + 2 * p1 * y + 6 * p2 * x
-                jxy = 0.5 * growth * xy2 + 2 * (p1 * x + p2 * y)
-                jyy = radial + growth * yy + 6 * p1 * y + 2 * p2 * x
-
                 value, slope = _loss((ru * ru + rv * rv) * weight * weight, loss, threshold)
                 cost += 0.5 * value
                 weight *= np.sqrt(slope)
@@ -279,8 +267,8 @@ def _linearize(given, state, blocks, cameras_first, loss, threshold):
                 rows[0, 8], rows[1, 9] = weight, weight
                 rows[0, 10], rows[1, 10] = fx_w * x * rr, fy_w * y * rr
                 rows[0, 11], rows[1, 11] = rows[0, 10] * rr, rows[1, 10] * rr
-                rows[0, 12], rows[1, 12] = fx_w * xy2, fy_w * (rr + 2 * yy)
-                rows[0, 13], rows[1, 13] = fx_w * (rr + 2 * xx), fy_w * xy2
+                rows[0, 12], rows[1, 12] = fx_w * 2 * x * y, fy_w * (rr + 2 * y * y)
+                rows[0, 13], rows[1, 13] = fx_w * (rr + 2 * x * x), fy_w * 2 * x * y
                 rows[0, 14], rows[1, 14] = rows[0, 11] * rr, rows[1, 11] * rr
                 for i in range(15):
                     rows[0, i] *= spread[c, i]
@@ -292,6 +280,30 @@ def _linearize(given, state, blocks, cameras_first, loss, threshold):
                         products[i, j] += rows[0, i] * rows[0, j] + rows[1, i] * rows[1, j]
             _distribute(products, gradient, c, s, blocks, cameras_first)
     return cost
+
+
+@njit(cache=True, fastmath=_FAST)
+def lens(px, py, depth, radius_squared, k1, k2, p1, p2, k3):
+    """Image of a point or sphere and its derivatives, like linearize._lens.
+
+    Returns:
+        x / px; the derivative of log x by depth; x, y, x^2 + y^2, the distorted x and y, and the symmetric
+        Jacobian of the distortion: xx, xy, yy.
+    """
+    squared = depth * depth
+    per_depth = depth / (squared - radius_squared)
+    log_slope = -(squared + radius_squared) / (depth * (squared - radius_squared))
+    x, y = px * per_depth, py * per_depth
+    xx, yy, xy2 = x * x, y * y, 2 * x * y
+    rr = xx + yy
+    radial = 1 + rr * (k1 + rr * (k2 + rr * k3))
+    growth = 2 * (k1 + rr * (2 * k2 + 3 * rr * k3))
+    xd = x * radial + p1 * xy2 + p2 * (rr + 2 * xx)
+    yd = y * radial + p1 * (rr + 2 * yy) + p2 * xy2
+    jxx = radial + growth * xx + 2 * p1 * y + 6 * p2 * x
+    jxy = 0.5 * growth * xy2 + 2 * (p1 * x + p2 * y)
+    jyy = radial + growth * yy + 6 * p1 * y + 2 * p2 * x
+    return per_depth, log_slope, x, y, rr, xd, yd, jxx, jxy, jyy
 
 
 @njit(cache=True, fastmath=_FAST)

@@ -12,9 +12,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from imgcal.estimation.fused import lens
 from imgcal.estimation.linearize import Problem, rig_at
 from imgcal.estimation.solver import Solution
 from imgcal.identity.blobs import Blobs
+from imgcal.projection import NEAREST_DEPTH
 from imgcal.rotations import left_jacobian
 
 FAST = {"contract", "reassoc", "nsz"}
@@ -180,22 +182,11 @@ def _rows(rotated, rotation, left, arm, focal, principal, distortion, spread, ra
     it but the difference of two almost equal numbers.
     """
     point = rotation @ arm
-    depth = max(point[2], 1e-3)
-    squared = depth * depth
-    per_depth = depth / (squared - radius_squared)
-    log_slope = -(squared + radius_squared) / (depth * (squared - radius_squared))
-    x, y = point[0] * per_depth, point[1] * per_depth
-    k1, k2, p1, p2, k3 = distortion[0], distortion[1], distortion[2], distortion[3], distortion[4]
-    xx, yy, xy2 = x * x, y * y, 2 * x * y
-    rr = xx + yy
-    radial = 1 + rr * (k1 + rr * (k2 + rr * k3))
-    growth = 2 * (k1 + rr * (2 * k2 + 3 * rr * k3))
-    xd = x * radial + p1 * xy2 + p2 * (rr + 2 * xx)
-    yd = y * radial + p1 * (rr + 2 * yy) + p2 * xy2
+    per_depth, log_slope, x, y, rr, xd, yd, jxx, jxy, jyy = lens(
+        point[0], point[1], max(point[2], NEAREST_DEPTH), radius_squared,
+        distortion[0], distortion[1], distortion[2], distortion[3], distortion[4],
+    )  # fmt: skip
     uv[0], uv[1] = focal[0] * xd + principal[0], focal[1] * yd + principal[1]
-    jxx = radial + growth * xx + 2 * p1 * y + 6 * p2 * x
-    jxy = 0.5 * growth * xy2 + 2 * (p1 * x + p2 * y)
-    jyy = radial + growth * yy + 6 * p1 * y + 2 * p2 * x
     slope = np.empty((2, 3))
     slope[0, 0], slope[0, 1], slope[0, 2] = per_depth * jxx, per_depth * jxy, log_slope * (jxx * x + jxy * y)
     slope[1, 0], slope[1, 1], slope[1, 2] = per_depth * jxy, per_depth * jyy, log_slope * (jxy * x + jyy * y)
@@ -211,8 +202,8 @@ def _rows(rotated, rotation, left, arm, focal, principal, distortion, spread, ra
     rows[0, 6], rows[1, 7], rows[0, 8], rows[1, 9] = xd, yd, 1.0, 1.0
     rows[0, 10], rows[1, 10] = focal[0] * x * rr, focal[1] * y * rr
     rows[0, 11], rows[1, 11] = rows[0, 10] * rr, rows[1, 10] * rr
-    rows[0, 12], rows[1, 12] = focal[0] * xy2, focal[1] * (rr + 2 * yy)
-    rows[0, 13], rows[1, 13] = focal[0] * (rr + 2 * xx), focal[1] * xy2
+    rows[0, 12], rows[1, 12] = focal[0] * 2 * x * y, focal[1] * (rr + 2 * y * y)
+    rows[0, 13], rows[1, 13] = focal[0] * (rr + 2 * x * x), focal[1] * 2 * x * y
     rows[0, 14], rows[1, 14] = rows[0, 11] * rr, rows[1, 11] * rr
     for r in range(2):
         rows[r, :15] *= spread

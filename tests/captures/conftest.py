@@ -85,12 +85,10 @@ def fit_rig(points: Points, cameras: tuple[str, ...], image_size: tuple[int, int
     )  # fmt: skip
 
 
-def disturbed(rig: CameraRig, points: Points, pixels: float, seed: int, common: bool = False) -> CameraRig:
+def disturbed(rig: CameraRig, points: Points, pixels: float, seed: int) -> CameraRig:
     """Turn, shift and rescale every camera by a few percent so that points move by `pixels` (RMS) in each camera."""
     generator = torch.Generator().manual_seed(seed)
     draw = torch.randn(rig.cameras, 15, generator=generator, dtype=torch.float64)
-    if common:
-        draw = draw[:1].expand(rig.cameras, -1)
     size = torch.cat(
         (torch.full((3,), 0.001), torch.full((3,), 1.0), torch.full((2,), 20.0), torch.full((2,), 5.0), torch.zeros(5))
     )
@@ -106,6 +104,17 @@ def disturbed(rig: CameraRig, points: Points, pixels: float, seed: int, common: 
 def predicted(rig: CameraRig, points: Points) -> np.ndarray:
     uv = rig.project(torch.from_numpy(points.xyz)).uv.numpy()
     return uv[points.camera, np.arange(len(points.xyz))]
+
+
+def at_own_centres(points: Points, found: Detections) -> tuple[Points, float]:
+    """Move points to the blobs that our own detector found within 2 px of them; also the share that has one."""
+    uv, kept = points.uv.copy(), np.zeros(len(points.uv), dtype=bool)
+    for camera in np.unique(points.camera):
+        rows = np.flatnonzero(points.camera == camera)
+        own = found.uv[(found.camera == camera) & found.usable]
+        distance = np.linalg.norm(points.uv[rows][:, None] - own, axis=-1)
+        kept[rows], uv[rows] = distance.min(1) < 2, own[distance.argmin(1)]
+    return replace(points, uv=uv).select(kept), float(kept.mean())
 
 
 def as_detections(points: Points, cameras: tuple[str, ...]) -> Detections:

@@ -10,7 +10,7 @@ from imgcal.cli.main import main
 from imgcal.formats import load_detections, load_object, save_detections
 from imgcal.projection import project
 from imgcal.rig import RigPrior
-from tests.captures.conftest import Points, as_detections, disturbed, fit_rig
+from tests.captures.conftest import Points, as_detections, at_own_centres, disturbed, fit_rig
 
 CAMERAS = ("cam3", "cam4")
 LIMITS = {"cam3": 0.70, "cam4": 0.80}  # px RMS, from the captures' README
@@ -77,16 +77,9 @@ def cavity(captures, tmp_path_factory):
     table = tmp_path_factory.mktemp("cavity") / "blobs.csv"
     assert main(["detect", str(folder), "--out", str(table)]) == 0
     found = load_detections(table)
-    held_out = points.select(~half)
-    kept = np.zeros(len(held_out.uv), dtype=bool)
-    for camera in range(2):
-        rows = np.flatnonzero(held_out.camera == camera)
-        own = found.uv[(found.camera == camera) & found.usable]
-        distance = np.linalg.norm(held_out.uv[rows][:, None] - own, axis=-1)
-        kept[rows] = distance.min(1) < 2
-        held_out.uv[rows] = own[distance.argmin(1)]
-    assert kept.mean() > 0.85
-    save_detections(as_detections(held_out.select(kept), CAMERAS), table.parent / "held_out.csv")
+    held_out, share = at_own_centres(points.select(~half), found)
+    assert share > 0.85
+    save_detections(as_detections(held_out, CAMERAS), table.parent / "held_out.csv")
     return folder, factory, points, table.parent / "held_out.csv"
 
 

@@ -7,7 +7,7 @@ import torch
 from imgcal.cli.main import main
 from imgcal.formats import load_detections, load_object, save_detections
 from imgcal.rig import RigPrior
-from tests.captures.conftest import as_detections, disturbed, fit_rig, read_points
+from tests.captures.conftest import as_detections, at_own_centres, disturbed, fit_rig, read_points
 
 CAMERAS = ("cam1", "cam2", "cam3")
 LIMITS = {"cam1": 0.40, "cam2": 0.46, "cam3": 0.46}  # px RMS, from the captures' README
@@ -25,17 +25,9 @@ def dots(captures, tmp_path_factory):
     table = tmp_path_factory.mktemp("dots") / "blobs.csv"
     assert main(["detect", str(folder), "--out", str(table)]) == 0
     found = load_detections(table)
-    held_out = points.select(~half)
-    uv, kept = held_out.uv.copy(), np.zeros(len(held_out.uv), dtype=bool)
-    for camera in range(3):
-        rows = np.flatnonzero(held_out.camera == camera)
-        own = found.uv[(found.camera == camera) & found.usable]
-        distance = np.linalg.norm(held_out.uv[rows][:, None] - own, axis=-1)
-        kept[rows], uv[rows] = distance.min(1) < 2, own[distance.argmin(1)]
-    assert kept.mean() > 0.95
+    held_out, share = at_own_centres(points.select(~half), found)
+    assert share > 0.95
     other = table.parent / "held_out.csv"
-    held_out = held_out.select(kept)
-    held_out.uv[:] = uv[kept]
     save_detections(as_detections(held_out, CAMERAS), other)
     return folder, factory, points, other
 
