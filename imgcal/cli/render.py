@@ -14,10 +14,9 @@ import tyro
 
 from imgcal.cli.common import check_folder, make_folder, progress, read_detections
 from imgcal.detection import DetectionOptions
-from imgcal.errors import InputError
 from imgcal.formats import load_object, load_rig, open_input, write_image
 from imgcal.labelling import label, matched_to_rig, to_observations
-from renderers import splat
+from imgcal.networks.rendering import LEVELS, ImageOptions, render_views
 
 
 @dataclass(frozen=True)
@@ -39,10 +38,7 @@ class Render:
 
     def run(self) -> None:
         """Render and write."""
-        if self.size < 8 or not 0 < self.dot < self.size:
-            raise InputError(
-                f"--size, --dot: found {self.size} and {self.dot}, expected at least 8 pixels and more than 0"
-            )
+        options = ImageOptions(self.size, self.dot)
         check_folder(self.out)
         rig, obj = load_rig(self.rig), load_object(self.object)
         detections, _ = read_detections(open_input(self.input, rig, obj.fiducials), self.snapshots, self.detection)
@@ -53,16 +49,12 @@ class Render:
         labelled = label(matched_to_rig(detections, rig), rig, obj, progress=bar)
         kept = labelled.detections.select(np.isin(labelled.detections.snapshot, labelled.used))
         observations = to_observations(kept, rig, obj)
-        scale = self.size / rig.image_size.to(observations.uv)
-        uv = (observations.uv + 0.5) * scale[:, None] - 0.5
         for camera in rig.camera_names:
             make_folder(self.out / camera)
         for row, snapshot in enumerate(progress(labelled.used, len(labelled.used), "rendering")):
             name = labelled.snapshots[snapshot].name
-            images = splat(
-                uv[row].float(), obj.colours.float(), self.dot, (self.size, self.size), visible=observations.seen[row]
-            )
-            pixels = (images.clamp(0, 1) * 255).round().to(torch.uint8).permute(0, 2, 3, 1).numpy()
+            images = render_views(observations.uv[row], observations.seen[row], rig.image_size, obj, options)
+            pixels = (images * LEVELS).round().to(torch.uint8).permute(0, 2, 3, 1).numpy()
             for camera, image in zip(rig.camera_names, pixels, strict=True):
                 write_image(self.out / camera / f"{name}.png", image)
         refused = len(labelled.snapshots) - len(labelled.used)
