@@ -12,6 +12,7 @@ from imgcal.cli.detect import Detect
 from imgcal.cli.render import Render
 from imgcal.cli.score import Score
 from imgcal.cli.simulate import Simulate
+from imgcal.cli.train import Train
 from imgcal.errors import InputError, RefusedError
 
 DONE, UNUSABLE, REFUSED, INTERRUPTED = 0, 2, 3, 130
@@ -22,6 +23,7 @@ Command = (
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
     | Annotated[Score, tyro.conf.subcommand("score")]
     | Annotated[Render, tyro.conf.subcommand("render")]
+    | Annotated[Train, tyro.conf.subcommand("train")]
 )
 
 DESCRIPTION = """Recalibrate infrared multi-camera rigs from images of a known calibration object.
@@ -50,8 +52,8 @@ def main(arguments: list[str] | None = None) -> int:
         return DONE
     except OSError as error:
         return _fail(error, UNUSABLE)
-    except KeyboardInterrupt:
-        return _fail(RuntimeError("interrupted"), INTERRUPTED)
+    except KeyboardInterrupt as stop:
+        return _fail(RuntimeError(str(stop) or "interrupted"), INTERRUPTED)
     return DONE
 
 

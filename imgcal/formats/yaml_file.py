@@ -67,6 +67,14 @@ def validated(
         raise InputError(f"{where}: {_summary(error, content, model, entry_names or {})}") from error
 
 
+def parse_yaml(text: str, where: str) -> Any:
+    """Read a value from YAML text that does not come from a file; errors begin with `where`."""
+    try:
+        return yaml.load(text, Loader=_Loader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise InputError(f"{where}: found {reprlib.repr(text)}, expected a value in YAML") from error
+
+
 def yaml_text(content: dict[str, Any]) -> str:
     """Write plain values as YAML in the given order; floats in their shortest exact form."""
     return yaml.dump(
@@ -75,7 +83,7 @@ def yaml_text(content: dict[str, Any]) -> str:
 
 
 class _Loader(_BaseLoader):
-    """YAML 1.2 numbers (1e-5 is one), and no silent overwriting of a key by a second one."""
+    """YAML 1.2 numbers (1e-5 is one), keys that stay text (`false: 0.1`), no silent overwriting of one by a second."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         seen: set[str] = set()
@@ -83,6 +91,8 @@ class _Loader(_BaseLoader):
             if isinstance(key, yaml.ScalarNode) and key.value in seen:
                 raise yaml.MarkedYAMLError(problem=f"key `{key.value}` given twice", problem_mark=key.start_mark)
             seen.add(str(key.value))
+            if key.tag == "tag:yaml.org,2002:bool":
+                key.tag = "tag:yaml.org,2002:str"
         mapping: dict[Any, Any] = super().construct_mapping(node, deep=deep)
         return mapping
 

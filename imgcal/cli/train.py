@@ -1,0 +1,78 @@
+"""`imgcal train`: an experiment file in, a trained network out."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Annotated
+
+import tyro
+
+from imgcal.cli.common import check_folder
+from imgcal.errors import InputError
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a network: writes OUT/model.safetensors, resolved.yaml, metrics.jsonl and TensorBoard's files.
+
+    Ctrl-C saves the state first; so do steps on the way, and --resume goes on from there, with the same result.
+    Several processes: accelerate launch -m imgcal train ... Example: imgcal train table1-row01 --out out/row01
+    """
+
+    experiment: Annotated[str, tyro.conf.Positional]  #: experiment file, or the name of a shipped experiment
+    out: Path  #: folder to write
+    resume: bool = False  #: go on with the training in OUT
+    set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE ...")] = ()
+    """values of the experiment to change, such as training.steps=100"""
+    minutes: float | None = None  #: train so long; the same as --set training.minutes=...
+
+    def run(self) -> None:
+        """Train and write."""
+        # Imported late: accelerate and TensorBoard take seconds, which the other commands should not wait.
+        import torch
+
+        from imgcal.training.engine import RESULT, STATE, finished, train
+        from imgcal.training.experiment import load_experiment
+
+        changes = self.set if self.minutes is None else (*self.set, f"training.minutes={float(self.minutes)!r}")
+        experiment = load_experiment(self.experiment, changes)
+        check_folder(self.out)
+        there = (self.out / STATE).exists()
+        if there and not self.resume:
+            raise InputError(f"{self.out}: found a training there already, expected a new folder, or --resume")
+        if self.resume and not there:
+            raise InputError(f"{self.out}: found no {STATE} there, expected one to --resume from")
+        if experiment.training.threads is not None:
+            torch.set_num_threads(experiment.training.threads)
+        with _asked_to_stop() as stop:
+            run = train(experiment, self.out, self.resume, stop)
+        if not finished(run, run.seconds):
+            raise KeyboardInterrupt(
+                f"interrupted and saved at step {run.step}; to go on, repeat the command with --resume"
+            )
+        if run.accelerator.is_main_process:
+            print(f"{run.step} steps, {run.seconds:.0f} s: {self.out / RESULT}", file=sys.stderr)
+
+
+@contextmanager
+def _asked_to_stop() -> Iterator[Callable[[], bool]]:
+    """Turn the first Ctrl-C or SIGTERM into a wish that can be asked for; a second one interrupts at once."""
+    asked: list[int] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        asked.append(number)
+        if len(asked) > 1:
+            raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(asked)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,82 @@
+"""Fresh synthetic rigs for every training step, made on the training device."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from imgcal.networks.prediction import Prediction, Views
+from imgcal.networks.rendering import ImageOptions, render_views
+from imgcal.objects import CalibrationObject
+from imgcal.rig import CameraRig
+from imgcal.synthesis import Drift, PoseRange, Snapshots, synthesize
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What a network sees, and what it should say."""
+
+    views: Views  # (B,)
+    truth: Prediction  # (B,) float32
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All tensors by name, to be saved."""
+        rig, pose = self.truth.rig, self.truth.rig_from_object
+        named = {
+            "uv": self.views.uv,
+            "seen": self.views.seen,
+            "images": self.views.images,
+            "focal_length": rig.focal_length,
+            "principal_point": rig.principal_point,
+            "distortion": rig.distortion,
+            "cam_from_rig.rotation": rig.cam_from_rig.rotation,
+            "cam_from_rig.translation": rig.cam_from_rig.translation,
+            "rig_from_object.rotation": pose.rotation,
+            "rig_from_object.translation": pose.translation,
+        }
+        return {name: tensor for name, tensor in named.items() if tensor is not None}
+
+
+@dataclass(frozen=True)
+class Source:
+    """Makes batches: `show(sample(count, generator), generator)`."""
+
+    factory: CameraRig  # float32, on the training device
+    obj: CalibrationObject  # float32, on the training device
+    drift: Drift
+    pose_range: PoseRange
+    images: ImageOptions | None = None  # None = the network takes points
+    canvas: dict[int, Tensor] = field(default_factory=dict)  # images that are drawn over, by number of rigs: CPU only
+
+    def sample(self, count: int, generator: torch.Generator) -> Snapshots:
+        """Make `count` random rigs; the generator is on the training device."""
+        return synthesize(self.factory, self.obj, count, generator, drift=self.drift, pose_range=self.pose_range)
+
+    def show(self, made: Snapshots, generator: torch.Generator) -> Batch:
+        """Make what the network sees of them. Images are valid until the next call."""
+        truth = Prediction(made.rig, made.rig_from_object)
+        uv, seen = made.projection.uv, made.projection.visible
+        if self.images is None:
+            return Batch(Views(uv=uv, seen=seen), truth)
+        size = self.factory.image_size
+        images = render_views(uv, seen, size, self.obj, self.images, quantise=True, out=self._canvas(uv))
+        return Batch(Views(images=images), truth)
+
+    def _canvas(self, uv: Tensor) -> Tensor | None:
+        """Memory to draw on: drawing over it is much faster on a CPU than asking for new."""
+        if self.images is None or uv.device.type != "cpu":
+            return None
+        count, size = len(uv), self.images.size
+        if count not in self.canvas:
+            self.canvas[count] = uv.new_empty(count, self.factory.cameras, 3, size, size)
+        return self.canvas[count]
+
+
+def object_to(
+    obj: CalibrationObject, device: torch.device | str, dtype: torch.dtype = torch.float32
+) -> CalibrationObject:
+    """Move an object to a device and another floating-point type."""
+    radius = None if obj.radius is None else obj.radius.to(device, dtype)
+    return replace(obj, points=obj.points.to(device, dtype), colours=obj.colours.to(device, dtype), radius=radius)

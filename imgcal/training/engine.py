@@ -1,0 +1,375 @@
+"""The training loop: accelerate (one process or several, CPU or GPU), exact resume, a log, one result."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from accelerate import Accelerator, DistributedDataParallelKwargs
+from accelerate.utils import broadcast
+from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel
+
+from imgcal.errors import InputError, RefusedError
+from imgcal.formats.safetensors_file import write_tensors
+from imgcal.losses import Loss, compound, images_of, reprojection_re
+from imgcal.networks.rendering import ImageOptions
+from imgcal.objects import CalibrationObject
+from imgcal.rig import CameraRig
+from imgcal.synthesis import Snapshots
+from imgcal.training.checkpoint import build_network, save_network, warm_start
+from imgcal.training.data import Batch, Source, object_to
+from imgcal.training.experiment import Experiment, save_experiment
+from imgcal.training.log import Log
+from imgcal.training.optimization import (
+    Schedule,
+    make_average,
+    make_optimizer,
+    optimizer_settings,
+    optimizer_tensors,
+    restore_optimizer,
+)
+from imgcal.training.state import State, load_state, random_states, restore_random_states, save_state
+
+RESULT, STATE, RESOLVED, BAD_BATCH = "model.safetensors", "state.safetensors", "resolved.yaml", "bad_batch.safetensors"
+
+# Seeds of what must not depend on how long the training takes: validation rigs.
+VALIDATION_SEED = 20_000_003
+
+
+@dataclass
+class Run:
+    """A training under way."""
+
+    experiment: Experiment
+    folder: Path
+    accelerator: Accelerator
+    factory: CameraRig  # float64
+    network: nn.Module  # as it is trained: wrapped when there are several processes
+    plain: nn.Module  # the same without the wrapping
+    optimizer: torch.optim.Optimizer
+    schedule: Schedule
+    average: AveragedModel | None  # running mean of the weights
+    source: Source
+    spread: Tensor  # (C, 15) of the drift
+    generator: torch.Generator  # of this process's data
+    validation: list[Snapshots]
+    batch_size: int  # of this process
+    step: int = 0
+    elapsed: float = 0.0  # s, of all sessions until this one began
+    began: float = field(default_factory=time.monotonic)
+    judged: Tensor | None = None  # (2,) sum of losses and their number since the schedule last judged
+    window: list[tuple[Tensor, Tensor]] = field(default_factory=list)  # losses and mean RE of passes since the last log
+    pending: tuple[Batch, Tensor] | None = None  # last batch, its (2,) loss and gradient norm: not yet looked at
+
+    @property
+    def seconds(self) -> float:
+        """Time spent on the training, all sessions together."""
+        return self.elapsed + time.monotonic() - self.began
+
+    @property
+    def best_weights(self) -> nn.Module:
+        """The network that is the result: the running mean where there is one."""
+        return self.plain if self.average is None else self.average.module
+
+
+def train(
+    experiment: Experiment,
+    folder: str | Path,
+    resume: bool = False,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> Run:
+    """Train the network of an experiment.
+
+    Args:
+        experiment: what to train, on what, for how long.
+        folder: gets model.safetensors, state.safetensors, resolved.yaml, metrics.jsonl and TensorBoard's files.
+        resume: go on from `folder`/state.safetensors.
+        should_stop: asked after every step of the main process; True = save and return early.
+
+    Returns:
+        The run as it ended; `finished(run, run.seconds)` tells whether it came to its end.
+
+    Raises:
+        InputError: unusable experiment, checkpoint or folder.
+        RefusedError: the loss or its gradient is not finite; the batch is saved.
+    """
+    run = prepare(experiment, Path(folder))
+    if resume:
+        load(run)
+    log = Log(run.folder, run.step, run.accelerator.is_main_process)
+    with log:
+        _announce(run, log)
+        seconds, stop = run.seconds, False
+        logged = (run.step, seconds)
+        while not (stop or finished(run, seconds)):
+            run.schedule.set_progress(progress(run, seconds))
+            train_step(run)
+            seconds, stop = _agreed(run, should_stop())
+            due = experiment.training
+            last = stop or finished(run, seconds)
+            if last or run.step % due.log_every == 0:
+                logged = _log(run, log, logged, seconds)
+            if run.validation and (last or run.step % due.validate_every == 0):
+                validate(run, log)
+            if last or run.step % due.save_every == 0:
+                save(run, log.last)
+    return run
+
+
+def prepare(experiment: Experiment, folder: Path) -> Run:
+    """Build everything a run needs, from the experiment alone."""
+    settings = experiment.training
+    accelerator = Accelerator(
+        cpu=settings.device == "cpu", kwargs_handlers=[DistributedDataParallelKwargs(find_unused_parameters=True)]
+    )
+    device, processes = accelerator.device, accelerator.num_processes
+    if settings.batch_size % processes:
+        raise InputError(
+            f"training: batch_size: found {settings.batch_size}, expected a multiple of the {processes} processes"
+        )
+    factory, obj = experiment.load_rig(), experiment.load_object()
+    torch.manual_seed(settings.seed)
+    network = build_network(experiment, factory, obj)
+    fresh = () if settings.init_from is None else warm_start(settings.init_from, network)
+    if fresh and accelerator.is_main_process:
+        accelerator.print(f"{settings.init_from}: without {', '.join(fresh)}: these start untrained")
+    plain = network.to(device)
+    source = Source(
+        factory.to(torch.float32, device),
+        object_to(obj, device),
+        experiment.drift.drift(),
+        experiment.poses.pose_range(),
+        images=_image_options(experiment, network),
+    )
+    seed = settings.seed * 4096 + accelerator.process_index
+    torch.manual_seed(seed)
+    optimizer = make_optimizer(plain, experiment.optimizer)
+    ema = experiment.optimizer.ema
+    run = Run(
+        experiment=experiment,
+        folder=folder,
+        accelerator=accelerator,
+        factory=factory,
+        network=accelerator.prepare(plain),
+        plain=plain,
+        optimizer=optimizer,
+        schedule=Schedule(optimizer, experiment.schedule),
+        average=None if ema is None else make_average(plain, ema),
+        source=source,
+        spread=source.drift.std(factory).to(device, torch.float32),
+        generator=torch.Generator(device).manual_seed(seed),
+        validation=_validation_rigs(source, settings.validation_rigs, settings.batch_size // processes, device),
+        batch_size=settings.batch_size // processes,
+    )
+    if accelerator.is_main_process:
+        folder.mkdir(parents=True, exist_ok=True)
+        save_experiment(experiment, folder / RESOLVED)
+    return run
+
+
+def train_step(run: Run) -> None:
+    """Take one step; nothing here waits for the device but the synthesis of the batch."""
+    made = run.source.sample(run.batch_size, run.generator)
+    check_finite(run)  # the step before this one: its numbers are there by now
+    batch = run.source.show(made, run.generator)
+    run.optimizer.zero_grad(set_to_none=True)
+    with autocast(run):
+        predictions = run.network(batch.views)
+    config, weights = run.experiment.loss, run.plain.parameters()
+    loss = compound(predictions, batch.truth, run.source.obj, config, run.step, run.spread, weights)
+    run.accelerator.backward(loss.total)
+    limit = run.experiment.optimizer.clip
+    norm = torch.nn.utils.clip_grad_norm_(run.plain.parameters(), float("inf") if limit is None else limit)
+    run.optimizer.step()
+    if run.average is not None:
+        run.average.update_parameters(run.plain)
+    run.step += 1
+    _account(run, batch, loss, norm)
+
+
+def autocast(run: Run) -> torch.autocast:
+    """Autocast as the experiment says; the networks keep their geometry out of it."""
+    enabled = run.experiment.training.precision == "bf16"
+    return torch.autocast(run.accelerator.device.type, torch.bfloat16, enabled=enabled)
+
+
+def check_finite(run: Run) -> None:
+    """Stop when the last step's loss or gradient was not finite.
+
+    Raises:
+        RefusedError: with the place of the batch; the state on disk is from before.
+    """
+    if run.pending is None:
+        return
+    batch, numbers = run.pending
+    run.pending = None
+    loss, norm = numbers.tolist()
+    if torch.tensor([loss, norm]).isfinite().all():
+        return
+    name = BAD_BATCH if run.accelerator.num_processes == 1 else f"{run.accelerator.process_index}_{BAD_BATCH}"
+    write_tensors(run.folder / name, batch.tensors(), "imgcal-batch/1", {"step": str(run.step - 1)})
+    raise RefusedError(
+        f"{run.folder}: step {run.step}: loss {loss:g}, norm of its gradient {norm:g}; the batch is in {name}; "
+        f"{STATE}, if there, is from before: go on from it with --resume after changing the experiment, or start again"
+    )
+
+
+@torch.no_grad()
+def evaluate(network: nn.Module, batches: Iterable[Batch], obj: CalibrationObject) -> Tensor:
+    """RE of each rig of some batches, in pixels: (R,). Batches may be made one after the other."""
+    was_training = network.training
+    network.eval()
+    errors = []
+    for batch in batches:
+        predicted, truth = network(batch.views)[-1].cameras_from_object, batch.truth.cameras_from_object
+        errors.append(reprojection_re(images_of(predicted, obj) - images_of(truth, obj)))
+    network.train(was_training)
+    return torch.cat(errors)
+
+
+def validate(run: Run, log: Log) -> None:
+    """Log the error of the weights as they would be the result, on rigs that are always the same."""
+    check_finite(run)
+    if not run.accelerator.is_main_process:
+        return
+    generator = torch.Generator(run.accelerator.device).manual_seed(VALIDATION_SEED)
+    batches = (run.source.show(made, generator) for made in run.validation)
+    with autocast(run):
+        errors = evaluate(run.best_weights, batches, run.source.obj)
+    mean, median = float(errors.mean()), float(errors.median())
+    log.write({"step": run.step, "validation_re_px": mean, "validation_re_median_px": median})
+    log.say_summary()
+
+
+def save(run: Run, metrics: dict[str, Any]) -> None:
+    """Write the state, and the network as it would be the result now; all processes must call this together.
+
+    Raises:
+        InputError: a file cannot be written; the previous ones survive.
+    """
+    check_finite(run)
+    gathered = {
+        name: run.accelerator.gather(state.to(run.accelerator.device)[None])
+        for name, state in random_states(run.generator).items()
+    }
+    judged = None if run.judged is None else run.judged.tolist()
+    values = {
+        "step": run.step,
+        "elapsed": run.seconds,
+        "processes": run.accelerator.num_processes,
+        "optimizer": optimizer_settings(run.optimizer),
+        "schedule": run.schedule.state(),
+        "judged": judged,
+    }
+    tensors = {
+        "network": run.plain.state_dict(),
+        "average": {} if run.average is None else run.average.state_dict(),
+        "optimizer": optimizer_tensors(run.optimizer),
+        "random": gathered,
+    }
+    if run.accelerator.is_main_process:
+        save_state(run.folder / STATE, State(tensors, values, run.experiment))
+        metrics = {name: value for name, value in metrics.items() if name != "lr"} | {"seconds": run.seconds}
+        save_network(run.folder / RESULT, run.best_weights, run.experiment, metrics, rig=run.factory)
+
+
+def load(run: Run) -> None:
+    """Go on where the state in the run's folder was saved.
+
+    Raises:
+        InputError: no state there, damaged, or of another experiment or number of processes.
+    """
+    path = run.folder / STATE
+    state = load_state(path, run.experiment)
+    values, tensors, index = state.values, state.tensors, run.accelerator.process_index
+    if values["processes"] != run.accelerator.num_processes:
+        expected = values["processes"]
+        raise InputError(f"{path}: found {run.accelerator.num_processes} processes, expected {expected} as before")
+    run.plain.load_state_dict(tensors["network"])
+    if run.average is not None:
+        run.average.load_state_dict(tensors["average"])
+    restore_optimizer(run.optimizer, tensors["optimizer"], values["optimizer"])
+    run.schedule.restore(values["schedule"])
+    restore_random_states(run.generator, {name: rows[index] for name, rows in tensors["random"].items()})
+    run.step, run.elapsed, run.began = values["step"], values["elapsed"], time.monotonic()
+    if values["judged"] is not None:
+        run.judged = torch.tensor(values["judged"], device=run.accelerator.device)
+
+
+def progress(run: Run, seconds: float) -> float:
+    """How much of the run is done, 0 to 1, by steps or by time, whichever is further."""
+    settings = run.experiment.training
+    by_steps = 0.0 if settings.steps is None else run.step / settings.steps
+    by_time = 0.0 if settings.minutes is None else seconds / (60 * settings.minutes)
+    return min(max(by_steps, by_time), 1.0)
+
+
+def finished(run: Run, seconds: float) -> bool:
+    """Tell whether the run came to its end."""
+    return progress(run, seconds) >= 1
+
+
+def _account(run: Run, batch: Batch, loss: Loss, norm: Tensor) -> None:
+    """Keep what the log, the schedule and the check for finite numbers will want to know."""
+    total = loss.total.detach()
+    run.pending = (batch, torch.stack((total, norm.detach())))
+    run.window.append((total, loss.passes))
+    if run.experiment.schedule.kind != "plateau":
+        return
+    added = torch.stack((total, torch.ones_like(total)))
+    run.judged = added if run.judged is None else run.judged + added
+    if run.step % run.experiment.schedule.every == 0:
+        loss_sum, count = run.accelerator.reduce(run.judged, "mean").tolist()
+        run.schedule.judge(loss_sum / count)
+        run.judged = None
+
+
+def _agreed(run: Run, stop: bool) -> tuple[float, bool]:
+    """The main process's clock and wish to stop, so that all processes do the same."""
+    if run.accelerator.num_processes == 1:
+        return run.seconds, stop
+    mine = torch.tensor([run.seconds, float(stop)], dtype=torch.float64, device=run.accelerator.device)
+    seconds, stopping = broadcast(mine).tolist()
+    return seconds, bool(stopping)
+
+
+def _log(run: Run, log: Log, logged: tuple[int, float], seconds: float) -> tuple[int, float]:
+    """Write the means since the last time; returns where the next means begin."""
+    totals, passes = (torch.stack(column) for column in zip(*run.window, strict=True))
+    run.window.clear()
+    numbers = run.accelerator.reduce(torch.cat((totals.mean()[None], passes.mean(0))), "mean").tolist()
+    steps, duration = run.step - logged[0], seconds - logged[1]
+    row: dict[str, Any] = {"step": run.step, "loss": numbers[0], "re_px": numbers[-1]}
+    row |= {f"re_pass{t + 1}_px": re for t, re in enumerate(numbers[1:-1])}
+    row["lr"] = max(group["lr"] for group in run.optimizer.param_groups)
+    row["rigs_per_s"] = steps * run.experiment.training.batch_size / max(duration, 1e-9)
+    row["seconds"] = seconds
+    log.write(row)
+    log.show(progress(run, seconds))
+    return run.step, seconds
+
+
+def _validation_rigs(source: Source, rigs: int, batch_size: int, device: torch.device) -> list[Snapshots]:
+    generator = torch.Generator(device).manual_seed(VALIDATION_SEED)
+    return [source.sample(min(batch_size, rigs - start), generator) for start in range(0, rigs, batch_size)]
+
+
+def _image_options(experiment: Experiment, network: nn.Module) -> ImageOptions | None:
+    options: Any = network.image_options
+    if experiment.images is None:
+        return options
+    if options is None:
+        raise InputError(f"images: found this block, but the network {experiment.network.preset} takes points")
+    return ImageOptions(**experiment.images.model_dump())
+
+
+def _announce(run: Run, log: Log) -> None:
+    count = sum(parameter.numel() for parameter in run.plain.parameters())
+    where = f"{run.accelerator.num_processes} x {run.accelerator.device.type}"
+    again = f", from step {run.step} on" if run.step else ""
+    log.say(f"{run.experiment.name}: {count:,} parameters, {where}{again}")

@@ -1,0 +1,247 @@
+"""Experiment files: YAML, `format: imgcal-experiment/1`. One file says everything about a training run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from imgcal.errors import InputError
+from imgcal.formats import load_object, load_rig, write_text
+from imgcal.formats.names import find_file
+from imgcal.formats.yaml_file import Flow, StrictModel, parse_yaml, read_yaml, validated, yaml_text
+from imgcal.losses import LossConfig
+from imgcal.networks import NetworkConfig
+from imgcal.objects import CalibrationObject
+from imgcal.rig import CameraRig
+from imgcal.synthesis import Drift, PhysicalDrift, PoseRange, RelativeDrift
+
+FORMAT = "imgcal-experiment/1"
+
+Kappa = Annotated[float, Field(ge=0, lt=1)]
+Spread = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1)]
+Interval = Annotated[list[Annotated[float, Field(ge=-360, le=360)]], Field(min_length=2, max_length=2)]
+
+
+class PaperRow(StrictModel):
+    """Where the paper reports this experiment, and its result."""
+
+    table: str
+    row: Count
+    re_px: Positive | None = None
+
+
+class PosesConfig(StrictModel):
+    """Where the rig may be, in degrees; the smaller angle first."""
+
+    theta_deg: Interval = Field(default=[0.0, 360.0])  # azimuth
+    phi_deg: Interval = Field(default=[0.0, 90.0])  # angle from the zenith
+    alpha_deg: Interval = Field(default=[0.0, 360.0])  # roll
+
+    @model_validator(mode="after")
+    def _in_order(self) -> PosesConfig:
+        for name in ("theta_deg", "phi_deg", "alpha_deg"):
+            low, high = getattr(self, name)
+            if low > high:
+                raise ValueError(f"{name}: found [{low:g}, {high:g}], expected the smaller angle first")
+        return self
+
+    def pose_range(self) -> PoseRange:
+        """The same in radians."""
+        theta, phi, alpha = (
+            (math.radians(low), math.radians(high)) for low, high in (self.theta_deg, self.phi_deg, self.alpha_deg)
+        )
+        return PoseRange(theta, phi, alpha)
+
+
+class DriftConfig(StrictModel):
+    """The paper's relative drift or a physical one; what is not named does not drift."""
+
+    kappa_intrinsics: Kappa | None = None
+    kappa_extrinsics: Kappa | None = None
+    rotation_deg: Spread | None = None  # one standard deviation, each axis
+    position: Spread | None = None  # mm, each axis
+    focal_length: Spread | None = None  # relative
+    principal_point: Spread | None = None  # pixels
+    distortion: Spread | None = None  # absolute
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> DriftConfig:
+        named = sorted(name for name, value in self if value is not None)
+        relative = [name for name in named if name.startswith("kappa")]
+        if relative and len(relative) < len(named):
+            physical = next(name for name in named if name not in relative)
+            raise ValueError(f"found {relative[0]} and {physical}, expected kappas or physical units, not both")
+        return self
+
+    def drift(self) -> Drift:
+        """The drift these numbers describe."""
+        values = {name: value for name, value in self if value is not None}
+        if values and not any(name.startswith("kappa") for name in values):
+            return PhysicalDrift(**{name: values.get(name, 0.0) for name in PhysicalDrift.__dataclass_fields__})
+        return RelativeDrift(self.kappa_intrinsics or 0.0, self.kappa_extrinsics or 0.0)
+
+
+class ImagesConfig(StrictModel):
+    """How the images of image variants are drawn."""
+
+    size: Annotated[int, Field(ge=8, le=4096)] = 224  # pixels, width and height
+    dot: Positive = 1.5  # pixels, standard deviation of a dot
+
+
+class CorruptionConfig(StrictModel):
+    """What goes wrong in the views during training."""
+
+    noise: Spread = 0.0  # pixels, one standard deviation of each axis
+    missing: Fraction = 0.0  # part of the fiducials
+    swapped: Fraction = 0.0  # part of the labels
+    false: Fraction = 0.0  # false blobs in place of this part of the missing fiducials
+
+
+class OptimizerConfig(StrictModel):
+    """Adam or AdamW with a learning rate for each group of parameters."""
+
+    kind: Literal["adam", "adamw"] = "adamw"
+    lr: Positive = 1e-3
+    learning_rates: dict[str, Positive] = Field(
+        default={}
+    )  # by group of the network (encoder, trunk, heads), instead of `lr`
+    betas: Annotated[list[Annotated[float, Field(ge=0, lt=1)]], Field(min_length=2, max_length=2)] = Field(
+        default=[0.9, 0.99]
+    )
+    weight_decay: Spread = 0.0  # of matrices only
+    clip: Positive | None = 1.0  # largest norm of the gradient
+    ema: Annotated[float, Field(gt=0, lt=1)] | None = 0.999  # decay of the running mean of weights that is the result
+
+
+class ScheduleConfig(StrictModel):
+    """How learning rates go: warmup and cosine to zero over the whole run, a plateau, or constant."""
+
+    kind: Literal["cosine", "plateau", "constant"] = "cosine"
+    warmup: Fraction = 0.02  # cosine: part of the run
+    final: Fraction = 0.0  # cosine: part of the learning rate that is left at the end
+    every: Count = 100  # plateau: steps over which the loss is averaged before it is judged
+    patience: Annotated[int, Field(ge=0)] = 10  # plateau: judgements without improvement
+    factor: Annotated[float, Field(gt=0, lt=1)] = 0.5  # plateau
+    threshold: Fraction = 1e-3  # plateau: relative improvement that counts
+
+
+class TrainingConfig(StrictModel):
+    """Length, batch, precision and bookkeeping of a run."""
+
+    steps: Count | None = None  # the run ends after this many steps ...
+    minutes: Positive | None = None  # ... or minutes of training, whichever comes first
+    batch_size: Count = 64  # rigs a step, over all processes
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    precision: Literal["float32", "bf16"] = "float32"  # of the encoder and trunk; geometry is always float32
+    device: Literal["auto", "cpu"] = "auto"
+    threads: Count | None = None  # of the CPU; None = as the environment says
+    init_from: str | None = None  # a checkpoint to start the weights from
+    log_every: Count = 50  # steps
+    validate_every: Count = 500  # steps
+    validation_rigs: Annotated[int, Field(ge=0)] = 512  # 0 = no validation
+    save_every: Count = 500  # steps
+
+    @model_validator(mode="after")
+    def _ends(self) -> TrainingConfig:
+        if self.steps is None and self.minutes is None:
+            raise ValueError("found neither `steps` nor `minutes`, expected one of them")
+        return self
+
+
+class Experiment(StrictModel):
+    """What an experiment file holds."""
+
+    format: Literal["imgcal-experiment/1"]
+    name: Annotated[str, Field(min_length=1)]
+    description: str = ""
+    paper: PaperRow | None = None
+    rig: str  # shipped name or path
+    object: str  # shipped name or path
+    poses: PosesConfig = PosesConfig()
+    drift: DriftConfig
+    network: NetworkConfig
+    images: ImagesConfig | None = None
+    corruption: CorruptionConfig = CorruptionConfig()
+    loss: LossConfig = LossConfig()
+    optimizer: OptimizerConfig = OptimizerConfig()
+    schedule: ScheduleConfig = ScheduleConfig()
+    training: TrainingConfig
+
+    def load_rig(self) -> CameraRig:
+        """Read the factory rig: float64, without batch axes."""
+        return load_rig(self.rig)
+
+    def load_object(self) -> CalibrationObject:
+        """Read the calibration object: float64."""
+        return load_object(self.object)
+
+
+def load_experiment(path: str | Path, changes: Iterable[str] = ()) -> Experiment:
+    """Read an experiment.
+
+    Args:
+        path: a YAML file, or the bare name of a shipped experiment when there is no such file.
+        changes: `key.key=value`, values in YAML, applied one after the other.
+
+    Raises:
+        InputError: one line with the file or the change, what was found and what was expected.
+    """
+    path = find_file(path, "experiments", ".yaml")
+    experiment = read_yaml(path, Experiment, FORMAT)
+    for change in changes:
+        experiment = changed(experiment, change)
+    return experiment
+
+
+def changed(experiment: Experiment, change: str) -> Experiment:
+    """Set one value of an experiment: `training.steps=100`, `drift={rotation_deg: 0.5}`."""
+    where = f"--set {change}"
+    key, equals, text = change.partition("=")
+    steps = key.strip().split(".")
+    if not equals or not all(steps):
+        raise InputError(f"{where}: found no key and value, expected something like training.steps=100")
+    content = as_written(experiment)
+    record: Any = content
+    for step in steps[:-1]:
+        if record.get(step) is None:
+            record[step] = {}
+        record = record[step]
+        if not isinstance(record, dict):
+            raise InputError(f"{where}: found the value {record!r} at `{step}`, expected a group of keys")
+    record[steps[-1]] = parse_yaml(text, where)
+    return validated(content, Experiment, where)
+
+
+def as_written(experiment: Experiment) -> dict[str, Any]:
+    """The plain values that were given, without defaults."""
+    return experiment.model_dump(exclude_unset=True)
+
+
+def resolved_text(experiment: Experiment) -> str:
+    """All values, defaults included, as YAML."""
+    return yaml_text(_resolved(experiment))
+
+
+def save_experiment(experiment: Experiment, path: str | Path) -> None:
+    """Write an experiment with all its values, so that it stays the same when a default changes."""
+    write_text(path, resolved_text(experiment))
+
+
+def _resolved(model: StrictModel) -> dict[str, Any]:
+    """All values but those that are None because nothing was given: a None that switches something off stays."""
+    fields = type(model).model_fields
+    values = {name: value for name, value in model if value is not None or fields[name].default is not None}
+    return {name: _plain(value) for name, value in values.items()}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, StrictModel):
+        return _resolved(value)
+    return Flow(value) if isinstance(value, list) else value

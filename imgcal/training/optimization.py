@@ -1,0 +1,127 @@
+"""Optimizers by group of parameters, schedules of learning rates, the running mean of weights."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.optim.lr_scheduler import ReduceLROnPlateau
+from torch.optim.swa_utils import AveragedModel
+
+from imgcal.errors import InputError
+from imgcal.formats.names import nearest
+from imgcal.training.experiment import OptimizerConfig, ScheduleConfig
+
+
+def make_optimizer(network: nn.Module, config: OptimizerConfig) -> torch.optim.Optimizer:
+    """Make Adam or AdamW; every group of the network's parameters may have its own learning rate.
+
+    Args:
+        network: may have `parameter_groups()`, a mapping of names to parameters; without, all are the group `network`.
+        config: learning rates by group, weight decay of matrices.
+
+    Raises:
+        InputError: a learning rate for a group that the network does not have.
+    """
+    groups = named_groups(network)
+    for name in config.learning_rates:
+        if name not in groups:
+            hint = nearest(name, groups) or f", expected one of {', '.join(groups)}"
+            raise InputError(f"optimizer: learning_rates: found the unknown group {name}{hint}")
+    settings = []
+    for name, parameters in groups.items():
+        lr = config.learning_rates.get(name, config.lr)
+        for matrices in (True, False):
+            members = [p for p in parameters if (p.ndim > 1) == matrices]
+            if members:
+                decay = config.weight_decay if matrices else 0.0
+                settings.append({"params": members, "name": name, "lr": lr, "initial_lr": lr, "weight_decay": decay})
+    kinds = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}
+    first, second = config.betas
+    return kinds[config.kind](settings, betas=(first, second), fused=True)
+
+
+def named_groups(network: nn.Module) -> dict[str, list[nn.Parameter]]:
+    """Group the trainable parameters of a network; what its `parameter_groups()` leaves out is the group `rest`."""
+    given: Callable[[], Mapping[str, Iterable[nn.Parameter]]] | None = getattr(network, "parameter_groups", None)
+    groups = {"network": network.parameters()} if given is None else given()
+    named = {name: [p for p in parameters if p.requires_grad] for name, parameters in groups.items()}
+    known = {id(p) for parameters in named.values() for p in parameters}
+    rest = [p for p in network.parameters() if p.requires_grad and id(p) not in known]
+    return {name: parameters for name, parameters in {**named, "rest": rest}.items() if parameters}
+
+
+class Schedule:
+    """Sets the learning rates of an optimizer, by the progress of the run or by a plateau of the loss."""
+
+    def __init__(self, optimizer: torch.optim.Optimizer, config: ScheduleConfig) -> None:
+        self.optimizer = optimizer
+        self.config = config
+        self.plateau = (
+            ReduceLROnPlateau(optimizer, factor=config.factor, patience=config.patience, threshold=config.threshold)
+            if config.kind == "plateau"
+            else None
+        )
+
+    def set_progress(self, progress: float) -> None:
+        """Set the learning rates of a step that begins at a progress of 0 to 1."""
+        if self.config.kind == "cosine":
+            factor = cosine(progress, self.config)
+            for group in self.optimizer.param_groups:
+                group["lr"] = group["initial_lr"] * factor
+
+    def judge(self, loss: float) -> None:
+        """Take in the mean loss of the last `every` steps; on a plateau, learning rates fall."""
+        if self.plateau is not None:
+            self.plateau.step(loss)
+
+    def state(self) -> dict[str, Any]:
+        """Plain values that `restore` needs."""
+        return {} if self.plateau is None else self.plateau.state_dict()
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on where another schedule was; learning rates are part of the optimizer's state."""
+        if self.plateau is not None:
+            self.plateau.load_state_dict(state)
+
+
+def cosine(progress: float, config: ScheduleConfig) -> float:
+    """Factor of the learning rate: linear warmup, then half a cosine down to `final`."""
+    if progress < config.warmup:
+        return progress / config.warmup
+    along = min((progress - config.warmup) / max(1 - config.warmup, 1e-9), 1.0)
+    return config.final + (1 - config.final) * 0.5 * (1 + math.cos(math.pi * along))
+
+
+def make_average(network: nn.Module, decay: float) -> AveragedModel:
+    """Make a running mean of the weights that forgets its first, bad weights faster: min(decay, (1 + n) / (10 + n))."""
+
+    def update(averaged: Any, current: Any, count: Tensor | int) -> None:
+        n = int(count)
+        torch._foreach_lerp_(averaged, current, 1 - min(decay, (1 + n) / (10 + n)))
+
+    return AveragedModel(network, multi_avg_fn=torch.no_grad()(update))
+
+
+def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """Moments and step counts, by `<number of the parameter>.<name>`."""
+    state = optimizer.state_dict()["state"]
+    return {f"{index}.{name}": value for index, entry in state.items() for name, value in entry.items()}
+
+
+def optimizer_settings(optimizer: torch.optim.Optimizer) -> list[dict[str, Any]]:
+    """Plain values of each group, learning rates among them."""
+    return optimizer.state_dict()["param_groups"]
+
+
+def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor], settings: list[Any]) -> None:
+    """Invert `optimizer_tensors` and `optimizer_settings`."""
+    state: dict[int, dict[str, Tensor]] = {}
+    for key, value in tensors.items():
+        index, name = key.split(".", 1)
+        state.setdefault(int(index), {})[name] = value
+    groups = [{**group, "betas": tuple(group["betas"])} for group in settings]
+    optimizer.load_state_dict({"state": state, "param_groups": groups})

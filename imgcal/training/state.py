@@ -1,0 +1,101 @@
+"""The state of a run in a file, so that a killed run goes on exactly where it was."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from imgcal.errors import InputError
+from imgcal.formats.safetensors_file import read_tensors, write_tensors
+from imgcal.training.experiment import Experiment
+
+FORMAT = "imgcal-training/1"
+
+# What may differ between a run and its continuation: how long it takes and what it tells, not what it computes.
+FREE = {("name",), ("description",), ("paper",)} | {
+    ("training", name) for name in ("steps", "minutes", "log_every", "validate_every", "validation_rigs", "save_every")
+}
+
+
+@dataclass(frozen=True)
+class State:
+    """Everything that the rest of a run depends on."""
+
+    tensors: dict[str, dict[str, Tensor]]  # by part: network, average, optimizer, random
+    values: dict[str, Any]  # plain values: step, elapsed, settings of the optimizer, schedule, window
+    experiment: Experiment
+
+
+def save_state(path: str | Path, state: State) -> None:
+    """Write a state in one step; on a full disk the previous one survives.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    tensors = {f"{part}/{name}": tensor for part, named in state.tensors.items() for name, tensor in named.items()}
+    texts = {"values": json.dumps(state.values), "experiment": json.dumps(state.experiment.model_dump())}
+    write_tensors(path, tensors, FORMAT, texts)
+
+
+def load_state(path: str | Path, experiment: Experiment) -> State:
+    """Read a state to go on with.
+
+    Raises:
+        InputError: not such a file, damaged, a pickle, or the state of another experiment.
+    """
+    tensors, texts = read_tensors(path, FORMAT)
+    try:
+        values, saved = json.loads(texts["values"]), json.loads(texts["experiment"])
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{path}: found no readable state in it: the file is damaged") from error
+    difference = first_difference(saved, experiment.model_dump())
+    if difference:
+        key, was, now = difference
+        raise InputError(
+            f"{path}: the training so far had {key}: {was}, found {now}: a continuation must not change it"
+        )
+    parts: dict[str, dict[str, Tensor]] = {}
+    for key, tensor in tensors.items():
+        part, name = key.split("/", 1)
+        parts.setdefault(part, {})[name] = tensor
+    return State(parts, values, experiment)
+
+
+def first_difference(
+    saved: Mapping[str, Any], found: Mapping[str, Any], place: tuple[str, ...] = ()
+) -> tuple[str, Any, Any] | None:
+    """Find the first value that differs and must not: its key, what it was, what it is."""
+    for name in (*saved, *(name for name in found if name not in saved)):
+        here = (*place, name)
+        was, now = saved.get(name), found.get(name)
+        if here in FREE or was == now:
+            continue
+        if isinstance(was, Mapping) and isinstance(now, Mapping):
+            deeper = first_difference(was, now, here)
+            if deeper:
+                return deeper
+            continue
+        return ".".join(here), was, now
+    return None
+
+
+def random_states(generator: torch.Generator) -> dict[str, Tensor]:
+    """States of the data's generator and of the default ones, from which dropout draws."""
+    states = {"data": generator.get_state(), "cpu": torch.get_rng_state()}
+    if generator.device.type == "cuda":
+        states["cuda"] = torch.cuda.get_rng_state(generator.device)
+    return states
+
+
+def restore_random_states(generator: torch.Generator, states: Mapping[str, Tensor]) -> None:
+    """Invert `random_states`."""
+    generator.set_state(states["data"])
+    torch.set_rng_state(states["cpu"])
+    if "cuda" in states and generator.device.type == "cuda":
+        torch.cuda.set_rng_state(states["cuda"], generator.device)
