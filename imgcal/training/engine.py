@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import torch
 from accelerate import Accelerator, DistributedDataParallelKwargs
 from accelerate.utils import broadcast
 from torch import Tensor, nn
-from torch.optim.swa_utils import AveragedModel
 
 from imgcal.errors import InputError, RefusedError
 from imgcal.formats.safetensors_file import write_tensors
@@ -32,6 +31,7 @@ from imgcal.training.optimization import (
     optimizer_settings,
     optimizer_tensors,
     restore_optimizer,
+    update_average,
 )
 from imgcal.training.state import State, load_state, random_states, restore_random_states, save_state
 
@@ -53,15 +53,16 @@ class Run:
     plain: nn.Module  # the same without the wrapping
     optimizer: torch.optim.Optimizer
     schedule: Schedule
-    average: AveragedModel | None  # running mean of the weights
+    average: nn.Module | None  # running mean of the weights
     source: Source
     spread: Tensor  # (C, 15) of the drift
     generator: torch.Generator  # of this process's data
     validation: list[Snapshots]
     batch_size: int  # of this process
+    untrained: tuple[str, ...]  # parameters that a warm start did not find
     step: int = 0
     elapsed: float = 0.0  # s, of all sessions until this one began
-    began: float = field(default_factory=time.monotonic)
+    began: float = field(default_factory=lambda: monotonic())
     judged: Tensor | None = None  # (2,) sum of losses and their number since the schedule last judged
     window: list[tuple[Tensor, Tensor]] = field(default_factory=list)  # losses and mean RE of passes since the last log
     pending: tuple[Batch, Tensor] | None = None  # last batch, its (2,) loss and gradient norm: not yet looked at
@@ -69,12 +70,12 @@ class Run:
     @property
     def seconds(self) -> float:
         """Time spent on the training, all sessions together."""
-        return self.elapsed + time.monotonic() - self.began
+        return self.elapsed + monotonic() - self.began
 
     @property
     def best_weights(self) -> nn.Module:
         """The network that is the result: the running mean where there is one."""
-        return self.plain if self.average is None else self.average.module
+        return self.plain if self.average is None else self.average
 
 
 def train(
@@ -98,9 +99,10 @@ def train(
         InputError: unusable experiment, checkpoint or folder.
         RefusedError: the loss or its gradient is not finite; the batch is saved.
     """
-    run = prepare(experiment, Path(folder))
-    if resume:
-        load(run)
+    run = prepare(experiment, Path(folder), resume)
+    if run.accelerator.is_main_process:
+        run.folder.mkdir(parents=True, exist_ok=True)
+        save_experiment(experiment, run.folder / RESOLVED)
     log = Log(run.folder, run.step, run.accelerator.is_main_process)
     with log:
         _announce(run, log)
@@ -121,8 +123,8 @@ def train(
     return run
 
 
-def prepare(experiment: Experiment, folder: Path) -> Run:
-    """Build everything a run needs, from the experiment alone."""
+def prepare(experiment: Experiment, folder: Path, resume: bool = False) -> Run:
+    """Build everything a run needs: untrained, or as it was when the state in `folder` was saved."""
     settings = experiment.training
     accelerator = Accelerator(
         cpu=settings.device == "cpu", kwargs_handlers=[DistributedDataParallelKwargs(find_unused_parameters=True)]
@@ -135,9 +137,7 @@ def prepare(experiment: Experiment, folder: Path) -> Run:
     factory, obj = experiment.load_rig(), experiment.load_object()
     torch.manual_seed(settings.seed)
     network = build_network(experiment, factory, obj)
-    fresh = () if settings.init_from is None else warm_start(settings.init_from, network)
-    if fresh and accelerator.is_main_process:
-        accelerator.print(f"{settings.init_from}: without {', '.join(fresh)}: these start untrained")
+    untrained = () if resume or settings.init_from is None else warm_start(settings.init_from, network)
     plain = network.to(device)
     source = Source(
         factory.to(torch.float32, device),
@@ -149,7 +149,7 @@ def prepare(experiment: Experiment, folder: Path) -> Run:
     seed = settings.seed * 4096 + accelerator.process_index
     torch.manual_seed(seed)
     optimizer = make_optimizer(plain, experiment.optimizer)
-    ema = experiment.optimizer.ema
+    average = None if experiment.optimizer.ema is None else make_average(plain)
     run = Run(
         experiment=experiment,
         folder=folder,
@@ -159,16 +159,16 @@ def prepare(experiment: Experiment, folder: Path) -> Run:
         plain=plain,
         optimizer=optimizer,
         schedule=Schedule(optimizer, experiment.schedule),
-        average=None if ema is None else make_average(plain, ema),
+        average=average,
         source=source,
         spread=source.drift.std(factory).to(device, torch.float32),
         generator=torch.Generator(device).manual_seed(seed),
         validation=_validation_rigs(source, settings.validation_rigs, settings.batch_size // processes, device),
         batch_size=settings.batch_size // processes,
+        untrained=untrained,
     )
-    if accelerator.is_main_process:
-        folder.mkdir(parents=True, exist_ok=True)
-        save_experiment(experiment, folder / RESOLVED)
+    if resume:
+        load(run)
     return run
 
 
@@ -186,9 +186,9 @@ def train_step(run: Run) -> None:
     limit = run.experiment.optimizer.clip
     norm = torch.nn.utils.clip_grad_norm_(run.plain.parameters(), float("inf") if limit is None else limit)
     run.optimizer.step()
-    if run.average is not None:
-        run.average.update_parameters(run.plain)
     run.step += 1
+    if run.average is not None and run.experiment.optimizer.ema is not None:
+        update_average(run.average, run.plain, run.step, run.experiment.optimizer.ema)
     _account(run, batch, loss, norm)
 
 
@@ -296,7 +296,7 @@ def load(run: Run) -> None:
     restore_optimizer(run.optimizer, tensors["optimizer"], values["optimizer"])
     run.schedule.restore(values["schedule"])
     restore_random_states(run.generator, {name: rows[index] for name, rows in tensors["random"].items()})
-    run.step, run.elapsed, run.began = values["step"], values["elapsed"], time.monotonic()
+    run.step, run.elapsed, run.began = values["step"], values["elapsed"], monotonic()
     if values["judged"] is not None:
         run.judged = torch.tensor(values["judged"], device=run.accelerator.device)
 
@@ -373,3 +373,5 @@ def _announce(run: Run, log: Log) -> None:
     where = f"{run.accelerator.num_processes} x {run.accelerator.device.type}"
     again = f", from step {run.step} on" if run.step else ""
     log.say(f"{run.experiment.name}: {count:,} parameters, {where}{again}")
+    if run.untrained:
+        log.say(f"{run.experiment.training.init_from}: nothing fits {', '.join(run.untrained)}: untrained")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -9,7 +10,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import ReduceLROnPlateau
-from torch.optim.swa_utils import AveragedModel
 
 from imgcal.errors import InputError
 from imgcal.formats.names import nearest
@@ -96,14 +96,23 @@ def cosine(progress: float, config: ScheduleConfig) -> float:
     return config.final + (1 - config.final) * 0.5 * (1 + math.cos(math.pi * along))
 
 
-def make_average(network: nn.Module, decay: float) -> AveragedModel:
-    """Make a running mean of the weights that forgets its first, bad weights faster: min(decay, (1 + n) / (10 + n))."""
+def make_average(network: nn.Module) -> nn.Module:
+    """Copy a network whose weights are to become the running mean of the other's."""
+    average = copy.deepcopy(network)
+    return average.requires_grad_(False)
 
-    def update(averaged: Any, current: Any, count: Tensor | int) -> None:
-        n = int(count)
-        torch._foreach_lerp_(averaged, current, 1 - min(decay, (1 + n) / (10 + n)))
 
-    return AveragedModel(network, multi_avg_fn=torch.no_grad()(update))
+@torch.no_grad()
+def update_average(average: nn.Module, network: nn.Module, step: int, decay: float) -> None:
+    """Take one step's weights into the running mean, which forgets the first, bad ones faster.
+
+    The decay is min(decay, (1 + step) / (10 + step)); the step is a plain number, so that no device is waited for
+    (torch.optim.swa_utils counts in a tensor).
+    """
+    share = 1 - min(decay, (1 + step) / (10 + step))
+    torch._foreach_lerp_(list(average.parameters()), list(network.parameters()), share)
+    for mean, latest in zip(average.buffers(), network.buffers(), strict=True):
+        mean.copy_(latest)
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:

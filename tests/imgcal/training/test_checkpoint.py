@@ -1,0 +1,161 @@
+import pickle
+import re
+from dataclasses import replace
+
+import pytest
+import torch
+
+from imgcal.errors import InputError
+from imgcal.formats import load_object, load_rig
+from imgcal.formats.safetensors_file import read_tensors, write_tensors
+from imgcal.networks.prediction import Views
+from imgcal.training.checkpoint import FORMAT, build_network, load_checkpoint, load_network, save_network, warm_start
+
+
+@pytest.fixture
+def made(experiment):
+    setup = experiment()
+    torch.manual_seed(3)
+    network = build_network(setup, setup.load_rig(), setup.load_object())
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
+    return setup, network.eval()
+
+
+@pytest.fixture
+def path(made, tmp_path):
+    experiment, network = made
+    save_network(tmp_path / "model.safetensors", network, experiment, {"re_px": 1.5}, rig=experiment.load_rig())
+    return tmp_path / "model.safetensors"
+
+
+def test_a_network_comes_back(made, path):
+    experiment, network = made
+    found = load_checkpoint(path, load_rig("T4"), load_object("asymmetric8"))
+    views = Views(uv=1000 * torch.rand(3, 4, 8, 2), seen=torch.ones(3, 4, 8, dtype=torch.bool))
+    expected, again = network(views)[-1], found.network(views)[-1]
+    assert torch.equal(again.rig.focal_length, expected.rig.focal_length)
+    assert torch.equal(again.rig_from_object.rotation, expected.rig_from_object.rotation)
+    assert not found.network.training
+    assert found.metrics == {"re_px": 1.5}
+    assert found.experiment == experiment
+    assert found.obj.name == "asymmetric8"
+    torch.testing.assert_close(found.drift_std, experiment.drift.drift().std(load_rig("T4")), rtol=1e-9, atol=1e-12)
+
+
+def test_without_the_full_rig_its_single_precision_is_recorded(made, tmp_path):
+    experiment, network = made
+    save_network(tmp_path / "a.safetensors", network, experiment, {})
+    load_network(tmp_path / "a.safetensors", load_rig("T4"), load_object("asymmetric8"))
+
+
+def test_bfloat16_is_for_parameters_only(made, tmp_path):
+    experiment, network = made
+    path = tmp_path / "small.safetensors"
+    save_network(path, network, experiment, {}, dtype=torch.bfloat16)
+    tensors, _ = read_tensors(path, FORMAT)
+    assert tensors["trunk.0.weight"].dtype == torch.bfloat16
+    assert torch.equal(tensors["spread"], network.spread)
+    found = load_network(path)
+    assert {tensor.dtype for tensor in found.state_dict().values()} == {torch.float32}
+    torch.testing.assert_close(found.trunk[0].weight, network.trunk[0].weight, rtol=2**-8, atol=0.0)
+
+
+@pytest.mark.parametrize(
+    ("rig", "obj", "expected"),
+    [
+        ("O10", "asymmetric8", "trained for another rig than O10 (T4): cameras: found cam01, cam02"),
+        ("T4", "cube8", "trained for another object than cube8 (asymmetric8): fiducial 1"),
+        ("T4", "sphere64", "found 64 fiducials, expected 8"),
+    ],
+)
+def test_another_rig_or_object_is_refused(path, rig, obj, expected):
+    with pytest.raises(InputError, match=re.escape(expected)):
+        load_network(path, load_rig(rig), load_object(obj))
+
+
+def test_another_factory_value_is_refused_by_camera(path):
+    rig = load_rig("T4")
+    principal_point = rig.principal_point.clone()
+    principal_point[2, 1] += 0.1
+    with pytest.raises(InputError, match=r"principal point of cam03: found 1024, 544\.1, expected 1024, 544"):
+        load_network(path, replace(rig, principal_point=principal_point))
+    step = torch.zeros(4, 15, dtype=torch.float64)
+    step[1, 4] = 0.5
+    with pytest.raises(InputError, match="position of cam02"):
+        load_network(path, rig.moved(step))
+    step[1, 4], step[3, 0] = 0.0, 1e-4
+    with pytest.raises(InputError, match="rotation of cam04"):
+        load_network(path, rig.moved(step))
+    load_network(path, replace(rig, name="another name"))
+
+
+def test_spheres_are_not_points(path):
+    obj = load_object("asymmetric8")
+    with pytest.raises(InputError, match="radius"):
+        load_network(path, obj=replace(obj, radius=torch.full((8,), 5.0, dtype=torch.float64)))
+
+
+class Malicious:
+    def __reduce__(self):
+        return (pytest.fail, ("a pickle was loaded",))
+
+
+def test_pickles_are_never_loaded(tmp_path):
+    for name, write in (
+        ("a.safetensors", lambda path: path.write_bytes(pickle.dumps(Malicious()))),
+        ("b.safetensors", lambda path: torch.save({"weight": Malicious()}, path)),
+        ("c.safetensors", lambda path: torch.save(Malicious(), path, _use_new_zipfile_serialization=False)),
+    ):
+        write(tmp_path / name)
+        with pytest.raises(InputError, match="found a pickle, which is never loaded"):
+            load_network(tmp_path / name)
+
+
+def test_damaged_files_are_refused(path, tmp_path):
+    content = path.read_bytes()
+    middle = bytearray(content)
+    middle[-100] ^= 1
+    for damaged, expected in (
+        (content[:-100], "damaged"),
+        (content[:50], "damaged"),
+        (b"", "damaged"),
+        (b"\xff" * 100, "damaged"),
+        (bytes(middle), "does not match its checksum"),
+    ):
+        bad = tmp_path / "bad.safetensors"
+        bad.write_bytes(damaged)
+        with pytest.raises(InputError, match=expected) as caught:
+            load_network(bad)
+        assert str(bad) in str(caught.value)
+
+
+def test_other_versions_and_kinds_are_refused(path, tmp_path):
+    tensors, texts = read_tensors(path, FORMAT)
+    other = tmp_path / "other.safetensors"
+    write_tensors(other, tensors, "imgcal-network/9", texts)
+    with pytest.raises(InputError, match="found format imgcal-network/9, expected imgcal-network/1"):
+        load_network(other)
+    write_tensors(other, {"weight": torch.ones(2)}, FORMAT, texts)
+    with pytest.raises(InputError, match="found other weights than its network has"):
+        load_network(other)
+    write_tensors(other, tensors, FORMAT, texts | {"experiment": "{"})
+    with pytest.raises(InputError, match="no readable experiment"):
+        load_network(other)
+    write_tensors(other, tensors, FORMAT, texts | {"rig": "format: nothing"})
+    with pytest.raises(InputError, match="no readable rig and object"):
+        load_network(other)
+    with pytest.raises(InputError, match="cannot be read"):
+        load_network(tmp_path / "missing.safetensors")
+
+
+def test_warm_start_takes_what_fits(made, path, experiment):
+    wider = experiment("rig=O10")
+    network = build_network(wider, wider.load_rig(), wider.load_object())
+    spread, trunk = network.spread.clone(), network.trunk[0].weight.clone()
+    assert warm_start(path, network) == ("trunk.0.weight", "head.weight", "head.bias")
+    assert torch.equal(network.trunk[0].bias, made[1].trunk[0].bias)
+    assert torch.equal(network.trunk[0].weight, trunk)
+    assert torch.equal(network.spread, spread)  # buffers belong to the new rig and drift
+    with pytest.raises(InputError, match="no parameter that fits"):
+        warm_start(path, torch.nn.Linear(3, 4))

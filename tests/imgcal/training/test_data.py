@@ -1,0 +1,50 @@
+import pytest
+import torch
+
+from imgcal.networks.rendering import ImageOptions
+from imgcal.training.data import Source, object_to
+
+
+@pytest.fixture
+def source(experiment):
+    setup = experiment()
+    return Source(
+        setup.load_rig().to(torch.float32),
+        object_to(setup.load_object(), "cpu"),
+        setup.drift.drift(),
+        setup.poses.pose_range(),
+    )
+
+
+def batch(source, count=3, seed=1):
+    generator = torch.Generator().manual_seed(seed)
+    return source.show(source.sample(count, generator), generator)
+
+
+def test_views_are_the_truth_seen_by_its_cameras(source):
+    made = batch(source)
+    assert made.views.uv.shape == (3, 4, 8, 2) and made.views.images is None
+    assert made.views.seen.all()
+    points = made.truth.rig_from_object.apply(source.obj.points)
+    torch.testing.assert_close(made.views.uv, made.truth.rig.project(points).uv)
+    assert {tensor.dtype for tensor in made.tensors().values()} == {torch.float32, torch.bool}
+
+
+def test_the_generator_decides(source):
+    one, same, other = batch(source), batch(source), batch(source, seed=2)
+    assert torch.equal(one.views.uv, same.views.uv)
+    assert not torch.equal(one.views.uv, other.views.uv)
+
+
+def test_image_networks_get_images_only(experiment, source):
+    drawing = Source(source.factory, source.obj, source.drift, source.pose_range, ImageOptions(size=32, dot=1.0))
+    made = batch(drawing)
+    assert made.views.uv is None
+    assert made.views.images.shape == (3, 4, 3, 32, 32)
+    assert 0.2 < made.views.images.amax() <= 1
+    assert "images" in made.tensors()
+    # The brightest pixel of each camera lies on a fiducial.
+    uv = drawing.images.from_sensor(batch(source).views.uv, source.factory.image_size)  # (3, 4, 8, 2)
+    brightest = made.views.images.sum(2).flatten(-2).argmax(-1)  # (3, 4)
+    at = torch.stack((brightest % 32, brightest // 32), -1)
+    assert ((uv - at[:, :, None]).norm(dim=-1).amin(-1) < 1.0).all()

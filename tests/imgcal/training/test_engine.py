@@ -1,0 +1,183 @@
+import json
+import resource
+
+import pytest
+import torch
+
+from imgcal import networks
+from imgcal.errors import InputError, RefusedError
+from imgcal.formats.safetensors_file import read_tensors
+from imgcal.training import engine
+from imgcal.training.checkpoint import load_checkpoint
+from imgcal.training.engine import BAD_BATCH, RESULT, STATE, finished, progress, train
+from imgcal.training.experiment import load_experiment
+from imgcal.training.log import read_metrics
+from tests.imgcal.training.toy import Toy, ToyOfImages
+
+
+def weights(folder):
+    return read_tensors(folder / RESULT, "imgcal-network/1")[0]
+
+
+def same(a, b):
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+def stopping_at(step):
+    """A wish to stop after so many steps of this session."""
+    asked = iter(range(1, 10**6))
+    return lambda: next(asked) == step
+
+
+def test_a_training_learns_and_tells(experiment, tmp_path):
+    run = train(experiment("training.steps=300", "training.log_every=50", "training.validate_every=150"), tmp_path)
+    assert finished(run, run.seconds)
+    rows = read_metrics(tmp_path / "metrics.jsonl")
+    logged = [row for row in rows if "loss" in row]
+    assert [row["step"] for row in logged] == [50, 100, 150, 200, 250, 300]
+    assert set(logged[0]) == {"step", "loss", "re_px", "re_pass1_px", "lr", "rigs_per_s", "seconds"}
+    assert logged[-1]["loss"] < 0.8 * logged[0]["loss"]
+    assert logged[-1]["lr"] < 0.01 * logged[0]["lr"]
+    validated = [row for row in rows if "validation_re_px" in row]
+    assert [row["step"] for row in validated] == [150, 300]
+    assert validated[1]["validation_re_px"] < validated[0]["validation_re_px"]
+    assert any((tmp_path / "tensorboard").iterdir())
+    assert load_experiment(tmp_path / "resolved.yaml") == run.experiment
+    found = load_checkpoint(tmp_path / RESULT, run.experiment.load_rig(), run.experiment.load_object())
+    assert found.metrics["validation_re_px"] == validated[1]["validation_re_px"]
+
+
+def test_the_result_is_the_running_mean(experiment, tmp_path):
+    run = train(experiment("training.steps=5"), tmp_path / "mean")
+    assert torch.equal(weights(tmp_path / "mean")["head.weight"], run.average.head.weight)
+    assert not torch.equal(run.average.head.weight, run.plain.head.weight)
+    run = train(experiment("training.steps=5", "optimizer.ema=null"), tmp_path / "last")
+    assert torch.equal(weights(tmp_path / "last")["head.weight"], run.plain.head.weight)
+
+
+@pytest.mark.parametrize("schedule", ["{kind: cosine}", "{kind: plateau, every: 7, patience: 0}"])
+def test_a_resumed_run_ends_bit_for_bit_the_same(experiment, tmp_path, schedule):
+    setup = experiment(f"schedule={schedule}", "training.steps=40")
+    train(setup, tmp_path / "whole")
+    first = train(setup, tmp_path / "parts", should_stop=stopping_at(17))
+    assert first.step == 17 and not finished(first, first.seconds)
+    torch.manual_seed(99)  # what another process has in its default generator
+    second = train(setup, tmp_path / "parts", resume=True)
+    assert second.step == 40
+    assert second.elapsed > 0
+    assert same(weights(tmp_path / "whole"), weights(tmp_path / "parts"))
+    rows = [read_metrics(tmp_path / name / "metrics.jsonl") for name in ("whole", "parts")]
+    assert rows[0][-1]["validation_re_px"] == rows[1][-1]["validation_re_px"]
+
+
+def test_a_cut_off_log_is_repaired(experiment, tmp_path):
+    setup = experiment("training.steps=30")
+    train(setup, tmp_path, should_stop=stopping_at(20))
+    with open(tmp_path / "metrics.jsonl", "a") as file:
+        file.write(json.dumps({"step": 25, "loss": 1.0}) + '\n{"step": 2')
+    train(setup, tmp_path, resume=True)
+    assert [row["step"] for row in read_metrics(tmp_path / "metrics.jsonl") if "loss" in row] == [10, 20, 30]
+
+
+def test_a_continuation_must_be_of_the_same_experiment(experiment, tmp_path):
+    train(experiment("training.steps=20"), tmp_path)
+    longer = train(experiment("training.steps=30", "training.log_every=5"), tmp_path, resume=True)
+    assert longer.step == 30
+    before = (tmp_path / "resolved.yaml").read_text()
+    for change, expected in (
+        ("optimizer.lr=0.1", r"had optimizer\.lr: 0\.003, found 0\.1"),
+        ("drift={position: 1}", r"had drift\.kappa_intrinsics: 0\.01, found None"),
+        ("training.batch_size=24", r"had training\.batch_size: 12, found 24"),
+    ):
+        with pytest.raises(InputError, match=expected):
+            train(experiment(change), tmp_path, resume=True)
+    assert (tmp_path / "resolved.yaml").read_text() == before
+
+
+def test_time_moves_the_schedule_and_ends_the_run(experiment, tmp_path, monkeypatch):
+    clock = iter(float(second) for second in range(10**6))
+    monkeypatch.setattr(engine, "monotonic", lambda: next(clock))
+    setup = experiment("training={minutes: 1.0, batch_size: 6, validation_rigs: 0, device: cpu, log_every: 1}")
+    run = train(setup, tmp_path)
+    rows = read_metrics(tmp_path / "metrics.jsonl")
+    assert rows[-2]["seconds"] < 60 <= rows[-1]["seconds"]
+    rates = [row["lr"] for row in rows]
+    assert rates[1] == max(rates) and rates[-1] < 0.01 * rates[1]
+    assert finished(run, 61.0) and progress(run, 30.0) == 0.5
+
+
+def test_a_resumed_clock_goes_on(experiment, tmp_path):
+    first = train(experiment(), tmp_path, should_stop=stopping_at(5))
+    assert train(experiment(), tmp_path, resume=True, should_stop=stopping_at(1)).seconds > first.elapsed
+
+
+class Diverging(Toy):
+    """Turns infinite when it sees its sixth batch in training."""
+
+    seen = 0
+
+    def forward(self, views):
+        if self.training:
+            self.seen += 1
+        predictions = super().forward(views)
+        if self.seen == 6:
+            predictions[-1].rig.focal_length.mul_(torch.nan)
+        return predictions
+
+
+def test_a_loss_that_is_not_finite_stops_with_the_batch(experiment, tmp_path, monkeypatch):
+    monkeypatch.setattr(networks, "build", Diverging)
+    with pytest.raises(RefusedError, match=r"step 6: loss nan, norm of its gradient nan; the batch is in bad_batch"):
+        train(experiment("training.save_every=5"), tmp_path)
+    tensors, texts = read_tensors(tmp_path / BAD_BATCH, "imgcal-batch/1")
+    assert texts["step"] == "5"
+    assert tensors["uv"].shape == (12, 4, 8, 2)
+    assert tensors["rig_from_object.rotation"].shape == (12, 3, 3)
+    assert all(tensor.isfinite().all() for tensor in weights(tmp_path).values())
+
+
+def test_a_full_disk_leaves_the_previous_checkpoint(experiment, tmp_path):
+    setup = experiment("training.steps=20")
+    train(setup, tmp_path)
+    before = {name: (tmp_path / name).read_bytes() for name in (STATE, RESULT)}
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before[STATE]) // 2, hard))
+    try:
+        with pytest.raises(InputError, match=f"{STATE}: cannot be written"):
+            train(experiment("training.steps=40"), tmp_path, resume=True)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert before == {name: (tmp_path / name).read_bytes() for name in (STATE, RESULT)}
+    assert not list(tmp_path.glob(".*"))
+    assert train(experiment("training.steps=40"), tmp_path, resume=True).step == 40
+
+
+def test_a_warm_start(experiment, tmp_path, capsys):
+    train(experiment("training.steps=20"), tmp_path / "a")
+    setup = experiment("training.steps=1", "optimizer.ema=null", "drift={kappa_intrinsics: 0.05}", "optimizer.lr=1e-9")
+    warm = setup.training.model_copy(update={"init_from": str(tmp_path / "a" / RESULT)})
+    run = train(setup.model_copy(update={"training": warm}), tmp_path / "b")
+    torch.testing.assert_close(run.plain.head.weight.detach(), weights(tmp_path / "a")["head.weight"])
+    torch.testing.assert_close(run.plain.spread, setup.drift.drift().std(setup.load_rig()).float())
+
+
+def test_images_and_bf16(experiment, tmp_path, monkeypatch):
+    monkeypatch.setattr(networks, "build", ToyOfImages)
+    setup = experiment("training.precision=bf16", "training.steps=4", "images={size: 20, dot: 1.0}")
+    run = train(setup, tmp_path)
+    assert run.source.images.size == 20
+    assert run.plain.head.weight.dtype == torch.float32
+    rows = read_metrics(tmp_path / "metrics.jsonl")
+    assert rows[-1]["validation_re_px"] > 0
+
+
+def test_images_for_a_point_network_are_an_error(experiment, tmp_path):
+    with pytest.raises(InputError, match="the network points takes points"):
+        train(experiment("images={size: 32}"), tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+def test_the_paper_preset_trains(experiment, tmp_path):
+    run = train(experiment("loss={kind: paper, paper: {reprojection_from: 10}}", "optimizer.kind=adam"), tmp_path)
+    losses = [row["loss"] for row in read_metrics(tmp_path / "metrics.jsonl") if "loss" in row]
+    assert run.step == 60 and losses[-1] < losses[0]
