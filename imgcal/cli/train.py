@@ -52,6 +52,7 @@ class Train:
             torch.set_num_threads(experiment.training.threads)
         with _asked_to_stop() as stop:
             run = train(experiment, self.out, self.resume, stop)
+        run.accelerator.end_training()
         if not finished(run, run.seconds):
             raise KeyboardInterrupt(
                 f"interrupted and saved at step {run.step}; to go on, repeat the command with --resume"

@@ -9,7 +9,7 @@ from time import monotonic
 from typing import Any
 
 import torch
-from accelerate import Accelerator, DistributedDataParallelKwargs
+from accelerate import Accelerator
 from accelerate.utils import broadcast
 from torch import Tensor, nn
 
@@ -126,9 +126,7 @@ def train(
 def prepare(experiment: Experiment, folder: Path, resume: bool = False) -> Run:
     """Build everything a run needs: untrained, or as it was when the state in `folder` was saved."""
     settings = experiment.training
-    accelerator = Accelerator(
-        cpu=settings.device == "cpu", kwargs_handlers=[DistributedDataParallelKwargs(find_unused_parameters=True)]
-    )
+    accelerator = Accelerator(cpu=settings.device == "cpu")
     device, processes = accelerator.device, accelerator.num_processes
     if settings.batch_size % processes:
         raise InputError(

@@ -188,35 +188,23 @@ def load_experiment(path: str | Path, changes: Iterable[str] = ()) -> Experiment
 
     Args:
         path: a YAML file, or the bare name of a shipped experiment when there is no such file.
-        changes: `key.key=value`, values in YAML, applied one after the other.
+        changes: `key.key=value`, values in YAML; the last one wins.
 
     Raises:
         InputError: one line with the file or the change, what was found and what was expected.
     """
     path = find_file(path, "experiments", ".yaml")
-    experiment = read_yaml(path, Experiment, FORMAT)
-    for change in changes:
-        experiment = changed(experiment, change)
-    return experiment
+    return changed(read_yaml(path, Experiment, FORMAT), *changes)
 
 
-def changed(experiment: Experiment, change: str) -> Experiment:
-    """Set one value of an experiment: `training.steps=100`, `drift={rotation_deg: 0.5}`."""
-    where = f"--set {change}"
-    key, equals, text = change.partition("=")
-    steps = key.strip().split(".")
-    if not equals or not all(steps):
-        raise InputError(f"{where}: found no key and value, expected something like training.steps=100")
+def changed(experiment: Experiment, *changes: str) -> Experiment:
+    """Set values of an experiment: `training.steps=100`, `drift={rotation_deg: 0.5}`; validated when all are set."""
+    if not changes:
+        return experiment
     content = as_written(experiment)
-    record: Any = content
-    for step in steps[:-1]:
-        if record.get(step) is None:
-            record[step] = {}
-        record = record[step]
-        if not isinstance(record, dict):
-            raise InputError(f"{where}: found the value {record!r} at `{step}`, expected a group of keys")
-    record[steps[-1]] = parse_yaml(text, where)
-    return validated(content, Experiment, where)
+    for change in changes:
+        _apply(content, change)
+    return validated(content, Experiment, f"--set {' '.join(changes)}")
 
 
 def as_written(experiment: Experiment) -> dict[str, Any]:
@@ -245,3 +233,19 @@ def _plain(value: Any) -> Any:
     if isinstance(value, StrictModel):
         return _resolved(value)
     return Flow(value) if isinstance(value, list) else value
+
+
+def _apply(content: dict[str, Any], change: str) -> None:
+    where = f"--set {change}"
+    key, equals, text = change.partition("=")
+    steps = key.strip().split(".")
+    if not equals or not all(steps):
+        raise InputError(f"{where}: found no key and value, expected something like training.steps=100")
+    record: Any = content
+    for step in steps[:-1]:
+        if record.get(step) is None:
+            record[step] = {}
+        record = record[step]
+        if not isinstance(record, dict):
+            raise InputError(f"{where}: found the value {record!r} at `{step}`, expected a group of keys")
+    record[steps[-1]] = parse_yaml(text, where)

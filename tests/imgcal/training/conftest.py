@@ -1,7 +1,7 @@
 import pytest
 
 from imgcal import networks
-from imgcal.training.experiment import Experiment, changed, load_experiment
+from imgcal.training.experiment import Experiment, load_experiment
 from tests.imgcal.training.toy import EXPERIMENT, Toy
 
 
@@ -18,9 +18,6 @@ def experiment(tmp_path):
     def make(*changes: str) -> Experiment:
         path = tmp_path / "toy.yaml"
         path.write_text(EXPERIMENT)
-        made = load_experiment(path)
-        for change in changes:
-            made = changed(made, change)
-        return made
+        return load_experiment(path, changes)
 
     return make

@@ -43,7 +43,7 @@ def test_degrees_become_radians(experiment):
 
 
 def test_changes_are_applied_in_order(experiment):
-    made = changed(changed(experiment(), "training.steps=7"), "training.steps=8")
+    made = changed(experiment(), "training.steps=7", "training.steps=8")
     assert made.training.steps == 8
     assert made.training.batch_size == 12
     assert changed(made, "paper={table: '1', row: 3}").paper.row == 3

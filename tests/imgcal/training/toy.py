@@ -3,10 +3,13 @@
 from torch import nn
 
 from imgcal import networks
+from imgcal.cli.main import run as command
 from imgcal.networks.prediction import Prediction
 from imgcal.networks.rendering import ImageOptions
 from imgcal.rig import PARAMETERS
 from imgcal.rotations import rotation_from_6d
+from imgcal.training import engine
+from imgcal.training.engine import save
 from imgcal.transforms import RigidTransform
 
 EXPERIMENT = """
@@ -68,8 +71,14 @@ class ToyOfImages(Toy):
     image_options = ImageOptions(size=16, dot=1.0)
 
 
-if __name__ == "__main__":
-    from imgcal.cli.main import run
+def save_and_compare(run, metrics):
+    """Save, and make sure that all processes hold the same weights."""
+    save(run, metrics)
+    copies = run.accelerator.gather(run.plain.head.weight.detach()[None].clone())
+    assert (copies == copies[0]).all()
 
+
+if __name__ == "__main__":
     networks.build = Toy
-    run()
+    engine.save = save_and_compare
+    command()

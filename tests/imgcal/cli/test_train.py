@@ -1,0 +1,92 @@
+import signal
+
+import pytest
+
+from imgcal import networks
+from imgcal.cli.main import main
+from imgcal.formats import load_object, load_rig
+from imgcal.training import engine
+from imgcal.training.checkpoint import load_network
+from imgcal.training.log import read_metrics
+from tests.imgcal.training.toy import EXPERIMENT, Toy
+
+
+@pytest.fixture
+def experiment(tmp_path, monkeypatch):
+    monkeypatch.setattr(networks, "build", Toy)
+    path = tmp_path / "toy.yaml"
+    path.write_text(EXPERIMENT)
+    return path
+
+
+def train(experiment, out, *more):
+    return main(["train", str(experiment), "--out", str(out), *more])
+
+
+def test_a_network_comes_out(experiment, tmp_path, capsys):
+    out = tmp_path / "deep" / "out"
+    assert train(experiment, out, "--set", "training.steps=20", "optimizer.lr=1e-3") == 0
+    load_network(out / "model.safetensors", load_rig("T4"), load_object("asymmetric8"))
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert "step 20  RE " in printed.err and "validation RE" in printed.err
+    assert printed.err.endswith(f"s: {out / 'model.safetensors'}\n")
+    assert "lr: 0.001" in (out / "resolved.yaml").read_text()
+    # What was resolved can be run itself, and a folder is not trained in twice.
+    assert train(out / "resolved.yaml", tmp_path / "again") == 0
+    assert train(experiment, out) == 2
+    assert "found a training there already, expected a new folder, or --resume" in capsys.readouterr().err
+
+
+def test_minutes_end_the_training(experiment, tmp_path):
+    out = tmp_path / "out"
+    assert train(experiment, out, "--minutes", "0.005", "--set", "training.steps=null") == 0
+    assert read_metrics(out / "metrics.jsonl")[-1]["step"] >= 1
+    assert "minutes: 0.005" in (out / "resolved.yaml").read_text()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_training_is_saved_and_says_how_to_resume(experiment, tmp_path, capsys, monkeypatch, number):
+    step = engine.train_step
+
+    def interrupted_at_seven(run):
+        step(run)
+        if run.step == 7:
+            signal.raise_signal(number)
+
+    monkeypatch.setattr(engine, "train_step", interrupted_at_seven)
+    handler = signal.getsignal(number)
+    assert train(experiment, tmp_path / "out") == 130
+    assert signal.getsignal(number) == handler
+    error = capsys.readouterr().err
+    assert "interrupted and saved at step 7; to go on, repeat the command with --resume" in error
+    load_network(tmp_path / "out" / "model.safetensors")
+    assert train(experiment, tmp_path / "out", "--resume") == 0
+    assert "from step 7 on" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--set", "drift.kappa_intrinsics=3.0"], "kappa_intrinsics: found 3.0, expected less than 1"),
+        (["--set", "training.stepz=1"], "unknown key `stepz`, nearest: steps"),
+        (["--set", "optimizer.learning_rates.head=0.1"], "unknown group head, nearest: heads"),
+        (["--set", "rig=O1"], "O1: no such file, nor one of the shipped rigs"),
+        (["--set", "training.init_from=nothing.safetensors"], "nothing.safetensors: cannot be read"),
+        (["--minutes", "-1"], "training: minutes: found -1.0"),
+        (["--resume"], "found no state.safetensors there"),
+    ],
+)
+def test_unusable_input_is_one_line(experiment, tmp_path, capsys, arguments, expected):
+    assert train(experiment, tmp_path / "out", *arguments) == 2
+    error = capsys.readouterr().err
+    assert expected in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_rig_without_cameras(experiment, tmp_path, capsys):
+    rig = tmp_path / "empty.yaml"
+    rig.write_text("format: imgcal-rig/1\nname: empty\ncameras: []\n")
+    assert train(experiment, tmp_path / "out", "--set", f"rig={rig}") == 2
+    assert "cameras: found 0 values, expected 1 or more" in capsys.readouterr().err

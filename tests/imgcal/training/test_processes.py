@@ -1,0 +1,90 @@
+"""Trainings in processes of their own: one that is killed, and one that consists of two."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import torch
+
+from imgcal.formats.safetensors_file import read_tensors, read_texts
+from imgcal.training.engine import RESULT, STATE, train
+from imgcal.training.log import read_metrics
+from tests.imgcal.training.toy import EXPERIMENT
+
+ROOT = Path(__file__).parents[3]
+TOY = "tests.imgcal.training.toy"
+
+
+def environment(**more):
+    return {
+        **os.environ,
+        "OMP_NUM_THREADS": "1",
+        "CUDA_VISIBLE_DEVICES": "",
+        "PYTHONPATH": str(ROOT),
+        **more,
+    }
+
+
+def weights(folder):
+    return read_tensors(folder / RESULT, "imgcal-network/1")[0]
+
+
+def state_step(folder):
+    return json.loads(read_texts(folder / STATE, "imgcal-training/1")["values"])["step"]
+
+
+def test_killed_and_resumed_is_bit_for_bit_uninterrupted(experiment, tmp_path):
+    steps, save_every = 400, 10
+    changes = [f"training.steps={steps}", f"training.save_every={save_every}"]
+    torch.set_num_threads(1)
+    train(experiment(*changes), tmp_path / "whole")
+    file = tmp_path / "toy.yaml"
+    command = [sys.executable, "-m", TOY, "train", str(file), "--out", str(tmp_path / "killed"), "--set", *changes]
+    process = subprocess.Popen(command, env=environment(), cwd=ROOT, stderr=subprocess.PIPE)
+    state = tmp_path / "killed" / STATE
+    while process.poll() is None and not (state.exists() and state_step(tmp_path / "killed") >= 3 * save_every):
+        time.sleep(0.002)
+    process.kill()
+    _, errors = process.communicate()
+    assert process.returncode == -signal.SIGKILL, errors.decode()
+    assert 3 * save_every <= state_step(tmp_path / "killed") < steps
+    resumed = train(experiment(*changes), tmp_path / "killed", resume=True)
+    assert resumed.step == steps
+    whole, killed = weights(tmp_path / "whole"), weights(tmp_path / "killed")
+    assert whole.keys() == killed.keys()
+    assert all(torch.equal(whole[name], killed[name]) for name in whole)
+
+
+def two_processes(tmp_path, *arguments):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    processes = []
+    for rank in range(2):
+        ranks = {"RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": "2"}
+        where = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "ACCELERATE_USE_CPU": "true"}
+        command = [sys.executable, "-m", TOY, "train", str(tmp_path / "toy.yaml"), *arguments]
+        process = subprocess.Popen(command, env=environment(**ranks, **where), cwd=ROOT, stderr=subprocess.PIPE)
+        processes.append(process)
+    errors = [process.communicate(timeout=60)[1].decode() for process in processes]
+    assert [process.returncode for process in processes] == [0, 0], errors
+    return errors
+
+
+def test_two_processes_share_a_batch(tmp_path):
+    (tmp_path / "toy.yaml").write_text(EXPERIMENT)
+    out = tmp_path / "two"
+    errors = two_processes(tmp_path, "--out", str(out), "--set", "training.steps=60")
+    assert "2 x cpu" in errors[0]
+    assert errors[1] == ""  # only the main process speaks
+    rows = read_metrics(out / "metrics.jsonl")
+    losses = [row["loss"] for row in rows if "loss" in row]
+    assert len(losses) == 6 and losses[-1] < losses[0]
+    state, _ = read_tensors(out / STATE, "imgcal-training/1")
+    assert state["random/data"].shape[0] == 2
+    assert not torch.equal(*state["random/data"])  # each process draws its own rigs
