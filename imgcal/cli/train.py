@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from time import monotonic
 from types import FrameType
 from typing import Annotated
 
@@ -16,13 +17,16 @@ import tyro
 from imgcal.cli.common import check_folder
 from imgcal.errors import InputError
 
+PATIENCE = 2.0  # s, between two signals that are not one and the same
+
 
 @dataclass(frozen=True)
 class Train:
     """Train a network: writes OUT/model.safetensors, resolved.yaml, metrics.jsonl and TensorBoard's files.
 
     Ctrl-C saves the state first; so do steps on the way, and --resume goes on from there, with the same result.
-    Several processes: accelerate launch -m imgcal train ... Example: imgcal train table1-row01 --out out/row01
+    Several processes: accelerate launch -m imgcal train ... or torchrun --nproc-per-node 2 -m imgcal train ...
+    Example: imgcal train table1-row01 --out out/row01
     """
 
     experiment: Annotated[str, tyro.conf.Positional]  #: experiment file, or the name of a shipped experiment
@@ -63,12 +67,15 @@ class Train:
 
 @contextmanager
 def _asked_to_stop() -> Iterator[Callable[[], bool]]:
-    """Turn the first Ctrl-C or SIGTERM into a wish that can be asked for; a second one interrupts at once."""
-    asked: list[int] = []
+    """Turn Ctrl-C or SIGTERM into a wish that can be asked for; repeated after a while, it interrupts at once.
+
+    After a while, because a launcher of several processes passes on the Ctrl-C that they have had already.
+    """
+    asked: list[float] = []
 
     def note(number: int, frame: FrameType | None) -> None:
-        asked.append(number)
-        if len(asked) > 1:
+        asked.append(monotonic())
+        if asked[-1] - asked[0] > PATIENCE:
             raise KeyboardInterrupt
 
     before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}

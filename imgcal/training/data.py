@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
+from imgcal.evaluation.corruption import Corruption
 from imgcal.networks.prediction import Prediction, Views
 from imgcal.networks.rendering import ImageOptions, render_views
 from imgcal.objects import CalibrationObject
@@ -47,6 +48,7 @@ class Source:
     obj: CalibrationObject  # float32, on the training device
     drift: Drift
     pose_range: PoseRange
+    corruption: Corruption = Corruption()
     images: ImageOptions | None = None  # None = the network takes points
     canvas: dict[int, Tensor] = field(default_factory=dict)  # images that are drawn over, by number of rigs: CPU only
 
@@ -57,11 +59,13 @@ class Source:
     def show(self, made: Snapshots, generator: torch.Generator) -> Batch:
         """Make what the network sees of them. Images are valid until the next call."""
         truth = Prediction(made.rig, made.rig_from_object)
-        uv, seen = made.projection.uv, made.projection.visible
-        if self.images is None:
-            return Batch(Views(uv=uv, seen=seen), truth)
-        size = self.factory.image_size
-        images = render_views(uv, seen, size, self.obj, self.images, quantise=True, out=self._canvas(uv))
+        views, size = Views(uv=made.projection.uv, seen=made.projection.visible), self.factory.image_size
+        if not self.corruption.nothing:
+            views = self.corruption.apply(views, size, generator).views
+        if self.images is None or views.uv is None or views.seen is None:
+            return Batch(views, truth)
+        canvas = self._canvas(views.uv)
+        images = render_views(views.uv, views.seen, size, self.obj, self.images, quantise=True, out=canvas)
         return Batch(Views(images=images), truth)
 
     def _canvas(self, uv: Tensor) -> Tensor | None:

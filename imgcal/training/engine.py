@@ -14,6 +14,7 @@ from accelerate.utils import broadcast
 from torch import Tensor, nn
 
 from imgcal.errors import InputError, RefusedError
+from imgcal.evaluation.corruption import Corruption
 from imgcal.formats.safetensors_file import write_tensors
 from imgcal.losses import Loss, compound, images_of, reprojection_re
 from imgcal.networks.rendering import ImageOptions
@@ -142,7 +143,8 @@ def prepare(experiment: Experiment, folder: Path, resume: bool = False) -> Run:
         object_to(obj, device),
         experiment.drift.drift(),
         experiment.poses.pose_range(),
-        images=_image_options(experiment, network),
+        Corruption(**experiment.corruption.model_dump()),
+        _image_options(experiment, network),
     )
     seed = settings.seed * 4096 + accelerator.process_index
     torch.manual_seed(seed)

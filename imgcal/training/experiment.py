@@ -96,12 +96,12 @@ class ImagesConfig(StrictModel):
 
 
 class CorruptionConfig(StrictModel):
-    """What goes wrong in the views during training."""
+    """What goes wrong in the views during training: `imgcal.evaluation.corruption.Corruption`."""
 
     noise: Spread = 0.0  # pixels, one standard deviation of each axis
-    missing: Fraction = 0.0  # part of the fiducials
-    swapped: Fraction = 0.0  # part of the labels
-    false: Fraction = 0.0  # false blobs in place of this part of the missing fiducials
+    missing: Fraction = 0.0  # share of the fiducials that is not seen
+    swapped: Fraction = 0.0  # share of the seen whose label is another one's
+    false: Fraction = 0.0  # share of the seen that is found anywhere else
 
 
 class OptimizerConfig(StrictModel):

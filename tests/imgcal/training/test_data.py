@@ -1,6 +1,9 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
+from imgcal.evaluation.corruption import Corruption
 from imgcal.networks.rendering import ImageOptions
 from imgcal.training.data import Source, object_to
 
@@ -36,8 +39,17 @@ def test_the_generator_decides(source):
     assert not torch.equal(one.views.uv, other.views.uv)
 
 
+def test_views_are_corrupted_and_the_truth_is_not(source):
+    worse = replace(source, corruption=Corruption(noise=0.5, missing=0.3))
+    clean, made = batch(source, count=40), batch(worse, count=40)
+    assert torch.equal(made.truth.rig.focal_length, clean.truth.rig.focal_length)
+    assert 0.65 < made.views.seen.float().mean() < 0.75
+    error = (made.views.uv - clean.views.uv)[made.views.seen]
+    assert 0.45 < error.std() < 0.55
+
+
 def test_image_networks_get_images_only(experiment, source):
-    drawing = Source(source.factory, source.obj, source.drift, source.pose_range, ImageOptions(size=32, dot=1.0))
+    drawing = replace(source, images=ImageOptions(size=32, dot=1.0), canvas={})
     made = batch(drawing)
     assert made.views.uv is None
     assert made.views.images.shape == (3, 4, 3, 32, 32)
