@@ -17,6 +17,7 @@ from imgcal.errors import InputError
 from imgcal.formats import load_object, load_rig, save_object, save_rig
 from imgcal.formats.safetensors_file import read_tensors, read_texts, write_tensors
 from imgcal.formats.yaml_file import validated
+from imgcal.networks.rendering import ImageOptions
 from imgcal.objects import CalibrationObject
 from imgcal.rig import CameraRig
 from imgcal.training.experiment import Experiment
@@ -44,9 +45,19 @@ class Checkpoint:
 
 
 def build_network(experiment: Experiment, rig: CameraRig, obj: CalibrationObject) -> nn.Module:
-    """Make the untrained network of an experiment, with float32 factory values."""
+    """Make the untrained network of an experiment, with float32 factory values.
+
+    Raises:
+        InputError: the experiment says how to draw images, and its network takes points.
+    """
     single = torch.float32
-    return networks.build(experiment.network, rig.to(single), obj, experiment.drift.drift().std(rig).to(single))
+    spread = experiment.drift.drift().std(rig).to(single)
+    network: nn.Module = networks.build(experiment.network, rig.to(single), obj, spread)
+    if experiment.images is not None:
+        if network.image_options is None:
+            raise InputError(f"images: found this block, but the network {experiment.network.preset} takes points")
+        network.image_options = ImageOptions(**experiment.images.model_dump())  # type: ignore[assignment]
+    return network
 
 
 def save_network(

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic
-from typing import Any
+from typing import Any, cast
 
 import torch
 from accelerate import Accelerator
@@ -144,7 +144,7 @@ def prepare(experiment: Experiment, folder: Path, resume: bool = False) -> Run:
         experiment.drift.drift(),
         experiment.poses.pose_range(),
         Corruption(**experiment.corruption.model_dump()),
-        _image_options(experiment, network),
+        cast(ImageOptions | None, network.image_options),
     )
     seed = settings.seed * 4096 + accelerator.process_index
     torch.manual_seed(seed)
@@ -178,7 +178,7 @@ def train_step(run: Run) -> None:
     check_finite(run)  # the step before this one: its numbers are there by now
     batch = run.source.show(made, run.generator)
     run.optimizer.zero_grad(set_to_none=True)
-    with autocast(run):
+    with autocast(run.experiment, run.accelerator.device):
         predictions = run.network(batch.views)
     config, weights = run.experiment.loss, run.plain.parameters()
     loss = compound(predictions, batch.truth, run.source.obj, config, run.step, run.spread, weights)
@@ -192,10 +192,9 @@ def train_step(run: Run) -> None:
     _account(run, batch, loss, norm)
 
 
-def autocast(run: Run) -> torch.autocast:
-    """Autocast as the experiment says; the networks keep their geometry out of it."""
-    enabled = run.experiment.training.precision == "bf16"
-    return torch.autocast(run.accelerator.device.type, torch.bfloat16, enabled=enabled)
+def autocast(experiment: Experiment, device: torch.device) -> torch.autocast:
+    """Autocast as the experiment says, for networks only; they keep their geometry out of it."""
+    return torch.autocast(device.type, torch.bfloat16, enabled=experiment.training.precision == "bf16")
 
 
 def check_finite(run: Run) -> None:
@@ -220,14 +219,16 @@ def check_finite(run: Run) -> None:
 
 
 @torch.no_grad()
-def evaluate(network: nn.Module, batches: Iterable[Batch], obj: CalibrationObject) -> Tensor:
+def evaluate(network: nn.Module, batches: Iterable[Batch], obj: CalibrationObject, experiment: Experiment) -> Tensor:
     """RE of each rig of some batches, in pixels: (R,). Batches may be made one after the other."""
     was_training = network.training
     network.eval()
     errors = []
     for batch in batches:
-        predicted, truth = network(batch.views)[-1].cameras_from_object, batch.truth.cameras_from_object
-        errors.append(reprojection_re(images_of(predicted, obj) - images_of(truth, obj)))
+        with autocast(experiment, obj.points.device):
+            predicted = network(batch.views)[-1]
+        difference = images_of(predicted.cameras_from_object, obj) - images_of(batch.truth.cameras_from_object, obj)
+        errors.append(reprojection_re(difference))
     network.train(was_training)
     return torch.cat(errors)
 
@@ -239,8 +240,7 @@ def validate(run: Run, log: Log) -> None:
         return
     generator = torch.Generator(run.accelerator.device).manual_seed(VALIDATION_SEED)
     batches = (run.source.show(made, generator) for made in run.validation)
-    with autocast(run):
-        errors = evaluate(run.best_weights, batches, run.source.obj)
+    errors = evaluate(run.best_weights, batches, run.source.obj, run.experiment)
     mean, median = float(errors.mean()), float(errors.median())
     log.write({"step": run.step, "validation_re_px": mean, "validation_re_median_px": median})
     log.say_summary()
@@ -357,15 +357,6 @@ def _log(run: Run, log: Log, logged: tuple[int, float], seconds: float) -> tuple
 def _validation_rigs(source: Source, rigs: int, batch_size: int, device: torch.device) -> list[Snapshots]:
     generator = torch.Generator(device).manual_seed(VALIDATION_SEED)
     return [source.sample(min(batch_size, rigs - start), generator) for start in range(0, rigs, batch_size)]
-
-
-def _image_options(experiment: Experiment, network: nn.Module) -> ImageOptions | None:
-    options: Any = network.image_options
-    if experiment.images is None:
-        return options
-    if options is None:
-        raise InputError(f"images: found this block, but the network {experiment.network.preset} takes points")
-    return ImageOptions(**experiment.images.model_dump())
 
 
 def _announce(run: Run, log: Log) -> None:

@@ -171,6 +171,18 @@ def test_images_and_bf16(experiment, tmp_path, monkeypatch):
     assert rows[-1]["validation_re_px"] > 0
 
 
+def test_bf16_stays_out_of_the_errors(experiment, tmp_path):
+    run = train(experiment("training.precision=bf16", "training.steps=1"), tmp_path)
+    generator = torch.Generator().manual_seed(1)
+    batch = run.source.show(run.source.sample(5, generator), generator)
+
+    class Oracle(torch.nn.Module):
+        def forward(self, views):
+            return (batch.truth,)
+
+    assert engine.evaluate(Oracle(), [batch], run.source.obj, run.experiment).max() < 1e-3
+
+
 def test_images_for_a_point_network_are_an_error(experiment, tmp_path):
     with pytest.raises(InputError, match="the network points takes points"):
         train(experiment("images={size: 32}"), tmp_path / "new")
