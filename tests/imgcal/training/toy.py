@@ -1,5 +1,6 @@
 """Tiny networks with the interface of the real ones; `python -m tests.imgcal.training.toy train ...` trains them."""
 
+import torch
 from torch import nn
 
 from imgcal import networks
@@ -59,6 +60,7 @@ class Toy(nn.Module):
             inputs = nn.functional.adaptive_avg_pool2d(views.images.flatten(1, 2), 2).flatten(1)
         return tuple(self.decoded(self.head(self.trunk(scale * inputs)).float()) for scale in (0.5, 1.0))
 
+    @torch.autocast("cpu", enabled=False)
     def decoded(self, numbers):
         steps = numbers[:, :-9].unflatten(1, (self.factory.cameras, PARAMETERS)) * self.spread
         sixd = numbers[:, -9:-3] + numbers.new_tensor([1.0, 0, 0, 0, -1, 0])
