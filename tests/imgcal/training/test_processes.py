@@ -71,7 +71,7 @@ def two_processes(tmp_path, *arguments):
         command = [sys.executable, "-m", TOY, "train", str(tmp_path / "toy.yaml"), *arguments]
         process = subprocess.Popen(command, env=environment(**ranks, **where), cwd=ROOT, stderr=subprocess.PIPE)
         processes.append(process)
-    errors = [process.communicate(timeout=60)[1].decode() for process in processes]
+    errors = [process.communicate(timeout=120)[1].decode() for process in processes]
     assert [process.returncode for process in processes] == [0, 0], errors
     return errors
 
