@@ -1,0 +1,228 @@
+"""Render-and-compare: the rig whose colour-coded images are the given ones, without detected points."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from imgcal.errors import InputError
+from imgcal.estimation import Estimate, EstimationOptions, estimate
+from imgcal.estimation.estimate import make_problem
+from imgcal.networks.prediction import Prediction
+from imgcal.networks.rendering import LEVELS, ImageOptions
+from imgcal.objects import CalibrationObject
+from imgcal.observations import Observations
+from imgcal.refinement.photometric import DotWindows, NearFit, ShiftPrior, blurred_step
+from imgcal.rig import CameraRig
+
+PRESENT = 0.5  # amplitude above which a dot counts as there
+FARTHEST = 1e3  # image widths beyond which a predicted pixel is as good as any other
+# Floats of a chunk's largest temporary: what a processor's cache holds, and what a GPU has room for.
+CHUNK = {"cpu": 1_000_000, "cuda": 200_000_000}
+FLOATS_A_PAIR = 52  # of that temporary, for each channel of each pair of dots: 4 products a row of 13
+
+
+@dataclass(frozen=True)
+class ImageRefinementOptions:
+    """How images are compared. Lengths in pixels of the image, brightness in grey levels of 8 bit."""
+
+    image: ImageOptions = ImageOptions()
+    blurs: tuple[float, ...] = (16.0, 8.0, 8.0, 4.0, 2.0, 1.0)  # standard deviations, one step each, far to near
+    shift: ShiftPrior = ShiftPrior(together=8.0, alone=2.0)  # of the dots, in each blurred step
+    trust: float = 0.1  # see `photometric.blurred_step`
+    pooling: int = 4  # pixels, each way, that are averaged before blurred steps
+    steps: int = 3  # near steps
+    rounds: int = 4  # at most, of steps and an estimate; all but the first only for rigs not yet confirmed
+    noise: float = 12**-0.5  # grey levels, one standard deviation; that of rounding to 8 bit
+    position_noise: float = 0.0  # sensor pixels: how far drawn dots are from where the fiducials were
+    most_residual: float = 2.0  # grey levels, RMS in a dot's window, beyond which the dot is not believed
+    most_chi2: float = 5.0  # per degree of freedom, beyond which a rig has not converged
+    estimation: EstimationOptions = EstimationOptions()
+
+
+@torch.no_grad()
+def refine_images(
+    prediction: Prediction,
+    images: Tensor,
+    factory: CameraRig,
+    obj: CalibrationObject,
+    spread: Tensor,
+    options: ImageRefinementOptions = ImageRefinementOptions(),
+) -> tuple[Estimate, Observations]:
+    """Refine a network's prediction on the images that it has seen: photometric Gauss-Newton, then MAP.
+
+    Each image is compared with rendered dots, blurred at first and sharp at last, every camera on its own, which gives
+    the dots' places and how well they are known; the most probable rig follows from those. Rigs that the images do not
+    confirm are tried again from there.
+
+    Args:
+        prediction: (B,) first guess.
+        images: (B, C, 3, size, size) in [0, 1] as `render_views` draws them.
+        factory: the factory rig, the centre of the prior.
+        obj: N fiducials in their colours.
+        spread: (C, 15) or (B, C, 15) standard deviation of each factory value.
+        options: how to compare.
+
+    Returns:
+        The estimate, one snapshot a rig, in float64 and in sensor pixels, and the dots that it was found from.
+        `converged` is false where the images are not explained: residuals too large, light where no dot is, or a rig
+        too improbable for its dots (`chi2_per_dof`).
+
+    Raises:
+        InputError: images of another shape than the options and the rig say.
+    """
+    _check(images, factory, options)
+    problem = _ImageProblem(factory.to(torch.float64), obj, spread.double(), options)
+    guess = prediction.detach().to(torch.float64)
+    guess = Prediction(guess.rig.resized(problem.size), guess.rig_from_object)
+    dots = problem.look(images, guess)
+    result = problem.solve(dots, guess)
+    for attempt in range(1, options.rounds):
+        again = (~result.converged).nonzero().squeeze(-1)
+        if len(again) == 0:
+            break
+        found = Prediction(result.rig, result.rig_from_object[:, 0])
+        # From near first: the rig mostly knows where dots are that its cameras have taken for each other.
+        known = dots.select(again) if attempt % 2 else None
+        there = Prediction(found.rig[again], found.rig_from_object[again])
+        dots = dots.updated(again, problem.look(images[again], there, known))
+        result = problem.solve(dots, found)
+    return problem.on_sensor(result, dots)
+
+
+@dataclass(frozen=True)
+class _Dots:
+    """What images show, in pixels of the image."""
+
+    uv: Tensor  # (B, C, N, 2)
+    sigma: Tensor  # (B, C, N)
+    amplitude: Tensor  # (B, C, N) about 1 where there is such light, 0 where there is not
+    believed: Tensor  # (B, C, N) bool
+    light: Tensor  # (B, C) of all channels, in dots of a channel of 1
+
+    def select(self, rows: Tensor) -> _Dots:
+        """Keep some rigs."""
+        return _Dots(**{name: value[rows] for name, value in vars(self).items()})
+
+    def updated(self, rows: Tensor, new: _Dots) -> _Dots:
+        """Replace some rigs."""
+        return _Dots(**{name: value.index_copy(0, rows, getattr(new, name)) for name, value in vars(self).items()})
+
+
+class _ImageProblem:
+    """The factory rig as it would be if the images were what its sensors deliver.
+
+    There, one standard deviation holds for both axes of a dot; on a sensor that is not square it does not. Whitened
+    parameters are the same in both, and so is everything in the normal equations.
+    """
+
+    def __init__(
+        self, factory: CameraRig, obj: CalibrationObject, spread: Tensor, options: ImageRefinementOptions
+    ) -> None:
+        """Take float64; predictions given to the other methods are for images, too."""
+        self.factory, self.obj, self.spread, self.options = factory, obj, spread, options
+        self.size = torch.full((2,), options.image.size, device=spread.device)
+        self.rig = factory.resized(self.size)
+        self.scale = options.image.size / factory.image_size.to(spread)  # (C, 2) image pixels a sensor pixel
+        self.unit = self.scale.prod(-1).sqrt()[:, None]  # (C, 1) the same, mean of both axes
+        units = torch.ones_like(spread)
+        units[..., 6:10] = torch.cat((self.scale, self.scale), -1)
+        self.image_spread = spread * units
+        self.points = obj.points.to(spread)
+        self.colours = obj.colours.to(spread.device, torch.float32)
+
+    def look(self, images: Tensor, guess: Prediction, known: _Dots | None = None) -> _Dots:
+        """Find the dots of images (B, C, 3, H, W) near where a prediction puts them, or near where they are known."""
+        options, size = self.options, self.options.image.size
+        flat, batch = images.flatten(0, 1), images.shape[:2]
+        radius = None if self.obj.radius is None else self.obj.radius.to(self.points)
+        uv = guess.rig.project(guess.rig_from_object.apply(self.points), radius).uv
+        uv = uv.nan_to_num(size / 2).clamp(-FARTHEST * size, FARTHEST * size)
+        if known is None:
+            uv, amplitude, light = (part.unflatten(0, batch) for part in self._far(flat, uv.flatten(0, 1)))
+        else:
+            uv = torch.where(known.believed[..., None], known.uv, uv)
+            amplitude, light = known.amplitude, known.light
+        steps = options.steps if known is None else 2 * options.steps
+        present = amplitude > PRESENT
+        fit = self._near(flat, uv.flatten(0, 1), present.flatten(0, 1), steps)
+        uv, variance, mean_square = (part.unflatten(0, batch) for part in (fit.uv, fit.variance, fit.mean_square))
+        noise = mean_square.clamp_min((options.noise / LEVELS) ** 2)
+        sigma = (variance * noise + (options.position_noise * self.unit) ** 2).sqrt()
+        inside = ((uv > -0.5) & (uv < size - 0.5)).all(-1)
+        explained = mean_square < (options.most_residual / LEVELS) ** 2
+        return _Dots(uv, sigma, amplitude, present & inside & explained & sigma.isfinite(), light)
+
+    def _far(self, flat: Tensor, uv: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Take blurred steps: places (M, N, 2), amplitudes (M, N) and the light of each image (M,)."""
+        options, pool = self.options, self.options.pooling
+        pooled, dot = _pooled(flat, pool), options.image.dot / pool
+        shift, amplitude = options.shift.scaled(1 / pool), uv.new_ones(uv.shape[:-1])
+        near = ((uv + 0.5) / pool - 0.5).to(self.colours)
+        for blur in options.blurs:
+            step, amplitude = blurred_step(pooled, near, self.colours, dot, blur / pool, shift, options.trust)
+            near = near + step
+        return (near.to(uv) + 0.5) * pool - 0.5, amplitude, pooled.sum((1, 2, 3)) / (2 * math.pi * dot**2)
+
+    def _near(self, flat: Tensor, uv: Tensor, present: Tensor, steps: int) -> NearFit:
+        """Take near steps, as many images at a time as their temporaries leave room for."""
+        floats = self.colours.numel() * len(self.colours) * FLOATS_A_PAIR
+        count = max(1, CHUNK[flat.device.type] // floats)
+        parts = zip(flat.split(count), uv.split(count), present.split(count), strict=True)
+        dot = self.options.image.dot
+        fits = [DotWindows(some, at, self.colours, dot).fit(at, there, steps) for some, at, there in parts]
+        return fits[0] if len(fits) == 1 else NearFit(*(torch.cat(column) for column in zip(*fits, strict=True)))
+
+    def solve(self, dots: _Dots, guess: Prediction) -> Estimate:
+        """Find the rig (for images) that explains the dots; `converged` where images and prior confirm it."""
+        result = estimate(
+            Observations(dots.uv.unsqueeze(1), dots.sigma.unsqueeze(1), dots.believed.unsqueeze(1)),
+            self.rig,
+            self.obj,
+            guess.rig_from_object.reshape(-1, 1),
+            spread=self.image_spread,
+            first_guess=guess.rig,
+            options=self.options.estimation,
+        )
+        brightness = self.colours.sum(-1)
+        stray = dots.light - (dots.believed * brightness).sum(-1)  # saturation and borders only make it smaller
+        explained = (stray < PRESENT * brightness.min()).all(-1) & (result.chi2_per_dof < self.options.most_chi2)
+        return replace(result, converged=result.converged & explained)
+
+    def on_sensor(self, result: Estimate, dots: _Dots) -> tuple[Estimate, Observations]:
+        """Take an estimate for images, and what it is from, to the sensors' pixels."""
+        observations = Observations(
+            self.options.image.to_sensor(dots.uv, self.factory.image_size).unsqueeze(1),
+            (dots.sigma / self.unit).unsqueeze(1),
+            dots.believed.unsqueeze(1),
+        )
+        sensor = replace(
+            result,
+            rig=result.rig.resized(self.factory.image_size),
+            residual=result.residual / self.scale[:, None],
+            problem=make_problem(observations, self.factory, self.obj, self.spread),
+        )
+        return sensor, observations
+
+
+def _pooled(images: Tensor, pool: int) -> Tensor:
+    """Mean over squares of pixels: (M, K, H, W) -> (M, K, H / pool, W / pool), float32."""
+    rows = images[:, :, ::pool].float()
+    for row in range(1, pool):  # slices: several times faster than a sum over a short axis
+        rows = rows + images[:, :, row::pool]
+    width = images.shape[-1]
+    average = torch.eye(width // pool, device=images.device).repeat_interleave(pool, 0) / pool**2
+    return rows @ average
+
+
+def _check(images: Tensor, factory: CameraRig, options: ImageRefinementOptions) -> None:
+    size = options.image.size
+    if size % options.pooling:
+        raise InputError(f"image size: found {size}, expected a multiple of the {options.pooling} pixels of pooling")
+    if images.ndim != 5 or images.shape[1:] != (factory.cameras, 3, size, size):
+        raise InputError(
+            f"images: found shape {tuple(images.shape)}, expected (rigs, {factory.cameras}, 3, {size}, {size})"
+        )

@@ -1,0 +1,217 @@
+"""Photometric normal equations of colour-coded dots: what images say about moving each dot.
+
+A dot is an outer product (colour x profile down x profile across), so products of images of dots are products of short
+one-dimensional sums. From afar (`blurred_step`) no image is rendered at all; from near (`DotWindows`) small windows are,
+because only there overlapping dots that saturate can be told from others.
+
+Axes: M images (rigs times cameras), N dots, K channels, H, W image, w side of a window.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from renderers.compositing import window_starts
+
+AMPLITUDE_RIDGE = 0.1  # how strongly a dot is believed to be there before the image is looked at
+WINDOW_SIGMAS = 3.5  # beyond it a dot is darker than half a grey level of 8 bit
+WINDOW_MARGIN = 0.75  # pixels that a dot may move in its window
+DAMPING = 1e-3  # relative addition to the diagonal of near normal equations
+
+
+@dataclass(frozen=True)
+class ShiftPrior:
+    """How far dots may be from where they are predicted: pixels, one standard deviation of each axis."""
+
+    together: float  # all dots of an image alike
+    alone: float  # each dot on its own
+
+    def precision(self, like: Tensor) -> Tensor:
+        """Inverse covariance of all u and all v of N dots, for colours (N, K) that give dtype and device: (2N, 2N)."""
+        count, alone, together = len(like), self.alone**2, self.together**2
+        one_axis = (torch.eye(count).to(like) - together / (alone + count * together)) / alone
+        return torch.block_diag(one_axis, one_axis)
+
+    def scaled(self, factor: float) -> ShiftPrior:
+        """Change the unit of length."""
+        return ShiftPrior(self.together * factor, self.alone * factor)
+
+
+def blurred_step(
+    images: Tensor, uv: Tensor, colours: Tensor, dot: float, blur: float, prior: ShiftPrior, trust: float
+) -> tuple[Tensor, Tensor]:
+    """Take one Gauss-Newton step of all dots at once towards the images, both blurred.
+
+    The blur is applied to the profiles instead of the images: a product with a blurred image is a product of the image
+    with a blurred profile. Amplitudes are solved for first, so that dots that are missing pull at nothing.
+
+    Args:
+        images: (M, K, H, W).
+        uv: (M, N, 2) pixels where dots are predicted, finite.
+        colours: (N, K).
+        dot: standard deviation of a dot, pixels.
+        blur: standard deviation of the blur, pixels.
+        prior: how far the dots may be from the prediction.
+        trust: share of a blurred dot's width to which its place in the blurred image is believed, against the prior.
+
+    Returns:
+        (M, N, 2) step in pixels, and (M, N) amplitude: about 1 where a dot is found, about 0 where it is missing.
+    """
+    height, width = images.shape[-2:]
+    count = len(colours)
+    model, match = math.hypot(dot, blur), math.sqrt(dot**2 + 2 * blur**2)
+    u, v = (_gram(*profile_and_slope(uv[..., i], model, size)) for i, size in ((0, width), (1, height)))
+    alike = colours @ colours.mT
+    overlap = alike * u.value * v.value
+
+    across = torch.cat(profile_and_slope(uv[..., 0], match, width), 1).mT  # (M, W, 2N)
+    value_v, slope_v = (part.mT for part in profile_and_slope(uv[..., 1], match, height))  # (M, H, N)
+    rows = torch.bmm(images.flatten(1, 2), across).unflatten(1, images.shape[1:3])  # (M, K, H, 2N)
+    of_value, of_slope = (rows.unflatten(-1, (2, count)) * colours.mT[:, None, None]).sum(1).unbind(-2)  # (M, H, N)
+    scale = model**4 / (dot * match) ** 2
+    light = scale * (of_value * value_v).sum(1)
+    by_u, by_v = scale * (of_slope * value_v).sum(1), scale * (of_value * slope_v).sum(1)
+
+    ridge = AMPLITUDE_RIDGE * math.pi * model**2 * alike.diagonal()
+    amplitude = torch.linalg.solve(overlap + torch.diag(ridge), light + ridge).clamp(0, 1)
+    by_u = by_u - (alike * u.cross.mT * v.value @ amplitude[..., None]).squeeze(-1)
+    by_v = by_v - (alike * u.value * v.cross.mT @ amplitude[..., None]).squeeze(-1)
+    pull = torch.cat((amplitude * by_u, amplitude * by_v), -1)
+    uv_block = alike * u.cross.mT * v.cross
+    hessian = _blocks(alike * u.slope * v.value, uv_block, uv_block.mT, alike * u.value * v.slope)
+    both = torch.cat((amplitude, amplitude), -1)
+    hessian = hessian * both[:, :, None] * both[:, None]
+    stiffness = math.pi / 2 * (trust * model) ** 2 * prior.precision(colours)
+    step = torch.linalg.solve(hessian + stiffness, pull)
+    return step.unflatten(1, (2, count)).mT, amplitude
+
+
+class NearFit(NamedTuple):
+    """Places of dots after some near steps, and what is known about them."""
+
+    uv: Tensor  # (M, N, 2) pixels
+    variance: Tensor  # (M, N) square pixels of each axis where a channel's noise has variance 1
+    mean_square: Tensor  # (M, N) residual of the last step's start, over the pixels and channels of each window
+
+
+class DotWindows:
+    """Windows of images around predicted dots, cut out once and compared with rendered dots again and again."""
+
+    def __init__(self, images: Tensor, uv: Tensor, colours: Tensor, dot: float) -> None:
+        """Cut the windows out.
+
+        Args:
+            images: (M, K, H, W).
+            uv: (M, N, 2) pixels, finite; what is outside the image gets the nearest window.
+            colours: (N, K), dtype of the computation.
+            dot: standard deviation of a dot, pixels.
+        """
+        height, width = images.shape[-2:]
+        self.colours, self.dot = colours, dot
+        self.side = min(2 * math.ceil(WINDOW_SIGMAS * dot + WINDOW_MARGIN) + 1, height, width)
+        starts = [window_starts(uv[..., i], self.side, size) for i, size in ((0, width), (1, height))]
+        self.start = torch.stack(starts, -1)  # (M, N, 2) first column and row
+        offsets = torch.arange(self.side, device=uv.device)
+        index = (starts[1][..., None] + offsets)[..., None] * width + (starts[0][..., None] + offsets)[..., None, :]
+        channels = images.shape[1]
+        pixels = images.flatten(2).gather(2, index.flatten(1)[:, None].expand(-1, channels, -1))
+        self.windows = pixels.unflatten(2, index.shape[1:]).transpose(1, 2).contiguous().to(colours)  # (M, N, K, w, w)
+
+    def fit(self, uv: Tensor, present: Tensor, steps: int) -> NearFit:
+        """Take Gauss-Newton steps, the last with the Hessian of the one before: the dots hardly move any more.
+
+        Args:
+            uv: (M, N, 2) pixels to start from.
+            present: (M, N) bool: dots that are there.
+            steps: at least 1.
+        """
+        count = len(self.colours)
+        for step in range(steps):
+            pull, mean_square, render = self._compare(uv, present)
+            if step == 0 or step < steps - 1:
+                hessian = self._hessian(*render)
+                diagonal = hessian.diagonal(dim1=1, dim2=2)
+                factor, _ = torch.linalg.cholesky_ex(hessian + torch.diag_embed(DAMPING * diagonal + (diagonal == 0)))
+            change = torch.cholesky_solve(pull[..., None], factor).squeeze(-1)
+            uv = uv + change.unflatten(1, (2, count)).mT.clamp(-1, 1).to(uv)
+        variance = torch.cholesky_inverse(factor).diagonal(dim1=1, dim2=2).unflatten(1, (2, count)).mean(1)
+        return NearFit(uv, variance.to(uv), mean_square.to(uv))
+
+    def _compare(self, uv: Tensor, present: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:
+        """Render all dots in all windows.
+
+        Returns:
+            Minus the gradient (M, 2N), the mean squared residual (M, N), and for `_hessian` the profiles across and
+            down (M, N windows, N dots, 2, w), value and slope, and where light may still grow (M, N, K, w, w).
+        """
+        colours = self.colours
+        # Relative to the window before the precision is lowered.
+        centre = (uv[:, None] - self.start[:, :, None]).to(colours)  # (M, N windows, N dots, 2)
+        both = torch.stack(profile_and_slope(centre, self.dot, self.side), -2)  # (M, N, N, 2 axes, 2, w)
+        across, down = (both * present.to(colours)[:, None, :, None, None, None]).unbind(3)
+        coloured = colours.mT[:, None] * down[..., 0, :].mT[:, :, None]  # (M, N, K, w, N)
+        model = (coloured.flatten(2, 3) @ across[..., 0, :]).unflatten(2, (-1, self.side))
+        free = (model < 1).to(model.dtype)
+        residual = self.windows - model.clamp_max(1)
+        own_across, own_down = self._own(across), self._own(down)
+        rows = ((residual * free).flatten(2, 3) @ own_across.mT).unflatten(2, (-1, self.side))  # (M, N, K, w, 2)
+        products = ((own_down[:, :, None] @ rows) * colours[..., None, None]).sum(2)  # (M, N, 2 down, 2 across)
+        pull = torch.cat((products[..., 0, 1], products[..., 1, 0]), -1)
+        return pull, residual.square().mean((2, 3, 4)), (across, down, free)
+
+    def _hessian(self, across: Tensor, down: Tensor, free: Tensor) -> Tensor:
+        """Gauss-Newton Hessian (M, 2N, 2N) from the windows: row n counts the pixels of window n."""
+        count = len(self.colours)
+        along = self._own(across)[:, :, None, :, None] * across[:, :, :, None]  # (M, N, N, 2 own, 2 other, w)
+        below = self._own(down)[:, :, None, :, None] * down[:, :, :, None]
+        rows = free.flatten(2, 3) @ along.flatten(2, 4).mT  # (M, N, K w, 4N)
+        rows = rows.unflatten(2, (-1, self.side)).unflatten(-1, (count, 4))
+        # Slope across goes with value down, and the other way round.
+        columns = below.flatten(3, 4).flip(3).permute(0, 1, 4, 2, 3)[:, :, None]  # (M, N, 1, w, N, 4)
+        pairs = self.colours[:, :, None] * self.colours.mT  # (N, K, N)
+        blocks = ((rows * columns).sum(3) * pairs[..., None]).sum(2)  # (M, N, N, 4): vv, vu, uv, uu
+        vv, vu, uv, uu = blocks.unbind(-1)
+        hessian = _blocks(uu, uv, vu, vv)
+        return 0.5 * (hessian + hessian.mT)
+
+    def _own(self, profiles: Tensor) -> Tensor:
+        """Of profiles of all dots in all windows, those of each window's own dot: (M, N, 2, w)."""
+        return profiles.diagonal(dim1=1, dim2=2).movedim(-1, 1)
+
+
+def profile_and_slope(centre: Tensor, size: float, length: int) -> tuple[Tensor, Tensor]:
+    """Integrate a Gaussian of peak 1 over neighbouring pixels, and differentiate that by its centre.
+
+    Args:
+        centre: (...) pixels from the first one's centre.
+        size: standard deviation, pixels.
+        length: number of pixels.
+
+    Returns:
+        Twice (..., length).
+    """
+    edges = torch.arange(length + 1, dtype=centre.dtype, device=centre.device) - 0.5 - centre[..., None]
+    scaled = edges * (1 / (math.sqrt(2) * size))
+    value = (math.sqrt(math.pi / 2) * size) * torch.erf(scaled).diff(dim=-1)
+    return value, -torch.exp(-scaled.square()).diff(dim=-1)
+
+
+@dataclass(frozen=True)
+class _Gram:
+    value: Tensor  # (M, N, N) <g_n, g_m>
+    cross: Tensor  # (M, N, N) <g_n, g'_m>
+    slope: Tensor  # (M, N, N) <g'_n, g'_m>
+
+
+def _gram(value: Tensor, slope: Tensor) -> _Gram:
+    return _Gram(value @ value.mT, value @ slope.mT, slope @ slope.mT)
+
+
+def _blocks(uu: Tensor, uv: Tensor, vu: Tensor, vv: Tensor) -> Tensor:
+    """Put blocks (M, N, N) together: (M, 2N, 2N), all u first."""
+    return torch.cat((torch.cat((uu, uv), 2), torch.cat((vu, vv), 2)), 1)

@@ -1,0 +1,59 @@
+"""Network, then MAP: the rig that best explains labelled points, found from a network's first guess."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from imgcal.estimation import Estimate, EstimationOptions, estimate
+from imgcal.networks.prediction import Prediction, Views
+from imgcal.objects import CalibrationObject
+from imgcal.observations import Observations
+from imgcal.rig import CameraRig
+
+
+def refine_points(
+    prediction: Prediction,
+    views: Views,
+    factory: CameraRig,
+    obj: CalibrationObject,
+    spread: Tensor,
+    sigma: Tensor | float,
+    options: EstimationOptions = EstimationOptions(),
+) -> Estimate:
+    """Refine a network's prediction on the points that it has seen.
+
+    In float64 whatever the network's precision. Differentiable in uv, sigma (per-observation weights), the factory rig
+    and the spread by the implicit function theorem; not in the prediction, which is only where the search starts.
+
+    Args:
+        prediction: (B,) first guess.
+        views: (B, C, N) points in pixels; `seen` None = all.
+        factory: the factory rig, the centre of the prior.
+        obj: N fiducials.
+        spread: (C, 15) or (B, C, 15) standard deviation of each factory value.
+        sigma: pixels, a number or broadcastable to (B, C, N): one standard deviation of each axis.
+        options: how to minimize.
+
+    Returns:
+        The estimate, one snapshot a rig; `converged` says which to believe.
+
+    Raises:
+        ValueError: views without points.
+        InputError: shapes that do not belong together.
+    """
+    if views.uv is None:
+        raise ValueError("refine_points needs views with points")
+    uv = views.uv.double().unsqueeze(1)  # (B, 1, C, N, 2)
+    seen = torch.ones_like(uv[..., 0], dtype=torch.bool) if views.seen is None else views.seen.unsqueeze(1)
+    sigmas = torch.as_tensor(sigma, dtype=uv.dtype, device=uv.device).expand(*seen[:, 0].shape).unsqueeze(1)
+    guess = prediction.detach().to(torch.float64)
+    return estimate(
+        Observations(uv, sigmas, seen),
+        factory.to(torch.float64),
+        obj,
+        guess.rig_from_object.reshape(len(uv), 1),
+        spread=spread.double(),
+        first_guess=guess.rig,
+        options=options,
+    )
