@@ -67,26 +67,37 @@ def detect_snapshot(
             return detect_snapshot(frames, options, masks=masks, pool=own_pool)
     present = [(camera, name) for camera, name in enumerate(frames) if frames[name] is not None]
     images = [checked_frame(frames[name], name) for _, name in present]
-    scales = [full_scale(image, options.bit_depth, name) for image, (_, name) in zip(images, present, strict=True)]
-    if not images:
-        return Blobs(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0, np.uint8), np.zeros(0, np.int64))
-    # Whole frames are read in parallel (OpenCV releases the interpreter), what stands out is handled as one batch.
-    screenings = list(pool.map(screen, images, [options] * len(images), scales))
-    blobs = measure(images, outline(images, screenings, options, scales), options, scales)
-    for index, (image, (_, name)) in enumerate(zip(images, present, strict=True)):
-        if masks is not None and name in masks:
-            rows = np.flatnonzero(blobs.camera == index)
-            blobs.flags[rows[_inside(checked_mask(masks[name], image, name), blobs.uv[rows])]] |= np.uint8(
-                BlobFlag.MASKED
-            )
-    order = np.argsort(blobs.camera, kind="stable")
-    camera = np.array([camera for camera, _ in present])[blobs.camera[order]]
-    return Blobs(blobs.uv[order], blobs.sigma[order], blobs.radius[order], blobs.flags[order], camera)
+    covered = [
+        None if masks is None or name not in masks else checked_mask(masks[name], image, name)
+        for image, (_, name) in zip(images, present, strict=True)
+    ]
+    names = [name for _, name in present]
+    # OpenCV and the compiled functions release the interpreter: frames are worked on in parallel.
+    found = list(pool.map(_detect_one, images, names, covered, [options] * len(images)))
+    camera = np.repeat([camera for camera, _ in present], [len(blobs.uv) for blobs in found]).astype(np.int64)
+    return Blobs(
+        np.concatenate([np.zeros((0, 2)), *(blobs.uv for blobs in found)]),
+        np.concatenate([np.zeros(0), *(blobs.sigma for blobs in found)]),
+        np.concatenate([np.zeros(0), *(blobs.radius for blobs in found)]),
+        np.concatenate([np.zeros(0, np.uint8), *(blobs.flags for blobs in found)]),
+        camera,
+    )
 
 
 def detect_frame(frame: Frame, options: DetectionOptions, mask: Mask | None = None) -> Blobs:
     """Detect the blobs of one frame (H, W)."""
     return detect_snapshot({"frame": frame}, options, masks=None if mask is None else {"frame": mask})
+
+
+def _detect_one(frame: Frame, name: str, mask: NDArray[np.bool_] | None, options: DetectionOptions) -> Blobs:
+    """Detect the blobs of one checked frame; their camera is 0."""
+    scale = full_scale(frame, options.bit_depth, name)
+    contiguous = frame if frame.flags.c_contiguous else frame.copy()
+    candidates = outline(contiguous, screen(contiguous, options, scale), options, scale)
+    blobs = measure(contiguous, candidates, options, scale)
+    if mask is not None:
+        blobs.flags[_inside(mask, blobs.uv)] |= np.uint8(BlobFlag.MASKED)
+    return blobs
 
 
 def _inside(mask: NDArray[np.bool_], uv: NDArray[np.float64]) -> NDArray[np.bool_]:

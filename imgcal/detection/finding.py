@@ -1,5 +1,9 @@
 """Where the blobs are: candidate components, found on block means so that each frame is read once."""
 
+# Compiled functions take their types from their arguments.
+# ruff: noqa: ANN001, ANN202
+# mypy: allow-untyped-defs, no-check-untyped-defs
+
 from __future__ import annotations
 
 import math
@@ -8,6 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from cv2.typing import MatLike
+from numba import njit
 from numpy.typing import NDArray
 
 from imgcal.detection.options import DetectionOptions, Frame
@@ -16,6 +21,7 @@ BLOCK = 4  # px, side of a block; a 4 x 4 mean is close to the matched filter of
 NOISE_FACTOR = 5.0  # candidates stand out of the block means by this many standard deviations
 LEAST_CONTRAST = 0.006  # of full scale: below this, block means tell quantization steps rather than blobs
 LEVELS = 5  # components that are too large are tried again at higher levels
+LEVEL_STEP = 1.6  # from one level to the next
 EDGE = 0.3  # of the level: what the blocks at the edge of a blob hold
 PEAK_FRACTION = 0.3  # of the local peak: keeps the skirts of neighbours apart
 
@@ -24,7 +30,7 @@ PEAK_FRACTION = 0.3  # of the local peak: keeps the skirts of neighbours apart
 class Screening:
     """Blocks of one frame that stand out of its background."""
 
-    blocks: NDArray[np.int64]  # (K,) flat indices of blocks
+    blocks: NDArray[np.int64]  # (K,) flat indices of blocks, ascending
     base: NDArray[np.floating]  # (K,) grey levels of the background
     excess: NDArray[np.floating]  # (K,) grey levels above the base that a pixel of a blob exceeds
     shape: tuple[int, int]  # blocks in a column and in a row of the frame
@@ -32,18 +38,12 @@ class Screening:
 
 @dataclass(frozen=True)
 class Candidates:
-    """Connected bright components of several frames."""
+    """Connected bright components of one frame. Their pixels are kept as tiles, one a block that holds any."""
 
-    mask: NDArray[np.uint8]  # (R, W) 255 on the components: the rows that hold any, of all frames below each other
-    rows: list[NDArray[np.int64]]  # (H,) of each frame: row of the mask that stands for a row of the frame, 0 = empty
-    frame: NDArray[np.int64]  # (K,) which frame
-    boxes: NDArray[np.int64]  # (K, 4) left, top, right, bottom pixel (included)
-    seeds: NDArray[np.int64]  # (K, 2) one pixel (u, v) of each component
-
-    @property
-    def centres(self) -> NDArray[np.int64]:
-        """Middle pixels of the boxes: (K, 2)."""
-        return (self.boxes[:, :2] + self.boxes[:, 2:]) // 2
+    tile: NDArray[np.int32]  # (R + 2, Q + 2) tile of each block, 0 = empty; one empty block around the frame
+    labels: NDArray[np.int32]  # (K + 1, 4, 4) component of each pixel of a tile, 0 = none
+    boxes: NDArray[np.int64]  # (M, 4) left, top, right, bottom pixel (included)
+    label: NDArray[np.int32]  # (M,) number of the component in `labels`
 
 
 def screen(frame: Frame, options: DetectionOptions, scale: int) -> Screening:
@@ -71,39 +71,32 @@ def screen(frame: Frame, options: DetectionOptions, scale: int) -> Screening:
     return Screening(blocks, background.ravel()[blocks] + floor, excess, (means.shape[0], means.shape[1]))
 
 
-def outline(
-    frames: list[Frame], screenings: list[Screening], options: DetectionOptions, scales: list[int]
-) -> Candidates:
-    """Outline the components of several frames at once; those too large are tried again at higher levels."""
-    heights = np.array([screening.shape[0] + 1 for screening in screenings])  # an empty row between frames
-    first = np.cumsum(heights) - heights
-    columns = max(screening.shape[1] for screening in screenings)
-    blocks = np.concatenate([screening.blocks for screening in screenings])
-    counts = [len(screening.blocks) for screening in screenings]
-    row, column = np.divmod(blocks, np.repeat([screening.shape[1] for screening in screenings], counts))
-    row += np.repeat(first, counts)
-    mask_rows = _mask_rows(row, int(heights.sum()))
-    row = mask_rows[row]
-    mask = np.zeros(((mask_rows.max() + 2) * BLOCK, columns * BLOCK), np.uint8)
-    tiles = mask.reshape(-1, BLOCK, columns, BLOCK)
-    base = np.concatenate([screening.base for screening in screenings])
-    excess = np.concatenate([screening.excess for screening in screenings])
-    smooth = _smooth_pixels(frames, screenings, scales if options.polarity == "dark" else None)
-    contours: list[MatLike] = []
+def outline(frame: Frame, screening: Screening, options: DetectionOptions, scale: int) -> Candidates:
+    """Connect the bright pixels of the screened blocks; components too large are tried again at higher levels.
+
+    Args:
+        frame: (H, W) grey values, contiguous.
+        screening: of this frame.
+        options: polarity and radii.
+        scale: largest grey value, for the inversion of dark blobs.
+    """
+    count = len(screening.blocks)
+    tile = np.zeros((screening.shape[0] + 2, screening.shape[1] + 2), np.int32)
+    smooth = _smooth_tiles(frame, screening.blocks, tile, scale if options.polarity == "dark" else -1)
+    labels = np.empty((count + 1, BLOCK, BLOCK), np.int32)
+    largest = 4 * options.max_radius + 8  # merged blobs pass: they are to be reported
+    level = screening.base + screening.excess
+    raised, excess = np.arange(count), screening.excess
     for _ in range(LEVELS):
-        tiles[row, :, column, :] = np.where(smooth > (base + excess)[:, None, None], 255, 0)
-        contours, oversize = _components(mask, 4 * options.max_radius + 8)  # merged blobs pass: they are to be reported
-        if oversize is None:
+        _threshold(smooth, level, labels)
+        boxes = _connect(screening.blocks, tile, labels)
+        small = (boxes[:, 2:] - boxes[:, :2]).max(1, initial=0) < largest
+        if small.all():
             break
-        raised = oversize.reshape(tiles.shape)[row, :, column, :].any((1, 2))
-        row, column, base, smooth, excess = (
-            row[raised],
-            column[raised],
-            base[raised],
-            smooth[raised],
-            1.6 * excess[raised],
-        )
-    return _candidates(mask, mask_rows, first, contours, [frame.shape for frame in frames])
+        oversize = np.append(~small, False)[labels[raised + 1] - 1].any((1, 2))  # label 0, of no component: the last
+        raised, excess = raised[oversize], LEVEL_STEP * excess[oversize]
+        level[raised] = screening.base[raised] + excess
+    return Candidates(tile, labels, boxes[small], np.flatnonzero(small).astype(np.int32) + 1)
 
 
 def _block_means(frame: Frame) -> MatLike:
@@ -129,69 +122,82 @@ def _levels(contrast: MatLike, options: DetectionOptions, scale: int) -> tuple[f
     return float(sample[sample.size // 2]), level
 
 
-def _mask_rows(used: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    """Number the rows of blocks that are in use from 1, with an empty one between bands: (count,), 0 = not in use.
+@njit(cache=True, nogil=True)
+def _smooth_tiles(frame, blocks, tile, invert):
+    """Number the tiles, and average the 3 x 3 pixels around each of their pixels: (K, 4, 4), -1 outside the frame.
 
-    A sparse frame then needs a mask of a fraction of its size, and outlining the components costs as much less.
+    `invert` is the grey value from which dark frames are subtracted, -1 = bright.
     """
-    in_use = np.zeros(count, np.bool_)
-    in_use[used] = True
-    starts = in_use & ~np.concatenate([[False], in_use[:-1]])
-    return np.where(in_use, np.cumsum(in_use) + np.cumsum(starts) - 1, 0)
+    height, width = frame.shape
+    smooth = np.full((len(blocks), BLOCK, BLOCK), np.float32(-1))
+    for k in range(len(blocks)):
+        row, column = blocks[k] // (tile.shape[1] - 2), blocks[k] % (tile.shape[1] - 2)
+        tile[row + 1, column + 1] = k + 1
+        for v in range(row * BLOCK, min(row * BLOCK + BLOCK, height)):
+            for u in range(column * BLOCK, min(column * BLOCK + BLOCK, width)):
+                total = 0
+                for y in range(v - 1, v + 2):
+                    for x in range(u - 1, u + 2):
+                        total += frame[min(max(y, 0), height - 1), min(max(x, 0), width - 1)]
+                mean = np.float32(total) / np.float32(9)
+                smooth[k, v % BLOCK, u % BLOCK] = np.float32(invert) - mean if invert >= 0 else mean
+    return smooth
 
 
-def _smooth_pixels(frames: list[Frame], screenings: list[Screening], invert: list[int] | None) -> NDArray[np.floating]:
-    """Average the 3 x 3 pixels around each pixel of the screened blocks: (K, 4, 4), bright polarity."""
-    reach = np.arange(-1, BLOCK + 1)
-    parts = []
-    for frame, screening in zip(frames, screenings, strict=True):
-        row, column = np.divmod(screening.blocks, screening.shape[1])
-        v = np.clip(row[:, None] * BLOCK + reach, 0, frame.shape[0] - 1) * frame.shape[1]
-        u = np.clip(column[:, None] * BLOCK + reach, 0, frame.shape[1] - 1)
-        parts.append(frame.take(v[:, :, None] + u[:, None, :]))  # (K, 6, 6)
-    pixels: NDArray[np.floating] = np.concatenate(parts).astype(np.float32)
-    pixels = pixels[:, :-2] + pixels[:, 1:-1] + pixels[:, 2:]
-    pixels = (pixels[:, :, :-2] + pixels[:, :, 1:-1] + pixels[:, :, 2:]) / 9
-    if invert is not None:
-        pixels = np.repeat(np.array(invert, np.float32), [len(part) for part in parts])[:, None, None] - pixels
-    return pixels
+@njit(cache=True, nogil=True)
+def _threshold(smooth, level, labels):
+    """Mark the pixels above the level of their tile (K,) by -1, all others by 0; tile 0 is empty."""
+    labels[0] = 0
+    for k in range(len(smooth)):
+        for i in range(BLOCK):
+            for j in range(BLOCK):
+                labels[k + 1, i, j] = -1 if smooth[k, i, j] > level[k] else 0
 
 
-def _components(mask: NDArray[np.uint8], largest: float) -> tuple[list[MatLike], NDArray[np.uint8] | None]:
-    """Outline the components of the mask up to the size `largest`, and draw those beyond: (R, W'), None without any."""
-    contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
-    kept, oversize = [], None
-    for index, contour in enumerate(contours):
-        if hierarchy[0, index, 3] >= 0:  # a hole
-            continue
-        if max(cv2.boundingRect(contour)[2:]) <= largest:
-            kept.append(contour)
-        else:
-            oversize = np.zeros_like(mask) if oversize is None else oversize
-            cv2.drawContours(oversize, contours, index, 255, cv2.FILLED, hierarchy=hierarchy, maxLevel=1)
-    return kept, oversize
+@njit(cache=True, nogil=True)
+def _place(tile, v, u):
+    """Place of a pixel, counted from the empty blocks around the frame, among all pixels of all tiles."""
+    return np.uint32(tile[np.uint32(v) >> 2, np.uint32(u) >> 2] * BLOCK * BLOCK + (v & 3) * BLOCK + (u & 3))
 
 
-def _candidates(
-    mask: NDArray[np.uint8],
-    mask_rows: NDArray[np.int64],
-    first: NDArray[np.int64],
-    contours: list[MatLike],
-    shapes: list[tuple[int, ...]],
-) -> Candidates:
-    """Bound the outlined components in pixels of their frames; those inside the padding of a frame are dropped."""
-    used = np.flatnonzero(mask_rows)
-    block_row = np.zeros(mask.shape[0] // BLOCK, np.int64)
-    block_row[mask_rows[used]] = used
-    rectangles = np.array([cv2.boundingRect(contour) for contour in contours], np.int64).reshape(-1, 4)
-    seeds = np.array([contour[0, 0] for contour in contours], np.int64).reshape(-1, 2)
-    points = np.stack([rectangles[:, :2], rectangles[:, :2] + rectangles[:, 2:] - 1, seeds])  # (3, K, 2)
-    block = block_row[points[..., 1] // BLOCK]
-    frame = np.searchsorted(first, block[0], side="right") - 1
-    points[..., 1] = (block - first[frame]) * BLOCK + points[..., 1] % BLOCK
-    limit = np.array([(width, height) for height, width in shapes])[frame]
-    inside = (points[0] < limit).all(1)
-    points = np.minimum(points, limit - 1)[:, inside]
-    pixel_rows = (mask_rows[:, None] * BLOCK + np.arange(BLOCK)).ravel()
-    rows = [pixel_rows[start * BLOCK :][: shape[0]] for start, shape in zip(first.tolist(), shapes, strict=True)]
-    return Candidates(mask, rows, frame[inside], np.hstack([points[0], points[1]]), points[2])
+@njit(cache=True, nogil=True)
+def _connect(blocks, tile, labels):
+    """Number the components (eight neighbours) of the marked pixels from 1, in place; return their boxes (M, 4)."""
+    columns, flat = tile.shape[1] - 2, labels.reshape(-1)
+    stack = np.empty((4 * BLOCK * BLOCK * len(blocks), 2), np.int32)  # a run of L pixels touches at most L + 3 runs
+    boxes = np.empty((4 * len(blocks), 4), np.int64)  # no more than four separate pixels fit into a tile
+    count = 0
+    for k in range(len(blocks)):
+        # Pixels are counted from the empty blocks around the frame.
+        top, left = BLOCK * (blocks[k] // columns + 1), BLOCK * (blocks[k] % columns + 1)
+        for i in range(BLOCK):
+            for j in range(BLOCK):
+                if labels[k + 1, i, j] >= 0:
+                    continue
+                box = boxes[count]
+                count += 1
+                box[0], box[1], box[2], box[3] = left + j, top + i, left + j, top + i
+                stack[0, 0], stack[0, 1], size = top + i, left + j, 1
+                while size:
+                    size -= 1
+                    v, first = stack[size, 0], stack[size, 1]
+                    # The whole run of marked pixels in this row, then the runs that touch it above and below.
+                    while flat[_place(tile, v, first - 1)] < 0:
+                        first -= 1
+                    last = first
+                    while flat[_place(tile, v, last)] < 0:
+                        flat[_place(tile, v, last)] = count
+                        last += 1
+                    if last == first:
+                        continue
+                    box[0], box[1] = min(box[0], first), min(box[1], v)
+                    box[2], box[3] = max(box[2], last - 1), max(box[3], v)
+                    for y in (v - 1, v + 1):
+                        inside = False
+                        for x in range(first - 1, last + 1):
+                            marked = flat[_place(tile, y, x)] < 0
+                            if marked and not inside:
+                                stack[size, 0], stack[size, 1] = y, x
+                                size += 1
+                            inside = marked
+    return boxes[:count] - BLOCK
