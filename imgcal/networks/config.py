@@ -1,0 +1,121 @@
+"""Which network: presets by name, and what may be changed in each."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from imgcal.formats.names import nearest
+from imgcal.formats.yaml_file import StrictModel
+
+Count = Annotated[int, Field(ge=1)]
+Encoder = Literal["transformer", "cnn1d"]
+
+
+class PaperPoints(StrictModel):
+    """The paper's point variant; camera by camera outputs, not offsets."""
+
+    encoder: Encoder = "transformer"
+    width: Count = 512
+    depth: Count = 8
+    heads: Count = 4
+    camera_identity: bool = True  # the paper's CIE
+    head_widths: tuple[int, ...] = (1024, 1024)
+
+
+class PaperImages(StrictModel):
+    """The paper's image variant: one pooled feature an image."""
+
+    backbone: str = "vit_base_patch16_224"
+    pretrained: bool = False
+    options: dict[str, Any] = {}  # further arguments of timm.create_model
+    bottleneck: Count = 128
+    head_widths: tuple[int, ...] = (128,)
+
+
+class TrunkConfig(StrictModel):
+    """Our network from positions to a rig."""
+
+    encoder: Encoder = "transformer"
+    width: Count = 128
+    heads: Count = 4
+    depth: Count = 5  # blocks of the first pass
+    later_depth: Count = 2  # blocks of every later pass, which share their weights
+    passes: Count = 3
+
+
+class Points(StrictModel):
+    """Our point variant."""
+
+    trunk: TrunkConfig = TrunkConfig()
+
+
+class Images(StrictModel):
+    """Our image variant: an encoder that also says where each fiducial is, then the same trunk."""
+
+    backbone: str = "vit_tiny_patch16_224"
+    pretrained: bool = False
+    options: dict[str, Any] = {}  # further arguments of timm.create_model
+    bottleneck: Count = 128
+    positions: bool = True  # hand the trunk each fiducial's position; otherwise the pooled feature alone
+    trunk: TrunkConfig = TrunkConfig()
+
+
+Variant = PaperPoints | PaperImages | Points | Images
+
+# Half a million parameters each, quick on a CPU: patches of 32 pixels, or a narrow ConvNeXt.
+SMALL_VIT = {"patch_size": 32, "embed_dim": 96, "depth": 3, "num_heads": 3}
+SMALL_CNN = {"depths": [1, 1, 2, 1], "dims": [16, 32, 64, 128]}
+
+PRESETS: dict[str, Variant] = {
+    "paper-points": PaperPoints(),
+    "paper-cnn1d": PaperPoints(encoder="cnn1d", depth=4, head_widths=(512,)),
+    "paper-vit": PaperImages(),
+    "paper-cnn2d": PaperImages(backbone="resnet50"),
+    "points": Points(),
+    "points-one-pass": Points(trunk=TrunkConfig(passes=1)),
+    "points-cnn1d": Points(trunk=TrunkConfig(encoder="cnn1d")),
+    "vit": Images(backbone="vit_tiny_patch16_224", options=SMALL_VIT),
+    "cnn": Images(backbone="convnext_atto", options=SMALL_CNN),
+    "vit-pooled": Images(backbone="vit_tiny_patch16_224", options=SMALL_VIT, positions=False),
+    "cnn-pooled": Images(backbone="convnext_atto", options=SMALL_CNN, positions=False),
+}
+
+
+class NetworkConfig(StrictModel):
+    """The block `network` of an experiment file: a preset, and what is changed in it."""
+
+    preset: str
+    change: dict[str, Any] = {}  # values of the preset to replace, by name; groups within groups
+
+    @model_validator(mode="after")
+    def _known(self) -> NetworkConfig:
+        if self.preset not in PRESETS:
+            raise ValueError(f"found preset `{self.preset}`{nearest(self.preset, PRESETS) or one_of(PRESETS)}")
+        self.variant()
+        return self
+
+    def variant(self) -> Variant:
+        """The preset with its changes.
+
+        Raises:
+            ValueError: a change that the preset does not know, or an impossible value (pydantic's ValidationError).
+        """
+        preset = PRESETS[self.preset]
+        return type(preset).model_validate(_merged(preset.model_dump(), self.change, self.preset), strict=False)
+
+
+def one_of(names: Any) -> str:
+    """Say what would have been right."""
+    return ", expected one of " + ", ".join(names)
+
+
+def _merged(values: dict[str, Any], change: dict[str, Any], where: str) -> dict[str, Any]:
+    merged = dict(values)
+    for name, value in change.items():
+        if name not in values:
+            raise ValueError(f"found `{name}` in the changes of {where}{nearest(name, values) or one_of(values)}")
+        inner = isinstance(values[name], dict) and isinstance(value, dict) and name != "options"
+        merged[name] = _merged(values[name], value, f"{where}: {name}") if inner else value
+    return merged

@@ -1,0 +1,118 @@
+"""Point variants: labelled fiducial positions in, a rig out. The paper's network and ours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import torch
+from torch import Tensor, nn
+
+from imgcal.networks.config import PaperPoints, Points
+from imgcal.networks.decode import Decoder
+from imgcal.networks.layers import conv1d, mlp, transformer
+from imgcal.networks.prediction import Prediction, Views
+from imgcal.networks.rendering import ImageOptions
+from imgcal.networks.trunk import Trunk
+
+CIE_NOISE = 0.01  # standard deviation of the noise on the one-hot camera identities
+
+PAPER_OUTPUTS = (6, 3, 2, 2, 5)  # 6D rotation, translation, focal length, principal point, distortion
+
+
+class CameraIdentity(nn.Module):
+    """The paper's Camera Identity Encoding: one-hot over the embedding, plus fixed noise, so that more cameras than
+    dimensions stay distinct.
+
+    Source: paper, supplementary section 1.1.
+    """
+
+    def __init__(self, cameras: int, width: int) -> None:
+        super().__init__()
+        generator = torch.Generator().manual_seed(0)
+        one_hot = torch.eye(width)[torch.arange(cameras) % width]
+        noise = CIE_NOISE * torch.randn(cameras, width, generator=generator)
+        self.register_buffer("encoding", one_hot + noise, persistent=False)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Add the identities: (B, C, width) -> (B, C, width)."""
+        return tokens + self.encoding
+
+
+class PaperHeads(nn.Module):
+    """Separate heads for r6D, t, f, pp and dist: (B, C, features) -> (B, C, 18), in float32 whatever autocast is on."""
+
+    def __init__(self, features: int, widths: tuple[int, ...]) -> None:
+        super().__init__()
+        self.heads = nn.ModuleList(mlp((features, *widths, outputs)) for outputs in PAPER_OUTPUTS)
+
+    def forward(self, features: Tensor) -> Tensor:
+        with torch.autocast(features.device.type, enabled=False):
+            features = features.float()
+            return torch.cat([head(features) for head in self.heads], dim=-1)
+
+
+class PaperPointNetwork(nn.Module):
+    """The paper's point variant: linear embedding of a camera's fiducials, CIE, encoder, five heads.
+
+    Source: paper, supplementary section 1.1.
+    """
+
+    image_options: ImageOptions | None = None
+
+    def __init__(self, config: PaperPoints, decoder: Decoder) -> None:
+        super().__init__()
+        self.decoder = decoder
+        cameras, fiducials = len(decoder.focal_length), len(decoder.centred)
+        self.embed = nn.Linear(2 * fiducials, config.width)
+        self.identity = CameraIdentity(cameras, config.width) if config.camera_identity else nn.Identity()
+        self.encoder = (
+            transformer(config.width, config.depth, config.heads)
+            if config.encoder == "transformer"
+            else conv1d(config.width, config.depth)
+        )
+        self.heads = PaperHeads(config.width, config.head_widths)
+
+    def forward(self, views: Views) -> tuple[Prediction, ...]:
+        """Predict the rig from `views.uv`; fiducials that are not seen count as at the principal point."""
+        uv, seen = points_of(views)
+        with torch.autocast(uv.device.type, enabled=False):
+            positions = torch.where(seen[..., None], self.decoder.normalized(uv.float()), 0.0).flatten(-2)
+        numbers = self.heads(self.encoder(self.identity(self.embed(positions))))
+        with torch.autocast(uv.device.type, enabled=False):
+            return (self.decoder.absolute(numbers),)
+
+    def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:
+        """Parameters that may have their own learning rates."""
+        return {"encoder": [*self.embed.parameters(), *self.encoder.parameters()], "heads": self.heads.parameters()}
+
+
+class PointNetwork(nn.Module):
+    """Our point variant: `Trunk` on the positions; fiducials that are missing are masked."""
+
+    image_options: ImageOptions | None = None
+
+    def __init__(self, config: Points, decoder: Decoder) -> None:
+        super().__init__()
+        self.decoder = decoder
+        self.trunk = Trunk(decoder, **config.trunk.model_dump())
+
+    def forward(self, views: Views) -> tuple[Prediction, ...]:
+        """Predict the rig from `views.uv` and `views.seen`; one prediction a pass."""
+        uv, seen = points_of(views)
+        return self.trunk(torch.where(seen[..., None], uv, 0.0), seen.to(uv.dtype))
+
+    def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:
+        """Parameters that may have their own learning rates."""
+        return {"trunk": self.trunk.parameters()}
+
+
+def points_of(views: Views) -> tuple[Tensor, Tensor]:
+    """Positions (B, C, N, 2) and which are seen (B, C, N).
+
+    Raises:
+        ValueError: the views hold images only.
+    """
+    if views.uv is None:
+        raise ValueError("a point variant needs views.uv, found images only")
+    seen = torch.ones_like(views.uv[..., 0], dtype=torch.bool) if views.seen is None else views.seen
+    return views.uv, seen

@@ -1,0 +1,83 @@
+"""Where each fiducial is in a colour-coded image: soft coordinates by colour, weighted by what an encoder believes.
+
+An image is almost all black. Only the pixels that are not are looked at, as one long ragged row over all images, so
+that the cost follows the number of dots, not the number of pixels.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+DARK = 8 / 255  # pixels below are background: quantization has left them no hue
+HUE_TOLERANCE = 0.06  # rad, how far a pixel's colour may lie from a fiducial's; the first 8 of the palette are 0.3 apart
+WINDOW = 2.0  # in sizes of a dot: the second look is through a Gaussian window around the first one's centre
+LEAST_LIGHT = 0.05  # share of a full dot's light below which nothing was seen
+OUTLIER_SPREAD = 2.0  # in sizes of a dot: light farther from its centre is not one dot
+
+
+def soft_positions(
+    images: Tensor, colours: Tensor, dot: float, belief: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Locate every fiducial in every image.
+
+    Args:
+        images: (I, 3, H, W) colour-coded splats on black, in [0, 1].
+        colours: (N, 3) of the fiducials.
+        dot: standard deviation of a dot in pixels.
+        belief: (I, N, h, w) log weights of an encoder's cells, which multiply the colour's; None = colour alone.
+
+    Returns:
+        uv (I, N, 2) pixels of the image and confidence (I, N) in [0, 1]: the share of a full dot's light that was found
+        in one place; zero where there is none, with finite positions. Differentiable in `belief`, float32.
+    """
+    count, _, height, width = images.shape
+    with torch.no_grad():
+        pixels = images.amax(1)
+        image, v, u = (pixels > DARK).nonzero(as_tuple=True)
+        colour = images[image, :, v, u]  # (M, 3)
+        likeness = _likeness(colour, colours.to(images))
+        light = (colour @ torch.nn.functional.normalize(colours.to(images), dim=-1).T) * likeness  # (M, N)
+        place = torch.stack((u, v), dim=-1).to(images)
+    weight = light
+    if belief is not None:
+        row, column = v * belief.shape[-2] // height, u * belief.shape[-1] // width
+        weight = light * belief[image, :, row, column].float().clamp(-8, 8).exp()
+    first, _, _ = _centres(weight, place, image, count)
+    with torch.no_grad():
+        apart = (place[:, None] - first[image]).square().sum(-1) / (WINDOW * dot) ** 2
+        window = torch.exp(-0.5 * apart)
+    second, found, spread = _centres(weight * window, place, image, count)
+    # A window of w sizes leaves w^2 / (1 + w^2) of a dot's light, and pulls its centre by the rest: undone here.
+    kept = WINDOW**2 / (1 + WINDOW**2)
+    centre = first.detach() + (second - first.detach()) / kept if belief is None else second
+    full = colours.to(images).norm(dim=-1) * (2 * torch.pi * dot**2) * kept
+    share = (_sums(light * window, image, count) / full).clamp(0, 1)
+    confidence = torch.where((share > LEAST_LIGHT) & (spread < (OUTLIER_SPREAD * dot) ** 2), share, 0.0)
+    return torch.where((found > 0)[..., None], centre, 0.0), confidence
+
+
+def _likeness(colour: Tensor, colours: Tensor) -> Tensor:
+    """How well the hue of pixels (M, 3) agrees with that of fiducials (N, 3): (M, N) in [0, 1]."""
+    direction = torch.nn.functional.normalize(colour, dim=-1)
+    cosine = (direction @ torch.nn.functional.normalize(colours, dim=-1).T).clamp(-1, 1)
+    # The quantization of a dark pixel turns its hue: it may be off by more.
+    tolerance = HUE_TOLERANCE + (0.5 / 255) / colour.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+    return torch.exp(-(1 - cosine) / tolerance.square())
+
+
+def _centres(weight: Tensor, place: Tensor, image: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Weighted centres (I, N, 2), sums of weights (I, N) and mean squared distances from the centre (I, N)."""
+    total = _sums(weight, image, count)
+    safe = total.clamp_min(1e-12)
+    moments = torch.stack([_sums(weight * place[:, axis, None], image, count) for axis in (0, 1)], dim=-1)
+    centre = moments / safe[..., None]
+    with torch.no_grad():
+        squared = (place[:, None] - centre[image]).square().sum(-1)
+        spread = _sums(weight * squared, image, count) / safe
+    return centre, total, spread
+
+
+def _sums(values: Tensor, image: Tensor, count: int) -> Tensor:
+    """Sum rows (M, N) by image: (I, N)."""
+    return values.new_zeros(count, values.shape[-1]).index_add(0, image, values)
