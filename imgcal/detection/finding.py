@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from cv2.typing import MatLike
 from numba import njit
 from numpy.typing import NDArray
 
@@ -99,19 +98,31 @@ def outline(frame: Frame, screening: Screening, options: DetectionOptions, scale
     return Candidates(tile, labels, boxes[small], np.flatnonzero(small).astype(np.int32) + 1)
 
 
-def _block_means(frame: Frame) -> MatLike:
-    """Average blocks of 4 x 4: (ceil(H / 4), ceil(W / 4)). Two halvings are much faster than one resize by four."""
-    height, width = (-(-n // BLOCK) * BLOCK for n in frame.shape)
-    if (height, width) != frame.shape:
-        pad = (0, height - frame.shape[0], 0, width - frame.shape[1])
-        padded = cv2.copyMakeBorder(frame, *pad, cv2.BORDER_REPLICATE)
-    else:
-        padded = frame
-    half = cv2.resize(padded, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
-    return cv2.resize(half, (width // 4, height // 4), interpolation=cv2.INTER_AREA)
+def _block_means(frame: Frame) -> Frame:
+    """Average blocks of 4 x 4: (ceil(H / 4), ceil(W / 4)). Beyond the border the last row or column repeats."""
+    height, width = (-(-n // BLOCK) for n in frame.shape)
+    means = np.empty((height, width), frame.dtype)
+    _average(frame, np.empty(BLOCK * width, np.uint16 if frame.dtype == np.uint8 else np.uint32), means)
+    return means
 
 
-def _levels(contrast: MatLike, options: DetectionOptions, scale: int) -> tuple[float, float]:
+@njit(cache=True, nogil=True)
+def _average(frame, sums, means):
+    """Fill the block means in one pass over the frame, which is far larger than the cache; (4 Q,) sums are scratch."""
+    height, width = frame.shape
+    for row in range(len(means)):
+        first, second = frame[BLOCK * row], frame[min(BLOCK * row + 1, height - 1)]
+        third, fourth = frame[min(BLOCK * row + 2, height - 1)], frame[min(BLOCK * row + 3, height - 1)]
+        mean = means[row]
+        for u in range(width):
+            sums[u] = first[u] + second[u] + third[u] + fourth[u]
+        for u in range(width, len(sums)):
+            sums[u] = sums[width - 1]
+        for q in range(len(mean)):
+            mean[q] = (sums[4 * q] + sums[4 * q + 1] + sums[4 * q + 2] + sums[4 * q + 3] + 8) >> 4
+
+
+def _levels(contrast: NDArray[np.generic], options: DetectionOptions, scale: int) -> tuple[float, float]:
     """Estimate what the opening leaves of an empty background, and how far above it a candidate must stand."""
     sample = np.sort(contrast[::8, ::8], axis=None)
     lower = sample[: max(1, int(0.6 * sample.size))]  # without the blobs and most of the texture
