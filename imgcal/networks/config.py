@@ -29,7 +29,7 @@ class PaperImages(StrictModel):
 
     backbone: str = "vit_base_patch16_224"
     pretrained: bool = False
-    options: dict[str, Any] = {}  # further arguments of timm.create_model
+    options: dict[str, Any] = Field(default={})  # further arguments of timm.create_model
     bottleneck: Count = 128
     head_widths: tuple[int, ...] = (128,)
 
@@ -56,7 +56,7 @@ class Images(StrictModel):
 
     backbone: str = "vit_tiny_patch16_224"
     pretrained: bool = False
-    options: dict[str, Any] = {}  # further arguments of timm.create_model
+    options: dict[str, Any] = Field(default={})  # further arguments of timm.create_model
     bottleneck: Count = 128
     positions: bool = True  # hand the trunk each fiducial's position; otherwise the pooled feature alone
     trunk: TrunkConfig = TrunkConfig()
@@ -87,7 +87,7 @@ class NetworkConfig(StrictModel):
     """The block `network` of an experiment file: a preset, and what is changed in it."""
 
     preset: str
-    change: dict[str, Any] = {}  # values of the preset to replace, by name; groups within groups
+    change: dict[str, Any] = Field(default={})  # values of the preset to replace, by name; groups within groups
 
     @model_validator(mode="after")
     def _known(self) -> NetworkConfig:

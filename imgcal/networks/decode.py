@@ -31,10 +31,21 @@ class RigState:
 class Decoder(nn.Module):
     """Turn head outputs into predictions; holds the factory rig, the object and the spread as buffers, no weights."""
 
+    focal_length: Tensor  # (C, 2)
+    principal_point: Tensor  # (C, 2)
+    distortion: Tensor  # (C, 5)
+    rotation: Tensor  # (C, 3, 3)
+    translation: Tensor  # (C, 3)
+    image_size: Tensor  # (C, 2)
+    spread: Tensor  # (C, 15)
+    centroid: Tensor  # (3,) mm
+    centred: Tensor  # (N, 3) mm
+    level: Tensor  # (3, 3)
+
     def __init__(self, factory: CameraRig, obj: CalibrationObject, spread: Tensor) -> None:
         super().__init__()
         if factory.working_distance is None:
-            raise InputError(f"rig {factory.name}: found no working_distance, expected one (mm): networks start from it")
+            raise InputError(f"rig {factory.name}: found no working_distance, expected one (mm) to start from")
         self._like = factory
         self.working_distance = factory.working_distance
         points = obj.points.to(factory.focal_length)

@@ -28,8 +28,8 @@ class Backbone(nn.Module):
 
     def __init__(self, name: str, pretrained: bool, options: Mapping[str, Any]) -> None:
         super().__init__()
-        self.model = make_backbone(name, pretrained, options)
-        self.width = int(self.model.num_features)
+        self.model: Any = make_backbone(name, pretrained, options)
+        self.width: int = self.model.num_features
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """(I, 3, H, W) -> pooled (I, width), map (I, width, h, w). Other sizes than the encoder's are resized."""
@@ -82,6 +82,8 @@ class ImageNetwork(nn.Module):
     `positions: false` the pooled feature is all that the trunk is told, as in the paper.
     """
 
+    colours: Tensor  # (N, 3)
+
     def __init__(self, config: Images, decoder: Decoder, colours: Tensor) -> None:
         super().__init__()
         self.image_options: ImageOptions = ImageOptions(size=SIZE)
@@ -92,8 +94,8 @@ class ImageNetwork(nn.Module):
         self.positions = config.positions
         if config.positions:
             self.belief = nn.Conv2d(self.backbone.width, len(colours), 1)
-            nn.init.zeros_(self.belief.weight)
-            nn.init.zeros_(self.belief.bias)
+            for parameter in self.belief.parameters():
+                nn.init.zeros_(parameter)
         self.trunk = Trunk(decoder, **config.trunk.model_dump(), features=config.bottleneck)
 
     def forward(self, views: Views) -> tuple[Prediction, ...]:

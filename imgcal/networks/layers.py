@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 from torch import Tensor, nn
@@ -61,7 +62,7 @@ def conv1d(width: int, depth: int) -> nn.Sequential:
 def mlp(widths: Sequence[int]) -> nn.Sequential:
     """Chain linear layers with GELU between them; `widths` from input to output."""
     layers: list[nn.Module] = []
-    for inputs, outputs in zip(widths[:-1], widths[1:], strict=True):
+    for inputs, outputs in itertools.pairwise(widths):
         layers += [nn.Linear(inputs, outputs), nn.GELU()]
     return nn.Sequential(*layers[:-1])
 

@@ -26,6 +26,8 @@ class CameraIdentity(nn.Module):
     Source: paper, supplementary section 1.1.
     """
 
+    encoding: Tensor  # (C, width)
+
     def __init__(self, cameras: int, width: int) -> None:
         super().__init__()
         generator = torch.Generator().manual_seed(0)
@@ -39,13 +41,14 @@ class CameraIdentity(nn.Module):
 
 
 class PaperHeads(nn.Module):
-    """Separate heads for r6D, t, f, pp and dist: (B, C, features) -> (B, C, 18), in float32 whatever autocast is on."""
+    """Separate heads for r6D, t, f, pp and dist."""
 
     def __init__(self, features: int, widths: tuple[int, ...]) -> None:
         super().__init__()
         self.heads = nn.ModuleList(mlp((features, *widths, outputs)) for outputs in PAPER_OUTPUTS)
 
     def forward(self, features: Tensor) -> Tensor:
+        """(B, C, features) -> (B, C, 18), in float32 whatever autocast is on."""
         with torch.autocast(features.device.type, enabled=False):
             features = features.float()
             return torch.cat([head(features) for head in self.heads], dim=-1)

@@ -10,15 +10,13 @@ import torch
 from torch import Tensor
 
 DARK = 8 / 255  # pixels below are background: quantization has left them no hue
-HUE_TOLERANCE = 0.06  # rad, how far a pixel's colour may lie from a fiducial's; the first 8 of the palette are 0.3 apart
+HUE_TOLERANCE = 0.06  # rad, how far a pixel's hue may lie from a fiducial's; the first 8 colours are 0.3 apart
 WINDOW = 2.0  # in sizes of a dot: the second look is through a Gaussian window around the first one's centre
 LEAST_LIGHT = 0.05  # share of a full dot's light below which nothing was seen
 OUTLIER_SPREAD = 2.0  # in sizes of a dot: light farther from its centre is not one dot
 
 
-def soft_positions(
-    images: Tensor, colours: Tensor, dot: float, belief: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
+def soft_positions(images: Tensor, colours: Tensor, dot: float, belief: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Locate every fiducial in every image.
 
     Args:

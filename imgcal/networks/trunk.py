@@ -1,6 +1,6 @@
 """From fiducial positions to a rig: our own network, common to the point and the image variants.
 
-One token a camera and one for the rig; attention over all of them. A first pass places the rig from the positions alone.
+One token a camera and one for the rig; attention over all of them. A first pass places the rig from positions alone.
 Every later pass projects the object with the rig as it stands and sees what is left over, so that positions reach the
 heads as differences: a fraction of a pixel is then a number that a network can act on. All heads predict offsets from
 the factory rig and start at zero: an untrained network returns the factory calibration.
@@ -72,9 +72,7 @@ class Trunk(nn.Module):
         self.first = Stage(3 * fiducials, features, cameras, 9, *shape)
         parts = 2 * (len(RESIDUAL_SCALES) + 2) + 1
         later = (encoder, width, later_depth, heads)
-        self.later = (
-            Stage(parts * fiducials + PARAMETERS, features, cameras, 6, *later) if passes > 1 else None
-        )
+        self.later = Stage(parts * fiducials + PARAMETERS, features, cameras, 6, *later) if passes > 1 else None
 
     def forward(self, uv: Tensor, weight: Tensor, features: Tensor | None = None) -> tuple[Prediction, ...]:
         """Predict.
