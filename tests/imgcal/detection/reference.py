@@ -15,9 +15,10 @@ def components(frame, screening, invert=None):
     level = np.full(screening.shape, np.inf)
     level.ravel()[screening.blocks] = screening.base + screening.excess
     level = np.kron(level, np.ones((4, 4)))[: frame.shape[0], : frame.shape[1]]
-    smooth = uniform_filter(frame.astype(np.float64), 3, mode="nearest")
+    total = cv2.boxFilter(frame, cv2.CV_32F, (3, 3), normalize=False, borderType=cv2.BORDER_REPLICATE)
+    smooth = total / np.float32(9)  # ties with the level are decided by the last bit
     if invert is not None:
-        smooth = invert - smooth
+        smooth = np.float32(invert) - smooth
     return cv2.connectedComponents((smooth > level).astype(np.uint8), connectivity=8)[1]
 
 
