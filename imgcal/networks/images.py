@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, cast
 
 import timm
 import torch
@@ -29,7 +29,7 @@ class Backbone(nn.Module):
     def __init__(self, name: str, pretrained: bool, options: Mapping[str, Any]) -> None:
         super().__init__()
         self.model: Any = make_backbone(name, pretrained, options)
-        self.width: int = self.model.num_features
+        self.width = cast(int, self.model.num_features)
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """(I, 3, H, W) -> pooled (I, width), map (I, width, h, w). Other sizes than the encoder's are resized."""
