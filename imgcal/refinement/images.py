@@ -99,7 +99,6 @@ class _Dots:
 
     uv: Tensor  # (B, C, N, 2)
     sigma: Tensor  # (B, C, N)
-    amplitude: Tensor  # (B, C, N) about 1 where there is such light, 0 where there is not
     believed: Tensor  # (B, C, N) bool
     light: Tensor  # (B, C) of all channels, in dots of a channel of 1
 
@@ -142,11 +141,12 @@ class _ImageProblem:
         uv = guess.rig.project(guess.rig_from_object.apply(self.points), radius).uv
         uv = uv.nan_to_num(size / 2).clamp(-FARTHEST * size, FARTHEST * size)
         if known is None:
-            uv, amplitude, light = (part.unflatten(0, batch) for part in self._far(flat, uv.flatten(0, 1)))
+            blurs, steps = options.blurs, options.steps
         else:
+            blurs, steps = options.blurs[-1:], 2 * options.steps
             uv = torch.where(known.believed[..., None], known.uv, uv)
-            amplitude, light = known.amplitude, known.light
-        steps = options.steps if known is None else 2 * options.steps
+        far, amplitude, light = (part.unflatten(0, batch) for part in self._far(flat, uv.flatten(0, 1), blurs))
+        uv = far if known is None else uv  # of what is known, only whether it is there is asked again
         present = amplitude > PRESENT
         fit = self._near(flat, uv.flatten(0, 1), present.flatten(0, 1), steps)
         uv, variance, mean_square = (part.unflatten(0, batch) for part in (fit.uv, fit.variance, fit.mean_square))
@@ -154,18 +154,20 @@ class _ImageProblem:
         sigma = (variance * noise + (options.position_noise * self.unit) ** 2).sqrt()
         inside = ((uv > -0.5) & (uv < size - 0.5)).all(-1)
         explained = mean_square < (options.most_residual / LEVELS) ** 2
-        return _Dots(uv, sigma, amplitude, present & inside & explained & sigma.isfinite(), light)
+        return _Dots(uv, sigma, present & inside & explained & sigma.isfinite(), light)
 
-    def _far(self, flat: Tensor, uv: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _far(self, flat: Tensor, uv: Tensor, blurs: tuple[float, ...]) -> tuple[Tensor, Tensor, Tensor]:
         """Take blurred steps: places (M, N, 2), amplitudes (M, N) and the light of each image (M,)."""
         options, pool = self.options, self.options.pooling
         pooled, dot = _pooled(flat, pool), options.image.dot / pool
         shift, amplitude = options.shift.scaled(1 / pool), uv.new_ones(uv.shape[:-1])
         near = ((uv + 0.5) / pool - 0.5).to(self.colours)
-        for blur in options.blurs:
+        for blur in blurs:
             step, amplitude = blurred_step(pooled, near, self.colours, dot, blur / pool, shift, options.trust)
             near = near + step
-        return (near.to(uv) + 0.5) * pool - 0.5, amplitude, pooled.sum((1, 2, 3)) / (2 * math.pi * dot**2)
+        dark = (1 + options.noise) / LEVELS  # noise that cannot be negative adds up over a black image
+        light = torch.where(pooled > dark, pooled, 0.0).sum((1, 2, 3))
+        return (near.to(uv) + 0.5) * pool - 0.5, amplitude, light / (2 * math.pi * dot**2)
 
     def _near(self, flat: Tensor, uv: Tensor, present: Tensor, steps: int) -> NearFit:
         """Take near steps, as many images at a time as their temporaries leave room for."""

@@ -1,7 +1,7 @@
 """Photometric normal equations of colour-coded dots: what images say about moving each dot.
 
 A dot is an outer product (colour x profile down x profile across), so products of images of dots are products of short
-one-dimensional sums. From afar (`blurred_step`) no image is rendered at all; from near (`DotWindows`) small windows are,
+one-dimensional sums. From afar (`blurred_step`) no image is rendered at all; from near (`DotWindows`) windows are,
 because only there overlapping dots that saturate can be told from others.
 
 Axes: M images (rigs times cameras), N dots, K channels, H, W image, w side of a window.
