@@ -11,6 +11,9 @@ from imgcal.objects import CalibrationObject
 from imgcal.observations import Observations
 from imgcal.rig import CameraRig
 
+# From a start this near, gross outliers (swapped labels, false blobs) are best given up at once.
+ROBUST = EstimationOptions(loss="cauchy")
+
 
 def refine_points(
     prediction: Prediction,
@@ -19,7 +22,7 @@ def refine_points(
     obj: CalibrationObject,
     spread: Tensor,
     sigma: Tensor | float,
-    options: EstimationOptions = EstimationOptions(),
+    options: EstimationOptions = ROBUST,
 ) -> Estimate:
     """Refine a network's prediction on the points that it has seen.
 
