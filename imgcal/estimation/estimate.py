@@ -92,18 +92,26 @@ def estimate(
     if rig_from_object is None:
         with torch.no_grad():
             rig_from_object = initial_pose(observations, first_guess or rig, obj)
-    start = make_start(problem, rig_from_object, first_guess)
-    loss: Loss = LOSSES[options.loss]
-    if options.loss != "squared":
-        loss = partial(loss, threshold=options.threshold)  # type: ignore[call-arg]
+    solution = minimize(problem, make_start(problem, rig_from_object, first_guess), options)
+    return conclude(problem, solution, implicit.attach_gradient(problem, solution, _loss(options)), batch)
+
+
+def _loss(options: EstimationOptions) -> Loss:
+    loss = LOSSES[options.loss]
+    return loss if options.loss == "squared" else partial(loss, threshold=options.threshold)  # type: ignore[call-arg]
+
+
+def minimize(problem: Problem, start: State, options: EstimationOptions) -> solver.Solution:
+    """Find the minimum from a start, on the CPU by the compiled solver; no gradient flows through it."""
     with torch.no_grad():
         if problem.uv.device.type == "cpu":
             limits = (options.loss, options.threshold, options.max_iterations, options.tolerance)
-            solution = fused.minimize(problem, start, *limits)
-        else:
-            solution = solver.minimize(problem, start, loss, options.max_iterations, options.tolerance)
-    state = implicit.attach_gradient(problem, solution, loss)
+            return fused.minimize(problem, start, *limits)
+        return solver.minimize(problem, start, _loss(options), options.max_iterations, options.tolerance)
 
+
+def conclude(problem: Problem, solution: solver.Solution, state: State, batch: torch.Size = torch.Size()) -> Estimate:
+    """Say what a solution means; `state` is the solution's, possibly with a gradient."""
     seen = problem.root_weight > 0
     plain = state is solution.state and state.offset.device.type == "cpu"  # no gradient to carry
     rigs, poses = (fused.rig_at if plain else rig_at)(problem, state.offset), pose_at(problem, state)

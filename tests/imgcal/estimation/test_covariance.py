@@ -1,5 +1,7 @@
 """Posterior covariance: against dense inverses, under a change of reference, and against the spread of samples."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -15,7 +17,7 @@ from imgcal.estimation import (
     relative_covariance,
     relative_difference,
 )
-from imgcal.estimation.covariance import relative_jacobian
+from imgcal.estimation.covariance import relative_jacobian, remaining_variance
 from imgcal.estimation.linearize import moved, rig_at
 from imgcal.rotations import rotation_from_vector
 from imgcal.synthesis import PhysicalDrift
@@ -42,6 +44,23 @@ def dense_inverse(found: Estimate) -> torch.Tensor:
             dense[:, rows, columns] = equations.coupling[:, s, c]
             dense[:, columns, rows] = equations.coupling[:, s, c].mT
     return torch.from_numpy(np.linalg.inv(dense.numpy()))
+
+
+@pytest.mark.parametrize("snapshots", [1, 3, 10, 12])  # compiled, compiled, cameras kept, and many snapshots
+def test_remaining_variance_is_the_diagonal_of_the_dense_inverse(simulate, snapshots: int) -> None:
+    case = simulate(2, snapshots=snapshots, cameras=4, missing=0.1)
+    case.spread[1, 10:] = 0  # fixed values keep all of nothing
+    found = run(case)
+    diagonal = dense_inverse(found).diagonal(dim1=-2, dim2=-1)[:, : 4 * 15].unflatten(-1, (4, 15))
+    np.testing.assert_allclose(remaining_variance(found.solution), diagonal, rtol=1e-6)
+    assert (remaining_variance(found.solution)[:, 1, 10:] == 1).all()
+
+
+def test_remaining_variance_needs_a_determined_pose(simulate) -> None:
+    found = run(simulate(2, snapshots=1, cameras=4))
+    equations = replace(found.solution.equations, pose=found.solution.equations.pose * 0)
+    with pytest.raises(RefusedError, match="do not determine"):
+        remaining_variance(replace(found.solution, equations=equations))
 
 
 @pytest.mark.parametrize("snapshots", [1, 3, 12])  # twelve snapshots of three cameras: snapshots are eliminated
