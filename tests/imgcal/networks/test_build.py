@@ -1,0 +1,161 @@
+"""Every preset: size, shapes, where it starts, and that the reprojection loss trains every head."""
+
+import pytest
+import torch
+
+from imgcal.errors import InputError
+from imgcal.formats import load_object, load_rig
+from imgcal.losses import images_of
+from imgcal.networks import PRESETS, NetworkConfig, Views, build
+from imgcal.networks.rendering import render_views
+from imgcal.synthesis import RelativeDrift, synthesize
+
+DRIFT = RelativeDrift(0.02, 0.02)
+SMALL = ["points", "points-one-pass", "points-cnn1d", "vit", "cnn", "vit-pooled", "cnn-pooled"]
+
+
+def make(preset, rig="T4", obj="asymmetric8", **change):
+    factory, thing = load_rig(rig).to(torch.float32), load_object(obj)
+    torch.manual_seed(0)
+    return build(NetworkConfig(preset=preset, change=change), factory, thing, DRIFT.std(factory)).eval()
+
+
+def snapshots(network, count=3, drift=DRIFT):
+    return synthesize(network.factory, network.obj, count, torch.Generator().manual_seed(1), drift=drift)
+
+
+def views(network, made):
+    uv, seen = made.projection.uv, made.projection.visible
+    if network.image_options is None:
+        return Views(uv=uv, seen=seen)
+    size = network.factory.image_size
+    return Views(images=render_views(uv, seen, size, network.obj, network.image_options, quantise=True))
+
+
+def millions(network):
+    return sum(parameter.numel() for parameter in network.parameters()) / 1e6
+
+
+@pytest.mark.parametrize(
+    ("preset", "expected"), [("paper-points", 33), ("paper-cnn1d", 8), ("paper-vit", 86), ("paper-cnn2d", 24)]
+)
+def test_presets_of_the_paper_have_its_size(preset, expected):
+    assert millions(make(preset, "O10", "cube8")) == pytest.approx(expected, abs=0.5)
+
+
+@pytest.mark.parametrize("preset", ["points", "vit", "cnn"])
+def test_presets_that_ship_are_small(preset):
+    assert 1 < millions(make(preset, "O10")) < 2.6
+
+
+@pytest.mark.parametrize("preset", SMALL)
+def test_an_untrained_network_returns_the_factory_calibration(preset):
+    network = make(preset)
+    predictions = network(views(network, snapshots(network)))
+    assert len(predictions) == network.trunk.passes
+    for prediction in predictions:
+        assert torch.equal(prediction.rig.focal_length, network.factory.focal_length.expand(3, -1, -1))
+        assert prediction.rig.difference(network.factory).abs().max() < 1e-3
+
+
+@pytest.mark.parametrize("preset", ["paper-points", "paper-cnn1d"])
+def test_paper_networks_return_cameras_of_their_own(preset):
+    network = make(preset, width=32, head_widths=(16,))
+    (prediction,) = network(views(network, snapshots(network)))
+    assert prediction.cameras_from_object.focal_length.shape == (3, 4, 2)
+    rotation = prediction.cameras_from_object.cam_from_rig.rotation
+    assert torch.allclose(rotation @ rotation.mT, torch.eye(3), atol=1e-5)
+
+
+@pytest.mark.parametrize("preset", ["points", "points-cnn1d", "paper-points", "vit"])
+def test_reprojection_error_trains_every_parameter(preset):
+    network = make(preset)
+    made = snapshots(network)
+    with torch.no_grad():  # away from the start, whose zero heads pass nothing on to what lies before them
+        for parameter in network.parameters():
+            parameter += 0.02 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(3))
+    given = views(network, made)
+    cameras = network(given)[-1].cameras_from_object
+    sum((images_of(p.cameras_from_object, network.obj) - made.projection.uv).square().mean() for p in network(given)).backward()
+    assert cameras.focal_length.isfinite().all()
+    for name, parameter in network.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all(), name
+        assert parameter.grad.abs().max() > 0, name
+
+
+@pytest.mark.parametrize("preset", ["points", "vit"])
+def test_batches_do_not_mix(preset):
+    network = make(preset)
+    made = snapshots(network)
+    given = views(network, made)
+    one = Views(*(None if x is None else x[1:2] for x in (given.uv, given.seen, given.images)))
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter += 0.02 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(3))
+        whole, alone = network(given)[-1], network(one)[-1]
+    assert torch.allclose(whole.rig.focal_length[1:2], alone.rig.focal_length, rtol=1e-5)
+    assert torch.allclose(whole.rig_from_object.rotation[1:2], alone.rig_from_object.rotation, atol=1e-5)
+
+
+def test_what_is_not_seen_does_not_matter():
+    network = make("points")
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter += 0.02 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(3))
+    made = snapshots(network)
+    seen = made.projection.visible.clone()
+    seen[:, 1, 3] = False
+    moved = made.projection.uv.clone()
+    moved[:, 1, 3] += 500
+    with torch.no_grad():
+        first, second = (network(Views(uv=uv, seen=seen))[-1] for uv in (made.projection.uv, moved))
+    assert torch.equal(first.rig.focal_length, second.rig.focal_length)
+
+
+def test_autocast_leaves_geometry_alone():
+    network = make("points")
+    with torch.autocast("cpu", torch.bfloat16):
+        prediction = network(views(network, snapshots(network)))[-1]
+    assert prediction.rig.focal_length.dtype == torch.float32
+    assert torch.equal(prediction.rig.focal_length, network.factory.focal_length.expand(3, -1, -1))
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"preset": "pointz"}, "nearest: points"),
+        ({"preset": "points", "change": {"trunk": {"widht": 3}}}, "nearest: width"),
+        ({"preset": "points", "change": {"trunk": {"passes": 0}}}, "greater than or equal to 1"),
+    ],
+)
+def test_impossible_configurations_are_refused(config, message):
+    with pytest.raises(ValueError, match=message):
+        NetworkConfig(**config)
+
+
+def test_an_unknown_backbone_is_refused():
+    with pytest.raises(InputError, match="nearest: vit_tiny_patch16_224"):
+        make("vit", backbone="vit_tiny_patch16_225")
+
+
+def test_pretrained_weights_that_cannot_be_loaded_say_what_to_do(monkeypatch, tmp_path):
+    def offline(*_, **__):
+        raise OSError("no route to host")
+
+    monkeypatch.setattr("imgcal.networks.images.timm.create_model", offline)
+    with pytest.raises(InputError, match="HF_HOME"):
+        make("vit", pretrained=True)
+
+
+def test_a_rig_without_working_distance_is_refused():
+    from dataclasses import replace
+
+    factory = replace(load_rig("T4").to(torch.float32), working_distance=None)
+    with pytest.raises(InputError, match="working_distance"):
+        build(NetworkConfig(preset="points"), factory, load_object("cube8"), DRIFT.std(factory))
+
+
+def test_every_preset_has_a_sound_variant():
+    for preset in PRESETS:
+        assert NetworkConfig(preset=preset).variant() == PRESETS[preset]
