@@ -27,6 +27,10 @@ class RigState:
     rotation: Tensor  # (B, 3, 3) rig_from_object
     centre: Tensor  # (B, 3) mm, the object's centroid in the rig
 
+    def detach(self) -> RigState:
+        """Cut the graph."""
+        return RigState(self.offsets.detach(), self.rotation.detach(), self.centre.detach())
+
 
 class Decoder(nn.Module):
     """Turn head outputs into predictions; holds the factory rig, the object and the spread as buffers, no weights."""

@@ -95,6 +95,7 @@ class Trunk(nn.Module):
             state = self.decoder.start(offsets, pose)
             predictions = [self.decoder.prediction(state)]
         for _ in range(self.passes - 1):
+            state = state.detach()  # each pass answers for its own error only, as in RAFT (Teed and Deng, ECCV 2020)
             with torch.autocast(device, enabled=False):
                 inputs = self._differences(state, predictions[-1], uv, weight)
             assert self.later is not None
@@ -106,10 +107,7 @@ class Trunk(nn.Module):
 
     @torch.no_grad()
     def _differences(self, state: RigState, prediction: Prediction, uv: Tensor, weight: Tensor) -> Tensor:
-        """What a later pass sees: (B, C, inputs). Each pass learns on its own: no gradient flows through the residual.
-
-        Residuals of an image's positions would pull them towards the prediction otherwise.
-        """
+        """What a later pass sees: (B, C, inputs), without gradient."""
         projected = self.decoder.project(prediction).uv
         residual = (projected - uv) * weight[..., None]
         scaled = [torch.tanh(residual / scale) for scale in RESIDUAL_SCALES]

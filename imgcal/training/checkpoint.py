@@ -117,9 +117,9 @@ def load_checkpoint(path: str | Path, rig: CameraRig | None = None, obj: Calibra
     experiment, metrics = _read_records(path, texts)
     trained_rig, trained_obj = _from_texts(path, texts)
     if rig is not None:
-        _check_rig(path, trained_rig, rig)
+        check_rig(path, trained_rig, rig)
     if obj is not None:
-        _check_object(path, trained_obj, obj)
+        check_object(path, trained_obj, obj)
     tensors, _ = read_tensors(path, FORMAT)
     network = build_network(experiment, trained_rig, trained_obj)
     _fill(path, network, tensors)
@@ -185,7 +185,13 @@ def _from_texts(path: str | Path, texts: dict[str, str]) -> tuple[CameraRig, Cal
             raise InputError(f"{path}: found no readable rig and object in it, expected both: {error}") from error
 
 
-def _check_rig(path: str | Path, trained: CameraRig, rig: CameraRig) -> None:
+def check_rig(path: str | Path, trained: CameraRig, rig: CameraRig) -> None:
+    """Compare the factory values of two rigs.
+
+    Raises:
+        InputError: they differ; names the first camera and value that do.
+    """
+
     def refuse(what: str, found: str, expected: str) -> None:
         before = f"{path}: trained for another rig than {rig.name} ({trained.name})"
         raise InputError(f"{before}: {what}: found {found}, expected {expected}")
@@ -208,7 +214,12 @@ def _check_rig(path: str | Path, trained: CameraRig, rig: CameraRig) -> None:
             refuse(place, _numbers(found[camera]), _numbers(expected[camera]))
 
 
-def _check_object(path: str | Path, trained: CalibrationObject, obj: CalibrationObject) -> None:
+def check_object(path: str | Path, trained: CalibrationObject, obj: CalibrationObject) -> None:
+    """Compare the fiducials of two objects, their radii included.
+
+    Raises:
+        InputError: they differ; names the first fiducial that does.
+    """
     before = f"{path}: trained for another object than {obj.name} ({trained.name})"
     if obj.fiducials != trained.fiducials:
         raise InputError(f"{before}: found {obj.fiducials} fiducials, expected {trained.fiducials}")
