@@ -12,12 +12,16 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.detection import DetectionOptions, detect
 from imgcal.detection.options import Frame
 from imgcal.errors import RefusedError
-from imgcal.estimation import Estimate, camera_std, estimate
+from imgcal.estimation import Estimate, estimate, initial_pose
+from imgcal.estimation.covariance import remaining_variance
+from imgcal.estimation.estimate import conclude, make_problem, make_start, minimize
+from imgcal.estimation.linearize import Problem, State
 from imgcal.labelling import Labelled, PipelineOptions, Progress, label, matched_to_rig, stack_poses, to_observations
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections, Observations
@@ -113,40 +117,43 @@ def fit_labelled(
         RefusedError: a camera saw nothing, the estimate has no minimum, or the residuals do not fit.
     """
     observations, poses = _used(labelled, rig, obj)
-    _require_cameras(observations, rig, options)
-    raw, model_error, guess = observations, options.identity_error, None
-    spread = (rig.prior or RigPrior()).std(rig)
+    variance, labels = observations.sigma.numpy() ** 2, observations.seen.numpy()
+    _require_cameras(labels, rig, options)
+    prior = (rig.prior or RigPrior()).std(rig)
+    problem = make_problem(observations, rig, obj, prior)
+    state = make_start(problem, poses or initial_pose(observations, rig, obj), None)
     widened: dict[str, float] = {}
+    seen, model_error = labels, options.identity_error
     for _ in range(8):
-        previous = model_error
-        weighted = replace(observations, sigma=(raw.sigma.square() + model_error**2).sqrt())
-        fit = estimate(weighted, rig, obj, poses, spread=spread, first_guess=guess, options=options.estimation)
-        if not bool(fit.converged):
-            raise RefusedError(
-                f"estimation: no minimum after {fit.iterations} iterations (RMS {2**0.5 * float(fit.rms):.3g} px)"
-            )
-        model_error, poses, guess = _model_error(fit, raw.sigma), fit.rig_from_object, fit.rig
+        fitted, noise = seen, variance + model_error**2
+        root_weight = torch.from_numpy(np.where(fitted, noise**-0.5, 0.0)).to(problem.uv)
+        problem = replace(problem, root_weight=root_weight[None])
+        solution = minimize(problem, state, options.estimation)
+        squared = np.square(solution.equations.residual[0].numpy()).sum(-2)  # (S, C, N)
+        if not bool(solution.converged):
+            rms = float(np.sqrt(squared[fitted].mean()))
+            raise RefusedError(f"estimation: no minimum after {solution.iterations} iterations (RMS {rms:.3g} px)")
+        state, remaining = solution.state, remaining_variance(solution)[0]
+        taken = 6 * len(fitted) + float((1 - remaining).sum())
+        previous, model_error = model_error, _model_error(squared[fitted], variance[fitted], taken)
         # Judged by the sigma of this fit: what a coarse fit leaves says little about fine outliers. Where a fiducial
         # was left out there is no residual: it stays out.
-        distance = fit.residual.norm(dim=-1) / weighted.sigma
-        keep = observations.seen & (distance <= options.outlier)
-        settled = abs(model_error - previous) <= 0.02 * previous and bool((keep == observations.seen).all())
-        if settled:
-            too_narrow = _too_narrow(fit)
-            widened = {kind: widened.get(kind, 1.0) * factor for kind, factor in too_narrow.items()} | {
-                kind: factor for kind, factor in widened.items() if kind not in too_narrow
-            }
-            spread = _widen(spread, too_narrow)
-            settled = not too_narrow or max(widened.values()) > options.widest_prior
-        observations = replace(observations, seen=keep)
-        if settled:
+        seen = fitted & (squared <= options.outlier**2 * noise)
+        if abs(model_error - previous) > 0.02 * previous or (seen != fitted).any():
+            continue
+        too_narrow = _too_narrow(state.offset[0].numpy(), remaining)
+        widened |= {kind: widened.get(kind, 1.0) * factor for kind, factor in too_narrow.items()}
+        if not too_narrow or max(widened.values()) > options.widest_prior:
             break
-    observations = weighted
-    outliers = int(raw.seen.sum()) - int(observations.seen.sum())
-    _require_cameras(observations, rig, options)
-    _require_near_prior(fit, rig, widened, options)
-    _require_most_labels(raw, observations, rig)
-    _require_fit(model_error, outliers / max(int(raw.seen.sum()), 1), 2**0.5 * float(fit.rms), options)
+        problem, state = _widen(problem, state, too_narrow)
+    fit = conclude(problem, solution, solution.state)
+    sigma = torch.from_numpy(np.sqrt(noise)).to(observations.sigma)
+    observations = replace(observations, sigma=sigma, seen=torch.from_numpy(fitted))
+    outliers = int(labels.sum() - fitted.sum())
+    _require_cameras(fitted, rig, options)
+    _require_near_prior(fit, prior, rig, widened, options)
+    _require_most_labels(labels, fitted, rig)
+    _require_fit(model_error, outliers / max(int(labels.sum()), 1), 2**0.5 * float(fit.rms), options)
     values = {name: getattr(fit, name) for name in Estimate.__dataclass_fields__}
     return Calibration(
         **values,
@@ -172,9 +179,8 @@ def _used(labelled: Labelled, rig: CameraRig, obj: CalibrationObject) -> tuple[O
     return observations, stack_poses(known) if len(known) == len(used) else None
 
 
-def _require_cameras(observations: Observations, rig: CameraRig, options: PipelineOptions) -> None:
-    seen = observations.seen.any(-1).any(0)
-    blind = [name for name, sees in zip(rig.camera_names, seen.tolist(), strict=True) if not sees]
+def _require_cameras(seen: NDArray[np.bool_], rig: CameraRig, options: PipelineOptions) -> None:
+    blind = [rig.camera_names[i] for i in np.flatnonzero(~seen.any(axis=(0, 2)))]
     if blind and (not options.blind_cameras or len(blind) == rig.cameras):
         raise RefusedError(
             f"camera {', '.join(blind)}: found no fiducial in any snapshot, expected some; nothing can be said of it "
@@ -196,31 +202,33 @@ def _require_fit(model_error: float, outlier_share: float, rms: float, options: 
         )
 
 
-def _model_error(fit: Estimate, sigma: Tensor) -> float:
-    """Standard deviation (px, each axis) that residuals hold beyond the blobs' own sigma (S, C, N); 0 = insignificant.
+def _model_error(squared: NDArray[np.floating], variance: NDArray[np.floating], taken: float) -> float:
+    """Standard deviation (px, each axis) that residuals hold beyond the blobs' own sigma; 0 = insignificant.
 
     The median of squared distances over two axes is 1.386 for unit noise, whatever a minority of outliers does.
     Residuals are smaller than the noise by what the parameters took: each takes the share of one observation that its
     prior left.
+
+    Args:
+        squared: (M,) px^2, squared lengths of the residuals.
+        variance: (M,) px^2 of each axis, the blobs' own.
+        taken: degrees of freedom that the parameters took.
     """
-    seen = fit.problem.root_weight.reshape(sigma.shape) > 0
-    spread = fit.problem.spread.reshape(fit.rig.distortion.shape[0], -1)
-    known = torch.where(spread > 0, (camera_std(fit) / spread.clamp_min(1e-30)).square().clamp_max(1), 1.0)
-    count = 2 * int(seen.sum())
-    free = max(count - 6 * sigma.shape[0] - float((1 - known).sum()), 1.0)
-    squared = fit.residual.square().sum(-1)[seen] * (count / free)
-    variance = sigma[seen].square()
+    count = 2 * len(squared)
+    free = max(count - taken, 1.0)
+    squared = squared * (count / free)
+    middle = (len(squared) - 1) // 2
 
     def excess(error: float) -> float:
-        return float((squared / (variance + error**2)).median()) / 1.386
+        return float(np.partition(squared / (variance + error**2), middle)[middle]) / 1.386
 
     # Six standard deviations of a chi-squared mean: below, the residuals fit the sigmas that the blobs have.
     if excess(0.0) <= 1 + 6 * (2 / free) ** 0.5:
         return 0.0
-    low, high = 0.0, float(squared.max().sqrt())
+    low, high = 0.0, float(np.sqrt(squared.max()))
     for _ in range(30):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if excess(middle) > 1 else (low, middle)
+        error = 0.5 * (low + high)
+        low, high = (error, high) if excess(error) > 1 else (low, error)
     return high
 
 
@@ -233,35 +241,35 @@ KINDS = {
 }
 
 
-def _too_narrow(fit: Estimate) -> dict[str, float]:
+def _too_narrow(offset: NDArray[np.floating], remaining: NDArray[np.float64]) -> dict[str, float]:
     """Kinds of values that have drifted more than their prior allows: factor by which the prior is too narrow.
 
-    The whitened offsets of a kind should have a mean square of one, over as many values as the data determine.
+    The whitened offsets (C, 15) of a kind should have a mean square of one, over as many values as the data determine:
+    those of which they leave little (C, 15) of the prior's variance.
     """
-    offset, spread = fit.solution.state.offset[0], fit.problem.spread[0]
-    determined = 1 - (camera_std(fit) / spread.clamp_min(1e-30)).square().clamp_max(1)
-    determined = torch.where(spread > 0, determined, 0.0)
     factors = {}
     for kind, part in KINDS.items():
-        freedom = float(determined[:, part].sum())
+        freedom = float((1 - remaining[:, part]).sum())
         if freedom > 1:
-            excess = float(offset[:, part].square().sum()) / freedom
+            excess = float(np.square(offset[:, part]).sum()) / freedom
             if excess > 1 + 4 * (2 / freedom) ** 0.5:
                 factors[kind] = excess**0.5
     return factors
 
 
-def _widen(spread: Tensor, factors: Mapping[str, float]) -> Tensor:
-    spread = spread.clone()
+def _widen(problem: Problem, state: State, factors: Mapping[str, float]) -> tuple[Problem, State]:
+    """Widen the prior; the state, counted in prior standard deviations, stays where it is."""
+    scale = torch.ones_like(problem.spread[0, 0])
     for kind, factor in factors.items():
-        spread[:, KINDS[kind]] *= factor
-    return spread
+        scale[KINDS[kind]] = factor
+    return replace(problem, spread=problem.spread * scale), replace(state, offset=state.offset / scale)
 
 
-def _require_near_prior(fit: Estimate, rig: CameraRig, widened: Mapping[str, float], options: PipelineOptions) -> None:
-    prior = (rig.prior or RigPrior()).std(rig)
-    drift = (fit.solution.state.offset[0] * fit.problem.spread[0] / prior.clamp_min(1e-30)).abs()
-    drift = torch.where(prior > 0, drift, 0.0)
+def _require_near_prior(
+    fit: Estimate, prior: Tensor, rig: CameraRig, widened: Mapping[str, float], options: PipelineOptions
+) -> None:
+    offset, spread, std = (tensor.numpy() for tensor in (fit.solution.state.offset[0], fit.problem.spread[0], prior))
+    drift = np.where(std > 0, np.abs(offset * spread) / np.maximum(std, 1e-30), 0.0)
     camera, parameter = divmod(int(drift.argmax()), drift.shape[1])
     largest = float(drift[camera, parameter])
     wide = max(widened.values(), default=1.0)
@@ -274,11 +282,11 @@ def _require_near_prior(fit: Estimate, rig: CameraRig, widened: Mapping[str, flo
         )
 
 
-def _require_most_labels(raw: Observations, kept: Observations, rig: CameraRig) -> None:
+def _require_most_labels(labels: NDArray[np.bool_], kept: NDArray[np.bool_], rig: CameraRig) -> None:
     """Refuse where most labels of one camera or one fiducial do not fit: they are not what they are said to be."""
     for name, axes, names in (("camera", (0, 2), rig.camera_names), ("fiducial", (0, 1), None)):
-        before, after = raw.seen.sum(axes), kept.seen.sum(axes)
-        bad = torch.nonzero((before >= 6) & (after < 0.5 * before)).flatten().tolist()
+        before, after = labels.sum(axes), kept.sum(axes)
+        bad = np.flatnonzero((before >= 6) & (after < 0.5 * before)).tolist()
         if bad:
             which = ", ".join(str(i) if names is None else names[i] for i in bad)
             raise RefusedError(

@@ -253,6 +253,8 @@ def _lower(values, result, stride):
 def _claim(own, other, crowded, smooth, territory):
     """Give a blob the pixels of the area that are no nearer to others than to it, up to its skirt: 1, all others 0.
 
+    Pixels as near to others as to the blob are border to both.
+
     Returns:
         The brightest border with a neighbour, 0 without one.
     """
@@ -271,7 +273,7 @@ def _claim(own, other, crowded, smooth, territory):
             if territory[i, j] > 0 and smooth[i, j] > saddle:
                 for y in range(i - 1, i + 2):
                     for x in range(j - 1, j + 2):
-                        if other[y, x] < own[y, x]:
+                        if other[y, x] <= own[y, x]:
                             saddle = max(saddle, smooth[i, j])
     return saddle
 

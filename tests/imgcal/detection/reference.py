@@ -53,7 +53,7 @@ def measure(frame, labels, label, box, half, saturation, invert=None):
     own = distance_transform_edt(found != label)
     free = (found == 0) | (found == label)
     other = np.where(free.all(), np.inf, distance_transform_edt(free))
-    foreign = cv2.dilate(((other < own) & inner).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    foreign = cv2.dilate(((other <= own) & inner).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     territory = (own <= window.SKIRT) & (own <= other) & inner & inside
     saddle = smooth[territory & foreign].max(initial=0)
 
