@@ -172,7 +172,7 @@ class _ImageProblem:
     def _near(self, flat: Tensor, uv: Tensor, present: Tensor, steps: int) -> NearFit:
         """Take near steps, as many images at a time as their temporaries leave room for."""
         floats = self.colours.numel() * len(self.colours) * FLOATS_A_PAIR
-        count = max(1, CHUNK[flat.device.type] // floats)
+        count = max(1, CHUNK.get(flat.device.type, CHUNK["cuda"]) // floats)
         parts = zip(flat.split(count), uv.split(count), present.split(count), strict=True)
         dot = self.options.image.dot
         fits = [DotWindows(some, at, self.colours, dot).fit(at, there, steps) for some, at, there in parts]

@@ -21,6 +21,7 @@ from renderers.compositing import window_starts
 AMPLITUDE_RIDGE = 0.1  # how strongly a dot is believed to be there before the image is looked at
 WINDOW_SIGMAS = 3.5  # beyond it a dot is darker than half a grey level of 8 bit
 WINDOW_MARGIN = 0.75  # pixels that a dot may move in its window
+FARTHEST = 30.0  # half the squared distance, in standard deviations, beyond which a profile is flat
 DAMPING = 1e-3  # relative addition to the diagonal of near normal equations
 
 
@@ -51,7 +52,7 @@ def blurred_step(
     with a blurred profile. Amplitudes are solved for first, so that dots that are missing pull at nothing.
 
     Args:
-        images: (M, K, H, W).
+        images: (M, K, H, W), square.
         uv: (M, N, 2) pixels where dots are predicted, finite.
         colours: (N, K).
         dot: standard deviation of a dot, pixels.
@@ -62,28 +63,32 @@ def blurred_step(
     Returns:
         (M, N, 2) step in pixels, and (M, N) amplitude: about 1 where a dot is found, about 0 where it is missing.
     """
-    height, width = images.shape[-2:]
-    count = len(colours)
+    size, count = images.shape[-1], len(colours)
     model, match = math.hypot(dot, blur), math.sqrt(dot**2 + 2 * blur**2)
-    u, v = (_gram(*profile_and_slope(uv[..., i], model, size)) for i, size in ((0, width), (1, height)))
+    value, slope = profile_and_slope(uv.mT, model, size)  # (M, 2 axes, N, size)
+    (value_u, value_v), (slope_u, slope_v), (cross_u, cross_v) = (  # (M, N, N): <g_n, g_m>, <g'_n, g'_m>, <g'_n, g_m>
+        (first @ second.mT).unbind(1) for first, second in ((value, value), (slope, slope), (slope, value))
+    )
     alike = colours @ colours.mT
-    overlap = alike * u.value * v.value
+    overlap = alike * value_u * value_v
+    alike_u, alike_v = alike * cross_u * value_v, alike * value_u * cross_v
 
-    across = torch.cat(profile_and_slope(uv[..., 0], match, width), 1).mT  # (M, W, 2N)
-    value_v, slope_v = (part.mT for part in profile_and_slope(uv[..., 1], match, height))  # (M, H, N)
+    value, slope = profile_and_slope(uv.mT, match, size)
+    across = torch.cat((value[:, 0], slope[:, 0]), 1).mT  # (M, W, 2N)
     rows = torch.bmm(images.flatten(1, 2), across).unflatten(1, images.shape[1:3])  # (M, K, H, 2N)
     of_value, of_slope = (rows.unflatten(-1, (2, count)) * colours.mT[:, None, None]).sum(1).unbind(-2)  # (M, H, N)
+    value_down, slope_down = value[:, 1].mT, slope[:, 1].mT  # (M, H, N)
     scale = model**4 / (dot * match) ** 2
-    light = scale * (of_value * value_v).sum(1)
-    by_u, by_v = scale * (of_slope * value_v).sum(1), scale * (of_value * slope_v).sum(1)
+    light = scale * (of_value * value_down).sum(1)
+    by_u, by_v = scale * (of_slope * value_down).sum(1), scale * (of_value * slope_down).sum(1)
 
     ridge = AMPLITUDE_RIDGE * math.pi * model**2 * alike.diagonal()
     amplitude = torch.linalg.solve(overlap + torch.diag(ridge), light + ridge).clamp(0, 1)
-    by_u = by_u - (alike * u.cross.mT * v.value @ amplitude[..., None]).squeeze(-1)
-    by_v = by_v - (alike * u.value * v.cross.mT @ amplitude[..., None]).squeeze(-1)
+    by_u = by_u - (alike_u @ amplitude[..., None]).squeeze(-1)
+    by_v = by_v - (alike_v @ amplitude[..., None]).squeeze(-1)
     pull = torch.cat((amplitude * by_u, amplitude * by_v), -1)
-    uv_block = alike * u.cross.mT * v.cross
-    hessian = _blocks(alike * u.slope * v.value, uv_block, uv_block.mT, alike * u.value * v.slope)
+    mixed = alike * cross_u * cross_v.mT
+    hessian = _blocks(alike * slope_u * value_v, mixed, mixed.mT, alike * value_u * slope_v)
     both = torch.cat((amplitude, amplitude), -1)
     hessian = hessian * both[:, :, None] * both[:, None]
     stiffness = math.pi / 2 * (trust * model) ** 2 * prior.precision(colours)
@@ -198,18 +203,8 @@ def profile_and_slope(centre: Tensor, size: float, length: int) -> tuple[Tensor,
     edges = torch.arange(length + 1, dtype=centre.dtype, device=centre.device) - 0.5 - centre[..., None]
     scaled = edges * (1 / (math.sqrt(2) * size))
     value = (math.sqrt(math.pi / 2) * size) * torch.erf(scaled).diff(dim=-1)
-    return value, -torch.exp(-scaled.square()).diff(dim=-1)
-
-
-@dataclass(frozen=True)
-class _Gram:
-    value: Tensor  # (M, N, N) <g_n, g_m>
-    cross: Tensor  # (M, N, N) <g_n, g'_m>
-    slope: Tensor  # (M, N, N) <g'_n, g'_m>
-
-
-def _gram(value: Tensor, slope: Tensor) -> _Gram:
-    return _Gram(value @ value.mT, value @ slope.mT, slope @ slope.mT)
+    # Far away exactly zero: numbers near underflow would make everything that follows several times slower.
+    return value, -torch.exp(-scaled.square().clamp_max(FARTHEST)).diff(dim=-1)
 
 
 def _blocks(uu: Tensor, uv: Tensor, vu: Tensor, vv: Tensor) -> Tensor:

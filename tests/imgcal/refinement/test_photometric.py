@@ -7,7 +7,7 @@ from imgcal.refinement.photometric import DAMPING, DotWindows, ShiftPrior, blurr
 from renderers import splat
 
 COLOURS = torch.tensor([[1.0, 1, 1], [1, 0, 0], [0.9, 0.7, 0.4], [0, 0.7, 0]], dtype=torch.float64)  # N = 4
-SIZE, DOT = (36, 44), 1.4
+SIZE, DOT = (44, 44), 1.4
 
 
 def places(close: bool) -> torch.Tensor:
