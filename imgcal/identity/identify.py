@@ -196,10 +196,11 @@ def _decide(scene: Scene, fits: Fits, options: IdentityOptions, known_pose: bool
     chosen = certain(scene, best, *odds)
     share, refusal, margin = _share(scene, chosen), None, -np.inf
     if share >= options.least_share:
-        best, margin = _against_motions(scene, best, known_pose)
-        margin = min(margin, _margin(scene, best, fits))
-        chosen = certain(scene, best, *odds)
-        share = _share(scene, chosen)
+        settled, margin = _against_motions(scene, best, known_pose)
+        margin = min(margin, _margin(scene, settled, fits))
+        if settled is not best:
+            chosen = certain(scene, settled, *odds)
+            share = _share(scene, chosen)
         if margin < options.least_margin:
             refusal = (
                 f"another labelling explains the blobs nearly as well: margin {margin:.1f}, "

@@ -2,7 +2,7 @@
 
 # Compiled functions take their types from their arguments.
 # ruff: noqa: ANN001, ANN202
-# mypy: allow-untyped-defs
+# mypy: allow-untyped-defs, no-check-untyped-defs
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from imgcal.estimation.fused import lens
-from imgcal.estimation.linearize import Problem, rig_at
+from imgcal.estimation.fused import _exponential, _multiply, lens
+from imgcal.estimation.linearize import Problem
 from imgcal.estimation.solver import Solution
 from imgcal.identity.blobs import Blobs
 from imgcal.projection import NEAREST_DEPTH
-from imgcal.rotations import left_jacobian
 
 FAST = {"contract", "reassoc", "nsz"}
 THRESHOLD = 3.0
@@ -54,7 +53,6 @@ def innovations(
         solution: the fit.
     """
     count, cameras, fiducials = labels.shape
-    rig = rig_at(problem, solution.state.offset)
     radius_squared = np.zeros(fiducials) if problem.radius_squared is None else problem.radius_squared.numpy()
     valid = blobs.row >= 0
     noise = blobs.sigma**2
@@ -64,7 +62,20 @@ def innovations(
     residual, freedom, uv = np.zeros(shape), np.zeros(shape), np.zeros((*shape, 2))
     complexity = np.full(count, np.inf)
     equations, state = solution.equations, solution.state
-    left = left_jacobian(state.offset[..., :3] * problem.spread[..., :3]).numpy()
+    factory = problem.factory
+    given = [
+        tensor.numpy()
+        for tensor in (
+            factory.cam_from_rig.rotation,
+            factory.positions,
+            factory.focal_length,
+            factory.principal_point,
+            factory.distortion,
+            problem.spread,
+            state.offset,
+        )
+    ]
+    turn, centre, points = state.rotation.numpy(), state.centre.numpy(), problem.points.numpy()
     for k in np.flatnonzero(np.isfinite(equations.cost.numpy())):
         # Lower factors of the cameras' blocks, of the couplings' and of the pose's: see arrow.reduce.
         eliminated = equations.camera[k].numpy().copy()
@@ -72,12 +83,9 @@ def innovations(
         kept = equations.pose[k, 0].numpy().copy()
         complexity[k] = _factorize(eliminated, whitened, kept)
         if np.isfinite(complexity[k]):
-            _compare(
-                rig.cam_from_rig.rotation[k].numpy(), left[k], rig.positions[k].numpy(), rig.focal_length[k].numpy(),
-                rig.principal_point[k].numpy(), rig.distortion[k].numpy(), problem.spread[k].numpy(),
-                state.rotation[k, 0].numpy(), state.centre[k, 0].numpy(),
-                problem.points.numpy(), radius_squared, eliminated, whitened, kept,
-                blobs.uv, noise, typical, blobs.count, labels[k], sigma[k] ** 2,
+            _compare(  # type: ignore[call-arg]
+                *(array[k] for array in given), turn[k, 0], centre[k, 0], points, radius_squared,
+                eliminated, whitened, kept, blobs.uv, noise, typical, blobs.count, labels[k], sigma[k] ** 2,
                 squared[k], log_det[k], own[k], residual[k], freedom[k], uv[k],
             )  # fmt: skip
     return Innovations(squared, log_det, own, residual, freedom, uv, complexity)
@@ -123,19 +131,25 @@ def _cholesky(matrix):
 
 @njit(cache=True, fastmath=FAST)
 def _compare(
-    rotation, left, position, focal, principal, distortion, spread, turn, centre, points, radius_squared,
+    rotation0, position0, focal0, principal0, distortion0, spread, offset, turn, centre, points, radius_squared,
     eliminated, whitened, kept, blob_uv, blob_noise, typical_noise, blob_count, labels, extra,
     squared, log_det, own, residual, freedom, uv,
 ):  # fmt: skip
     """Fill the outputs for one labelling."""
     rows, parts = np.empty((2, 21)), np.empty((2, 21))
+    rotation, exponential, left = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     unit = max(1.0, np.sqrt(centre[0] ** 2 + centre[1] ** 2 + centre[2] ** 2))
-    for c in range(len(rotation)):
+    for c in range(len(rotation0)):
+        step = offset[c] * spread[c]
+        _exponential(step[:3], exponential, left)
+        _multiply(exponential, rotation0[c], rotation)
+        position, focal, principal = position0[c] + step[3:6], focal0[c] + step[6:8], principal0[c] + step[8:10]
+        distortion = distortion0[c] + step[10:15]
         for n in range(len(points)):
             rotated = turn @ points[n]
             _rows(
-                rotated, rotation[c], left[c], rotated + centre - position[c],
-                focal[c], principal[c], distortion[c], spread[c], radius_squared[n], unit, rows, uv[c, n],
+                rotated, rotation, left, rotated + centre - position,
+                focal, principal, distortion, spread[c], radius_squared[n], unit, rows, uv[c, n],
             )  # fmt: skip
             _whiten(rows, eliminated[c], whitened[c], kept, parts)
             uu, uv_, vv = (parts[0] * parts[0]).sum(), (parts[0] * parts[1]).sum(), (parts[1] * parts[1]).sum()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +28,13 @@ class Motion:
 
 def lattice_shifts(obj: CalibrationObject) -> list[Motion]:
     """Find the translations, smallest first, that take most fiducials onto others: the steps of a lattice."""
-    points = obj.points.double().cpu().numpy()
-    tolerance = 0.01 * obj.size
+    return list(_lattice_shifts(obj.points.double().cpu().numpy().tobytes(), 0.01 * obj.size))
+
+
+@lru_cache(maxsize=16)
+def _lattice_shifts(coordinates: bytes, tolerance: float) -> tuple[Motion, ...]:
+    """Find the shifts once for each object: snapshots are many, objects few."""
+    points = np.frombuffer(coordinates).reshape(-1, 3)
     differences = (points[None] - points[:, None]).reshape(-1, 3)
     cells, place, counts = np.unique(
         np.round(differences / (2 * tolerance)).astype(np.int64), axis=0, return_inverse=True, return_counts=True
@@ -37,7 +43,7 @@ def lattice_shifts(obj: CalibrationObject) -> list[Motion]:
     sums = np.stack([np.bincount(place.ravel(), weights=differences[:, i]) for i in range(3)], axis=1)
     shifts = sums[often] / counts[often, None]
     shifts = shifts[np.argsort(np.linalg.norm(shifts, axis=1), kind="stable")[:MOST_SHIFTS]]
-    return [Motion(np.eye(3), shift, _onto(points, points + shift, 2 * tolerance)) for shift in shifts]
+    return tuple(Motion(np.eye(3), shift, _onto(points, points + shift, 2 * tolerance)) for shift in shifts)
 
 
 def near_turns(obj: CalibrationObject, tolerance: float) -> list[Motion]:

@@ -6,7 +6,7 @@ Only after such a fit can a label be judged: the factory rig alone is off by ten
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from functools import reduce
+from functools import cached_property, reduce
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.estimation import fused
-from imgcal.estimation.linearize import Problem, State, pose_at, rig_at
+from imgcal.estimation.linearize import Problem, State, pose_at
 from imgcal.identity.assignment import assign
 from imgcal.identity.blobs import Blobs
 from imgcal.identity.hypotheses import Poses
@@ -43,6 +43,21 @@ class Scene:
     obj: CalibrationObject
     rig: CameraRig
     std: Tensor  # (C, 15)
+
+    @cached_property
+    def problem(self) -> Problem:
+        """Of one labelling, without any label."""
+        points, radius = self.obj.points.double(), self.obj.radius
+        centroid, cameras = points.mean(0), self.rig.cameras
+        return Problem(
+            uv=points.new_zeros(1, 1, cameras, 2, len(points)),
+            root_weight=points.new_zeros(1, 1, cameras, len(points)),
+            points=points - centroid,
+            centroid=centroid,
+            radius_squared=None if radius is None else radius.double().square(),
+            factory=self.rig.expand(1),
+            spread=self.std.expand(1, -1, -1),
+        )
 
 
 @dataclass(frozen=True)
@@ -156,7 +171,7 @@ def predictions(fits: Fits) -> NDArray[np.float64]:
 def rig_and_pose(scene: Scene, fits: Fits, row: int) -> tuple[CameraRig, RigidTransform]:
     """Give the rig and rig_from_object of one labelling, without batch axes."""
     problem = _problem(scene, fits)
-    return rig_at(problem, fits.state.offset)[row], pose_at(problem, fits.state)[row, 0]
+    return fused.rig_at(problem, fits.state.offset)[row], pose_at(problem, fits.state)[row, 0]
 
 
 def _found(fits: Fits) -> Innovations:
@@ -179,17 +194,14 @@ def _problem(scene: Scene, fits: Fits) -> Problem:
     seen = fits.labels >= 0
     uv = np.where(seen[..., None], scene.blobs.uv[np.arange(cameras)[:, None], np.maximum(fits.labels, 0)], 0.0)
     sigma = np.sqrt(_blob_noise(scene, fits) + fits.sigma[:, None, None] ** 2)
-    points, radius = scene.obj.points.double(), scene.obj.radius
-    centroid = points.mean(0)
-    return Problem(
-        torch.from_numpy(np.ascontiguousarray(uv.swapaxes(-1, -2)))[:, None],
-        torch.from_numpy(seen / sigma)[:, None],
-        points - centroid,
-        centroid,
-        None if radius is None else radius.double().square(),
-        scene.rig.expand(count),
-        scene.std.expand(count, -1, -1),
+    problem = replace(
+        scene.problem,
+        uv=torch.from_numpy(np.ascontiguousarray(uv.swapaxes(-1, -2)))[:, None],
+        root_weight=torch.from_numpy(seen / sigma)[:, None],
     )
+    if count == 1:
+        return problem
+    return replace(problem, factory=scene.rig.expand(count), spread=scene.std.expand(count, -1, -1))
 
 
 def _fit(scene: Scene, fits: Fits) -> Fits:
