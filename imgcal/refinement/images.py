@@ -159,7 +159,8 @@ class _ImageProblem:
     def _far(self, flat: Tensor, uv: Tensor, blurs: tuple[float, ...]) -> tuple[Tensor, Tensor, Tensor]:
         """Take blurred steps: places (M, N, 2), amplitudes (M, N) and the light of each image (M,)."""
         options, pool = self.options, self.options.pooling
-        pooled, dot = _pooled(flat, pool), options.image.dot / pool
+        pieces = flat.split(_chunk(flat, flat.shape[1:].numel()))
+        pooled, dot = torch.cat([_pooled(some, pool) for some in pieces]), options.image.dot / pool
         shift, amplitude = options.shift.scaled(1 / pool), uv.new_ones(uv.shape[:-1])
         near = ((uv + 0.5) / pool - 0.5).to(self.colours)
         for blur in blurs:
@@ -171,8 +172,7 @@ class _ImageProblem:
 
     def _near(self, flat: Tensor, uv: Tensor, present: Tensor, steps: int) -> NearFit:
         """Take near steps, as many images at a time as their temporaries leave room for."""
-        floats = self.colours.numel() * len(self.colours) * FLOATS_A_PAIR
-        count = max(1, CHUNK.get(flat.device.type, CHUNK["cuda"]) // floats)
+        count = _chunk(flat, self.colours.numel() * len(self.colours) * FLOATS_A_PAIR)
         parts = zip(flat.split(count), uv.split(count), present.split(count), strict=True)
         dot = self.options.image.dot
         fits = [DotWindows(some, at, self.colours, dot).fit(at, there, steps) for some, at, there in parts]
@@ -208,6 +208,11 @@ class _ImageProblem:
             problem=make_problem(observations, self.factory, self.obj, self.spread),
         )
         return sensor, observations
+
+
+def _chunk(images: Tensor, floats: int) -> int:
+    """How many images to work on at a time, where one needs so many floats."""
+    return max(1, CHUNK.get(images.device.type, CHUNK["cuda"]) // floats)
 
 
 def _pooled(images: Tensor, pool: int) -> Tensor:
