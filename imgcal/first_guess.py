@@ -62,9 +62,14 @@ class Guesser:
             views = Views(images=drawn)
         predicted: Prediction = self.network(views)[-1].to(rig.focal_length.dtype)
         each, poses = predicted.rig.resized(rig.image_size), predicted.rig_from_object
-        residual = each.project(poses.apply(obj.points.to(poses.rotation)), obj.radius).uv - observations.uv
-        residual = torch.where(observations.seen[..., None], residual, 0.0)
+        residual = residual_of(each, poses, observations, obj)
         return FirstGuess(self.name, rig.moved(each.difference(rig).mean(0)), poses, residual)
+
+
+def residual_of(rig: CameraRig, poses: RigidTransform, observations: Observations, obj: CalibrationObject) -> Tensor:
+    """Predicted minus observed: (S, C, N, 2) pixels, zero where not seen; one rig a snapshot or one for all."""
+    uv = rig.expand(len(observations.uv)).project(poses.apply(obj.points.to(poses.rotation)), obj.radius).uv
+    return torch.where(observations.seen[..., None], uv - observations.uv, 0.0)
 
 
 def load_guesser(name: str, rig: CameraRig, obj: CalibrationObject) -> Guesser:

@@ -22,6 +22,7 @@ from imgcal.estimation import Estimate, estimate, initial_pose
 from imgcal.estimation.covariance import remaining_variance
 from imgcal.estimation.estimate import conclude, make_problem, make_start, minimize
 from imgcal.estimation.linearize import Problem, State
+from imgcal.first_guess import FirstGuess, Guesser, residual_of
 from imgcal.labelling import Labelled, PipelineOptions, Progress, label, matched_to_rig, stack_poses, to_observations
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections, Observations
@@ -42,6 +43,8 @@ class Calibration(Estimate):
     widened: Mapping[str, float]  # by kind of value: factor by which the prior was too narrow, where it was
     factory: CameraRig
     obj: CalibrationObject
+    first_guess: FirstGuess | None = None  # what a network said, where one was asked
+    guess_used: bool = False  # its guess was nearer to the images than the factory calibration
     seconds: Mapping[str, float] = field(default_factory=dict)  # by stage
 
     @cached_property
@@ -68,6 +71,7 @@ def calibrate(
     options: PipelineOptions = PipelineOptions(),
     *,
     detection: DetectionOptions = DetectionOptions(),
+    guesser: Guesser | None = None,
     progress: Progress | None = None,
 ) -> Calibration:
     """Recalibrate a rig from what its cameras saw.
@@ -78,6 +82,7 @@ def calibrate(
         obj: the calibration object.
         options: how sure the result must be.
         detection: how blobs are found in frames.
+        guesser: network whose first guess the estimate starts from (`imgcal.first_guess.load_guesser`).
         progress: wraps the loop over snapshots, for a progress bar.
 
     Raises:
@@ -90,7 +95,7 @@ def calibrate(
     found = time.perf_counter()
     labelled = label(detections, rig, obj, options, progress)
     identified = time.perf_counter()
-    fit = fit_labelled(labelled, rig, obj, options)
+    fit = fit_labelled(labelled, rig, obj, options, guesser)
     seconds = {
         "detection": found - started,
         "identity": identified - found,
@@ -104,6 +109,7 @@ def fit_labelled(
     rig: CameraRig,
     obj: CalibrationObject,
     options: PipelineOptions = PipelineOptions(),
+    guesser: Guesser | None = None,
 ) -> Calibration:
     """Estimate the rig from all labelled snapshots, leaving out what does not fit, and check that the rest does.
 
@@ -112,6 +118,7 @@ def fit_labelled(
         rig: the factory calibration.
         obj: the calibration object.
         options: how sure the result must be.
+        guesser: network whose first guess is the start, where it is nearer to the images than the factory calibration.
 
     Raises:
         RefusedError: a camera saw nothing, the estimate has no minimum, or the residuals do not fit.
@@ -121,7 +128,12 @@ def fit_labelled(
     _require_cameras(labels, rig, options)
     prior = (rig.prior or RigPrior()).std(rig)
     problem = make_problem(observations, rig, obj, prior)
-    state = make_start(problem, poses or initial_pose(observations, rig, obj), None)
+    poses = poses or initial_pose(observations, rig, obj)
+    guess = None if guesser is None else guesser.guess(observations, rig, obj)
+    guess_used = guess is not None and _rms(guess.residual) < _rms(residual_of(rig, poses, observations, obj))
+    state = make_start(problem, poses, None)
+    if guess is not None and guess_used:
+        state = make_start(problem, guess.rig_from_object, guess.rig)
     widened: dict[str, float] = {}
     seen, model_error = labels, options.identity_error
     for _ in range(8):
@@ -164,7 +176,13 @@ def fit_labelled(
         widened=widened,
         factory=rig,
         obj=obj,
+        first_guess=guess,
+        guess_used=guess_used,
     )
+
+
+def _rms(residual: Tensor) -> float:
+    return float(residual.square().sum().sqrt())
 
 
 def _used(labelled: Labelled, rig: CameraRig, obj: CalibrationObject) -> tuple[Observations, RigidTransform | None]:

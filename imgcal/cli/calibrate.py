@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 
@@ -24,6 +24,7 @@ from imgcal.cli.describe import describe, describe_refusal
 from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import relative_covariance
+from imgcal.first_guess import load_guesser
 from imgcal.formats import RigCovariance, load_object, load_rig, open_input, save_rig, write_text
 from imgcal.labelling import PipelineOptions
 from imgcal.pipeline import Calibration, calibrate, rms_length
@@ -45,7 +46,7 @@ class Calibrate:
     object: str  #: object: file, or the name of a shipped one
     out: Path  #: folder to write
     snapshots: str | None = None  #: A:B, numbers in file order from 0, B excluded
-    first_guess: Literal["none"] = "none"  #: where to start from; "none" = the factory rig
+    first_guess: str = "none"  #: where to start: none (factory rig), points, vit or cnn (shipped networks), or a file
     without: tuple[str, ...] = ()  #: cameras to leave out
     blind_cameras: bool = False  #: accept cameras that see nothing; they keep their factory values
     full_covariance: bool = False  #: write the whole covariance matrix to rig.yaml, too
@@ -63,6 +64,7 @@ class Calibrate:
         rig = without_cameras(complete, self.without)
         reference = self._reference(rig)
         source = open_input(self.input, complete, obj.fiducials)
+        guesser = None if self.first_guess == "none" else load_guesser(self.first_guess, rig, obj)
         loaded = time.perf_counter()
         detections, frames = read_detections(source, self.snapshots, self.detection)
         detections = only_cameras(detections, rig)
@@ -76,7 +78,7 @@ class Calibrate:
         calibration: Calibration | None = None
         try:
             calibration = calibrate(
-                detections, rig, obj, PipelineOptions(blind_cameras=self.blind_cameras), progress=bar
+                detections, rig, obj, PipelineOptions(blind_cameras=self.blind_cameras), guesser=guesser, progress=bar
             )
         except RefusedError as error:
             refusal = error
@@ -131,6 +133,7 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         "identity_alternatives": alternatives,
         "rms_px_before": rms_length(calibration.before.residual, seen),
         "rms_px_after": rms_length(calibration.residual, seen),
+        "first_guess": _guess_summary(calibration),
         "chi2_per_dof": float(calibration.chi2_per_dof),
         "model_error_px": calibration.model_error,
         "outliers": calibration.outliers,
@@ -143,6 +146,14 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
     }
 
 
+def _guess_summary(calibration: Calibration) -> dict[str, Any] | None:
+    guess = calibration.first_guess
+    if guess is None:
+        return None
+    rms = rms_length(guess.residual, calibration.observations.seen)
+    return {"network": guess.name, "rms_px": rms, "used": calibration.guess_used}
+
+
 def refused_summary(reason: str, snapshot_names: tuple[str, ...], seconds: dict[str, float]) -> dict[str, Any]:
     """Say why there is no result, with the same keys."""
     return {
@@ -152,6 +163,7 @@ def refused_summary(reason: str, snapshot_names: tuple[str, ...], seconds: dict[
         "identity_alternatives": None,
         "rms_px_before": None,
         "rms_px_after": None,
+        "first_guess": None,
         "chi2_per_dof": None,
         "model_error_px": None,
         "outliers": None,
@@ -165,7 +177,12 @@ def refused_summary(reason: str, snapshot_names: tuple[str, ...], seconds: dict[
 
 
 def _print(result: dict[str, Any], out: Path, report: bool) -> None:
-    print(f"reprojection error before {result['rms_px_before']:.3f} px, after {result['rms_px_after']:.4f} px (RMS)")
+    guess = result["first_guess"]
+    network = "" if guess is None else f"network alone {guess['rms_px']:.3f} px, "
+    before, after = result["rms_px_before"], result["rms_px_after"]
+    print(f"reprojection error before {before:.3f} px, {network}after {after:.4f} px (RMS)")
+    if guess is not None and not guess["used"]:
+        print("note: the network's guess was no better than the factory calibration: not used", file=sys.stderr)
     print(
         f"identity {result['identity']}, {result['snapshots_used']} snapshots used, "
         f"{result['snapshots_rejected']} rejected"
