@@ -1,0 +1,231 @@
+"""What others would use: OpenCV camera by camera, scipy's least squares. One rig at a time, on the CPU."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from torch import Tensor
+
+from imgcal.estimation import initial_pose
+from imgcal.estimation.estimate import make_problem, make_start
+from imgcal.estimation.linearize import Problem, State, moved, pose_at, rig_at
+from imgcal.networks.prediction import Prediction
+from imgcal.objects import CalibrationObject
+from imgcal.observations import Observations
+from imgcal.rig import PARAMETERS, CameraRig, pack21, unpack21
+from imgcal.transforms import RigidTransform
+
+Array = NDArray[np.float64]
+Intrinsics = tuple[Array, Array]  # camera matrix (3, 3), distortion (5,)
+
+LEAST_POINTS = 4
+STEP = 1e-6  # of numerical derivatives, whitened units
+MOST_EVALUATIONS = 200
+
+
+def pnp(uv: Tensor, seen: Tensor, factory: CameraRig, obj: CalibrationObject, otherwise: Prediction) -> Prediction:
+    """Find every camera's pose on its own, with factory intrinsics: SQPnP, then Levenberg-Marquardt on pixels.
+
+    Args:
+        uv: (B, C, N, 2) pixels.
+        seen: (B, C, N) bool.
+        factory: the factory rig, without batch axes.
+        obj: N fiducials.
+        otherwise: (B,) taken for cameras that see fewer than four fiducials, or where OpenCV fails.
+    """
+    points = _numpy(obj.points)
+    lenses = [_intrinsics(factory, camera) for camera in range(factory.cameras)]
+
+    def solve(camera: int, uv: Array, seen: NDArray[np.bool_]) -> _Camera | None:
+        matrix, distortion = lenses[camera]
+        pose = _solve_pnp(points[seen], uv[seen], matrix, distortion)
+        return None if pose is None else _Camera(matrix, distortion, *pose)
+
+    return _camera_by_camera(solve, uv, seen, factory, otherwise)
+
+
+def calibrate_cameras(
+    uv: Tensor, seen: Tensor, factory: CameraRig, obj: CalibrationObject, otherwise: Prediction
+) -> Prediction:
+    """Calibrate every camera on its own with OpenCV, from its factory intrinsics; arguments as for `pnp`.
+
+    One snapshot of eight points gives 16 equations for 15 unknowns, and OpenCV has no prior. Where fewer points are
+    seen, values are held at the factory's until there are as many equations: k3, k2 and p1, p2; k1; principal point.
+    """
+    points = _numpy(obj.points)
+    lenses = [_intrinsics(factory, camera) for camera in range(factory.cameras)]
+    sizes = [(int(width), int(height)) for width, height in factory.image_size.tolist()]
+
+    def solve(camera: int, uv: Array, seen: NDArray[np.bool_]) -> _Camera | None:
+        flags = _flags(int(seen.sum()))
+        if flags is None:
+            return None
+        shown = [points[seen].astype(np.float32)], [uv[seen].astype(np.float32)]
+        start = [value.copy() for value in lenses[camera]]
+        try:
+            _, matrix, distortion, turns, shifts = cv2.calibrateCamera(*shown, sizes[camera], *start, flags=flags)
+        except cv2.error:
+            return None
+        found = _Camera(_array(matrix), _array(distortion).ravel()[:5], _matrix_of(turns[0]), _array(shifts[0]))
+        return found if found.usable else None
+
+    return _camera_by_camera(solve, uv, seen, factory, otherwise)
+
+
+def _flags(points: int) -> int | None:
+    """What OpenCV must hold fixed, so that there are no more unknowns than equations; None = it cannot be done."""
+    if points < LEAST_POINTS:
+        return None
+    flags = cv2.CALIB_USE_INTRINSIC_GUESS
+    if points < 8:  # 15 unknowns
+        flags |= cv2.CALIB_FIX_K3 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_TANGENT_DIST
+    if points < 6:  # 11 unknowns
+        flags |= cv2.CALIB_FIX_K1
+    if points < 5:  # 10 unknowns
+        flags |= cv2.CALIB_FIX_PRINCIPAL_POINT
+    return flags
+
+
+def _camera_by_camera(
+    solve: Callable[[int, Array, NDArray[np.bool_]], _Camera | None],
+    uv: Tensor,
+    seen: Tensor,
+    factory: CameraRig,
+    otherwise: Prediction,
+) -> Prediction:
+    """Solve for every camera of every rig; `solve(camera, uv (N, 2), seen (N,))` returns None where it cannot."""
+    cameras = pack21(otherwise.cameras_from_object).clone()
+    places, flags = _numpy(uv), seen.cpu().numpy()
+    for row in range(len(uv)):
+        for camera in range(factory.cameras):
+            found = solve(camera, places[row, camera], flags[row, camera])
+            if found is not None:
+                cameras[row, camera] = torch.from_numpy(found.numbers)
+    return Prediction.from_cameras(unpack21(cameras, factory), factory)
+
+
+def _solve_pnp(points: Array, uv: Array, matrix: Array, distortion: Array) -> tuple[Array, Array] | None:
+    """Rotation (3, 3) and translation (3,) of cam_from_object, or None."""
+    if len(points) < LEAST_POINTS:
+        return None
+    try:
+        found, turn, shift = cv2.solvePnP(points, uv, matrix, distortion, flags=cv2.SOLVEPNP_SQPNP)
+        if not found:
+            return None
+        refined = cv2.solvePnPRefineLM(points, uv, matrix, distortion, turn.copy(), shift.copy())
+        # Outliers can make the refinement diverge.
+        turn, shift = min((turn, shift), refined, key=lambda pose: _misfit(points, uv, matrix, distortion, *pose))
+    except cv2.error:
+        return None
+    return _matrix_of(turn), _array(shift).ravel()
+
+
+def _misfit(points: Array, uv: Array, matrix: Array, distortion: Array, turn: Any, shift: Any) -> float:
+    """Sum of squared pixel errors; infinite where it is not finite."""
+    error = float(np.square(cv2.projectPoints(points, turn, shift, matrix, distortion)[0][:, 0] - uv).sum())
+    return error if np.isfinite(error) else float("inf")
+
+
+def _matrix_of(turn: Any) -> Array:
+    return _array(cv2.Rodrigues(turn)[0])
+
+
+def _array(values: Any) -> Array:
+    return np.asarray(values, dtype=np.float64)
+
+
+def _intrinsics(rig: CameraRig, camera: int) -> Intrinsics:
+    fx, fy = rig.focal_length[camera].tolist()
+    cx, cy = rig.principal_point[camera].tolist()
+    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    return matrix, _numpy(rig.distortion[camera])
+
+
+def _numpy(tensor: Tensor) -> Array:
+    return tensor.detach().cpu().double().numpy()
+
+
+def bundle_adjustment(
+    observations: Observations, factory: CameraRig, obj: CalibrationObject, spread: Tensor
+) -> Prediction:
+    """Minimize the MAP cost with squared loss by scipy's least_squares (MINPACK), numerical derivatives.
+
+    Args:
+        observations: (B, 1, C, N).
+        factory: the factory rig, without batch axes; where the search starts, with a pose by PnP.
+        obj: N fiducials.
+        spread: (C, 15) standard deviation of each factory value.
+    """
+    found = []
+    for row in range(len(observations.uv)):
+        one = Observations(
+            *(value[row : row + 1] for value in (observations.uv, observations.sigma, observations.seen))
+        )
+        problem = make_problem(one, factory, obj, spread)
+        state = _least_squares(problem, make_start(problem, initial_pose(one, factory, obj), None))
+        found.append((rig_at(problem, state.offset), pose_at(problem, state)))
+    turns = torch.cat([pose.rotation[:, 0] for _, pose in found])
+    shifts = torch.cat([pose.translation[:, 0] for _, pose in found])
+    rigs = [rig for rig, _ in found]
+    extrinsics = RigidTransform(
+        torch.cat([rig.cam_from_rig.rotation for rig in rigs]),
+        torch.cat([rig.cam_from_rig.translation for rig in rigs]),
+    )
+    rig = replace(
+        factory,
+        focal_length=torch.cat([rig.focal_length for rig in rigs]),
+        principal_point=torch.cat([rig.principal_point for rig in rigs]),
+        distortion=torch.cat([rig.distortion for rig in rigs]),
+        cam_from_rig=extrinsics,
+    )
+    return Prediction(rig, RigidTransform(turns, shifts))
+
+
+def _least_squares(problem: Problem, start: State) -> State:
+    """Minimize the cost of one rig with one snapshot."""
+    cameras = problem.uv.shape[2]
+    split = PARAMETERS * cameras
+
+    def at(x: Tensor) -> State:
+        """States (R,) at steps (R, 15 C + 6)."""
+        return moved(problem, start, x[:, :split].unflatten(1, (cameras, PARAMETERS)), x[:, None, split:])
+
+    def residuals(x: Tensor) -> Tensor:
+        state = at(x)
+        points = pose_at(problem, state).apply(problem.points + problem.centroid)[:, 0]  # (R, N, 3)
+        radius = None if problem.radius_squared is None else problem.radius_squared.sqrt()
+        uv = rig_at(problem, state.offset).project(points, radius).uv
+        whitened = (uv.mT - problem.uv[:, 0]) * problem.root_weight[:, 0].unsqueeze(-2)
+        return torch.cat((whitened.flatten(1), state.offset.flatten(1)), dim=1)
+
+    def residual(x: Array) -> Array:
+        return _numpy(residuals(torch.from_numpy(x)[None])[0])
+
+    def jacobian(x: Array) -> Array:
+        """All forward differences at once, as one batch."""
+        steps = torch.from_numpy(x) + STEP * torch.eye(len(x), dtype=torch.float64)
+        values = residuals(torch.cat((torch.from_numpy(x)[None], steps)))
+        return _numpy((values[1:] - values[:1]).mT / STEP)
+
+    solution = least_squares(residual, np.zeros(split + 6), jac=jacobian, method="lm", max_nfev=MOST_EVALUATIONS)
+    return at(torch.from_numpy(solution.x)[None])
+
+
+class _Camera:
+    """One camera in the object's frame, as OpenCV gives it."""
+
+    def __init__(self, matrix: Array, distortion: Array, rotation: Array, translation: Array) -> None:
+        focal, principal = (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2])
+        self.numbers = np.concatenate((rotation.ravel(), translation.ravel(), focal, principal, distortion.ravel()))
+
+    @property
+    def usable(self) -> bool:
+        """Tell whether the numbers are finite and the focal lengths positive."""
+        return bool(np.isfinite(self.numbers).all() and (self.numbers[12:14] > 0).all())

@@ -1,0 +1,160 @@
+"""Everything that turns views into a prediction, as plain functions in a dict: `BASELINES`, and networks.
+
+Each is given the same: views, the factory rig, the object, the spread of the drift and the noise. None knows the truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+
+from imgcal.estimation import estimate
+from imgcal.evaluation import classical
+from imgcal.evaluation.metrics import of_estimate
+from imgcal.evaluation.refine import observed, refine_robustly, robust_pose
+from imgcal.networks.prediction import Prediction, Views
+from imgcal.networks.rendering import ImageOptions, render_views
+from imgcal.objects import CalibrationObject
+from imgcal.rig import CameraRig
+
+
+@dataclass(frozen=True)
+class Given:
+    """What a method may use. Double precision, on the CPU."""
+
+    views: Views  # (B,) uv and seen
+    factory: CameraRig  # without batch axes
+    obj: CalibrationObject
+    spread: Tensor  # (C, 15) standard deviation of each factory value
+    sigma: float  # pixels, noise of the points
+    drawn: dict[ImageOptions, Tensor] = field(default_factory=dict)  # images, as far as somebody has asked for them
+
+    @property
+    def uv(self) -> Tensor:
+        """(B, C, N, 2) pixels."""
+        if self.views.uv is None:
+            raise ValueError("views hold no points")
+        return self.views.uv
+
+    @property
+    def seen(self) -> Tensor:
+        """(B, C, N) bool."""
+        if self.views.seen is None:
+            raise ValueError("views hold no points")
+        return self.views.seen
+
+    def images(self, options: ImageOptions) -> Tensor:
+        """Colour-coded images of the points, 8 bit a channel: (B, C, 3, size, size) float32; drawn once."""
+        if options not in self.drawn:
+            uv = self.uv.to(torch.float32)
+            self.drawn[options] = render_views(uv, self.seen, self.factory.image_size, self.obj, options, quantise=True)
+        return self.drawn[options]
+
+
+Predict = Callable[[Given], Prediction]
+Refine = Callable[[Prediction, Given], Prediction]
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way to calibrate, with its refinement as a second column where it has one."""
+
+    predict: Predict
+    refine: Refine | None = None
+    most: int | None = None  # rigs of a trial that it is given: it is slow
+    batch: int | None = None  # rigs at once at most: it needs much memory
+    images: ImageOptions | None = None  # what it looks at, when not at points
+
+
+def factory_alone(given: Given) -> Prediction:
+    """Keep the factory rig and fit only the object's pose: what a tracking system does that is not recalibrated.
+
+    The true pose would make this worse and less honest: nobody knows it, and a rig is only as wrong as its cameras
+    disagree about where the object is. Huber's loss; every camera votes.
+    """
+    observations = observed(given.uv, given.seen, given.sigma)
+    fixed = torch.zeros_like(given.spread)
+    return of_estimate(estimate(observations, given.factory, given.obj, spread=fixed))
+
+
+def map_from_pnp(given: Given) -> Prediction:
+    """MAP estimation of the whole rig from the factory rig and a pose by PnP over all cameras; Huber's loss."""
+    observations = observed(given.uv, given.seen, given.sigma)
+    return of_estimate(estimate(observations, given.factory, given.obj, spread=given.spread))
+
+
+def robust_from_pnp(given: Given) -> Prediction:
+    """PnP in spite of outliers, then the same robust refinement that follows the networks."""
+    start = robust_pose(given.views, given.factory, given.obj, given.sigma)
+    return refined_by_points(start, given)
+
+
+def refined_by_points(prediction: Prediction, given: Given) -> Prediction:
+    """`refine_robustly` with what is given."""
+    return refine_robustly(prediction, given.views, given.factory, given.obj, given.spread, sigma=given.sigma)
+
+
+def pnp(given: Given) -> Prediction:
+    """PnP for every camera on its own, with its factory intrinsics (OpenCV's solvePnP)."""
+    return classical.pnp(given.uv, given.seen, given.factory, given.obj, factory_alone(given))
+
+
+def opencv_calibrate(given: Given) -> Prediction:
+    """OpenCV's calibrateCamera for every camera on its own, starting from the factory intrinsics."""
+    return classical.calibrate_cameras(given.uv, given.seen, given.factory, given.obj, factory_alone(given))
+
+
+def scipy_bundle_adjustment(given: Given) -> Prediction:
+    """Minimize the cost of MAP estimation, squared loss, with scipy's least_squares from a pose by PnP."""
+    observations = observed(given.uv, given.seen, given.sigma)
+    return classical.bundle_adjustment(observations, given.factory, given.obj, given.spread)
+
+
+BASELINES: dict[str, Method] = {
+    "factory, pose fitted": Method(factory_alone),
+    "PnP per camera, factory intrinsics": Method(pnp, most=2000),
+    "OpenCV calibrateCamera per camera": Method(opencv_calibrate, most=200),
+    "scipy bundle adjustment": Method(scipy_bundle_adjustment, most=50),
+    "MAP from PnP": Method(map_from_pnp),
+    "PnP + robust bundle adjustment": Method(robust_from_pnp),
+}
+"""The competitors, by the name they have in tables. Slow ones get the first `most` rigs of every trial."""
+
+
+def network_method(network: nn.Module, batch: int | None = None) -> Method:
+    """Make a method of a network in evaluation mode, on whatever device it is; refinement runs on the CPU.
+
+    Args:
+        network: takes `Views`, returns predictions coarse to fine (`imgcal.networks`).
+        batch: rigs at once at most; None = 512 for points, 32 for images.
+    """
+    options: ImageOptions | None = network.image_options  # type: ignore[assignment]
+    device = next((parameter.device for parameter in network.parameters()), torch.device("cpu"))
+
+    @torch.no_grad()
+    def predict(given: Given) -> Prediction:
+        if options is None:
+            views = Views(uv=given.uv.to(device, torch.float32), seen=given.seen.to(device))
+        else:
+            views = Views(images=given.images(options).to(device))
+        prediction: Prediction = network(views)[-1]
+        return prediction.to(torch.float64, "cpu")
+
+    if options is None:
+        return Method(predict, refined_by_points, batch=batch or 512)
+    return Method(predict, _refined_by_images(options), batch=batch or 32, images=options)
+
+
+def _refined_by_images(options: ImageOptions) -> Refine:
+    def refine(prediction: Prediction, given: Given) -> Prediction:
+        from imgcal.refinement import ImageRefinementOptions, refine_images
+
+        comparison = ImageRefinementOptions(image=options, position_noise=given.sigma)
+        images = given.images(options)
+        fit, _ = refine_images(prediction, images, given.factory, given.obj, given.spread, comparison)
+        return of_estimate(fit)
+
+    return refine

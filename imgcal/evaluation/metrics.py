@@ -1,0 +1,139 @@
+"""How far a prediction is from the truth, and how near physics lets any estimator come."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import torch
+from torch import Tensor
+
+from imgcal.estimation import Estimate, relative_covariance, relative_difference
+from imgcal.estimation.linearize import POSE_PARAMETERS, NormalEquations, linearize
+from imgcal.estimation.robust import squared
+from imgcal.networks.prediction import Prediction
+from imgcal.objects import CalibrationObject
+from imgcal.rig import PARAMETERS, CameraRig
+from imgcal.transforms import RigidTransform
+
+
+@dataclass(frozen=True)
+class Errors:
+    """One number a rig for each kind of error, (B,): root mean square over cameras (and axes). Bounds have this form.
+
+    Rotations and positions are relative to the first camera, which does not count: free of the gauge.
+    """
+
+    re: Tensor  # pixels
+    focal_length: Tensor  # pixels
+    focal_length_percent: Tensor  # of the true focal length
+    principal_point: Tensor  # pixels
+    distortion: Tensor  # all five coefficients alike
+    rotation_deg: Tensor  # angle
+    position: Tensor  # mm, distance
+
+    def __len__(self) -> int:
+        return len(self.re)
+
+    def __getitem__(self, rows: slice) -> Errors:
+        return Errors(**{name: getattr(self, name)[rows] for name in KINDS})
+
+
+KINDS = tuple(field.name for field in fields(Errors))
+
+
+def concatenate(parts: Sequence[Errors]) -> Errors:
+    """Join errors of several batches."""
+    return Errors(**{name: torch.cat([getattr(part, name) for part in parts]) for name in KINDS})
+
+
+@torch.no_grad()
+def reprojection_error(predicted: CameraRig, truth: CameraRig, obj: CalibrationObject) -> Tensor:
+    """RE, the paper's error: root mean square over cameras, fiducials and both axes of the pixel error.
+
+    Args:
+        predicted: (B,) cameras in the object's frame (`Prediction.cameras_from_object`).
+        truth: (B,) likewise.
+        obj: N fiducials, all of which count, seen or not.
+
+    Returns:
+        (B,) pixels. A fiducial behind a predicted camera counts with the finite, huge pixel that projection gives it.
+    """
+    batch = torch.broadcast_shapes(predicted.batch_shape, truth.batch_shape)
+    dtype = torch.promote_types(predicted.focal_length.dtype, truth.focal_length.dtype)
+    points = obj.points.to(dtype).expand(*batch, -1, -1)
+    radius = None if obj.radius is None else obj.radius.to(dtype)
+    difference = predicted.to(dtype).project(points, radius).uv - truth.to(dtype).project(points, radius).uv
+    return difference.square().mean((-1, -2, -3)).sqrt()
+
+
+@torch.no_grad()
+def errors(predicted: Prediction, truth: Prediction, obj: CalibrationObject) -> Errors:
+    """Compare predictions (B,) with the truth."""
+    difference = relative_difference(predicted.rig, truth.rig)
+    re = reprojection_error(predicted.cameras_from_object, truth.cameras_from_object, obj)
+    return _summed_up(difference.square(), re, truth.rig.focal_length)
+
+
+@torch.no_grad()
+def cramer_rao(estimate: Estimate) -> Errors:
+    """Posterior Cramer-Rao bound of every kind of error: root of the mean variance that the data and the prior leave.
+
+    Evaluated at the MAP estimate from the true inliers, not at the truth: the two differ by less than the noise, and
+    there the normal equations are at hand. Under the uniform drift of the paper the prior is a Gaussian of equal
+    variance, so this is the bound of estimators that know the drift's spread and no more.
+
+    Args:
+        estimate: (B,) with one snapshot each, by the squared loss.
+    """
+    variance = relative_covariance(estimate).diagonal(dim1=-2, dim2=-1).unflatten(-1, (estimate.rig.cameras, -1))
+    return _summed_up(variance.clamp_min(0), _re_bound(estimate), estimate.rig.focal_length)
+
+
+def _summed_up(squares: Tensor, re: Tensor, focal_length: Tensor) -> Errors:
+    """Reduce squared errors or variances (B, C, 15), extrinsics relative to the first camera."""
+    others = squares[..., 1:, :] if squares.shape[-2] > 1 else squares
+    focal = squares[..., 6:8]
+    return Errors(
+        re=re,
+        focal_length=focal.mean((-1, -2)).sqrt(),
+        focal_length_percent=100 * (focal / focal_length.square()).mean((-1, -2)).sqrt(),
+        principal_point=squares[..., 8:10].mean((-1, -2)).sqrt(),
+        distortion=squares[..., 10:15].mean((-1, -2)).sqrt(),
+        rotation_deg=others[..., 0:3].sum(-1).mean(-1).sqrt() * (180 / math.pi),
+        position=others[..., 3:6].sum(-1).mean(-1).sqrt(),
+    )
+
+
+def _re_bound(estimate: Estimate) -> Tensor:
+    """Root of the mean variance of all N fiducials' pixels in all cameras, seen or not: (B,)."""
+    problem, solution = estimate.problem, estimate.solution
+    every = replace(problem, root_weight=torch.ones_like(problem.root_weight))
+    full = linearize(every, solution.state, squared)
+    information = _dense(full)
+    diagonal = information.diagonal(dim1=-2, dim2=-1)
+    diagonal[:, : diagonal.shape[1] - POSE_PARAMETERS] -= 1  # the prior's unit matrix
+    covariance = torch.cholesky_inverse(torch.linalg.cholesky(_dense(solution.equations)))
+    variance = (information * covariance).sum((-1, -2)) / (2 * problem.root_weight[0].numel())
+    return variance.clamp_min(0).sqrt()
+
+
+def _dense(equations: NormalEquations) -> Tensor:
+    """Normal matrix of one snapshot a rig: (B, 15 C + 6, 15 C + 6)."""
+    batch, cameras = equations.camera.shape[:2]
+    size = cameras * PARAMETERS
+    matrix = equations.camera.new_zeros(batch, size + POSE_PARAMETERS, size + POSE_PARAMETERS)
+    blocks = matrix[:, :size, :size].unflatten(1, (cameras, PARAMETERS)).unflatten(-1, (cameras, PARAMETERS))
+    blocks.diagonal(dim1=1, dim2=3).copy_(equations.camera.permute(0, 2, 3, 1))
+    coupling = equations.coupling[:, 0].reshape(batch, size, POSE_PARAMETERS)
+    matrix[:, :size, size:] = coupling
+    matrix[:, size:, :size] = coupling.mT
+    matrix[:, size:, size:] = equations.pose[:, 0]
+    return matrix
+
+
+def of_estimate(estimate: Estimate) -> Prediction:
+    """Take an estimate of one snapshot a rig, (B,) and (B, 1) poses, as a prediction."""
+    pose = estimate.rig_from_object
+    return Prediction(estimate.rig, RigidTransform(pose.rotation[..., 0, :, :], pose.translation[..., 0, :]))

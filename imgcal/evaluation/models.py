@@ -1,0 +1,93 @@
+"""Trained networks as they are evaluated: from checkpoints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from imgcal.errors import InputError
+from imgcal.evaluation.methods import Method, network_method
+from imgcal.evaluation.protocol import Conditions
+from imgcal.objects import CalibrationObject
+from imgcal.rig import CameraRig
+from imgcal.training.checkpoint import Checkpoint, load_checkpoint
+
+METRICS = "metrics.jsonl"
+
+
+@dataclass(frozen=True)
+class Model:
+    """A network from a file."""
+
+    name: str
+    path: Path
+    checkpoint: Checkpoint
+    method: Method
+    history: tuple[dict[str, Any], ...]  # what its training logged, if that lies beside it
+
+    @property
+    def parameters(self) -> int:
+        """Number of trained values."""
+        return sum(parameter.numel() for parameter in self.checkpoint.network.parameters())
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file."""
+        return self.path.stat().st_size
+
+    @property
+    def conditions(self) -> Conditions:
+        """What it was trained for, without corruption."""
+        experiment = self.checkpoint.experiment
+        return Conditions(
+            self.checkpoint.rig, self.checkpoint.obj, experiment.poses.pose_range(), experiment.drift.drift()
+        )
+
+
+def load_models(
+    paths: Sequence[Path],
+    rig: CameraRig | None = None,
+    obj: CalibrationObject | None = None,
+    device: torch.device | str = "cpu",
+) -> list[Model]:
+    """Read networks that are to be evaluated on the same rigs.
+
+    Args:
+        paths: checkpoints, or folders of training runs.
+        rig: what they must be for; None = what the first one is for.
+        obj: likewise.
+        device: where they run.
+
+    Raises:
+        InputError: a file that cannot be used, or a network for another rig or object.
+    """
+    models: list[Model] = []
+    files = [path / "model.safetensors" if path.is_dir() else path for path in paths]
+    for path, name in zip(files, _names(files), strict=True):
+        checkpoint = load_checkpoint(path, rig, obj)
+        rig, obj = rig or checkpoint.rig, obj or checkpoint.obj
+        network = checkpoint.network.to(device)
+        models.append(Model(name, path, checkpoint, network_method(network), _history(path.parent / METRICS)))
+    return models
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """Short names that differ: of the file, or of the folder where a training run has put it."""
+    names = [path.parent.resolve().name if path.stem == "model" else path.stem for path in paths]
+    if len(set(names)) < len(names):
+        names = [str(path.with_suffix("")) for path in paths]
+    if len(set(names)) < len(names):
+        raise InputError(f"models: found {', '.join(map(str, paths))}, expected each one once")
+    return names
+
+
+def _history(path: Path) -> tuple[dict[str, Any], ...]:
+    if not path.is_file():
+        return ()
+    from imgcal.training.log import read_metrics  # brings TensorBoard along, which is slow to import
+
+    return tuple(read_metrics(path))

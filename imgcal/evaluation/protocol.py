@@ -1,0 +1,238 @@
+"""The paper's protocol: many random rigs, several trials, every method on the same rigs."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from imgcal.errors import InputError
+from imgcal.estimation import Estimate
+from imgcal.evaluation.corruption import Corrupted, Corruption
+from imgcal.evaluation.methods import Given, Method
+from imgcal.evaluation.metrics import KINDS, Errors, concatenate, cramer_rao, errors, of_estimate
+from imgcal.evaluation.refine import Target
+from imgcal.networks.prediction import Prediction, Views
+from imgcal.objects import CalibrationObject
+from imgcal.rig import CameraRig
+from imgcal.synthesis import Drift, PoseRange, RelativeDrift, synthesize
+
+REFERENCE = "MAP, true inliers"
+LEAST_SIGMA = 0.02  # pixels: what exact points are believed to
+
+Progress = Callable[[int], None]
+"""Called with a number of rigs whenever that many have been given to one more method."""
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What random rigs are drawn from, and what happens to their views."""
+
+    rig: CameraRig  # factory, float64, without batch axes
+    obj: CalibrationObject
+    pose_range: PoseRange = PoseRange()
+    drift: Drift = RelativeDrift()
+    corruption: Corruption = Corruption()
+
+    @property
+    def sigma(self) -> float:
+        """What methods are told about the noise: pixels."""
+        return max(self.corruption.noise, LEAST_SIGMA)
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """How much to evaluate."""
+
+    count: int = 20_000  # rigs a trial
+    trials: int = 3
+    seed: int = 0
+    batch: int = 512  # rigs at once at most
+    bound_count: int = 512  # rigs of a trial whose Cramer-Rao bounds are evaluated, where there is noise
+
+    def __post_init__(self) -> None:
+        for name in ("count", "trials", "batch"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name}: found {getattr(self, name)}, expected at least 1")
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Errors of one column over all trials."""
+
+    trials: tuple[Errors, ...]
+    bounds: tuple[Errors, ...]  # of the first rigs of each trial
+
+    @property
+    def re(self) -> Tensor:
+        """RE of all rigs of all trials, pixels."""
+        return torch.cat([trial.re for trial in self.trials])
+
+    def statistics(self) -> dict[str, int | float | list[float] | None]:
+        """RE: mean over rigs, averaged over trials, with the standard deviation of that mean over trials, and so on."""
+        means = [float(trial.re.mean()) for trial in self.trials]
+        re = self.re
+        return {
+            "rigs": len(re),
+            "mean": statistics.fmean(means),
+            "spread": statistics.stdev(means) if len(means) > 1 else None,
+            "trial_means": means,
+            "median": float(re.median()),
+            "p95": float(re.quantile(0.95)),
+            "p99": float(re.quantile(0.99)),
+            "share_under_half_px": float((re < 0.5).double().mean()),
+        }
+
+    def parameters(self) -> dict[str, float]:
+        """Root mean square over rigs of every error but RE."""
+        joined = concatenate(self.trials)
+        return {kind: _rms(getattr(joined, kind)) for kind in KINDS if kind != "re"}
+
+    def cramer_rao_ratios(self) -> dict[str, float | None]:
+        """Root mean square error over root mean square bound, on the rigs that have a bound; None where it is zero."""
+        if not self.bounds:
+            return dict.fromkeys(KINDS)
+        pairs = [(trial, bound) for trial, bound in zip(self.trials, self.bounds, strict=True)]
+        shared = [min(len(trial), len(bound)) for trial, bound in pairs]
+        found = concatenate([trial[:count] for (trial, _), count in zip(pairs, shared, strict=True)])
+        bound = concatenate([bound[:count] for (_, bound), count in zip(pairs, shared, strict=True)])
+        limits = {kind: _rms(getattr(bound, kind)) for kind in KINDS}
+        return {kind: _rms(getattr(found, kind)) / limit if limit > 0 else None for kind, limit in limits.items()}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method: alone, and refined where it has a refinement."""
+
+    alone: Scores
+    refined: Scores | None = None
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Every method on the same rigs, and what MAP estimation makes of the true inliers, from the truth."""
+
+    conditions: Conditions
+    protocol: Protocol
+    rows: Mapping[str, Row]
+    reference: Scores
+
+
+@dataclass
+class _Collected:
+    """Errors of one trial, batch by batch."""
+
+    alone: list[Errors] = field(default_factory=list)
+    refined: list[Errors] = field(default_factory=list)
+
+
+def evaluate(
+    methods: Mapping[str, Method],
+    conditions: Conditions,
+    protocol: Protocol = Protocol(),
+    progress: Progress = lambda rigs: None,
+) -> Evaluation:
+    """Measure methods on random rigs.
+
+    Args:
+        methods: by the name that they get in tables.
+        conditions: what rigs are drawn from, and how their views are corrupted.
+        protocol: how many rigs; the same seed gives the same rigs, whatever the methods are.
+        progress: called after each method has done a batch.
+
+    Raises:
+        RefusedError: too few random rigs see the whole object.
+    """
+    done: dict[str, list[_Collected]] = {name: [] for name in methods}
+    reference: list[Errors] = []
+    bounds: list[Errors] = []
+    for trial in range(protocol.trials):
+        parts = {name: _Collected() for name in methods}
+        exact: list[Errors] = []
+        limits: list[Errors] = []
+        for first, batch in _batches(conditions, protocol, trial):
+            fit = batch.reference()
+            exact.append(errors(of_estimate(fit), batch.truth, conditions.obj))
+            if first < protocol.bound_count and conditions.corruption.noise >= LEAST_SIGMA:
+                limits.append(cramer_rao(fit))
+            progress(len(batch))
+            for name, method in methods.items():
+                _measure(method, batch, first, parts[name])
+                progress(len(batch))
+        reference.append(concatenate(exact))
+        bounds.extend([concatenate(limits)] if limits else [])
+        for name, collected in parts.items():
+            done[name].append(collected)
+    limits_of_trials = tuple(bounds)
+    rows = {name: _row(collected, limits_of_trials) for name, collected in done.items()}
+    return Evaluation(conditions, protocol, rows, Scores(tuple(reference), limits_of_trials))
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Random rigs, the truth about them, and what methods are given."""
+
+    truth: Prediction  # (B,)
+    corrupted: Corrupted  # (B,)
+    conditions: Conditions
+
+    def __len__(self) -> int:
+        return len(self.corrupted.views)
+
+    def given(self, rows: slice = slice(None)) -> Given:
+        """What methods may use, of some of the rigs."""
+        views, known = self.corrupted.views, self.conditions
+        assert views.uv is not None and views.seen is not None  # points are what is corrupted
+        some = Views(uv=views.uv[rows], seen=views.seen[rows])
+        return Given(some, known.rig, known.obj, known.drift.std(known.rig), known.sigma)
+
+    def reference(self) -> Estimate:
+        """MAP estimate of the true inliers from the truth, squared loss."""
+        given = self.given()
+        target = Target(given.uv, self.corrupted.inlier, given.factory, given.obj, given.spread, given.sigma)
+        return target.fit(self.truth)
+
+
+def draw(conditions: Conditions, count: int, generator: torch.Generator) -> Sample:
+    """Draw random rigs and corrupt what they see."""
+    made = synthesize(
+        conditions.rig, conditions.obj, count, generator, drift=conditions.drift, pose_range=conditions.pose_range
+    )
+    views = Views(uv=made.projection.uv, seen=made.projection.visible)
+    corrupted = conditions.corruption.apply(views, conditions.rig.image_size, generator)
+    return Sample(Prediction(made.rig, made.rig_from_object), corrupted, conditions)
+
+
+def _batches(conditions: Conditions, protocol: Protocol, trial: int) -> Iterator[tuple[int, Sample]]:
+    """Rigs of a trial with the number of the first one of each batch."""
+    generator = torch.Generator().manual_seed(protocol.seed * 65_536 + trial)
+    for first in range(0, protocol.count, protocol.batch):
+        yield first, draw(conditions, min(protocol.batch, protocol.count - first), generator)
+
+
+def _measure(method: Method, batch: Sample, first: int, into: _Collected) -> None:
+    """Give a method those rigs of a batch that are its share, a few at a time."""
+    count = len(batch) if method.most is None else max(0, min(len(batch), method.most - first))
+    size = method.batch or max(count, 1)
+    for start in range(0, count, size):
+        rows = slice(start, min(start + size, count))
+        given = batch.given(rows)
+        truth = Prediction(batch.truth.rig[rows], batch.truth.rig_from_object[rows])
+        prediction = method.predict(given)
+        into.alone.append(errors(prediction, truth, given.obj))
+        if method.refine is not None:
+            into.refined.append(errors(method.refine(prediction, given), truth, given.obj))
+
+
+def _row(trials: Sequence[_Collected], bounds: tuple[Errors, ...]) -> Row:
+    alone = Scores(tuple(concatenate(trial.alone) for trial in trials), bounds)
+    if not trials[0].refined:
+        return Row(alone)
+    return Row(alone, Scores(tuple(concatenate(trial.refined) for trial in trials), bounds))
+
+
+def _rms(values: Tensor) -> float:
+    return float(values.square().mean().sqrt())
