@@ -41,7 +41,7 @@ def measure_all(
     """Fill the columns of all candidates of a frame."""
     side = 2 * half_size.max() + 1 + 2 * MARGIN if len(half_size) else 0
     scratch, ring = np.empty((4, side * side), np.float32), np.empty((4, 4 * RING * side), np.float32)
-    distances = np.empty((3, side * side), np.uint8)
+    distances, offsets = np.empty((3, side * side), np.uint8), np.empty((2, side * side), np.float32)
     least, smallest, largest, longest = limits
     for k in range(len(boxes)):
         u, v = (boxes[k, 0] + boxes[k, 2]) // 2, (boxes[k, 1] + boxes[k, 3]) // 2
@@ -51,14 +51,14 @@ def measure_all(
         grey, smooth = scratch[0, :pixels].reshape(shape), scratch[1, :pixels].reshape(shape)
         weight, ramp = scratch[2, :pixels].reshape(shape), scratch[3, :pixels].reshape(shape)
         own, other = distances[0, :pixels].reshape(shape), distances[1, :pixels].reshape(shape)
-        brightest = _copy(frame, first, u, v, invert, plane, grey)
+        brightest = _copy(frame, first, u, v, invert, plane, grey, offsets)
         _blur(grey, smooth)
         crowded = _spread_labels(tile, labels, first, label[k], distances[2, :pixels].reshape(shape), own, other)
         saddle = _claim(own, other, crowded, smooth, weight)
         _weigh(grey, smooth, noise, weight, ramp)
-        x, y, brightness, lever, tilt = _find_centre(grey, weight, ramp, first[1] - u, first[0] - v)
+        x, y, brightness, lever, tilt = _find_centre(grey, weight, ramp, offsets[0, :pixels], offsets[1, :pixels])
         peak, peak_mean = _find_peaks(grey, smooth, weight)
-        elongation, two_peaked = _find_shape(grey, weight, first[1] - u, first[0] - v, peak_mean / 2)
+        elongation, two_peaked = _find_shape(grey, weight, offsets[0, :pixels], offsets[1, :pixels], peak_mean / 2)
 
         uv[k, 0], uv[k, 1], radius[k] = u + x, v + y, np.sqrt(brightness / peak / np.pi)
         # Each pixel's noise moves the centroid by its lever arm over the brightness; mean of both axes.
@@ -170,8 +170,12 @@ def _solve(a, b, c, d, e, f, x, y, z):
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _copy(frame, first, u, v, invert, plane, grey):
-    """Copy the area and its margin out of a frame without the background; return the brightest pixel, with it."""
+def _copy(frame, first, u, v, invert, plane, grey, offsets):
+    """Copy the area and its margin out of a frame without the background, and fill offsets from (u, v).
+
+    Returns:
+        The brightest pixel, background included.
+    """
     rows, columns = grey.shape
     inside = first[1] >= 0 and first[1] + columns <= frame.shape[1]
     brightest = np.float32(-1)
@@ -185,6 +189,7 @@ def _copy(frame, first, u, v, invert, plane, grey):
                 value = np.float32(invert) - value
             brightest = max(brightest, value)
             row[j] = value - level - slope * np.float32(j)
+            offsets[0, i * columns + j], offsets[1, i * columns + j] = first[1] + j - u, first[0] + i - v
     return brightest
 
 
@@ -325,74 +330,58 @@ def _is_saturated(frame, first, invert, saturation, weight):
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _find_centre(grey, weight, ramp, left, top):
-    """Sum up the blob; the first column and row of the arrays lie at `left` and `top` from the middle of the window.
+def _find_centre(grey, weight, ramp, x, y):
+    """Sum up the blob over all pixels at (x, y) from the middle of the window, as one row.
 
     Returns:
-        Centre x, y from the middle of the window, brightness, and two sums of squared distances from the centre:
-        weighted by the squared gain of each pixel's noise, and by the weight.
+        Centre x, y, brightness, and two sums of squared distances from the centre: weighted by the squared gain of each
+        pixel's noise, and by the weight.
     """
-    brightness = bx = by = gain = gx = gy = gg = total = tx = ty = tt = 0.0
-    for i in range(MARGIN - 1, grey.shape[0] - MARGIN + 1):
-        above, middle, below, part, value = ramp[i - 1], ramp[i], ramp[i + 1], weight[i], grey[i]
-        b = b_x = g = g_x = g_xx = t = t_x = t_xx = np.float32(0)  # sums over this row
-        for j in range(MARGIN - 1, grey.shape[1] - MARGIN + 1):
-            x, w = np.float32(j + left), part[j]
-            outer = above[j - 1] + above[j] + above[j + 1] + below[j - 1] + below[j] + below[j + 1]
-            noise = w + (outer + middle[j - 1] + middle[j] + middle[j + 1]) * np.float32(1 / 9)
-            noise *= noise
-            mass = w * value[j]
-            b, b_x = b + mass, b_x + mass * x
-            g, g_x, g_xx = g + noise, g_x + noise * x, g_xx + noise * x * x
-            t, t_x, t_xx = t + w, t_x + w * x, t_xx + w * x * x
-        y = i + top
-        brightness, bx, by = brightness + b, bx + b_x, by + b * y
-        gain, gx, gy, gg = gain + g, gx + g_x, gy + g * y, gg + g_xx + g * y * y
-        total, tx, ty, tt = total + t, tx + t_x, ty + t * y, tt + t_xx + t * y * y
-    brightness = max(brightness, 1e-6)
+    wide, pixels = grey.shape[1], grey.size
+    value, part, slope = grey.reshape(-1), weight.reshape(-1), ramp.reshape(-1)
+    above, middle, below = slope[: -2 * wide], slope[wide:-wide], slope[2 * wide :]
+    value, part, x, y = value[wide:-wide], part[wide:-wide], x[wide : pixels - wide], y[wide : pixels - wide]
+    b = bx = by = g = gx = gy = gg = t = tx = ty = tt = np.float32(0)
+    for p in range(1, len(value) - 1):
+        outer = above[p - 1] + above[p] + above[p + 1] + below[p - 1] + below[p] + below[p + 1]
+        gain = part[p] + (outer + middle[p - 1] + middle[p] + middle[p + 1]) * np.float32(1 / 9)
+        gain *= gain
+        mass, square = part[p] * value[p], x[p] * x[p] + y[p] * y[p]
+        b, bx, by = b + mass, bx + mass * x[p], by + mass * y[p]
+        g, gx, gy, gg = g + gain, gx + gain * x[p], gy + gain * y[p], gg + gain * square
+        t, tx, ty, tt = t + part[p], tx + part[p] * x[p], ty + part[p] * y[p], tt + part[p] * square
+    brightness = max(float(b), 1e-6)
     x0, y0 = bx / brightness, by / brightness
     away = x0 * x0 + y0 * y0
-    lever = gg - 2 * (x0 * gx + y0 * gy) + away * gain
-    return x0, y0, brightness, lever, tt - 2 * (x0 * tx + y0 * ty) + away * total
+    return x0, y0, brightness, gg - 2 * (x0 * gx + y0 * gy) + away * g, tt - 2 * (x0 * tx + y0 * ty) + away * t
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _find_shape(grey, weight, left, top, most):
+def _find_shape(grey, weight, x, y, most):
     """Tell the elongation of a blob whose masses are cut at `most`, and whether it has two parts along its major axis.
 
     Source: Sarle's bimodality coefficient, (skewness ** 2 + 1) / kurtosis: 0.50 for any filled ellipse and less when it
     is blurred, 0.60 for two discs that touch and 0.51 to 0.57 when they are blurred, 0.56 for a uniform rod.
     """
-    rows, columns = grey.shape
-    zero, most = np.float32(0), np.float32(most)
-    total = sx = sy = xx = yy = xy = 0.0
-    for i in range(MARGIN, rows - MARGIN):
-        part, value = weight[i], grey[i]
-        t = t_x = t_xx = zero  # sums over this row
-        for j in range(MARGIN, columns - MARGIN):
-            x, mass = np.float32(j + left), min(max(part[j] * value[j], zero), most)
-            t, t_x, t_xx = t + mass, t_x + mass * x, t_xx + mass * x * x
-        y = i + top
-        total, sx, sy = total + t, sx + t_x, sy + t * y
-        xx, yy, xy = xx + t_xx, yy + t * y * y, xy + t_x * y
-    total = max(total, 1e-6)
+    value, part, zero, most = grey.reshape(-1), weight.reshape(-1), np.float32(0), np.float32(most)
+    t = sx = sy = sxx = syy = sxy = cube = fourth = zero
+    for p in range(len(value)):
+        mass = min(max(part[p] * value[p], zero), most)
+        t, sx, sy = t + mass, sx + mass * x[p], sy + mass * y[p]
+        sxx, syy, sxy = sxx + mass * x[p] * x[p], syy + mass * y[p] * y[p], sxy + mass * x[p] * y[p]
+    total = max(float(t), 1e-6)
     x0, y0 = sx / total, sy / total
-    xx, yy, xy = xx / total - x0 * x0, yy / total - y0 * y0, xy / total - x0 * y0
+    xx, yy, xy = sxx / total - x0 * x0, syy / total - y0 * y0, sxy / total - x0 * y0
     angle, swing = 0.5 * np.arctan2(2 * xy, xx - yy), np.hypot(xx - yy, 2 * xy)
     major, minor = (xx + yy + swing) / 2, (xx + yy - swing) / 2
     elongation = np.sqrt(major / max(minor, 1 / 12))  # no narrower than a pixel
-    third = fourth = 0.0
-    cosine = np.float32(np.cos(angle))
-    for i in range(MARGIN, rows - MARGIN):
-        part, value = weight[i], grey[i]
-        start = np.float32((i + top - y0) * np.sin(angle) + (left - x0) * np.cos(angle))
-        cube = square = zero
-        for j in range(MARGIN, columns - MARGIN):
-            mass = min(max(part[j] * value[j], zero), most)
-            along = start + np.float32(j) * cosine
-            moment = mass * along * along
-            cube, square = cube + moment * along, square + moment * along * along
-        third, fourth = third + cube, fourth + square
-    third, fourth = third / total, fourth / total
+    cosine, sine = np.float32(np.cos(angle)), np.float32(np.sin(angle))
+    start = np.float32(x0 * cosine + y0 * sine)
+    for p in range(len(value)):
+        mass = min(max(part[p] * value[p], zero), most)
+        along = x[p] * cosine + y[p] * sine - start
+        moment = mass * along * along
+        cube, fourth = cube + moment * along, fourth + moment * along * along
+    third, fourth = cube / total, fourth / total
     bimodality = (third**2 / max(major, 1e-6) ** 3 + 1) * major**2 / max(fourth, 1e-6)
     return elongation, bimodality > TWO_PEAKED and elongation > 1.3
