@@ -9,6 +9,7 @@ import tyro
 
 from imgcal.cli.calibrate import Calibrate
 from imgcal.cli.detect import Detect
+from imgcal.cli.evaluate import Compare, Evaluate
 from imgcal.cli.render import Render
 from imgcal.cli.score import Score
 from imgcal.cli.simulate import Simulate
@@ -24,6 +25,8 @@ Command = (
     | Annotated[Score, tyro.conf.subcommand("score")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Compare, tyro.conf.subcommand("compare")]
 )
 
 DESCRIPTION = """Recalibrate infrared multi-camera rigs from images of a known calibration object.

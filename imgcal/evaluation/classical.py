@@ -27,7 +27,7 @@ Intrinsics = tuple[Array, Array]  # camera matrix (3, 3), distortion (5,)
 
 LEAST_POINTS = 4
 STEP = 1e-6  # of numerical derivatives, whitened units
-MOST_EVALUATIONS = 200
+MOST_EVALUATIONS = 60  # of least squares: outliers can keep it busy without end
 
 
 def pnp(uv: Tensor, seen: Tensor, factory: CameraRig, obj: CalibrationObject, otherwise: Prediction) -> Prediction:
@@ -61,6 +61,7 @@ def calibrate_cameras(
     """
     points = _numpy(obj.points)
     lenses = [_intrinsics(factory, camera) for camera in range(factory.cameras)]
+    run: Any = cv2.calibrateCamera  # its stubs know half of what it takes
     sizes = [(int(width), int(height)) for width, height in factory.image_size.tolist()]
 
     def solve(camera: int, uv: Array, seen: NDArray[np.bool_]) -> _Camera | None:
@@ -70,7 +71,7 @@ def calibrate_cameras(
         shown = [points[seen].astype(np.float32)], [uv[seen].astype(np.float32)]
         start = [value.copy() for value in lenses[camera]]
         try:
-            _, matrix, distortion, turns, shifts = cv2.calibrateCamera(*shown, sizes[camera], *start, flags=flags)
+            _, matrix, distortion, turns, shifts = run(*shown, sizes[camera], *start, flags=flags)
         except cv2.error:
             return None
         found = _Camera(_array(matrix), _array(distortion).ravel()[:5], _matrix_of(turns[0]), _array(shifts[0]))

@@ -12,6 +12,7 @@ import torch
 from imgcal.errors import InputError
 from imgcal.evaluation.methods import Method, network_method
 from imgcal.evaluation.protocol import Conditions
+from imgcal.evaluation.report import Facts
 from imgcal.objects import CalibrationObject
 from imgcal.rig import CameraRig
 from imgcal.training.checkpoint import Checkpoint, load_checkpoint
@@ -38,6 +39,11 @@ class Model:
     def size(self) -> int:
         """Bytes of the file."""
         return self.path.stat().st_size
+
+    @property
+    def facts(self) -> Facts:
+        """What reports say about it."""
+        return Facts(self.parameters, self.size, self.history)
 
     @property
     def conditions(self) -> Conditions:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import statistics
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TypedDict
 
 import torch
 from torch import Tensor
@@ -59,6 +60,19 @@ class Protocol:
                 raise InputError(f"{name}: found {getattr(self, name)}, expected at least 1")
 
 
+class Statistics(TypedDict):
+    """RE in pixels, over all rigs of all trials."""
+
+    rigs: int
+    mean: float  # over rigs, averaged over trials
+    spread: float | None  # standard deviation of the trials' means; None = one trial
+    trial_means: tuple[float, ...]
+    median: float
+    p95: float
+    p99: float
+    share_under_half_px: float
+
+
 @dataclass(frozen=True)
 class Scores:
     """Errors of one column over all trials."""
@@ -71,20 +85,21 @@ class Scores:
         """RE of all rigs of all trials, pixels."""
         return torch.cat([trial.re for trial in self.trials])
 
-    def statistics(self) -> dict[str, int | float | list[float] | None]:
-        """RE: mean over rigs, averaged over trials, with the standard deviation of that mean over trials, and so on."""
+    def statistics(self) -> Statistics:
+        """Sum up RE."""
         means = [float(trial.re.mean()) for trial in self.trials]
-        re = self.re
-        return {
-            "rigs": len(re),
-            "mean": statistics.fmean(means),
-            "spread": statistics.stdev(means) if len(means) > 1 else None,
-            "trial_means": means,
-            "median": float(re.median()),
-            "p95": float(re.quantile(0.95)),
-            "p99": float(re.quantile(0.99)),
-            "share_under_half_px": float((re < 0.5).double().mean()),
-        }
+        re = self.re.double()
+        median, p95, p99 = re.quantile(re.new_tensor((0.5, 0.95, 0.99))).tolist()
+        return Statistics(
+            rigs=len(re),
+            mean=statistics.fmean(means),
+            spread=statistics.stdev(means) if len(means) > 1 else None,
+            trial_means=tuple(means),
+            median=median,
+            p95=p95,
+            p99=p99,
+            share_under_half_px=float((re < 0.5).double().mean()),
+        )
 
     def parameters(self) -> dict[str, float]:
         """Root mean square over rigs of every error but RE."""

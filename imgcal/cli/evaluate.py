@@ -1,0 +1,191 @@
+"""`imgcal evaluate` and `imgcal compare`: how good networks and classical methods are on random rigs."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from math import radians
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from imgcal.cli.common import check_folder, make_folder
+from imgcal.errors import InputError
+from imgcal.formats import load_object, load_rig
+
+if TYPE_CHECKING:
+    from imgcal.evaluation import Conditions, Method, Protocol
+    from imgcal.evaluation.models import Model
+    from imgcal.evaluation.protocol import Progress as Advance
+    from imgcal.evaluation.report import Report
+
+Axis = Literal["kappa", "phi", "noise", "missing", "swapped", "false"]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What the random rigs are."""
+
+    rig: str | None = None  #: factory rig: file, or the name of a shipped one; default: the first model's
+    object: str | None = None  #: object: file, or the name of a shipped one; default: the first model's
+    kappa: float | None = None  #: perturbation of all parameters, 0.025 = 2.5 %; default: the first model's drift
+    phi: tuple[float, float] | None = None  #: angles from the zenith in degrees; default: the first model's
+    noise: float = 0.0  #: px, standard deviation of each axis
+    missing: float = 0.0  #: share of fiducials that are not seen
+    swapped: float = 0.0  #: share of labels exchanged within a camera
+    false: float = 0.0  #: share of fiducials found somewhere else in the image
+    count: int = 20_000  #: rigs a trial
+    trials: int = 3  #: each with other rigs
+    seed: int = 0  #: same seed, same rigs
+    sweep: tuple[Axis, ...] = ()  #: draw the error against these, without the slow baselines
+    sweep_count: int = 1000  #: rigs at every point of a sweep
+    device: Literal["auto", "cpu"] = "auto"  #: where networks run; "auto" = on a GPU if there is one
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Measure networks and classical methods on random rigs, alone and refined.
+
+    RE is the paper's error: per rig the root mean square over cameras, fiducials and both axes, averaged over the rigs
+    of a trial; mean and spread over trials. Slow baselines get the first few rigs of every trial (last column). With
+    --out: evaluation.json, evaluation.md and plots. Examples:
+    imgcal evaluate out/row01 --out result
+    imgcal evaluate --rig O10 --object cube8 --kappa 0.025 --count 2000 --noise 0.1 --missing 0.2 --swapped 0.1
+    """
+
+    models: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    """trained networks: *.safetensors, or folders of training runs; none = baselines alone"""
+    setting: Annotated[Setting, tyro.conf.arg(name="")] = field(default_factory=Setting)
+    baselines: bool = True  #: classical methods in the same table
+    out: Path | None = None  #: folder to write; default: nothing is written
+
+    def run(self) -> None:
+        """Evaluate, print and write."""
+        if not (self.models or self.baselines):
+            raise InputError("evaluate: found neither models nor --baselines, expected something to evaluate")
+        _run(self.models, self.setting, self.baselines, self.out)
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Compare networks side by side on the same random rigs: accuracy alone and refined, time, parameters, size.
+
+    All must be for the same rig and object; poses and drift are those of the first unless said otherwise. Writes
+    OUT/evaluation.json, OUT/evaluation.md and plots (latency against accuracy, training curves).
+    Example: imgcal compare out/vit out/cnn --out comparison --count 2000
+    """
+
+    models: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """two trained networks or more: *.safetensors, or folders of training runs"""
+    out: Path  #: folder to write
+    setting: Annotated[Setting, tyro.conf.arg(name="")] = field(default_factory=Setting)
+    baselines: bool = False  #: classical methods in the same table
+
+    def run(self) -> None:
+        """Compare, print and write."""
+        if len(self.models) < 2:
+            raise InputError(f"compare: found {len(self.models)} models, expected two or more")
+        _run(self.models, self.setting, self.baselines, self.out)
+
+
+def _run(paths: tuple[Path, ...], setting: Setting, baselines: bool, out: Path | None) -> None:
+    # Imported late: what brings networks and plots along takes seconds, which the other commands should not wait.
+    from imgcal.evaluation import BASELINES, Protocol
+    from imgcal.evaluation.report import write
+
+    if out is not None:
+        check_folder(out)
+    protocol = Protocol(setting.count, setting.trials, setting.seed)
+    models = _load(paths, setting)
+    conditions = _conditions(models, setting)
+    methods = {model.name: model.method for model in models} | (BASELINES if baselines else {})
+    report = _measure(methods, conditions, protocol, setting)
+    report = replace(report, facts={model.name: model.facts for model in models})
+    _print(report)
+    if out is not None:
+        for path in write(report, make_folder(out)):
+            print(f"wrote {path}", file=sys.stderr)
+
+
+def _load(paths: tuple[Path, ...], setting: Setting) -> list[Model]:
+    if not paths:
+        return []
+    import torch
+
+    from imgcal.evaluation.models import load_models
+
+    rig = None if setting.rig is None else load_rig(setting.rig)
+    obj = None if setting.object is None else load_object(setting.object)
+    device = "cuda" if setting.device == "auto" and torch.cuda.is_available() else "cpu"
+    return load_models(paths, rig, obj, device)
+
+
+def _conditions(models: list[Model], setting: Setting) -> Conditions:
+    """What is asked for, and for the rest what the first model was trained for."""
+    from imgcal.evaluation import Conditions, Corruption
+    from imgcal.synthesis import PoseRange, RelativeDrift
+
+    if models:
+        known = models[0].conditions
+    elif setting.rig is None or setting.object is None:
+        raise InputError("evaluate: found no model, expected --rig and --object")
+    else:
+        known = Conditions(load_rig(setting.rig), load_object(setting.object))
+    poses: PoseRange = known.pose_range
+    if setting.phi is not None:
+        low, high = setting.phi
+        if not 0 <= low <= high <= 180:
+            raise InputError(f"--phi: found {low:g} {high:g}, expected two angles from 0 to 180, the smaller first")
+        poses = replace(poses, phi=(radians(low), radians(high)))
+    return replace(
+        known,
+        pose_range=poses,
+        drift=known.drift if setting.kappa is None else RelativeDrift(setting.kappa, setting.kappa),
+        corruption=Corruption(setting.noise, setting.missing, setting.swapped, setting.false),
+    )
+
+
+def _measure(methods: Mapping[str, Method], conditions: Conditions, protocol: Protocol, setting: Setting) -> Report:
+    from imgcal.evaluation import AXES, evaluate, sweep
+    from imgcal.evaluation.latency import latency
+    from imgcal.evaluation.report import Report
+
+    fast = {name: method for name, method in methods.items() if method.most is None}
+    along = replace(protocol, count=setting.sweep_count, trials=1)
+    points = sum(len(AXES[axis].values) for axis in setting.sweep)
+    shares = [min(method.most or protocol.count, protocol.count) for method in methods.values()]
+    total = protocol.trials * (protocol.count + sum(shares)) + points * along.count * (1 + len(fast))
+    with _bar(total) as advance:
+        evaluation = evaluate(methods, conditions, protocol, advance)
+        sweeps = tuple(sweep(fast, conditions, axis, along, progress=advance) for axis in setting.sweep)
+    repeats = {name: 50 if method.most is None else 10 for name, method in methods.items()}
+    took = {name: latency(method, conditions, repeats[name]) for name, method in methods.items()}
+    return Report(evaluation, took, {}, sweeps)
+
+
+@contextmanager
+def _bar(total: int) -> Iterator[Advance]:
+    """Show a progress bar on standard error, if that is a terminal."""
+    console = Console(file=sys.stderr)
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("evaluating", total=total)
+        yield lambda rigs: bar.advance(task, rigs)
+
+
+def _print(report: Report) -> None:
+    """Tables on standard output: for people on a terminal, as Markdown elsewhere."""
+    from imgcal.evaluation.report import describe, markdown, tables
+
+    if not sys.stdout.isatty():
+        print(markdown(report), end="")
+        return
+    console = Console()
+    console.print(describe(report.evaluation))
+    for table in tables(report):
+        console.print(table.rich())
