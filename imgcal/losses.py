@@ -67,6 +67,13 @@ class ExtraLoss(StrictModel):
     l1: Weight = 0.0
 
 
+class RefinedLoss(StrictModel):
+    """End-to-end training: the RE after MAP refinement, through the solution, trains the weights of the fiducials."""
+
+    weight: Weight = 0.0  # of log(1 + RE of the refined rig / 1 px); 0 = off
+    sigma: Positive = 0.1  # pixels, noise of a fiducial that is fully trusted
+
+
 class LossConfig(StrictModel):
     """The block `loss` of an experiment file."""
 
@@ -74,6 +81,7 @@ class LossConfig(StrictModel):
     robust: RobustLoss = RobustLoss()
     paper: PaperLoss = PaperLoss()
     extra: ExtraLoss = ExtraLoss()
+    refined: RefinedLoss = RefinedLoss()
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,7 @@ class TrunkConfig(StrictModel):
     depth: Count = 5  # blocks of the first pass
     later_depth: Count = 2  # blocks of every later pass, which share their weights
     passes: Count = 3
+    trust: bool = False  # predict how far the refinement may trust each fiducial
 
 
 class Points(StrictModel):

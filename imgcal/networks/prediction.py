@@ -33,6 +33,7 @@ class Prediction:
 
     rig: CameraRig  # (B,)
     rig_from_object: RigidTransform  # (B,)
+    log_sigma: Tensor | None = None  # (B, C, N) log of the factor on each fiducial's sigma in a refinement; None = 1
 
     @property
     def cameras_from_object(self) -> CameraRig:
@@ -71,8 +72,10 @@ class Prediction:
     def detach(self) -> Prediction:
         """Cut the graph."""
         pose = RigidTransform(self.rig_from_object.rotation.detach(), self.rig_from_object.translation.detach())
-        return Prediction(self.rig.map_tensors(lambda tensor, _: tensor.detach()), pose)
+        log_sigma = None if self.log_sigma is None else self.log_sigma.detach()
+        return Prediction(self.rig.map_tensors(lambda tensor, _: tensor.detach()), pose, log_sigma)
 
     def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Prediction:
         """Change the floating-point type, move to a device, or both."""
-        return Prediction(self.rig.to(dtype, device), self.rig_from_object.to(dtype, device))
+        log_sigma = None if self.log_sigma is None else self.log_sigma.to(dtype=dtype, device=device)
+        return Prediction(self.rig.to(dtype, device), self.rig_from_object.to(dtype, device), log_sigma)

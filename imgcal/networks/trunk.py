@@ -8,6 +8,8 @@ the factory rig and start at zero: an untrained network returns the factory cali
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor, nn
 
@@ -18,6 +20,7 @@ from imgcal.rig import PARAMETERS
 
 RESIDUAL_SCALES = (20.0, 4.0)  # pixels, where a residual saturates; a linear part (in 100 px) stands beside
 LIMIT = 5.0  # largest input of the linear parts
+LEAST_TRUST = 7.0  # largest log of a factor on sigma: a thousand sigmas, no weight at all
 
 
 class Stage(nn.Module):
@@ -63,6 +66,7 @@ class Trunk(nn.Module):
         depth: int,
         later_depth: int,
         passes: int,
+        trust: bool = False,
         features: int = 0,
     ) -> None:
         super().__init__()
@@ -72,7 +76,9 @@ class Trunk(nn.Module):
         self.first = Stage(3 * fiducials, features, cameras, 9, *shape)
         parts = 2 * (len(RESIDUAL_SCALES) + 2) + 1
         later = (encoder, width, later_depth, heads)
-        self.later = Stage(parts * fiducials + PARAMETERS, features, cameras, 6, *later) if passes > 1 else None
+        inputs = parts * fiducials + PARAMETERS
+        self.later = Stage(inputs, features, cameras, 6, *later) if passes > 1 else None
+        self.trust_head = zeroed(mlp((inputs, width, fiducials))) if trust else None
 
     def forward(self, uv: Tensor, weight: Tensor, features: Tensor | None = None) -> tuple[Prediction, ...]:
         """Predict.
@@ -103,6 +109,10 @@ class Trunk(nn.Module):
             with torch.autocast(device, enabled=False):
                 state = self.decoder.move(state, offsets, pose)
                 predictions.append(self.decoder.prediction(state))
+        if self.trust_head is not None:
+            with torch.autocast(device, enabled=False):
+                log_sigma = self.trust_head(self._differences(state.detach(), predictions[-1], uv, weight))
+            predictions[-1] = replace(predictions[-1], log_sigma=log_sigma.clamp(-LEAST_TRUST, LEAST_TRUST))
         return tuple(predictions)
 
     @torch.no_grad()

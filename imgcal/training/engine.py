@@ -23,6 +23,7 @@ from imgcal.rig import CameraRig
 from imgcal.synthesis import Snapshots
 from imgcal.training.checkpoint import build_network, save_network, warm_start
 from imgcal.training.data import Batch, Source, object_to
+from imgcal.training.end_to_end import refined_loss
 from imgcal.training.experiment import Experiment, save_experiment
 from imgcal.training.log import Log
 from imgcal.training.optimization import (
@@ -182,7 +183,8 @@ def train_step(run: Run) -> None:
         predictions = run.network(batch.views)
     config, weights = run.experiment.loss, run.plain.parameters()
     loss = compound(predictions, batch.truth, run.source.obj, config, run.step, run.spread, weights)
-    run.accelerator.backward(loss.total)
+    total = loss.total + refined_loss(predictions[-1], batch, run.source, run.spread, config.refined)
+    run.accelerator.backward(total)
     limit = run.experiment.optimizer.clip
     norm = torch.nn.utils.clip_grad_norm_(run.plain.parameters(), float("inf") if limit is None else limit)
     run.optimizer.step()

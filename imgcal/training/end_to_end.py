@@ -1,0 +1,52 @@
+"""End-to-end training: the error after the refinement, differentiated through its solution."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from imgcal.errors import InputError
+from imgcal.losses import RefinedLoss, images_of, reprojection_re
+from imgcal.networks.prediction import Prediction
+from imgcal.refinement import refine_points
+from imgcal.training.data import Batch, Source
+from imgcal.transforms import RigidTransform
+
+WORST = 200.0  # pixels: where the error of a refined rig stops to count
+
+
+def refined_loss(
+    prediction: Prediction, batch: Batch, source: Source, spread: Tensor, config: RefinedLoss
+) -> Tensor | float:
+    """Weigh every fiducial as the network says, estimate the rig, and compare it with the truth.
+
+    Args:
+        prediction: (B,) last pass, with `log_sigma`.
+        batch: what the network saw, and the truth.
+        source: the factory rig and the object.
+        spread: (C, 15) of the drift, the prior of the estimate.
+        config: weight and noise; a weight of zero costs nothing.
+
+    Returns:
+        Mean log(1 + RE) of the refined rigs times the weight; its gradient reaches `log_sigma` by the implicit function
+        theorem. Rigs whose estimate did not converge do not count.
+
+    Raises:
+        InputError: a network without weights of the fiducials, or without points.
+    """
+    if not config.weight:
+        return 0.0
+    if prediction.log_sigma is None or batch.views.uv is None:
+        raise InputError(
+            "loss: refined: found a network that weighs no points, expected a point variant with "
+            "`change: {trunk: {trust: true}}`"
+        )
+    with torch.autocast(batch.views.uv.device.type, enabled=False):
+        sigma = config.sigma * prediction.log_sigma.double().exp()
+        fit = refine_points(prediction, batch.views, source.factory, source.obj, spread, sigma)
+        pose = RigidTransform(fit.rig_from_object.rotation[:, 0], fit.rig_from_object.translation[:, 0])
+        truth = images_of(batch.truth.cameras_from_object, source.obj).double()
+        re = reprojection_re(images_of(fit.rig.from_object(pose), source.obj) - truth)
+        counts = fit.converged & (re < WORST)
+        error = torch.where(counts, torch.log1p(torch.where(counts, re, 0.0)), 0.0)
+        return config.weight * (error.sum() / counts.sum().clamp_min(1)).float()
