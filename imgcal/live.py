@@ -115,7 +115,7 @@ class Recalibrator:
         blobs = replace(blobs, fiducial=labels)
         snapshot = SnapshotIdentity(name, "by_tracking", "near the last prediction", 1, pose)
         try:
-            result = self._fit(blobs, snapshot)
+            result = self._fit(blobs, snapshot, latest)
         except RefusedError:
             return None
         if int(result.observations.seen[-1].sum()) < LEAST_FOLLOWED * before:
@@ -123,11 +123,11 @@ class Recalibrator:
         self._follower.pose = result.rig_from_object[-1]
         return self._keep(blobs, snapshot, result)
 
-    def _fit(self, blobs: Detections, snapshot: SnapshotIdentity) -> Calibration:
+    def _fit(self, blobs: Detections, snapshot: SnapshotIdentity, latest: Calibration | None = None) -> Calibration:
         """Fit the latest snapshots and a new one, which is not kept yet: it may be what spoils the fit."""
         window = self._recent.maxlen or 1
         recent = [*self._recent, (blobs, snapshot)][-window:]
-        return fit_labelled(_joined(recent, self.rig), self.rig, self.obj, self.options)
+        return fit_labelled(_joined(recent, self.rig), self.rig, self.obj, self.options, latest=latest)
 
     def _keep(self, blobs: Detections, snapshot: SnapshotIdentity, result: Calibration) -> Calibration:
         self._recent.append((blobs, snapshot))

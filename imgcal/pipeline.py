@@ -19,14 +19,13 @@ from imgcal.detection import DetectionOptions, detect
 from imgcal.detection.options import Frame
 from imgcal.errors import RefusedError
 from imgcal.estimation import Estimate, estimate, initial_pose
-from imgcal.estimation.covariance import remaining_variance
-from imgcal.estimation.estimate import conclude, make_problem, make_start, minimize
-from imgcal.estimation.linearize import Problem, State
+from imgcal.estimation.estimate import conclude, make_problem, make_start
 from imgcal.first_guess import FirstGuess, Guesser, residual_of
 from imgcal.labelling import Labelled, PipelineOptions, Progress, label, matched_to_rig, stack_poses, to_observations
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections, Observations
 from imgcal.rig import PARAMETER_NAMES, CameraRig, RigPrior
+from imgcal.settling import settle
 from imgcal.transforms import RigidTransform
 
 Frames = Mapping[str, Frame | Sequence[Frame | None] | None]
@@ -110,6 +109,8 @@ def fit_labelled(
     obj: CalibrationObject,
     options: PipelineOptions = PipelineOptions(),
     guesser: Guesser | None = None,
+    *,
+    latest: Calibration | None = None,
 ) -> Calibration:
     """Estimate the rig from all labelled snapshots, leaving out what does not fit, and check that the rest does.
 
@@ -119,6 +120,7 @@ def fit_labelled(
         obj: the calibration object.
         options: how sure the result must be.
         guesser: network whose first guess is the start, where it is nearer to the images than the factory calibration.
+        latest: what the snapshot before gave, from the same factory calibration: a start that saves time.
 
     Raises:
         RefusedError: a camera saw nothing, the estimate has no minimum, or the residuals do not fit.
@@ -134,46 +136,26 @@ def fit_labelled(
     state = make_start(problem, poses, None)
     if guess is not None and guess_used:
         state = make_start(problem, guess.rig_from_object, guess.rig)
-    widened: dict[str, float] = {}
-    seen, model_error = labels, options.identity_error
-    for _ in range(8):
-        fitted, noise = seen, variance + model_error**2
-        root_weight = torch.from_numpy(np.where(fitted, noise**-0.5, 0.0)).to(problem.uv)
-        problem = replace(problem, root_weight=root_weight[None])
-        solution = minimize(problem, state, options.estimation)
-        squared = np.square(solution.equations.residual[0].numpy()).sum(-2)  # (S, C, N)
-        if not bool(solution.converged):
-            rms = float(np.sqrt(squared[fitted].mean()))
-            raise RefusedError(f"estimation: no minimum after {solution.iterations} iterations (RMS {rms:.3g} px)")
-        state, remaining = solution.state, remaining_variance(solution)[0]
-        taken = 6 * len(fitted) + float((1 - remaining).sum())
-        previous, model_error = model_error, _model_error(squared[fitted], variance[fitted], taken)
-        # Judged by the sigma of this fit: what a coarse fit leaves says little about fine outliers. Where a fiducial
-        # was left out there is no residual: it stays out.
-        seen = fitted & (squared <= options.outlier**2 * noise)
-        if abs(model_error - previous) > 0.02 * previous or (seen != fitted).any():
-            continue
-        too_narrow = _too_narrow(state.offset[0].numpy(), remaining)
-        widened |= {kind: widened.get(kind, 1.0) * factor for kind, factor in too_narrow.items()}
-        if not too_narrow or max(widened.values()) > options.widest_prior:
-            break
-        problem, state = _widen(problem, state, too_narrow)
-    fit = conclude(problem, solution, solution.state)
-    sigma = torch.from_numpy(np.sqrt(noise)).to(observations.sigma)
-    observations = replace(observations, sigma=sigma, seen=torch.from_numpy(fitted))
-    outliers = int(labels.sum() - fitted.sum())
-    _require_cameras(fitted, rig, options)
-    _require_near_prior(fit, prior, rig, widened, options)
-    _require_most_labels(labels, fitted, rig)
-    _require_fit(model_error, outliers / max(int(labels.sum()), 1), 2**0.5 * float(fit.rms), options)
+    starts = [(state, options.identity_error)]
+    if latest is not None and not latest.widened:
+        starts.insert(0, (replace(state, offset=latest.solution.state.offset), latest.model_error))
+    found = settle(problem, starts, variance, labels, options)
+    fit = conclude(found.problem, found.solution, found.solution.state)
+    outliers = int(labels.sum() - found.seen.sum())
+    _require_cameras(found.seen, rig, options)
+    _require_near_prior(fit, prior, rig, found.widened, options)
+    _require_most_labels(labels, found.seen, rig)
+    _require_fit(found.model_error, outliers / max(int(labels.sum()), 1), 2**0.5 * float(fit.rms), options)
     values = {name: getattr(fit, name) for name in Estimate.__dataclass_fields__}
     return Calibration(
         **values,
         labelled=labelled,
-        observations=observations,
-        model_error=model_error,
+        observations=Observations(
+            observations.uv, torch.from_numpy(found.sigma).to(observations.sigma), torch.from_numpy(found.seen)
+        ),
+        model_error=found.model_error,
         outliers=outliers,
-        widened=widened,
+        widened=found.widened,
         factory=rig,
         obj=obj,
         first_guess=guess,
@@ -218,69 +200,6 @@ def _require_fit(model_error: float, outlier_share: float, rms: float, options: 
             f"estimation: {100 * outlier_share:.0f} % of the labelled blobs do not fit, expected at most "
             f"{100 * options.most_outliers:.0f} %"
         )
-
-
-def _model_error(squared: NDArray[np.floating], variance: NDArray[np.floating], taken: float) -> float:
-    """Standard deviation (px, each axis) that residuals hold beyond the blobs' own sigma; 0 = insignificant.
-
-    The median of squared distances over two axes is 1.386 for unit noise, whatever a minority of outliers does.
-    Residuals are smaller than the noise by what the parameters took: each takes the share of one observation that its
-    prior left.
-
-    Args:
-        squared: (M,) px^2, squared lengths of the residuals.
-        variance: (M,) px^2 of each axis, the blobs' own.
-        taken: degrees of freedom that the parameters took.
-    """
-    count = 2 * len(squared)
-    free = max(count - taken, 1.0)
-    squared = squared * (count / free)
-    middle = (len(squared) - 1) // 2
-
-    def excess(error: float) -> float:
-        return float(np.partition(squared / (variance + error**2), middle)[middle]) / 1.386
-
-    # Six standard deviations of a chi-squared mean: below, the residuals fit the sigmas that the blobs have.
-    if excess(0.0) <= 1 + 6 * (2 / free) ** 0.5:
-        return 0.0
-    low, high = 0.0, float(np.sqrt(squared.max()))
-    for _ in range(30):
-        error = 0.5 * (low + high)
-        low, high = (error, high) if excess(error) > 1 else (low, error)
-    return high
-
-
-KINDS = {
-    "rotation": slice(0, 3),
-    "position": slice(3, 6),
-    "focal_length": slice(6, 8),
-    "principal_point": slice(8, 10),
-    "distortion": slice(10, 15),
-}
-
-
-def _too_narrow(offset: NDArray[np.floating], remaining: NDArray[np.float64]) -> dict[str, float]:
-    """Kinds of values that have drifted more than their prior allows: factor by which the prior is too narrow.
-
-    The whitened offsets (C, 15) of a kind should have a mean square of one, over as many values as the data determine:
-    those of which they leave little (C, 15) of the prior's variance.
-    """
-    factors = {}
-    for kind, part in KINDS.items():
-        freedom = float((1 - remaining[:, part]).sum())
-        if freedom > 1:
-            excess = float(np.square(offset[:, part]).sum()) / freedom
-            if excess > 1 + 4 * (2 / freedom) ** 0.5:
-                factors[kind] = excess**0.5
-    return factors
-
-
-def _widen(problem: Problem, state: State, factors: Mapping[str, float]) -> tuple[Problem, State]:
-    """Widen the prior; the state, counted in prior standard deviations, stays where it is."""
-    scale = torch.ones_like(problem.spread[0, 0])
-    for kind, factor in factors.items():
-        scale[KINDS[kind]] = factor
-    return replace(problem, spread=problem.spread * scale), replace(state, offset=state.offset / scale)
 
 
 def _require_near_prior(
