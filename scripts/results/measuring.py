@@ -1,0 +1,201 @@
+"""Evaluates one trained network: everything that the tables say about it, as plain values."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+from output import surroundings
+
+from imgcal.errors import InputError
+from imgcal.evaluation import BASELINES, Conditions, Corruption, Evaluation, Method, Protocol, Scores, evaluate, sweep
+from imgcal.evaluation.latency import latency
+from imgcal.evaluation.models import Model, load_models
+from imgcal.formats.safetensors_file import read_texts
+from imgcal.training.checkpoint import FORMAT
+from imgcal.training.log import read_metrics
+
+NOISE = Corruption(noise=0.1)
+ROBUSTNESS = Corruption(noise=0.1, missing=0.2, swapped=0.1)
+FACTORY, WITHOUT, ROBUST = "factory, pose fitted", "MAP from PnP", "PnP + robust bundle adjustment"
+NETWORK = "network"
+HISTORY = 60  # points of the curve over training time
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How many rigs are evaluated."""
+
+    count: int = 20_000  # rigs a trial
+    image_count: int = 20_000  # rigs a trial of image models, which take some 20 times as long
+    trials: int = 3
+    extra: int = 1000  # rigs a trial with noise, with outliers, and of methods without a network
+
+    def rigs(self, images: bool) -> int:
+        """Rigs of all trials."""
+        return self.trials * (min(self.count, self.image_count) if images else self.count)
+
+
+@dataclass(frozen=True)
+class Source:
+    """A checkpoint on disk."""
+
+    path: Path
+    experiment: str
+    sha256: str
+    shipped: bool
+    log: Path  # folder of the training run
+
+
+def find(runs: Path, models: Path) -> list[Source]:
+    """Look for checkpoints: of training runs, and shipped ones, which replace the runs that they come from.
+
+    Raises:
+        InputError: a file that cannot be used, or two of the same experiment.
+    """
+    found: dict[str, Source] = {}
+    files = [(path, False) for path in sorted(runs.glob("*/model.safetensors"))]
+    files += [(path, True) for path in sorted(models.glob("*.safetensors"))]
+    for path, shipped in files:
+        name, digest = _experiment_name(path), hashlib.sha256(path.read_bytes()).hexdigest()
+        before = found.get(name)
+        if before is not None and before.shipped == shipped:
+            raise InputError(f"{path}: found another run of {name} in {before.path}, expected one")
+        found[name] = Source(path, name, digest, shipped, path.parent if before is None else before.log)
+    return list(found.values())
+
+
+def measure(source: Source, effort: Effort, device: str, trained_on: str) -> dict[str, Any]:
+    """Evaluate one network.
+
+    Args:
+        source: its file.
+        effort: how many rigs.
+        device: where it runs.
+        trained_on: the machine of its training, in words.
+    """
+    [model] = load_models([source.path], device=device)
+    name, images = model.checkpoint.experiment.name, model.method.images is not None
+    count = min(effort.count, effort.image_count) if images else effort.count
+    exact = Protocol(count, effort.trials)
+    few = Protocol(min(effort.extra, count), effort.trials)
+    methods = {
+        NETWORK: model.method,
+        FACTORY: replace(BASELINES[FACTORY], most=few.count),
+        WITHOUT: replace(BASELINES[WITHOUT], most=few.count),
+    }
+    result = {
+        "experiment": name,
+        "sha256": source.sha256,
+        "shipped": source.shipped,
+        "bytes": model.size,
+        "parameters": model.parameters,
+        "training": training_of(model, trained_on),
+        "surroundings": surroundings(device),
+        "images": images,
+        "rigs": effort.rigs(images),
+        "exact": _columns(_evaluated(methods, model.conditions, exact, f"{name}, exact"), methods),
+        "noise": _columns(
+            _evaluated({NETWORK: model.method}, replace(model.conditions, corruption=NOISE), few, f"{name}, noise"),
+            {NETWORK: model.method},
+        ),
+        "latency_ms": vars(latency(model.method, model.conditions)),
+        "history": history_of(read_metrics(source.log / "metrics.jsonl")),
+    }
+    if name.startswith("shipped"):
+        all_methods = {NETWORK: model.method} | {key: BASELINES[key] for key in (FACTORY, WITHOUT, ROBUST)}
+        conditions = replace(model.conditions, corruption=ROBUSTNESS)
+        result["robustness"] = _columns(_evaluated(all_methods, conditions, few, f"{name}, outliers"), all_methods)
+    return result
+
+
+def swept(source: Source, count: int, device: str) -> dict[str, Any]:
+    """Evaluate one network against perturbation and angle, everything else as in its training."""
+    [model] = load_models([source.path], device=device)
+    methods = {NETWORK: model.method, WITHOUT: BASELINES[WITHOUT]}
+    result: dict[str, Any] = {
+        "experiment": model.checkpoint.experiment.name,
+        "sha256": source.sha256,
+        "rigs": count,
+        "trained_kappa": model.checkpoint.experiment.drift.kappa_intrinsics,
+        "surroundings": surroundings(device),
+    }
+    for axis in ("kappa", "phi"):
+        found = sweep(methods, model.conditions, axis, Protocol(count, 1))
+        rows = [_columns(evaluation, methods) for evaluation in found.evaluations]
+        result[axis] = {"values": list(found.values), "rows": rows}
+    return result
+
+
+def training_of(model: Model, trained_on: str) -> dict[str, Any]:
+    """What a training took."""
+    metrics, experiment = model.checkpoint.metrics, model.checkpoint.experiment
+    start = experiment.training.init_from
+    return {
+        "minutes": metrics.get("seconds", 0.0) / 60,
+        "steps": metrics.get("step", 0),
+        "batch_size": experiment.training.batch_size,
+        "started_from": None if start is None else _name_of_start(Path(start)),
+        "machine": trained_on,
+    }
+
+
+def history_of(rows: list[dict[str, Any]]) -> list[list[float]]:
+    """Minutes and training RE in pixels, thinned out."""
+    told = [[row["seconds"] / 60, row["re_px"]] for row in rows if "seconds" in row and "re_px" in row]
+    every = max(1, -(-len(told) // HISTORY))
+    return told[::-1][::every][::-1]
+
+
+def _name_of_start(path: Path) -> str:
+    return path.parent.name if path.stem == "model" else path.stem
+
+
+def _experiment_name(path: Path) -> str:
+    try:
+        return str(json.loads(read_texts(path, FORMAT)["experiment"])["name"])
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{path}: found no readable experiment in it: the file is damaged") from error
+
+
+def _columns(evaluation: Evaluation, methods: dict[str, Method]) -> dict[str, Any]:
+    columns: dict[str, Any] = {"MAP, true inliers": _scores(evaluation.reference)}
+    for name in methods:
+        row = evaluation.rows[name]
+        columns[name] = _scores(row.alone)
+        if row.refined is not None:
+            columns[f"{name} + refinement"] = _scores(row.refined)
+    return columns
+
+
+def _scores(scores: Scores) -> dict[str, Any]:
+    found: dict[str, Any] = dict(scores.statistics()) | {"parameters": scores.parameters()}
+    found.pop("trial_means")
+    if scores.bounds:
+        found["times_cramer_rao"] = scores.cramer_rao_ratios()
+    return found
+
+
+def _evaluated(methods: dict[str, Method], conditions: Conditions, protocol: Protocol, what: str) -> Evaluation:
+    began = monotonic()
+    found = evaluate(methods, conditions, protocol, _progress(what, protocol, len(methods)))
+    print(f"\r{what}: {protocol.trials} x {protocol.count} rigs, {monotonic() - began:.0f} s", file=sys.stderr)
+    return found
+
+
+def _progress(what: str, protocol: Protocol, methods: int) -> Callable[[int], None]:
+    """Show how far an evaluation is, where somebody looks on."""
+    total, done = protocol.count * protocol.trials * (methods + 1), [0]
+
+    def show(rigs: int) -> None:
+        done[0] += rigs
+        if sys.stderr.isatty():
+            print(f"\r{what}: {100 * done[0] / total:.0f} %", end="", file=sys.stderr, flush=True)
+
+    return show

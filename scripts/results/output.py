@@ -1,0 +1,112 @@
+"""What the scripts of this folder share: where results lie, JSON beside the machine's name, small figures."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import platform
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import torch
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+
+from imgcal.errors import InputError, RefusedError
+from imgcal.formats import write_text
+from imgcal.formats.atomic import write_bytes
+
+ROOT = Path(__file__).resolve().parents[2]
+RESULTS = ROOT / "docs" / "results"
+BLUE, RED, GREEN, GREY = "#1f5fa8", "#c43c2f", "#2e8b57", "#777777"
+
+
+def machine(device: str = "cpu") -> str:
+    """Name the processor and the versions, not the host."""
+    path = Path("/proc/cpuinfo")
+    models = [x for x in path.read_text().splitlines() if x.startswith("model name")] if path.is_file() else []
+    name = models[0].split(":")[1].strip() if models else platform.processor()
+    gpu = f", {torch.cuda.get_device_name(0)}" if device.startswith("cuda") else ""
+    versions = f"Python {platform.python_version()}, torch {torch.__version__}, OpenCV {cv2.__version__}"
+    return f"{name}, {os.cpu_count()} cores{gpu}, {versions}"
+
+
+def surroundings(device: str = "cpu") -> dict[str, Any]:
+    """What every result file begins with."""
+    load = round(os.getloadavg()[0], 2)  # well above zero: others use the machine, and times are long for that
+    return {"machine": machine(device), "threads": torch.get_num_threads(), "load_average": load}
+
+
+def write_json(path: Path, result: dict[str, Any]) -> None:
+    """Write a result in one step, numbers to five digits; those that are not finite become null."""
+    make_folder(path.parent)
+    write_text(path, json.dumps(_rounded(result), indent=1, allow_nan=False) + "\n")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a result.
+
+    Raises:
+        InputError: not JSON.
+    """
+    try:
+        content: dict[str, Any] = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: found no readable JSON, expected a result of scripts/results: {error}") from error
+    return content
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder, unless it is there.
+
+    Raises:
+        InputError: it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made: {error.strerror or error}") from error
+
+
+@contextmanager
+def figure(path: Path, panels: int = 1, rows: int = 1, size: tuple[float, float] = (7.0, 3.6)) -> Iterator[list[Axes]]:
+    """Make panels to draw on; when the block ends well, writes them as a PNG of a few colours: some 20 kB."""
+    canvas = FigureCanvasAgg(Figure(figsize=size, dpi=100, layout="constrained"))
+    axes = [canvas.figure.add_subplot(rows, panels, number + 1) for number in range(rows * panels)]
+    yield axes
+    for one in axes:
+        one.spines[["top", "right"]].set_visible(False)
+        one.grid(True, which="major", color="#dddddd", linewidth=0.6)
+        one.set_axisbelow(True)
+    drawn, packed = io.BytesIO(), io.BytesIO()
+    canvas.print_png(drawn)
+    Image.open(drawn).convert("RGB").quantize(48, dither=Image.Dither.NONE).save(packed, "PNG", optimize=True)
+    make_folder(path.parent)
+    write_bytes(path, packed.getvalue())
+
+
+def command(main: Callable[[], object]) -> None:
+    """Run as a command: what cannot be used or decided is one line on standard error, exit code 2 or 3."""
+    try:
+        main()
+    except (InputError, RefusedError) as error:
+        print(" ".join(str(error).split()), file=sys.stderr)
+        sys.exit(2 if isinstance(error, InputError) else 3)
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _rounded(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_rounded(item) for item in value]
+    if isinstance(value, float):
+        return float(f"{value:.5g}") if math.isfinite(value) else None
+    return value

@@ -1,0 +1,230 @@
+"""Turns results into the tables of docs/results.md, between its markers."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from measuring import FACTORY, NETWORK, ROBUST, WITHOUT
+
+from imgcal.errors import InputError
+from imgcal.networks.config import Images, PaperImages
+from imgcal.training.experiment import Experiment
+
+Results = Mapping[str, dict[str, Any]]
+
+MISSING = "not trained yet"
+TRAINING = ("minutes", "steps x rigs", "started from", "machine")
+REFINED = f"{NETWORK} + refinement"
+
+# RE in pixels that was aimed at, by row of table 1: network alone, and refined on exact points or 8-bit images.
+GOALS = {1: 2.0, 2: 3.0, 3: 5.0, 4: 3.0, 5: 3.0, 6: 2.0, 7: 0.2, 8: 1.0, 9: 3.0, 10: 1.5, 11: 1.5, 12: 2.5, 13: 4.0}
+REFINED_GOALS = {"points": 0.02, "images": 0.1}
+
+
+def accuracy_table(experiments: Sequence[Experiment], results: Results) -> str:
+    """Table 1, our networks: both columns beside the paper's."""
+    head = (
+        "row",
+        "what",
+        "paper's RE",
+        "goal, network alone",
+        "network alone",
+        "goal, refined",
+        "network + refinement",
+        "p99",
+        "share <= 0.5 px",
+    )
+    rows = []
+    for experiment in experiments:
+        row, kind = row_of(experiment), variant(experiment)
+        cells = [str(row), label(experiment), _paper(experiment), _px(GOALS.get(row))]
+        result = results.get(experiment.name)
+        if result is None:
+            cells += [MISSING, _px(REFINED_GOALS[kind]), "", "", ""]
+        else:
+            alone, refined = result["exact"][NETWORK], result["exact"][REFINED]
+            cells += [
+                f"**{mean(alone)}**",
+                _px(REFINED_GOALS[kind]),
+                f"**{mean(refined)}**",
+                _px(refined["p99"]),
+                _percent(refined["share_under_half_px"]),
+            ]
+        rows.append(cells)
+    return markdown(head, rows)
+
+
+def background_table(experiments: Sequence[Experiment], results: Results) -> str:
+    """Table 1, second half: noise, what other methods get there, and what each training took."""
+    head = (
+        "row",
+        "what",
+        "factory rig, pose fitted",
+        "MAP without network",
+        "0.1 px noise: alone",
+        "refined",
+        "refined / Cramer-Rao bound",
+        "rigs",
+        *TRAINING,
+    )
+    rows, missing = [], []
+    for experiment in experiments:
+        result = results.get(experiment.name)
+        if result is None:
+            missing.append(experiment.name)
+            continue
+        exact, noise = result["exact"], result["noise"]
+        cells = [str(row_of(experiment)), label(experiment), _px(exact[FACTORY]["mean"]), _px(exact[WITHOUT]["mean"])]
+        cells += [_px(noise[NETWORK]["mean"]), _px(noise[REFINED]["mean"]), _bound(noise[REFINED])]
+        rows.append([*cells, f"{result['rigs']:,}", *training_cells(result)])
+    return markdown(head, rows) + _left_out(missing)
+
+
+def paper_table(experiments: Sequence[Experiment], results: Results) -> str:
+    """Trained networks of the paper's own design."""
+    head = ("row", "what", "paper's RE", "network alone", REFINED, "parameters", *TRAINING)
+    rows, missing = [], []
+    for experiment in experiments:
+        result = results.get(experiment.name)
+        if result is None:
+            missing.append(experiment.name)
+            continue
+        cells = [str(row_of(experiment)), label(experiment), _paper(experiment)]
+        cells += [mean(result["exact"][NETWORK]), mean(result["exact"][REFINED]), _millions(result["parameters"])]
+        rows.append([*cells, *training_cells(result)])
+    return markdown(head, rows) + _left_out(missing)
+
+
+def shipped_table(experiments: Sequence[Experiment], results: Results) -> str:
+    """Size, speed and accuracy of the models that ship."""
+    head = (
+        "model",
+        "parameters",
+        "file, MB",
+        "network alone",
+        REFINED,
+        "p99",
+        "share <= 0.5 px",
+        "alone, ms p50 / p99",
+        "refined, ms p50 / p99",
+        *TRAINING,
+    )
+    rows = []
+    for experiment in experiments:
+        result = results.get(experiment.name)
+        if result is None:
+            rows.append([experiment.name, MISSING])
+            continue
+        exact, took = result["exact"], result["latency_ms"]
+        name = experiment.name if result["shipped"] else f"{experiment.name} (float32 run)"
+        cells = [name, _millions(result["parameters"]), f"{result['bytes'] / 1e6:.1f}"]
+        cells += [mean(exact[NETWORK]), mean(exact[REFINED]), _px(exact[REFINED]["p99"])]
+        cells += [_percent(exact[REFINED]["share_under_half_px"])]
+        cells += [f"{took['alone_p50']:.1f} / {took['alone_p99']:.1f}"]
+        cells += [f"{took['refined_p50']:.1f} / {took['refined_p99']:.1f}", *training_cells(result)]
+        rows.append(cells)
+    return markdown(head, rows)
+
+
+def robustness_table(experiments: Sequence[Experiment], results: Results) -> str:
+    """Median RE with outliers, everybody on the same rigs."""
+    columns = ("MAP, true inliers", NETWORK, REFINED, ROBUST, WITHOUT, FACTORY)
+    rows, missing = [], []
+    for experiment in experiments:
+        robust = results.get(experiment.name, {}).get("robustness")
+        if robust is None:
+            missing.append(experiment.name)
+            continue
+        best = robust[columns[0]]["median"]
+        medians = [_px(robust[name]["median"]) for name in columns]
+        rows.append([experiment.name, *medians, f"{robust[REFINED]['median'] / best:.2f}"])
+    return markdown(("model", *columns, "network + refinement / true inliers"), rows) + _left_out(missing)
+
+
+def replaced(page: str, sections: Mapping[str, str], where: Path) -> str:
+    """Put sections between their markers `<!-- begin NAME -->` and `<!-- end NAME -->`.
+
+    Raises:
+        InputError: a marker is missing.
+    """
+    for name, text in sections.items():
+        pattern = re.compile(rf"(<!-- begin {re.escape(name)} -->\n).*?(<!-- end {re.escape(name)} -->)", re.DOTALL)
+        if not pattern.search(page):
+            raise InputError(f"{where}: found no markers of `{name}`, expected <!-- begin {name} --> and its end")
+        page = pattern.sub(lambda match, text=text: f"{match[1]}\n{text}\n\n{match[2]}", page)  # type: ignore[misc]
+    return page
+
+
+def variant(experiment: Experiment) -> str:
+    """Tell what the network of an experiment takes: points or images."""
+    return "images" if isinstance(experiment.network.variant(), Images | PaperImages) else "points"
+
+
+def label(experiment: Experiment) -> str:
+    """Say in a few words what an experiment is about."""
+    drift, poses = experiment.drift, experiment.poses
+    where = "overhead" if poses.phi_deg == [0.0, 0.0] else "hemisphere"
+    kappas = f"{100 * (drift.kappa_intrinsics or 0):g} / {100 * (drift.kappa_extrinsics or 0):g} %"
+    changes = ", ".join(f"{key} {value}" for key, value in experiment.network.change.items())
+    if experiment.loss.kind == "paper" and experiment.loss.paper.lambda_scale == 1:
+        changes = ", ".join(filter(None, (changes, "no value scaling")))
+    network = experiment.network.preset + (f" ({changes})" if changes else "")
+    return f"{network}, {where}, {experiment.rig} {experiment.object}, kappa {kappas}"
+
+
+def mean(column: Mapping[str, Any]) -> str:
+    """Mean RE, and the spread of that mean over trials."""
+    if column["mean"] is None:
+        return "not finite"
+    spread = column["spread"]
+    return _px(column["mean"]) + ("" if spread is None else f" ± {spread:.1g}")
+
+
+def training_cells(result: Mapping[str, Any]) -> list[str]:
+    """What a training took: minutes, steps, start, machine."""
+    training = result["training"]
+    steps = f"{training['steps']:,} x {training['batch_size']}"
+    return [f"{training['minutes']:.0f}", steps, training["started_from"] or "", training["machine"]]
+
+
+def markdown(head: Iterable[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table; short rows are filled up."""
+    columns = list(head)
+    lines = [columns, ["---"] * len(columns)]
+    lines += [[*row, *[""] * (len(columns) - len(row))] for row in rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def row_of(experiment: Experiment) -> int:
+    """Row of the paper's table."""
+    return experiment.paper.row if experiment.paper else 0
+
+
+def _paper(experiment: Experiment) -> str:
+    return f"{experiment.paper.re_px:g}" if experiment.paper and experiment.paper.re_px else ""
+
+
+def _left_out(missing: Sequence[str]) -> str:
+    return f"\n\nNot trained yet: {', '.join(missing)}." if missing else ""
+
+
+def _px(value: float | None) -> str:
+    if value is None:
+        return ""
+    return f"{value:.0f}" if 100 <= value < 1e5 else f"{value:.3g}"
+
+
+def _percent(share: float) -> str:
+    return "100 %" if share == 1 else f"{100 * share:.2f} %"
+
+
+def _millions(count: int) -> str:
+    return f"{count / 1e6:.2f} M"
+
+
+def _bound(column: Mapping[str, Any]) -> str:
+    ratio = column.get("times_cramer_rao", {}).get("re")
+    return "" if ratio is None else f"{ratio:.2f}"

@@ -1,0 +1,128 @@
+"""Evaluate trained networks and rewrite docs/results.md: ``python scripts/results/table.py out/runs``.
+
+Reads out/runs/<experiment>/model.safetensors, as `imgcal train` writes them, and data/models. The figures of a network
+are kept in docs/results/<experiment>.json under the hash of its file: another call evaluates only what is new.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from charts import over_time, sweeps
+from measuring import Effort, Source, find, measure, swept
+from output import RESULTS, ROOT, command, read_json, write_json
+from pages import accuracy_table, background_table, paper_table, replaced, robustness_table, row_of, shipped_table
+
+from imgcal.errors import InputError
+from imgcal.formats import write_text
+from imgcal.resources import shipped_names
+from imgcal.training.experiment import Experiment, load_experiment
+
+
+@dataclass(frozen=True)
+class Options:
+    """Evaluate trained networks and rewrite the page of results."""
+
+    runs: Annotated[Path, tyro.conf.Positional] = Path("out/runs")  #: folder of training runs
+    models: Path = ROOT / "data" / "models"  #: folder of shipped networks
+    page: Path = ROOT / "docs" / "results.md"  #: page whose tables are rewritten
+    results: Path = RESULTS  #: folder of JSON results and plots
+    effort: Annotated[Effort, tyro.conf.arg(name="")] = field(default_factory=Effort)
+    only: tuple[str, ...] = ()  #: evaluate these experiments only; the page gets all known ones
+    sweep: str = "table1-row01"  #: experiment whose error is drawn against perturbation and angle
+    sweep_count: int = 1000  #: rigs at each point of those curves
+    machine: str = "2 CPU cores shared, 1 thread a training"  #: what new runs were trained on
+    device: str = "cpu"  #: where networks run; refinement is always on the CPU
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Evaluate what is new, then write the page and the plots."""
+    options = tyro.cli(Options, args=arguments, description=__doc__)
+    page = _read(options.page)
+    experiments = {name: load_experiment(name) for name in shipped_names("experiments", ".yaml")}
+    sources = find(options.runs, options.models)
+    _check_names(options.only, sources)
+    for source in sources:
+        if source.experiment not in experiments:
+            print(f"{source.path}: {source.experiment} is not in data/experiments: left out", file=sys.stderr)
+            continue
+        if options.only and source.experiment not in options.only:
+            continue
+        place = options.results / f"{source.experiment}.json"
+        if not _known(place, source, options.effort):
+            write_json(place, measure(source, options.effort, options.device, options.machine))
+        if source.experiment == options.sweep:
+            _sweep(options, source)
+    places = {name: options.results / f"{name}.json" for name in experiments}
+    results = {name: read_json(place) for name, place in places.items() if place.is_file()}
+    over_time(results, options.results / "training.png")
+    texts = sections(list(experiments.values()), results) | pictures(options.results)
+    write_text(options.page, replaced(page, texts, options.page))
+
+
+def sections(experiments: list[Experiment], results: dict[str, dict[str, Any]]) -> dict[str, str]:
+    """Make all tables, by the name of their markers."""
+    table1 = [e for e in experiments if e.paper is not None and e.paper.table == "1"]
+    ours = sorted((e for e in table1 if not e.name.endswith("-paper")), key=_order)
+    theirs = sorted((e for e in table1 if e.name.endswith("-paper")), key=_order)
+    ablation = sorted((e for e in experiments if e.paper is not None and e.paper.table == "ablation"), key=_order)
+    shipped = [e for e in experiments if e.name.startswith("shipped-")]
+    return {
+        "table 1": accuracy_table(ours, results),
+        "table 1 background": background_table(ours, results),
+        "paper's networks": paper_table(theirs, results),
+        "ablation": paper_table(ablation, results),
+        "shipped": shipped_table(shipped, results),
+        "robustness": robustness_table(shipped, results),
+    }
+
+
+def pictures(folder: Path) -> dict[str, str]:
+    """Show the figures that there are, by the name of their markers."""
+    texts = {"training": "RE over training time", "sweep": "RE against kappa and phi"}
+    there = {name: (folder / f"{name}.png").is_file() for name in texts}
+    return {name: f"![{text}](results/{name}.png)" if there[name] else "Not made yet." for name, text in texts.items()}
+
+
+def _order(experiment: Experiment) -> tuple[int, str]:
+    return (row_of(experiment), experiment.name)
+
+
+def _known(place: Path, source: Source, effort: Effort) -> bool:
+    """Tell whether a network has been evaluated already, on no fewer rigs."""
+    if not place.is_file():
+        return False
+    found = read_json(place)
+    return bool(found["sha256"] == source.sha256 and found["rigs"] >= effort.rigs(found["images"]))
+
+
+def _sweep(options: Options, source: Source) -> None:
+    place = options.results / "sweep.json"
+    known = read_json(place) if place.is_file() else {}
+    if known.get("sha256") != source.sha256 or known["rigs"] < options.sweep_count:
+        known = swept(source, options.sweep_count, options.device)
+        write_json(place, known)
+    sweeps(known, options.results / "sweep.png")
+
+
+def _check_names(only: Iterable[str], sources: list[Source]) -> None:
+    there = [source.experiment for source in sources]
+    for name in only:
+        if name not in there:
+            raise InputError(f"--only: found {name}, expected one of {', '.join(there) or 'the runs: there are none'}")
+
+
+def _read(page: Path) -> str:
+    try:
+        return page.read_text("utf-8")
+    except OSError as error:
+        raise InputError(f"{page}: cannot be read: {error.strerror or error}") from error
+
+
+if __name__ == "__main__":
+    command(lambda: main(sys.argv[1:]))
