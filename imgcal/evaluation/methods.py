@@ -20,6 +20,8 @@ from imgcal.networks.rendering import ImageOptions, render_views
 from imgcal.objects import CalibrationObject
 from imgcal.rig import CameraRig
 
+DRIFTED_SIGMA = 10.0  # pixels: what the points of a factory rig are off by
+
 
 @dataclass(frozen=True)
 class Given:
@@ -72,10 +74,10 @@ class Method:
 def factory_alone(given: Given) -> Prediction:
     """Keep the factory rig and fit only the object's pose: what a tracking system does that is not recalibrated.
 
-    The true pose would make this worse and less honest: nobody knows it, and a rig is only as wrong as its cameras
-    disagree about where the object is. Huber's loss; every camera votes.
+    With the true pose RE would be larger, and nobody knows it. Least squares over all cameras, Huber's loss beyond what
+    a drifted rig misses by.
     """
-    observations = observed(given.uv, given.seen, given.sigma)
+    observations = observed(given.uv, given.seen, max(given.sigma, DRIFTED_SIGMA))
     fixed = torch.zeros_like(given.spread)
     return of_estimate(estimate(observations, given.factory, given.obj, spread=fixed))
 

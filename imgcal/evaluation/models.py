@@ -72,6 +72,8 @@ def load_models(
         InputError: a file that cannot be used, or a network for another rig or object.
     """
     models: list[Model] = []
+    if not paths:
+        return []
     files = [path / "model.safetensors" if path.is_dir() else path for path in paths]
     for path, name in zip(files, _names(files), strict=True):
         checkpoint = load_checkpoint(path, rig, obj)
@@ -82,13 +84,13 @@ def load_models(
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """Short names that differ: of the file, or of the folder where a training run has put it."""
-    names = [path.parent.resolve().name if path.stem == "model" else path.stem for path in paths]
-    if len(set(names)) < len(names):
-        names = [str(path.with_suffix("")) for path in paths]
-    if len(set(names)) < len(names):
-        raise InputError(f"models: found {', '.join(map(str, paths))}, expected each one once")
-    return names
+    """Short names that differ: of the file, or of the folder where a training run has put it; and folders above."""
+    parts = [(path.parent if path.stem == "model" else path.with_suffix("")).resolve().parts for path in paths]
+    for depth in range(1, max(map(len, parts), default=0) + 1):
+        names = ["/".join(some[-depth:]) for some in parts]
+        if len(set(names)) == len(names):
+            return names
+    raise InputError(f"models: found {', '.join(map(str, paths))}, expected each one once")
 
 
 def _history(path: Path) -> tuple[dict[str, Any], ...]:

@@ -10,7 +10,7 @@ Source: graduated non-convexity as in Yang et al., RA-L 2020.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -51,9 +51,11 @@ class Target:
     obj: CalibrationObject
     spread: Tensor  # (C, 15) standard deviations of the factory values
     sigma: float  # pixels, noise of the points
+    factor: Tensor | None = None  # (B, C, N) on the sigma of each fiducial, as a network may say
 
     def __getitem__(self, rows: Tensor) -> Target:
-        return Target(self.uv[rows], self.seen[rows], self.factory, self.obj, self.spread, self.sigma)
+        factor = None if self.factor is None else self.factor[rows]
+        return Target(self.uv[rows], self.seen[rows], self.factory, self.obj, self.spread, self.sigma, factor)
 
     def fit(
         self,
@@ -64,6 +66,8 @@ class Target:
     ) -> Estimate:
         """MAP estimate from a start, of all points or of the given ones."""
         observations = observed(self.uv if uv is None else uv, self.seen if seen is None else seen, self.sigma)
+        if self.factor is not None:
+            observations = replace(observations, sigma=observations.sigma * self.factor[:, None])
         pose = start.rig_from_object
         poses = RigidTransform(pose.rotation[:, None], pose.translation[:, None])
         return estimate(
@@ -84,7 +88,7 @@ def refine_robustly(
     """Refine predictions by the points that were seen.
 
     Args:
-        prediction: (B,) first guesses, a network's or others; double precision is best.
+        prediction: (B,) first guesses, a network's or others; its `log_sigma` weighs the points.
         views: (B,) uv and seen.
         factory: the factory rig, without batch axes.
         obj: N fiducials.
@@ -98,7 +102,8 @@ def refine_robustly(
     if views.uv is None or views.seen is None:
         raise ValueError("views hold no points")
     dtype = views.uv.dtype
-    target = Target(views.uv, views.seen, factory.to(dtype), obj, spread.to(dtype), sigma)
+    trust = None if prediction.log_sigma is None else prediction.log_sigma.to(dtype).exp()
+    target = Target(views.uv, views.seen, factory.to(dtype), obj, spread.to(dtype), sigma, trust)
     fit = target.fit(prediction.to(dtype), AT_FIRST)
     suspect = (~fits(fit, sigma, options.fits)).nonzero().squeeze(-1)
     result = of_estimate(fit)

@@ -1,0 +1,122 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from imgcal.evaluation import classical
+from imgcal.evaluation.methods import BASELINES, factory_alone, map_from_pnp, network_method, pnp
+from imgcal.evaluation.metrics import errors
+from imgcal.networks.prediction import Prediction
+from imgcal.networks.rendering import ImageOptions
+from tests.imgcal.evaluation.conftest import Fake, disturbed
+
+
+def re(prediction, some):
+    return errors(prediction, some.truth, some.conditions.obj).re
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_every_baseline_finds_a_rig_that_has_not_drifted(sample, name):
+    some = sample(3, kappa=0.0)
+    assert (re(BASELINES[name].predict(some.given()), some) < 1e-2).all()
+
+
+@pytest.mark.parametrize("name", ["scipy bundle adjustment", "MAP from PnP", "PnP + robust bundle adjustment"])
+def test_estimates_of_the_whole_rig_reach_the_reference(sample, name):
+    some = sample(4, noise=0.1)
+    reference = some.reference().rig
+    found = BASELINES[name].predict(some.given())
+    assert torch.allclose(found.rig.focal_length, reference.focal_length, atol=0.3)
+    assert torch.allclose(found.rig.positions, reference.positions, atol=0.3)
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_every_baseline_survives_views_with_hardly_any_points(sample, name):
+    some = sample(2, noise=0.1, rig="O10")
+    some.corrupted.views.seen[0, 1, 2:] = False
+    some.corrupted.views.seen[1, 3, :] = False
+    found = BASELINES[name].predict(some.given())
+    assert torch.isfinite(re(found, some)).all()
+
+
+def test_the_factory_rig_stays_as_it_is(sample):
+    some = sample(3)
+    found = factory_alone(some.given())
+    assert torch.equal(found.rig.distortion, some.conditions.rig.distortion.expand(3, 4, 5))
+    # Fitting the pose is never worse than knowing it, as far as the image goes.
+    true_pose = Prediction(some.conditions.rig.expand(3), some.truth.rig_from_object)
+    assert (re(found, some) <= re(true_pose, some) + 1e-6).all()
+
+
+def test_pnp_moves_each_camera_on_its_own(sample):
+    some = sample(3)
+    found = pnp(some.given()).cameras_from_object
+    assert torch.allclose(found.focal_length, some.conditions.rig.focal_length.expand(3, 4, 2))
+    assert (re(pnp(some.given()), some) < re(factory_alone(some.given()), some)).all()
+
+
+def test_opencv_with_eight_points_explains_them_all(sample):
+    some = sample(3)
+    found = BASELINES["OpenCV calibrateCamera per camera"].predict(some.given())
+    assert (re(found, some) < 0.05).all()
+    assert not torch.allclose(found.rig.focal_length, some.conditions.rig.focal_length.expand(3, 4, 2))
+
+
+def test_an_outlier_does_not_make_pnp_diverge_further(sample):
+    points = sample().conditions.obj.points.numpy()
+    matrix, distortion = classical._intrinsics(sample().conditions.rig, 0)
+    some = sample(1, kappa=0.0)
+    uv = some.given().uv[0, 0].numpy().copy()
+    uv[2] += 300
+    rotation, translation = classical._solve_pnp(points, uv, matrix, distortion)
+    assert classical._misfit(points, uv, matrix, distortion, rotation, translation) < 8 * 300**2
+
+
+def test_unseen_points_do_not_matter(sample):
+    some = sample(3, missing=0.2)
+    given = some.given()
+    elsewhere = replace(given.views, uv=torch.where(given.seen[..., None], given.uv, 77.0))
+    for method in (map_from_pnp, pnp):
+        first, second = method(given), method(replace(given, views=elsewhere))
+        assert torch.equal(first.rig.focal_length, second.rig.focal_length)
+
+
+def test_a_network_gets_single_precision_and_its_refinement_double(sample):
+    some = sample(4)
+    network = Fake(some.conditions)
+    method = network_method(network)
+    prediction = method.predict(some.given())
+    assert network.calls == [torch.float32]
+    assert prediction.rig.focal_length.dtype == torch.float64
+    refined = method.refine(disturbed(some.truth, some.given().spread), some.given())
+    assert (re(refined, some) < 0.02).all()
+
+
+def test_an_image_network_gets_images_that_are_drawn_once(sample):
+    some, seen = sample(3, swapped=0.2), []
+
+    class Looks(Fake):
+        image_options = ImageOptions(size=32, dot=1.0)
+
+        def forward(self, views):
+            seen.append(views.images)
+            return super().forward(replace(views, uv=views.images))
+
+    method, given = network_method(Looks(some.conditions)), some.given()
+    method.predict(given)
+    method.predict(given)
+    assert seen[0].shape == (3, 4, 3, 32, 32)
+    assert seen[0] is seen[1]
+    assert method.images == ImageOptions(size=32, dot=1.0)
+
+
+def test_images_are_refined_by_render_and_compare(sample):
+    some = sample(2)
+
+    class Looks(Fake):
+        image_options = ImageOptions()
+
+    method = network_method(Looks(some.conditions))
+    guess = disturbed(some.truth, some.given().spread, 0.05)
+    assert (re(method.refine(guess, some.given()), some) < 0.2).all()
+    assert (re(guess, some) > 0.2).all()

@@ -1,0 +1,114 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from imgcal.errors import InputError
+from imgcal.evaluation import BASELINES, Conditions, Method, Protocol, evaluate, network_method
+from imgcal.evaluation.latency import latency
+from imgcal.evaluation.methods import factory_alone
+from imgcal.evaluation.metrics import KINDS, Errors
+from imgcal.evaluation.protocol import LEAST_SIGMA, Scores
+from tests.imgcal.evaluation.conftest import Fake, straight_down
+
+FACTORY = {"factory": Method(factory_alone)}
+
+
+def of_re(values: list[float]) -> Errors:
+    zeros = dict.fromkeys(KINDS, torch.ones(len(values), dtype=torch.float64))
+    return Errors(**(zeros | {"re": torch.tensor(values, dtype=torch.float64)}))
+
+
+def test_statistics_of_known_errors():
+    found = Scores((of_re([0.0, 1.0]), of_re([0.2, 2.8])), ()).statistics()
+    assert found["rigs"] == 4
+    assert found["mean"] == pytest.approx(1.0)
+    assert found["spread"] == pytest.approx(2**-0.5)
+    assert found["trial_means"] == pytest.approx((0.5, 1.5))
+    assert found["median"] == pytest.approx(0.6)
+    assert found["share_under_half_px"] == 0.5
+    assert Scores((of_re([0.0, 1.0]),), ()).statistics()["spread"] is None
+
+
+def test_cramer_rao_ratios_are_of_the_rigs_that_have_a_bound():
+    scores = Scores((of_re([3.0, 4.0, 100.0]),), (of_re([2.0, 1.0]),))
+    assert scores.cramer_rao_ratios()["re"] == pytest.approx(5**0.5)
+    assert Scores((of_re([1.0]),), (of_re([0.0]),)).cramer_rao_ratios()["re"] is None
+    assert Scores((of_re([1.0]),), ()).cramer_rao_ratios()["re"] is None
+
+
+def test_rigs_depend_on_the_seed_and_the_trial_but_not_on_the_methods(conditions):
+    known = conditions(noise=0.1, missing=0.1)
+    few = Protocol(count=7, trials=2, batch=4)
+    alone = evaluate(FACTORY, known, few)
+    both = evaluate({"pnp": BASELINES["MAP from PnP"]} | FACTORY, known, few)
+    assert torch.equal(alone.rows["factory"].alone.re, both.rows["factory"].alone.re)
+    first, second = alone.rows["factory"].alone.trials
+    assert len(first) == len(second) == 7
+    assert not torch.equal(first.re, second.re)
+    other = evaluate(FACTORY, known, replace(few, seed=1))
+    assert not torch.equal(alone.rows["factory"].alone.re, other.rows["factory"].alone.re)
+
+
+def test_a_slow_method_gets_the_first_rigs_of_every_trial(conditions):
+    methods = FACTORY | {"slow": replace(FACTORY["factory"], most=5)}
+    found = evaluate(methods, conditions(), Protocol(count=9, trials=2, batch=4))
+    for all_rigs, some in zip(found.rows["factory"].alone.trials, found.rows["slow"].alone.trials, strict=True):
+        assert torch.allclose(all_rigs.re[:5], some.re, atol=1e-6)
+
+
+def test_small_batches_of_a_method_change_nothing(conditions):
+    methods = FACTORY | {"small": replace(FACTORY["factory"], batch=2)}
+    found = evaluate(methods, conditions(noise=0.1), Protocol(count=5, trials=1))
+    assert torch.allclose(found.rows["factory"].alone.re, found.rows["small"].alone.re, atol=1e-6)
+
+
+def test_a_network_has_two_columns(conditions):
+    known = straight_down(conditions(kappa=0.002))
+    found = evaluate({"fake": network_method(Fake(known))} | FACTORY, known, Protocol(count=6, trials=1))
+    row = found.rows["fake"]
+    assert row.refined is not None
+    assert float(row.refined.re.max()) < 0.02 < float(row.alone.re.min())
+    assert found.rows["factory"].refined is None
+
+
+def test_progress_counts_every_rig_of_every_method_and_of_the_reference(conditions):
+    counted = []
+    evaluate(FACTORY, conditions(), Protocol(count=5, trials=2, batch=3), counted.append)
+    assert sum(counted) == 2 * (5 + 5)
+
+
+def test_bounds_exist_where_there_is_noise(conditions):
+    few = Protocol(count=3, trials=1)
+    assert evaluate(FACTORY, conditions(), few).reference.cramer_rao_ratios()["re"] is None
+    assert evaluate(FACTORY, conditions(noise=0.1), few).reference.cramer_rao_ratios()["re"] is not None
+
+
+def test_methods_are_told_the_noise(conditions):
+    told = []
+
+    def listen(given):
+        told.append((given.sigma, given.spread))
+        return factory_alone(given)
+
+    for noise in (0.0, 0.3):
+        known: Conditions = conditions(noise=noise, kappa=0.01)
+        evaluate({"listener": Method(listen)}, known, Protocol(count=1, trials=1))
+    assert [sigma for sigma, _ in told] == [LEAST_SIGMA, 0.3]
+    assert torch.equal(told[0][1], known.drift.std(known.rig))
+
+
+@pytest.mark.parametrize("name", ["count", "trials", "batch"])
+def test_nothing_to_do_is_refused(name):
+    with pytest.raises(InputError, match=name):
+        Protocol(**{name: 0})
+
+
+def test_latency_has_a_second_figure_where_there_is_a_refinement(conditions):
+    known = straight_down(conditions(kappa=0.002))
+    alone = latency(FACTORY["factory"], known, repeats=2)
+    assert 0 < alone.alone_p50 <= alone.alone_p99
+    assert alone.refined_p50 is None
+    both = latency(network_method(Fake(known)), known, repeats=2)
+    assert both.refined_p50 is not None
+    assert both.refined_p50 > both.alone_p50

@@ -1,0 +1,107 @@
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+from imgcal.evaluation import Evaluation, Method, Protocol, Row, Scores, evaluate, network_method, sweep
+from imgcal.evaluation.latency import Latency
+from imgcal.evaluation.methods import factory_alone
+from imgcal.evaluation.plots import draw_latency, draw_sweep, draw_training
+from imgcal.evaluation.report import Facts, Report, Table, as_values, describe, markdown, tables, write
+from tests.imgcal.evaluation.conftest import Fake, straight_down
+
+HISTORY = ({"step": 10, "re_px": 9.0}, {"step": 20, "re_px": 5.0, "validation_re_px": 6.0})
+
+
+@pytest.fixture(scope="module")
+def report(conditions) -> Report:
+    known = straight_down(conditions(kappa=0.002, noise=0.1))
+    methods = {"fake": network_method(Fake(known)), "factory": Method(factory_alone)}
+    few = Protocol(count=4, trials=2)
+    return Report(
+        evaluate(methods, known, few),
+        {"fake": Latency(1.0, 2.0, 3.0, 4.0), "factory": Latency(5.0, 6.0, None, None)},
+        {"fake": Facts(1234, 5_600_000, HISTORY)},
+        (sweep(methods, known, "noise", replace(few, trials=1), (0.0, 0.1)),),
+    )
+
+
+def test_values_are_json_with_both_columns(report):
+    values = json.loads(json.dumps(as_values(report), allow_nan=False))
+    assert values["format"] == "imgcal-evaluation/1"
+    assert values["rig"] == "T4"
+    assert values["corruption"]["noise"] == 0.1
+    assert values["poses_deg"]["phi"] == [0.0, 0.0]
+    fake = values["methods"]["fake"]
+    assert fake["refined"]["re_px"]["mean"] < fake["alone"]["re_px"]["mean"]
+    assert fake["refined"]["cramer_rao_ratio"]["re"] > 0
+    assert fake["latency_ms"]["refined_p50"] == 3.0
+    assert fake["model"] == {"parameters": 1234, "bytes": 5_600_000}
+    assert values["methods"]["factory"]["refined"] is None
+    assert values["methods"]["factory"]["model"] is None
+    assert values["sweeps"]["noise"]["values"] == [0.0, 0.1]
+    assert len(values["sweeps"]["noise"]["methods"]["fake"]["refined"]) == 2
+
+
+def test_what_is_not_finite_is_null(report):
+    row = report.evaluation.rows["factory"]
+    broken = replace(row.alone.trials[0], re=torch.full((4,), torch.inf, dtype=torch.float64))
+    evaluation = replace(report.evaluation, rows={"factory": Row(Scores((broken,), ()))})
+    values = as_values(Report(evaluation))
+    assert values["methods"]["factory"]["alone"]["re_px"]["mean"] is None
+    assert "> 10000" in markdown(Report(evaluation))
+
+
+def test_tables_show_every_method_and_the_reference(report):
+    errors, parameters, cost = tables(report)
+    assert [row[0] for row in errors.rows] == ["fake", "factory", "MAP, true inliers"]
+    assert [row[0] for row in parameters.rows] == ["fake", "fake, refined", "factory", "MAP, true inliers"]
+    assert "–" in errors.rows[1]
+    assert cost.rows[0][-2:] == ("1,234", "5.6")
+    assert cost.rows[1][3:] == ("–", "–", "–", "–")
+    assert errors.rich().row_count == 3
+
+
+def test_markdown_is_a_table():
+    lines = Table("Title", ("method", "a"), (("x", "1"), ("longer", "22"))).markdown().splitlines()
+    assert lines == ["### Title", "", "| method |  a |", "| :----- | -: |", "| x      |  1 |", "| longer | 22 |"]
+
+
+def test_the_description_says_what_the_rigs_were(report):
+    text = describe(report.evaluation)
+    assert "Rig T4, object asymmetric8, phi 0 to 0 deg" in text
+    assert "noise 0.1" in text
+    exact: Evaluation = replace(
+        report.evaluation,
+        conditions=replace(report.evaluation.conditions, corruption=type(report.evaluation.conditions.corruption)()),
+    )
+    assert "exact points" in describe(exact)
+
+
+def test_files_are_written(report, tmp_path):
+    files = write(report, tmp_path)
+    expected = ["evaluation.json", "evaluation.md", "error-noise.png", "training.png", "latency.png"]
+    assert [path.name for path in files] == expected
+    assert {path.name for path in tmp_path.iterdir()} == set(expected)
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in files[2:])
+    assert json.loads(files[0].read_text())["trials"] == 2
+
+
+def test_only_what_there_are_data_for_is_drawn(report, tmp_path):
+    assert [path.suffix for path in write(Report(report.evaluation), tmp_path)] == [".json", ".md"]
+
+
+def test_plots_show_what_was_measured(report):
+    [axes] = draw_sweep(report.sweeps[0]).axes
+    assert [line.get_label() for line in axes.lines] == ["fake", "fake, refined", "factory", "MAP, true inliers"]
+    assert list(axes.lines[0].get_xdata()) == [0.0, 0.1]
+    [axes] = draw_training(report).axes
+    assert [list(line.get_xdata()) for line in axes.lines] == [[10, 20], [20]]
+    assert list(axes.lines[1].get_ydata()) == [6.0]
+    [axes] = draw_latency(report).axes
+    assert {line.get_label() for line in axes.lines if not line.get_label().startswith("_")} == {
+        "fake",
+        "fake, refined",
+        "factory",
+    }
