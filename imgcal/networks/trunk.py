@@ -116,6 +116,23 @@ class Trunk(nn.Module):
         return tuple(predictions)
 
     @torch.no_grad()
+    def rescale(self, spread: Tensor) -> None:
+        """Make weights that were trained with offsets in other units say the same in those of this network.
+
+        Args:
+            spread: (C', 15) of the other training; cameras may differ, their mean counts.
+        """
+        old, new = spread.to(self.decoder.spread).mean(0), self.decoder.spread.mean(0)
+        ratio = torch.where((old > 0) & (new > 0), old / new.clamp_min(1e-30), 1.0)
+        for stage in (self.first, self.later):
+            if stage is not None:
+                stage.camera_head[-1].weight *= ratio[:, None]
+                stage.camera_head[-1].bias *= ratio
+        if self.later is not None:  # it is also told the offsets: its last inputs
+            for layer in (self.later.embed[0], self.later.camera_head[0]):
+                layer.weight[:, -PARAMETERS:] /= ratio
+
+    @torch.no_grad()
     def _differences(self, state: RigState, prediction: Prediction, uv: Tensor, weight: Tensor) -> Tensor:
         """What a later pass sees: (B, C, inputs), without gradient."""
         projected = self.decoder.project(prediction).uv

@@ -18,6 +18,7 @@ from imgcal.formats import load_object, load_rig, save_object, save_rig
 from imgcal.formats.safetensors_file import read_tensors, read_texts, write_tensors
 from imgcal.formats.yaml_file import validated
 from imgcal.networks.rendering import ImageOptions
+from imgcal.networks.trunk import Trunk
 from imgcal.objects import CalibrationObject
 from imgcal.rig import CameraRig
 from imgcal.training.experiment import Experiment
@@ -143,6 +144,11 @@ def warm_start(path: str | Path, network: nn.Module) -> tuple[str, ...]:
     with torch.no_grad():
         for name in fitting:
             own[name].copy_(tensors[name])
+    trunk = getattr(network, "trunk", None)
+    if isinstance(trunk, Trunk):
+        texts = read_texts(path, FORMAT)
+        experiment, _ = _read_records(path, texts)
+        trunk.rescale(experiment.drift.drift().std(_from_texts(path, texts)[0]))
     return tuple(name for name in own if name not in fitting)
 
 

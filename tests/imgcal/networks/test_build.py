@@ -158,3 +158,19 @@ def test_a_rig_without_working_distance_is_refused():
 def test_every_preset_has_a_sound_variant():
     for preset in PRESETS:
         assert NetworkConfig(preset=preset).variant() == PRESETS[preset]
+
+
+def test_rescaled_weights_say_the_same_of_another_drift():
+    narrow = make("points")
+    factory, obj = narrow.factory, narrow.obj
+    with torch.no_grad():
+        for parameter in narrow.parameters():
+            parameter += 0.02 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(3))
+    wide = build(narrow.config, factory, obj, 3 * narrow.decoder.spread).eval()
+    wide.load_state_dict(narrow.state_dict())
+    wide.trunk.rescale(narrow.decoder.spread)
+    made = snapshots(narrow)
+    with torch.no_grad():
+        first, second = (network(views(narrow, made))[-1].rig for network in (narrow, wide))
+    assert torch.allclose(first.focal_length, second.focal_length, rtol=1e-6)
+    assert torch.allclose(first.distortion, second.distortion, atol=1e-6)
