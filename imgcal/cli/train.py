@@ -32,7 +32,9 @@ class Train:
     experiment: Annotated[str, tyro.conf.Positional]  #: experiment file, or the name of a shipped experiment
     out: Path  #: folder to write
     resume: bool = False  #: go on with the training in OUT
-    set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE ...")] = ()
+    set: Annotated[
+        tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="KEY=VALUE ...")
+    ] = ()
     """values of the experiment to change, such as training.steps=100"""
     minutes: float | None = None  #: train so long; the same as --set training.minutes=...
 
@@ -44,7 +46,8 @@ class Train:
         from imgcal.training.engine import RESULT, STATE, finished, train
         from imgcal.training.experiment import load_experiment
 
-        changes = self.set if self.minutes is None else (*self.set, f"training.minutes={float(self.minutes)!r}")
+        changes = [change for changes in self.set for change in changes]
+        changes += [] if self.minutes is None else [f"training.minutes={float(self.minutes)!r}"]
         experiment = load_experiment(self.experiment, changes)
         check_folder(self.out)
         there = (self.out / STATE).exists()

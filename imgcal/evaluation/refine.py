@@ -28,6 +28,9 @@ SQUARED = EstimationOptions(loss="squared")
 AT_FIRST = EstimationOptions(loss="squared", max_iterations=15)  # outliers can keep it busy without end
 
 
+FAR = 100.0  # pixels: points farther off are all equally wrong
+
+
 @dataclass(frozen=True)
 class RefinementOptions:
     """What counts as an outlier. All but `thresholds` in standard deviations or multiples of others."""
@@ -136,7 +139,15 @@ def _robust(guess: Prediction, target: Target, options: RefinementOptions) -> Pr
     for _ in range(options.rounds):
         points = mended(result, target, options.gate)
         result = of_estimate(target.fit(result, uv=points.uv, seen=points.fits))
-    return result
+    worse = ~(_misfit(result, target) < _misfit(guess, target))
+    return _replaced(result, (rows := worse.nonzero().squeeze(-1)), rows_of(guess, rows))
+
+
+def _misfit(prediction: Prediction, target: Target) -> Tensor:
+    """Mean distance of the points from where they are expected, each at most `FAR`: (B,) pixels. A fit that ran away
+    from a bad start fits nothing, the start at least some."""
+    distance = (_predicted_uv(prediction, target) - target.uv).norm(dim=-1).nan_to_num(nan=FAR).clamp_max(FAR)
+    return (distance * target.seen).sum((1, 2)) / target.seen.sum((1, 2)).clamp_min(1)
 
 
 def _first_round(guess: Prediction, target: Target, limits: tuple[float, ...], share: float) -> Tensor:

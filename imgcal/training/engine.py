@@ -367,4 +367,6 @@ def _announce(run: Run, log: Log) -> None:
     again = f", from step {run.step} on" if run.step else ""
     log.say(f"{run.experiment.name}: {count:,} parameters, {where}{again}")
     if run.untrained:
-        log.say(f"{run.experiment.training.init_from}: nothing fits {', '.join(run.untrained)}: untrained")
+        parts = sorted({name.partition(".")[0] for name in run.untrained})
+        count = len(run.untrained)
+        log.say(f"{run.experiment.training.init_from}: nothing fits {count} tensors of {', '.join(parts)}: untrained")

@@ -25,7 +25,7 @@ def train(experiment, out, *more):
 
 def test_a_network_comes_out(experiment, tmp_path, capsys):
     out = tmp_path / "deep" / "out"
-    assert train(experiment, out, "--set", "training.steps=20", "optimizer.lr=1e-3") == 0
+    assert train(experiment, out, "--set", "training.steps=30", "optimizer.lr=1e-3", "--set", "training.steps=20") == 0
     load_network(out / "model.safetensors", load_rig("T4"), load_object("asymmetric8"))
     printed = capsys.readouterr()
     assert printed.out == ""
