@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from imgcal.errors import InputError
+from imgcal.formats.names import nearest
 from imgcal.networks.prediction import Prediction, Views
 from imgcal.networks.rendering import ImageOptions, render_views
 from imgcal.objects import CalibrationObject
@@ -84,6 +85,11 @@ def load_guesser(name: str, rig: CameraRig, obj: CalibrationObject) -> Guesser:
         InputError: no such file, or no network for this rig and object.
     """
     if name not in KINDS:
+        if not Path(name).is_file():
+            raise InputError(
+                f"first guess: found `{name}`, expected none, {', '.join(KINDS)}, or a file of `imgcal train`"
+                f"{nearest(name, KINDS)}"
+            )
         return _load(Path(name), rig, obj)
     shipped = [stem for stem in shipped_names("models", ".safetensors") if stem.startswith(f"{name}-")]
     reasons = []

@@ -1,0 +1,68 @@
+"""Put trained networks where the package ships them: bf16 weights in data/models, named by kind, rig and object.
+
+Usage: python scripts/results/ship.py out/runs/shipped-points-asymmetric8 out/runs/shipped-vit-asymmetric8 ...
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import torch
+
+from imgcal.networks import Views
+from imgcal.networks.rendering import render_views
+from imgcal.synthesis import synthesize
+from imgcal.training.checkpoint import Checkpoint, load_checkpoint, save_network
+from imgcal.training.experiment import Experiment, changed
+
+MODELS = Path("data/models")
+RIGS = 64  # on which both precisions are compared
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="+", type=Path, help="folders of `imgcal train` whose experiments are shipped-*")
+    parser.add_argument("--out", type=Path, default=MODELS)
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    for run in arguments.runs:
+        trained = load_checkpoint(run / "model.safetensors")
+        experiment = portable(trained.experiment)
+        kind = experiment.name.split("-")[1]
+        path = arguments.out / f"{kind}-{experiment.rig}-{experiment.object}.safetensors"
+        save_network(path, trained.network, experiment, trained.metrics, torch.bfloat16, rig=trained.rig)
+        before, after = error(trained), error(load_checkpoint(path))
+        print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, RE {before:.3f} px, in bf16 {after:.3f} px")
+
+
+def portable(experiment: Experiment) -> Experiment:
+    """Say where a warm start came from by the name of that experiment, not by a path of this machine."""
+    start = experiment.training.init_from
+    if start is None:
+        return experiment
+    return changed(
+        experiment, f"training.init_from=out/runs/{load_checkpoint(start).experiment.name}/model.safetensors"
+    )
+
+
+@torch.no_grad()
+def error(checkpoint: Checkpoint) -> float:
+    """Mean RE of a network on a few random rigs, exact points."""
+    network, experiment = checkpoint.network, checkpoint.experiment
+    factory, generator = checkpoint.rig.to(torch.float32), torch.Generator().manual_seed(0)
+    drift, poses = experiment.drift.drift(), experiment.poses.pose_range()
+    made = synthesize(factory, checkpoint.obj, RIGS, generator, drift=drift, pose_range=poses)
+    uv, seen = made.projection.uv, made.projection.visible
+    views = Views(uv=uv, seen=seen)
+    if network.image_options is not None:
+        images = render_views(uv, seen, factory.image_size, checkpoint.obj, network.image_options, quantise=True)
+        views = Views(images=images)
+    predicted = network(views)[-1]
+    points = checkpoint.obj.points.to(uv)
+    found = predicted.rig.project(predicted.rig_from_object.apply(points), checkpoint.obj.radius).uv
+    return float((found - uv).square().mean((1, 2, 3)).sqrt().mean())
+
+
+if __name__ == "__main__":
+    main()
