@@ -32,9 +32,7 @@ class Train:
     experiment: Annotated[str, tyro.conf.Positional]  #: experiment file, or the name of a shipped experiment
     out: Path  #: folder to write
     resume: bool = False  #: go on with the training in OUT
-    set: Annotated[
-        tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="KEY=VALUE ...")
-    ] = ()
+    set: Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="KEY=VALUE ...")] = ()
     """values of the experiment to change, such as training.steps=100"""
     minutes: float | None = None  #: train so long; the same as --set training.minutes=...
 

@@ -145,7 +145,8 @@ def _robust(guess: Prediction, target: Target, options: RefinementOptions) -> Pr
 
 def _misfit(prediction: Prediction, target: Target) -> Tensor:
     """Mean distance of the points from where they are expected, each at most `FAR`: (B,) pixels. A fit that ran away
-    from a bad start fits nothing, the start at least some."""
+    from a bad start fits nothing, the start at least some.
+    """
     distance = (_predicted_uv(prediction, target) - target.uv).norm(dim=-1).nan_to_num(nan=FAR).clamp_max(FAR)
     return (distance * target.seen).sum((1, 2)) / target.seen.sum((1, 2)).clamp_min(1)
 

@@ -126,11 +126,11 @@ class Trunk(nn.Module):
         ratio = torch.where((old > 0) & (new > 0), old / new.clamp_min(1e-30), 1.0)
         for stage in (self.first, self.later):
             if stage is not None:
-                stage.camera_head[-1].weight *= ratio[:, None]
-                stage.camera_head[-1].bias *= ratio
+                for parameter in stage.camera_head[-1].parameters():  # (15, width) and (15,)
+                    parameter.mT.mul_(ratio) if parameter.ndim == 2 else parameter.mul_(ratio)
         if self.later is not None:  # it is also told the offsets: its last inputs
             for layer in (self.later.embed[0], self.later.camera_head[0]):
-                layer.weight[:, -PARAMETERS:] /= ratio
+                next(layer.parameters())[:, -PARAMETERS:] /= ratio
 
     @torch.no_grad()
     def _differences(self, state: RigState, prediction: Prediction, uv: Tensor, weight: Tensor) -> Tensor:
