@@ -99,9 +99,9 @@ def main() -> None:
         "one_rig": {path.stem: latency(path) for path in paths},
         "training": {name: throughput(f"shipped-{name}-cube8") for name in ("points", "vit", "cnn")},
     }
-    print(
-        f"{'network':28s} {'parameters':>10s} {'MB':>5s} {'forward ms':>11s} {'refine ms':>10s} {'both p50':>9s} {'p99':>7s}"
-    )
+    columns = ("parameters", "MB", "forward ms", "refine ms", "both p50", "p99")
+    widths = (10, 5, 11, 10, 9, 7)
+    print(f"{'network':28s}", *(f"{column:>{width}s}" for column, width in zip(columns, widths, strict=True)))
     for name, row in result["one_rig"].items():
         both = row["forward_and_refinement"]
         print(
