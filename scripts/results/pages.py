@@ -98,6 +98,21 @@ def paper_table(experiments: Sequence[Experiment], results: Results) -> str:
     return markdown(head, rows) + _left_out(missing)
 
 
+def comparison_table(experiments: Sequence[Experiment], results: Results) -> str:
+    """What single decisions are worth, in equal minutes from nothing."""
+    head = ("what", "network alone", "median", "parameters", *TRAINING)
+    rows, missing = [], []
+    for experiment in experiments:
+        result = results.get(experiment.name)
+        if result is None:
+            missing.append(experiment.name)
+            continue
+        alone = result["exact"][NETWORK]
+        cells = [experiment.description.partition(":")[0], mean(alone), _px(alone["median"])]
+        rows.append([*cells, _millions(result["parameters"]), *training_cells(result)])
+    return markdown(head, rows) + _left_out(missing)
+
+
 def shipped_table(experiments: Sequence[Experiment], results: Results) -> str:
     """Size, speed and accuracy of the models that ship."""
     head = (

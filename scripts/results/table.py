@@ -16,7 +16,16 @@ import tyro
 from charts import over_time, sweeps
 from measuring import Effort, Source, find, measure, swept
 from output import RESULTS, ROOT, command, read_json, write_json
-from pages import accuracy_table, background_table, paper_table, replaced, robustness_table, row_of, shipped_table
+from pages import (
+    accuracy_table,
+    background_table,
+    comparison_table,
+    paper_table,
+    replaced,
+    robustness_table,
+    row_of,
+    shipped_table,
+)
 
 from imgcal.errors import InputError
 from imgcal.formats import write_text
@@ -77,6 +86,7 @@ def sections(experiments: list[Experiment], results: dict[str, dict[str, Any]]) 
         "table 1 background": background_table(ours, results),
         "paper's networks": paper_table(theirs, results),
         "ablation": paper_table(ablation, results),
+        "comparison": comparison_table([e for e in experiments if e.name.startswith("comparison-")], results),
         "shipped": shipped_table(shipped, results),
         "robustness": robustness_table(shipped, results),
     }
