@@ -1,6 +1,6 @@
 """Measure networks: ``python scripts/benchmarks/bench_networks.py`` prints a table, writes results/networks.json.
 
-One rig at a time through each shipped network and its refinement, exact points and the 8-bit images drawn from them, and
+One rig at a time through each shipped network and its refinement, on exact points or 8-bit images of them, and
 the throughput of a training step (synthesis, drawing, forward, loss, backward, optimizer) of each preset that ships.
 """
 
