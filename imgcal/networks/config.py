@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
@@ -107,7 +108,7 @@ class NetworkConfig(StrictModel):
         return type(preset).model_validate(_merged(preset.model_dump(), self.change, self.preset), strict=False)
 
 
-def one_of(names: Any) -> str:
+def one_of(names: Iterable[str]) -> str:
     """Say what would have been right."""
     return ", expected one of " + ", ".join(names)
 

@@ -29,18 +29,25 @@ class Backbone(nn.Module):
     def __init__(self, name: str, pretrained: bool, options: Mapping[str, Any]) -> None:
         super().__init__()
         self.model: Any = make_backbone(name, pretrained, options)
-        self.width = cast(int, self.model.num_features)
+        self.map_width = cast(int, self.model.num_features)
+        self.pooled_width = cast(int, getattr(self.model, "head_hidden_size", None) or self.map_width)
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """(I, 3, H, W) -> pooled (I, width), map (I, width, h, w). Other sizes than the encoder's are resized."""
+        """Encode images (I, 3, H, W); other sizes than the encoder's are resized.
+
+        Returns:
+            The pooled feature (I, pooled_width) and the map (I, map_width, h, w).
+        """
         if images.shape[-2:] != (SIZE, SIZE):
             images = functional.interpolate(images, (SIZE, SIZE), mode="bilinear", antialias=True, align_corners=False)
         features = self.model.forward_features(images)
         pooled = self.model.forward_head(features, pre_logits=True)
         if features.ndim == 3:  # tokens: those before the patches (class token) do not belong to the map
-            patches = features[:, int(self.model.num_prefix_tokens) :]
+            patches = features[:, int(getattr(self.model, "num_prefix_tokens", 0)) :]
             side = round(patches.shape[1] ** 0.5)
             features = patches.mT.unflatten(-1, (side, -1))
+        elif getattr(self.model, "output_fmt", "NCHW") == "NHWC":
+            features = features.movedim(-1, 1)
         return pooled, features
 
 
@@ -55,7 +62,7 @@ class PaperImageNetwork(nn.Module):
         self.image_options: ImageOptions = ImageOptions(size=SIZE)
         self.decoder = decoder
         self.backbone = Backbone(config.backbone, config.pretrained, config.options)
-        self.bottleneck = nn.Linear(self.backbone.width, config.bottleneck)
+        self.bottleneck = nn.Linear(self.backbone.pooled_width, config.bottleneck)
         self.heads = PaperHeads(config.bottleneck, config.head_widths)
 
     def forward(self, views: Views) -> tuple[Prediction, ...]:
@@ -90,10 +97,10 @@ class ImageNetwork(nn.Module):
         self.decoder = decoder
         self.register_buffer("colours", colours.to(decoder.focal_length), persistent=False)
         self.backbone = Backbone(config.backbone, config.pretrained, config.options)
-        self.bottleneck = nn.Linear(self.backbone.width, config.bottleneck)
+        self.bottleneck = nn.Linear(self.backbone.pooled_width, config.bottleneck)
         self.positions = config.positions
         if config.positions:
-            self.belief = nn.Conv2d(self.backbone.width, len(colours), 1)
+            self.belief = nn.Conv2d(self.backbone.map_width, len(colours), 1)
             for parameter in self.belief.parameters():
                 nn.init.zeros_(parameter)
         self.trunk = Trunk(decoder, **config.trunk.model_dump(), features=config.bottleneck)

@@ -80,7 +80,8 @@ class PaperPointNetwork(nn.Module):
         uv, seen = points_of(views)
         with torch.autocast(uv.device.type, enabled=False):
             positions = torch.where(seen[..., None], self.decoder.normalized(uv.float()), 0.0).flatten(-2)
-        numbers = self.heads(self.encoder(self.identity(self.embed(positions))))
+            embedded = self.embed(positions)  # bf16 would round a position to a pixel before it is looked at
+        numbers = self.heads(self.encoder(self.identity(embedded)))
         with torch.autocast(uv.device.type, enabled=False):
             return (self.decoder.absolute(numbers),)
 

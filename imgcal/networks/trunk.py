@@ -128,9 +128,10 @@ class Trunk(nn.Module):
             if stage is not None:
                 for parameter in stage.camera_head[-1].parameters():  # (15, width) and (15,)
                     parameter.mT.mul_(ratio) if parameter.ndim == 2 else parameter.mul_(ratio)
-        if self.later is not None:  # it is also told the offsets: its last inputs
-            for layer in (self.later.embed[0], self.later.camera_head[0]):
-                next(layer.parameters())[:, -PARAMETERS:] /= ratio
+        # Some layers are also told the offsets: their last inputs.
+        told = [] if self.later is None else [self.later.embed[0], self.later.camera_head[0]]
+        for layer in [*told, *([] if self.trust_head is None else [self.trust_head[0]])]:
+            next(layer.parameters())[:, -PARAMETERS:] /= ratio
 
     @torch.no_grad()
     def _differences(self, state: RigState, prediction: Prediction, uv: Tensor, weight: Tensor) -> Tensor:

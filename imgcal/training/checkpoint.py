@@ -61,6 +61,15 @@ def build_network(experiment: Experiment, rig: CameraRig, obj: CalibrationObject
     return network
 
 
+def without_pretrained(experiment: Experiment) -> Experiment:
+    """The same without published weights, which are not to be asked for where others replace them."""
+    network = experiment.network
+    if "pretrained" not in network.change:
+        return experiment
+    plain = network.model_copy(update={"change": {**network.change, "pretrained": False}})
+    return experiment.model_copy(update={"network": plain})
+
+
 def save_network(
     path: str | Path,
     network: nn.Module,
@@ -122,7 +131,7 @@ def load_checkpoint(path: str | Path, rig: CameraRig | None = None, obj: Calibra
     if obj is not None:
         check_object(path, trained_obj, obj)
     tensors, _ = read_tensors(path, FORMAT)
-    network = build_network(experiment, trained_rig, trained_obj)
+    network = build_network(without_pretrained(experiment), trained_rig, trained_obj)
     _fill(path, network, tensors)
     return Checkpoint(network.eval(), trained_rig, trained_obj, experiment, metrics)
 

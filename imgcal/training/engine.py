@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import monotonic
 from typing import Any, cast
@@ -21,7 +21,7 @@ from imgcal.networks.rendering import ImageOptions
 from imgcal.objects import CalibrationObject
 from imgcal.rig import CameraRig
 from imgcal.synthesis import Snapshots
-from imgcal.training.checkpoint import build_network, save_network, warm_start
+from imgcal.training.checkpoint import build_network, save_network, warm_start, without_pretrained
 from imgcal.training.data import Batch, Source, object_to
 from imgcal.training.end_to_end import refined_loss
 from imgcal.training.experiment import Experiment, save_experiment
@@ -136,7 +136,7 @@ def prepare(experiment: Experiment, folder: Path, resume: bool = False) -> Run:
         )
     factory, obj = experiment.load_rig(), experiment.load_object()
     torch.manual_seed(settings.seed)
-    network = build_network(experiment, factory, obj)
+    network = build_network(without_pretrained(experiment) if resume else experiment, factory, obj)
     untrained = () if resume or settings.init_from is None else warm_start(settings.init_from, network)
     plain = network.to(device)
     source = Source(
@@ -183,8 +183,9 @@ def train_step(run: Run) -> None:
         predictions = run.network(batch.views)
     config, weights = run.experiment.loss, run.plain.parameters()
     loss = compound(predictions, batch.truth, run.source.obj, config, run.step, run.spread, weights)
-    total = loss.total + refined_loss(predictions[-1], batch, run.source, run.spread, config.refined)
-    run.accelerator.backward(total)
+    refined = refined_loss(predictions[-1], batch, run.source, run.spread, config.refined)
+    loss = replace(loss, total=loss.total + refined)
+    run.accelerator.backward(loss.total)
     limit = run.experiment.optimizer.clip
     norm = torch.nn.utils.clip_grad_norm_(run.plain.parameters(), float("inf") if limit is None else limit)
     run.optimizer.step()

@@ -28,7 +28,7 @@ class State:
     """Everything that the rest of a run depends on."""
 
     tensors: dict[str, dict[str, Tensor]]  # by part: network, average, optimizer, random
-    values: dict[str, Any]  # plain values: step, elapsed, settings of the optimizer, schedule, window
+    values: dict[str, Any]  # plain values: step, elapsed, processes, settings of the optimizer, schedule, judged
     experiment: Experiment
 
 

@@ -133,6 +133,31 @@ def test_impossible_configurations_are_refused(config, message):
         NetworkConfig(**config)
 
 
+@pytest.mark.parametrize(
+    ("backbone", "options"),
+    [
+        ("swin_tiny_patch4_window7_224", {"embed_dim": 24, "depths": [1, 1], "num_heads": [1, 2]}),  # channels last
+        ("mixer_s32_224", {}),  # tokens, and none before the patches
+        ("mobilenetv3_small_050", {}),  # a pooled feature of another width than the map's
+        ("deit_tiny_distilled_patch16_224", {"depth": 1}),  # two tokens before the patches
+    ],
+)
+def test_any_backbone_fits(backbone, options):
+    network = make("vit", backbone=backbone, options=options)
+    with torch.no_grad():
+        images = torch.rand(2, 3, 224, 224, generator=torch.Generator().manual_seed(0))
+        shifted = images.clone()
+        shifted[1, :, 112:] = 0  # the lower half of one image
+        (pooled, here), (_, there) = network.backbone(images), network.backbone(shifted)
+        assert pooled.shape == (2, network.bottleneck.in_features)
+        assert here.shape[:2] == (2, network.belief.in_channels)
+        assert here.shape[2] == here.shape[3]
+        apart = (here - there).abs().sum(1)
+        assert apart[0].max() == 0
+        assert apart[1, -1].mean() > apart[1, 0].mean()  # rows are rows
+        assert len(network(views(network, snapshots(network)))) == network.trunk.passes
+
+
 def test_an_unknown_backbone_is_refused():
     with pytest.raises(InputError, match="nearest: vit_tiny_patch16_224"):
         make("vit", backbone="vit_tiny_patch16_225")

@@ -5,11 +5,13 @@ from dataclasses import replace
 import pytest
 import torch
 
+from imgcal import networks
 from imgcal.errors import InputError
 from imgcal.formats import load_object, load_rig
 from imgcal.formats.safetensors_file import read_tensors, write_tensors
 from imgcal.networks.prediction import Views
 from imgcal.training.checkpoint import FORMAT, build_network, load_checkpoint, load_network, save_network, warm_start
+from tests.imgcal.training.toy import Toy
 
 
 @pytest.fixture
@@ -41,6 +43,20 @@ def test_a_network_comes_back(made, path):
     assert found.experiment == experiment
     assert found.obj.name == "asymmetric8"
     torch.testing.assert_close(found.drift_std, experiment.drift.drift().std(load_rig("T4")), rtol=1e-9, atol=1e-12)
+
+
+def test_published_weights_are_not_asked_for_where_trained_ones_replace_them(experiment, tmp_path, monkeypatch):
+    setup, asked = experiment("network={preset: vit, change: {pretrained: true}}"), []
+
+    def build(config, *given):
+        asked.append(config.variant().pretrained)
+        return Toy(config, *given)
+
+    monkeypatch.setattr(networks, "build", build)
+    network = build_network(setup, setup.load_rig(), setup.load_object())
+    save_network(tmp_path / "a.safetensors", network, setup, {}, rig=setup.load_rig())
+    assert load_checkpoint(tmp_path / "a.safetensors").experiment == setup
+    assert asked == [True, False]
 
 
 def test_without_the_full_rig_its_single_precision_is_recorded(made, tmp_path):
