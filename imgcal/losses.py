@@ -116,7 +116,7 @@ def compound(
     with torch.autocast(truth.rig.focal_length.device.type, enabled=False):
         predicted = _stacked(predictions)  # (T, B)
         cameras, true_cameras = predicted.cameras_from_object, truth.cameras_from_object
-        difference = images_of(cameras, obj) - images_of(true_cameras, obj)
+        difference = project_fiducials(cameras, obj) - project_fiducials(true_cameras, obj)
         re = reprojection_re(difference)  # (T, B)
         if config.kind == "robust":
             terms = _robust_terms(predicted, truth, re, config.robust, spread)
@@ -133,7 +133,7 @@ def compound(
     return Loss(total, re[-1], re.mean(-1))
 
 
-def images_of(cameras: CameraRig, obj: CalibrationObject) -> Tensor:
+def project_fiducials(cameras: CameraRig, obj: CalibrationObject) -> Tensor:
     """Project the fiducials through kornia into cameras given in the object's frame.
 
     Args:

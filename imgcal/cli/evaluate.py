@@ -75,14 +75,14 @@ class Evaluate:
 class Compare:
     """Compare networks side by side on the same random rigs: accuracy alone and refined, time, parameters, size.
 
-    All must be for the same rig and object; poses and drift are those of the first unless said otherwise. Writes
-    OUT/evaluation.json, OUT/evaluation.md and plots (latency against accuracy, training curves).
+    All must be for the same rig and object; poses and drift are those of the first unless said otherwise. With
+    --out: evaluation.json, evaluation.md and plots (latency against accuracy, training curves).
     Example: imgcal compare out/vit out/cnn --out comparison --count 2000
     """
 
     models: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """two trained networks or more: *.safetensors, or folders of training runs"""
-    out: Path  #: folder to write
+    out: Path | None = None  #: folder to write; default: nothing is written
     setting: Annotated[Setting, tyro.conf.arg(name="")] = field(default_factory=Setting)
     baselines: bool = False  #: classical methods in the same table
 

@@ -1,10 +1,9 @@
-"""How good calibrations are: corruption of views, metrics, baselines, the paper's protocol, reports."""
+"""How good calibrations are: metrics, baselines, the paper's protocol, reports."""
 
-from imgcal.evaluation.corruption import Corrupted, Corruption
+from imgcal.corruption import Corrupted, Corruption
 from imgcal.evaluation.methods import BASELINES, Given, Method, network_method
 from imgcal.evaluation.metrics import Errors, cramer_rao, errors, reprojection_error
 from imgcal.evaluation.protocol import Conditions, Evaluation, Protocol, Row, Scores, evaluate
-from imgcal.evaluation.refine import RefinementOptions, refine_robustly
 from imgcal.evaluation.sweep import AXES, Sweep, sweep
 
 __all__ = [
@@ -18,7 +17,6 @@ __all__ = [
     "Given",
     "Method",
     "Protocol",
-    "RefinementOptions",
     "Row",
     "Scores",
     "Sweep",
@@ -26,7 +24,6 @@ __all__ = [
     "errors",
     "evaluate",
     "network_method",
-    "refine_robustly",
     "reprojection_error",
     "sweep",
 ]

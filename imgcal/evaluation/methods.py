@@ -13,11 +13,12 @@ from torch import Tensor, nn
 
 from imgcal.estimation import estimate
 from imgcal.evaluation import classical
-from imgcal.evaluation.metrics import of_estimate
-from imgcal.evaluation.refine import observed, refine_robustly, robust_pose
 from imgcal.networks.prediction import Prediction, Views
 from imgcal.networks.rendering import ImageOptions, render_views
 from imgcal.objects import CalibrationObject
+from imgcal.refinement import ImageRefinementOptions, as_prediction, refine_images, refine_robustly
+from imgcal.refinement.points import observed
+from imgcal.refinement.robust import robust_pose
 from imgcal.rig import CameraRig
 
 DRIFTED_SIGMA = 10.0  # pixels: what the points of a factory rig are off by
@@ -79,13 +80,13 @@ def factory_alone(given: Given) -> Prediction:
     """
     observations = observed(given.uv, given.seen, max(given.sigma, DRIFTED_SIGMA))
     fixed = torch.zeros_like(given.spread)
-    return of_estimate(estimate(observations, given.factory, given.obj, spread=fixed))
+    return as_prediction(estimate(observations, given.factory, given.obj, spread=fixed))
 
 
 def map_from_pnp(given: Given) -> Prediction:
     """MAP estimation of the whole rig from the factory rig and a pose by PnP over all cameras; Huber's loss."""
     observations = observed(given.uv, given.seen, given.sigma)
-    return of_estimate(estimate(observations, given.factory, given.obj, spread=given.spread))
+    return as_prediction(estimate(observations, given.factory, given.obj, spread=given.spread))
 
 
 def robust_from_pnp(given: Given) -> Prediction:
@@ -152,11 +153,9 @@ def network_method(network: nn.Module, batch: int | None = None) -> Method:
 
 def _refined_by_images(options: ImageOptions) -> Refine:
     def refine(prediction: Prediction, given: Given) -> Prediction:
-        from imgcal.refinement import ImageRefinementOptions, refine_images
-
         comparison = ImageRefinementOptions(image=options, position_noise=given.sigma)
         images = given.images(options)
         fit, _ = refine_images(prediction, images, given.factory, given.obj, given.spread, comparison)
-        return of_estimate(fit)
+        return as_prediction(fit)
 
     return refine

@@ -15,7 +15,6 @@ from imgcal.estimation.robust import squared
 from imgcal.networks.prediction import Prediction
 from imgcal.objects import CalibrationObject
 from imgcal.rig import PARAMETERS, CameraRig
-from imgcal.transforms import RigidTransform
 
 
 @dataclass(frozen=True)
@@ -62,8 +61,9 @@ def reprojection_error(predicted: CameraRig, truth: CameraRig, obj: CalibrationO
     """
     batch = torch.broadcast_shapes(predicted.batch_shape, truth.batch_shape)
     dtype = torch.promote_types(predicted.focal_length.dtype, truth.focal_length.dtype)
-    points = obj.points.to(dtype).expand(*batch, -1, -1)
-    radius = None if obj.radius is None else obj.radius.to(dtype)
+    device = truth.focal_length.device
+    points = obj.points.to(device, dtype).expand(*batch, -1, -1)
+    radius = None if obj.radius is None else obj.radius.to(device, dtype)
     difference = predicted.to(dtype).project(points, radius).uv - truth.to(dtype).project(points, radius).uv
     return difference.square().mean((-1, -2, -3)).sqrt()
 
@@ -131,9 +131,3 @@ def _dense(equations: NormalEquations) -> Tensor:
     matrix[:, size:, :size] = coupling.mT
     matrix[:, size:, size:] = equations.pose[:, 0]
     return matrix
-
-
-def of_estimate(estimate: Estimate) -> Prediction:
-    """Take an estimate of one snapshot a rig, (B,) and (B, 1) poses, as a prediction."""
-    pose = estimate.rig_from_object
-    return Prediction(estimate.rig, RigidTransform(pose.rotation[..., 0, :, :], pose.translation[..., 0, :]))

@@ -10,14 +10,15 @@ from typing import TypedDict
 import torch
 from torch import Tensor
 
+from imgcal.corruption import Corrupted, Corruption
 from imgcal.errors import InputError
 from imgcal.estimation import Estimate
-from imgcal.evaluation.corruption import Corrupted, Corruption
 from imgcal.evaluation.methods import Given, Method
-from imgcal.evaluation.metrics import KINDS, Errors, concatenate, cramer_rao, errors, of_estimate
-from imgcal.evaluation.refine import Target
+from imgcal.evaluation.metrics import KINDS, Errors, concatenate, cramer_rao, errors
 from imgcal.networks.prediction import Prediction, Views
 from imgcal.objects import CalibrationObject
+from imgcal.refinement import as_prediction, refine_points
+from imgcal.refinement.robust import SQUARED
 from imgcal.rig import CameraRig
 from imgcal.synthesis import Drift, PoseRange, RelativeDrift, synthesize
 
@@ -170,7 +171,7 @@ def evaluate(
         limits: list[Errors] = []
         for first, batch in _batches(conditions, protocol, trial):
             fit = batch.reference()
-            exact.append(errors(of_estimate(fit), batch.truth, conditions.obj))
+            exact.append(errors(as_prediction(fit), batch.truth, conditions.obj))
             if first < protocol.bound_count and conditions.corruption.noise >= LEAST_SIGMA:
                 limits.append(cramer_rao(fit))
             progress(len(batch))
@@ -207,8 +208,8 @@ class Sample:
     def reference(self) -> Estimate:
         """MAP estimate of the true inliers from the truth, squared loss."""
         given = self.given()
-        target = Target(given.uv, self.corrupted.inlier, given.factory, given.obj, given.spread, given.sigma)
-        return target.fit(self.truth)
+        inliers = Views(uv=given.uv, seen=self.corrupted.inlier)
+        return refine_points(self.truth, inliers, given.factory, given.obj, given.spread, given.sigma, SQUARED)
 
 
 def draw(conditions: Conditions, count: int, generator: torch.Generator) -> Sample:
@@ -235,7 +236,7 @@ def _measure(method: Method, batch: Sample, first: int, into: _Collected) -> Non
     for start in range(0, count, size):
         rows = slice(start, min(start + size, count))
         given = batch.given(rows)
-        truth = Prediction(batch.truth.rig[rows], batch.truth.rig_from_object[rows])
+        truth = batch.truth[rows]
         prediction = method.predict(given)
         into.alone.append(errors(prediction, truth, given.obj))
         if method.refine is not None:

@@ -35,6 +35,11 @@ class Prediction:
     rig_from_object: RigidTransform  # (B,)
     log_sigma: Tensor | None = None  # (B, C, N) log of the factor on each fiducial's sigma in a refinement; None = 1
 
+    def __getitem__(self, rows: Tensor | slice) -> Prediction:
+        """Keep some rigs of the batch."""
+        log_sigma = None if self.log_sigma is None else self.log_sigma[rows]
+        return Prediction(self.rig[rows], self.rig_from_object[rows], log_sigma)
+
     @property
     def cameras_from_object(self) -> CameraRig:
         """The cameras in the object's frame: what the paper's 21 numbers a camera describe."""

@@ -16,6 +16,7 @@ from imgcal.networks.rendering import LEVELS, ImageOptions
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Observations
 from imgcal.refinement.photometric import DotWindows, NearFit, ShiftPrior, blurred_step
+from imgcal.refinement.points import as_prediction
 from imgcal.rig import CameraRig
 
 PRESENT = 0.5  # amplitude above which a dot counts as there
@@ -84,11 +85,10 @@ def refine_images(
         again = (~result.converged).nonzero().squeeze(-1)
         if len(again) == 0:
             break
-        found = Prediction(result.rig, result.rig_from_object[:, 0])
+        found = as_prediction(result)
         # From near first: the rig mostly knows where dots are that its cameras have taken for each other.
         known = dots.select(again) if attempt % 2 else None
-        there = Prediction(found.rig[again], found.rig_from_object[again])
-        dots = dots.updated(again, problem.look(images[again], there, known))
+        dots = dots.updated(again, problem.look(images[again], found[again], known))
         result = problem.solve(dots, found)
     return problem.on_sensor(result, dots)
 

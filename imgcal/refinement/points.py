@@ -47,12 +47,11 @@ def refine_points(
     """
     if views.uv is None:
         raise ValueError("refine_points needs views with points")
-    uv = views.uv.double().unsqueeze(1)  # (B, 1, C, N, 2)
-    seen = torch.ones_like(uv[..., 0], dtype=torch.bool) if views.seen is None else views.seen.unsqueeze(1)
-    sigmas = torch.as_tensor(sigma, dtype=uv.dtype, device=uv.device).expand(*seen[:, 0].shape).unsqueeze(1)
+    uv = views.uv.double()
+    seen = torch.ones_like(uv[..., 0], dtype=torch.bool) if views.seen is None else views.seen
     guess = prediction.detach().to(torch.float64)
     return estimate(
-        Observations(uv, sigmas, seen),
+        observed(uv, seen, sigma),
         factory.to(torch.float64),
         obj,
         guess.rig_from_object.reshape(len(uv), 1),
@@ -60,3 +59,14 @@ def refine_points(
         first_guess=guess.rig,
         options=options,
     )
+
+
+def observed(uv: Tensor, seen: Tensor, sigma: Tensor | float) -> Observations:
+    """One snapshot a rig, uv (B, C, N, 2), seen and sigma (B, C, N), as observations (B, 1, C, N)."""
+    sigmas = torch.as_tensor(sigma, dtype=uv.dtype, device=uv.device).expand(seen.shape)
+    return Observations(uv[:, None], sigmas[:, None], seen[:, None])
+
+
+def as_prediction(estimate: Estimate) -> Prediction:
+    """Take an estimate of one snapshot a rig, (B,) and (B, 1) poses, as a prediction."""
+    return Prediction(estimate.rig, estimate.rig_from_object[:, 0])

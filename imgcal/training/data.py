@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from imgcal.evaluation.corruption import Corruption
+from imgcal.corruption import Corruption
 from imgcal.networks.prediction import Prediction, Views
 from imgcal.networks.rendering import ImageOptions, render_views
 from imgcal.objects import CalibrationObject

@@ -6,11 +6,10 @@ import torch
 from torch import Tensor
 
 from imgcal.errors import InputError
-from imgcal.losses import RefinedLoss, images_of, reprojection_re
+from imgcal.losses import RefinedLoss, project_fiducials, reprojection_re
 from imgcal.networks.prediction import Prediction
-from imgcal.refinement import refine_points
+from imgcal.refinement import as_prediction, refine_points
 from imgcal.training.data import Batch, Source
-from imgcal.transforms import RigidTransform
 
 WORST = 200.0  # pixels: where the error of a refined rig stops to count
 
@@ -44,9 +43,8 @@ def refined_loss(
     with torch.autocast(batch.views.uv.device.type, enabled=False):
         sigma = config.sigma * prediction.log_sigma.double().exp()
         fit = refine_points(prediction, batch.views, source.factory, source.obj, spread, sigma)
-        pose = RigidTransform(fit.rig_from_object.rotation[:, 0], fit.rig_from_object.translation[:, 0])
-        truth = images_of(batch.truth.cameras_from_object, source.obj).double()
-        re = reprojection_re(images_of(fit.rig.from_object(pose), source.obj) - truth)
+        truth = project_fiducials(batch.truth.cameras_from_object, source.obj).double()
+        re = reprojection_re(project_fiducials(as_prediction(fit).cameras_from_object, source.obj) - truth)
         counts = fit.converged & (re < WORST)
         error = torch.where(counts, torch.log1p(torch.where(counts, re, 0.0)), 0.0)
         return config.weight * (error.sum() / counts.sum().clamp_min(1)).float()

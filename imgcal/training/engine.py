@@ -13,10 +13,10 @@ from accelerate import Accelerator
 from accelerate.utils import broadcast
 from torch import Tensor, nn
 
+from imgcal.corruption import Corruption
 from imgcal.errors import InputError, RefusedError
-from imgcal.evaluation.corruption import Corruption
 from imgcal.formats.safetensors_file import write_tensors
-from imgcal.losses import Loss, compound, images_of, reprojection_re
+from imgcal.losses import Loss, compound, project_fiducials, reprojection_re
 from imgcal.networks.rendering import ImageOptions
 from imgcal.objects import CalibrationObject
 from imgcal.rig import CameraRig
@@ -230,7 +230,9 @@ def evaluate(network: nn.Module, batches: Iterable[Batch], obj: CalibrationObjec
     for batch in batches:
         with autocast(experiment, obj.points.device):
             predicted = network(batch.views)[-1]
-        difference = images_of(predicted.cameras_from_object, obj) - images_of(batch.truth.cameras_from_object, obj)
+        difference = project_fiducials(predicted.cameras_from_object, obj) - project_fiducials(
+            batch.truth.cameras_from_object, obj
+        )
         errors.append(reprojection_re(difference))
     network.train(was_training)
     return torch.cat(errors)

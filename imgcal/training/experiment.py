@@ -96,7 +96,7 @@ class ImagesConfig(StrictModel):
 
 
 class CorruptionConfig(StrictModel):
-    """What goes wrong in the views during training: `imgcal.evaluation.corruption.Corruption`."""
+    """What goes wrong in the views during training: `imgcal.corruption.Corruption`."""
 
     noise: Spread = 0.0  # pixels, one standard deviation of each axis
     missing: Fraction = 0.0  # share of the fiducials that is not seen

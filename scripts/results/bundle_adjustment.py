@@ -27,11 +27,11 @@ from torch import Tensor
 
 from imgcal.estimation import EstimationOptions, estimate, initial_pose
 from imgcal.evaluation import BASELINES, Conditions, Given, network_method, reprojection_error
-from imgcal.evaluation.metrics import of_estimate
 from imgcal.evaluation.protocol import Sample, draw
-from imgcal.evaluation.refine import observed
 from imgcal.formats import load_object, load_rig
 from imgcal.networks import Prediction
+from imgcal.refinement import as_prediction
+from imgcal.refinement.points import observed
 from imgcal.rig import CameraRig, pack21
 from imgcal.rotations import vector_from_rotation
 from imgcal.synthesis import PoseRange, RelativeDrift
@@ -132,7 +132,7 @@ def _map(sample: Sample, iterations: int) -> Column:
         start = time.perf_counter()
         found = estimate(observations, given.factory, given.obj, pose, spread=given.spread, options=limits)
         seconds.append(time.perf_counter() - start)
-        errors += _errors(of_estimate(found), sample, one)
+        errors += _errors(as_prediction(found), sample, one)
     return Column(errors, seconds)
 
 

@@ -17,13 +17,13 @@ from output import ROOT, command, make_folder
 from torch import Tensor
 
 from imgcal.errors import InputError
-from imgcal.evaluation import BASELINES, Conditions, Given, Method, network_method, reprojection_error
+from imgcal.evaluation import BASELINES, Conditions, Given, Method, reprojection_error
+from imgcal.evaluation.models import load_models
 from imgcal.evaluation.protocol import draw
 from imgcal.formats import load_object, load_rig, write_text
 from imgcal.networks import Prediction
 from imgcal.rig import CameraRig
 from imgcal.synthesis import RelativeDrift
-from imgcal.training import load_checkpoint
 
 AXIS = 60.0  # mm, length of the line that shows where a camera looks
 TRUE, PREDICTED, FIRST, FIDUCIALS = "#2563eb", "#dc2626", "#facc15", "#333333"
@@ -86,11 +86,9 @@ def _chosen(options: Options) -> tuple[Conditions, Method, str]:
         rig, obj = load_rig(options.rig), load_object(options.object)
         name = "factory, pose fitted"
         return Conditions(rig, obj, drift=RelativeDrift()), BASELINES[name], name
-    checkpoint = load_checkpoint(options.model)
-    experiment = checkpoint.experiment
-    conditions = Conditions(checkpoint.rig, checkpoint.obj, experiment.poses.pose_range(), experiment.drift.drift())
-    name = experiment.name + (" + refinement" if options.refined else "")
-    return conditions, network_method(checkpoint.network), name
+    [model] = load_models([options.model])
+    name = model.checkpoint.experiment.name + (" + refinement" if options.refined else "")
+    return model.conditions, model.method, name
 
 
 def _dots(name: str, points: Tensor, colour: str, size: int, edge: str = "#ffffff") -> go.Scatter3d:

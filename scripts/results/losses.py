@@ -24,12 +24,12 @@ from imgcal.losses import (
     distortion_size,
     focal_ratio,
     geodesic,
-    images_of,
     inverse_focal,
     l1_norm,
     log_cosh,
     parameter_rmse,
     principal_point_shift,
+    project_fiducials,
     reprojection_rmse,
 )
 from imgcal.networks.prediction import Prediction
@@ -122,7 +122,7 @@ def terms(
     return {
         "parameter RMSE": parameter_rmse(cameras, true_cameras, scale),
         "geodesic": geodesic(cameras, true_cameras).mean(),
-        "reprojection RMSE": reprojection_rmse(images_of(cameras, obj) - images_of(true_cameras, obj)),
+        "reprojection RMSE": reprojection_rmse(project_fiducials(cameras, obj) - project_fiducials(true_cameras, obj)),
         "log-cosh": log_cosh(cameras, true_cameras, scale),
         "distortion": distortion_size(cameras),
         "focal ratio": focal_ratio(cameras),

@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import cast
 
 import torch
 
+from imgcal.evaluation import reprojection_error
 from imgcal.networks import Views
-from imgcal.networks.rendering import render_views
+from imgcal.networks.rendering import ImageOptions, render_views
 from imgcal.synthesis import synthesize
 from imgcal.training.checkpoint import Checkpoint, load_checkpoint, save_network
 from imgcal.training.experiment import Experiment, changed
@@ -55,13 +57,13 @@ def error(checkpoint: Checkpoint) -> float:
     made = synthesize(factory, checkpoint.obj, RIGS, generator, drift=drift, pose_range=poses)
     uv, seen = made.projection.uv, made.projection.visible
     views = Views(uv=uv, seen=seen)
-    if network.image_options is not None:
-        images = render_views(uv, seen, factory.image_size, checkpoint.obj, network.image_options, quantise=True)
+    options = cast(ImageOptions | None, network.image_options)
+    if options is not None:
+        images = render_views(uv, seen, factory.image_size, checkpoint.obj, options, quantise=True)
         views = Views(images=images)
     predicted = network(views)[-1]
-    points = checkpoint.obj.points.to(uv)
-    found = predicted.rig.project(predicted.rig_from_object.apply(points), checkpoint.obj.radius).uv
-    return float((found - uv).square().mean((1, 2, 3)).sqrt().mean())
+    truth = made.rig.from_object(made.rig_from_object)
+    return float(reprojection_error(predicted.cameras_from_object, truth, checkpoint.obj).mean())
 
 
 if __name__ == "__main__":

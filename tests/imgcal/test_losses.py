@@ -14,13 +14,13 @@ from imgcal.losses import (
     distortion_size,
     focal_ratio,
     geodesic,
-    images_of,
     inverse_focal,
     l1_norm,
     log_cosh,
     offsets_error,
     parameter_rmse,
     principal_point_shift,
+    project_fiducials,
     reprojection_re,
     reprojection_rmse,
 )
@@ -68,7 +68,7 @@ def test_the_truth_costs_nothing_and_has_a_finite_gradient(truth, spread, asymme
 
 def test_the_reprojection_gradient_reaches_every_parameter(truth, spread, asymmetric8):
     step = steps(spread).requires_grad_()
-    difference = images_of(off_by(truth, step).cameras_from_object, asymmetric8) - images_of(
+    difference = project_fiducials(off_by(truth, step).cameras_from_object, asymmetric8) - project_fiducials(
         truth.cameras_from_object, asymmetric8
     )
     reprojection_rmse(difference).backward()
@@ -82,21 +82,21 @@ def test_the_reprojection_gradient_reaches_the_object_pose(truth, asymmetric8):
     shift = torch.ones(B, 3, dtype=torch.float64, requires_grad=True)
     pose = RigidTransform(rotation_from_vector(vector), shift) @ truth.rig_from_object
     cameras = truth.rig.from_object(pose)
-    difference = images_of(cameras, asymmetric8) - images_of(truth.cameras_from_object, asymmetric8)
+    difference = project_fiducials(cameras, asymmetric8) - project_fiducials(truth.cameras_from_object, asymmetric8)
     reprojection_re(difference).sum().backward()
     for grad in (vector.grad, shift.grad):
         assert grad.isfinite().all() and (grad != 0).all()
 
 
-def test_images_are_those_of_the_rig(truth, asymmetric8):
+def test_projected_fiducials_are_those_of_the_rig(truth, asymmetric8):
     expected = truth.rig.project(truth.rig_from_object.apply(asymmetric8.points)).uv
-    torch.testing.assert_close(images_of(truth.cameras_from_object, asymmetric8), expected)
+    torch.testing.assert_close(project_fiducials(truth.cameras_from_object, asymmetric8), expected)
 
 
-def test_images_of_spheres_are_their_apparent_centres(truth, asymmetric8):
+def test_projected_spheres_are_their_apparent_centres(truth, asymmetric8):
     spheres = replace(asymmetric8, radius=torch.linspace(2, 30, N, dtype=torch.float64))
     expected = truth.rig.project(truth.rig_from_object.apply(spheres.points), spheres.radius).uv
-    torch.testing.assert_close(images_of(truth.cameras_from_object, spheres), expected)
+    torch.testing.assert_close(project_fiducials(truth.cameras_from_object, spheres), expected)
 
 
 def test_re_is_the_mean_over_axes_cameras_and_fiducials():
@@ -196,7 +196,7 @@ def test_the_second_stage_of_the_paper(truth, spread, asymmetric8):
     cameras, true_cameras = prediction.cameras_from_object, truth.cameras_from_object
     first = 100 * parameter_rmse(cameras, true_cameras) + 100 * geodesic(cameras, true_cameras).mean()
     torch.testing.assert_close(before, first)
-    difference = images_of(cameras, asymmetric8) - images_of(true_cameras, asymmetric8)
+    difference = project_fiducials(cameras, asymmetric8) - project_fiducials(true_cameras, asymmetric8)
     torch.testing.assert_close(after, first + 0.01 * reprojection_rmse(difference))
 
 

@@ -5,7 +5,7 @@ import torch
 
 from imgcal.errors import InputError
 from imgcal.formats import load_object, load_rig
-from imgcal.losses import images_of
+from imgcal.losses import project_fiducials
 from imgcal.networks import PRESETS, NetworkConfig, Views, build
 from imgcal.networks.rendering import render_views
 from imgcal.synthesis import RelativeDrift, synthesize
@@ -75,7 +75,7 @@ def test_reprojection_error_trains_every_parameter(preset):
         for parameter in network.parameters():
             parameter += 0.02 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(3))
     given = views(network, made)
-    errors = [images_of(p.cameras_from_object, network.obj) - made.projection.uv for p in network(given)]
+    errors = [project_fiducials(p.cameras_from_object, network.obj) - made.projection.uv for p in network(given)]
     torch.stack(errors).square().mean().backward()
     for name, parameter in network.named_parameters():
         assert parameter.grad is not None, name

@@ -12,6 +12,7 @@ from imgcal.rig import CameraRig
 from imgcal.rotations import rotation_from_vector
 from imgcal.synthesis import RelativeDrift, Snapshots, synthesize
 from imgcal.transforms import RigidTransform
+from tests.imgcal.evaluation.conftest import conditions, sample  # noqa: F401  fixtures
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from imgcal.evaluation.corruption import Corruption
+from imgcal.corruption import Corruption
 from imgcal.networks.rendering import ImageOptions
 from imgcal.training.data import Source, object_to
 

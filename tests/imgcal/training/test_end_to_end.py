@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from imgcal.corruption import Corruption
 from imgcal.errors import InputError
-from imgcal.evaluation.corruption import Corruption
 from imgcal.formats import load_object, load_rig
 from imgcal.losses import RefinedLoss
 from imgcal.networks.prediction import Prediction

@@ -10,29 +10,25 @@ Source: graduated non-convexity as in Yang et al., RA-L 2020.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from imgcal.estimation import EstimationOptions, estimate, initial_pose
-from imgcal.estimation.estimate import Estimate
-from imgcal.evaluation.metrics import of_estimate
+from imgcal.estimation import Estimate, EstimationOptions, initial_pose
 from imgcal.networks.prediction import Prediction, Views
 from imgcal.objects import CalibrationObject
-from imgcal.observations import Observations
+from imgcal.refinement.points import as_prediction, observed, refine_points
 from imgcal.rig import CameraRig
 from imgcal.transforms import RigidTransform
 
 SQUARED = EstimationOptions(loss="squared")
 AT_FIRST = EstimationOptions(loss="squared", max_iterations=15)  # outliers can keep it busy without end
-
-
 FAR = 100.0  # pixels: points farther off are all equally wrong
 
 
 @dataclass(frozen=True)
-class RefinementOptions:
+class RobustOptions:
     """What counts as an outlier. All but `thresholds` in standard deviations or multiples of others."""
 
     thresholds: tuple[float, ...] = (64.0, 32.0, 16.0, 8.0, 4.0, 2.0, 1.0, 0.5)  # pixels, of rounds from far to near
@@ -68,14 +64,9 @@ class Target:
         seen: Tensor | None = None,
     ) -> Estimate:
         """MAP estimate from a start, of all points or of the given ones."""
-        observations = observed(self.uv if uv is None else uv, self.seen if seen is None else seen, self.sigma)
-        if self.factor is not None:
-            observations = replace(observations, sigma=observations.sigma * self.factor[:, None])
-        pose = start.rig_from_object
-        poses = RigidTransform(pose.rotation[:, None], pose.translation[:, None])
-        return estimate(
-            observations, self.factory, self.obj, poses, spread=self.spread, first_guess=start.rig, options=options
-        )
+        views = Views(uv=self.uv if uv is None else uv, seen=self.seen if seen is None else seen)
+        sigma = self.sigma if self.factor is None else self.sigma * self.factor
+        return refine_points(start, views, self.factory, self.obj, self.spread, sigma, options)
 
 
 def refine_robustly(
@@ -86,7 +77,7 @@ def refine_robustly(
     spread: Tensor,
     *,
     sigma: float,
-    options: RefinementOptions = RefinementOptions(),
+    options: RobustOptions = RobustOptions(),
 ) -> Prediction:
     """Refine predictions by the points that were seen.
 
@@ -100,18 +91,18 @@ def refine_robustly(
         options: what counts as an outlier.
 
     Returns:
-        (B,) refined, in the precision of the points. Each rig on its own: the others of its batch do not matter.
+        (B,) refined, in float64. Each rig on its own: the others of its batch do not matter.
     """
     if views.uv is None or views.seen is None:
         raise ValueError("views hold no points")
-    dtype = views.uv.dtype
-    trust = None if prediction.log_sigma is None else prediction.log_sigma.to(dtype).exp()
-    target = Target(views.uv, views.seen, factory.to(dtype), obj, spread.to(dtype), sigma, trust)
-    fit = target.fit(prediction.to(dtype), AT_FIRST)
+    guess = prediction.detach().to(torch.float64)
+    trust = None if guess.log_sigma is None else guess.log_sigma.exp()
+    target = Target(views.uv.double(), views.seen, factory.to(torch.float64), obj, spread.double(), sigma, trust)
+    fit = target.fit(guess, AT_FIRST)
     suspect = (~fits(fit, sigma, options.fits)).nonzero().squeeze(-1)
-    result = of_estimate(fit)
+    result = as_prediction(fit)
     if len(suspect):
-        result = _replaced(result, suspect, _robust(rows_of(prediction.to(dtype), suspect), target[suspect], options))
+        result = _replaced(result, suspect, _robust(guess[suspect], target[suspect], options))
     return result
 
 
@@ -123,7 +114,7 @@ def fits(fit: Estimate, sigma: float, limit: float) -> Tensor:
     return whole & each & fit.converged
 
 
-def _robust(guess: Prediction, target: Target, options: RefinementOptions) -> Prediction:
+def _robust(guess: Prediction, target: Target, options: RobustOptions) -> Prediction:
     """Refine rigs that have outliers."""
     near = options.last_threshold
     limits = (*(limit for pixels in options.thresholds if (limit := pixels / target.sigma) > near), near)
@@ -132,15 +123,16 @@ def _robust(guess: Prediction, target: Target, options: RefinementOptions) -> Pr
     for number, limit in enumerate(limits):
         rows = (begin <= number).nonzero().squeeze(-1)
         if len(rows):
-            part, some = rows_of(result, rows), target[rows]
+            part, some = result[rows], target[rows]
             bounded = EstimationOptions(loss="geman_mcclure", threshold=limit)
             points = mended(part, some, options.mending * limit)
-            result = _replaced(result, rows, of_estimate(some.fit(part, bounded, points.uv, points.seen)))
+            result = _replaced(result, rows, as_prediction(some.fit(part, bounded, points.uv, points.seen)))
     for _ in range(options.rounds):
         points = mended(result, target, options.gate)
-        result = of_estimate(target.fit(result, uv=points.uv, seen=points.fits))
+        result = as_prediction(target.fit(result, uv=points.uv, seen=points.fits))
     worse = ~(_misfit(result, target) < _misfit(guess, target))
-    return _replaced(result, (rows := worse.nonzero().squeeze(-1)), rows_of(guess, rows))
+    rows = worse.nonzero().squeeze(-1)
+    return _replaced(result, rows, guess[rows])
 
 
 def _misfit(prediction: Prediction, target: Target) -> Tensor:
@@ -195,25 +187,15 @@ def robust_pose(views: Views, factory: CameraRig, obj: CalibrationObject, sigma:
     """Place the object with the factory rig as it stands, in spite of outliers: a start without a network."""
     if views.uv is None or views.seen is None:
         raise ValueError("views hold no points")
-    rig = factory.to(views.uv.dtype)
+    uv, rig = views.uv.double(), factory.to(torch.float64)
     fixed = torch.zeros_like(rig.distortion[..., :1]).expand(rig.cameras, 15)
-    target = Target(views.uv, views.seen, rig, obj, fixed, sigma)
-    pose = initial_pose(observed(views.uv, views.seen, sigma), rig, obj)[:, 0]
+    target = Target(uv, views.seen, rig, obj, fixed, sigma)
+    pose = initial_pose(observed(uv, views.seen, sigma), rig, obj)[:, 0]
     result = Prediction(rig.expand(len(views)), pose)
     for pixels in (100.0, 30.0):
         bounded = EstimationOptions(loss="geman_mcclure", threshold=pixels / sigma)
-        result = of_estimate(target.fit(result, bounded))
+        result = as_prediction(target.fit(result, bounded))
     return result
-
-
-def observed(uv: Tensor, seen: Tensor, sigma: float) -> Observations:
-    """One snapshot a rig: uv (B, C, N, 2) and seen (B, C, N) as observations (B, 1, C, N)."""
-    return Observations(uv[:, None], torch.full_like(uv[:, None, ..., 0], sigma), seen[:, None])
-
-
-def rows_of(prediction: Prediction, rows: Tensor) -> Prediction:
-    """Keep some rigs of a batch."""
-    return Prediction(prediction.rig[rows], prediction.rig_from_object[rows])
 
 
 def _predicted_uv(prediction: Prediction, target: Target) -> Tensor:
@@ -228,12 +210,10 @@ def _replaced(whole: Prediction, rows: Tensor, part: Prediction) -> Prediction:
     def put(old: Tensor, new: Tensor) -> Tensor:
         return old.index_copy(0, rows, new)
 
-    transform = RigidTransform(
-        put(whole.rig_from_object.rotation, part.rig_from_object.rotation),
-        put(whole.rig_from_object.translation, part.rig_from_object.translation),
-    )
-    news = iter(_tensors(part.rig))
-    return Prediction(whole.rig.map_tensors(lambda tensor, _: put(tensor, next(news))), transform)
+    rig, pose, other = whole.rig, whole.rig_from_object, part.rig_from_object
+    tensors = iter(_tensors(part.rig))
+    moved = RigidTransform(put(pose.rotation, other.rotation), put(pose.translation, other.translation))
+    return Prediction(rig.map_tensors(lambda tensor, _: put(tensor, next(tensors))), moved)
 
 
 def _tensors(rig: CameraRig) -> list[Tensor]:

@@ -1,8 +1,8 @@
 import pytest
 import torch
 
+from imgcal.corruption import FALSE, SWAPPED, Corruption
 from imgcal.errors import InputError
-from imgcal.evaluation.corruption import FALSE, SWAPPED, Corruption
 from imgcal.networks.prediction import Views
 
 SIZE = torch.tensor([[200, 100], [64, 48], [300, 300]])
