@@ -1,5 +1,7 @@
+import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -62,14 +64,17 @@ def test_opencv_with_eight_points_explains_them_all(sample):
     assert not torch.allclose(found.rig.focal_length, some.conditions.rig.focal_length.expand(3, 4, 2))
 
 
-def test_an_outlier_does_not_make_pnp_diverge_further(sample):
-    points = sample().conditions.obj.points.numpy()
-    matrix, distortion = classical._intrinsics(sample().conditions.rig, 0)
+@pytest.mark.parametrize("value", [math.nan, 1e9])
+def test_a_refinement_of_pnp_that_diverges_is_not_taken(sample, monkeypatch, value):
     some = sample(1, kappa=0.0)
-    uv = some.given().uv[0, 0].numpy().copy()
-    uv[2] += 300
+    points, uv = some.conditions.obj.points.numpy(), some.given().uv[0, 0].numpy()
+    matrix, distortion = classical._intrinsics(some.conditions.rig, 0)
     rotation, translation = classical._solve_pnp(points, uv, matrix, distortion)
-    assert classical._misfit(points, uv, matrix, distortion, rotation, translation) < 8 * 300**2
+    diverged = np.zeros((3, 1)), np.full((3, 1), value)
+    monkeypatch.setattr(classical.cv2, "solvePnPRefineLM", lambda *_: diverged)
+    kept = classical._solve_pnp(points, uv, matrix, distortion)
+    np.testing.assert_allclose(kept[0], rotation, atol=1e-4)
+    np.testing.assert_allclose(kept[1], translation, atol=0.1)
 
 
 def test_unseen_points_do_not_matter(sample):

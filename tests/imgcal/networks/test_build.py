@@ -112,6 +112,15 @@ def test_what_is_not_seen_does_not_matter():
     assert torch.equal(first.rig.focal_length, second.rig.focal_length)
 
 
+def test_positions_reach_the_paper_network_in_float32_under_autocast():
+    network = make("paper-points", width=32, head_widths=(16,))
+    seen = []
+    network.embed.register_forward_hook(lambda module, given, out: seen.append(out.dtype))
+    with torch.autocast("cpu", torch.bfloat16):
+        network(views(network, snapshots(network)))
+    assert seen == [torch.float32]
+
+
 def test_autocast_leaves_geometry_alone():
     network = make("points")
     with torch.autocast("cpu", torch.bfloat16):
@@ -186,7 +195,7 @@ def test_every_preset_has_a_sound_variant():
 
 
 def test_rescaled_weights_say_the_same_of_another_drift():
-    narrow = make("points")
+    narrow = make("points", trunk={"trust": True})
     factory, obj = narrow.factory, narrow.obj
     with torch.no_grad():
         for parameter in narrow.parameters():
@@ -196,6 +205,8 @@ def test_rescaled_weights_say_the_same_of_another_drift():
     wide.trunk.rescale(narrow.decoder.spread)
     made = snapshots(narrow)
     with torch.no_grad():
-        first, second = (network(views(narrow, made))[-1].rig for network in (narrow, wide))
-    assert torch.allclose(first.focal_length, second.focal_length, rtol=1e-6)
-    assert torch.allclose(first.distortion, second.distortion, atol=1e-6)
+        one, other = (network(views(narrow, made))[-1] for network in (narrow, wide))
+    assert torch.allclose(one.rig.focal_length, other.rig.focal_length, rtol=1e-6)
+    assert torch.allclose(one.rig.distortion, other.rig.distortion, atol=1e-6)
+    assert one.log_sigma.abs().max() > 0.01
+    assert torch.allclose(one.log_sigma, other.log_sigma, atol=1e-4)

@@ -47,6 +47,15 @@ def test_a_training_learns_and_tells(experiment, tmp_path):
     assert found.metrics["validation_re_px"] == validated[1]["validation_re_px"]
 
 
+def test_the_logged_loss_is_what_is_minimized(experiment, tmp_path, monkeypatch):
+    setup = experiment("training.steps=1", "training.log_every=1", "training.validation_rigs=0")
+    train(setup, tmp_path / "plain")
+    monkeypatch.setattr(engine, "refined_loss", lambda *_: 7.0)
+    train(setup, tmp_path / "more")
+    plain, more = (read_metrics(tmp_path / name / "metrics.jsonl")[0]["loss"] for name in ("plain", "more"))
+    assert more == pytest.approx(plain + 7.0)
+
+
 def test_the_result_is_the_running_mean(experiment, tmp_path):
     run = train(experiment("training.steps=5"), tmp_path / "mean")
     assert torch.equal(weights(tmp_path / "mean")["head.weight"], run.average.head.weight)
