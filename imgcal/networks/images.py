@@ -75,10 +75,8 @@ class PaperImageNetwork(nn.Module):
 
     def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:
         """Parameters that may have their own learning rates."""
-        return {
-            "encoder": self.backbone.parameters(),
-            "heads": [*self.bottleneck.parameters(), *self.heads.parameters()],
-        }
+        groups = {"encoder": self.backbone.parameters(), "bottleneck": self.bottleneck.parameters()}
+        return groups | self.heads.groups()
 
 
 class ImageNetwork(nn.Module):

@@ -16,7 +16,8 @@ from imgcal.networks.trunk import Trunk
 
 CIE_NOISE = 0.01  # standard deviation of the noise on the one-hot camera identities
 
-PAPER_OUTPUTS = (6, 3, 2, 2, 5)  # 6D rotation, translation, focal length, principal point, distortion
+# Numbers of each head of the paper's networks, in the order of their output; each may have its own learning rate.
+PAPER_OUTPUTS = {"rotation": 6, "translation": 3, "focal_length": 2, "principal_point": 2, "distortion": 5}
 
 
 class CameraIdentity(nn.Module):
@@ -45,13 +46,17 @@ class PaperHeads(nn.Module):
 
     def __init__(self, features: int, widths: tuple[int, ...]) -> None:
         super().__init__()
-        self.heads = nn.ModuleList(mlp((features, *widths, outputs)) for outputs in PAPER_OUTPUTS)
+        self.heads = nn.ModuleList(mlp((features, *widths, outputs)) for outputs in PAPER_OUTPUTS.values())
 
     def forward(self, features: Tensor) -> Tensor:
         """(B, C, features) -> (B, C, 18), in float32 whatever autocast is on."""
         with torch.autocast(features.device.type, enabled=False):
             features = features.float()
             return torch.cat([head(features) for head in self.heads], dim=-1)
+
+    def groups(self) -> dict[str, Iterable[nn.Parameter]]:
+        """Parameters of each head by its name."""
+        return {name: head.parameters() for name, head in zip(PAPER_OUTPUTS, self.heads, strict=True)}
 
 
 class PaperPointNetwork(nn.Module):
@@ -87,7 +92,7 @@ class PaperPointNetwork(nn.Module):
 
     def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:
         """Parameters that may have their own learning rates."""
-        return {"encoder": [*self.embed.parameters(), *self.encoder.parameters()], "heads": self.heads.parameters()}
+        return {"encoder": [*self.embed.parameters(), *self.encoder.parameters()]} | self.heads.groups()
 
 
 class PointNetwork(nn.Module):

@@ -210,3 +210,14 @@ def test_rescaled_weights_say_the_same_of_another_drift():
     assert torch.allclose(one.rig.distortion, other.rig.distortion, atol=1e-6)
     assert one.log_sigma.abs().max() > 0.01
     assert torch.allclose(one.log_sigma, other.log_sigma, atol=1e-4)
+
+
+@pytest.mark.parametrize("preset", ["paper-points", *SMALL])
+def test_every_parameter_is_in_one_group(preset):
+    network = make(preset)
+    grouped = [parameter for group in network.parameter_groups().values() for parameter in group]
+    assert sorted(map(id, grouped)) == sorted(map(id, network.parameters()))
+    if preset == "paper-points":
+        assert {"rotation", "translation", "focal_length", "principal_point", "distortion"} < set(
+            network.parameter_groups()
+        )
