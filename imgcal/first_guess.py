@@ -98,10 +98,11 @@ def load_guesser(name: str, rig: CameraRig, obj: CalibrationObject) -> Guesser:
             return _load(data_path("models", f"{stem}.safetensors"), rig, obj)
         except InputError as error:
             reasons.append(error)
+    why = "".join(f" ({reason})" for reason in reasons[:1])
     raise InputError(
         f"first guess `{name}`: found no shipped network for rig {rig.name} and object {obj.name}, expected one of "
-        f"{', '.join(shipped) or 'none'}: train one with `imgcal train` and give its file"
-    ) from (reasons[0] if reasons else None)
+        f"{', '.join(shipped) or 'none'}: train one with `imgcal train` and give its file{why}"
+    )
 
 
 def _load(path: Path, rig: CameraRig, obj: CalibrationObject) -> Guesser:

@@ -51,9 +51,8 @@ class Calibrate:
     blind_cameras: bool = False  #: accept cameras that see nothing; they keep their factory values
     full_covariance: bool = False  #: write the whole covariance matrix to rig.yaml, too
     report: bool = True  #: write report.html
-    reference: str | None = (
-        None  #: camera that the uncertainty of positions and rotations refers to; default: the first
-    )
+    reference: str | None = None
+    """camera that the uncertainty of positions and rotations refers to; default: the first"""
     detection: Annotated[DetectionOptions, tyro.conf.arg(name="")] = field(default_factory=DetectionOptions)
 
     def run(self) -> None:

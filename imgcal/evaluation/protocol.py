@@ -237,7 +237,13 @@ def _measure(method: Method, batch: Sample, first: int, into: _Collected) -> Non
         rows = slice(start, min(start + size, count))
         given = batch.given(rows)
         truth = batch.truth[rows]
-        prediction = method.predict(given)
+        try:
+            prediction = method.predict(given)
+        except torch.linalg.LinAlgError as error:
+            raise InputError(
+                f"missing: found {batch.conditions.corruption.missing:g}, expected a smaller share: a rig sees too few "
+                "fiducials for any pose"
+            ) from error
         into.alone.append(errors(prediction, truth, given.obj))
         if method.refine is not None:
             into.refined.append(errors(method.refine(prediction, given), truth, given.obj))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field, model_validator
 
@@ -12,6 +12,13 @@ from imgcal.formats.yaml_file import StrictModel
 
 Count = Annotated[int, Field(ge=1)]
 Encoder = Literal["transformer", "cnn1d"]
+Attending = TypeVar("Attending", "PaperPoints", "TrunkConfig")
+
+
+def _with_whole_heads(config: Attending) -> Attending:
+    if config.encoder == "transformer" and config.width % config.heads:
+        raise ValueError(f"found width {config.width} and {config.heads} heads, expected a multiple of the heads")
+    return config
 
 
 class PaperPoints(StrictModel):
@@ -22,7 +29,11 @@ class PaperPoints(StrictModel):
     depth: Count = 8
     heads: Count = 4
     camera_identity: bool = True  # the paper's CIE
-    head_widths: tuple[int, ...] = (1024, 1024)
+    head_widths: tuple[Count, ...] = (1024, 1024)
+
+    @model_validator(mode="after")
+    def _divisible(self) -> PaperPoints:
+        return _with_whole_heads(self)
 
 
 class PaperImages(StrictModel):
@@ -32,7 +43,7 @@ class PaperImages(StrictModel):
     pretrained: bool = False
     options: dict[str, Any] = Field(default={})  # further arguments of timm.create_model
     bottleneck: Count = 128
-    head_widths: tuple[int, ...] = (128,)
+    head_widths: tuple[Count, ...] = (128,)
 
 
 class TrunkConfig(StrictModel):
@@ -45,6 +56,10 @@ class TrunkConfig(StrictModel):
     later_depth: Count = 2  # blocks of every later pass, which share their weights
     passes: Count = 3
     trust: bool = False  # predict how far the refinement may trust each fiducial
+
+    @model_validator(mode="after")
+    def _divisible(self) -> TrunkConfig:
+        return _with_whole_heads(self)
 
 
 class Points(StrictModel):

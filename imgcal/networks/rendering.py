@@ -13,7 +13,7 @@ from imgcal.objects import CalibrationObject
 from renderers import splat
 
 LEVELS = 255  # largest grey level of images as they are saved
-LEAST_SIZE = 8
+LEAST_SIZE, MOST_SIZE = 8, 4096
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class ImageOptions:
     dot: float = 1.5  # pixels of the image, standard deviation of a dot
 
     def __post_init__(self) -> None:
-        if self.size < LEAST_SIZE:
-            raise InputError(f"image size: found {self.size}, expected at least {LEAST_SIZE} pixels")
+        if not LEAST_SIZE <= self.size <= MOST_SIZE:
+            raise InputError(f"image size: found {self.size}, expected {LEAST_SIZE} to {MOST_SIZE} pixels")
         if not (math.isfinite(self.dot) and 0 < self.dot < self.size):
             raise InputError(f"dot: found {self.dot}, expected more than 0 and less than the {self.size} pixels")
 

@@ -89,6 +89,12 @@ def test_what_does_not_fit_is_refused(name, rig, message):
         load_guesser(name, load_rig(rig), load_object("asymmetric8"))
 
 
+def test_what_a_shipped_network_lacks_is_said():
+    fewer = load_rig("O10").select([0, 1, 3])
+    with pytest.raises(InputError, match=r"train one .* cameras: found cam01, cam02, cam04, expected cam01, cam02"):
+        load_guesser("vit", fewer, load_object("asymmetric8"))
+
+
 @pytest.mark.parametrize(("turn", "used"), [(0.0, True), (0.3, False)])
 def test_the_result_does_not_depend_on_the_guess(turn, used, o10, asymmetric8):
     truth = simulate_truth(o10, asymmetric8, SNAPSHOTS, torch.Generator().manual_seed(2), PhysicalDrift())

@@ -109,6 +109,7 @@ def test_compare_puts_networks_side_by_side(models, tmp_path, capsys):
         (["--object", "cube8"], "cube8"),
         (["--kappa", "3"], "kappa"),
         (["--missing", "2"], "missing"),
+        (["--missing", "1"], "missing: found 1, expected a smaller share"),
         (["--count", "0"], "count"),
         (["--phi", "20", "10"], "--phi"),
     ],

@@ -135,6 +135,9 @@ def test_autocast_leaves_geometry_alone():
         ({"preset": "pointz"}, "nearest: points"),
         ({"preset": "points", "change": {"trunk": {"widht": 3}}}, "nearest: width"),
         ({"preset": "points", "change": {"trunk": {"passes": 0}}}, "greater than or equal to 1"),
+        ({"preset": "points", "change": {"trunk": {"width": 130}}}, "found width 130 and 4 heads"),
+        ({"preset": "paper-points", "change": {"heads": 3}}, "found width 512 and 3 heads"),
+        ({"preset": "paper-vit", "change": {"head_widths": [0]}}, "greater than or equal to 1"),
     ],
 )
 def test_impossible_configurations_are_refused(config, message):

@@ -83,7 +83,7 @@ def test_gradient_by_uv(asymmetric8):
         render_views(uv, seen, SENSOR, asymmetric8, tiny, out=torch.empty(2, 3, 3, 12, 12, dtype=uv.dtype))
 
 
-@pytest.mark.parametrize(("size", "dot"), [(4, 1.5), (224, 0.0), (224, math.nan), (224, 300.0)])
+@pytest.mark.parametrize(("size", "dot"), [(4, 1.5), (100_000, 1.5), (224, 0.0), (224, math.nan), (224, 300.0)])
 def test_impossible_options_are_refused(size, dot):
     with pytest.raises(InputError, match=r"image size|dot"):
         ImageOptions(size, dot)
