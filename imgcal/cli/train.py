@@ -25,7 +25,7 @@ class Train:
     """Train a network: writes OUT/model.safetensors, resolved.yaml, metrics.jsonl and TensorBoard's files.
 
     Ctrl-C saves the state first; so do steps on the way, and --resume goes on from there, with the same result.
-    Several processes: accelerate launch -m imgcal train ... or torchrun --nproc-per-node 2 -m imgcal train ...
+    Several processes: torchrun --nproc-per-node 2 -m imgcal train ...; on GPUs also accelerate launch -m imgcal ...
     Example: imgcal train table1-row01 --out out/row01
     """
 

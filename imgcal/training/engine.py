@@ -128,7 +128,8 @@ def train(
 def prepare(experiment: Experiment, folder: Path, resume: bool = False) -> Run:
     """Build everything a run needs: untrained, or as it was when the state in `folder` was saved."""
     settings = experiment.training
-    accelerator = Accelerator(cpu=settings.device == "cpu")
+    # Without a GPU, accelerate joins several processes only where it is told to stay on the CPU.
+    accelerator = Accelerator(cpu=settings.device == "cpu" or not torch.accelerator.is_available())
     device, processes = accelerator.device, accelerator.num_processes
     if settings.batch_size % processes:
         raise InputError(

@@ -67,7 +67,7 @@ def two_processes(tmp_path, *arguments):
     processes = []
     for rank in range(2):
         ranks = {"RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": "2"}
-        where = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "ACCELERATE_USE_CPU": "true"}
+        where = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
         command = [sys.executable, "-m", TOY, "train", str(tmp_path / "toy.yaml"), *arguments]
         process = subprocess.Popen(command, env=environment(**ranks, **where), cwd=ROOT, stderr=subprocess.PIPE)
         processes.append(process)
@@ -79,7 +79,7 @@ def two_processes(tmp_path, *arguments):
 def test_two_processes_share_a_batch(tmp_path):
     (tmp_path / "toy.yaml").write_text(EXPERIMENT)
     out = tmp_path / "two"
-    errors = two_processes(tmp_path, "--out", str(out), "--set", "training.steps=60")
+    errors = two_processes(tmp_path, "--out", str(out), "--set", "training.steps=60", "training.device=auto")
     assert "2 x cpu" in errors[0]
     assert errors[1] == ""  # only the main process speaks
     rows = read_metrics(out / "metrics.jsonl")
