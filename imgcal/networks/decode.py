@@ -11,6 +11,7 @@ from imgcal.errors import InputError
 from imgcal.networks.prediction import Prediction
 from imgcal.objects import CalibrationObject
 from imgcal.projection import Projection
+from imgcal.projection_compiled import project
 from imgcal.rig import CameraRig, unpack18
 from imgcal.rotations import rotation_from_6d, rotation_from_vector
 from imgcal.transforms import RigidTransform, rotate
@@ -110,8 +111,8 @@ class Decoder(nn.Module):
         return Prediction(self.factory.moved(state.offsets * self.spread), RigidTransform(state.rotation, shift))
 
     def project(self, prediction: Prediction) -> Projection:
-        """Project the object's fiducials: (B, C, N)."""
-        return prediction.rig.project(prediction.rig_from_object.apply(self.centred + self.centroid))
+        """Project the object's fiducials, as points: (B, C, N), without gradient."""
+        return project(prediction.rig, prediction.rig_from_object.apply(self.centred + self.centroid))
 
     def absolute(self, numbers: Tensor) -> Prediction:
         """Decode the paper's 18 numbers a camera: (B, C, 18), each camera on its own in the object's frame.
