@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -16,7 +17,7 @@ from imgcal.errors import InputError
 from imgcal.formats.names import nearest
 from imgcal.networks.prediction import Prediction, Views
 from imgcal.networks.rendering import ImageOptions, render_views
-from imgcal.objects import CalibrationObject
+from imgcal.objects import CalibrationObject, SelfMotion
 from imgcal.observations import Observations
 from imgcal.resources import data_path, shipped_names
 from imgcal.rig import CameraRig
@@ -24,6 +25,7 @@ from imgcal.training.checkpoint import check_object, check_rig, load_checkpoint
 from imgcal.transforms import RigidTransform
 
 KINDS = ("points", "vit", "cnn")
+CHUNK = 32  # snapshots at once: their images take memory
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,9 @@ class Guesser:
     def guess(self, observations: Observations, rig: CameraRig, obj: CalibrationObject) -> FirstGuess:
         """Look at every snapshot on its own.
 
+        A symmetric object may have been labelled in a turn that the network has never seen: all turns are tried, and each
+        snapshot keeps the one that fits best.
+
         Args:
             observations: (S, C, N) labelled fiducials, in the pixels of `rig`.
             rig: the factory rig.
@@ -55,16 +60,48 @@ class Guesser:
         """
         size, trained_size = rig.image_size.to(observations.uv), self.trained.image_size.to(observations.uv)
         uv = ((observations.uv + 0.5) * (trained_size / size)[:, None] - 0.5).float()
+        offsets, poses, residual = self._turned(uv, observations, rig, obj, obj.symmetries[0])
+        for motion in obj.symmetries[1:]:
+            more = self._turned(uv, observations, rig, obj, motion)
+            better = more[2].square().sum((1, 2, 3)) < residual.square().sum((1, 2, 3))
+            rotation = torch.where(better[:, None, None], more[1].rotation, poses.rotation)
+            poses = RigidTransform(rotation, torch.where(better[:, None], more[1].translation, poses.translation))
+            offsets = torch.where(better[:, None, None], more[0], offsets)
+            residual = torch.where(better[:, None, None, None], more[2], residual)
+        return FirstGuess(self.name, rig.moved(offsets.mean(0)), poses, residual)
+
+    def _turned(
+        self, uv: Tensor, observations: Observations, rig: CameraRig, obj: CalibrationObject, motion: SelfMotion
+    ) -> tuple[Tensor, RigidTransform, Tensor]:
+        """What the network says of an object turned by a symmetry, turned back.
+
+        Returns:
+            Offsets (S, C, 15) from the factory rig, poses (S,), residuals (S, C, N, 2).
+        """
+        source = torch.from_numpy(np.argsort(motion.permutation))  # fiducial whose image each label gets
+        predictions = [
+            self._predict(some, seen, obj)
+            for some, seen in zip(
+                uv[:, :, source].split(CHUNK), observations.seen[:, :, source].split(CHUNK), strict=True
+            )
+        ]
+        dtype = rig.focal_length.dtype
+        turn = RigidTransform(torch.from_numpy(motion.rotation), torch.from_numpy(motion.translation)).to(dtype)
+        rotation = torch.cat([p.rig_from_object.rotation for p in predictions]).to(dtype)
+        translation = torch.cat([p.rig_from_object.translation for p in predictions]).to(dtype)
+        poses = RigidTransform(rotation, translation) @ turn
+        factory = self.trained.to(dtype)
+        offsets = torch.cat([p.rig.to(dtype).difference(factory) for p in predictions])
+        each = factory.moved(offsets).resized(rig.image_size)
+        return each.difference(rig), poses, residual_of(each, poses, observations, obj)
+
+    def _predict(self, uv: Tensor, seen: Tensor, obj: CalibrationObject) -> Prediction:
         options = cast(ImageOptions | None, self.network.image_options)
-        if options is None:
-            views = Views(uv=uv, seen=observations.seen)
-        else:
-            drawn = render_views(uv, observations.seen, self.trained.image_size, obj, options, quantise=True)
-            views = Views(images=drawn)
-        predicted: Prediction = self.network(views)[-1].to(rig.focal_length.dtype)
-        each, poses = predicted.rig.resized(rig.image_size), predicted.rig_from_object
-        residual = residual_of(each, poses, observations, obj)
-        return FirstGuess(self.name, rig.moved(each.difference(rig).mean(0)), poses, residual)
+        views = Views(uv=uv, seen=seen)
+        if options is not None:
+            views = Views(images=render_views(uv, seen, self.trained.image_size, obj, options, quantise=True))
+        prediction: Prediction = self.network(views)[-1]
+        return prediction
 
 
 def residual_of(rig: CameraRig, poses: RigidTransform, observations: Observations, obj: CalibrationObject) -> Tensor:

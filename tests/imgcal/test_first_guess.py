@@ -108,3 +108,16 @@ def test_the_result_does_not_depend_on_the_guess(turn, used, o10, asymmetric8):
     assert guided.first_guess.name == "oracle"
     assert plain.first_guess is None and not plain.guess_used
     assert torch.allclose(guided.rig.focal_length, plain.rig.focal_length, atol=0.05)
+
+
+def test_a_symmetric_object_may_be_labelled_in_any_turn(o10):
+    cube, generator = load_object("cube8"), torch.Generator().manual_seed(7)
+    made = synthesize(o10, cube, SNAPSHOTS, generator, drift=RelativeDrift())
+    sigma = torch.full(made.projection.visible.shape, 0.1, dtype=torch.float64)
+    guesser = load_guesser("points", o10, cube)
+    upright = guesser.guess(Observations(made.projection.uv, sigma, made.projection.visible), o10, cube)
+    for motion in (cube.symmetries[5], cube.symmetries[17]):
+        uv = made.projection.uv[:, :, motion.permutation]
+        turned = guesser.guess(Observations(uv, sigma, made.projection.visible), o10, cube)
+        assert rms_length(turned.residual, made.projection.visible) < 1.0
+        assert torch.allclose(turned.rig.focal_length, upright.rig.focal_length, atol=1e-3)
