@@ -50,8 +50,8 @@ class Guesser:
     def guess(self, observations: Observations, rig: CameraRig, obj: CalibrationObject) -> FirstGuess:
         """Look at every snapshot on its own.
 
-        A symmetric object may have been labelled in a turn that the network has never seen: all turns are tried, and each
-        snapshot keeps the one that fits best.
+        A symmetric object may have been labelled in a turn that the network has never seen: all turns are tried, and
+        each snapshot keeps the one that fits best.
 
         Args:
             observations: (S, C, N) labelled fiducials, in the pixels of `rig`.
