@@ -19,6 +19,7 @@ from imgcal.networks.prediction import Prediction, Views
 from imgcal.networks.rendering import ImageOptions, render_views
 from imgcal.objects import CalibrationObject, SelfMotion
 from imgcal.observations import Observations
+from imgcal.projection import resized_pixels
 from imgcal.resources import data_path, shipped_names
 from imgcal.rig import CameraRig
 from imgcal.training.checkpoint import check_object, check_rig, load_checkpoint
@@ -58,42 +59,24 @@ class Guesser:
             rig: the factory rig.
             obj: the object.
         """
-        size, trained_size = rig.image_size.to(observations.uv), self.trained.image_size.to(observations.uv)
-        uv = ((observations.uv + 0.5) * (trained_size / size)[:, None] - 0.5).float()
-        offsets, poses, residual = self._turned(uv, observations, rig, obj, obj.symmetries[0])
-        for motion in obj.symmetries[1:]:
-            more = self._turned(uv, observations, rig, obj, motion)
-            better = more[2].square().sum((1, 2, 3)) < residual.square().sum((1, 2, 3))
-            rotation = torch.where(better[:, None, None], more[1].rotation, poses.rotation)
-            poses = RigidTransform(rotation, torch.where(better[:, None], more[1].translation, poses.translation))
-            offsets = torch.where(better[:, None, None], more[0], offsets)
-            residual = torch.where(better[:, None, None, None], more[2], residual)
-        return FirstGuess(self.name, rig.moved(offsets.mean(0)), poses, residual)
+        scale = self.trained.image_size.to(observations.uv) / rig.image_size
+        uv = resized_pixels(observations.uv, scale[:, None]).float()
+        turns = [self._turned(uv, observations, rig, obj, motion) for motion in obj.symmetries]
+        residuals = torch.stack([residual_of(turn, observations, obj) for turn in turns])  # (turns, S, C, N, 2)
+        best = residuals.square().sum((2, 3, 4)).nan_to_num(torch.inf).argmin(0), torch.arange(len(uv))
+        guess = Prediction.joined(turns, lambda tensors: torch.stack(tensors)[best])
+        mean = rig.moved(guess.rig.difference(rig).mean(0))
+        return FirstGuess(self.name, mean, guess.rig_from_object, residuals[best])
 
     def _turned(
         self, uv: Tensor, observations: Observations, rig: CameraRig, obj: CalibrationObject, motion: SelfMotion
-    ) -> tuple[Tensor, RigidTransform, Tensor]:
-        """What the network says of an object turned by a symmetry, turned back.
-
-        Returns:
-            Offsets (S, C, 15) from the factory rig, poses (S,), residuals (S, C, N, 2).
-        """
+    ) -> Prediction:
+        """What the network says of an object turned by a symmetry, turned back: (S,), in the pixels of `rig`."""
         source = torch.from_numpy(np.argsort(motion.permutation))  # fiducial whose image each label gets
-        predictions = [
-            self._predict(some, seen, obj)
-            for some, seen in zip(
-                uv[:, :, source].split(CHUNK), observations.seen[:, :, source].split(CHUNK), strict=True
-            )
-        ]
-        dtype = rig.focal_length.dtype
-        turn = RigidTransform(torch.from_numpy(motion.rotation), torch.from_numpy(motion.translation)).to(dtype)
-        rotation = torch.cat([p.rig_from_object.rotation for p in predictions]).to(dtype)
-        translation = torch.cat([p.rig_from_object.translation for p in predictions]).to(dtype)
-        poses = RigidTransform(rotation, translation) @ turn
-        factory = self.trained.to(dtype)
-        offsets = torch.cat([p.rig.to(dtype).difference(factory) for p in predictions])
-        each = factory.moved(offsets).resized(rig.image_size)
-        return each.difference(rig), poses, residual_of(each, poses, observations, obj)
+        views = zip(uv[:, :, source].split(CHUNK), observations.seen[:, :, source].split(CHUNK), strict=True)
+        said = Prediction.joined([self._predict(*chunk, obj) for chunk in views], torch.cat).to(rig.focal_length.dtype)
+        turn = RigidTransform(torch.from_numpy(motion.rotation), torch.from_numpy(motion.translation))
+        return Prediction(said.rig.resized(rig.image_size), said.rig_from_object @ turn.to(rig.focal_length.dtype))
 
     def _predict(self, uv: Tensor, seen: Tensor, obj: CalibrationObject) -> Prediction:
         options = cast(ImageOptions | None, self.network.image_options)
@@ -104,9 +87,11 @@ class Guesser:
         return prediction
 
 
-def residual_of(rig: CameraRig, poses: RigidTransform, observations: Observations, obj: CalibrationObject) -> Tensor:
-    """Predicted minus observed: (S, C, N, 2) pixels, zero where not seen; one rig a snapshot or one for all."""
-    uv = rig.expand(len(observations.uv)).project(poses.apply(obj.points.to(poses.rotation)), obj.radius).uv
+def residual_of(prediction: Prediction, observations: Observations, obj: CalibrationObject) -> Tensor:
+    """Predicted minus observed: (S, C, N, 2) pixels, zero where not seen; one rig (S,) a snapshot or one for all."""
+    poses = prediction.rig_from_object
+    rigs = prediction.rig.expand(len(observations.uv))
+    uv = rigs.project(poses.apply(obj.points.to(poses.rotation)), obj.radius).uv
     return torch.where(observations.seen[..., None], uv - observations.uv, 0.0)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -168,7 +168,7 @@ class Follower:
         parts = [to_observations(replace(b, fiducial=given), self.factory, self.obj) for b, given, _ in self.accepted]
         sigma = (torch.cat([p.sigma for p in parts]).square() + self.options.identity_error**2).sqrt()
         observations = Observations(torch.cat([p.uv for p in parts]), sigma, torch.cat([p.seen for p in parts]))
-        poses = stack_poses([p for _, _, p in self.accepted])
+        poses = RigidTransform.joined([p for _, _, p in self.accepted], torch.stack)
         fit = estimate(observations, self.factory, self.obj, poses, options=self.options.estimation)
         if bool(fit.converged):
             prior = (self.factory.prior or RigPrior()).std(self.factory)
@@ -209,8 +209,3 @@ def _coded_snapshots(detections: Detections, count: int) -> NDArray[np.bool_]:
     coded = np.zeros(count, dtype=bool)
     coded[detections.snapshot[detections.fiducial >= 0]] = True
     return coded
-
-
-def stack_poses(poses: Sequence[RigidTransform]) -> RigidTransform:
-    """Put single transforms into one batch: (S,)."""
-    return RigidTransform(torch.stack([p.rotation for p in poses]), torch.stack([p.translation for p in poses]))

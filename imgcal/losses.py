@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import torch
@@ -22,7 +22,6 @@ from imgcal.objects import CalibrationObject
 from imgcal.projection import project_kornia
 from imgcal.rig import CameraRig, pack21
 from imgcal.rotations import geodesic_angle
-from imgcal.transforms import RigidTransform
 
 # Nearer points (mm) are projected at this depth, differences are cut at this size (pixels): what an untrained network
 # predicts behind a camera would overflow float32, whose gradient is then nan even where the loss itself is clamped.
@@ -269,20 +268,7 @@ def _extra_terms(cameras: CameraRig, true_cameras: CameraRig, config: LossConfig
 
 def _stacked(predictions: Sequence[Prediction]) -> Prediction:
     """Put passes on an axis of their own, in float32 or better: (T, B)."""
-    rigs = [prediction.rig for prediction in predictions]
-    poses = [prediction.rig_from_object for prediction in predictions]
-    rig = replace(
-        rigs[0],
-        focal_length=_stack([rig.focal_length for rig in rigs]),
-        principal_point=_stack([rig.principal_point for rig in rigs]),
-        distortion=_stack([rig.distortion for rig in rigs]),
-        cam_from_rig=_stack_transforms([rig.cam_from_rig for rig in rigs]),
-    )
-    return Prediction(rig, _stack_transforms(poses))
-
-
-def _stack_transforms(parts: list[RigidTransform]) -> RigidTransform:
-    return RigidTransform(_stack([p.rotation for p in parts]), _stack([p.translation for p in parts]))
+    return Prediction.joined(predictions, _stack)
 
 
 def _stack(tensors: list[Tensor]) -> Tensor:

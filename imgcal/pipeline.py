@@ -21,7 +21,8 @@ from imgcal.errors import RefusedError
 from imgcal.estimation import Estimate, estimate, initial_pose
 from imgcal.estimation.estimate import conclude, make_problem, make_start
 from imgcal.first_guess import FirstGuess, Guesser, residual_of
-from imgcal.labelling import Labelled, PipelineOptions, Progress, label, matched_to_rig, stack_poses, to_observations
+from imgcal.labelling import Labelled, PipelineOptions, Progress, label, matched_to_rig, to_observations
+from imgcal.networks.prediction import Prediction
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections, Observations
 from imgcal.rig import PARAMETER_NAMES, CameraRig, RigPrior
@@ -132,7 +133,9 @@ def fit_labelled(
     problem = make_problem(observations, rig, obj, prior)
     poses = poses or initial_pose(observations, rig, obj)
     guess = None if guesser is None else guesser.guess(observations, rig, obj)
-    guess_used = guess is not None and _rms(guess.residual) < _rms(residual_of(rig, poses, observations, obj))
+    guess_used = guess is not None and bool(
+        guess.residual.norm() < residual_of(Prediction(rig, poses), observations, obj).norm()
+    )
     state = make_start(problem, poses, None)
     if guess is not None and guess_used:
         state = make_start(problem, guess.rig_from_object, guess.rig)
@@ -163,10 +166,6 @@ def fit_labelled(
     )
 
 
-def _rms(residual: Tensor) -> float:
-    return float(residual.square().sum().sqrt())
-
-
 def _used(labelled: Labelled, rig: CameraRig, obj: CalibrationObject) -> tuple[Observations, RigidTransform | None]:
     """Observations of the accepted snapshots, and their poses where identity found all of them."""
     used = labelled.used
@@ -176,7 +175,7 @@ def _used(labelled: Labelled, rig: CameraRig, obj: CalibrationObject) -> tuple[O
     )
     poses = [labelled.snapshots[s].rig_from_object for s in used]
     known = [pose for pose in poses if pose is not None]
-    return observations, stack_poses(known) if len(known) == len(used) else None
+    return observations, RigidTransform.joined(known, torch.stack) if len(known) == len(used) else None
 
 
 def _require_cameras(seen: NDArray[np.bool_], rig: CameraRig, options: PipelineOptions) -> None:

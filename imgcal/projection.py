@@ -25,6 +25,11 @@ class Projection:
     visible: Tensor  # (*B, C, N) bool: in front, inside the image, before the distortion folds over
 
 
+def resized_pixels(uv: Tensor, scale: Tensor | float) -> Tensor:
+    """Take pixels to the same image in another size, by the pixel-centre rule u' + 1/2 = scale (u + 1/2)."""
+    return (uv + 0.5) * scale - 0.5
+
+
 def apparent_centre_scale(depth: Tensor, radius: Tensor | None) -> Tensor | float:
     """Factor that takes the centre of a sphere to the centre of its elliptic image, on the z = 1 plane.
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from imgcal.projection import Projection, project_components
+from imgcal.projection import Projection, project_components, resized_pixels
 from imgcal.rotations import rotation_from_6d, rotation_from_vector, sixd_from_rotation, vector_from_rotation
-from imgcal.transforms import RigidTransform, rotate
+from imgcal.transforms import Join, RigidTransform, rotate
 
 PARAMETERS = 15
 """Free parameters of a camera, in this order: rotation (3, rad), position (3, mm), focal length (2, pixels), principal
@@ -155,7 +155,7 @@ class CameraRig:
         return replace(
             self,
             focal_length=self.focal_length * scale,
-            principal_point=(self.principal_point + 0.5) * scale - 0.5,
+            principal_point=resized_pixels(self.principal_point, scale),
             image_size=image_size,
         )
 
@@ -172,6 +172,17 @@ class CameraRig:
             ),
             image_size=self.image_size[index],
             camera_names=tuple(self.camera_names[i] for i in index),
+        )
+
+    @classmethod
+    def joined(cls, rigs: Sequence[CameraRig], join: Join) -> CameraRig:
+        """Make one of several; `join` takes the list of their focal lengths, and so on. The rest is the first one's."""
+        return replace(
+            rigs[0],
+            focal_length=join([rig.focal_length for rig in rigs]),
+            principal_point=join([rig.principal_point for rig in rigs]),
+            distortion=join([rig.distortion for rig in rigs]),
+            cam_from_rig=RigidTransform.joined([rig.cam_from_rig for rig in rigs], join),
         )
 
     def __getitem__(self, index: object) -> CameraRig:

@@ -237,24 +237,13 @@ def _take(snapshots: Snapshots, rows: Tensor) -> Snapshots:
 
 
 def _concatenate(parts: list[Snapshots]) -> Snapshots:
-    rigs = [part.rig for part in parts]
-    rig = replace(
-        rigs[0],
-        focal_length=torch.cat([r.focal_length for r in rigs]),
-        principal_point=torch.cat([r.principal_point for r in rigs]),
-        distortion=torch.cat([r.distortion for r in rigs]),
-        cam_from_rig=_concatenate_transforms([r.cam_from_rig for r in rigs]),
-    )
+    rig = CameraRig.joined([part.rig for part in parts], torch.cat)
     projection = Projection(
         torch.cat([part.projection.uv for part in parts]),
         torch.cat([part.projection.depth for part in parts]),
         torch.cat([part.projection.visible for part in parts]),
     )
-    return Snapshots(rig, _concatenate_transforms([part.rig_from_object for part in parts]), projection)
-
-
-def _concatenate_transforms(parts: list[RigidTransform]) -> RigidTransform:
-    return RigidTransform(torch.cat([p.rotation for p in parts]), torch.cat([p.translation for p in parts]))
+    return Snapshots(rig, RigidTransform.joined([part.rig_from_object for part in parts], torch.cat), projection)
 
 
 def _parameters_first(

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+
+Join = Callable[[list[Tensor]], Tensor]
+"""Puts tensors together: `torch.cat`, `torch.stack`, or a choice between them."""
 
 
 @dataclass(frozen=True)
@@ -22,6 +26,11 @@ class RigidTransform:
         """Make identity transforms of the given batch shape."""
         eye = torch.eye(3, dtype=dtype, device=device).expand(*batch, 3, 3)
         return cls(eye, torch.zeros(*batch, 3, dtype=dtype, device=device))
+
+    @classmethod
+    def joined(cls, parts: Sequence[RigidTransform], join: Join) -> RigidTransform:
+        """Make one of several; `join` takes the list of their rotations, then of their translations."""
+        return cls(join([part.rotation for part in parts]), join([part.translation for part in parts]))
 
     def __matmul__(self, other: RigidTransform) -> RigidTransform:
         """Chain: `a_from_b @ b_from_c` is `a_from_c`; batch axes broadcast."""

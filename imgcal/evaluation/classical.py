@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -20,7 +19,6 @@ from imgcal.networks.prediction import Prediction
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Observations
 from imgcal.rig import PARAMETERS, CameraRig, pack21, unpack21
-from imgcal.transforms import RigidTransform
 
 Array = NDArray[np.float64]
 Intrinsics = tuple[Array, Array]  # camera matrix (3, 3), distortion (5,)
@@ -171,22 +169,8 @@ def bundle_adjustment(
         )
         problem = make_problem(one, factory, obj, spread)
         state = _least_squares(problem, make_start(problem, initial_pose(one, factory, obj), None))
-        found.append((rig_at(problem, state.offset), pose_at(problem, state)))
-    turns = torch.cat([pose.rotation[:, 0] for _, pose in found])
-    shifts = torch.cat([pose.translation[:, 0] for _, pose in found])
-    rigs = [rig for rig, _ in found]
-    extrinsics = RigidTransform(
-        torch.cat([rig.cam_from_rig.rotation for rig in rigs]),
-        torch.cat([rig.cam_from_rig.translation for rig in rigs]),
-    )
-    rig = replace(
-        factory,
-        focal_length=torch.cat([rig.focal_length for rig in rigs]),
-        principal_point=torch.cat([rig.principal_point for rig in rigs]),
-        distortion=torch.cat([rig.distortion for rig in rigs]),
-        cam_from_rig=extrinsics,
-    )
-    return Prediction(rig, RigidTransform(turns, shifts))
+        found.append(Prediction(rig_at(problem, state.offset), pose_at(problem, state)[:, 0]))
+    return Prediction.joined(found, torch.cat)
 
 
 def _least_squares(problem: Problem, start: State) -> State:

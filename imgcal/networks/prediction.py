@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from imgcal.rig import CameraRig
 from imgcal.rotations import rotation_from_6d, sixd_from_rotation
-from imgcal.transforms import RigidTransform
+from imgcal.transforms import Join, RigidTransform
 
 
 @dataclass(frozen=True)
@@ -61,18 +62,20 @@ class Prediction:
         pose = RigidTransform(rotation, each.translation.mean(-2))
         inverse = pose.inverse()
         cam_from_rig = cameras.cam_from_rig @ RigidTransform(inverse.rotation[:, None], inverse.translation[:, None])
-        rig = CameraRig(
-            cameras.focal_length,
-            cameras.principal_point,
-            cameras.distortion,
-            cam_from_rig,
-            factory.image_size,
-            factory.camera_names,
-            factory.name,
-            factory.working_distance,
-            factory.prior,
+        rig = replace(
+            factory,
+            focal_length=cameras.focal_length,
+            principal_point=cameras.principal_point,
+            distortion=cameras.distortion,
+            cam_from_rig=cam_from_rig,
         )
         return cls(rig, pose)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Prediction], join: Join) -> Prediction:
+        """Make one of several as `CameraRig.joined` does; `log_sigma` is left out."""
+        poses = RigidTransform.joined([part.rig_from_object for part in parts], join)
+        return cls(CameraRig.joined([part.rig for part in parts], join), poses)
 
     def detach(self) -> Prediction:
         """Cut the graph."""

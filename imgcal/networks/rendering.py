@@ -10,6 +10,7 @@ from torch import Tensor
 
 from imgcal.errors import InputError
 from imgcal.objects import CalibrationObject
+from imgcal.projection import resized_pixels
 from renderers import splat
 
 LEVELS = 255  # largest grey level of images as they are saved
@@ -31,13 +32,11 @@ class ImageOptions:
 
     def from_sensor(self, uv: Tensor, image_size: Tensor) -> Tensor:
         """Take sensor pixels (*B, C, N, 2) to pixels of the image by the pixel-centre rule u' + 1/2 = s (u + 1/2)."""
-        scale = (self.size / image_size.to(uv))[:, None]
-        return (uv + 0.5) * scale - 0.5
+        return resized_pixels(uv, (self.size / image_size.to(uv))[:, None])
 
     def to_sensor(self, uv: Tensor, image_size: Tensor) -> Tensor:
         """Invert `from_sensor`."""
-        scale = (image_size.to(uv) / self.size)[:, None]
-        return (uv + 0.5) * scale - 0.5
+        return resized_pixels(uv, (image_size.to(uv) / self.size)[:, None])
 
 
 def render_views(

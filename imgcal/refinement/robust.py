@@ -20,7 +20,6 @@ from imgcal.networks.prediction import Prediction, Views
 from imgcal.objects import CalibrationObject
 from imgcal.refinement.points import as_prediction, observed, refine_points
 from imgcal.rig import CameraRig
-from imgcal.transforms import RigidTransform
 
 SQUARED = EstimationOptions(loss="squared")
 AT_FIRST = EstimationOptions(loss="squared", max_iterations=15)  # outliers can keep it busy without end
@@ -206,23 +205,4 @@ def _predicted_uv(prediction: Prediction, target: Target) -> Tensor:
 
 def _replaced(whole: Prediction, rows: Tensor, part: Prediction) -> Prediction:
     """Put `part` in the place of some rigs of a batch."""
-
-    def put(old: Tensor, new: Tensor) -> Tensor:
-        return old.index_copy(0, rows, new)
-
-    rig, pose, other = whole.rig, whole.rig_from_object, part.rig_from_object
-    tensors = iter(_tensors(part.rig))
-    moved = RigidTransform(put(pose.rotation, other.rotation), put(pose.translation, other.translation))
-    return Prediction(rig.map_tensors(lambda tensor, _: put(tensor, next(tensors))), moved)
-
-
-def _tensors(rig: CameraRig) -> list[Tensor]:
-    """The tensors of a rig in the order in which `map_tensors` goes through them."""
-    found: list[Tensor] = []
-
-    def note(tensor: Tensor, _: int) -> Tensor:
-        found.append(tensor)
-        return tensor
-
-    rig.map_tensors(note)
-    return found
+    return Prediction.joined((whole, part), lambda pair: pair[0].index_copy(0, rows, pair[1]))

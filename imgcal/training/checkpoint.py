@@ -145,7 +145,7 @@ def warm_start(path: str | Path, network: nn.Module) -> tuple[str, ...]:
     Raises:
         InputError: the file cannot be used, or nothing in it fits.
     """
-    tensors, _ = read_tensors(path, FORMAT)
+    tensors, texts = read_tensors(path, FORMAT)
     own = dict(network.named_parameters())
     fitting = [name for name in own if name in tensors and tensors[name].shape == own[name].shape]
     if not fitting:
@@ -155,7 +155,6 @@ def warm_start(path: str | Path, network: nn.Module) -> tuple[str, ...]:
             own[name].copy_(tensors[name])
     trunk = getattr(network, "trunk", None)
     if isinstance(trunk, Trunk):
-        texts = read_texts(path, FORMAT)
         experiment, _ = _read_records(path, texts)
         trunk.rescale(experiment.drift.drift().std(_from_texts(path, texts)[0]))
     return tuple(name for name in own if name not in fitting)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -70,47 +70,44 @@ def background_table(experiments: Sequence[Experiment], results: Results) -> str
         "rigs",
         *TRAINING,
     )
-    rows, missing = [], []
-    for experiment in experiments:
-        result = results.get(experiment.name)
-        if result is None:
-            missing.append(experiment.name)
-            continue
+
+    def cells(experiment: Experiment, result: dict[str, Any]) -> list[str]:
         exact, noise = result["exact"], result["noise"]
-        cells = [str(row_of(experiment)), label(experiment), _px(exact[FACTORY]["mean"]), _px(exact[WITHOUT]["mean"])]
-        cells += [_px(noise[NETWORK]["mean"]), _px(noise[REFINED]["mean"]), _bound(noise[REFINED])]
-        rows.append([*cells, f"{result['rigs']:,}", *training_cells(result)])
-    return markdown(head, rows) + _left_out(missing)
+        row = [str(row_of(experiment)), label(experiment), _px(exact[FACTORY]["mean"]), _px(exact[WITHOUT]["mean"])]
+        row += [_px(noise[NETWORK]["mean"]), _px(noise[REFINED]["mean"]), _bound(noise[REFINED])]
+        return [*row, f"{result['rigs']:,}", *training_cells(result)]
+
+    return _of_trained(head, experiments, results, cells)
 
 
 def paper_table(experiments: Sequence[Experiment], results: Results) -> str:
     """Trained networks of the paper's own design."""
     head = ("row", "what", "paper's RE", "network alone", REFINED, "parameters", *TRAINING)
-    rows, missing = [], []
-    for experiment in experiments:
-        result = results.get(experiment.name)
-        if result is None:
-            missing.append(experiment.name)
-            continue
-        cells = [str(row_of(experiment)), label(experiment), _paper(experiment)]
-        cells += [mean(result["exact"][NETWORK]), mean(result["exact"][REFINED]), _millions(result["parameters"])]
-        rows.append([*cells, *training_cells(result)])
-    return markdown(head, rows) + _left_out(missing)
+
+    def cells(experiment: Experiment, result: dict[str, Any]) -> list[str]:
+        exact = result["exact"]
+        row = [str(row_of(experiment)), label(experiment), _paper(experiment)]
+        return [
+            *row,
+            mean(exact[NETWORK]),
+            mean(exact[REFINED]),
+            _millions(result["parameters"]),
+            *training_cells(result),
+        ]
+
+    return _of_trained(head, experiments, results, cells)
 
 
 def comparison_table(experiments: Sequence[Experiment], results: Results) -> str:
     """What single decisions are worth, in equal minutes from nothing."""
     head = ("what", "network alone", "median", "parameters", *TRAINING)
-    rows, missing = [], []
-    for experiment in experiments:
-        result = results.get(experiment.name)
-        if result is None:
-            missing.append(experiment.name)
-            continue
+
+    def cells(experiment: Experiment, result: dict[str, Any]) -> list[str]:
         alone = result["exact"][NETWORK]
-        cells = [experiment.description.partition(":")[0], mean(alone), _px(alone["median"])]
-        rows.append([*cells, _millions(result["parameters"]), *training_cells(result)])
-    return markdown(head, rows) + _left_out(missing)
+        row = [experiment.description.partition(":")[0], mean(alone), _px(alone["median"])]
+        return [*row, _millions(result["parameters"]), *training_cells(result)]
+
+    return _of_trained(head, experiments, results, cells)
 
 
 def shipped_table(experiments: Sequence[Experiment], results: Results) -> str:
@@ -147,16 +144,13 @@ def shipped_table(experiments: Sequence[Experiment], results: Results) -> str:
 def robustness_table(experiments: Sequence[Experiment], results: Results) -> str:
     """Median RE with outliers, everybody on the same rigs."""
     columns = ("MAP, true inliers", NETWORK, REFINED, ROBUST, WITHOUT, FACTORY)
-    rows, missing = [], []
-    for experiment in experiments:
-        robust = results.get(experiment.name, {}).get("robustness")
-        if robust is None:
-            missing.append(experiment.name)
-            continue
-        best = robust[columns[0]]["median"]
-        medians = [_px(robust[name]["median"]) for name in columns]
-        rows.append([experiment.name, *medians, f"{robust[REFINED]['median'] / best:.2f}"])
-    return markdown(("model", *columns, "network + refinement / true inliers"), rows) + _left_out(missing)
+
+    def cells(experiment: Experiment, result: dict[str, Any]) -> list[str]:
+        medians = {name: result["robustness"][name]["median"] for name in columns}
+        return [experiment.name, *map(_px, medians.values()), f"{medians[REFINED] / medians[columns[0]]:.2f}"]
+
+    tried = {name: result for name, result in results.items() if result.get("robustness") is not None}
+    return _of_trained(("model", *columns, "network + refinement / true inliers"), experiments, tried, cells)
 
 
 def replaced(page: str, sections: Mapping[str, str], where: Path) -> str:
@@ -222,8 +216,16 @@ def _paper(experiment: Experiment) -> str:
     return f"{experiment.paper.re_px:g}" if experiment.paper and experiment.paper.re_px else ""
 
 
-def _left_out(missing: Sequence[str]) -> str:
-    return f"\n\nNot trained yet: {', '.join(missing)}." if missing else ""
+def _of_trained(
+    head: Iterable[str],
+    experiments: Sequence[Experiment],
+    results: Results,
+    cells: Callable[[Experiment, dict[str, Any]], list[str]],
+) -> str:
+    """A table of the experiments that have results, and the names of those that have none."""
+    rows = [cells(experiment, results[experiment.name]) for experiment in experiments if experiment.name in results]
+    missing = [experiment.name for experiment in experiments if experiment.name not in results]
+    return markdown(head, rows) + (f"\n\nNot trained yet: {', '.join(missing)}." if missing else "")
 
 
 def _px(value: float | None) -> str:
