@@ -1,4 +1,4 @@
-"""Repeat the paper's study of bundle adjustment: ``python scripts/results/bundle_adjustment.py``.
+"""Repeat the paper's study of bundle adjustment: ``python -m scripts.results.bundle_adjustment``.
 
 1,000 rigs O6 over cube8 with intrinsics off by up to 10 %, one snapshot each: RE left alone, after 1 and 25 iterations
 of imgcal's MAP solver and of a plain bundle adjustment, and of a network when its file is given; seconds for each
@@ -21,7 +21,6 @@ import numpy as np
 import torch
 import tyro
 from numpy.typing import NDArray
-from output import BLUE, GREEN, GREY, RED, RESULTS, command, figure, surroundings, write_json
 from scipy.optimize import least_squares
 from torch import Tensor
 
@@ -36,6 +35,7 @@ from imgcal.rig import CameraRig, pack21
 from imgcal.rotations import vector_from_rotation
 from imgcal.synthesis import PoseRange, RelativeDrift
 from imgcal.training import load_network
+from scripts.output import BLUE, GREEN, GREY, RED, RESULTS, command, figure, surroundings, write_json
 
 Array = NDArray[np.float64]
 

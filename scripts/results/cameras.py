@@ -1,4 +1,4 @@
-"""Draw true and predicted cameras in 3D, to turn around in a browser: ``python scripts/results/cameras.py``.
+"""Draw true and predicted cameras in 3D, to turn around in a browser: ``python -m scripts.results.cameras``.
 
 Several random rigs on the hemisphere over the object: true cameras blue, predicted red, the first of each rig yellow.
 Writes out/results/cameras.html, which needs nothing else (plotly is inside: some megabytes).
@@ -13,7 +13,6 @@ from pathlib import Path
 import plotly.graph_objects as go
 import torch
 import tyro
-from output import ROOT, command, make_folder
 from torch import Tensor
 
 from imgcal.errors import InputError
@@ -24,6 +23,7 @@ from imgcal.formats import load_object, load_rig, write_text
 from imgcal.networks import Prediction
 from imgcal.rig import CameraRig
 from imgcal.synthesis import RelativeDrift
+from scripts.output import ROOT, command, make_folder
 
 AXIS = 60.0  # mm, length of the line that shows where a camera looks
 TRUE, PREDICTED, FIRST, FIDUCIALS = "#2563eb", "#dc2626", "#facc15", "#333333"

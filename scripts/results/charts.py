@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from measuring import NETWORK, WITHOUT
-from output import BLUE, GREEN, RED, figure
+from scripts.output import BLUE, GREEN, RED, figure
+from scripts.results.measuring import NETWORK, WITHOUT
 
 LEAST_RE = 1e-4  # pixels: exact points are refined to rounding errors, which say nothing
 

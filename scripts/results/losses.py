@@ -1,4 +1,4 @@
-"""Repeat the paper's loss figure: ``python scripts/results/losses.py`` writes docs/results/losses.json and .png.
+"""Repeat the paper's loss figure: ``python -m scripts.results.losses`` writes docs/results/losses.json and .png.
 
 Trains a point network with the paper's loss alone, and watches on fixed rigs what happens to the terms that the paper
 tried as well: they fall to what the true cameras have, without being minimized. The network is the paper's, narrower,
@@ -16,7 +16,6 @@ from typing import Any
 
 import torch
 import tyro
-from output import BLUE, GREY, RESULTS, command, figure, surroundings, write_json
 from torch import Tensor
 
 from imgcal.errors import InputError
@@ -36,6 +35,7 @@ from imgcal.networks.prediction import Prediction
 from imgcal.objects import CalibrationObject
 from imgcal.training.engine import Run, check_finite, prepare, train_step
 from imgcal.training.experiment import Experiment, changed, load_experiment
+from scripts.output import BLUE, GREY, RESULTS, command, figure, surroundings, write_json
 
 PROPOSED = ("parameter RMSE", "geodesic", "reprojection RMSE")
 NETWORK = "network={preset: paper-points, change: {width: 128, depth: 3, head_widths: [256]}}"

@@ -11,8 +11,6 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from output import surroundings
-
 from imgcal.errors import InputError
 from imgcal.evaluation import BASELINES, Conditions, Corruption, Evaluation, Method, Protocol, Scores, evaluate, sweep
 from imgcal.evaluation.latency import latency
@@ -20,6 +18,7 @@ from imgcal.evaluation.models import Model, load_models
 from imgcal.formats.safetensors_file import read_texts
 from imgcal.training.checkpoint import FORMAT
 from imgcal.training.log import read_metrics
+from scripts.output import surroundings
 
 NOISE = Corruption(noise=0.1)
 ROBUSTNESS = Corruption(noise=0.1, missing=0.2, swapped=0.1)

@@ -7,11 +7,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from measuring import FACTORY, NETWORK, ROBUST, WITHOUT
-
 from imgcal.errors import InputError
 from imgcal.networks.config import Images, PaperImages
 from imgcal.training.experiment import Experiment
+from scripts.results.measuring import FACTORY, NETWORK, ROBUST, WITHOUT
 
 Results = Mapping[str, dict[str, Any]]
 

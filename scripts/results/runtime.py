@@ -1,4 +1,4 @@
-"""Measure the paper's runtime figure: ``python scripts/results/runtime.py`` writes docs/results/runtime.json and .png.
+"""Measure the paper's runtime figure: ``python -m scripts.results.runtime`` writes docs/results/runtime.json and .png.
 
 One camera calibrated by OpenCV, against the number of images and of Levenberg-Marquardt iterations; beside it a whole
 rig of 2 to 1024 cameras from one snapshot: networks, and network + MAP refinement. Networks are untrained: the time
@@ -20,7 +20,6 @@ import numpy as np
 import torch
 import tyro
 from numpy.typing import NDArray
-from output import BLUE, GREEN, GREY, RED, RESULTS, command, figure, surroundings, write_json
 from torch import Tensor, nn
 
 from imgcal import networks
@@ -32,6 +31,7 @@ from imgcal.rig import CameraRig
 from imgcal.rotations import rotation_from_vector
 from imgcal.synthesis import PhysicalDrift, Snapshots, synthesize
 from imgcal.transforms import RigidTransform
+from scripts.output import BLUE, GREEN, GREY, RED, RESULTS, command, figure, surroundings, write_json
 
 DRIFT = PhysicalDrift()
 NOISE = 0.05  # px, of OpenCV's points and of the refinement's

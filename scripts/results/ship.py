@@ -1,6 +1,6 @@
 """Put trained networks where the package ships them: bf16 weights in data/models, named by kind, rig and object.
 
-Usage: python scripts/results/ship.py out/runs/shipped-points-asymmetric8 out/runs/shipped-vit-asymmetric8 ...
+Usage: python -m scripts.results.ship out/runs/shipped-points-asymmetric8 out/runs/shipped-vit-asymmetric8 ...
 """
 
 from __future__ import annotations

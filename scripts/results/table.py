@@ -1,4 +1,4 @@
-"""Evaluate trained networks and rewrite docs/results.md: ``python scripts/results/table.py out/runs``.
+"""Evaluate trained networks and rewrite docs/results.md: ``python -m scripts.results.table out/runs``.
 
 Reads out/runs/<experiment>/model.safetensors, as `imgcal train` writes them, and data/models. The figures of a network
 are kept in docs/results/<experiment>.json under the hash of its file: another call evaluates only what is new.
@@ -13,10 +13,15 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from charts import over_time, sweeps
-from measuring import Effort, Source, find, measure, swept
-from output import RESULTS, ROOT, command, read_json, write_json
-from pages import (
+
+from imgcal.errors import InputError
+from imgcal.formats import write_text
+from imgcal.resources import shipped_names
+from imgcal.training.experiment import Experiment, load_experiment
+from scripts.output import RESULTS, ROOT, command, read_json, write_json
+from scripts.results.charts import over_time, sweeps
+from scripts.results.measuring import Effort, Source, find, measure, swept
+from scripts.results.pages import (
     accuracy_table,
     background_table,
     comparison_table,
@@ -26,11 +31,6 @@ from pages import (
     row_of,
     shipped_table,
 )
-
-from imgcal.errors import InputError
-from imgcal.formats import write_text
-from imgcal.resources import shipped_names
-from imgcal.training.experiment import Experiment, load_experiment
 
 
 @dataclass(frozen=True)

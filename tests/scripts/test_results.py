@@ -2,7 +2,7 @@
 
 import json
 import math
-import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -20,15 +20,8 @@ LEVEL = "poses={theta_deg: [0, 0], phi_deg: [0, 0], alpha_deg: [269, 271]}"
 FEW = ["--count", "5", "--image-count", "3", "--trials", "2", "--extra", "4", "--sweep-count", "2"]
 
 
-@pytest.fixture
-def script(monkeypatch):
-    """Import scripts as they see each other when they run."""
-    monkeypatch.syspath_prepend(str(FOLDER))
-    before = set(sys.modules)
-    yield lambda name: __import__(name)
-    for name in set(sys.modules) - before:
-        if getattr(sys.modules[name], "__file__", None) and Path(sys.modules[name].__file__).parent == FOLDER:
-            del sys.modules[name]
+def script(name):
+    return import_module(f"scripts.results.{name}")
 
 
 @pytest.fixture
@@ -58,7 +51,7 @@ def table_arguments(folder, *more):
     return [str(folder / "runs"), *folders, *FEW, *more]
 
 
-def test_table_evaluates_what_is_new_and_keeps_the_rest(script, trained, tmp_path, monkeypatch):
+def test_table_evaluates_what_is_new_and_keeps_the_rest(trained, tmp_path, monkeypatch):
     table = script("table")
     trained("table1-row08", SMALL, LEVEL)
     table.main(table_arguments(tmp_path, "--sweep", "table1-row08"))
@@ -85,7 +78,7 @@ def test_table_evaluates_what_is_new_and_keeps_the_rest(script, trained, tmp_pat
     assert (tmp_path / "results.md").read_text() == page
 
 
-def test_table_of_a_shipped_model(script, trained, tmp_path):
+def test_table_of_a_shipped_model(trained, tmp_path):
     file = trained("shipped-points-asymmetric8", SMALL, LEVEL)
     (tmp_path / "models").mkdir()
     shipped = tmp_path / "models" / "points-O10-asymmetric8.safetensors"
@@ -101,7 +94,7 @@ def test_table_of_a_shipped_model(script, trained, tmp_path):
     assert "| shipped-cnn-cube8 | not trained yet" in page
 
 
-def test_two_runs_of_one_experiment_are_refused(script, trained, tmp_path):
+def test_two_runs_of_one_experiment_are_refused(trained, tmp_path):
     file = trained("table1-row08", SMALL, LEVEL)
     (tmp_path / "runs" / "again").mkdir()
     (tmp_path / "runs" / "again" / "model.safetensors").write_bytes(file.read_bytes())
@@ -109,19 +102,19 @@ def test_two_runs_of_one_experiment_are_refused(script, trained, tmp_path):
         script("table").main(table_arguments(tmp_path))
 
 
-def test_page_without_markers_is_refused(script, tmp_path):
+def test_page_without_markers_is_refused(tmp_path):
     (tmp_path / "results.md").write_text("# Results\n")
     with pytest.raises(InputError, match="no markers of `table 1`"):
         script("table").main(table_arguments(tmp_path))
 
 
-def test_committed_page_has_all_markers(script):
+def test_committed_page_has_all_markers():
     table, pages = script("table"), script("pages")
     filled = pages.replaced(PAGE.read_text("utf-8"), table.sections([], {}), PAGE)
     assert "not trained yet" not in filled[filled.index("begin table 1 -->") : filled.index("end table 1 -->")]
 
 
-def test_runtime(script, tmp_path):
+def test_runtime(tmp_path):
     arguments = ["--images", "3", "5", "--iterations", "1", "3", "--iteration-images", "3", "--cameras", "2", "5"]
     script("runtime").main([*arguments, "--repeats", "1", "--out", str(tmp_path)])
     result = json.loads((tmp_path / "runtime.json").read_text())
@@ -130,7 +123,7 @@ def test_runtime(script, tmp_path):
     assert (tmp_path / "runtime.png").stat().st_size < 60_000
 
 
-def test_ring_is_the_reference_ring(script):
+def test_ring_is_the_reference_ring():
     from imgcal.formats import load_rig
 
     made, reference = script("runtime").ring(10), load_rig("O10")
@@ -138,7 +131,7 @@ def test_ring_is_the_reference_ring(script):
     torch.testing.assert_close(made.cam_from_rig.rotation, reference.cam_from_rig.rotation, atol=1e-5, rtol=0)
 
 
-def test_bundle_adjustment(script, trained, tmp_path):
+def test_bundle_adjustment(trained, tmp_path):
     file = trained("table1-row09", SMALL)
     arguments = ["--trials", "4", "--plain-trials", "2", "--model", str(file), "--out", str(tmp_path)]
     script("bundle_adjustment").main(arguments)
@@ -150,7 +143,7 @@ def test_bundle_adjustment(script, trained, tmp_path):
     assert columns["plain BA, 1 iteration"]["trials"] == 2
 
 
-def test_plain_bundle_adjustment_starts_at_the_projection_of_the_rig(script):
+def test_plain_bundle_adjustment_starts_at_the_projection_of_the_rig():
     from imgcal.formats import load_object, load_rig
     from imgcal.synthesis import synthesize
 
@@ -162,7 +155,7 @@ def test_plain_bundle_adjustment_starts_at_the_projection_of_the_rig(script):
     )
 
 
-def test_losses(script, tmp_path):
+def test_losses(tmp_path):
     network = "network={preset: paper-points, change: {width: 16, depth: 1, head_widths: [8]}}"
     sets = ["--set", network, "training.batch_size=8", "optimizer={lr: 1.0e-3, ema: null}"]
     script("losses").main(["--minutes", "0.02", *sets, "--every", "5", "--rigs", "6", "--out", str(tmp_path)])
@@ -173,7 +166,7 @@ def test_losses(script, tmp_path):
     assert result["losses"]["parameter RMSE"][-1] < result["losses"]["parameter RMSE"][0]
 
 
-def test_cameras(script, trained, tmp_path, capsys):
+def test_cameras(trained, tmp_path, capsys):
     out = tmp_path / "made" / "cameras.html"
     script("cameras").main(["--count", "2", "--rig", "T4", "--object", "cube8", "--out", str(out)])
     text = out.read_text("utf-8")
@@ -182,8 +175,8 @@ def test_cameras(script, trained, tmp_path, capsys):
     assert "O6, cube8: table1-row08 + refinement, RE 0.0" in capsys.readouterr().out
 
 
-def test_scripts_say_what_is_wrong_in_one_line(script, tmp_path, capsys, monkeypatch):
-    output = script("output")
+def test_scripts_say_what_is_wrong_in_one_line(tmp_path, capsys, monkeypatch):
+    output = import_module("scripts.output")
 
     def fail():
         raise InputError("--count: found 0,\nexpected at least 1")

@@ -24,7 +24,7 @@ from imgcal.errors import InputError, RefusedError
 from imgcal.formats import write_text
 from imgcal.formats.atomic import write_bytes
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "docs" / "results"
 BLUE, RED, GREEN, GREY = "#1f5fa8", "#c43c2f", "#2e8b57", "#777777"
 
