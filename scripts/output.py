@@ -7,8 +7,9 @@ import json
 import math
 import os
 import platform
+import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -91,6 +92,28 @@ def figure(path: Path, panels: int = 1, rows: int = 1, size: tuple[float, float]
     Image.open(drawn).convert("RGB").quantize(48, dither=Image.Dither.NONE).save(packed, "PNG", optimize=True)
     make_folder(path.parent)
     write_bytes(path, packed.getvalue())
+
+
+def markdown(head: Iterable[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table; short rows are filled up."""
+    columns = list(head)
+    lines = [columns, ["---"] * len(columns)]
+    lines += [[*row, *[""] * (len(columns) - len(row))] for row in rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def replaced(page: str, sections: Mapping[str, str], where: Path) -> str:
+    """Put sections between their markers `<!-- begin NAME -->` and `<!-- end NAME -->`.
+
+    Raises:
+        InputError: a marker is missing.
+    """
+    for name, text in sections.items():
+        pattern = re.compile(rf"(<!-- begin {re.escape(name)} -->\n).*?(<!-- end {re.escape(name)} -->)", re.DOTALL)
+        if not pattern.search(page):
+            raise InputError(f"{where}: found no markers of `{name}`, expected <!-- begin {name} --> and its end")
+        page = pattern.sub(lambda match, text=text: f"{match[1]}\n{text}\n\n{match[2]}", page)  # type: ignore[misc]
+    return page
 
 
 def command(main: Callable[[], object]) -> None:

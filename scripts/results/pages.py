@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-from imgcal.errors import InputError
 from imgcal.networks.config import Images, PaperImages
 from imgcal.training.experiment import Experiment
+from scripts.output import markdown
 from scripts.results.measuring import FACTORY, NETWORK, ROBUST, WITHOUT
 
 Results = Mapping[str, dict[str, Any]]
@@ -152,20 +150,6 @@ def robustness_table(experiments: Sequence[Experiment], results: Results) -> str
     return _of_trained(("model", *columns, "network + refinement / true inliers"), experiments, tried, cells)
 
 
-def replaced(page: str, sections: Mapping[str, str], where: Path) -> str:
-    """Put sections between their markers `<!-- begin NAME -->` and `<!-- end NAME -->`.
-
-    Raises:
-        InputError: a marker is missing.
-    """
-    for name, text in sections.items():
-        pattern = re.compile(rf"(<!-- begin {re.escape(name)} -->\n).*?(<!-- end {re.escape(name)} -->)", re.DOTALL)
-        if not pattern.search(page):
-            raise InputError(f"{where}: found no markers of `{name}`, expected <!-- begin {name} --> and its end")
-        page = pattern.sub(lambda match, text=text: f"{match[1]}\n{text}\n\n{match[2]}", page)  # type: ignore[misc]
-    return page
-
-
 def variant(experiment: Experiment) -> str:
     """Tell what the network of an experiment takes: points or images."""
     return "images" if isinstance(experiment.network.variant(), Images | PaperImages) else "points"
@@ -196,14 +180,6 @@ def training_cells(result: Mapping[str, Any]) -> list[str]:
     training = result["training"]
     steps = f"{training['steps']:,} x {training['batch_size']}"
     return [f"{training['minutes']:.0f}", steps, training["started_from"] or "", training["machine"]]
-
-
-def markdown(head: Iterable[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table; short rows are filled up."""
-    columns = list(head)
-    lines = [columns, ["---"] * len(columns)]
-    lines += [[*row, *[""] * (len(columns) - len(row))] for row in rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def row_of(experiment: Experiment) -> int:

@@ -18,7 +18,7 @@ from imgcal.errors import InputError
 from imgcal.formats import write_text
 from imgcal.resources import shipped_names
 from imgcal.training.experiment import Experiment, load_experiment
-from scripts.output import RESULTS, ROOT, command, read_json, write_json
+from scripts.output import RESULTS, ROOT, command, read_json, replaced, write_json
 from scripts.results.charts import over_time, sweeps
 from scripts.results.measuring import Effort, Source, find, measure, swept
 from scripts.results.pages import (
@@ -26,7 +26,6 @@ from scripts.results.pages import (
     background_table,
     comparison_table,
     paper_table,
-    replaced,
     robustness_table,
     row_of,
     shipped_table,

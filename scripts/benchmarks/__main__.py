@@ -1,0 +1,121 @@
+"""Run benchmarks beside their peers and rewrite docs/benchmarks.md: ``scripts/benchmark``, or ``... blobs splatting``.
+
+A benchmark is a module of this folder with three functions: ``measure(effort)`` returns plain values,
+``tables(result)`` makes Markdown tables by the name of their markers in the page,
+``draw(result, path)`` writes one plot.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from subprocess import run
+from typing import Annotated, Any, Protocol
+
+import tyro
+
+from imgcal.errors import InputError
+from imgcal.formats import write_text
+from scripts.benchmarks.effort import Effort
+from scripts.output import ROOT, command, make_folder, read_json, replaced, surroundings, write_json
+
+# In the order of the page, with minutes that they take.
+BENCHMARKS = {
+    "recalibration": 8,
+    "blobs": 4,
+    "projection": 2,
+    "splatting": 2,
+    "identity": 4,
+    "end_to_end": 5,
+    "networks": 2,
+}
+PAGE = ROOT / "docs" / "benchmarks.md"
+RESULTS = ROOT / "docs" / "benchmarks"
+
+
+class Benchmark(Protocol):
+    """What a module of this folder offers."""
+
+    def measure(self, effort: Effort) -> dict[str, Any]: ...
+    def tables(self, result: Mapping[str, Any]) -> dict[str, str]: ...
+    def draw(self, result: Mapping[str, Any], path: Path) -> None: ...
+
+
+@dataclass(frozen=True)
+class Options:
+    """Measure imgcal beside its peers, on the same data in the same run."""
+
+    names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Benchmarks to run; all of them if none is named."""
+    smoke: bool = False
+    """Next to nothing of each, in two minutes: whether it runs, not how fast."""
+    out: Path | None = None
+    """Folder of the results, NAME.json and NAME.png; docs/benchmarks, or out/benchmarks of a smoke run."""
+
+    @property
+    def folder(self) -> Path:
+        """Where the results lie."""
+        return self.out or (ROOT / "out" / "benchmarks" if self.smoke else RESULTS)
+
+    @property
+    def page(self) -> Path:
+        """The page whose tables are rewritten from all results of the folder: beside it."""
+        return self.folder.with_suffix(".md")
+
+
+def main(arguments: list[str]) -> int:
+    """Run the named benchmarks, each in its own process, and rewrite the page.
+
+    Raises:
+        InputError: unknown name.
+    """
+    options = tyro.cli(Options, args=arguments, prog="scripts/benchmark", description=__doc__)
+    for name in options.names:
+        if name not in BENCHMARKS:
+            raise InputError(f"{name}: found no such benchmark, expected one of {', '.join(BENCHMARKS)}")
+    make_folder(options.folder)
+    failed = []
+    if len(options.names) == 1:  # in this process: the error's traceback is what one wants to see
+        _measure(options.names[0], options)
+    else:
+        for name in options.names or BENCHMARKS:
+            again = [name, "--out", str(options.folder), *["--smoke"] * options.smoke]
+            failed += [name] * bool(run([sys.executable, "-m", "scripts.benchmarks", *again], cwd=ROOT).returncode)
+    _rewrite(options)
+    for name in failed:
+        print(f"{name}: failed, its old result stays", file=sys.stderr)
+    return len(failed)
+
+
+def _measure(name: str, options: Options) -> None:
+    module, begin = _module(name), time.monotonic()
+    print(f"{name}: about {BENCHMARKS[name]} minutes" * (not options.smoke) or f"{name}: smoke", file=sys.stderr)
+    before = surroundings()
+    result = module.measure(Effort(smoke=options.smoke))
+    result = before | {"seconds": round(time.monotonic() - begin)} | result
+    write_json(options.folder / f"{name}.json", result)
+    module.draw(result, options.folder / f"{name}.png")
+    for title, table in module.tables(read_json(options.folder / f"{name}.json")).items():
+        print(f"\n{title}\n\n{table}", flush=True)
+
+
+def _rewrite(options: Options) -> None:
+    texts: dict[str, str] = {}
+    for name in BENCHMARKS:
+        path = options.folder / f"{name}.json"
+        if path.is_file():
+            texts |= _module(name).tables(read_json(path))
+    page = options.page if options.page.is_file() else PAGE
+    write_text(options.page, replaced(page.read_text("utf-8"), texts, page))
+
+
+def _module(name: str) -> Benchmark:
+    return import_module(f"scripts.benchmarks.{name}")
+
+
+if __name__ == "__main__":
+    command(lambda: sys.exit(main(sys.argv[1:])))

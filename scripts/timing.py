@@ -1,0 +1,72 @@
+"""Times cases side by side, so that a busy moment of the machine hits all of them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+SLICE = 0.05  # seconds that a case runs before the next one has its turn
+LEAST_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Wall time of one call, in milliseconds."""
+
+    p50: float
+    p99: float
+    best: float
+    calls: int
+
+    def values(self) -> dict[str, float]:
+        """Return plain values, for JSON."""
+        return asdict(self)
+
+
+def timing_of(seconds: list[float]) -> Timing:
+    """Summarize times of single calls in seconds."""
+    ms = 1e3 * np.sort(np.array(seconds))
+    return Timing(float(np.median(ms)), float(np.percentile(ms, 99)), float(ms[0]), len(ms))
+
+
+def side_by_side(
+    cases: Mapping[str, Callable[[], object]], seconds: float, prepare: Callable[[], object] | None = None
+) -> dict[str, Timing]:
+    """Run cases in turn, round after round, each about as long in every round.
+
+    Args:
+        cases: what to call, by name; every case is called once before anything is measured (caches, compilation).
+        seconds: about how long all of it takes; three rounds are run in any case, but one of a case so slow that its
+            first call took a quarter of the time.
+        prepare: called before every single call, its time does not count.
+
+    Returns:
+        The times by name, in the order of the cases.
+    """
+    first = {}
+    for name, run in cases.items():
+        begin = time.perf_counter()
+        _once(run, prepare)
+        first[name] = time.perf_counter() - begin
+    warm = {name: _once(run, prepare) if first[name] < seconds / 4 else first[name] for name, run in cases.items()}
+    times: dict[str, list[float]] = {name: [] for name in cases}
+    begin, rounds = time.perf_counter(), 0
+    while rounds < LEAST_ROUNDS or time.perf_counter() - begin < seconds:
+        for name, run in cases.items():
+            if rounds and warm[name] > seconds / 4:
+                continue
+            for _ in range(max(1, int(SLICE / max(warm[name], 1e-6)))):
+                times[name].append(_once(run, prepare))
+        rounds += 1
+    return {name: timing_of(taken) for name, taken in times.items()}
+
+
+def _once(run: Callable[[], object], prepare: Callable[[], object] | None) -> float:
+    if prepare is not None:
+        prepare()
+    begin = time.perf_counter()
+    run()
+    return time.perf_counter() - begin
