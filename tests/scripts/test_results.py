@@ -109,7 +109,7 @@ def test_page_without_markers_is_refused(tmp_path):
 
 
 def test_committed_page_has_all_markers():
-    table, pages = script("table"), script("pages")
+    table = script("table")
     filled = import_module("scripts.output").replaced(PAGE.read_text("utf-8"), table.sections([], {}), PAGE)
     assert "not trained yet" not in filled[filled.index("begin table 1 -->") : filled.index("end table 1 -->")]
 
