@@ -6,6 +6,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from renderers import adding, adding_compiled
+from renderers.adding import profile
 from renderers.compositing import Canvas, composite_windows, window_starts
 
 # A window of 5 standard deviations cuts the profile off at 4e-6 of its peak.
@@ -31,16 +33,16 @@ def splat(
     A pixel holds ``colour * intensity * integral of exp(-r^2 / (2 size^2))`` over its area: a wide splat peaks at its
     colour, a narrow one dims but keeps its mass ``2 pi size^2``, wherever in the pixel it lies. Differentiable in
     ``uv``, ``colours``, ``size`` and ``intensity``; a fiducial that is invisible, not finite or far outside the image
-    draws nothing and gets zero gradients.
+    draws nothing and gets zero gradients. Light below the rounding of a splat's peak may be left out.
 
     Where splats overlap, ``"add"`` sums their light, in any order (values may exceed 1 and are not clamped). ``"over"``
     composites front to back: a splat has the opacity ``intensity * profile``, clamped to [0, 1], and hides what lies
     deeper. Where nothing overlaps both give the same image; ``"over"`` costs several times more, cuts profiles off
     beyond 5 sizes, and needs memory for the images plus one window a fiducial.
 
-    On a CPU most of the time of a large fresh output goes into page faults. Either render into a reused ``out``, or
-    start Python with ``THP_MEM_ALLOC_ENABLE=1``, which lets PyTorch ask Linux for huge pages: measured four times
-    faster and two to four times faster; the second keeps gradients.
+    On a CPU ``"add"`` costs little more than clearing the images: a reused ``out`` that stays in the cache is fastest,
+    while fresh memory costs page faults for every image. ``"over"`` gains from ``THP_MEM_ALLOC_ENABLE=1``, with which
+    PyTorch asks Linux for huge pages; ``"add"`` asks for them itself.
 
     Args:
         uv: (*B, N, 2) pixels of the output image.
@@ -90,44 +92,20 @@ def splat(
         return composed if out is None else out.copy_(composed)
 
 
-def profile(centre: Tensor, size: Tensor, start: Tensor | int, length: int) -> Tensor:
-    """Integrate a Gaussian of peak 1 over each of ``length`` neighbouring pixels.
-
-    Args:
-        centre: (...) pixels.
-        size: (...) standard deviation in pixels.
-        start: First pixel, a number or (...).
-        length: Number of pixels.
-
-    Returns:
-        (..., length) integrals; they sum to ``sqrt(2 pi) size`` over an infinite line.
-
-    """
-    first_edge = start - 0.5 - centre
-    edges = first_edge[..., None] + torch.arange(length + 1, dtype=centre.dtype, device=centre.device)
-    cumulative = torch.erf(edges / (math.sqrt(2) * size[..., None]))
-    return (math.sqrt(math.pi / 2) * size[..., None]) * cumulative.diff(dim=-1)
-
-
 def _add(uv: Tensor, colours: Tensor, sizes: Tensor, shape: tuple[int, ...], out: Tensor | None) -> Tensor:
-    """Sum the splats: an outer product each, so one matrix product an image (uv (B, N, 2), colours (B, N, K))."""
-    height, width = shape[-2:]
-    along_u = profile(uv[..., 0], sizes, 0, width)  # (B, N, W)
-    along_v = profile(uv[..., 1], sizes, 0, height)  # (B, N, H)
-    left = (colours[..., None] * along_v[..., None, :]).flatten(2).mT  # (B, K*H, N)
+    """Sum the splats (uv (B, N, 2), colours (B, N, K)) in any order."""
+    added = adding_compiled.added if uv.device.type == "cpu" else adding.added
+    image_size = (shape[-2], shape[-1])
     if out is None:
-        return torch.bmm(left, along_u).view(shape)
-    flat = out.view(left.shape[0], left.shape[1], width)
+        return added(uv, sizes, colours, image_size).view(shape)
+    images = out.view(len(uv), *shape[-3:])
     if out.dtype == uv.dtype:
-        torch.bmm(left, along_u, out=flat)
+        added(uv, sizes, colours, image_size, images)
         return out
-    for target, some_left, some_u in zip(
-        flat.split(IMAGES_PER_CONVERSION),
-        left.split(IMAGES_PER_CONVERSION),
-        along_u.split(IMAGES_PER_CONVERSION),
-        strict=True,
-    ):
-        target.copy_(torch.bmm(some_left, some_u))
+    buffer = uv.new_empty(min(len(uv), IMAGES_PER_CONVERSION), *shape[-3:])
+    parts = (x.split(IMAGES_PER_CONVERSION) for x in (images, uv, sizes, colours))
+    for target, some_uv, some_sizes, some_colours in zip(*parts, strict=True):
+        target.copy_(added(some_uv, some_sizes, some_colours, image_size, buffer[: len(target)]))
     return out
 
 
