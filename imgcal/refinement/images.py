@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -11,12 +12,14 @@ from torch import Tensor
 from imgcal.errors import InputError
 from imgcal.estimation import Estimate, EstimationOptions, estimate
 from imgcal.estimation.estimate import make_problem
-from imgcal.networks.prediction import Prediction
+from imgcal.networks.prediction import Prediction, Views
 from imgcal.networks.rendering import LEVELS, ImageOptions
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Observations
+from imgcal.refinement.exchanged import colours_at, exchanged
 from imgcal.refinement.photometric import DotWindows, NearFit, ShiftPrior, blurred_step
 from imgcal.refinement.points import as_prediction
+from imgcal.refinement.robust import refine_robustly
 from imgcal.rig import CameraRig
 
 PRESENT = 0.5  # amplitude above which a dot counts as there
@@ -24,6 +27,12 @@ FARTHEST = 1e3  # image widths beyond which a predicted pixel is as good as any 
 # Floats of a chunk's largest temporary: what a processor's cache holds, and what a GPU has room for.
 CHUNK = {"cpu": 1_000_000, "cuda": 200_000_000}
 FLOATS_A_PAIR = 52  # of that temporary, for each channel of each pair of dots: 4 products a row of 13
+
+
+Attempt = Literal["relabel", "near", "far"]
+"""What to try for rigs that images do not confirm: dots in each other's colours; from near, as the rig mostly knows
+where dots are that its cameras have taken for each other; or from afar again.
+"""
 
 
 @dataclass(frozen=True)
@@ -36,9 +45,11 @@ class ImageRefinementOptions:
     trust: float = 0.1  # see `photometric.blurred_step`
     pooling: int = 4  # pixels, each way, that are averaged before blurred steps
     steps: int = 3  # near steps
-    rounds: int = 4  # at most, of steps and an estimate; all but the first only for rigs not yet confirmed
+    attempts: tuple[Attempt, ...] = ("relabel", "near", "far", "near", "relabel")  # while a rig is not confirmed
     noise: float = 12**-0.5  # grey levels, one standard deviation; that of rounding to 8 bit
     position_noise: float = 0.0  # sensor pixels: how far drawn dots are from where the fiducials were
+    near: float = 3.0  # pixels, median: how far the first guess may be off where colours are asked for
+    gate: float = 8.0  # sigma, beyond which a dot is not the fiducial that it was taken for
     most_residual: float = 2.0  # grey levels, RMS in a dot's window, beyond which the dot is not believed
     most_chi2: float = 5.0  # per degree of freedom, beyond which a rig has not converged
     estimation: EstimationOptions = EstimationOptions()
@@ -57,7 +68,7 @@ def refine_images(
 
     Each image is compared with rendered dots, blurred at first and sharp at last, every camera on its own, which gives
     the dots' places and how well they are known; the most probable rig follows from those. Rigs that the images do not
-    confirm are tried again from there.
+    confirm are tried again from there, and with dots taken for those whose places they have (`exchanged`).
 
     Args:
         prediction: (B,) first guess.
@@ -81,14 +92,22 @@ def refine_images(
     guess = Prediction(guess.rig.resized(problem.size), guess.rig_from_object)
     dots = problem.look(images, guess)
     result = problem.solve(dots, guess)
-    for attempt in range(1, options.rounds):
+    for attempt in options.attempts:
         again = (~result.converged).nonzero().squeeze(-1)
         if len(again) == 0:
             break
         found = as_prediction(result)
-        # From near first: the rig mostly knows where dots are that its cameras have taken for each other.
-        known = dots.select(again) if attempt % 2 else None
-        dots = dots.updated(again, problem.look(images[again], found[again], known))
+        if attempt == "relabel":
+            again = again[problem.near(guess[again], dots.select(again))]
+            if len(again) == 0:
+                continue
+            new = problem.relabel(images[again], guess[again], dots.select(again))
+            relabelled = problem.solve(new, found[again])
+            better = problem.explained(relabelled, new) > problem.explained(result, dots)[again]
+            again, new = again[better], new.select(better)
+        else:
+            new = problem.look(images[again], found[again], dots.select(again) if attempt == "near" else None)
+        dots = dots.updated(again, new)
         result = problem.solve(dots, found)
     return problem.on_sensor(result, dots)
 
@@ -101,6 +120,7 @@ class _Dots:
     sigma: Tensor  # (B, C, N)
     believed: Tensor  # (B, C, N) bool
     light: Tensor  # (B, C) of all channels, in dots of a channel of 1
+    colour: Tensor  # (B, C, N) the fiducial whose colour the dot has: another one's where labels are exchanged
 
     def select(self, rows: Tensor) -> _Dots:
         """Keep some rigs."""
@@ -135,11 +155,8 @@ class _ImageProblem:
 
     def look(self, images: Tensor, guess: Prediction, known: _Dots | None = None) -> _Dots:
         """Find the dots of images (B, C, 3, H, W) near where a prediction puts them, or near where they are known."""
-        options, size = self.options, self.options.image.size
-        flat, batch = images.flatten(0, 1), images.shape[:2]
-        radius = None if self.obj.radius is None else self.obj.radius.to(self.points)
-        uv = guess.rig.project(guess.rig_from_object.apply(self.points), radius).uv
-        uv = uv.nan_to_num(size / 2).clamp(-FARTHEST * size, FARTHEST * size)
+        options, flat, batch = self.options, images.flatten(0, 1), images.shape[:2]
+        uv = self._places(guess)
         if known is None:
             blurs, steps = options.blurs, options.steps
         else:
@@ -147,14 +164,78 @@ class _ImageProblem:
             uv = torch.where(known.believed[..., None], known.uv, uv)
         far, amplitude, light = (part.unflatten(0, batch) for part in self._far(flat, uv.flatten(0, 1), blurs))
         uv = far if known is None else uv  # of what is known, only whether it is there is asked again
-        present = amplitude > PRESENT
-        fit = self._near(flat, uv.flatten(0, 1), present.flatten(0, 1), steps)
-        uv, variance, mean_square = (part.unflatten(0, batch) for part in (fit.uv, fit.variance, fit.mean_square))
+        own = torch.arange(self.obj.fiducials, device=uv.device).expand(uv.shape[:-1])
+        return self._measure(images, uv, amplitude > PRESENT, own, light, steps)
+
+    def near(self, guess: Prediction, dots: _Dots) -> Tensor:
+        """Tell which guesses most dots are near to: (B,) bool."""
+        offset = torch.where(dots.believed, (self._places(guess) - dots.uv).norm(dim=-1), torch.nan)
+        return offset.flatten(1).nanmedian(-1).values < self.options.near
+
+    def explained(self, result: Estimate, dots: _Dots) -> Tensor:
+        """Count the dots that rigs explain, (B,): none where they contradict each other."""
+        return dots.believed.sum((1, 2)) * (result.chi2_per_dof < self.options.most_chi2)
+
+    def relabel(self, images: Tensor, guess: Prediction, dots: _Dots) -> _Dots:
+        """Find dots again that were drawn in each other's colours, by the rig that most dots agree on.
+
+        Args:
+            images: (B, C, 3, H, W).
+            guess: (B,) where to start.
+            dots: what was found; some may be at the place of another fiducial.
+        """
+        rig = self._agreed(guess, dots)
+        uv = self._places(rig)
+        offset = (uv - dots.uv).norm(dim=-1)
+        colour = colours_at(images.flatten(0, 1), uv.flatten(0, 1), self.options.image.dot)
+        fits = dots.believed & (offset < self.options.gate * dots.sigma)
+        taken = exchanged(colour.unflatten(0, uv.shape[:2]), self.colours, fits)
+        return self._measure(images, uv, taken >= 0, taken.clamp_min(0), dots.light, 2 * self.options.steps)
+
+    def _agreed(self, guess: Prediction, dots: _Dots) -> Prediction:
+        """Estimate rigs in spite of dots that are not what they seem."""
+        typical = float(dots.sigma[dots.believed].median()) if bool(dots.believed.any()) else 1.0
+        factor = torch.where(dots.believed, dots.sigma / typical, 1.0)
+        weighed = Prediction(guess.rig, guess.rig_from_object, factor.log())
+        views = Views(uv=dots.uv, seen=dots.believed)
+        return refine_robustly(weighed, views, self.rig, self.obj, self.image_spread, sigma=typical)
+
+    def _places(self, guess: Prediction) -> Tensor:
+        """Where a prediction puts the dots: (B, C, N, 2), finite."""
+        size = self.options.image.size
+        radius = None if self.obj.radius is None else self.obj.radius.to(self.points)
+        uv = guess.rig.project(guess.rig_from_object.apply(self.points), radius).uv
+        return uv.nan_to_num(size / 2).clamp(-FARTHEST * size, FARTHEST * size)
+
+    def _measure(self, images: Tensor, uv: Tensor, present: Tensor, colour: Tensor, light: Tensor, steps: int) -> _Dots:
+        """Fit dots of given colours near given places, and say which to believe.
+
+        Args:
+            images: (B, C, 3, H, W).
+            uv: (B, C, N, 2) where they are expected.
+            present: (B, C, N) bool: which are there.
+            colour: (B, C, N) the fiducial whose colour they have; those of the present ones differ.
+            light: (B, C), see `_Dots`.
+            steps: near steps.
+        """
+        options, size = self.options, self.options.image.size
+        batch = uv.shape[:2]
+        painted, there = uv.clone(), torch.zeros_like(present)  # in the order of the colours
+        place = present.nonzero(as_tuple=True)
+        paint = (*place[:2], colour[place])
+        painted[paint], there[paint] = uv[place], True
+        fit = self._near(images.flatten(0, 1), painted.flatten(0, 1), there.flatten(0, 1), steps)
+        uv, variance, mean_square = (
+            part.unflatten(0, batch).gather(
+                2, colour.view(*colour.shape, *[1] * (part.ndim - 2)).expand(*colour.shape, *part.shape[2:])
+            )
+            for part in (fit.uv, fit.variance, fit.mean_square)
+        )
         noise = mean_square.clamp_min((options.noise / LEVELS) ** 2)
         sigma = (variance * noise + (options.position_noise * self.unit) ** 2).sqrt()
         inside = ((uv > -0.5) & (uv < size - 0.5)).all(-1)
         explained = mean_square < (options.most_residual / LEVELS) ** 2
-        return _Dots(uv, sigma, present & inside & explained & sigma.isfinite(), light)
+        return _Dots(uv, sigma, present & inside & explained & sigma.isfinite(), light, colour)
 
     def _far(self, flat: Tensor, uv: Tensor, blurs: tuple[float, ...]) -> tuple[Tensor, Tensor, Tensor]:
         """Take blurred steps: places (M, N, 2), amplitudes (M, N) and the light of each image (M,)."""
@@ -190,7 +271,9 @@ class _ImageProblem:
             options=self.options.estimation,
         )
         brightness = self.colours.sum(-1)
-        stray = dots.light - (dots.believed * brightness).sum(-1)  # saturation and borders only make it smaller
+        stray = dots.light - (dots.believed * brightness[dots.colour]).sum(
+            -1
+        )  # saturation and borders only make it smaller
         explained = (stray < PRESENT * brightness.min()).all(-1) & (result.chi2_per_dof < self.options.most_chi2)
         return replace(result, converged=result.converged & explained)
 
@@ -219,7 +302,7 @@ def _pooled(images: Tensor, pool: int) -> Tensor:
     """Mean over squares of pixels: (M, K, H, W) -> (M, K, H / pool, W / pool), float32."""
     rows = images[:, :, ::pool].float()
     for row in range(1, pool):  # slices: several times faster than a sum over a short axis
-        rows = rows + images[:, :, row::pool]
+        rows = rows + images[:, :, row::pool].float()
     width = images.shape[-1]
     average = torch.eye(width // pool, device=images.device).repeat_interleave(pool, 0) / pool**2
     return rows @ average
