@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from imgcal.detection import Blobs, DetectionOptions, detect_snapshot
 from imgcal.detection.options import Frame
 from imgcal.errors import InputError, RefusedError
+from imgcal.identity.assignment import mutual_nearest, spacing
 from imgcal.labelling import Follower, Labelled, PipelineOptions, SnapshotIdentity
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections
@@ -154,17 +155,14 @@ def _nearest(blobs: Detections, predicted: NDArray[np.float64]) -> NDArray[np.in
     Near is a quarter of the distance between predictions: a pattern that has moved less keeps its labels.
     """
     labels = np.full(len(blobs), -1, dtype=np.int64)
-    between = np.linalg.norm(predicted[:, :, None] - predicted[:, None], axis=-1)  # (C, N, N)
-    between[:, np.arange(between.shape[1]), np.arange(between.shape[1])] = np.inf
-    gate = 0.25 * np.median(between.min(2))
-    for camera in range(len(predicted)):
-        rows = np.flatnonzero(blobs.camera == camera)
-        if len(rows):
-            distance = np.linalg.norm(blobs.uv[rows][:, None] - predicted[camera], axis=-1)  # (M, N)
-            nearest = distance.argmin(1)
-            mutual = distance.argmin(0)[nearest] == np.arange(len(rows))
-            good = mutual & (distance[np.arange(len(rows)), nearest] < gate)
-            labels[rows[good]] = nearest[good]
+    reach = 0.25 * spacing(predicted)
+    order = np.argsort(blobs.camera, kind="stable")
+    ends = np.searchsorted(blobs.camera[order], np.arange(len(predicted) + 1))
+    for places, begin, end in zip(predicted, ends[:-1], ends[1:], strict=True):
+        rows, found = order[begin:end], np.empty(len(places), dtype=np.int64)
+        mutual_nearest(places, blobs.uv[rows], reach, found)
+        named = np.flatnonzero(found >= 0)
+        labels[rows[found[named]]] = named
     return labels
 
 

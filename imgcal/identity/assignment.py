@@ -1,26 +1,58 @@
 """One-to-one pairing of fiducials with blobs."""
 
+# Compiled functions take their types from their arguments.
+# ruff: noqa: ANN001, ANN202
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 
-def mutual_nearest(cost: NDArray[np.floating], gate: float) -> NDArray[np.int64]:
-    """Pair those that are each other's cheapest.
+@njit(cache=True)
+def mutual_nearest(places, blobs, reach, labels) -> None:
+    """Pair places with blobs where each is the other's nearest.
 
     Args:
-        cost: (*B, N, M).
-        gate: pairs at this cost or above are not made.
-
-    Returns:
-        (*B, N) blob of each fiducial, -1 = none.
+        places: (N, 2) pixels.
+        blobs: (M, 2) pixels.
+        reach: pixels; pairs this far apart or farther are not made.
+        labels: (N,), filled with the blob of each place, -1 = none.
     """
-    best, back = cost.argmin(-1), cost.argmin(-2)
-    agreed = np.take_along_axis(back, best, -1) == np.arange(cost.shape[-2])
-    cheap = np.take_along_axis(cost, best[..., None], -1)[..., 0] < gate
-    return np.where(agreed & cheap, best, -1)
+    back, nearest = np.full(len(blobs), -1), np.full(len(blobs), np.inf)
+    for n in range(len(places)):
+        labels[n], least = -1, np.inf
+        for m in range(len(blobs)):
+            u, v = blobs[m, 0] - places[n, 0], blobs[m, 1] - places[n, 1]
+            squared = u * u + v * v
+            if squared < least:
+                labels[n], least = m, squared
+            if squared < nearest[m]:
+                back[m], nearest[m] = n, squared
+    for n in range(len(places)):
+        m = labels[n]
+        if m >= 0 and (back[m] != n or nearest[m] >= reach * reach):
+            labels[n] = -1
+
+
+def spacing(places: NDArray[np.float64]) -> float:
+    """Median distance (px) from a fiducial's image to the nearest other one in the same camera; places (C, N, 2)."""
+    return float(np.median(_gaps(np.ascontiguousarray(places))))
+
+
+@njit(cache=True)
+def _gaps(places):
+    gaps = np.full(places.shape[:2], np.inf)
+    for c in range(len(places)):
+        for i in range(places.shape[1]):
+            for j in range(i):
+                u, v = places[c, i, 0] - places[c, j, 0], places[c, i, 1] - places[c, j, 1]
+                squared = u * u + v * v
+                gaps[c, i], gaps[c, j] = min(gaps[c, i], squared), min(gaps[c, j], squared)
+    return np.sqrt(gaps)
 
 
 def assign(cost: NDArray[np.floating], gate: float) -> NDArray[np.int64]:
@@ -35,11 +67,9 @@ def assign(cost: NDArray[np.floating], gate: float) -> NDArray[np.int64]:
     """
     batch, (fiducials, blobs) = cost.shape[:-2], cost.shape[-2:]
     flat = cost.reshape(-1, fiducials, blobs)
-    labels = np.where(flat.min(-1) < gate, flat.argmin(-1), -1)
+    labels = np.full(flat.shape[:2], -1, dtype=np.int64)
     # Where all cheapest blobs differ, nothing is cheaper. Only the others need the full search.
-    ordered = np.sort(labels, axis=1)
-    contested = ((ordered[:, 1:] == ordered[:, :-1]) & (ordered[:, 1:] >= 0)).any(1)
-    for b in np.flatnonzero(contested):
+    for b in np.flatnonzero(_cheapest(flat, gate, labels)):
         possible = flat[b] < gate
         rows, columns = np.flatnonzero(possible.any(1)), np.flatnonzero(possible.any(0))
         part = np.minimum(flat[b][np.ix_(rows, columns)], gate)
@@ -48,3 +78,20 @@ def assign(cost: NDArray[np.floating], gate: float) -> NDArray[np.int64]:
         labels[b] = -1
         labels[b, rows[i[made]]] = columns[j[made]]
     return labels.reshape(*batch, fiducials)
+
+
+@njit(cache=True)
+def _cheapest(cost, gate, labels):
+    """Give each fiducial its cheapest blob, and tell where two would share one: (B,)."""
+    contested = np.zeros(len(cost), dtype=np.bool_)
+    for b in range(len(cost)):
+        taken = np.zeros(cost.shape[2], dtype=np.bool_)
+        for n in range(cost.shape[1]):
+            least = gate
+            for m in range(cost.shape[2]):
+                if cost[b, n, m] < least:
+                    least, labels[b, n] = cost[b, n, m], m
+            if labels[b, n] >= 0:
+                contested[b] |= taken[labels[b, n]]
+                taken[labels[b, n]] = True
+    return contested

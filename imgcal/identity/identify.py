@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from imgcal.identity.assignment import spacing
 from imgcal.identity.blobs import Spread, gather, spread_of
 from imgcal.identity.hypotheses import (
     FiducialTriples,
@@ -94,8 +95,8 @@ def track(
     distance = float(np.median(_distances(rig, poses, obj)))
     tolerance, gate = _bounds(scene, distance, pose_known=True)
     # Where the fiducials are dense, a wide tolerance pairs them with anything: also try a narrow one.
-    spacing = _spacing(predicted)
-    tolerances = [tolerance, max(3.0, 0.2 * spacing)] if tolerance > 0.4 * spacing else [tolerance]
+    gap = spacing(predicted[0])
+    tolerances = [tolerance, max(3.0, 0.2 * gap)] if tolerance > 0.4 * gap else [tolerance]
     attempts = [
         match(scene.blobs, predicted, vote(scene.blobs, predicted, reach, gate).shift, 1.25 * reach)
         for reach in tolerances
@@ -302,10 +303,3 @@ def _guess_distance(scene: Scene) -> float:
 def _distances(rig: CameraRig, poses: Poses, obj: CalibrationObject) -> NDArray[np.float64]:
     centre = poses.rotation[0] @ obj.points.mean(0).numpy() + poses.translation[0]
     return np.linalg.norm(rig.positions.numpy() - centre, axis=1)
-
-
-def _spacing(predicted: NDArray[np.float64]) -> float:
-    """Median distance (px) from a fiducial's image to the nearest other, predictions (1, C, N, 2)."""
-    gaps = np.linalg.norm(predicted[0, :, :, None] - predicted[0, :, None], axis=-1)
-    gaps[:, np.arange(gaps.shape[1]), np.arange(gaps.shape[1])] = np.inf
-    return float(np.median(gaps.min(-1)))

@@ -91,6 +91,34 @@ def innovations(
     return Innovations(squared, log_det, own, residual, freedom, uv, complexity)
 
 
+def contested(labels: NDArray[np.int64], found: Innovations, undecided: float) -> NDArray[np.bool_]:
+    """Mark labels (K, C, N) whose blob may as well belong to another fiducial, alone or in exchange for its blob.
+
+    Args:
+        labels: (K, C, N) blob of each fiducial, -1 = none: those of the fit.
+        found: from `innovations`.
+        undecided: how little the squared normalized innovations of two pairings may differ.
+    """
+    result = np.zeros(labels.shape, dtype=bool)
+    _contest(labels, found.squared, found.log_det, found.own, undecided, result)
+    return result
+
+
+@njit(cache=True)
+def _contest(labels, squared, log_det, own, undecided, result):
+    for k in range(len(labels)):
+        for c in range(labels.shape[1]):
+            mine = labels[k, c]
+            for i in np.flatnonzero(mine >= 0):
+                for j in range(len(mine)):
+                    change = squared[k, c, j, mine[i]] + log_det[k, c, j] - own[k, c, i] - log_det[k, c, i]
+                    if mine[j] >= 0:  # in exchange
+                        change += squared[k, c, i, mine[j]] + log_det[k, c, i] - own[k, c, j] - log_det[k, c, j]
+                    if i != j and change < undecided:
+                        result[k, c, i] = True
+                        break
+
+
 @njit(cache=True, fastmath=FAST)
 def _factorize(blocks, coupling, kept):
     """Factorize the arrow in place; return the logarithm of its determinant, inf where it is not positive definite."""

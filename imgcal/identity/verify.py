@@ -18,7 +18,7 @@ from imgcal.estimation.linearize import Problem, State, pose_at
 from imgcal.identity.assignment import assign
 from imgcal.identity.blobs import Blobs
 from imgcal.identity.hypotheses import Poses
-from imgcal.identity.innovation import THRESHOLD, Innovations, innovations
+from imgcal.identity.innovation import THRESHOLD, Innovations, contested, innovations
 from imgcal.objects import CalibrationObject
 from imgcal.rig import CameraRig
 from imgcal.transforms import RigidTransform
@@ -145,7 +145,7 @@ def certain(scene: Scene, fits: Fits, odds: float, least_odds: float) -> Fits:
     for _ in range(4):
         found = _found(fits)
         log_odds = _log_density(found) + surroundings
-        good = (found.own < GATE) & (log_odds > demanded) & ~_contested(fits.labels, found)
+        good = (found.own < GATE) & (log_odds > demanded) & ~contested(fits.labels, found, UNDECIDED)
         good &= (good.sum(-1) >= enough)[..., None]
         if np.array_equal(good, fits.labels >= 0):
             break
@@ -264,15 +264,3 @@ def _detection_odds(scene: Scene, fits: Fits) -> NDArray[np.float64]:
 def _log_density(found: Innovations) -> NDArray[np.float64]:
     """Log density (per px^2) of each label's blob where it is (K, C, N); -inf = no label."""
     return -np.log(2 * np.pi) - 0.5 * found.log_det - 0.5 * found.own
-
-
-def _contested(labels: NDArray[np.int64], found: Innovations) -> NDArray[np.bool_]:
-    """Mark labels (K, C, N) whose blob may as well belong to another fiducial, alone or in exchange for its blob."""
-    labelled = labels >= 0
-    cost = found.squared + found.log_det[..., None]
-    # of_other[i, j]: cost of giving the blob of fiducial i to fiducial j.
-    of_other = np.take_along_axis(cost, np.maximum(labels, 0)[:, :, None, :], -1).swapaxes(-1, -2)
-    alone = of_other - np.where(np.isfinite(found.own), found.own + found.log_det, 0)[..., None]
-    change = np.where(labelled[:, :, None, :], alone + alone.swapaxes(-1, -2), alone)
-    other = ~np.eye(labels.shape[-1], dtype=bool) & labelled[..., None]
-    return (other & (change < UNDECIDED)).any(-1)

@@ -117,13 +117,35 @@ def match(
     Returns:
         (K, C, N) blob of each fiducial, -1 = none.
     """
-    gaps = blobs.ideal[None, :, None] - predicted[:, :, :, None]  # (K, C, N, M, 2)
-    for reach in (1.5, 1.2):
-        residual = gaps - shift[:, :, None, None]
-        squared = (residual * residual).sum(-1)
-        nearest = squared.argmin(-1)[..., None]
-        weight = np.maximum(0, 1 - np.take_along_axis(squared, nearest, -1) / (reach * tolerance) ** 2)
-        step = np.take_along_axis(residual, nearest[..., None], -2)[..., 0, :]
-        shift = shift + (weight * step).sum(2) / np.maximum(weight.sum(2), 1e-6)
-    residual = gaps - shift[:, :, None, None]
-    return mutual_nearest((residual * residual).sum(-1), tolerance**2)
+    labels = np.empty(predicted.shape[:3], dtype=np.int64)
+    _match(predicted, blobs.ideal, blobs.count, np.asarray(shift, dtype=np.float64), tolerance, labels)
+    return labels
+
+
+@njit(cache=True)
+def _match(predicted, ideal, number, shifts, tolerance, labels):
+    for k in range(len(predicted)):
+        for c in range(len(number)):
+            blobs, places, shift = ideal[c, : number[c]], predicted[k, c].copy(), shifts[k, c].copy()
+            for reach in (1.5, 1.2):
+                shift += _mean_residual(predicted[k, c], blobs, shift, (reach * tolerance) ** 2)
+            places += shift
+            mutual_nearest(places, blobs, tolerance, labels[k, c])
+
+
+@njit(cache=True)
+def _mean_residual(places, blobs, shift, reach_squared):
+    """Mean distance to the nearest blobs, the nearer the more it counts: (2,)."""
+    total, step = 0.0, np.zeros(2)
+    for n in range(len(places)):
+        least, nearest_u, nearest_v = reach_squared, 0.0, 0.0
+        for m in range(len(blobs)):
+            u, v = blobs[m, 0] - places[n, 0] - shift[0], blobs[m, 1] - places[n, 1] - shift[1]
+            squared = u * u + v * v
+            if squared < least:
+                least, nearest_u, nearest_v = squared, u, v
+        weight = 1 - least / reach_squared
+        total += weight
+        step[0] += weight * nearest_u
+        step[1] += weight * nearest_v
+    return step / max(total, 1e-6)
