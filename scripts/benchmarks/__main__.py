@@ -21,7 +21,7 @@ import tyro
 from imgcal.errors import InputError
 from imgcal.formats import write_text
 from scripts.benchmarks.effort import Effort
-from scripts.output import ROOT, command, make_folder, read_json, replaced, surroundings, write_json
+from scripts.output import ROOT, command, make_folder, markdown, read_json, replaced, surroundings, write_json
 
 # In the order of the page, with minutes that they take.
 BENCHMARKS = {
@@ -104,11 +104,15 @@ def _measure(name: str, options: Options) -> None:
 
 
 def _rewrite(options: Options) -> None:
-    texts: dict[str, str] = {}
-    for name in BENCHMARKS:
-        path = options.folder / f"{name}.json"
-        if path.is_file():
-            texts |= _module(name).tables(read_json(path))
+    found = {name: path for name in BENCHMARKS if (path := options.folder / f"{name}.json").is_file()}
+    results = {name: read_json(path) for name, path in found.items()}
+    rows = [
+        (name, *(str(result[key]) for key in ("machine", "load_average", "seconds")))
+        for name, result in results.items()
+    ]
+    texts = {"machine": markdown(("benchmark", "machine", "load average before", "seconds"), rows)}
+    for name, result in results.items():
+        texts |= _module(name).tables(result)
     page = options.page if options.page.is_file() else PAGE
     write_text(options.page, replaced(page.read_text("utf-8"), texts, page))
 
