@@ -22,7 +22,7 @@ from imgcal.observations import Observations
 from imgcal.projection import resized_pixels
 from imgcal.resources import data_path, shipped_names
 from imgcal.rig import CameraRig
-from imgcal.training.checkpoint import check_object, check_rig, load_checkpoint
+from imgcal.training.checkpoint import check_object, check_rig, load_checkpoint, read_subject
 from imgcal.transforms import RigidTransform
 
 KINDS = ("points", "vit", "cnn")
@@ -41,11 +41,12 @@ class FirstGuess:
 
 @dataclass(frozen=True)
 class Guesser:
-    """A trained network, ready for a rig whose images may have another size than those it was trained for."""
+    """A trained network, ready for a rig of some of its cameras and images of another size than in training."""
 
     name: str
     network: nn.Module
     trained: CameraRig  # factory rig of the training
+    cameras: tuple[int, ...] | None = None  # those that there are, in the order of the rig; None = all
 
     @torch.no_grad()
     def guess(self, observations: Observations, rig: CameraRig, obj: CalibrationObject) -> FirstGuess:
@@ -59,24 +60,38 @@ class Guesser:
             rig: the factory rig.
             obj: the object.
         """
-        scale = self.trained.image_size.to(observations.uv) / rig.image_size
-        uv = resized_pixels(observations.uv, scale[:, None]).float()
-        turns = [self._turned(uv, observations, rig, obj, motion) for motion in obj.symmetries]
+        shown = self._shown(observations, rig)
+        turns = [self._turned(shown, rig, obj, motion) for motion in obj.symmetries]
         residuals = torch.stack([residual_of(turn, observations, obj) for turn in turns])  # (turns, S, C, N, 2)
-        best = residuals.square().sum((2, 3, 4)).nan_to_num(torch.inf).argmin(0), torch.arange(len(uv))
+        best = residuals.square().sum((2, 3, 4)).nan_to_num(torch.inf).argmin(0), torch.arange(len(observations.uv))
         guess = Prediction.joined(turns, lambda tensors: torch.stack(tensors)[best])
         mean = rig.moved(guess.rig.difference(rig).mean(0))
         return FirstGuess(self.name, mean, guess.rig_from_object, residuals[best])
 
-    def _turned(
-        self, uv: Tensor, observations: Observations, rig: CameraRig, obj: CalibrationObject, motion: SelfMotion
-    ) -> Prediction:
+    def _shown(self, observations: Observations, rig: CameraRig) -> Views:
+        """What all cameras of the training see: those that are not there see nothing."""
+        cameras = self._present
+        scale = self.trained.image_size[cameras].to(observations.uv) / rig.image_size
+        snapshots, _, fiducials = observations.seen.shape
+        uv = torch.zeros(snapshots, self.trained.cameras, fiducials, 2)
+        uv[:, cameras] = resized_pixels(observations.uv, scale[:, None]).float()
+        seen = torch.zeros(uv.shape[:-1], dtype=torch.bool)
+        seen[:, cameras] = observations.seen
+        return Views(uv=uv, seen=seen)
+
+    @property
+    def _present(self) -> list[int]:
+        return list(range(self.trained.cameras) if self.cameras is None else self.cameras)
+
+    def _turned(self, shown: Views, rig: CameraRig, obj: CalibrationObject, motion: SelfMotion) -> Prediction:
         """What the network says of an object turned by a symmetry, turned back: (S,), in the pixels of `rig`."""
+        assert shown.uv is not None and shown.seen is not None
         source = torch.from_numpy(np.argsort(motion.permutation))  # fiducial whose image each label gets
-        views = zip(uv[:, :, source].split(CHUNK), observations.seen[:, :, source].split(CHUNK), strict=True)
+        views = zip(shown.uv[:, :, source].split(CHUNK), shown.seen[:, :, source].split(CHUNK), strict=True)
         said = Prediction.joined([self._predict(*chunk, obj) for chunk in views], torch.cat).to(rig.focal_length.dtype)
         turn = RigidTransform(torch.from_numpy(motion.rotation), torch.from_numpy(motion.translation))
-        return Prediction(said.rig.resized(rig.image_size), said.rig_from_object @ turn.to(rig.focal_length.dtype))
+        there = said.rig.select(self._present).resized(rig.image_size)
+        return Prediction(there, said.rig_from_object @ turn.to(rig.focal_length.dtype))
 
     def _predict(self, uv: Tensor, seen: Tensor, obj: CalibrationObject) -> Prediction:
         options = cast(ImageOptions | None, self.network.image_options)
@@ -100,7 +115,7 @@ def load_guesser(name: str, rig: CameraRig, obj: CalibrationObject) -> Guesser:
 
     Args:
         name: one of `KINDS`, for the shipped networks, or a file that `imgcal train` wrote.
-        rig: the factory rig; its images may be smaller or larger than those of the training.
+        rig: the factory rig: all cameras of the training or some of them; its images may be smaller or larger.
         obj: the object; the radius of its fiducials does not matter to a first guess.
 
     Raises:
@@ -128,9 +143,9 @@ def load_guesser(name: str, rig: CameraRig, obj: CalibrationObject) -> Guesser:
 
 
 def _load(path: Path, rig: CameraRig, obj: CalibrationObject) -> Guesser:
-    checkpoint = load_checkpoint(path)
-    if rig.cameras == checkpoint.rig.cameras:
-        rig = rig.resized(checkpoint.rig.image_size)
-    check_rig(path, checkpoint.rig, rig)
-    check_object(path, replace(checkpoint.obj, radius=None), replace(obj, radius=None))
-    return Guesser(path.stem, checkpoint.network, checkpoint.rig)
+    trained, trained_obj = read_subject(path)
+    cameras = tuple(trained.camera_names.index(name) for name in rig.camera_names if name in trained.camera_names)
+    there = trained.select(cameras) if len(cameras) == rig.cameras else trained
+    check_rig(path, there, rig.resized(there.image_size) if rig.cameras == there.cameras else rig)
+    check_object(path, replace(trained_obj, radius=None), replace(obj, radius=None))
+    return Guesser(path.stem, load_checkpoint(path).network, trained, cameras)

@@ -10,6 +10,8 @@ from pathlib import Path
 from imgcal.errors import InputError
 from imgcal.resources import data_path, shipped_names
 
+MOST_NAMES = 8  # that a message lists
+
 
 def natural_key(name: str) -> tuple[list[str | int], str]:
     """Sort key that counts: "2" before "10"; equal numbers ("1", "01") stay apart."""
@@ -47,6 +49,8 @@ def find_file(path: str | Path, kind: str, suffix: str) -> Path:
         return data_path(kind, str(path) + suffix)
     if path.exists():
         raise InputError(f"{path}: found a folder, expected a file")
+    some = difflib.get_close_matches(path.stem, shipped, n=MOST_NAMES, cutoff=0.3) or shipped[:MOST_NAMES]
+    names = shipped if len(shipped) <= MOST_NAMES else [*some, f"... {len(shipped)} in all"]
     raise InputError(
-        f"{path}: no such file, nor one of the shipped {kind} ({', '.join(shipped)}){nearest(path.stem, shipped)}"
+        f"{path}: no such file, nor one of the shipped {kind} ({', '.join(names)}){nearest(path.stem, shipped)}"
     )

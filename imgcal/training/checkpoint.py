@@ -136,6 +136,15 @@ def load_checkpoint(path: str | Path, rig: CameraRig | None = None, obj: Calibra
     return Checkpoint(network.eval(), trained_rig, trained_obj, experiment, metrics)
 
 
+def read_subject(path: str | Path) -> tuple[CameraRig, CalibrationObject]:
+    """Read the rig and the object that a network was trained for, and not the network.
+
+    Raises:
+        InputError: not such a file, damaged, another version, or a pickle.
+    """
+    return _from_texts(path, read_texts(path, FORMAT))
+
+
 def warm_start(path: str | Path, network: nn.Module) -> tuple[str, ...]:
     """Take over the parameters of a checkpoint that fit by name and shape, whatever rig or drift it was trained for.
 
