@@ -15,7 +15,7 @@ uv = truth.uv.clone().requires_grad_()
 seen = torch.ones(uv.shape[:-1], dtype=torch.bool)
 result = imgcal.estimate(Observations(uv, torch.full(uv.shape[:-1], 0.05, dtype=uv.dtype), seen), factory, obj)
 
-result.rig.focal_length[0, 0].backward()  # fx of the first camera
+(gradient,) = torch.autograd.grad(result.rig.focal_length[0, 0], uv)  # of fx of the first camera
 print("d fx / d u of each fiducial in the first snapshot of the first camera:")
-print(uv.grad[0, 0, :, 0])
-print("largest influence through another camera:", f"{uv.grad[0, 1:].abs().max():.3f}")
+print(gradient[0, 0, :, 0])
+print("largest influence through another camera:", f"{gradient[0, 1:].abs().max():.3f}")

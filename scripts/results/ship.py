@@ -5,11 +5,13 @@ Usage: python -m scripts.results.ship out/runs/shipped-points-asymmetric8 out/ru
 
 from __future__ import annotations
 
-import argparse
+import sys
+from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import Annotated, cast
 
 import torch
+import tyro
 
 from imgcal.evaluation import reprojection_error
 from imgcal.networks import Views
@@ -17,22 +19,31 @@ from imgcal.networks.rendering import ImageOptions, render_views
 from imgcal.synthesis import synthesize
 from imgcal.training.checkpoint import Checkpoint, load_checkpoint, save_network
 from imgcal.training.experiment import Experiment, changed
+from scripts.output import command, make_folder
 
 MODELS = Path("data/models")
 RIGS = 64  # on which both precisions are compared
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("runs", nargs="+", type=Path, help="folders of `imgcal train` whose experiments are shipped-*")
-    parser.add_argument("--out", type=Path, default=MODELS)
-    arguments = parser.parse_args()
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    for run in arguments.runs:
+@dataclass(frozen=True)
+class Options:
+    """Put trained networks where the package ships them."""
+
+    runs: Annotated[
+        tuple[Path, ...], tyro.conf.Positional
+    ]  #: folders of `imgcal train` whose experiments are shipped-*
+    out: Path = MODELS  #: folder of the shipped networks
+
+
+def main(arguments: list[str]) -> None:
+    """Write each network with bf16 weights, and print what that costs."""
+    options = tyro.cli(Options, args=arguments, description=__doc__)
+    make_folder(options.out)
+    for run in options.runs:
         trained = load_checkpoint(run / "model.safetensors")
         experiment = portable(trained.experiment)
         kind = experiment.name.split("-")[1]
-        path = arguments.out / f"{kind}-{experiment.rig}-{experiment.object}.safetensors"
+        path = options.out / f"{kind}-{experiment.rig}-{experiment.object}.safetensors"
         save_network(path, trained.network, experiment, trained.metrics, torch.bfloat16, rig=trained.rig)
         before, after = error(trained), error(load_checkpoint(path))
         print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, RE {before:.3f} px, in bf16 {after:.3f} px")
@@ -67,4 +78,4 @@ def error(checkpoint: Checkpoint) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    command(lambda: main(sys.argv[1:]))
