@@ -13,6 +13,7 @@ from typing import Annotated, cast
 import torch
 import tyro
 
+from imgcal.errors import InputError
 from imgcal.evaluation import reprojection_error
 from imgcal.networks import Views
 from imgcal.networks.rendering import ImageOptions, render_views
@@ -29,15 +30,15 @@ RIGS = 64  # on which both precisions are compared
 class Options:
     """Put trained networks where the package ships them."""
 
-    runs: Annotated[
-        tuple[Path, ...], tyro.conf.Positional
-    ]  #: folders of `imgcal train` whose experiments are shipped-*
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]  #: folders of training runs of shipped-*
     out: Path = MODELS  #: folder of the shipped networks
 
 
 def main(arguments: list[str]) -> None:
     """Write each network with bf16 weights, and print what that costs."""
     options = tyro.cli(Options, args=arguments, description=__doc__)
+    if not options.runs:
+        raise InputError("found no folder of a training run, expected at least one")
     make_folder(options.out)
     for run in options.runs:
         trained = load_checkpoint(run / "model.safetensors")
