@@ -1,9 +1,34 @@
 """Add Gaussian splats to images with tensors: an outer product each, so one matrix product an image."""
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
+
+
+class Splats(NamedTuple):
+    """What is drawn: all of one floating-point type, at least float32."""
+
+    uv: Tensor  # (B, N, 2) pixels
+    sizes: Tensor  # (B, N) standard deviations in pixels
+    weight: Tensor  # (B, N) intensities
+    colours: Tensor  # (B, N, K)
+    visible: Tensor  # (B, N) bool; the others may hold anything
+
+    def drawn(self) -> "Splats":
+        """Replace what is invisible or not finite by numbers that draw nothing.
+
+        Replaced, not multiplied by zero: a NaN times zero is still a NaN, in the image and in the gradient.
+        """
+        drawn = self.uv.isfinite().all(-1) & self.visible
+        return Splats(
+            torch.where(drawn[..., None], self.uv, 0.0),
+            torch.where(drawn, self.sizes, 1.0),
+            torch.where(drawn, self.weight, 0.0),
+            torch.where(drawn[..., None], self.colours, 0.0),
+            drawn,
+        )
 
 
 def profile(centre: Tensor, size: Tensor, start: Tensor | int, length: int) -> Tensor:
@@ -25,13 +50,11 @@ def profile(centre: Tensor, size: Tensor, start: Tensor | int, length: int) -> T
     return (math.sqrt(math.pi / 2) * size[..., None]) * cumulative.diff(dim=-1)
 
 
-def added(uv: Tensor, sizes: Tensor, colours: Tensor, image_size: tuple[int, int], out: Tensor | None = None) -> Tensor:
+def added(splats: Splats, image_size: tuple[int, int], out: Tensor | None = None) -> Tensor:
     """Draw splats into images.
 
     Args:
-        uv: (B, N, 2) pixels.
-        sizes: (B, N) standard deviations in pixels.
-        colours: (B, N, K).
+        splats: What is drawn.
         image_size: Height and width.
         out: (B, K, H, W) contiguous images of the same dtype, overwritten; not differentiable.
 
@@ -39,10 +62,11 @@ def added(uv: Tensor, sizes: Tensor, colours: Tensor, image_size: tuple[int, int
         (B, K, H, W) images on black.
 
     """
+    uv, sizes, weight, colours, _ = splats.drawn()
     height, width = image_size
     along_u = profile(uv[..., 0], sizes, 0, width)  # (B, N, W)
     along_v = profile(uv[..., 1], sizes, 0, height)  # (B, N, H)
-    left = (colours[..., None] * along_v[..., None, :]).flatten(2).mT  # (B, K*H, N)
+    left = ((colours * weight[..., None])[..., None] * along_v[..., None, :]).flatten(2).mT  # (B, K*H, N)
     if out is None:
         return torch.bmm(left, along_u).unflatten(1, (-1, height))
     torch.bmm(left, along_u, out=out.flatten(1, 2))

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from renderers import adding, adding_compiled
-from renderers.adding import profile
+from renderers.adding import Splats, profile
 from renderers.compositing import Canvas, composite_windows, window_starts
 
 # A window of 5 standard deviations cuts the profile off at 4e-6 of its peak.
@@ -73,46 +73,44 @@ def splat(
     dtype = torch.promote_types(uv.dtype, torch.float32)
     # Autocast would round the profiles to bfloat16, and the gradient of a coordinate with them.
     with torch.autocast(uv.device.type, enabled=False):
-        drawn = uv.isfinite().all(-1)
-        if visible is not None:
-            drawn = drawn & visible.expand(*batch, count)
         sizes = torch.as_tensor(size, dtype=dtype, device=uv.device).expand(*batch, count)
-        weight = torch.ones_like(sizes) if intensity is None else intensity.to(dtype).expand(*batch, count)
-        # Replaced, not multiplied by zero: a NaN times zero is still a NaN, in the image and in the gradient.
-        uv = torch.where(drawn[..., None], uv.to(dtype), 0.0).reshape(images, count, 2)
-        sizes = torch.where(drawn, sizes, 1.0).reshape(images, count)
-        weight = torch.where(drawn, weight, 0.0).reshape(images, count)
-        colours = torch.where(drawn[..., None], colours.to(dtype), 0.0).reshape(images, count, colours.shape[-1])
+        ones = torch.ones((), dtype=dtype, device=uv.device)
+        splats = Splats(
+            uv.to(dtype).reshape(images, count, 2),
+            sizes.reshape(images, count),
+            (ones if intensity is None else intensity.to(dtype)).expand(*batch, count).reshape(images, count),
+            colours.to(dtype).expand(*batch, *colours.shape[-2:]).reshape(images, count, colours.shape[-1]),
+            (ones > 0 if visible is None else visible).expand(*batch, count).reshape(images, count),
+        )
         shape = (*batch, colours.shape[-1], *image_size)
         if out is not None:
-            _check_out(out, shape, uv.device, (uv, colours, sizes, weight))
+            _check_out(out, shape, uv.device, splats)
         if compositing == "add":
-            return _add(uv, colours * weight[..., None], sizes, shape, out)
-        composed = _over(uv, colours, sizes, weight, image_size, depth).reshape(shape)
+            return _add(splats, shape, out)
+        composed = _over(splats.drawn(), image_size, depth).reshape(shape)
         return composed if out is None else out.copy_(composed)
 
 
-def _add(uv: Tensor, colours: Tensor, sizes: Tensor, shape: tuple[int, ...], out: Tensor | None) -> Tensor:
-    """Sum the splats (uv (B, N, 2), colours (B, N, K)) in any order."""
-    added = adding_compiled.added if uv.device.type == "cpu" else adding.added
+def _add(splats: Splats, shape: tuple[int, ...], out: Tensor | None) -> Tensor:
+    """Sum the splats in any order."""
+    added = adding_compiled.added if splats.uv.device.type == "cpu" else adding.added
     image_size = (shape[-2], shape[-1])
     if out is None:
-        return added(uv, sizes, colours, image_size).view(shape)
-    images = out.view(len(uv), *shape[-3:])
-    if out.dtype == uv.dtype:
-        added(uv, sizes, colours, image_size, images)
+        return added(splats, image_size).view(shape)
+    images, count = out.view(len(splats.uv), *shape[-3:]), len(splats.uv)
+    if out.dtype == splats.uv.dtype:
+        added(splats, image_size, images)
         return out
-    buffer = uv.new_empty(min(len(uv), IMAGES_PER_CONVERSION), *shape[-3:])
-    parts = (x.split(IMAGES_PER_CONVERSION) for x in (images, uv, sizes, colours))
-    for target, some_uv, some_sizes, some_colours in zip(*parts, strict=True):
-        target.copy_(added(some_uv, some_sizes, some_colours, image_size, buffer[: len(target)]))
+    buffer = splats.uv.new_empty(min(count, IMAGES_PER_CONVERSION), *shape[-3:])
+    for first in range(0, count, IMAGES_PER_CONVERSION):
+        part = slice(first, min(first + IMAGES_PER_CONVERSION, count))
+        images[part] = added(Splats(*(x[part] for x in splats)), image_size, buffer[: part.stop - first])
     return out
 
 
-def _over(
-    uv: Tensor, colours: Tensor, sizes: Tensor, weight: Tensor, image_size: tuple[int, int], depth: Tensor | None
-) -> Tensor:
-    """Composite the splats front to back on local windows (uv (B, N, 2), colours (B, N, K)) -> (B, K, H, W)."""
+def _over(splats: Splats, image_size: tuple[int, int], depth: Tensor | None) -> Tensor:
+    """Composite the splats front to back on local windows: (B, K, H, W)."""
+    uv, sizes, weight, colours, _ = splats
     if depth is not None:
         order = depth.reshape(sizes.shape).argsort(dim=-1, stable=True)
         uv, colours = (x.gather(1, order[..., None].expand_as(x)) for x in (uv, colours))
