@@ -1,7 +1,7 @@
 """One-to-one pairing of fiducials with blobs."""
 
 # Compiled functions take their types from their arguments.
-# ruff: noqa: ANN001, ANN202
+# ruff: noqa: ANN001, ANN201, ANN202
 # mypy: allow-untyped-defs
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from scipy.optimize import linear_sum_assignment
 
 
 @njit(cache=True)
-def mutual_nearest(places, blobs, reach, labels) -> None:
+def mutual_nearest(places, blobs, reach, labels):
     """Pair places with blobs where each is the other's nearest.
 
     Args:

@@ -12,6 +12,7 @@ from itertools import permutations
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from imgcal.identity.blobs import Blobs
 from imgcal.identity.p3p import FAST, three_point_pose
@@ -56,13 +57,14 @@ class Poses:
 
 
 def fiducial_triples(obj: CalibrationObject, generator: np.random.Generator) -> FiducialTriples:
-    """List the triples to try: all of them, or a random choice where there are too many."""
+    """List the triples to try: all of them; of many fiducials those of the outer ones, or a random choice of these."""
     points = obj.points.double().cpu().numpy()
     count = len(points)
-    if count * (count - 1) * (count - 2) <= MOST_FIDUCIAL_TRIPLES:
-        triples = np.array(list(permutations(range(count), 3)))
+    outer = ConvexHull(points).vertices if many(obj) and not obj.planar else np.arange(count)
+    if _orders(len(outer)) <= MOST_FIDUCIAL_TRIPLES:
+        triples = outer[list(permutations(range(len(outer)), 3))]
     else:
-        triples = generator.integers(0, count, (MOST_FIDUCIAL_TRIPLES, 3))
+        triples = outer[generator.integers(0, len(outer), (MOST_FIDUCIAL_TRIPLES, 3))]
         triples = triples[(triples != np.roll(triples, 1, axis=1)).all(1)]
     if len(obj.symmetries) > 1:
         permuted = np.stack([motion.permutation[triples] for motion in obj.symmetries])  # (G, T, 3)
@@ -78,13 +80,38 @@ def fiducial_triples(obj: CalibrationObject, generator: np.random.Generator) -> 
     return FiducialTriples(triples, sides, frames, points, generator.permutation(count))
 
 
-def blob_triples(blobs: Blobs, camera: int, count: int, generator: np.random.Generator) -> NDArray[np.int64]:
-    """Draw triples of blobs (count, 3) that are likely to be fiducials: close to other blobs, and not too narrow."""
+def many(obj: CalibrationObject) -> bool:
+    """Tell whether the object has more triples than can be tried.
+
+    Then only outer blobs are compared with outer fiducials: what is outermost in an image is so in space.
+    """
+    return _orders(obj.fiducials) > MOST_FIDUCIAL_TRIPLES
+
+
+def _orders(count: int) -> int:
+    """Number of ordered triples."""
+    return count * (count - 1) * (count - 2)
+
+
+def blob_triples(
+    blobs: Blobs, camera: int, count: int, outer: bool, generator: np.random.Generator
+) -> NDArray[np.int64]:
+    """Draw triples of blobs (count, 3) that are likely to be fiducials: close to other blobs, and not too narrow.
+
+    Args:
+        blobs: the snapshot.
+        camera: index of the camera.
+        count: number of triples.
+        outer: take the outermost blobs only, see `many`.
+        generator: source of randomness.
+    """
     uv = blobs.ideal[camera, : blobs.count[camera]].astype(np.float64)
     gaps = np.sort(np.hypot(*(uv[:, None] - uv[None]).transpose(2, 0, 1)), axis=1)[:, min(3, len(uv) - 1)]
-    dense = np.flatnonzero(gaps <= 2 * np.sort(gaps)[len(uv) // 4])
+    dense = np.flatnonzero(gaps <= (4 if outer else 2) * np.sort(gaps)[len(uv) // 4])  # sparser at the rim
     if len(dense) < 4:
         dense = np.argsort(gaps)[:4]
+    if outer:
+        dense = dense[ConvexHull(uv[dense], qhull_options="QJ").vertices]
     drawn = dense[generator.random((DRAWS * count, len(dense))).argpartition(2, axis=1)[:, :3]]
     a, b = uv[drawn[:, 1]] - uv[drawn[:, 0]], uv[drawn[:, 2]] - uv[drawn[:, 0]]
     area = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).reshape(DRAWS, count)

@@ -16,6 +16,7 @@ from imgcal.identity.hypotheses import (
     Poses,
     blob_triples,
     fiducial_triples,
+    many,
     single_camera_poses,
 )
 from imgcal.identity.planar import planar_poses
@@ -41,7 +42,8 @@ from imgcal.rig import CameraRig
 from imgcal.transforms import RigidTransform
 
 TRIPLES = 10  # of blobs in a round, over all cameras
-MOST_HYPOTHESES = 400_000  # in a round: large objects get fewer triples of blobs
+FIRST_HYPOTHESES = 8_000  # in the first round: large objects get fewer triples of blobs; then twice as many each time
+MOST_HYPOTHESES = 400_000  # in a round
 KEPT = 8  # poses of each
 MANY = 40  # fiducials of a planar object, above which triples are too many
 PATIENCE = 3  # rounds that end with two good labellings
@@ -125,8 +127,9 @@ def bootstrap(
     fits: Fits | None = None
     result = _refused(scene, "no pose of the object explains the blobs")
     undecided = 0
-    for _ in range(options.rounds):
-        fresh = _round(scene, cameras, triples, tolerance, gate, generator)
+    for number in range(options.rounds):
+        hypotheses = min(FIRST_HYPOTHESES << number, MOST_HYPOTHESES)
+        fresh = _round(scene, cameras, triples, hypotheses, (tolerance, gate), generator)
         if fresh is None:
             continue
         fits = fresh if fits is None else _best(scene, join(fits, fresh), 2 * VERIFIED)
@@ -142,20 +145,22 @@ def _round(
     scene: Scene,
     cameras: NDArray[np.int64],
     triples: FiducialTriples,
-    tolerance: float,
-    gate: float,
+    hypotheses: int,
+    bounds: tuple[float, float],
     generator: np.random.Generator,
 ) -> Fits | None:
-    """Make hypotheses, let the rig vote, fit the best."""
+    """Make so many hypotheses, let the rig vote within the bounds (see `_bounds`), fit the best."""
+    tolerance, gate = bounds
     if scene.obj.planar and scene.obj.fiducials > MANY:
         cameras = generator.permutation(cameras)[:2]
         poses = planar_poses(scene.blobs, scene.rig, cameras[0], scene.obj)
         for camera in cameras[1:]:
             poses = poses + planar_poses(scene.blobs, scene.rig, camera, scene.obj)
     else:
-        number = int(np.clip(MOST_HYPOTHESES // len(triples.triples), 1, TRIPLES))
+        number = int(np.clip(hypotheses // len(triples.triples), 1, TRIPLES))
         cameras = generator.permutation(cameras)[:number]
-        chosen = [blob_triples(scene.blobs, camera, -(-number // len(cameras)), generator) for camera in cameras]
+        each, outer = -(-number // len(cameras)), many(scene.obj)
+        chosen = [blob_triples(scene.blobs, camera, each, outer, generator) for camera in cameras]
         camera = np.repeat(cameras, [len(rows) for rows in chosen])
         poses = single_camera_poses(scene.blobs, scene.rig, camera, np.concatenate(chosen), triples, tolerance, KEPT)
     if len(poses) == 0:
