@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 
 from imgcal.detection.finding import BLOCK
+from imgcal.detection.fitting import BAND, FARTHEST, MOST, PARAMETERS, ROWS, fit_centre, start_of
 from imgcal.observations import BlobFlag
 
 RING = 2  # px, width of the frame of a window from which the background is taken
@@ -26,10 +27,11 @@ MARGIN = SPREAD + 1  # px around the area: distances are asked for in the pixels
 TWO_PEAKED = 0.515  # bimodality coefficient
 SIGNIFICANT = 6.0  # standard deviations of a 3 x 3 mean that the brightest one of a blob must reach
 CROWDED = 0.6  # of the peak: a border this bright with a neighbour is no border
-SMALLEST_SIGMA = 0.001  # px, what sampling by pixels leaves without any noise
+SMALLEST_SIGMA = 0.0005  # px, what sampling by pixels leaves without any noise
 # px * sqrt(px): position lost where clipping turns a soft edge into a step, over sqrt(radius); the worst case of the
 # exposures (2 to 15 times full scale) in the tests.
 CLIPPED_SIGMA = 0.045
+CLIPPED_FIT = 0.01  # the same where clipped pixels are left out of a fit
 _MERGED, _SATURATED = int(BlobFlag.MERGED), int(BlobFlag.SATURATED)
 _FAR = 200  # px^2; with two distances added to it still within 8 bit
 
@@ -41,6 +43,7 @@ def measure_all(
     """Fill the columns of all candidates of a frame."""
     side = 2 * half_size.max() + 1 + 2 * MARGIN if len(half_size) else 0
     scratch, ring = np.empty((4, side * side), np.float32), np.empty((4, 4 * RING * side), np.float32)
+    fit = np.empty((ROWS, MOST), np.float32)
     distances, offsets = np.empty((3, side * side), np.uint8), np.empty((2, side * side), np.float32)
     least, smallest, largest, longest = limits
     for k in range(len(boxes)):
@@ -55,24 +58,35 @@ def measure_all(
         _blur(grey, smooth)
         crowded = _spread_labels(tile, labels, first, label[k], distances[2, :pixels].reshape(shape), own, other)
         saddle = _claim(own, other, crowded, smooth, weight)
-        _weigh(grey, smooth, noise, weight, ramp)
-        x, y, brightness, lever, tilt = _find_centre(grey, weight, ramp, offsets[0, :pixels], offsets[1, :pixels])
-        peak, peak_mean = _find_peaks(grey, smooth, weight)
-        elongation, two_peaked = _find_shape(grey, weight, offsets[0, :pixels], offsets[1, :pixels], peak_mean / 2)
-
-        uv[k, 0], uv[k, 1], radius[k] = u + x, v + y, np.sqrt(brightness / peak / np.pi)
-        # Each pixel's noise moves the centroid by its lever arm over the brightness; mean of both axes.
-        variance = (noise**2 * lever / 2 + (slope * tilt / 2) ** 2) / brightness**2 + SMALLEST_SIGMA**2
-        if brightest >= saturation and _is_saturated(frame, first, invert, saturation, weight):
-            flags[k] |= _SATURATED
-            variance += CLIPPED_SIGMA**2 / max(radius[k], 1.0)
-        if two_peaked or saddle > CROWDED * peak_mean:
-            flags[k] |= _MERGED
-        sigma[k] = np.sqrt(variance)
+        scale = _weigh(smooth, noise, weight)
+        peak, peak_mean, brightness = _find_peaks(grey, smooth, weight)
+        radius[k] = np.sqrt(brightness / peak / np.pi)
+        x, y = offsets[0, :pixels], offsets[1, :pixels]
+        elongation, two_peaked, middle, moments = _find_shape(grey, weight, x, y, peak_mean / 2)
         kept[k] = (
             smallest <= radius[k] <= largest and peak >= least
             and peak_mean > SIGNIFICANT / 3 * noise and elongation <= longest
         )  # fmt: skip
+        if not kept[k]:
+            continue
+        clipped = brightest >= saturation and _is_saturated(frame, first, invert, saturation, weight)
+        flags[k] = clipped * _SATURATED + (two_peaked or saddle > CROWDED * peak_mean) * _MERGED
+        known = x0 = y0 = residual = 0.0
+        if not flags[k] & _MERGED:
+            start = start_of(peak, radius[k], clipped, moments, middle)
+            count = _gather(grey, x, y, own, other, plane, saturation if clipped else np.inf, start, fit)
+            if count > PARAMETERS:
+                x0, y0, known, residual = fit_centre(fit, count, start, clipped, noise)
+        if known > 0 and (x0 - middle[0]) ** 2 + (y0 - middle[1]) ** 2 < FARTHEST**2:
+            variance = max(noise**2, residual) / known + (slope * brightness / known) ** 2
+            variance += clipped * CLIPPED_FIT**2 / max(radius[k], 1.0)
+        else:
+            _find_ramp(grey, weight, scale, ramp)
+            x0, y0, lever, tilt = _find_centroid(grey, weight, ramp, x, y)
+            # Each pixel's noise moves the centroid by its lever arm over the brightness; mean of both axes.
+            variance = (noise**2 * lever / 2 + (slope * tilt / 2) ** 2) / brightness**2
+            variance += clipped * CLIPPED_SIGMA**2 / max(radius[k], 1.0)
+        uv[k, 0], uv[k, 1], sigma[k] = u + x0, v + y0, np.sqrt(variance + SMALLEST_SIGMA**2)
 
 
 @njit(cache=True, nogil=True)
@@ -283,13 +297,40 @@ def _claim(own, other, crowded, smooth, territory):
     return saddle
 
 
+@njit(cache=True, nogil=True)
+def _gather(grey, x, y, own, other, plane, saturation, start, fit):
+    """List the pixels around the edge of a blob that are its own and not saturated, for `fit_centre`.
+
+    Returns:
+        Their number, 0 if there are too many; the last rows of `fit` are their offsets x, y and grey values.
+    """
+    (rows, columns), count = grey.shape, 0
+    limit, inner = np.uint8(SKIRT * SKIRT), np.float32(max(start[1] - BAND, 0.0) ** 2 - 1)
+    xx, xy, yy, x0, y0 = start[2:].astype(np.float32)
+    value = grey.reshape(-1)
+    near, far = own.reshape(-1), other.reshape(-1)
+    most, level, tilt = np.float32(saturation - 0.1), np.float32(plane[0]), np.array(plane[1:], np.float32)
+    listed_x, listed_y, listed_value = fit[ROWS - 3], fit[ROWS - 2], fit[ROWS - 1]
+    for i in range(MARGIN, rows - MARGIN):
+        for p in range(i * columns + MARGIN, (i + 1) * columns - MARGIN):
+            dx, dy = x[p] - x0, y[p] - y0
+            outer = xx * dx * dx + np.float32(2) * xy * dx * dy + yy * dy * dy >= inner
+            listed_x[count], listed_y[count], listed_value[count] = x[p], y[p], value[p]
+            full = level + tilt[0] * x[p] + tilt[1] * y[p] + value[p] >= most
+            count += (near[p] <= limit) & (near[p] <= far[p]) & outer & (not full)
+        if count + columns > MOST:
+            return 0
+    return count
+
+
 @njit(cache=True, nogil=True, fastmath=True)
-def _weigh(grey, smooth, noise, weight, ramp):
+def _weigh(smooth, noise, weight):
     """Turn the territory in `weight` into how much a pixel belongs to the blob: from 0 to 1 with its brightness.
 
-    On the ramp between background and blob, the noise of the 3 x 3 mean moves the weight as well: `ramp` says how much.
+    Returns:
+        How much the weight grows with the 3 x 3 mean.
     """
-    rows, columns = grey.shape
+    rows, columns = smooth.shape
     top = np.float32(0)
     for i in range(MARGIN, rows - MARGIN):
         part, mean = weight[i], smooth[i]
@@ -297,26 +338,25 @@ def _weigh(grey, smooth, noise, weight, ramp):
             top = max(top, mean[j] * part[j])
     scale = np.float32(1 / min(max(CLIP_PEAK * top, CLIP[0] / 3 * noise), CLIP[1] / 3 * noise))
     zero, one = np.float32(0), np.float32(1)
-    ramp[:] = 0
     for i in range(MARGIN, rows - MARGIN):
-        part, mean, value, slope = weight[i], smooth[i], grey[i], ramp[i]
+        part, mean = weight[i], smooth[i]
         for j in range(MARGIN, columns - MARGIN):
-            w = min(max(mean[j] * scale - one, zero), one) * part[j]
-            part[j] = w
-            slope[j] = value[j] * scale if zero < w < one else zero
+            part[j] *= min(max(mean[j] * scale - one, zero), one)
+    return scale
 
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _find_peaks(grey, smooth, weight):
-    """Brightest pixel and brightest 3 x 3 mean of what is blob rather than background."""
-    peak, top = np.float32(1e-6), np.float32(0)
+    """Brightest pixel and brightest 3 x 3 mean of what is blob rather than background, and the sum of the blob."""
+    peak, top, total = np.float32(1e-6), np.float32(0), np.float32(0)
     for i in range(MARGIN, grey.shape[0] - MARGIN):
         part, value, mean = weight[i], grey[i], smooth[i]
         for j in range(MARGIN, grey.shape[1] - MARGIN):
             inside = part[j] > np.float32(0.5)
             peak = max(peak, value[j] if inside else np.float32(0))
             top = max(top, mean[j] if inside else np.float32(0))
-    return peak, top
+            total += part[j] * value[j]
+    return peak, top, max(float(total), 1e-6)
 
 
 @njit(cache=True, nogil=True)
@@ -330,12 +370,23 @@ def _is_saturated(frame, first, invert, saturation, weight):
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _find_centre(grey, weight, ramp, x, y):
+def _find_ramp(grey, weight, scale, ramp):
+    """On the ramp between background and blob, the noise of the 3 x 3 mean moves the weight as well: how much."""
+    zero, one = np.float32(0), np.float32(1)
+    ramp[:] = 0
+    for i in range(MARGIN, grey.shape[0] - MARGIN):
+        part, value, slope = weight[i], grey[i], ramp[i]
+        for j in range(MARGIN, grey.shape[1] - MARGIN):
+            slope[j] = value[j] * scale if zero < part[j] < one else zero
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _find_centroid(grey, weight, ramp, x, y):
     """Sum up the blob over all pixels at (x, y) from the middle of the window, as one row.
 
     Returns:
-        Centre x, y, brightness, and two sums of squared distances from the centre: weighted by the squared gain of each
-        pixel's noise, and by the weight.
+        Centroid x, y, and two sums of squared distances from it: weighted by the squared gain of each pixel's noise, and
+        by the weight.
     """
     wide, pixels = grey.shape[1], grey.size
     value, part, slope = grey.reshape(-1), weight.reshape(-1), ramp.reshape(-1)
@@ -353,12 +404,13 @@ def _find_centre(grey, weight, ramp, x, y):
     brightness = max(float(b), 1e-6)
     x0, y0 = bx / brightness, by / brightness
     away = x0 * x0 + y0 * y0
-    return x0, y0, brightness, gg - 2 * (x0 * gx + y0 * gy) + away * g, tt - 2 * (x0 * tx + y0 * ty) + away * t
+    return x0, y0, gg - 2 * (x0 * gx + y0 * gy) + away * g, tt - 2 * (x0 * tx + y0 * ty) + away * t
 
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _find_shape(grey, weight, x, y, most):
-    """Tell the elongation of a blob whose masses are cut at `most`, and whether it has two parts along its major axis.
+    """Tell the elongation of a blob whose masses are cut at `most`, whether it has two parts along its major axis, its
+    middle, and its moments xx, xy, yy.
 
     Source: Sarle's bimodality coefficient, (skewness ** 2 + 1) / kurtosis: 0.50 for any filled ellipse and less when it
     is blurred, 0.60 for two discs that touch and 0.51 to 0.57 when they are blurred, 0.56 for a uniform rod.
@@ -384,4 +436,4 @@ def _find_shape(grey, weight, x, y, most):
         cube, fourth = cube + moment * along, fourth + moment * along * along
     third, fourth = cube / total, fourth / total
     bimodality = (third**2 / max(major, 1e-6) ** 3 + 1) * major**2 / max(fourth, 1e-6)
-    return elongation, bimodality > TWO_PEAKED and elongation > 1.3
+    return elongation, bimodality > TWO_PEAKED and elongation > 1.3, (x0, y0), (xx, xy, yy)

@@ -18,10 +18,11 @@ def draw_discs(
     background: NDArray[np.float64] | float = 20.0,
     blur: float = 0.7,
     squeeze: float = 1.0,
+    angle: float = 0.0,
 ) -> NDArray[np.float64]:
     """Draw discs at `uv` (M, 2), blurred by a Gaussian of `blur` px: (H, W) grey levels without noise.
 
-    `squeeze` < 1 flattens them to ellipses.
+    `squeeze` < 1 flattens them to ellipses, whose longer axis is turned by `angle` (rad).
     """
     covered = np.zeros(shape)  # discs that overlap hide each other: their light does not add
     frame = np.zeros(shape) + background
@@ -31,7 +32,10 @@ def draw_discs(
         half = int(np.ceil(r + 5 * blur)) + 2
         column, row = int(np.rint(u)), int(np.rint(v))
         fine = ((np.arange((2 * half + 1) * FINE) + 0.5) / FINE - 0.5 - half).astype(np.float32)
-        distance = np.hypot(fine[None, :] - (u - column), (fine[:, None] - (v - row)) / squeeze)
+        right, down = fine[None, :] - (u - column), fine[:, None] - (v - row)
+        along = np.float32(np.cos(angle)) * right + np.float32(np.sin(angle)) * down
+        across = np.float32(np.cos(angle)) * down - np.float32(np.sin(angle)) * right
+        distance = np.hypot(along, across / squeeze)
         disc = np.clip((r - distance) * FINE + 0.5, 0, 1).astype(np.float32)
         if blur > 0:
             disc = cv2.GaussianBlur(disc, (0, 0), blur * FINE)

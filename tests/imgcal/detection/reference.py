@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt, uniform_filter
 
-from imgcal.detection import window
+from imgcal.detection import fitting, window
 from imgcal.observations import BlobFlag
 
 
@@ -36,8 +36,8 @@ def measure(frame, labels, label, box, half, saturation, invert=None):
 
     Returns None where the brightest pixels do not stand out.
     """
-    middle = np.array([(box[0] + box[2]) // 2, (box[1] + box[3]) // 2])
-    v, u = np.arange(middle[1] - half, middle[1] + half + 1)[:, None], np.arange(middle[0] - half, middle[0] + half + 1)
+    centre = np.array([(box[0] + box[2]) // 2, (box[1] + box[3]) // 2])
+    v, u = np.arange(centre[1] - half, centre[1] + half + 1)[:, None], np.arange(centre[0] - half, centre[0] + half + 1)
     rows, columns = np.clip(v, 0, frame.shape[0] - 1), np.clip(u, 0, frame.shape[1] - 1)
     inside = (rows == v) & (columns == u)
     raw = frame[rows, columns].astype(np.float64)
@@ -59,22 +59,85 @@ def measure(frame, labels, label, box, half, saturation, invert=None):
 
     clip = np.clip(window.CLIP_PEAK * smooth[territory].max(initial=0), *(c / 3 * noise for c in window.CLIP))
     weight = np.where(territory, np.clip(smooth / clip - 1, 0, 1), 0)
-    gain = weight + uniform_filter(np.where((weight > 0) & (weight < 1), grey / clip, 0), 3)
-    mass, core = weight * grey, weight > 0.5
+    core = weight > 0.5
     if not core.any():
         return None
-    brightness = mass.sum()
-    x0, y0 = (mass * x).sum() / brightness, (mass * y).sum() / brightness
+    brightness, top = (weight * grey).sum(), smooth[core].max()
+    radius = np.sqrt(brightness / grey[core].max() / np.pi)
+    elongation, two_peaked, middle, moments = shape(np.clip(weight * grey, 0, top / 2), x, y)
+    clipped = bool((raw[core] >= saturation).any())
+    flags = BlobFlag.SATURATED if clipped else BlobFlag.NONE
+    fitted = None
+    if two_peaked or saddle > window.CROWDED * top:
+        flags |= BlobFlag.MERGED
+    else:
+        start = fitting.start_of(grey[core].max(), radius, clipped, moments, middle)
+        rows = territory & (quadratic(start, x, y) >= max(start[1] - fitting.BAND, 0) ** 2 - 1)
+        rows &= (raw < saturation) | (not clipped)
+        fitted = fit(x[rows], y[rows], grey[rows], start, clipped, noise)
+    if fitted is not None and np.hypot(*(fitted[:2] - middle)) < window.FARTHEST:
+        x0, y0, known, residual = fitted
+        variance = max(noise**2, residual) / known + (slope * brightness / known) ** 2
+        variance += clipped * window.CLIPPED_FIT**2 / max(radius, 1)
+    else:
+        x0, y0, variance = centroid(grey, weight, clip, noise, slope, x, y)
+        variance += clipped * window.CLIPPED_SIGMA**2 / max(radius, 1)
+    sigma = np.sqrt(variance + window.SMALLEST_SIGMA**2)
+    return centre[0] + x0, centre[1] + y0, sigma, radius, elongation, flags
+
+
+def centroid(grey, weight, clip, noise, slope, x, y):
+    """Centre x, y and variance of the weighted centroid; the noise of the 3 x 3 mean moves the weights as well."""
+    gain = weight + uniform_filter(np.where((weight > 0) & (weight < 1), grey / clip, 0), 3)
+    brightness = (weight * grey).sum()
+    x0, y0 = (weight * grey * x).sum() / brightness, (weight * grey * y).sum() / brightness
     squared = (x - x0) ** 2 + (y - y0) ** 2
-    radius, top = np.sqrt(brightness / grey[core].max() / np.pi), smooth[core].max()
     variance = noise**2 * (gain**2 * squared).sum() / 2 + (slope * (weight * squared).sum() / 2) ** 2
-    variance = variance / brightness**2 + window.SMALLEST_SIGMA**2
-    elongation, two_peaked = shape(np.clip(mass, 0, top / 2), x, y)
-    flags = BlobFlag.MERGED if two_peaked or saddle > window.CROWDED * top else BlobFlag.NONE
-    if (raw[core] >= saturation).any():
-        flags |= BlobFlag.SATURATED
-        variance += window.CLIPPED_SIGMA**2 / max(radius, 1)
-    return middle[0] + x0, middle[1] + y0, np.sqrt(variance), radius, elongation, flags
+    return x0, y0, variance / brightness**2
+
+
+def quadratic(parameters, x, y):
+    """Squared distance from the centre in units of the blur."""
+    xx, xy, yy, x0, y0 = parameters[2:]
+    return xx * (x - x0) ** 2 + 2 * xy * (x - x0) * (y - y0) + yy * (y - y0) ** 2
+
+
+def fit(x, y, grey, start, clipped, noise):
+    """Levenberg and Marquardt on A Phi(t): centre x, y, information, mean squared residual; None where it fails."""
+    if len(x) <= fitting.PARAMETERS:
+        return None
+    now, damping, moved = start, 1e-3, False
+    value, jacobian = drawn(now, x, y)
+    for _ in range(fitting.CLIPPED_STEPS if clipped else fitting.STEPS):
+        residual, normal = grey - value, jacobian.T @ jacobian
+        gradient = jacobian.T @ residual
+        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
+        if moved and (np.diag(normal)[5:] * step[5:] ** 2).sum() < fitting.SETTLED * noise**2:
+            covariance = np.linalg.inv(normal)
+            mean_square = (residual @ residual - gradient @ step) / (len(x) - fitting.PARAMETERS)
+            return *(now + step)[5:], 2 / np.trace(covariance[5:, 5:]), mean_square
+        trial = now + step
+        if trial[:3].min() > 0 and trial[2] * trial[4] - trial[3] ** 2 > 1e-3:
+            after = drawn(trial, x, y)
+            if ((grey - after[0]) ** 2).sum() < residual @ residual:
+                now, damping, moved, (value, jacobian) = trial, damping / 10, True, after
+                continue
+        damping = max(30 * damping, 1e-2)
+    return None
+
+
+def drawn(parameters, x, y):
+    """The model and its derivatives (P, 7); how the ellipse's shape changes the softness of its edge is left out."""
+    height, edge, xx, xy, yy, x0, y0 = parameters
+    dx, dy = x - x0, y - y0
+    gx, gy, along = xx * dx + xy * dy, xy * dx + yy * dy, quadratic(parameters, x, y)
+    away = np.sqrt(1 + along)
+    steep = np.sqrt((1 + np.sqrt(xx * yy - xy**2) * along) / (1 + gx**2 + gy**2))
+    rise, density = phi(steep * (edge - away))
+    slope = height * steep * density
+    toward = slope / away
+    columns = rise, slope, -toward * dx**2 / 2, -toward * dx * dy, -toward * dy**2 / 2, toward * gx, toward * gy
+    return height * columns[0], np.stack(columns, 1)
 
 
 def background(ring, x, y):
@@ -92,13 +155,24 @@ def background(ring, x, y):
 
 
 def shape(mass, x, y):
-    """Ratio of the axes of the ellipse of equal moments, and whether there are two parts along the longer one."""
+    """Ratio of the axes of the ellipse of equal moments, whether there are two parts along the longer one, the middle
+    (2,), and the moments xx, xy, yy.
+    """
     mass = mass / mass.sum()
-    x, y = x - (mass * x).sum(), y - (mass * y).sum()
+    middle = np.array([(mass * x).sum(), (mass * y).sum()])
+    x, y = x - middle[0], y - middle[1]
     moments = np.array([[(mass * a * b).sum() for a in (x, y)] for b in (x, y)])
     (minor, major), axes = np.linalg.eigh(moments)
     along = axes[0, 1] * x + axes[1, 1] * y
     skewness = (mass * along**3).sum() / major**1.5
     kurtosis = (mass * along**4).sum() / major**2
     elongation = np.sqrt(major / max(minor, 1 / 12))
-    return elongation, (skewness**2 + 1) / kurtosis > window.TWO_PEAKED and elongation > 1.3
+    two_peaked = (skewness**2 + 1) / kurtosis > window.TWO_PEAKED and elongation > 1.3
+    return elongation, two_peaked, middle, (moments[0, 0], moments[0, 1], moments[1, 1])
+
+
+def phi(t):
+    """The detector's normal distribution and its density: a polynomial within +-END."""
+    odd = np.polynomial.Polynomial(np.stack([np.zeros(6), fitting.PHI.astype(float)], 1).ravel())
+    t = np.clip(t, -fitting.END, fitting.END)
+    return 0.5 + odd(t), odd.deriv()(t)

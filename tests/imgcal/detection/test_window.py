@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from imgcal.detection import DetectionOptions
 from imgcal.detection.finding import outline, screen
@@ -109,3 +110,11 @@ def test_a_frame_full_of_blobs_and_an_empty_one():
     empty = np.zeros((64, 68), np.uint8)
     _, found = candidates_of(empty, DetectionOptions(), 255)
     assert len(found.boxes) == len(measure(empty, found, DetectionOptions(), 255).uv) == 0
+
+
+def test_the_edge_is_a_normal_distribution():
+    t = np.linspace(-6, 6, 1201)
+    rise, density = reference.phi(t)
+    np.testing.assert_allclose(rise, ndtr(t), atol=2.5e-4)
+    np.testing.assert_allclose(density, np.exp(-(t**2) / 2) / np.sqrt(2 * np.pi), atol=3e-3)
+    assert (np.diff(rise) > -1e-7).all()
