@@ -16,7 +16,7 @@ from imgcal.detection import Blobs, DetectionOptions, detect_snapshot
 from imgcal.detection.options import Frame
 from imgcal.errors import InputError, RefusedError
 from imgcal.identity.assignment import mutual_nearest, spacing
-from imgcal.labelling import Follower, Labelled, PipelineOptions, SnapshotIdentity
+from imgcal.labelling import Follower, Labelled, PipelineOptions, SnapshotIdentity, matched_to_rig
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections
 from imgcal.pipeline import Calibration, fit_labelled
@@ -73,31 +73,42 @@ class Recalibrator:
         """End the threads."""
         self._pool.shutdown()
 
-    def update(self, frames: Mapping[str, Frame | None]) -> Calibration:
-        """Recalibrate from the frames of a new snapshot: camera name -> (H, W), None = no frame.
+    def update(self, source: Mapping[str, Frame | None] | Detections) -> Calibration:
+        """Recalibrate from a new snapshot.
+
+        Args:
+            source: frames by camera, (H, W), None = no frame; or blobs that were found elsewhere, labelled or not.
 
         Raises:
             RefusedError: this snapshot cannot decide; the next one is tried afresh.
-            InputError: a frame is no grey image, or is of a camera that the rig does not have.
+            InputError: a frame is no grey image, or is of a camera that the rig does not have; blobs of more than one
+                snapshot.
         """
-        unknown = [name for name in frames if name not in self.rig.camera_names]
-        if unknown:
-            raise InputError(f"frames: found camera {unknown[0]}, expected one of {', '.join(self.rig.camera_names)}")
-        ordered = {name: frames.get(name) for name in self.rig.camera_names}
-        blobs = detect_snapshot(ordered, self.detection, pool=self._pool)
         name = f"{self._count:05d}"
         self._count += 1
-        detections = _table(blobs, name, self.rig)
+        detections = self._blobs(source, name)
         usable = detections.select(detections.usable)
-        followed = self._follow(usable, name)
+        coded = usable.fiducial.copy() if (usable.fiducial >= 0).any() else None
+        followed = self._follow(usable, name) if coded is None else None
         if followed is not None:
             return followed
         self._latest = None
-        snapshot, labels = self._follower.decide(usable, name, None)
+        snapshot, labels = self._follower.decide(usable, name, coded)
         if snapshot.status == "refused":
             raise RefusedError(f"identity: {snapshot.reason}")
-        usable.fiducial[:] = labels
+        usable = replace(usable, fiducial=labels)
         return self._keep(usable, snapshot, self._fit(usable, snapshot))
+
+    def _blobs(self, source: Mapping[str, Frame | None] | Detections, name: str) -> Detections:
+        if isinstance(source, Detections):
+            if len(source.snapshot_names) != 1:
+                raise InputError(f"detections: found {len(source.snapshot_names)} snapshots, expected one")
+            return replace(matched_to_rig(source, self.rig), snapshot_names=(name,))
+        unknown = [camera for camera in source if camera not in self.rig.camera_names]
+        if unknown:
+            raise InputError(f"frames: found camera {unknown[0]}, expected one of {', '.join(self.rig.camera_names)}")
+        frames = {camera: source.get(camera) for camera in self.rig.camera_names}
+        return _table(detect_snapshot(frames, self.detection, pool=self._pool), name, self.rig)
 
     def _follow(self, blobs: Detections, name: str) -> Calibration | None:
         """Label blobs by the last result's prediction, where the object has moved little; None = not to be trusted.

@@ -1,12 +1,15 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
-from imgcal.errors import RefusedError
+from imgcal.detection import detect
+from imgcal.errors import InputError, RefusedError
 from imgcal.formats import load_object, load_rig
 from imgcal.live import Recalibrator
 from imgcal.rotations import rotation_from_vector
-from imgcal.simulation import FrameModel, Truth, simulate_frames, simulate_truth
+from imgcal.simulation import FrameModel, Truth, simulate_frames, simulate_truth, true_detections
 from imgcal.synthesis import PhysicalDrift
 from imgcal.transforms import RigidTransform
 
@@ -55,3 +58,18 @@ def test_a_dark_snapshot_is_refused_and_the_next_one_is_not(small):
         with pytest.raises(RefusedError):
             recalibrator.update({name: np.full_like(frame, 12) for name, frame in frames[0].items()})
         assert recalibrator.update(frames[1]).rms < 0.1
+
+
+def test_blobs_found_elsewhere_give_the_same_rig(small):
+    rig, obj, truth, frames = small
+    found = [detect(snapshot) for snapshot in frames[:2]]
+    with Recalibrator(rig, obj) as by_frames, Recalibrator(rig, obj) as by_blobs, Recalibrator(rig, obj) as by_labels:
+        for snapshot, blobs in zip(frames, found, strict=False):
+            first, second = by_frames.update(snapshot), by_blobs.update(blobs)
+            assert first.identity == second.identity
+            assert torch.equal(first.rig.focal_length, second.rig.focal_length)
+        labelled = true_detections(truth)
+        coded = by_labels.update(replace(labelled.select(labelled.snapshot == 0), snapshot_names=("0",)))
+        assert coded.identity == "coded" and coded.rms < 0.02
+        with pytest.raises(InputError, match="found 6 snapshots"):
+            by_labels.update(labelled)
