@@ -30,21 +30,24 @@ def project(rig: CameraRig, points_rig: Tensor, radius: Tensor | None = None) ->
     if points_rig.device.type != "cpu":
         with torch.no_grad():
             return rig.project(points_rig, radius)
-    count, fiducials, _ = points_rig.shape
-    image = points_rig.new_empty(count, rig.cameras, 4, fiducials)  # u, v, depth, visible
-    radius_squared = points_rig.new_zeros(fiducials) if radius is None else radius.square()
-    transform, lens = rig.cam_from_rig, (rig.focal_length, rig.principal_point, rig.distortion)
-    size = rig.image_size.to(image.dtype)
-    given = (points_rig.mT, radius_squared, transform.rotation, transform.translation, *lens, size)
-    arrays = [tensor.detach().contiguous().numpy() for tensor in given]
-    _project(*arrays, image.numpy())  # type: ignore[call-arg]
-    return Projection(image[..., :2, :].mT, image[..., 2, :], image[..., 3, :] > 0)
+    transform = rig.cam_from_rig
+    given = (transform.rotation, transform.translation, rig.focal_length, rig.principal_point, rig.distortion)
+    # NumPy's calls take half the time of PyTorch's, and its large arrays ask Linux for huge pages.
+    points = np.ascontiguousarray(points_rig.detach().numpy().transpose(0, 2, 1))
+    count, _, fiducials = points.shape
+    kind = points.dtype
+    radius_squared = np.zeros(fiducials, kind) if radius is None else radius.detach().numpy().astype(kind) ** 2
+    image = np.empty((count, rig.cameras, 4, fiducials), kind)  # u, v, depth, visible
+    arrays = [np.ascontiguousarray(tensor.detach().numpy()) for tensor in given]
+    _project(points, radius_squared, *arrays, rig.image_size.numpy(), image)  # type: ignore[call-arg]
+    uv, depth, visible = image[:, :, :2].swapaxes(2, 3), image[:, :, 2], image[:, :, 3] > 0
+    return Projection(torch.from_numpy(uv), torch.from_numpy(depth), torch.from_numpy(visible))
 
 
 @njit(cache=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
 def _project(
     points: Array, radius_squared: Array, rotation: Array, translation: Array,
-    focal_length: Array, principal_point: Array, distortion: Array, image_size: Array, image: Array,
+    focal_length: Array, principal_point: Array, distortion: Array, image_size: NDArray[Any], image: Array,
 ) -> None:  # fmt: skip
     # One output array and constants of the points' own type: with more of either, the inner loop is not vectorized.
     kind = points.dtype.type
@@ -58,7 +61,7 @@ def _project(
             fx, fy = focal_length[b, c]
             cx, cy = principal_point[b, c]
             k1, k2, p1, p2, k3 = distortion[b, c]
-            width, height = image_size[c, 0] - half, image_size[c, 1] - half
+            width, height = kind(image_size[c, 0]) - half, kind(image_size[c, 1]) - half
             slope1, slope2, slope3 = kind(3) * k1, kind(5) * k2, kind(7) * k3
             blind_from = kind(_blind_from(slope1, slope2, slope3))
             for n in range(points.shape[2]):
