@@ -1,9 +1,9 @@
 """The image of a disc fitted to a blob, compiled: its centre is as exact as the noise allows.
 
 A centroid counts all pixels of a blob alike, but only its edge tells where it is. The model is an ellipse with a soft
-edge, A Phi(c - sqrt(1 + d' Q d)) at the offset d from the centre: smooth in the middle, as a small blurred disc is, and
-a blurred step far out, as the edge of a large one. It fits blurred discs of any radius to a thousandth of their
-contrast. Being symmetric about its centre, it does not move the centre of other symmetric blobs, which it fits less well.
+edge, A Phi(c - sqrt(1 + d' Q d)) at the offset d from the centre: smooth in the middle, as a small blurred disc is,
+and a blurred step far out, as the edge of a large one. It fits blurred discs of any radius to a thousandth of their
+contrast. Symmetric about its centre, it does not move the centre of other symmetric blobs, which it fits less well.
 """
 
 # Compiled functions take their types from their arguments.
@@ -40,6 +40,7 @@ def fit_centre(rows, pixels, start, clipped, noise):
         pixels: P, how many of them.
         start: (PARAMETERS,) where to begin.
         clipped: whether pixels are missing because they are saturated.
+        noise: one standard deviation of a pixel.
 
     Returns:
         Centre x, y; information about it, 1 / px^2 at a noise of 1 (mean of the axes, 0 where the fit has failed); and

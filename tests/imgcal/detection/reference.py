@@ -7,6 +7,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, uniform_filter
 
 from imgcal.detection import fitting, window
+from imgcal.detection import moments as moments_of
 from imgcal.observations import BlobFlag
 
 
@@ -67,16 +68,15 @@ def measure(frame, labels, label, box, half, saturation, invert=None):
     elongation, two_peaked, middle, moments = shape(np.clip(weight * grey, 0, top / 2), x, y)
     clipped = bool((raw[core] >= saturation).any())
     flags = BlobFlag.SATURATED if clipped else BlobFlag.NONE
-    fitted = None
+    x0 = y0 = known = residual = 0.0
     if two_peaked or saddle > window.CROWDED * top:
         flags |= BlobFlag.MERGED
     else:
         start = fitting.start_of(grey[core].max(), radius, clipped, moments, middle)
         rows = territory & (quadratic(start, x, y) >= max(start[1] - fitting.BAND, 0) ** 2 - 1)
         rows &= (raw < saturation) | (not clipped)
-        fitted = fit(x[rows], y[rows], grey[rows], start, clipped, noise)
-    if fitted is not None and np.hypot(*(fitted[:2] - middle)) < window.FARTHEST:
-        x0, y0, known, residual = fitted
+        x0, y0, known, residual = fit(x[rows], y[rows], grey[rows], start, clipped, noise)
+    if known > 0 and np.hypot(x0 - middle[0], y0 - middle[1]) < window.FARTHEST:
         variance = max(noise**2, residual) / known + (slope * brightness / known) ** 2
         variance += clipped * window.CLIPPED_FIT**2 / max(radius, 1)
     else:
@@ -103,9 +103,9 @@ def quadratic(parameters, x, y):
 
 
 def fit(x, y, grey, start, clipped, noise):
-    """Levenberg and Marquardt on A Phi(t): centre x, y, information, mean squared residual; None where it fails."""
+    """Levenberg and Marquardt on A Phi(t): centre x, y, information (0 where it fails), mean squared residual."""
     if len(x) <= fitting.PARAMETERS:
-        return None
+        return 0.0, 0.0, 0.0, 0.0
     now, damping, moved = start, 1e-3, False
     value, jacobian = drawn(now, x, y)
     for _ in range(fitting.CLIPPED_STEPS if clipped else fitting.STEPS):
@@ -123,7 +123,7 @@ def fit(x, y, grey, start, clipped, noise):
                 now, damping, moved, (value, jacobian) = trial, damping / 10, True, after
                 continue
         damping = max(30 * damping, 1e-2)
-    return None
+    return *now[5:], 0.0, ((grey - value) ** 2).sum() / (len(x) - fitting.PARAMETERS)
 
 
 def drawn(parameters, x, y):
@@ -167,7 +167,7 @@ def shape(mass, x, y):
     skewness = (mass * along**3).sum() / major**1.5
     kurtosis = (mass * along**4).sum() / major**2
     elongation = np.sqrt(major / max(minor, 1 / 12))
-    two_peaked = (skewness**2 + 1) / kurtosis > window.TWO_PEAKED and elongation > 1.3
+    two_peaked = (skewness**2 + 1) / kurtosis > moments_of.TWO_PEAKED and elongation > 1.3
     return elongation, two_peaked, middle, (moments[0, 0], moments[0, 1], moments[1, 1])
 
 
