@@ -10,21 +10,26 @@ from dataclasses import replace
 from types import TracebackType
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from imgcal.detection import Blobs, DetectionOptions, detect_snapshot
 from imgcal.detection.options import Frame
 from imgcal.errors import InputError, RefusedError
+from imgcal.estimation import estimate
 from imgcal.identity.assignment import mutual_nearest, spacing
-from imgcal.labelling import Follower, Labelled, PipelineOptions, SnapshotIdentity, matched_to_rig
+from imgcal.labelling import Follower, Labelled, PipelineOptions, SnapshotIdentity, matched_to_rig, to_observations
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections
 from imgcal.pipeline import Calibration, fit_labelled
 from imgcal.rig import CameraRig
+from imgcal.transforms import RigidTransform
 
 MOST_FOLLOWED = 64
 """Fiducials up to which a snapshot may be labelled by the last prediction alone; a larger lattice could have slipped by
 a pitch unnoticed."""
+MOST_APART = 5.0
+"""Times the median distance that a blob may be from its fiducial, once the pose has been fitted with the last rig."""
 LEAST_FOLLOWED = 0.9
 """Share of the last snapshot's labels that must be found again, and fit."""
 
@@ -118,13 +123,12 @@ class Recalibrator:
         latest = self._latest
         if latest is None or self.obj.fiducials > MOST_FOLLOWED:
             return None
-        pose = latest.rig_from_object[-1]
-        predicted = latest.rig.project(pose.apply(self.obj.points), self.obj.radius).uv.numpy()  # (C, N, 2)
-        labels = _nearest(blobs, predicted)
+        points = latest.rig_from_object[-1].apply(self.obj.points)
+        predicted = latest.rig.project(points, self.obj.radius).uv.numpy()  # (C, N, 2)
+        blobs, pose = self._without_strays(replace(blobs, fiducial=_nearest(blobs, predicted)), latest)
         before = int(latest.observations.seen[-1].sum())
-        if (labels >= 0).sum() < LEAST_FOLLOWED * before:
+        if (blobs.fiducial >= 0).sum() < LEAST_FOLLOWED * before:
             return None
-        blobs = replace(blobs, fiducial=labels)
         snapshot = SnapshotIdentity(name, "by_tracking", "near the last prediction", 1, pose)
         try:
             result = self._fit(blobs, snapshot, latest)
@@ -134,6 +138,18 @@ class Recalibrator:
             return None
         self._follower.pose = result.rig_from_object[-1]
         return self._keep(blobs, snapshot, result)
+
+    def _without_strays(self, blobs: Detections, latest: Calibration) -> tuple[Detections, RigidTransform]:
+        """Fit the pose with the last rig, and drop labels that are off: two markers in one, a reflection beside one."""
+        seen = to_observations(blobs, self.rig, self.obj)
+        even = replace(seen, sigma=torch.full_like(seen.sigma, self.options.identity_error))
+        held, robust = torch.zeros_like(latest.problem.spread[0]), replace(self.options.estimation, loss="cauchy")
+        fit = estimate(even, latest.rig, self.obj, latest.rig_from_object[-1:], spread=held, options=robust)
+        distance = fit.residual[0].norm(dim=-1)  # (C, N)
+        usual = distance[seen.seen[0]].median() if bool(seen.seen.any()) else torch.inf
+        stray = (distance > self.options.identity_error + MOST_APART * usual).numpy()
+        fiducial = np.where(stray[blobs.camera, blobs.fiducial], -1, blobs.fiducial)
+        return replace(blobs, fiducial=fiducial), fit.rig_from_object[0]
 
     def _fit(self, blobs: Detections, snapshot: SnapshotIdentity, latest: Calibration | None = None) -> Calibration:
         """Fit the latest snapshots and a new one, which is not kept yet: it may be what spoils the fit."""

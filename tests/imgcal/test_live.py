@@ -73,3 +73,16 @@ def test_blobs_found_elsewhere_give_the_same_rig(small):
         assert coded.identity == "coded" and coded.rms < 0.02
         with pytest.raises(InputError, match="found 6 snapshots"):
             by_labels.update(labelled)
+
+
+def test_a_blob_that_is_off_loses_its_label_and_is_no_reason_to_start_anew(small):
+    rig, obj, truth, _ = small
+    exact = replace(true_detections(truth), fiducial=np.full(truth.uv[..., 0].numel(), -1))
+    first, second = (replace(exact.select(exact.snapshot == s), snapshot_names=("",)) for s in (0, 1))
+    second.uv[3] += [1.5, -1.0]  # as of two markers that overlap
+    with Recalibrator(rig, obj) as recalibrator:
+        recalibrator.update(first)
+        result = recalibrator.update(second)
+    assert result.labelled.snapshots[0].reason == "near the last prediction"
+    assert result.labelled.detections.fiducial[3] == -1 and int(result.observations.seen.sum()) == len(second) - 1
+    assert result.rms < 0.02
