@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
+from typing import Literal, TypeVar
 
 import torch
 from torch import Tensor
@@ -19,6 +19,14 @@ from imgcal.observations import Observations
 from imgcal.rig import PARAMETERS, CameraRig, RigPrior
 from imgcal.transforms import RigidTransform
 
+PATIENCE = 15
+"""Steps after which a rig begins again; from factory values within their prior, 6 are usual."""
+COARSER = (3000.0, 300.0, 30.0, 3.0)
+"""Times the standard deviation of the observations, in stages."""
+COARSE_TOLERANCE = 0.1
+
+Record = TypeVar("Record", Problem, State)
+
 
 @dataclass(frozen=True)
 class EstimationOptions:
@@ -26,7 +34,7 @@ class EstimationOptions:
 
     loss: Literal["squared", "huber", "cauchy", "geman_mcclure"] = "huber"
     threshold: float = 3.0  # standard deviations, where the loss stops being quadratic
-    max_iterations: int = 100
+    max_iterations: int = 100  # of one attempt; see `minimize`
     tolerance: float = 1e-4  # expected decrease of the cost (half a squared standard deviation) at which to stop
 
 
@@ -102,12 +110,50 @@ def _loss(options: EstimationOptions) -> Loss:
 
 
 def minimize(problem: Problem, start: State, options: EstimationOptions) -> solver.Solution:
-    """Find the minimum from a start, on the CPU by the compiled solver; no gradient flows through it."""
+    """Find the minimum from a start, on the CPU by the compiled solver; no gradient flows through it.
+
+    Precise observations make narrow, winding valleys of the cost. A rig that is not through after `PATIENCE` steps
+    begins again with less precise ones, and comes back to the given precision by and by (graduated non-convexity).
+    """
+    first = _solve(problem, start, replace(options, max_iterations=min(options.max_iterations, PATIENCE)))
+    rows = (~first.converged).nonzero().squeeze(-1)
+    left = options.max_iterations - first.iterations
+    if left <= 0 or not len(rows):
+        return first
+    slow = _rows(problem, rows)
+    coarse = replace(options, tolerance=COARSE_TOLERANCE, max_iterations=min(options.max_iterations, 2 * PATIENCE))
+    state, spent = _rows(start, rows), first.iterations
+    for factor in COARSER:
+        stage = _solve(replace(slow, root_weight=slow.root_weight / factor), state, coarse)
+        state, spent = stage.state, spent + stage.iterations
+    second = _solve(slow, state, options)
+    spent += second.iterations
+    if not bool((second.converged & (second.equations.cost <= first.equations.cost[rows])).all()):
+        further = _solve(slow, _rows(first.state, rows), replace(options, max_iterations=left))
+        spent += further.iterations
+        second = solver.better(second, further)
+    return solver.replaced(first, rows, second, spent)
+
+
+def _solve(problem: Problem, start: State, options: EstimationOptions) -> solver.Solution:
     with torch.no_grad():
         if problem.uv.device.type == "cpu":
             limits = (options.loss, options.threshold, options.max_iterations, options.tolerance)
             return fused.minimize(problem, start, *limits)
         return solver.minimize(problem, start, _loss(options), options.max_iterations, options.tolerance)
+
+
+def _rows(record: Record, rows: Tensor) -> Record:
+    """Some rigs of a problem or a state."""
+    if isinstance(record, State):
+        return State(record.offset[rows], record.rotation[rows], record.centre[rows])
+    return replace(
+        record,
+        uv=record.uv[rows],
+        root_weight=record.root_weight[rows],
+        factory=record.factory[rows],
+        spread=record.spread[rows],
+    )
 
 
 def conclude(problem: Problem, solution: solver.Solution, state: State, batch: torch.Size = torch.Size()) -> Estimate:

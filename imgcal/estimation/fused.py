@@ -15,7 +15,15 @@ from numba import njit, prange
 from torch import Tensor
 
 from imgcal.estimation.linearize import NormalEquations, Problem, State
-from imgcal.estimation.solver import FIRST_GROWTH, LEAST_DAMPING, MOST_DAMPING, RELAX, Solution, pixel_rounding
+from imgcal.estimation.solver import (
+    FIRST_GROWTH,
+    GREATEST_RELAX,
+    LEAST_DAMPING,
+    MOST_DAMPING,
+    RELAX,
+    Solution,
+    pixel_rounding,
+)
 from imgcal.projection import NEAREST_DEPTH
 from imgcal.rig import CameraRig
 from imgcal.transforms import RigidTransform
@@ -139,7 +147,7 @@ def _minimize_rig(
     rounding = 4 * np.finfo(uv.dtype).eps
     damping, growth = LEAST_DAMPING, FIRST_GROWTH
     cost[0] = _linearize(given, best, best_blocks, cameras_first, loss, threshold)
-    swapped = False
+    swapped, relax = False, RELAX
     for iteration in range(max_iterations):
         iterations[0] = iteration + 1
         a, w, d, ga, gd, _ = best_blocks
@@ -153,6 +161,7 @@ def _minimize_rig(
             trial_cost = _linearize(given, trial, trial_blocks, cameras_first, loss, threshold)
             small = gain <= tolerance + rounding * cost[0]
             if trial_cost < cost[0]:
+                relax = min(max(1 - (2 * (cost[0] - trial_cost) / gain - 1) ** 3, RELAX), GREATEST_RELAX)
                 better, swapped, cost[0] = True, not swapped, trial_cost
                 best, trial = trial, best
                 best_blocks, trial_blocks = trial_blocks, best_blocks
@@ -160,7 +169,7 @@ def _minimize_rig(
         if small and damping <= 1e-3 and np.isfinite(cost[0]):
             converged[0] = True
             break
-        damping = max(damping * RELAX, LEAST_DAMPING) if better else min(damping * growth, MOST_DAMPING)
+        damping = min(max(damping * (relax if better else growth), LEAST_DAMPING), MOST_DAMPING)
         growth = FIRST_GROWTH if better else 2 * growth
     if swapped:
         _copy(offset, best[0])

@@ -16,7 +16,8 @@ from imgcal.rig import PARAMETERS
 LEAST_DAMPING = 1e-9
 MOST_DAMPING = 1e12
 RELAX = 0.2
-"""Of the damping, after a step that was taken."""
+"""Of the damping, after a step that lowered the cost as expected; less and less than expected: up to GREATEST_RELAX."""
+GREATEST_RELAX = 2.0
 FIRST_GROWTH = 4.0
 """Of the damping, after the first of a series of rejected steps; doubled with each further one."""
 
@@ -37,7 +38,8 @@ def minimize(problem: Problem, start: State, loss: Loss, max_iterations: int, to
     """Minimize the MAP cost of every rig of a batch.
 
     A step that does not lower the cost, or whose factorization fails, is rejected and retried with more damping, each
-    time twice as much more (Nielsen 1999): never taken, never replaced by nothing.
+    time twice as much more: never taken, never replaced by nothing. After a step that was taken, the damping follows
+    from how much of the expected decrease came true (Nielsen 1999).
 
     Args:
         problem: what is given, with one batch axis B.
@@ -62,7 +64,8 @@ def minimize(problem: Problem, start: State, loss: Loss, max_iterations: int, to
         small = (gain <= tolerances + rounding * equations.cost) & ~failed
         trial_state = moved(problem, state, camera_step, pose_step)
         trial = linearize(problem, trial_state, loss)
-        better = (trial.cost < equations.cost) & ~failed & ~converged
+        before = equations.cost
+        better = (trial.cost < before) & ~failed & ~converged
         if bool(better.all()):
             state, equations = trial_state, trial
         else:
@@ -70,7 +73,9 @@ def minimize(problem: Problem, start: State, loss: Loss, max_iterations: int, to
         # A tiny step that does not help has met the rounding error: this is the minimum. Damping alone also makes steps
         # tiny, so only a lightly damped one counts.
         converged = converged | (small & (damping <= 1e-3) & ~torch.isinf(equations.cost))
-        damping = torch.where(better, damping * RELAX, damping * growth).clamp(LEAST_DAMPING, MOST_DAMPING)
+        relax = 1 - (2 * (before - trial.cost) / gain - 1) ** 3
+        damping = torch.where(better, damping * relax.clamp(RELAX, GREATEST_RELAX), damping * growth)
+        damping = damping.clamp(LEAST_DAMPING, MOST_DAMPING)
         growth = torch.where(better, FIRST_GROWTH, 2 * growth)
     return Solution(state, equations, converged, iteration)
 
@@ -118,6 +123,34 @@ def factorize(equations: NormalEquations, damping: Tensor | None = None) -> tupl
     if POSE_PARAMETERS * pose.shape[1] <= PARAMETERS * camera.shape[1]:
         return arrow.reduce(camera, coupling.transpose(1, 2), pose), True
     return arrow.reduce(pose, coupling.mT, camera), False
+
+
+def better(first: Solution, second: Solution) -> Solution:
+    """Choose rig by rig the solution of the lower cost."""
+    choose = first.equations.cost <= second.equations.cost
+    return Solution(
+        _where(choose, first.state, second.state),
+        _where(choose, first.equations, second.equations),
+        torch.where(choose, first.converged, second.converged),
+        max(first.iterations, second.iterations),
+    )
+
+
+def replaced(solution: Solution, rows: Tensor, by: Solution, iterations: int) -> Solution:
+    """Put other solutions (R,) in the place of some rows (R,) of a batch."""
+    index = torch.zeros(len(solution.converged), dtype=torch.long, device=rows.device)
+    chosen = torch.ones_like(index, dtype=torch.bool)
+    index[rows], chosen[rows] = torch.arange(len(rows), device=rows.device), False
+
+    def spread_out(record: Record) -> Record:
+        return replace(record, **{field.name: getattr(record, field.name)[index] for field in fields(record)})
+
+    return Solution(
+        _where(chosen, solution.state, spread_out(by.state)),
+        _where(chosen, solution.equations, spread_out(by.equations)),
+        torch.where(chosen, solution.converged, by.converged[index]),
+        iterations,
+    )
 
 
 def _where(choose: Tensor, first: Record, second: Record) -> Record:

@@ -8,12 +8,14 @@ from imgcal.estimation import (
     EstimationOptions,
     camera_covariance,
     estimate,
+    fused,
     relative_covariance,
     relative_difference,
 )
-from imgcal.estimation.estimate import make_start
+from imgcal.estimation.estimate import PATIENCE, make_start
 from imgcal.estimation.implicit import map_cost
 from imgcal.estimation.robust import LOSSES
+from imgcal.observations import Observations
 from imgcal.synthesis import Drift, PhysicalDrift, RelativeDrift
 
 SQUARED = EstimationOptions(loss="squared")
@@ -66,3 +68,26 @@ def test_converges_from_ten_percent(simulate) -> None:
     at_truth = map_cost(problem, make_start(problem, case.poses, case.truth), LOSSES[options.loss])
     right = found.converged & (0.5 * found.chi2 <= at_truth)
     assert float(right.double().mean()) >= 0.999
+
+
+@pytest.mark.parametrize(("snapshots", "count"), [(1, 60), (5, 30)])
+def test_converges_from_far_beyond_usual_drift(simulate, snapshots: int, count: int) -> None:
+    drift = PhysicalDrift(rotation_deg=6, position=60, focal_length=0.2, principal_point=60, distortion=0.02)
+    case = simulate(count, snapshots=snapshots, noise=0.05, drift=drift)
+    found = estimate(case.observations, case.factory, case.obj, spread=case.spread, options=SQUARED)
+    problem = case.problem()
+    at_truth = map_cost(problem, make_start(problem, case.poses, case.truth), LOSSES["squared"])
+    right = found.converged & (0.5 * found.chi2 <= at_truth)
+    assert float(right.double().mean()) >= 0.95  # 0.7 of the single snapshots without beginning again
+
+
+def test_beginning_again_leaves_the_others_alone(simulate) -> None:
+    case = simulate(40, snapshots=1, noise=0.05, drift=PhysicalDrift(4, 40, 0.15, 40, 0.02))
+    together = estimate(case.observations, case.factory, case.obj, spread=case.spread, options=SQUARED)
+    problem, start = case.problem(), make_start(case.problem(), together.rig_from_object, None)
+    assert 0 < int((~fused.minimize(problem, start, "squared", 3.0, PATIENCE, 1e-4).converged).sum()) < 40
+    for row in range(0, 40, 5):
+        observations = Observations(*(value[row] for value in vars(case.observations).values()))
+        alone = estimate(observations, case.factory, case.obj, spread=case.spread, options=SQUARED)
+        torch.testing.assert_close(together.chi2[row], alone.chi2)
+        torch.testing.assert_close(together.rig[row].focal_length, alone.rig.focal_length)
