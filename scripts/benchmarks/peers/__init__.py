@@ -1,0 +1,1 @@
+"""Adapters to the peers: arrays in, arrays out."""

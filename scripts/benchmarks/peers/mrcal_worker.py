@@ -1,0 +1,66 @@
+"""Runs mrcal, by Debian's Python, without imgcal: tasks from an npz; one index a line in, seconds out; then an npz.
+
+    /usr/bin/python3 mrcal_worker.py TASKS.npz ANSWERS.npz
+
+Convention: millimetres become metres, in which mrcal's scales are meant.
+"""
+
+import sys
+import time
+
+import mrcal
+import numpy as np
+
+
+def stated(tasks, index):
+    """Arguments of mrcal.optimize: the object is the world, each camera of each snapshot has a pose of its own."""
+    uv = tasks["uv"][index]
+    snapshots, cameras, fiducials, _ = uv.shape
+    place, camera, fiducial = (
+        axis.ravel() for axis in np.meshgrid(*map(np.arange, (snapshots, cameras, fiducials)), indexing="ij")
+    )
+    seen = np.column_stack((uv.reshape(-1, 2), np.ones(uv.size // 2)))
+    indices = np.column_stack((fiducial, camera, place * cameras + camera)).astype(np.int32)
+    return {
+        "intrinsics": tasks["intrinsics"][index].copy(),
+        "extrinsics_rt_fromref": tasks["extrinsics"][index].reshape(-1, 6).copy(),
+        "frames_rt_toref": None,
+        "points": tasks["points"] / 1000,
+        "observations_board": None,
+        "indices_frame_camintrinsics_camextrinsics": None,
+        "observations_point": seen,
+        "indices_point_camintrinsics_camextrinsics": indices,
+        "lensmodel": "LENSMODEL_OPENCV5",
+        "imagersizes": np.tile(tasks["image_size"], (cameras, 1)).astype(np.int32),
+        "Npoints_fixed": fiducials,
+        "point_min_range": 0.01,
+        "point_max_range": 100.0,
+        "do_optimize_intrinsics_distortions": bool(tasks["distortion"]),
+        "do_optimize_calobject_warp": False,
+        "do_apply_outlier_rejection": False,
+        "verbose": False,
+    }
+
+
+def main(given, answers):
+    """Solve what is asked for, keep the last answer of each task."""
+    tasks = dict(np.load(given))
+    intrinsics, extrinsics = tasks["intrinsics"].copy(), tasks["extrinsics"].copy()
+    for line in sys.stdin:
+        index = int(line)
+        arguments = stated(tasks, index)
+        begin = time.perf_counter()
+        try:
+            mrcal.optimize(**arguments)
+            seconds = time.perf_counter() - begin
+        except RuntimeError:
+            print("nan", flush=True)
+            continue
+        intrinsics[index] = arguments["intrinsics"]
+        extrinsics[index] = arguments["extrinsics_rt_fromref"].reshape(extrinsics.shape[1:])
+        print(seconds, flush=True)
+    np.savez(answers, intrinsics=intrinsics, extrinsics=extrinsics)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
