@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal, TypeVar
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -24,8 +24,6 @@ PATIENCE = 15
 COARSER = (3000.0, 300.0, 30.0, 3.0)
 """Times the standard deviation of the observations, in stages."""
 COARSE_TOLERANCE = 0.1
-
-Record = TypeVar("Record", Problem, State)
 
 
 @dataclass(frozen=True)
@@ -120,16 +118,16 @@ def minimize(problem: Problem, start: State, options: EstimationOptions) -> solv
     left = options.max_iterations - first.iterations
     if left <= 0 or not len(rows):
         return first
-    slow = _rows(problem, rows)
+    slow = _problem_of(problem, rows)
     coarse = replace(options, tolerance=COARSE_TOLERANCE, max_iterations=min(options.max_iterations, 2 * PATIENCE))
-    state, spent = _rows(start, rows), first.iterations
+    state, spent = _state_of(start, rows), first.iterations
     for factor in COARSER:
         stage = _solve(replace(slow, root_weight=slow.root_weight / factor), state, coarse)
         state, spent = stage.state, spent + stage.iterations
     second = _solve(slow, state, options)
     spent += second.iterations
     if not bool((second.converged & (second.equations.cost <= first.equations.cost[rows])).all()):
-        further = _solve(slow, _rows(first.state, rows), replace(options, max_iterations=left))
+        further = _solve(slow, _state_of(first.state, rows), replace(options, max_iterations=left))
         spent += further.iterations
         second = solver.better(second, further)
     return solver.replaced(first, rows, second, spent)
@@ -143,17 +141,14 @@ def _solve(problem: Problem, start: State, options: EstimationOptions) -> solver
         return solver.minimize(problem, start, _loss(options), options.max_iterations, options.tolerance)
 
 
-def _rows(record: Record, rows: Tensor) -> Record:
-    """Some rigs of a problem or a state."""
-    if isinstance(record, State):
-        return State(record.offset[rows], record.rotation[rows], record.centre[rows])
-    return replace(
-        record,
-        uv=record.uv[rows],
-        root_weight=record.root_weight[rows],
-        factory=record.factory[rows],
-        spread=record.spread[rows],
-    )
+def _problem_of(problem: Problem, rows: Tensor) -> Problem:
+    """Keep some rigs."""
+    factory, spread = problem.factory[rows], problem.spread[rows]
+    return replace(problem, uv=problem.uv[rows], root_weight=problem.root_weight[rows], factory=factory, spread=spread)
+
+
+def _state_of(state: State, rows: Tensor) -> State:
+    return State(state.offset[rows], state.rotation[rows], state.centre[rows])
 
 
 def conclude(problem: Problem, solution: solver.Solution, state: State, batch: torch.Size = torch.Size()) -> Estimate:

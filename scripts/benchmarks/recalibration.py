@@ -55,6 +55,7 @@ def _compare(cases: Cases, names: Sequence[str], seconds: float) -> dict[str, An
     spans: dict[str, list[float]] = {}
     solved = {}
     with methods(cases, names) as found:
+        runs: dict[str, Callable[[], object]]
         runs = {name: _in_turn(method, len(cases), spans.setdefault(name, [])) for name, method in found.items()}
         runs["start"] = lambda: initial_pose(cases.one(0), cases.factory[0], cases.obj)
         times = side_by_side(runs, seconds)

@@ -5,14 +5,17 @@
 Convention: millimetres become metres, in which mrcal's scales are meant.
 """
 
+from __future__ import annotations
+
 import sys
 import time
+from typing import Any
 
-import mrcal
+import mrcal  # type: ignore[import-not-found]
 import numpy as np
 
 
-def stated(tasks, index):
+def stated(tasks: dict[str, Any], index: int) -> dict[str, Any]:
     """Arguments of mrcal.optimize: the object is the world, each camera of each snapshot has a pose of its own."""
     uv = tasks["uv"][index]
     snapshots, cameras, fiducials, _ = uv.shape
@@ -42,7 +45,7 @@ def stated(tasks, index):
     }
 
 
-def main(given, answers):
+def main(given: str, answers: str) -> None:
     """Solve what is asked for, keep the last answer of each task."""
     tasks = dict(np.load(given))
     intrinsics, extrinsics = tasks["intrinsics"].copy(), tasks["extrinsics"].copy()

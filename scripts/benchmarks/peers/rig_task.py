@@ -45,13 +45,13 @@ class RigAnswer:
 def rotation_matrices(vectors: Array) -> Array:
     """Rotation vectors (..., 3) to matrices (..., 3, 3)."""
     flat = [cv2.Rodrigues(vector)[0] for vector in vectors.reshape(-1, 3)]
-    return np.array(flat).reshape(*vectors.shape[:-1], 3, 3)
+    return np.array(flat, dtype=np.float64).reshape(*vectors.shape[:-1], 3, 3)
 
 
 def rotation_vectors(matrices: Array) -> Array:
     """Rotation matrices (..., 3, 3) to vectors (..., 3)."""
     flat = [cv2.Rodrigues(matrix)[0].ravel() for matrix in matrices.reshape(-1, 3, 3)]
-    return np.array(flat).reshape(matrices.shape[:-1])
+    return np.array(flat, dtype=np.float64).reshape(matrices.shape[:-1])
 
 
 def mean_extrinsics(rotation: Array, translation: Array) -> tuple[Array, Array]:
