@@ -18,7 +18,7 @@ from scripts.benchmarks.peers.rig_task import Array, RigAnswer, rotation_matrice
 
 LENS = cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_FIX_TANGENT_DIST
 FLAGS = cv2.CALIB_USE_INTRINSIC_GUESS | LENS  # eight points of one view do not give the lens too
-NEAR = 30.0  # px, of a blob from its fiducial's projection
+NEAR = 10.0  # px, of a blob from its fiducial's projection
 LEAST = 6  # labelled blobs of a camera that is calibrated
 
 
