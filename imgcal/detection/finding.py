@@ -63,7 +63,7 @@ def screen(frame: Frame, options: DetectionOptions, scale: int) -> Screening:
     floor, level = _levels(contrast, options, scale)
     local_peak = cv2.dilate(contrast, np.ones((3, 3), np.uint8))
     # Blocks that stand out, and those next to them that hold something.
-    blocks = np.flatnonzero((local_peak > int(floor + level)) & (contrast > int(floor + EDGE * level)))
+    blocks = _marked((local_peak > int(floor + level)) & (contrast > int(floor + EDGE * level)))
     local_peak = local_peak.ravel()[blocks] - floor
     # The mean of the 3 x 3 pixels around a pixel has 4/3 of the noise of a block mean.
     excess = np.maximum(level * 4 / 3, PEAK_FRACTION * local_peak)
@@ -98,6 +98,15 @@ def outline(frame: Frame, screening: Screening, options: DetectionOptions, scale
     return Candidates(tile, labels, boxes[small], np.flatnonzero(small).astype(np.int32) + 1)
 
 
+def _marked(marks: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Flat indices of the few true ones, eight looked at together."""
+    flat = marks.ravel()
+    whole = len(flat) // 8 * 8
+    places = (8 * np.flatnonzero(flat[:whole].view(np.int64))[:, None] + np.arange(8)).ravel()
+    places = np.append(places, np.arange(whole, len(flat)))
+    return places[flat[places]]
+
+
 def _block_means(frame: Frame) -> Frame:
     """Average blocks of 4 x 4: (ceil(H / 4), ceil(W / 4)). Beyond the border the last row or column repeats."""
     height, width = (-(-n // BLOCK) for n in frame.shape)
@@ -124,7 +133,7 @@ def _average(frame, sums, means):
 
 def _levels(contrast: NDArray[np.generic], options: DetectionOptions, scale: int) -> tuple[float, float]:
     """Estimate what the opening leaves of an empty background, and how far above it a candidate must stand."""
-    sample = np.sort(contrast[::8, ::8], axis=None)
+    sample = np.sort(contrast[::8, ::8], axis=None, kind="stable")  # by radix: these are integers
     lower = sample[: max(1, int(0.6 * sample.size))]  # without the blobs and most of the texture
     noise = 1.54 * float(lower.std())  # the standard deviation of a normal variable below its 60th percentile
     level = max(NOISE_FACTOR * noise, LEAST_CONTRAST * scale)

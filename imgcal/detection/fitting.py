@@ -48,9 +48,10 @@ def fit_centre(rows, pixels, start, clipped, noise):
     """
     now, cost = start, _draw(rows, pixels, start)
     normal = _products(rows, pixels)
-    damping, moved, settled = 1e-3, False, False
+    factor, damping, moved, settled = normal, 1e-3, False, False
     for _ in range(CLIPPED_STEPS if clipped else STEPS):
-        step = _solve(_factor(normal, damping), normal[PARAMETERS, :PARAMETERS])
+        factor = _factor(normal, damping)
+        step = _solve(factor, normal[PARAMETERS, :PARAMETERS])
         trial = now + step
         # What is left moves the centre by much less than the noise does: no need to draw it again.
         settled = moved and normal[5, 5] * step[5] ** 2 + normal[6, 6] * step[6] ** 2 < SETTLED * noise**2
@@ -63,7 +64,8 @@ def fit_centre(rows, pixels, start, clipped, noise):
             normal, moved = _products(rows, pixels), True
         else:
             damping = max(30 * damping, 1e-2)
-    factor = _factor(normal, 1e-9)
+    if damping > 1e-4:  # less makes no difference
+        factor = _factor(normal, 1e-9)
     a, b, d = factor[5, 5], factor[6, 5], factor[6, 6]
     known = a * a * d * d / ((a * a + b * b + d * d) / 2)  # one over the mean of the inverse's diagonal
     return now[5], now[6], known if settled else 0.0, cost / max(pixels - PARAMETERS, 1)
@@ -148,7 +150,7 @@ def _products(rows, pixels):
 @njit(cache=True, nogil=True, error_model="numpy")
 def _factor(normal, damping):
     """Cholesky factor of the normal matrix, its diagonal grown by the damping."""
-    factor = np.zeros((PARAMETERS, PARAMETERS))
+    factor = np.empty((PARAMETERS, PARAMETERS))  # above its diagonal it is never read
     for i in range(PARAMETERS):
         for j in range(i + 1):
             value = normal[i, j] * (1 + damping) if i == j else normal[i, j]

@@ -56,7 +56,8 @@ def measure_all(
         own, other = distances[0, :pixels].reshape(shape), distances[1, :pixels].reshape(shape)
         brightest = _copy(frame, first, u, v, invert, plane, grey, offsets)
         _blur(grey, smooth)
-        crowded = _spread_labels(tile, labels, first, label[k], distances[2, :pixels].reshape(shape), own, other)
+        spare = distances[2, :pixels].reshape(shape)
+        crowded = _spread_labels(tile, labels, first, label[k], spare, own, other)
         saddle = _claim(own, other, crowded, smooth, weight)
         scale = _weigh(smooth, noise, weight)
         peak, peak_mean, brightness = _find_peaks(grey, smooth, weight)
@@ -74,7 +75,7 @@ def measure_all(
         known = x0 = y0 = residual = 0.0
         if not flags[k] & _MERGED:
             start = start_of(peak, radius[k], clipped, moments, middle)
-            count = _gather(grey, x, y, own, other, plane, saturation if clipped else np.inf, start, fit)
+            count = _gather(grey, x, y, own, other, spare, plane, saturation if clipped else 1e9, start, fit)
             if count > PARAMETERS:
                 x0, y0, known, residual = fit_centre(fit, count, start, clipped, noise)
         if known > 0 and (x0 - middle[0]) ** 2 + (y0 - middle[1]) ** 2 < FARTHEST**2:
@@ -297,8 +298,8 @@ def _claim(own, other, crowded, smooth, territory):
     return saddle
 
 
-@njit(cache=True, nogil=True)
-def _gather(grey, x, y, own, other, plane, saturation, start, fit):
+@njit(cache=True, nogil=True, fastmath=True)
+def _gather(grey, x, y, own, other, marks, plane, saturation, start, fit):
     """List the pixels around the edge of a blob that are its own and not saturated, for `fit_centre`.
 
     Returns:
@@ -309,15 +310,20 @@ def _gather(grey, x, y, own, other, plane, saturation, start, fit):
     xx, xy, yy, x0, y0 = start[2:].astype(np.float32)
     value = grey.reshape(-1)
     near, far = own.reshape(-1), other.reshape(-1)
-    most, level, tilt = np.float32(saturation - 0.1), np.float32(plane[0]), np.array(plane[1:], np.float32)
+    most, level, tilt_x, tilt_y = (
+        np.float32(saturation - 0.1), np.float32(plane[0]), np.float32(plane[1]), np.float32(plane[2]),
+    )  # fmt: skip
     listed_x, listed_y, listed_value = fit[ROWS - 3], fit[ROWS - 2], fit[ROWS - 1]
+    two, zero, one, flat = np.float32(2), np.uint8(0), np.uint8(1), marks.reshape(-1)
+    for p in range(len(value)):  # all pixels alike, which is vectorized
+        dx, dy = x[p] - x0, y[p] - y0
+        outer = xx * dx * dx + two * xy * dx * dy + yy * dy * dy >= inner
+        dim = level + tilt_x * x[p] + tilt_y * y[p] + value[p] < most
+        flat[p] = one if (near[p] <= limit) & (near[p] <= far[p]) & outer & dim else zero
     for i in range(MARGIN, rows - MARGIN):
         for p in range(i * columns + MARGIN, (i + 1) * columns - MARGIN):
-            dx, dy = x[p] - x0, y[p] - y0
-            outer = xx * dx * dx + np.float32(2) * xy * dx * dy + yy * dy * dy >= inner
             listed_x[count], listed_y[count], listed_value[count] = x[p], y[p], value[p]
-            full = level + tilt[0] * x[p] + tilt[1] * y[p] + value[p] >= most
-            count += (near[p] <= limit) & (near[p] <= far[p]) & outer & (not full)
+            count += flat[p]
         if count + columns > MOST:
             return 0
     return count
