@@ -23,6 +23,7 @@ MOST_FIDUCIAL_TRIPLES = 300_000
 DRAWS = 3  # blob triples of which the widest is taken
 PROBES = 8  # fiducials that every hypothesis is tested on; only promising ones are tested on all
 CELLS = 4  # raster cells to a tolerance
+MOST_CELLS = 512  # across the blobs; where that makes cells larger, the tolerance is larger too
 
 
 @dataclass(frozen=True)
@@ -135,17 +136,19 @@ def single_camera_poses(
         cameras: (Q,) camera of each triple.
         triples: (Q, 3) blobs.
         fiducials: triples to match them with.
-        tolerance: pixels within which a predicted fiducial counts as seen.
+        tolerance: pixels within which a predicted fiducial counts as seen, at least.
         keep: poses to keep of each triple of blobs.
     """
     focal = rig.focal_length.mean(-1).numpy()
     rays = blobs.ideal[cameras[:, None], triples].astype(np.float64) / focal[cameras, None, None]
-    raster, origin = _rasterize(blobs.ideal, blobs.count, tolerance / CELLS)
+    seen = blobs.ideal[blobs.row >= 0]
+    cell = max(tolerance / CELLS, float(np.ptp(seen, axis=0).max()) / MOST_CELLS)
+    raster, origin = _rasterize(blobs.ideal, blobs.count, cell)
     score = np.zeros((len(triples), keep))
     rotation, translation = np.zeros((len(triples), keep, 3, 3)), np.zeros((len(triples), keep, 3))
     _search(
         rays, cameras, fiducials.triples, fiducials.sides, fiducials.frames, fiducials.points, fiducials.order,
-        focal, raster, origin, CELLS / tolerance, score, rotation, translation,
+        focal, raster, origin, 1 / cell, score, rotation, translation,
     )  # fmt: skip
     found = score > 0
     camera = np.broadcast_to(cameras[:, None], found.shape)[found]

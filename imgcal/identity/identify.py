@@ -48,6 +48,7 @@ KEPT = 8  # poses of each
 MANY = 40  # fiducials of a planar object, above which triples are too many
 PATIENCE = 3  # rounds that end with two good labellings
 MOST_STEPS = 6  # from one labelling to a better one of the moved object
+APPROXIMATE = 0.02  # rad, what poses from three points are off by, even for a perfect camera
 VERIFIED = 2  # different labellings that are fitted, the best of a round
 
 
@@ -290,7 +291,8 @@ def _bounds(scene: Scene, distance: float, pose_known: bool) -> tuple[float, flo
     baseline = float(np.linalg.norm(positions - positions.mean(0), axis=1).max())
     parallax = 2 * spread.shape * focal * baseline / distance
     shift = float(np.hypot(spread.shift.max() * (1.0 if pose_known else np.sqrt(2)), 0.0 if pose_known else parallax))
-    return max(3.0, 2.5 * spread.shape * focal * scene.obj.size / distance), max(10.0, 4 * shift)
+    bend = 2.5 * spread.shape if pose_known else float(np.hypot(2.5 * spread.shape, APPROXIMATE))
+    return max(3.0, bend * focal * scene.obj.size / distance), max(10.0, 4 * shift)
 
 
 def _guess_distance(scene: Scene) -> float:
