@@ -26,6 +26,7 @@ SKIRT = 3.5  # px, how far the blurred edge reaches beyond the component that wa
 SPREAD = 5  # px, up to which distances are exact
 MARGIN = SPREAD + 1  # px around the area: distances are asked for in the pixels next to it
 SIGNIFICANT = 6.0  # standard deviations of a 3 x 3 mean that the brightest one of a blob must reach
+MISFIT = 0.05  # of the peak, beyond the noise: RMS residual from which a blob is no ellipse and keeps its centroid
 CROWDED = 0.6  # of the peak: a border this bright with a neighbour is no border
 SMALLEST_SIGMA = 0.0005  # px, what sampling by pixels leaves without any noise
 # px * sqrt(px): position lost where clipping turns a soft edge into a step, over sqrt(radius); the worst case of the
@@ -78,7 +79,8 @@ def measure_all(
             count = _gather(grey, x, y, own, other, spare, plane, saturation if clipped else 1e9, start, fit)
             if count > PARAMETERS:
                 x0, y0, known, residual = fit_centre(fit, count, start, clipped, noise)
-        if known > 0 and (x0 - middle[0]) ** 2 + (y0 - middle[1]) ** 2 < FARTHEST**2:
+        fits = known > 0 and residual - noise**2 < (MISFIT * peak) ** 2
+        if fits and (x0 - middle[0]) ** 2 + (y0 - middle[1]) ** 2 < FARTHEST**2:
             variance = max(noise**2, residual) / known + (slope * brightness / known) ** 2
             variance += clipped * CLIPPED_FIT**2 / max(radius[k], 1.0)
         else:

@@ -76,7 +76,8 @@ def measure(frame, labels, label, box, half, saturation, invert=None):
         rows = territory & (quadratic(start, x, y) >= max(start[1] - fitting.BAND, 0) ** 2 - 1)
         rows &= (raw < saturation) | (not clipped)
         x0, y0, known, residual = fit(x[rows], y[rows], grey[rows], start, clipped, noise)
-    if known > 0 and np.hypot(x0 - middle[0], y0 - middle[1]) < window.FARTHEST:
+    fits = known > 0 and residual - noise**2 < (window.MISFIT * grey[core].max()) ** 2
+    if fits and np.hypot(x0 - middle[0], y0 - middle[1]) < window.FARTHEST:
         variance = max(noise**2, residual) / known + (slope * brightness / known) ** 2
         variance += clipped * window.CLIPPED_FIT**2 / max(radius, 1)
     else:
