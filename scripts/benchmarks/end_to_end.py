@@ -70,7 +70,7 @@ def measure(effort: Effort) -> dict[str, Any]:
             OPENCV: Classical(stream, pool, joint=False).update,
             SCIPY: Classical(stream, pool, joint=True).update,
         }
-        compared = _compared(stream, methods, effort.pick(25.0, 1.0), effort.pick(JUDGED, 2))
+        compared = _compared(stream, methods, effort.pick(20.0, 1.0), effort.pick(JUDGED, 2))
         endurance = _endurance(stream, live, effort.pick(10_000, 30), effort.pick(1_000, 30))
     return {
         "cores": os.cpu_count(),

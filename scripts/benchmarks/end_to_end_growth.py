@@ -62,7 +62,7 @@ class Scene:
 
 def measure(effort: Effort) -> dict[str, Any]:
     """Measure all four; every point takes about the same time."""
-    seconds = effort.pick(2.0, 0.02)
+    seconds = effort.pick(1.0, 0.02)
     o10, few = load_rig("O10"), load_object("asymmetric8")
     cameras = effort.pick((2, 4, 8, 16, 32, 64, 128, 256, 512, 1024), (2, 4))
     fiducials = effort.pick((8, 16, 32, 64, 128, 256, 437), (8, 12))
@@ -182,9 +182,11 @@ def of_frames(width: int, height: int, seconds: float) -> dict[str, float]:
     frames = _frames(scene)
     scale = width / 2048
     finder = opencv_live.detector((6.0 * scale, 24.0 * scale))
-    with Recalibrator(rig, obj) as live, ThreadPoolExecutor(1) as pool:
+    usual = DetectionOptions()
+    options = replace(usual, max_radius=usual.max_radius * max(scale, 1.0))
+    with Recalibrator(rig, obj, detection=options) as live, ThreadPoolExecutor(1) as pool:
         cases: dict[str, Callable[[], object]] = {
-            DETECTION: lambda: detect_snapshot(frames, DetectionOptions(), pool=pool),
+            DETECTION: lambda: detect_snapshot(frames, options, pool=pool),
             FRAMES: lambda: live.update(frames),
             FINDER: lambda: [finder.detect(frame) for frame in frames.values()],
         }
