@@ -1,4 +1,4 @@
-"""Blobs in captured frames: OpenCV finds them, intensity-weighted centroids measure them."""
+"""Blobs in captured frames: OpenCV finds them, a fitted ellipse measures them."""
 
 from imgcal.detection.detector import detect, detect_frame, detect_snapshot
 from imgcal.detection.measuring import Blobs

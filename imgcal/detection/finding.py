@@ -63,7 +63,7 @@ def screen(frame: Frame, options: DetectionOptions, scale: int) -> Screening:
     floor, level = _levels(contrast, options, scale)
     local_peak = cv2.dilate(contrast, np.ones((3, 3), np.uint8))
     # Blocks that stand out, and those next to them that hold something.
-    blocks = _marked((local_peak > int(floor + level)) & (contrast > int(floor + EDGE * level)))
+    blocks = np.flatnonzero((local_peak > int(floor + level)) & (contrast > int(floor + EDGE * level)))
     local_peak = local_peak.ravel()[blocks] - floor
     # The mean of the 3 x 3 pixels around a pixel has 4/3 of the noise of a block mean.
     excess = np.maximum(level * 4 / 3, PEAK_FRACTION * local_peak)
@@ -96,15 +96,6 @@ def outline(frame: Frame, screening: Screening, options: DetectionOptions, scale
         raised, excess = raised[oversize], LEVEL_STEP * excess[oversize]
         level[raised] = screening.base[raised] + excess
     return Candidates(tile, labels, boxes[small], np.flatnonzero(small).astype(np.int32) + 1)
-
-
-def _marked(marks: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Flat indices of the few true ones, eight looked at together."""
-    flat = marks.ravel()
-    whole = len(flat) // 8 * 8
-    places = (8 * np.flatnonzero(flat[:whole].view(np.int64))[:, None] + np.arange(8)).ravel()
-    places = np.append(places, np.arange(whole, len(flat)))
-    return places[flat[places]]
 
 
 def _block_means(frame: Frame) -> Frame:

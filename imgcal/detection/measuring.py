@@ -1,4 +1,4 @@
-"""How exactly a blob lies where: background-subtracted, intensity-weighted centroids.
+"""How exactly a blob lies where: a blurred ellipse fitted above the local background, else the weighted centroid.
 
 Each blob is measured in a window of its own that is walked a few times while it is in the cache.
 """
