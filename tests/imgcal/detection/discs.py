@@ -63,7 +63,7 @@ def exposed(
 ) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """Add read noise (grey levels), round and clip to `bits`."""
     grey = np.clip(np.rint(light + rng.normal(0, noise, light.shape)), 0, 2**bits - 1)
-    return grey.astype(np.uint8 if bits == 8 else np.uint16)
+    return grey.astype(np.uint8) if bits == 8 else grey.astype(np.uint16)
 
 
 def nearest(found: NDArray[np.float64], truth: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
