@@ -39,27 +39,23 @@ def side_by_side(
 
     Args:
         cases: what to call, by name; every case is called once before anything is measured (caches, compilation).
-        seconds: about how long all of it takes; three rounds are run in any case, but one of a case so slow that its
-            first call took a quarter of the time.
+        seconds: about how long all of it takes; three rounds are run in any case, but one of a case so slow that a
+            call takes a quarter of the time.
         prepare: called before every single call, its time does not count.
 
     Returns:
         The times by name, in the order of the cases.
     """
-    first = {}
-    for name, run in cases.items():
-        begin = time.perf_counter()
+    for run in cases.values():
         _once(run, prepare)
-        first[name] = time.perf_counter() - begin
-    warm = {name: _once(run, prepare) if first[name] < seconds / 4 else first[name] for name, run in cases.items()}
     times: dict[str, list[float]] = {name: [] for name in cases}
     begin, rounds = time.perf_counter(), 0
     while rounds < LEAST_ROUNDS or time.perf_counter() - begin < seconds:
         for name, run in cases.items():
-            if rounds and warm[name] > seconds / 4:
+            before = min(times[name], default=SLICE)
+            if before > seconds / 4:
                 continue
-            for _ in range(max(1, int(SLICE / max(warm[name], 1e-6)))):
-                times[name].append(_once(run, prepare))
+            times[name] += [_once(run, prepare) for _ in range(max(1, int(SLICE / max(before, 1e-6))))]
         rounds += 1
     return {name: timing_of(taken) for name, taken in times.items()}
 
