@@ -53,7 +53,7 @@ def side_by_side(
     while rounds < LEAST_ROUNDS or time.perf_counter() - begin < seconds:
         for name, run in cases.items():
             before = min(times[name], default=SLICE)
-            if before > seconds / 4:
+            if times[name] and before > seconds / 4:
                 continue
             times[name] += [_once(run, prepare) for _ in range(max(1, int(SLICE / max(before, 1e-6))))]
         rounds += 1
