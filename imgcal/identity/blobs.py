@@ -33,6 +33,12 @@ class Blobs:
     count: NDArray[np.int64]  # (C,)
     rows: int  # rows of the detections, usable or not
 
+    def only(self, camera: int) -> Blobs:
+        """Keep one camera; labels keep their numbers."""
+        one = [camera]
+        kept = (self.uv[one], self.ideal[one], self.sigma[one], self.radius[one], self.row[one], self.count[one])
+        return Blobs(*kept, self.rows)
+
     def to_rows(self, labels: NDArray[np.int64]) -> NDArray[np.int64]:
         """Turn blob indices of fiducials (C, N) into fiducials of detection rows (rows,)."""
         result = np.full(self.rows, -1, dtype=np.int64)

@@ -21,7 +21,7 @@ from imgcal.identity.hypotheses import (
 )
 from imgcal.identity.planar import planar_poses
 from imgcal.identity.result import Identity, IdentityOptions, Status
-from imgcal.identity.rivals import conflicts, differ, displacement, lattice_shifts, moved, near_turns
+from imgcal.identity.rivals import Motion, conflicts, differ, displacement, lattice_shifts, moved, near_turns
 from imgcal.identity.verify import (
     STAGES,
     Fits,
@@ -49,6 +49,8 @@ MANY = 40  # fiducials of a planar object, above which triples are too many
 PATIENCE = 3  # rounds that end with two good labellings
 MOST_STEPS = 6  # from one labelling to a better one of the moved object
 APPROXIMATE = 0.02  # rad, what poses from three points are off by, even for a perfect camera
+EXCLUDED = 60.0  # margin of a labelling in one camera, above which the rig need not be asked
+LEAST_ALONE = 6  # labels from which one camera can be fitted by itself
 VERIFIED = 2  # different labellings that are fitted, the best of a round
 
 
@@ -260,18 +262,73 @@ def _against_motions(scene: Scene, best: Fits, known_pose: bool) -> tuple[Fits, 
     for _ in range(MOST_STEPS):
         _, pose = rig_and_pose(scene, best, 0)
         labels = best.labels[0]
+        alone = _shifted_alone(scene, best, shifts, 6 * spread.shift)
+        together = _preferred(labels, alone)
+        if together is not None:
+            fit = refine(scene, start(scene, _one(pose), together[None]), stages=STAGES[:1])
+            if _margin(scene, best, fit) < 0:
+                best = settle(scene, fit)
+                continue
         rivals = [moved(pose, labels, [motion]) for motion in shifts + turns]
-        for motion in shifts:
-            for camera in np.flatnonzero(displacement(predictions(best), motion) < 6 * spread.shift):
-                alone = labels[None].copy()
-                alone[:, camera] = moved(pose, labels, [motion])[1][:, camera]
-                rivals.append((Poses(pose.rotation.numpy()[None], pose.translation.numpy()[None]), alone))
+        rivals += [(_one(pose), rival[None]) for margin, _, rival in alone if margin < EXCLUDED]
         fits = [refine(scene, start(scene, *rival), stages=STAGES[:1]) for rival in rivals]
         margins = [_margin(scene, best, rival) for rival in fits]
         if not margins or min(margins) >= 0:
-            return best, min([np.inf, *margins])
+            excluded = [margin for margin, _, _ in alone if margin >= EXCLUDED]
+            return best, min([np.inf, *margins, *excluded])
         best = settle(scene, fits[int(np.argmin(margins))])
     return best, 0.0
+
+
+def _shifted_alone(
+    scene: Scene, best: Fits, shifts: list[Motion], reach: NDArray[np.float64]
+) -> list[tuple[float, int, NDArray[np.int64]]]:
+    """Compare a labelling with those in which the object is shifted for one camera alone, as that camera sees it.
+
+    A camera by itself, its pose free, knows only which labelling explains more of its blobs. What it would rather not
+    have, the rig does not want either: there, the shift must be borne by the camera's prior in addition.
+
+    Args:
+        scene: the snapshot.
+        best: a labelling, fitted.
+        shifts: steps of a lattice.
+        reach: (C,) pixels, farther shifts are beyond the prior.
+
+    Returns:
+        Margin against the labelling in that camera, camera, labels (C, N) of all cameras; margin 0 = it cannot tell.
+    """
+    _, pose = rig_and_pose(scene, best, 0)
+    labels, uv, found = best.labels[0], predictions(best), []
+    for camera in range(scene.rig.cameras):
+        near = [motion for motion in shifts if displacement(uv, motion)[camera] < reach[camera]]
+        seen = (labels[camera] >= 0).sum() >= LEAST_ALONE
+        part = scene.only(camera)
+        mine = refine(part, start(part, _one(pose), labels[None, [camera]]), STAGES[:1]) if near and seen else None
+        for motion in near:
+            where, shifted = moved(pose, labels, [motion])
+            margin = 0.0
+            if mine is not None:
+                rival = refine(part, start(part, where, shifted[:, [camera]]), STAGES[:1])
+                margin = _margin(part, mine, rival)
+            alone = labels.copy()
+            alone[camera] = shifted[0, camera]
+            found.append((margin, camera, alone))
+    return found
+
+
+def _preferred(
+    labels: NDArray[np.int64], alone: list[tuple[float, int, NDArray[np.int64]]]
+) -> NDArray[np.int64] | None:
+    """Labels (C, N) in which every camera has the shift that it likes better; None = they all like theirs best."""
+    together, least = labels.copy(), np.zeros(len(labels))
+    for margin, camera, shifted in alone:
+        if margin < least[camera]:
+            together[camera], least[camera] = shifted[camera], margin
+    return together if (least < 0).any() else None
+
+
+def _one(pose: RigidTransform) -> Poses:
+    return Poses(pose.rotation.numpy()[None], pose.translation.numpy()[None])
 
 
 def _refused(scene: Scene, reason: str) -> Identity:

@@ -19,6 +19,7 @@ from imgcal.identity.assignment import assign
 from imgcal.identity.blobs import Blobs
 from imgcal.identity.hypotheses import Poses
 from imgcal.identity.innovation import THRESHOLD, Innovations, contested, innovations
+from imgcal.identity.rivals import lattice_shifts
 from imgcal.objects import CalibrationObject
 from imgcal.rig import CameraRig
 from imgcal.transforms import RigidTransform
@@ -58,6 +59,10 @@ class Scene:
             factory=self.rig.expand(1),
             spread=self.std.expand(1, -1, -1),
         )
+
+    def only(self, camera: int) -> Scene:
+        """Keep one camera."""
+        return Scene(self.blobs.only(camera), self.obj, self.rig.select([camera]), self.std[[camera]])
 
 
 @dataclass(frozen=True)
@@ -141,7 +146,9 @@ def certain(scene: Scene, fits: Fits, odds: float, least_odds: float) -> Fits:
     usual = np.median(log_odds[np.isfinite(log_odds)]) if np.isfinite(log_odds).any() else 0.0
     demanded = np.clip(usual - np.log(100), np.log(least_odds), np.log(odds))
     # Two or three labels of one camera can support each other in the wrong place: most of what it sees must fit.
-    enough = np.maximum(3, 0.5 * np.minimum(scene.blobs.count, scene.obj.fiducials))
+    # In a lattice, half of them can, a step away.
+    most = 0.7 if lattice_shifts(scene.obj) else 0.5
+    enough = np.maximum(3, most * np.minimum(scene.blobs.count, scene.obj.fiducials))
     for _ in range(4):
         found = _found(fits)
         log_odds = _log_density(found) + surroundings

@@ -194,6 +194,40 @@ def test_a_shifted_lattice_ends_in_the_right_answer_or_none(o10: CameraRig) -> N
     assert accepted > 0
 
 
+def test_a_lattice_finds_its_place_in_ten_cameras(o10: CameraRig) -> None:
+    # Factory poses leave each camera some pitches to choose from: all of them must walk to the right one.
+    lattice = np.stack(np.meshgrid(np.arange(10) * 12.0, np.arange(10) * 12.0, [0.0]), axis=-1).reshape(-1, 3)
+    obj, generator = make_object(lattice - lattice.mean(0)), np.random.default_rng(1)
+    drift = PhysicalDrift(rotation_deg=0.05, principal_point=1.0)
+    truth = simulate_truth(o10, obj, 1, torch.Generator().manual_seed(0), drift)
+    exact = true_detections(truth)
+    for _ in range(2):  # of the second, one camera starts badly: it gets no labels rather than some
+        shown = exact.select(generator.random(len(exact)) >= 0.15)
+        uv = shown.uv + 0.05 * generator.standard_normal(shown.uv.shape)
+        blobs = replace(shown, uv=uv, sigma=np.full(len(shown), 0.3), fiducial=np.full(len(shown), -1))
+        found = bootstrap(blobs, o10, obj, o10.prior.std(o10))
+        right, wrong = agreements(found.labels, shown.fiducial, obj)
+        assert wrong == 0 and right > 0.85 * len(shown)
+
+
+def test_a_large_cloud_is_found_by_its_outer_fiducials(o10: CameraRig) -> None:
+    obj = make_object(120 * (np.random.default_rng(0).random((150, 3)) - 0.5))
+    _, [(blobs, truth)] = snapshots(o10, obj, 1, 140, 5)
+    found = bootstrap(blobs, o10, obj, DRIFT.std(o10))
+    right, wrong = agreements(found.labels, truth, obj)
+    assert found.status == "unique" and wrong <= 0.01 * right and right > 0.9 * 10 * 140
+
+
+def test_a_narrow_prior_finds_the_same(o10: CameraRig, asymmetric: CalibrationObject) -> None:
+    std = 0.1 * DRIFT.std(o10)
+    truth = simulate_truth(o10, asymmetric, 3, torch.Generator().manual_seed(0), RelativeDrift(0.005, 0.005))
+    exact = true_detections(truth)
+    for s in range(3):
+        shown = replace(exact.select(exact.snapshot == s), snapshot_names=("0", "1", "2"))
+        found = bootstrap(replace(shown, fiducial=np.full(len(shown), -1)), o10, asymmetric, std)
+        np.testing.assert_array_equal(found.labels, shown.fiducial)
+
+
 def test_blobs_of_other_cameras_or_of_two_snapshots_are_an_error(o10: CameraRig, asymmetric: CalibrationObject) -> None:
     _, [(blobs, _)] = snapshots(o10, asymmetric, 1, 8, 0)
     with pytest.raises(InputError, match="cameras"):
