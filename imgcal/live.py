@@ -17,7 +17,8 @@ from imgcal.detection import Blobs, DetectionOptions, detect_snapshot
 from imgcal.detection.options import Frame
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import estimate
-from imgcal.identity.assignment import mutual_nearest, spacing
+from imgcal.identity.assignment import distances_to_nearest, mutual_nearest
+from imgcal.identity.rivals import lattice_shifts
 from imgcal.labelling import Follower, Labelled, PipelineOptions, SnapshotIdentity, matched_to_rig, to_observations
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections
@@ -26,8 +27,10 @@ from imgcal.rig import CameraRig
 from imgcal.transforms import RigidTransform
 
 MOST_FOLLOWED = 64
-"""Fiducials up to which a snapshot may be labelled by the last prediction alone; a larger lattice could have slipped by
-a pitch unnoticed."""
+"""Fiducials of a lattice up to which a snapshot may be labelled by the last prediction alone; a larger one could have
+slipped by a pitch unnoticed."""
+TOO_NEAR = 0.6
+"""Distance (px) between two predictions below which nearness does not tell which is which."""
 MOST_APART = 5.0
 """Times the median distance that a blob may be from its fiducial, once the pose has been fitted with the last rig."""
 LEAST_FOLLOWED = 0.9
@@ -66,6 +69,7 @@ class Recalibrator:
         self._recent: deque[tuple[Detections, SnapshotIdentity]] = deque(maxlen=window)
         self._latest: Calibration | None = None
         self._count = 0
+        self._slips = obj.fiducials > MOST_FOLLOWED and bool(lattice_shifts(obj))
         self._pool = ThreadPoolExecutor(min(rig.cameras, os.cpu_count() or 1))
 
     def __enter__(self) -> Recalibrator:
@@ -121,7 +125,7 @@ class Recalibrator:
         What is accepted here has been fitted: as many labels as before, hardly any of them an outlier.
         """
         latest = self._latest
-        if latest is None or self.obj.fiducials > MOST_FOLLOWED:
+        if latest is None or self._slips:
             return None
         points = latest.rig_from_object[-1].apply(self.obj.points)
         predicted = latest.rig.project(points, self.obj.radius).uv.numpy()  # (C, N, 2)
@@ -179,16 +183,18 @@ def _joined(recent: list[tuple[Detections, SnapshotIdentity]], rig: CameraRig) -
 def _nearest(blobs: Detections, predicted: NDArray[np.float64]) -> NDArray[np.int64]:
     """Fiducial (M,) whose prediction (C, N, 2) is nearest to each blob, -1 where that is not mutual or not near enough.
 
-    Near is a quarter of the distance between predictions: a pattern that has moved less keeps its labels.
+    Near is a quarter of the distance between predictions: a pattern that has moved less keeps its labels. Fiducials
+    whose predictions all but coincide get none.
     """
     labels = np.full(len(blobs), -1, dtype=np.int64)
-    reach = 0.25 * spacing(predicted)
+    gaps = distances_to_nearest(predicted)
+    reach = 0.25 * float(np.median(gaps))
     order = np.argsort(blobs.camera, kind="stable")
     ends = np.searchsorted(blobs.camera[order], np.arange(len(predicted) + 1))
-    for places, begin, end in zip(predicted, ends[:-1], ends[1:], strict=True):
+    for places, crowded, begin, end in zip(predicted, gaps < TOO_NEAR, ends[:-1], ends[1:], strict=True):
         rows, found = order[begin:end], np.empty(len(places), dtype=np.int64)
         mutual_nearest(places, blobs.uv[rows], reach, found)
-        named = np.flatnonzero(found >= 0)
+        named = np.flatnonzero((found >= 0) & ~crowded)
         labels[rows[found[named]]] = named
     return labels
 

@@ -40,11 +40,12 @@ def mutual_nearest(places, blobs, reach, labels):
 
 def spacing(places: NDArray[np.float64]) -> float:
     """Median distance (px) from a fiducial's image to the nearest other one in the same camera; places (C, N, 2)."""
-    return float(np.median(_gaps(np.ascontiguousarray(places))))
+    return float(np.median(distances_to_nearest(np.ascontiguousarray(places))))
 
 
 @njit(cache=True)
-def _gaps(places):
+def distances_to_nearest(places):
+    """Distance (px) from each place (C, N, 2) to the nearest other one in the same camera: (C, N)."""
     gaps = np.full(places.shape[:2], np.inf)
     for c in range(len(places)):
         for i in range(places.shape[1]):

@@ -8,6 +8,7 @@ from imgcal.detection import detect
 from imgcal.errors import InputError, RefusedError
 from imgcal.formats import load_object, load_rig
 from imgcal.live import Recalibrator
+from imgcal.objects import CalibrationObject
 from imgcal.rotations import rotation_from_vector
 from imgcal.simulation import FrameModel, Truth, simulate_frames, simulate_truth, true_detections
 from imgcal.synthesis import PhysicalDrift
@@ -86,3 +87,21 @@ def test_a_blob_that_is_off_loses_its_label_and_is_no_reason_to_start_anew(small
     assert result.labelled.snapshots[0].reason == "near the last prediction"
     assert result.labelled.detections.fiducial[3] == -1 and int(result.observations.seen.sum()) == len(second) - 1
     assert result.rms < 0.02
+
+
+def test_a_large_cloud_is_followed_and_a_large_lattice_is_not():
+    rig, generator = load_rig("T4"), torch.Generator().manual_seed(0)
+    cloud = 120 * (torch.rand(100, 3, generator=generator, dtype=torch.float64) - 0.5)
+    lattice = torch.cartesian_prod(*[torch.arange(n).double() * 12 for n in (10, 10, 1)])
+    for points, reason in ((cloud, "near the last"), (lattice - lattice.mean(0), "explains")):
+        obj = CalibrationObject(points, torch.ones_like(points))
+        truth = simulate_truth(rig, obj, 1, torch.Generator().manual_seed(0), PhysicalDrift(rotation_deg=0.05))
+        labelled = true_detections(truth)
+        blobs = replace(labelled, fiducial=np.full(len(labelled), -1))
+        with Recalibrator(rig, obj) as recalibrator:
+            recalibrator.update(blobs)
+            result = recalibrator.update(blobs)
+        assert result.labelled.snapshots[0].reason.startswith(reason)
+        found = result.labelled.detections.fiducial
+        right = [((found < 0) | (m.permutation[labelled.fiducial] == found)).all() for m in obj.symmetries]
+        assert any(right) and (found >= 0).mean() > 0.9
