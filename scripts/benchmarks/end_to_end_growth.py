@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
 from imgcal.detection import DetectionOptions, detect_snapshot
@@ -102,6 +103,7 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
             low = min(row[stage] for row in result[axis] for stage in stages if row.get(stage) is not None)
             axes.plot(n, low * n / n[0], ":", color=GREY, linewidth=1, label="linear")
             axes.set(xscale="log", yscale="log", xlabel=axis)
+            axes.xaxis.set_minor_formatter(NullFormatter())
             axes.legend(fontsize=5.5)
         panels[0].set_ylabel("ms")
 

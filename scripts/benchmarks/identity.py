@@ -93,8 +93,12 @@ def tables(result: Mapping[str, Any]) -> dict[str, str]:
     tracked = [
         (name, *(f"{_decided(row, method)}, {_time(row, method)} ms" for method in known)) for name, row in rows.items()
     ]
+    run = sorted({int(row[VOTE]["snapshots"]) for row in rows.values() if VOTE in row})
+    peers = f"{run[0]} to {run[-1]} snapshots" if run else ABSENT
+    ours = max(int(row[OURS]["snapshots"]) for row in rows.values())
+    amounts = (f"{ours} snapshots a row", *[peers] * 2)
     return {
-        "identity": markdown(("a camera sees", *cold), decided),
+        "identity": markdown(("a camera sees", *cold), [("", *amounts), *decided]),
         "identity time": markdown(("a camera sees", *(f"{method}, ms p50 / p95" for method in cold)), times),
         "identity known pose": markdown(("a camera sees", *known), tracked),
     }
@@ -128,7 +132,11 @@ def _decided(row: Mapping[str, Any], method: str) -> str:
 
 
 def _time(row: Mapping[str, Any], method: str) -> str:
-    return f"{row[method]['ms_p50']:.3g} / {row[method]['ms_p95']:.3g}" if method in row else ABSENT
+    return " / ".join(_ms(row[method][key]) for key in ("ms_p50", "ms_p95")) if method in row else ABSENT
+
+
+def _ms(value: float) -> str:
+    return f"{value:,.0f}" if value >= 100 else f"{value:.1f}"
 
 
 def _case(case: Case, snapshots: int, patience: float) -> dict[str, dict[str, float]]:

@@ -24,7 +24,7 @@ def test_smoke(tmp_path):
 def test_an_absent_baseline_is_a_column_that_says_so(monkeypatch):
     monkeypatch.setattr(identity, "peer", lambda name: None)
     result = json.loads(json.dumps(identity.measure(Effort(smoke=True))))
-    assert identity.tables(result)["identity"].splitlines()[2].endswith("| absent | absent |")
+    assert identity.tables(result)["identity"].splitlines()[3].endswith("| absent | absent |")
 
 
 @pytest.mark.parametrize("name", ["asymmetric8", "cube8"])
