@@ -81,9 +81,9 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
             ours = "megabytes" in row
             time_ms = row["refined" if ours else "alone"]["p50"]
             axes.plot(row["parameters"] / 1e6, time_ms, "o", color=BLUE if ours else GREY, markersize=5)
-            axes.annotate(
-                name, (row["parameters"] / 1e6, time_ms), fontsize=6, xytext=(4, 3), textcoords="offset points"
-            )
+            if not name.endswith("cube8"):  # as large and as fast as its sibling
+                place = (row["parameters"] / 1e6, time_ms)
+                axes.annotate(name.split("-O10")[0], place, fontsize=7, xytext=(5, 3), textcoords="offset points")
         axes.set(xscale="log", yscale="log", xlabel="parameters, millions", ylabel="one rig: ms, 1 thread")
         axes.margins(x=0.3)
 
