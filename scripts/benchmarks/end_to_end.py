@@ -37,7 +37,8 @@ from scripts.benchmarks.peers.rig_task import RigAnswer, RigTask
 from scripts.output import markdown
 from scripts.timing import side_by_side, timing_of
 
-OURS, OPENCV, SCIPY = "imgcal", "OpenCV, camera by camera", "OpenCV, then SciPy for the rig"
+OURS, QUICK, EXACT = "imgcal", "OpenCV, 1 threshold", "OpenCV, 10 thresholds"
+SCIPY = f"{EXACT}, then SciPy for the rig"
 RADIUS = (6.0, 24.0)  # px, of markers of 6 mm, generously
 JUDGED = 20  # results of each whose accuracy is measured
 NOISE = 0.05  # px, what SciPy is told of the centres' error
@@ -67,8 +68,9 @@ def measure(effort: Effort) -> dict[str, Any]:
     with ThreadPoolExecutor(os.cpu_count()) as pool, Recalibrator(stream.factory, stream.obj) as live:
         methods: dict[str, Callable[[int], Outcome]] = {
             OURS: Ours(stream, live).update,
-            OPENCV: Classical(stream, pool, joint=False).update,
-            SCIPY: Classical(stream, pool, joint=True).update,
+            QUICK: Classical(stream, pool, 1, joint=False).update,
+            EXACT: Classical(stream, pool, 10, joint=False).update,
+            SCIPY: Classical(stream, pool, 10, joint=True).update,
         }
         compared = _compared(stream, methods, effort.pick(20.0, 1.0), effort.pick(JUDGED, 2))
         endurance = _endurance(stream, live, effort.pick(10_000, 30), effort.pick(1_000, 30))
@@ -154,10 +156,10 @@ class Ours:
 class Classical:
     """The peers in the running state, which are told the labels of the first snapshot."""
 
-    def __init__(self, stream: Stream, pool: ThreadPoolExecutor, joint: bool) -> None:
+    def __init__(self, stream: Stream, pool: ThreadPoolExecutor, thresholds: int, joint: bool) -> None:
         self.stream, self.pool, self.joint = stream, pool, joint
         self.points = stream.obj.points.numpy()
-        self.finder = opencv_live.detector(RADIUS)
+        self.finder = opencv_live.detector(RADIUS, thresholds)
         self.views = [_first_view(stream, camera) for camera in range(stream.factory.cameras)]
 
     def update(self, snapshot: int) -> Outcome:
@@ -215,7 +217,7 @@ def _first_view(stream: Stream, camera: int) -> opencv_live.View:
     )
     labels, uv = np.arange(len(points)), stream.truth.uv[0, camera].numpy()
     size = (int(rig.image_size[camera, 0]), int(rig.image_size[camera, 1]))
-    return opencv_live.calibrated(labels, uv, points, start, size)
+    return opencv_live.calibrated(labels, uv, points, start, size)[0]
 
 
 def _rig(answer: RigAnswer, like: CameraRig) -> CameraRig:

@@ -40,15 +40,16 @@ SIZES = ((640, 480), (1280, 1024), (2048, 1088), (4096, 3000))
 COLD, KNOWN, RUNNING = "identity, cold", "identity, pose known", "running: blobs to a rig"
 LABELLED, OPENCV = "labels to a rig", "OpenCV, labels to cameras"
 IDENTITY, ESTIMATION = "identity", "estimation"
-DETECTION, FRAMES, FINDER = "detection", "running: frames to a rig", "OpenCV, detection"
+DETECTION, FRAMES = "detection", "running: frames to a rig"
+QUICK, EXACT = "OpenCV, detection, 1 threshold", "OpenCV, detection, 10 thresholds"
 COLOURS = {COLD: GREEN, KNOWN: "#8fbf6f", RUNNING: BLUE, LABELLED: "#6fa8dc", OPENCV: RED}
-COLOURS |= {IDENTITY: GREEN, ESTIMATION: BLUE, DETECTION: GREEN, FRAMES: BLUE, FINDER: RED}
+COLOURS |= {IDENTITY: GREEN, ESTIMATION: BLUE, DETECTION: GREEN, FRAMES: BLUE, QUICK: "#e58a80", EXACT: RED}
 AXES = {
     "cameras": (COLD, KNOWN, RUNNING, LABELLED, OPENCV),
     "fiducials": (COLD, KNOWN, RUNNING, LABELLED, OPENCV),
     "fiducials of a lattice": (COLD, KNOWN),
     "snapshots": (IDENTITY, ESTIMATION, OPENCV),
-    "megapixels": (DETECTION, FRAMES, FINDER),
+    "megapixels": (DETECTION, FRAMES, QUICK, EXACT),
 }
 
 
@@ -196,14 +197,15 @@ def of_frames(width: int, height: int, seconds: float) -> dict[str, float]:
     scene = make_scene(rig, obj)
     frames = _frames(scene)
     scale = width / 2048
-    finder = opencv_live.detector((6.0 * scale, 24.0 * scale))
+    quick, exact = (opencv_live.detector((6.0 * scale, 24.0 * scale), number) for number in (1, 10))
     usual = DetectionOptions()
     options = replace(usual, max_radius=usual.max_radius * max(scale, 1.0))
     with Recalibrator(rig, obj, detection=options) as live, ThreadPoolExecutor(1) as pool:
         cases: dict[str, Callable[[], object]] = {
             DETECTION: lambda: detect_snapshot(frames, options, pool=pool),
             FRAMES: lambda: live.update(frames),
-            FINDER: lambda: [finder.detect(frame) for frame in frames.values()],
+            QUICK: lambda: [quick.detect(frame) for frame in frames.values()],
+            EXACT: lambda: [exact.detect(frame) for frame in frames.values()],
         }
         return {name: timing.p50 for name, timing in side_by_side(cases, seconds).items()}
 

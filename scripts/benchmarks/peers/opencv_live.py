@@ -19,7 +19,10 @@ from scripts.benchmarks.peers.rig_task import Array, RigAnswer, rotation_matrice
 LENS = cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_FIX_TANGENT_DIST
 FLAGS = cv2.CALIB_USE_INTRINSIC_GUESS | LENS  # eight points of one view do not give the lens too
 NEAR = 10.0  # px, of a blob from its fiducial's projection
+LARGEST = 1.0  # px, of a labelled blob from its fiducial's projection by the last intrinsics
 LEAST = 6  # labelled blobs of a camera that is calibrated
+
+Seen = tuple[NDArray[np.int64], Array]  # fiducials (K,), places (K, 2)
 
 
 @dataclass(frozen=True)
@@ -36,14 +39,18 @@ class View:
         return np.asarray(uv[:, 0], dtype=float)
 
 
-def detector(radius: tuple[float, float]) -> Any:
+def detector(radius: tuple[float, float], thresholds: int) -> Any:
     """Tuned for bright markers of a radius between these (px), of some 180 grey levels over a dark ground.
 
-    Three thresholds, of whose centres it takes the mean: more cost time and gain nothing, one is 30 % less exact.
+    A blob's centre is the mean over the thresholds at which it was found: more are more exact and slower. One is enough
+    to find them.
     """
     settings = cv2.SimpleBlobDetector.Params()
-    settings.minThreshold, settings.maxThreshold, settings.thresholdStep = 60, 151, 45
-    settings.minRepeatability, settings.minDistBetweenBlobs = 2, 5
+    settings.minThreshold, settings.maxThreshold, settings.thresholdStep = 100, 101, 10
+    if thresholds > 1:
+        step = 140 / (thresholds - 1)
+        settings.minThreshold, settings.maxThreshold, settings.thresholdStep = 40, 180 + step / 2, step
+    settings.minRepeatability, settings.minDistBetweenBlobs = min(thresholds, 2), 5
     settings.filterByColor, settings.blobColor = True, 255
     settings.filterByArea = True
     settings.minArea, settings.maxArea = np.pi * radius[0] ** 2, np.pi * radius[1] ** 2
@@ -55,7 +62,7 @@ def detector(radius: tuple[float, float]) -> Any:
 
 def update(
     frames: Sequence[NDArray[np.uint8]], points: Array, views: Sequence[View], finder: Any, pool: Executor
-) -> tuple[list[View], list[tuple[NDArray[np.int64], Array]]]:
+) -> tuple[list[View], list[Seen]]:
     """Calibrate every camera from its frame of this moment.
 
     Args:
@@ -66,19 +73,18 @@ def update(
         pool: threads, which take a camera each.
 
     Returns:
-        The cameras, and the fiducials (K,) and places (K, 2) of the labelled blobs of each.
+        The cameras, and the fiducials (K,) and places (K, 2) of the blobs of each that fit.
     """
     size = (frames[0].shape[1], frames[0].shape[0])
 
-    def one(frame: NDArray[np.uint8], view: View) -> tuple[View, tuple[NDArray[np.int64], Array]]:
-        seen = labelled(_blobs(finder, frame), points, view)
-        return calibrated(*seen, points, view, size), seen
+    def one(frame: NDArray[np.uint8], view: View) -> tuple[View, Seen]:
+        return calibrated(*labelled(_blobs(finder, frame), points, view), points, view, size)
 
     found = list(pool.map(one, frames, views))
     return [view for view, _ in found], [seen for _, seen in found]
 
 
-def labelled(uv: Array, points: Array, view: View) -> tuple[NDArray[np.int64], Array]:
+def labelled(uv: Array, points: Array, view: View) -> Seen:
     """Give each blob (M, 2) the fiducial whose projection is nearest, where that is mutual."""
     if len(uv) == 0:
         return np.empty(0, dtype=np.int64), uv
@@ -88,19 +94,34 @@ def labelled(uv: Array, points: Array, view: View) -> tuple[NDArray[np.int64], A
     return nearest[good], uv[good]
 
 
-def calibrated(labels: NDArray[np.int64], uv: Array, points: Array, view: View, size: tuple[int, int]) -> View:
-    """Find the pose by solvePnP, from the last one, then pose, focal length and principal point together."""
+def calibrated(
+    labels: NDArray[np.int64], uv: Array, points: Array, view: View, size: tuple[int, int]
+) -> tuple[View, Seen]:
+    """Find the pose by solvePnPRansac, from the last one, then pose, focal length and principal point together.
+
+    Returns:
+        The camera, and the labels and places that fit: all of them where too few fit the intrinsics as they were.
+    """
     if len(labels) < LEAST:
-        return view
+        return view, (labels, uv)
     shown = points[labels]
-    _, vector, shift = cv2.solvePnP(
-        shown, uv, view.matrix, view.distortion, view.rotation[:, None].copy(), view.translation[:, None].copy(), True
+    _, vector, shift, inliers = cv2.solvePnPRansac(
+        shown,
+        uv,
+        view.matrix,
+        view.distortion,
+        view.rotation[:, None].copy(),
+        view.translation[:, None].copy(),
+        True,
+        reprojectionError=LARGEST,
     )
+    if inliers is not None and len(inliers) >= LEAST:
+        labels, uv, shown = labels[inliers[:, 0]], uv[inliers[:, 0]], shown[inliers[:, 0]]
     view = replace(view, rotation=np.asarray(vector[:, 0], float), translation=np.asarray(shift[:, 0], float))
     calibrate: Any = cv2.calibrateCamera  # its stubs know half of what it takes
     given = ([shown.astype(np.float32)], [uv.astype(np.float32)], size)
     _, matrix, distortion, vectors, shifts = calibrate(*given, view.matrix.copy(), view.distortion.copy(), flags=FLAGS)
-    return View(matrix, np.ravel(distortion)[:5], np.ravel(vectors[0]), np.ravel(shifts[0]))
+    return View(matrix, np.ravel(distortion)[:5], np.ravel(vectors[0]), np.ravel(shifts[0])), (labels, uv)
 
 
 def answer(views: Sequence[View]) -> RigAnswer:
