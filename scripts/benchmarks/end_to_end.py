@@ -217,7 +217,7 @@ def _first_view(stream: Stream, camera: int) -> opencv_live.View:
     )
     labels, uv = np.arange(len(points)), stream.truth.uv[0, camera].numpy()
     size = (int(rig.image_size[camera, 0]), int(rig.image_size[camera, 1]))
-    return opencv_live.calibrated(labels, uv, points, start, size)[0]
+    return opencv_live.calibrated(labels, uv, points, start, size)
 
 
 def _rig(answer: RigAnswer, like: CameraRig) -> CameraRig:

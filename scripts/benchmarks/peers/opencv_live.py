@@ -78,7 +78,8 @@ def update(
     size = (frames[0].shape[1], frames[0].shape[0])
 
     def one(frame: NDArray[np.uint8], view: View) -> tuple[View, Seen]:
-        return calibrated(*labelled(_blobs(finder, frame), points, view), points, view, size)
+        seen = without_outliers(*labelled(_blobs(finder, frame), points, view), points, view)
+        return calibrated(*seen, points, view, size), seen
 
     found = list(pool.map(one, frames, views))
     return [view for view, _ in found], [seen for _, seen in found]
@@ -94,34 +95,31 @@ def labelled(uv: Array, points: Array, view: View) -> Seen:
     return nearest[good], uv[good]
 
 
-def calibrated(
-    labels: NDArray[np.int64], uv: Array, points: Array, view: View, size: tuple[int, int]
-) -> tuple[View, Seen]:
-    """Find the pose by solvePnPRansac, from the last one, then pose, focal length and principal point together.
-
-    Returns:
-        The camera, and the labels and places that fit: all of them where too few fit the intrinsics as they were.
-    """
+def without_outliers(labels: NDArray[np.int64], uv: Array, points: Array, view: View) -> Seen:
+    """Keep the labels that fit the last intrinsics, by solvePnPRansac; all of them where too few do."""
     if len(labels) < LEAST:
-        return view, (labels, uv)
+        return labels, uv
+    pose = (view.rotation[:, None].copy(), view.translation[:, None].copy())
+    lens = (view.matrix, view.distortion)
+    inliers = cv2.solvePnPRansac(points[labels], uv, *lens, *pose, True, reprojectionError=LARGEST)[3]
+    if inliers is None or len(inliers) < LEAST:
+        return labels, uv
+    return labels[inliers[:, 0]], uv[inliers[:, 0]]
+
+
+def calibrated(labels: NDArray[np.int64], uv: Array, points: Array, view: View, size: tuple[int, int]) -> View:
+    """Find the pose by solvePnP, from the last one, then pose, focal length and principal point together."""
+    if len(labels) < LEAST:
+        return view
     shown = points[labels]
-    _, vector, shift, inliers = cv2.solvePnPRansac(
-        shown,
-        uv,
-        view.matrix,
-        view.distortion,
-        view.rotation[:, None].copy(),
-        view.translation[:, None].copy(),
-        True,
-        reprojectionError=LARGEST,
+    _, vector, shift = cv2.solvePnP(
+        shown, uv, view.matrix, view.distortion, view.rotation[:, None].copy(), view.translation[:, None].copy(), True
     )
-    if inliers is not None and len(inliers) >= LEAST:
-        labels, uv, shown = labels[inliers[:, 0]], uv[inliers[:, 0]], shown[inliers[:, 0]]
     view = replace(view, rotation=np.asarray(vector[:, 0], float), translation=np.asarray(shift[:, 0], float))
     calibrate: Any = cv2.calibrateCamera  # its stubs know half of what it takes
     given = ([shown.astype(np.float32)], [uv.astype(np.float32)], size)
     _, matrix, distortion, vectors, shifts = calibrate(*given, view.matrix.copy(), view.distortion.copy(), flags=FLAGS)
-    return View(matrix, np.ravel(distortion)[:5], np.ravel(vectors[0]), np.ravel(shifts[0])), (labels, uv)
+    return View(matrix, np.ravel(distortion)[:5], np.ravel(vectors[0]), np.ravel(shifts[0]))
 
 
 def answer(views: Sequence[View]) -> RigAnswer:
