@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from imgcal.refinement.photometric import profile_and_slope
+from imgcal.refinement.robust import mutual_nearest
 
 RIDGE = 0.05  # of a dot's own weight: dots in the same place share what is there
 MOST_DIFFERENCE = 0.3  # between a dot's colour and that of a fiducial, as a distance in RGB
@@ -46,7 +47,6 @@ def exchanged(found: Tensor, colours: Tensor, fits: Tensor) -> Tensor:
     own = torch.arange(len(colours), device=found.device)
     difference = (found.unsqueeze(-2) - colours.to(found)).norm(dim=-1)  # (*B, N places, N colours)
     difference = difference.masked_fill(fits.unsqueeze(-1) | fits.unsqueeze(-2), torch.inf)
-    nearest, colour = difference.min(-1)
-    mutual = difference.argmin(-2).gather(-1, colour) == own
+    nearest, colour, mutual = mutual_nearest(difference)
     named = torch.where(mutual & (nearest < MOST_DIFFERENCE), colour, -1)
     return torch.where(fits, own, named)

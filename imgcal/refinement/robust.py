@@ -172,14 +172,24 @@ def mended(prediction: Prediction, target: Target, gate: float) -> Mended:
     lost = target.seen & ~fit
     distance = (target.uv.unsqueeze(-2) - expected.unsqueeze(-3)).norm(dim=-1)  # (B, C, N points, N fiducials)
     distance = torch.where(lost.unsqueeze(-1) & ~fit.unsqueeze(-2), distance, torch.inf)
-    nearest, fiducial = distance.min(-1)
-    mutual = distance.argmin(-2).gather(-1, fiducial) == torch.arange(distance.shape[-1], device=distance.device)
+    nearest, fiducial, mutual = mutual_nearest(distance)
     source = (mutual & (nearest <= limit)).nonzero(as_tuple=True)
     place = (*source[:2], fiducial[source])
     uv, seen = target.uv.clone(), target.seen.clone()
     seen[source] = False
     uv[place], seen[place], fit[place] = target.uv[source], True, True
     return Mended(uv, seen, fit)
+
+
+def mutual_nearest(distance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Find the nearest column of each row of (*B, N, N), and whether that column's nearest row is the same one.
+
+    Returns:
+        Distance, column, and bool, each (*B, N).
+    """
+    nearest, column = distance.min(-1)
+    rows = torch.arange(distance.shape[-2], device=distance.device)
+    return nearest, column, distance.argmin(-2).gather(-1, column) == rows
 
 
 def robust_pose(views: Views, factory: CameraRig, obj: CalibrationObject, sigma: float) -> Prediction:
