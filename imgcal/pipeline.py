@@ -12,9 +12,9 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from imgcal.checks import require_cameras, require_fit, require_most_labels, require_near_prior
 from imgcal.detection import DetectionOptions, detect
 from imgcal.detection.options import Frame
 from imgcal.errors import RefusedError
@@ -25,7 +25,7 @@ from imgcal.labelling import Labelled, PipelineOptions, Progress, label, matched
 from imgcal.networks.prediction import Prediction
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections, Observations
-from imgcal.rig import PARAMETER_NAMES, CameraRig, RigPrior
+from imgcal.rig import CameraRig, RigPrior
 from imgcal.settling import settle
 from imgcal.transforms import RigidTransform
 
@@ -128,7 +128,7 @@ def fit_labelled(
     """
     observations, poses = _used(labelled, rig, obj)
     variance, labels = observations.sigma.numpy() ** 2, observations.seen.numpy()
-    _require_cameras(labels, rig, options)
+    require_cameras(labels, rig, options)
     prior = (rig.prior or RigPrior()).std(rig)
     problem = make_problem(observations, rig, obj, prior)
     poses = poses or initial_pose(observations, rig, obj)
@@ -145,10 +145,10 @@ def fit_labelled(
     found = settle(problem, starts, variance, labels, options)
     fit = conclude(found.problem, found.solution, found.solution.state)
     outliers = int(labels.sum() - found.seen.sum())
-    _require_cameras(found.seen, rig, options)
-    _require_near_prior(fit, prior, rig, found.widened, options)
-    _require_most_labels(labels, found.seen, rig)
-    _require_fit(found.model_error, outliers / max(int(labels.sum()), 1), 2**0.5 * float(fit.rms), options)
+    require_cameras(found.seen, rig, options)
+    require_near_prior(fit, prior, rig, found.widened, options)
+    require_most_labels(labels, found.seen, rig)
+    require_fit(found.model_error, outliers / max(int(labels.sum()), 1), 2**0.5 * float(fit.rms), options)
     values = {name: getattr(fit, name) for name in Estimate.__dataclass_fields__}
     return Calibration(
         **values,
@@ -176,59 +176,6 @@ def _used(labelled: Labelled, rig: CameraRig, obj: CalibrationObject) -> tuple[O
     poses = [labelled.snapshots[s].rig_from_object for s in used]
     known = [pose for pose in poses if pose is not None]
     return observations, RigidTransform.joined(known, torch.stack) if len(known) == len(used) else None
-
-
-def _require_cameras(seen: NDArray[np.bool_], rig: CameraRig, options: PipelineOptions) -> None:
-    blind = [rig.camera_names[i] for i in np.flatnonzero(~seen.any(axis=(0, 2)))]
-    if blind and (not options.blind_cameras or len(blind) == rig.cameras):
-        raise RefusedError(
-            f"camera {', '.join(blind)}: found no fiducial in any snapshot, expected some; nothing can be said of it "
-            "(--without leaves a camera out, --blind-cameras keeps its factory values)"
-        )
-
-
-def _require_fit(model_error: float, outlier_share: float, rms: float, options: PipelineOptions) -> None:
-    if model_error > options.largest_model_error:
-        raise RefusedError(
-            f"estimation: residuals of {rms:.2f} px RMS do not fit the noise: found an unexplained error "
-            f"of {model_error:.2f} px, expected at most {options.largest_model_error:g}; the object, the labels or the "
-            "camera model are not what they are said to be"
-        )
-    if outlier_share > options.most_outliers:
-        raise RefusedError(
-            f"estimation: {100 * outlier_share:.0f} % of the labelled blobs do not fit, expected at most "
-            f"{100 * options.most_outliers:.0f} %"
-        )
-
-
-def _require_near_prior(
-    fit: Estimate, prior: Tensor, rig: CameraRig, widened: Mapping[str, float], options: PipelineOptions
-) -> None:
-    offset, spread, std = (tensor.numpy() for tensor in (fit.solution.state.offset[0], fit.problem.spread[0], prior))
-    drift = np.where(std > 0, np.abs(offset * spread) / np.maximum(std, 1e-30), 0.0)
-    camera, parameter = divmod(int(drift.argmax()), drift.shape[1])
-    largest = float(drift[camera, parameter])
-    wide = max(widened.values(), default=1.0)
-    if largest > options.largest_drift or wide > options.widest_prior:
-        raise RefusedError(
-            f"estimation: camera {rig.camera_names[camera]}: {PARAMETER_NAMES[parameter]} is {largest:.1f} prior "
-            f"standard deviations off its factory value, expected at most {options.largest_drift:g}, and "
-            f"{options.widest_prior:g} for all of a kind; cameras may be swapped, labels wrong, or the prior in the "
-            "rig file too narrow"
-        )
-
-
-def _require_most_labels(labels: NDArray[np.bool_], kept: NDArray[np.bool_], rig: CameraRig) -> None:
-    """Refuse where most labels of one camera or one fiducial do not fit: they are not what they are said to be."""
-    for name, axes, names in (("camera", (0, 2), rig.camera_names), ("fiducial", (0, 1), None)):
-        before, after = labels.sum(axes), kept.sum(axes)
-        bad = np.flatnonzero((before >= 6) & (after < 0.5 * before)).tolist()
-        if bad:
-            which = ", ".join(str(i) if names is None else names[i] for i in bad)
-            raise RefusedError(
-                f"estimation: {name} {which}: most labels do not fit the rest (frames of another moment, swapped "
-                "labels, or a fiducial that has moved)"
-            )
 
 
 def rms_length(residual: Tensor, seen: Tensor) -> float | None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from imgcal.markers import sphere_images
@@ -26,6 +27,7 @@ class Truth:
     rig: CameraRig  # the drifted rig
     rig_from_object: RigidTransform  # (S,)
     uv: Tensor  # (S, C, N, 2) pixels, exact image points
+    visible: Tensor | None = None  # (S, C, N) bool, where a camera does not see everything; None = all is seen
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,37 @@ def simulate_truth(
     return Truth(true_rig, poses, torch.cat([part.projection.uv for part in parts]))
 
 
+def simulate_volume(
+    rig: CameraRig,
+    obj: CalibrationObject,
+    snapshots: int,
+    generator: torch.Generator,
+    drift: Drift | None,
+    low: tuple[float, float, float] = (-1600.0, -1600.0, 300.0),
+    high: tuple[float, float, float] = (1600.0, 1600.0, 2000.0),
+) -> Truth:
+    """Disturb the rig once, then carry the object through a box: a wand in a room, seen by some cameras at a time.
+
+    Args:
+        rig: the factory rig, without batch axes.
+        obj: the calibration object.
+        snapshots: number of poses, S: positions even in the box, orientations even over all rotations.
+        generator: source of randomness.
+        drift: how the parameters differ from the factory's; None = not at all.
+        low: lower corner of the box for the object's centroid, mm in the rig's frame.
+        high: upper corner of the box.
+    """
+    true_rig = rig if drift is None else drift.apply(rig, generator)
+    points = obj.points.to(rig.focal_length)
+    corners = points.new_tensor((low, high))
+    centres = torch.lerp(corners[0], corners[1], torch.rand(snapshots, 3, generator=generator, dtype=points.dtype))
+    quaternion = torch.randn(snapshots, 4, generator=generator, dtype=points.dtype)
+    rotation = torch.from_numpy(Rotation.from_quat(quaternion.numpy()).as_matrix()).to(points)
+    poses = RigidTransform(rotation, centres - rotation @ points.mean(0))
+    seen = true_rig.expand(snapshots).project(poses.apply(points), obj.radius)
+    return Truth(true_rig, poses, seen.uv, seen.visible)
+
+
 def simulate_frames(
     truth: Truth, obj: CalibrationObject, model: FrameModel, generator: torch.Generator
 ) -> Iterator[dict[str, NDArray[np.uint8] | NDArray[np.uint16]]]:
@@ -83,11 +116,11 @@ def simulate_frames(
 
 
 def true_detections(truth: Truth) -> Detections:
-    """The exact image points as labelled detections, without noise."""
+    """The exact image points of what is seen as labelled detections, without noise."""
     snapshots, cameras, fiducials = truth.uv.shape[:3]
     snapshot, camera, fiducial = (a.reshape(-1) for a in np.indices((snapshots, cameras, fiducials)))
     count = len(snapshot)
-    return Detections(
+    exact = Detections(
         uv=truth.uv.reshape(-1, 2).double().numpy(),
         sigma=np.full(count, 0.1),
         camera=camera,
@@ -98,6 +131,7 @@ def true_detections(truth: Truth) -> Detections:
         camera_names=truth.rig.camera_names,
         snapshot_names=tuple(f"{s:05d}" for s in range(snapshots)),
     )
+    return exact if truth.visible is None else exact.select(truth.visible.reshape(-1).numpy())
 
 
 def _frames(

@@ -37,8 +37,8 @@ class Simulate:
     Example: imgcal simulate --rig O10 --object asymmetric8 --out my_capture --snapshots 20 --kappa 0.05
     """
 
-    rig: str  #: factory rig: file, or the name of a shipped one (O10, O6, U7, T4)
-    object: str  #: object: file, or the name of a shipped one (asymmetric8, cube8, cube27, sphere64)
+    rig: str  #: factory rig: file, or the name of a shipped one (O10, O6, U7, T4, room10)
+    object: str  #: object: file, or the name of a shipped one (asymmetric8, cube8, cube27, sphere64, wand4)
     out: Path  #: folder to write; must not hold a capture yet
     snapshots: int = 10  #: number of poses of the object
     seed: int = 0  #: the same seed gives the same capture
