@@ -22,8 +22,9 @@ PATIENCE = 2.0  # s, between two signals that are not one and the same
 
 @dataclass(frozen=True)
 class Train:
-    """Train a network: writes OUT/model.safetensors, resolved.yaml, metrics.jsonl and TensorBoard's files.
+    """Train a network as an experiment file says.
 
+    Writes OUT/model.safetensors, resolved.yaml, metrics.jsonl and TensorBoard's files.
     Ctrl-C saves the state first; so do steps on the way, and --resume goes on from there, with the same result.
     Several processes: torchrun --nproc-per-node 2 -m imgcal train ...; on GPUs also accelerate launch -m imgcal ...
     Example: imgcal train table1-row01 --out out/row01

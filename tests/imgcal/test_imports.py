@@ -1,0 +1,57 @@
+"""What is imported when: nobody waits for a library that he does not use."""
+
+import subprocess
+import sys
+from importlib import import_module
+from types import ModuleType
+
+import pytest
+
+import imgcal
+from imgcal.cli.main import COMMANDS
+
+HEAVY = {"torch", "numba", "cv2", "scipy", "kornia", "timm", "plotly", "tensorboard", "accelerate", "matplotlib"}
+OF_OTHER_COMMANDS = {"timm", "tensorboard", "accelerate", "matplotlib"}
+
+
+def imported_by(code: str) -> set[str]:
+    """Top-level modules there after a piece of code, in a process of its own; SystemExit is passed over."""
+    script = f"import sys\ntry:\n    {code}\nexcept SystemExit:\n    pass\nprint('|', *sys.modules)"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    return {name.partition(".")[0] for name in done.stdout.rpartition("|")[2].split()}
+
+
+def test_import_waits_for_nothing() -> None:
+    assert not imported_by("import imgcal") & (HEAVY | {"numpy", "pydantic"})
+
+
+@pytest.mark.parametrize("arguments", [["--help"], [], ["calibarte"]])
+def test_help_waits_for_nothing_heavy(arguments: list[str]) -> None:
+    assert not imported_by(f"from imgcal.cli.main import main; main({arguments})") & HEAVY
+
+
+@pytest.mark.parametrize("command", ["simulate", "detect", "calibrate", "score", "evaluate", "train"])
+def test_help_of_a_command_waits_for_no_network_or_plot(command: str) -> None:
+    found = imported_by(f"from imgcal.cli.main import main; main(['{command}', '--help'])")
+    assert not found & OF_OTHER_COMMANDS
+
+
+def test_every_public_name_is_there_and_is_no_module() -> None:
+    for name in imgcal.__all__:
+        assert not isinstance(getattr(imgcal, name), ModuleType), name
+    assert set(imgcal.__all__) <= set(dir(imgcal))
+    assert sorted(imgcal._HOMES) == imgcal.__all__
+
+
+def test_modules_are_attributes_and_what_is_not_there_is_an_attribute_error() -> None:
+    assert imgcal.formats is import_module("imgcal.formats")
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = imgcal.nothing
+    assert not hasattr(imgcal, "__path_of_nothing__")
+
+
+def test_the_list_of_commands_says_what_the_commands_say() -> None:
+    for name, (module, summary) in COMMANDS.items():
+        command = getattr(import_module(module), name.capitalize())
+        text = " ".join(command.__doc__.split("\n\n")[0].split())
+        assert text.startswith(summary), name
