@@ -85,7 +85,7 @@ class Calibrate:
         if calibration is None:
             # A rig of an earlier run beside a refusal would be taken for the result of this one.
             (out / "rig.yaml").unlink(missing_ok=True)
-            result = refused_summary(str(refusal), detections.snapshot_names, seconds)
+            result = refused_summary(refusal.for_command, detections.snapshot_names, seconds)
         else:
             covariance = RigCovariance.from_matrix(
                 relative_covariance(calibration, reference), rig.camera_names[reference]
@@ -94,7 +94,7 @@ class Calibrate:
             result = summary(calibration, seconds)
         if self.report:
             content = (
-                describe_refusal(str(refusal), detections, rig, obj, frames, seconds)
+                describe_refusal(refusal.for_command, detections, rig, obj, frames, seconds)
                 if calibration is None
                 else describe(calibration, rig, obj, frames, reference, seconds)
             )

@@ -64,7 +64,7 @@ def main(arguments: list[str] | None = None) -> int:
     except InputError as error:
         return _fail(error, UNUSABLE)
     except RefusedError as error:
-        return _fail(error, REFUSED)
+        return _fail(RuntimeError(error.for_command), REFUSED)
     except BrokenPipeError:  # the reader of our output has seen enough
         sys.stdout = None
         return DONE

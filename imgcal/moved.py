@@ -1,0 +1,44 @@
+"""A camera that did not stand still while a rig was in use: what is said about it, wherever it was noticed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Kind = Literal["rotation", "position", "focal_length", "unknown"]
+
+UNITS: dict[Kind, str] = {"rotation": "deg", "position": "mm", "focal_length": "px", "unknown": ""}
+
+
+@dataclass(frozen=True)
+class MovedCamera:
+    """One camera, the first snapshot that it saw from its new place, and how far it went."""
+
+    camera: str
+    snapshot: str  # name of the first snapshot after the move
+    kind: Kind  # what explains the change best; unknown = nothing of what it saw afterwards could be labelled
+    size: float | None = None  # in `unit`; None = not known
+    sigma: float | None = None  # one standard deviation of the size
+
+    @property
+    def unit(self) -> str:
+        """Unit of the size."""
+        return UNITS[self.kind]
+
+    def as_values(self) -> dict[str, str | float | None]:
+        """The form that scripts read."""
+        return {
+            "camera": self.camera,
+            "snapshot": self.snapshot,
+            "kind": self.kind,
+            "size": self.size,
+            "sigma": self.sigma,
+            "unit": self.unit,
+        }
+
+    def __str__(self) -> str:
+        """Say it in words."""
+        where = f"camera {self.camera} moved before snapshot {self.snapshot}"
+        if self.size is None or self.sigma is None:
+            return where
+        return f"{where} ({self.kind.replace('_', ' ')} {self.size:.3g} +- {self.sigma:.1g} {self.unit})"
