@@ -1,5 +1,14 @@
 """`python -m imgcal` is the command `imgcal`."""
 
-from imgcal.cli.main import run
+from imgcal.cli.interruption import ends_at_once
 
-run()
+
+def run() -> None:
+    """Entry point of the installed command."""
+    with ends_at_once():
+        from imgcal.cli.main import run as run_command
+    run_command()
+
+
+if __name__ == "__main__":
+    run()

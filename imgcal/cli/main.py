@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import re
 import sys
+import traceback
+import warnings
 from dataclasses import make_dataclass
 from importlib import import_module
+from pathlib import Path
 from typing import Annotated, Any, Protocol, Union
 
 import tyro
 
+from imgcal.cli.interruption import ends_at_once
 from imgcal.errors import InputError, RefusedError
+from imgcal.messages import one_line, quoted
 
 DONE, UNUSABLE, REFUSED, INTERRUPTED = 0, 2, 3, 130
+
+DEBUG = "--debug"
 
 COMMANDS = {
     "simulate": (
@@ -47,7 +57,9 @@ COMMANDS = {
 
 DESCRIPTION = """Recalibrate infrared multi-camera rigs from images of a known calibration object.
 
-imgcal COMMAND --help tells more. Exit codes: 0 done, 2 unusable input, 3 refused (the data cannot decide)."""
+imgcal COMMAND --help tells more. Exit codes: 0 done, 2 unusable input (or a fault of imgcal's own, which says so),
+3 refused (the data cannot decide), 130 interrupted. With --debug anywhere on the command line, a failure also shows
+its traceback."""
 
 
 class Runnable(Protocol):
@@ -58,20 +70,22 @@ class Runnable(Protocol):
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run a command line; returns the exit code."""
+    """Run a command line; returns the exit code, whatever happens."""
+    given = sys.argv[1:] if arguments is None else arguments
+    debug = DEBUG in given
     try:
-        parse(sys.argv[1:] if arguments is None else arguments).run()
-    except InputError as error:
-        return _fail(error, UNUSABLE)
-    except RefusedError as error:
-        return _fail(RuntimeError(error.for_command), REFUSED)
+        parse([argument for argument in given if argument != DEBUG]).run()
+    except SystemExit as stop:  # help was asked for
+        return DONE if stop.code is None else int(stop.code)
     except BrokenPipeError:  # the reader of our output has seen enough
         sys.stdout = None
         return DONE
-    except OSError as error:
-        return _fail(error, UNUSABLE)
-    except KeyboardInterrupt as stop:
-        return _fail(RuntimeError(str(stop) or "interrupted"), INTERRUPTED)
+    except BaseException as error:
+        if debug:
+            traceback.print_exc()
+        code, message = _verdict(error)
+        print(f"imgcal: {one_line(message)}", file=sys.stderr)
+        return code
     return DONE
 
 
@@ -79,11 +93,25 @@ def parse(arguments: list[str]) -> Runnable:
     """Turn a command line into its command; imports that command alone.
 
     Raises:
-        SystemExit: help was asked for, or the command line is not understood.
+        InputError: the command line is not understood.
+        SystemExit: help was asked for.
     """
+    drawn = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(drawn):
+            return _understood(arguments)
+    except SystemExit as stop:
+        if stop.code in (None, DONE):
+            raise
+        raise InputError(_undrawn(drawn.getvalue())) from None
+
+
+def _understood(arguments: list[str]) -> Runnable:
     first = arguments[0] if arguments else ""
     if first in COMMANDS:
-        return tyro.cli(_load(first), prog=f"imgcal {first}", args=arguments[1:])
+        with ends_at_once():  # imports take a while
+            command = _load(first)
+        return tyro.cli(command, prog=f"imgcal {first}", args=arguments[1:])
     # The shell's completion knows the options of every command; all else ends here, and names and summaries will do.
     load = _load if first.startswith("--tyro-") else _summary
     commands: Any = Union[tuple(Annotated[load(name), tyro.conf.subcommand(name)] for name in COMMANDS)]  # noqa: UP007
@@ -98,11 +126,38 @@ def _summary(name: str) -> Any:
     return make_dataclass(name.capitalize(), (), namespace={"__doc__": COMMANDS[name][1]})
 
 
-def _fail(error: Exception, code: int) -> int:
-    print(f"imgcal: {' '.join(str(error).split())}", file=sys.stderr)
-    return code
+def _undrawn(box: str) -> str:
+    """Take the words from the box that tyro draws about a command line."""
+    rows = (line.strip("│╭╮╰╯─| ") for line in box.splitlines()[1:])
+    text = " ".join(row for row in rows if row)
+    problem, _, hint = text.partition("For full helptext, ")
+    problem = problem.partition("Argument helptext:")[0].replace("__tyro-dummy-inner__.", "")
+    command = re.search(r"imgcal[a-z ]* --help", hint)
+    return f"{problem.strip()}; see {command[0] if command else 'imgcal --help'}"
+
+
+def _verdict(error: BaseException) -> tuple[int, str]:
+    """Say what a failure means to the user: exit code and message."""
+    match error:
+        case InputError() | OSError():
+            return UNUSABLE, str(error)
+        case RefusedError():
+            return REFUSED, error.for_command
+        case KeyboardInterrupt():
+            return INTERRUPTED, str(error) or "interrupted"
+        case MemoryError():
+            return UNUSABLE, f"not enough memory for this input ({str(error) or 'MemoryError'}); {DEBUG} shows where"
+    ours = [frame for frame in traceback.extract_tb(error.__traceback__) if "imgcal" in Path(frame.filename).parts]
+    place = f" ({Path(ours[-1].filename).name}:{ours[-1].lineno})" if ours else ""
+    what = quoted(f"{type(error).__name__}: {error}")
+    return UNUSABLE, f"internal error{place}: {what}; this input found a fault of imgcal, {DEBUG} shows where"
 
 
 def run() -> None:
-    """Entry point of the installed command."""
+    """Run the command line of this process, and end it."""
+    if not sys.warnoptions and DEBUG not in sys.argv:
+        warnings.simplefilter("ignore")  # remarks of other libraries; what matters to the user is in our one line
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # paths may hold bytes that are no text
     sys.exit(main())

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.errors import InputError
-from imgcal.formats.names import nearest, shortened
+from imgcal.formats.names import nearest
+from imgcal.messages import shortened
 
 Numbers = NDArray[np.float64]
 

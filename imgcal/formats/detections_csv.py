@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from imgcal.errors import InputError
 from imgcal.formats.atomic import replacing
 from imgcal.formats.csv_file import Chunk, fail_row, read_chunks
-from imgcal.formats.names import nearest, shortened
+from imgcal.formats.names import nearest
+from imgcal.messages import shortened
 from imgcal.observations import BlobFlag, Detections
 from imgcal.rig import CameraRig
 

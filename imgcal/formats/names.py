@@ -25,11 +25,6 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f", nearest: {names[matches[0]]}" if matches else ""
 
 
-def shortened(text: str) -> str:
-    """Keep what a message quotes from a file to a readable length."""
-    return text if len(text) <= 40 else text[:37] + "..."
-
-
 def find_file(path: str | Path, kind: str, suffix: str) -> Path:
     """Find a file by its path or, when there is none, by the bare name of a shipped one.
 

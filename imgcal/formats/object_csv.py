@@ -10,7 +10,8 @@ import torch
 from imgcal.errors import InputError
 from imgcal.formats.atomic import write_text
 from imgcal.formats.csv_file import Chunk, read_chunks
-from imgcal.formats.names import find_file, shortened
+from imgcal.formats.names import find_file
+from imgcal.messages import shortened
 from imgcal.objects import CalibrationObject
 from renderers.palette import palette
 

@@ -1,0 +1,28 @@
+"""Ctrl-C while modules are imported: light, so that it is there before they are."""
+
+import contextlib
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from types import FrameType
+
+
+@contextlib.contextmanager
+def ends_at_once() -> Iterator[None]:
+    """End the process with one line at Ctrl-C: within an import, KeyboardInterrupt can surface as anything."""
+    # In the background of a shell, Ctrl-C is not for us; and other programs may have handlers of their own.
+    ours = threading.current_thread() is threading.main_thread()
+    if not (ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler):
+        yield
+        return
+    signal.signal(signal.SIGINT, _end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _end(number: int, frame: FrameType | None) -> None:
+    os.write(2, b"imgcal: interrupted\n")
+    os._exit(130)

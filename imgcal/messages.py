@@ -1,0 +1,33 @@
+"""The words of messages: how much of what others wrote is repeated in them, and how."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+MOST_QUOTED = 200  # characters of a file's or another program's text
+LONGEST = 1000  # characters of a message
+
+
+def shortened(text: str) -> str:
+    """Keep a name or a cell that a message quotes to a readable length."""
+    return text if len(text) <= 40 else text[:37] + "..."
+
+
+def quoted(text: str) -> str:
+    """Keep what a message repeats of another program's words, or of a whole value, to a readable length."""
+    return text if len(text) <= MOST_QUOTED else text[: MOST_QUOTED - 3] + "..."
+
+
+def listed(names: Iterable[str]) -> str:
+    """List names, as many as fit."""
+    whole = list(names)
+    shown = [shortened(name) for name in whole]
+    if len(", ".join(shown)) <= MOST_QUOTED:
+        return ", ".join(shown)
+    return f"{', '.join(shown[: MOST_QUOTED // 50])}, ... ({len(whole)} in all)"
+
+
+def one_line(message: str) -> str:
+    """Make one line of it that a terminal takes for text: no line breaks, no control characters, not endless."""
+    text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in " ".join(message.split()))
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - MOST_QUOTED - 3]}...{text[-MOST_QUOTED:]}"

@@ -1,0 +1,106 @@
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from imgcal.cli import main as module
+from imgcal.cli.main import main
+from imgcal.errors import InputError
+
+
+def one_line(capsys):
+    output = capsys.readouterr()
+    assert "Traceback" not in output.err
+    (line,) = output.err.splitlines()
+    return line
+
+
+def failing(error):
+    class Failing:
+        def run(self):
+            raise error
+
+    return lambda arguments: Failing()
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        (ZeroDivisionError("division by zero"), "internal error (test_main.py:"),
+        (AssertionError(), "internal error"),
+        (RecursionError("too deep"), "too deep"),
+        (MemoryError(), "not enough memory"),
+        (UnicodeEncodeError("utf-8", "\udcff", 0, 1, "surrogates not allowed"), "surrogates"),
+        (ValueError("x" * 100_000 + "\n" * 10), "..."),
+        (InputError("a.csv: found \x1b[31m\nred\udcff"), "\\x1b[31m red\\udcff"),
+        (OSError(28, "No space left on device", "a.csv"), "a.csv"),
+    ],
+)
+def test_whatever_is_left_is_one_line(error, expected, monkeypatch, capsys):
+    monkeypatch.setattr(module, "parse", failing(error))
+    assert main(["score"]) == 2
+    line = one_line(capsys)
+    assert line.startswith("imgcal: ") and expected in line and len(line) < 1100
+
+
+def test_debug_shows_the_traceback_before_the_line(monkeypatch, capsys):
+    monkeypatch.setattr(module, "parse", failing(ZeroDivisionError("nothing to divide by")))
+    assert main(["--debug", "score"]) == 2
+    error = capsys.readouterr().err
+    assert "Traceback" in error and "ZeroDivisionError" in error.splitlines()[-1]
+
+
+def test_debug_may_stand_anywhere_and_is_no_argument_of_the_command(tmp_path, capsys):
+    assert main(["score", "--debug", str(tmp_path / "absent"), "--rig", "O10", "--object", "cube8"]) == 2
+    assert "no such file or folder" in capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ([], "simulate, detect"),
+        (["frobnicate"], "frobnicate"),
+        (["simulate"], "--rig"),
+        (["simulate", "--rig"], "--rig"),
+        (["simulate", "--rig", "O10", "--objekt", "cube8", "--out", "x"], "--objekt"),
+        (["simulate", "--rig", "O10", "--object", "cube8", "--out", "x", "--snapshots", "many"], "'many'"),
+        (["simulate", "--rig", "O10", "--object", "cube8", "--out", "x", "--sensor.bit-depth", "9"], "'9'"),
+        (["simulate", "--rig", "O10", "--object", "cube8", "--out", "x", "--sensor.blur", "-1"], "blur"),
+    ],
+)
+def test_a_command_line_that_cannot_be_read_is_one_line(arguments, expected, capsys):
+    assert main(arguments) == 2
+    line = one_line(capsys)
+    assert line.startswith("imgcal: ") and expected in line and "--help" in line
+    assert not set(line) & set("│╭╰─") and "dummy" not in line
+
+
+def test_help_is_no_failure(capsys):
+    assert main(["--help"]) == 0
+    assert "--debug" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("slow", "arguments"), [("tyro", ["--help"]), ("torch", ["score", "--help"])])
+def test_an_interruption_during_start_up_is_one_line(slow, arguments, tmp_path):
+    # The module sleeps on import: however long it really takes, the signal meets it.
+    (tmp_path / "sitecustomize.py").write_text(
+        "import sys, importlib.abc\n"
+        "class Slow(importlib.abc.MetaPathFinder):\n"
+        "    def find_spec(self, name, path, target=None):\n"
+        f"        if name == '{slow}':\n"
+        "            print('importing', flush=True)\n"
+        "            import time; time.sleep(5)\n"
+        "sys.meta_path.insert(0, Slow())\n"
+    )
+    environment = os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{Path.cwd()}"}
+    command = [sys.executable, "-m", "imgcal", *arguments]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+    assert process.stdout is not None and process.stdout.readline() == "importing\n"
+    time.sleep(0.2)
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=60)
+    assert (process.returncode, error) == (130, "imgcal: interrupted\n")
