@@ -159,7 +159,10 @@ class Recalibrator:
         """Fit the latest snapshots and a new one, which is not kept yet: it may be what spoils the fit."""
         window = self._recent.maxlen or 1
         recent = [*self._recent, (blobs, snapshot)][-window:]
-        return fit_labelled(_joined(recent, self.rig), self.rig, self.obj, self.options, latest=latest)
+        result = fit_labelled(_joined(recent, self.rig), self.rig, self.obj, self.options, latest=latest)
+        if (now := result.labelled.snapshots[-1]).status == "refused":
+            raise RefusedError(f"estimation: {now.reason}")
+        return result
 
     def _keep(self, blobs: Detections, snapshot: SnapshotIdentity, result: Calibration) -> Calibration:
         self._recent.append((blobs, snapshot))

@@ -25,9 +25,13 @@ from imgcal.labelling import Labelled, PipelineOptions, Progress, label, matched
 from imgcal.networks.prediction import Prediction
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections, Observations
+from imgcal.pose_support import UndeterminedPosesError, require_poses, without_snapshots
 from imgcal.rig import CameraRig, RigPrior
 from imgcal.settling import settle
 from imgcal.transforms import RigidTransform
+
+LEAST_KEPT = 0.8
+"""Share of the snapshots that must keep a pose when outliers have been left out."""
 
 Frames = Mapping[str, Frame | Sequence[Frame | None] | None]
 
@@ -126,6 +130,28 @@ def fit_labelled(
     Raises:
         RefusedError: a camera saw nothing, the estimate has no minimum, or the residuals do not fit.
     """
+    labelled = given = _with_poses(labelled, rig, obj)
+    while True:
+        try:
+            return _fit_labelled(labelled, rig, obj, options, guesser, latest)
+        except UndeterminedPosesError as error:
+            labelled = without_snapshots(labelled, error.rows)
+            if len(labelled.used) < LEAST_KEPT * len(given.used):
+                raise RefusedError(
+                    f"{error} (found {len(given.used) - len(labelled.used)} of {len(given.used)} such snapshots): some "
+                    "fiducial is not where the object file says"
+                ) from error
+
+
+def _fit_labelled(
+    labelled: Labelled,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    options: PipelineOptions,
+    guesser: Guesser | None,
+    latest: Calibration | None,
+) -> Calibration:
+    """Do the work of `fit_labelled` for snapshots that all have a pose."""
     observations, poses = _used(labelled, rig, obj)
     variance, labels = observations.sigma.numpy() ** 2, observations.seen.numpy()
     require_cameras(labels, rig, options)
@@ -164,6 +190,15 @@ def fit_labelled(
         first_guess=guess,
         guess_used=guess_used,
     )
+
+
+def _with_poses(labelled: Labelled, rig: CameraRig, obj: CalibrationObject) -> Labelled:
+    """Refuse the snapshots whose labels lie on one line."""
+    try:
+        require_poses(_used(labelled, rig, obj)[0].seen.numpy(), obj.points)
+    except UndeterminedPosesError as error:
+        return without_snapshots(labelled, error.rows)
+    return labelled
 
 
 def _used(labelled: Labelled, rig: CameraRig, obj: CalibrationObject) -> tuple[Observations, RigidTransform | None]:

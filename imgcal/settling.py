@@ -15,6 +15,7 @@ from imgcal.estimation.estimate import minimize
 from imgcal.estimation.linearize import Problem, State
 from imgcal.estimation.solver import Solution
 from imgcal.labelling import PipelineOptions
+from imgcal.pose_support import require_poses
 
 KINDS = {
     "rotation": slice(0, 3),
@@ -56,6 +57,7 @@ def settle(
 
     Raises:
         RefusedError: no minimum was found.
+        UndeterminedPosesError: without outliers some snapshots do not say where the object is.
     """
     (state, model_error), *later = starts
     widened: dict[str, float] = {}
@@ -66,6 +68,7 @@ def settle(
         # Judged by the sigma of this fit: what a coarse fit leaves says little about fine outliers. Where a fiducial
         # was left out there is no residual: it stays out.
         kept = seen & (squared <= options.outlier**2 * noise)
+        require_poses(kept, problem.points)
         if later and not (bool(solution.converged) and (kept == labels).all()):
             (state, model_error), *later = later
             kept = labels
