@@ -159,9 +159,7 @@ def _fit_labelled(
     problem = make_problem(observations, rig, obj, prior)
     poses = poses or initial_pose(observations, rig, obj)
     guess = None if guesser is None else guesser.guess(observations, rig, obj)
-    guess_used = guess is not None and bool(
-        guess.residual.norm() < residual_of(Prediction(rig, poses), observations, obj).norm()
-    )
+    guess_used = guess is not None and _nearer(guess, Prediction(rig, poses), observations, obj)
     state = make_start(problem, poses, None)
     if guess is not None and guess_used:
         state = make_start(problem, guess.rig_from_object, guess.rig)
@@ -190,6 +188,12 @@ def _fit_labelled(
         first_guess=guess,
         guess_used=guess_used,
     )
+
+
+def _nearer(guess: FirstGuess, factory: Prediction, observations: Observations, obj: CalibrationObject) -> bool:
+    """Tell whether the start that a guess gives, its mean rig, is nearer to the images than the factory calibration."""
+    start = Prediction(guess.rig, guess.rig_from_object)
+    return bool(residual_of(start, observations, obj).norm() < residual_of(factory, observations, obj).norm())
 
 
 def _with_poses(labelled: Labelled, rig: CameraRig, obj: CalibrationObject) -> Labelled:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from imgcal.corruption import Corrupted, Corruption
-from imgcal.errors import InputError
+from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import Estimate
 from imgcal.evaluation.methods import Given, Method
 from imgcal.evaluation.metrics import KINDS, Errors, concatenate, cramer_rao, errors
@@ -23,6 +23,7 @@ from imgcal.rig import CameraRig
 from imgcal.synthesis import Drift, PoseRange, RelativeDrift, synthesize
 
 REFERENCE = "MAP, true inliers"
+LEAST_FIDUCIALS = 3  # different ones that a pose needs
 LEAST_SIGMA = 0.02  # pixels: what exact points are believed to
 
 Progress = Callable[[int], None]
@@ -176,7 +177,7 @@ def evaluate(
                 limits.append(cramer_rao(fit))
             progress(len(batch))
             for name, method in methods.items():
-                _measure(method, batch, first, parts[name])
+                _measure(name, method, batch, first, parts[name])
                 progress(len(batch))
         reference.append(concatenate(exact))
         bounds.extend([concatenate(limits)] if limits else [])
@@ -229,8 +230,13 @@ def _batches(conditions: Conditions, protocol: Protocol, trial: int) -> Iterator
         yield first, draw(conditions, min(protocol.batch, protocol.count - first), generator)
 
 
-def _measure(method: Method, batch: Sample, first: int, into: _Collected) -> None:
-    """Give a method those rigs of a batch that are its share, a few at a time."""
+def _measure(name: str, method: Method, batch: Sample, first: int, into: _Collected) -> None:
+    """Give a method those rigs of a batch that are its share, a few at a time.
+
+    Raises:
+        InputError: a rig sees too few fiducials.
+        RefusedError: the method has met a singular system for another reason.
+    """
     count = len(batch) if method.most is None else max(0, min(len(batch), method.most - first))
     size = method.batch or max(count, 1)
     for start in range(0, count, size):
@@ -240,9 +246,15 @@ def _measure(method: Method, batch: Sample, first: int, into: _Collected) -> Non
         try:
             prediction = method.predict(given)
         except torch.linalg.LinAlgError as error:
-            raise InputError(
-                f"missing: found {batch.conditions.corruption.missing:g}, expected a smaller share: a rig sees too few "
-                "fiducials for any pose"
+            least = int(given.seen.any(1).sum(-1).min())
+            if least < LEAST_FIDUCIALS:
+                raise InputError(
+                    f"missing: found {batch.conditions.corruption.missing:g}, expected a smaller share: of one rig "
+                    f"{least} fiducials are left, and a pose needs {LEAST_FIDUCIALS}"
+                ) from error
+            raise RefusedError(
+                f"evaluation: {name}: a system of equations has no solution ({error}), though every rig sees at least "
+                f"{least} different fiducials: an object on one line, or a fault of this method"
             ) from error
         into.alone.append(errors(prediction, truth, given.obj))
         if method.refine is not None:

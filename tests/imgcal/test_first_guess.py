@@ -13,8 +13,10 @@ from imgcal.formats import load_object, load_rig
 from imgcal.networks import Prediction
 from imgcal.observations import Observations
 from imgcal.pipeline import calibrate, rms_length
+from imgcal.rotations import rotation_from_vector
 from imgcal.simulation import simulate_truth, true_detections
 from imgcal.synthesis import PhysicalDrift, PoseRange, RelativeDrift, synthesize
+from imgcal.transforms import RigidTransform
 
 SNAPSHOTS = 3
 
@@ -108,6 +110,26 @@ def test_the_result_does_not_depend_on_the_guess(turn, used, o10, asymmetric8):
     assert guided.first_guess.name == "oracle"
     assert plain.first_guess is None and not plain.guess_used
     assert torch.allclose(guided.rig.focal_length, plain.rig.focal_length, atol=0.05)
+
+
+class PerSnapshot(Oracle):
+    """Explains every snapshot perfectly, each with a rig that is turned by another angle, and the object with it."""
+
+    def forward(self, views):
+        angles = torch.linspace(-0.2, 0.2, SNAPSHOTS, dtype=torch.float64)
+        turn = rotation_from_vector(torch.stack((angles, -angles, angles.square()), -1))
+        motion = RigidTransform(turn, torch.zeros(SNAPSHOTS, 3, dtype=torch.float64))
+        there = self.truth.rig.cam_from_rig @ motion.inverse()[:, None]
+        rig = replace(self.truth.rig, cam_from_rig=there)
+        return (Prediction(rig, motion @ self.truth.rig_from_object),)
+
+
+def test_a_guess_is_judged_by_the_mean_rig_that_the_start_is_made_of(o10, asymmetric8):
+    truth = simulate_truth(o10, asymmetric8, SNAPSHOTS, torch.Generator().manual_seed(2), PhysicalDrift())
+    known = Prediction(truth.rig.expand(SNAPSHOTS), truth.rig_from_object)
+    result = calibrate(true_detections(truth), o10, asymmetric8, guesser=Guesser("oracle", PerSnapshot(known), o10))
+    assert result.first_guess.residual.abs().max() < 1e-6  # of each snapshot's own rig
+    assert not result.guess_used
 
 
 def test_a_symmetric_object_may_be_labelled_in_any_turn(o10):

@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from imgcal.errors import InputError
+from imgcal.errors import InputError, RefusedError
 from imgcal.evaluation import BASELINES, Conditions, Method, Protocol, evaluate, network_method
 from imgcal.evaluation.latency import latency
 from imgcal.evaluation.methods import factory_alone
@@ -112,3 +112,17 @@ def test_latency_has_a_second_figure_where_there_is_a_refinement(conditions):
     both = latency(network_method(Fake(known)), known, repeats=2)
     assert both.refined_p50 is not None
     assert both.refined_p50 > both.alone_p50
+
+
+def singular(given):
+    raise torch.linalg.LinAlgError("the input matrix is singular")
+
+
+def test_a_singular_system_is_not_blamed_on_fiducials_that_are_there(conditions):
+    with pytest.raises(RefusedError, match="broken: .* though every rig sees at least 8 different fiducials"):
+        evaluate({"broken": Method(singular)}, conditions(), Protocol(count=3, trials=1))
+
+
+def test_a_singular_system_for_want_of_fiducials_is_said_to_be_one(conditions):
+    with pytest.raises(InputError, match=r"missing: found 0.9, .* fiducials are left"):
+        evaluate({"broken": Method(singular)}, conditions(missing=0.9), Protocol(count=9, trials=1))
