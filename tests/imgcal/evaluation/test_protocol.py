@@ -119,7 +119,7 @@ def singular(given):
 
 
 def test_a_singular_system_is_not_blamed_on_fiducials_that_are_there(conditions):
-    with pytest.raises(RefusedError, match="broken: .* though every rig sees at least 8 different fiducials"):
+    with pytest.raises(RefusedError, match=r"broken: .* though every rig sees at least 8 different fiducials"):
         evaluate({"broken": Method(singular)}, conditions(), Protocol(count=3, trials=1))
 
 
