@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import EstimationOptions, camera_std, estimate
-from imgcal.identity import Identity, IdentityOptions, identify
+from imgcal.identity import Identity, IdentityOptions, Status, identify, oriented
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections, Observations
 from imgcal.rig import CameraRig, RigPrior
@@ -20,6 +20,8 @@ from imgcal.transforms import RigidTransform
 
 MOST_REMEMBERED = 64
 """Snapshots that take part in refits of the rig while identity goes on: later ones add little to it."""
+
+LEAST_CERTAIN_FIRST = ("ambiguous", "by_prior", "unique", "coded", "by_tracking")
 
 Progress = Callable[[Iterable[int], int], Iterable[int]]
 
@@ -40,6 +42,9 @@ class PipelineOptions:
     largest_drift: float = 10.0  # prior standard deviations that one factory value may be off
     widest_prior: float = 4.0  # factor by which a kind of factory values may have drifted more than the prior says
     blind_cameras: bool = False  # accept cameras that saw nothing; they keep their factory values
+    start_pose: RigidTransform | None = (
+        None  # rig_from_object of the first snapshot, roughly: decides which way round a symmetric object is
+    )
 
 
 @dataclass(frozen=True)
@@ -67,9 +72,12 @@ class Labelled:
 
     @property
     def identity(self) -> str:
-        """How identity was decided as a whole: that of the first snapshot, which the others follow."""
-        used = self.used
-        return self.snapshots[used[0]].status if used else "refused"
+        """How identity was decided as a whole: as the least certain snapshot was.
+
+        Snapshots that were followed from another are as certain as that one.
+        """
+        found = {snapshot.status for snapshot in self.snapshots}
+        return next((status for status in LEAST_CERTAIN_FIRST if status in found), "refused")
 
 
 def label(
@@ -91,7 +99,7 @@ def label(
     coded = _coded_snapshots(detections, count)
     follower = Follower(rig, obj, options)
     results: dict[int, tuple[SnapshotIdentity, NDArray[np.int64]]] = {}
-    rows = [np.flatnonzero((detections.snapshot == s) & detections.usable) for s in range(count)]
+    rows = _rows_by_snapshot(detections, count)
 
     def decide(s: int) -> None:
         labels = detections.fiducial[rows[s]] if coded[s] else None
@@ -103,7 +111,12 @@ def label(
     again = [s for s in range(count) if not coded[s] and _incomplete(*results[s], detections.camera[rows[s]])]
     if again and any(results[s][0].status != "refused" for s in range(count)):
         for s in again:
+            first = results[s][0]
             decide(s)
+            if first.status != "refused" and results[s][0].status != "refused":
+                # The rig that it helped to find labels more of it, but says nothing new of how sure it is.
+                retold = replace(results[s][0], status=first.status, alternatives=first.alternatives)
+                results[s] = retold, results[s][1]
     fiducial = np.full(len(detections), -1, dtype=np.int64)
     for s in range(count):
         if results[s][0].status != "refused":
@@ -128,8 +141,8 @@ class Follower:
         self.factory, self.obj, self.options = rig, obj, options
         self.rig = rig
         self.spread = (rig.prior or RigPrior()).std(rig)
-        # Many captures are taken with the object at the origin of the rig's frame; it costs little to look there first.
-        self.pose = RigidTransform.identity(dtype=rig.focal_length.dtype)
+        self.pose = None if options.start_pose is None else _checked_pose(options.start_pose, rig)
+        self.alternatives = 0  # that the accepted snapshots leave open, 0 = none was accepted yet
         self.accepted: list[tuple[Detections, NDArray[np.int64], RigidTransform]] = []
 
     def decide(
@@ -152,9 +165,31 @@ class Follower:
         self._remember(blobs, labels, identity.rig_from_object)
         return SnapshotIdentity(name, status, identity.reason, identity.alternatives, identity.rig_from_object), labels
 
+    def follow(self, pose: RigidTransform) -> tuple[Status, int]:
+        """Take over the pose of a snapshot that was followed from the last one.
+
+        Returns:
+            How sure that one is: status and alternatives, which it inherits.
+        """
+        self.pose = pose
+        return ("ambiguous" if self.alternatives > 1 else "by_tracking"), max(self.alternatives, 1)
+
     def _identify(self, blobs: Detections) -> Identity:
         blobs = replace(blobs, sigma=np.hypot(blobs.sigma, self.options.identity_error))
-        return identify(blobs, self.rig, self.obj, self.spread, [self.pose], self.options.identity)
+        known = [] if self.pose is None else [self.pose]
+        # Many captures are taken with the object at the origin of the rig's frame; it costs little to look there first.
+        guesses = [] if known else [RigidTransform.identity(dtype=self.rig.focal_length.dtype)]
+        found = identify(blobs, self.rig, self.obj, self.spread, known, self.options.identity, guesses)
+        pose = found.rig_from_object
+        if not found.accepted or pose is None:
+            return found
+        if self.alternatives == 0 and self.pose is not None and found.status != "unique":
+            found = oriented(found, self.obj, self.pose)
+        elif found.status == "by_tracking":
+            status, alternatives = self.follow(pose)
+            found = replace(found, status=status, alternatives=alternatives)
+        self.alternatives = found.alternatives
+        return found
 
     def _remember(self, blobs: Detections, labels: NDArray[np.int64], pose: RigidTransform) -> None:
         """Keep the pose; refit the rig after 1, 2, 4, 8, ... accepted snapshots."""
@@ -173,6 +208,22 @@ class Follower:
         if bool(fit.converged):
             prior = (self.factory.prior or RigPrior()).std(self.factory)
             self.rig, self.spread = fit.rig, torch.minimum(2 * camera_std(fit), prior)
+
+
+def _checked_pose(pose: RigidTransform, rig: CameraRig) -> RigidTransform:
+    """Return a pose that a user gave, in the rig's precision.
+
+    Raises:
+        InputError: it is none.
+    """
+    shapes = tuple(pose.rotation.shape), tuple(pose.translation.shape)
+    if shapes != ((3, 3), (3,)):
+        raise InputError(f"start pose: found shapes {shapes[0]} and {shapes[1]}, expected one rotation and translation")
+    pose = pose.to(rig.focal_length.dtype)
+    off = (pose.rotation @ pose.rotation.mT - torch.eye(3, dtype=pose.rotation.dtype)).abs().max()
+    if not (bool(off < 1e-3) and bool(torch.det(pose.rotation) > 0) and bool(pose.translation.isfinite().all())):
+        raise InputError("start pose: found no rotation and finite translation, expected those of rig_from_object")
+    return pose
 
 
 def matched_to_rig(detections: Detections, rig: CameraRig) -> Detections:
@@ -202,6 +253,14 @@ def to_observations(detections: Detections, rig: CameraRig, obj: CalibrationObje
     uv[where], sigma[where], seen[where] = detections.uv[rows], detections.sigma[rows], True
     dtype = rig.focal_length.dtype
     return Observations(torch.from_numpy(uv).to(dtype), torch.from_numpy(sigma).to(dtype), torch.from_numpy(seen))
+
+
+def _rows_by_snapshot(detections: Detections, count: int) -> list[NDArray[np.int64]]:
+    """Rows of the usable blobs of each snapshot, in one pass over the table."""
+    usable = np.flatnonzero(detections.usable)
+    snapshot = detections.snapshot[usable]
+    order = np.argsort(snapshot, kind="stable")
+    return np.split(usable[order], np.searchsorted(snapshot[order], np.arange(1, count)))[:count]
 
 
 def _coded_snapshots(detections: Detections, count: int) -> NDArray[np.bool_]:

@@ -140,8 +140,8 @@ class Recalibrator:
             return None
         if int(result.observations.seen[-1].sum()) < LEAST_FOLLOWED * before:
             return None
-        self._follower.pose = result.rig_from_object[-1]
-        return self._keep(blobs, snapshot, result)
+        status, alternatives = self._follower.follow(result.rig_from_object[-1])
+        return self._keep(blobs, replace(snapshot, status=status, alternatives=alternatives), result)
 
     def _without_strays(self, blobs: Detections, latest: Calibration) -> tuple[Detections, RigidTransform]:
         """Fit the pose with the last rig, and drop labels that are off: two markers in one, a reflection beside one."""

@@ -13,11 +13,13 @@ from typing import Annotated, Any
 import tyro
 
 from imgcal.cli.common import (
+    StartPose,
     check_folder,
     make_folder,
     only_cameras,
     progress,
     read_detections,
+    start_pose,
     without_cameras,
 )
 from imgcal.cli.describe import describe, describe_refusal
@@ -49,6 +51,9 @@ class Calibrate:
     first_guess: str = "none"  #: where to start: none (factory rig), points, vit or cnn (shipped networks), or a file
     without: tuple[str, ...] = ()  #: cameras to leave out
     blind_cameras: bool = False  #: accept cameras that see nothing; they keep their factory values
+    start_pose: StartPose | None = None
+    """rig_from_object of the first snapshot, roughly: rotation vector (3 numbers, rad) and translation (3, mm); decides
+    which way round a symmetric object is"""
     full_covariance: bool = False  #: write the whole covariance matrix to rig.yaml, too
     report: bool = True  #: write report.html
     reference: str | None = None
@@ -62,6 +67,7 @@ class Calibrate:
         complete, obj = load_rig(self.rig), load_object(self.object)
         rig = without_cameras(complete, self.without)
         reference = self._reference(rig)
+        options = PipelineOptions(blind_cameras=self.blind_cameras, start_pose=start_pose(self.start_pose))
         source = open_input(self.input, complete, obj.fiducials)
         guesser = None if self.first_guess == "none" else load_guesser(self.first_guess, rig, obj)
         loaded = time.perf_counter()
@@ -76,9 +82,7 @@ class Calibrate:
         refusal: RefusedError | None = None
         calibration: Calibration | None = None
         try:
-            calibration = calibrate(
-                detections, rig, obj, PipelineOptions(blind_cameras=self.blind_cameras), guesser=guesser, progress=bar
-            )
+            calibration = calibrate(detections, rig, obj, options, guesser=guesser, progress=bar)
         except RefusedError as error:
             refusal = error
         seconds |= {} if calibration is None else {k: v for k, v in calibration.seconds.items() if k != "detection"}

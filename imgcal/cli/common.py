@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import sys
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
+import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -20,6 +22,8 @@ from imgcal.errors import InputError
 from imgcal.formats import Capture, Frame
 from imgcal.observations import Detections
 from imgcal.rig import CameraRig
+from imgcal.rotations import rotation_from_vector
+from imgcal.transforms import RigidTransform
 
 Item = TypeVar("Item")
 
@@ -88,6 +92,19 @@ def progress(items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
     console = Console(file=sys.stderr)
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         yield from bar.track(items, total=total, description=label)
+
+
+StartPose = tuple[float, float, float, float, float, float]
+
+
+def start_pose(values: StartPose | None) -> RigidTransform | None:
+    """Make rig_from_object of a rotation vector (rad) and a translation (mm)."""
+    if values is None:
+        return None
+    if not all(map(math.isfinite, values)):
+        raise InputError(f"--start-pose: found {' '.join(map(str, values))}, expected six finite numbers")
+    numbers = torch.tensor(values, dtype=torch.float64)
+    return RigidTransform(rotation_from_vector(numbers[:3]), numbers[3:])
 
 
 def without_cameras(rig: CameraRig, names: tuple[str, ...]) -> CameraRig:

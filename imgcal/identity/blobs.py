@@ -48,7 +48,7 @@ class Blobs:
 
 
 def gather(detections: Detections, rig: CameraRig) -> Blobs:
-    """Collect the usable blobs of one snapshot.
+    """Collect the usable blobs of one snapshot; of several at exactly the same place the first one.
 
     Args:
         detections: blobs of one snapshot; its cameras are the rig's, in the rig's order.
@@ -64,6 +64,8 @@ def gather(detections: Detections, rig: CameraRig) -> Blobs:
     if len(np.unique(detections.snapshot)) > 1:
         raise InputError("identity: found blobs of several snapshots, expected those of one")
     rows = np.flatnonzero(detections.usable)
+    places = np.column_stack((detections.camera[rows], detections.uv[rows]))
+    rows = rows[np.sort(np.unique(places, axis=0, return_index=True)[1])]
     camera = detections.camera[rows]
     order = np.argsort(camera, kind="stable")
     rows, camera = rows[order], camera[order]

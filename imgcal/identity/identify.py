@@ -51,6 +51,9 @@ MOST_STEPS = 6  # from one labelling to a better one of the moved object
 APPROXIMATE = 0.02  # rad, what poses from three points are off by, even for a perfect camera
 EXCLUDED = 60.0  # margin of a labelling in one camera, above which the rig need not be asked
 LEAST_ALONE = 6  # labels from which one camera can be fitted by itself
+# Explained part near a known pose, below which it is asked whether another pose explains more: an object shifted by its
+# own edge still explains half.
+CONVINCING = 0.6
 VERIFIED = 2  # different labellings that are fitted, the best of a round
 
 
@@ -61,8 +64,9 @@ def identify(
     std: Tensor,
     candidates: Sequence[RigidTransform] = (),
     options: IdentityOptions = IdentityOptions(),
+    guesses: Sequence[RigidTransform] = (),
 ) -> Identity:
-    """Label the blobs of one snapshot: try the candidate poses first, then look for others.
+    """Label the blobs of one snapshot: try the candidate poses first, then the guesses, then look for others.
 
     Args:
         detections: blobs of one snapshot; only usable ones count.
@@ -71,6 +75,8 @@ def identify(
         std: (C, 15) prior standard deviation of each camera's parameters: how far the factory values may be off.
         candidates: rig_from_object that may hold, the likeliest first: last snapshot's, or one known from the set-up.
         options: how sure to be.
+        guesses: rig_from_object that nobody knows anything of, but that are worth a look: what is found there must
+            stand against all turns of the object, as without them.
 
     Returns:
         The decision; `Identity.accepted` tells whether the labels may be used.
@@ -78,11 +84,14 @@ def identify(
     Raises:
         InputError: blobs of several snapshots, or cameras that are not the rig's.
     """
-    for pose in candidates:
-        tracked = track(detections, rig, obj, std, pose, options)
-        if tracked.accepted:
-            return tracked
-    return bootstrap(detections, rig, obj, std, options)
+    partial: Identity | None = None
+    for pose, known in [*((pose, True) for pose in candidates), *((pose, False) for pose in guesses)]:
+        found = track(detections, rig, obj, std, pose, options, pose_known=known)
+        if found.accepted and found.explained >= CONVINCING:
+            return found
+        partial = found if partial is None and found.accepted else partial
+    anew = bootstrap(detections, rig, obj, std, options)
+    return partial if partial is not None and anew.explained <= partial.explained else anew
 
 
 def track(
@@ -92,8 +101,10 @@ def track(
     std: Tensor,
     rig_from_object: RigidTransform,
     options: IdentityOptions = IdentityOptions(),
+    *,
+    pose_known: bool = True,
 ) -> Identity:
-    """Label the blobs of one snapshot near a known pose; arguments as in `identify`."""
+    """Label the blobs of one snapshot near a pose; arguments as in `identify`, `pose_known` = it is no mere guess."""
     scene = Scene(gather(detections, rig), obj, rig, std)
     poses = Poses(rig_from_object.rotation.numpy()[None], rig_from_object.translation.numpy()[None])
     predicted = predict_ideal(rig, scene.obj.points.numpy(), poses)
@@ -107,7 +118,7 @@ def track(
         for reach in tolerances
     ]
     fits = refine(scene, start(scene, poses.select(np.zeros(len(attempts), dtype=int)), np.concatenate(attempts)))
-    return _decide(scene, fits, options, known_pose=True)
+    return _decide(scene, fits, options, pose_known)
 
 
 def bootstrap(
@@ -227,7 +238,7 @@ def _decide(scene: Scene, fits: Fits, options: IdentityOptions, known_pose: bool
     order = 1 if known_pose else len(scene.obj.symmetries)
     status: Status = "by_tracking" if known_pose else "ambiguous" if order > 1 else "unique"
     reason = f"explains {100 * share:.0f} % of what could be seen, margin {margin:.0f}"
-    return Identity(scene.blobs.to_rows(chosen.labels[0]), pose, rig, status, order, margin, reason)
+    return Identity(scene.blobs.to_rows(chosen.labels[0]), pose, rig, status, order, margin, reason, share)
 
 
 def _share(scene: Scene, fits: Fits) -> float:

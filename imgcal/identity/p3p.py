@@ -30,7 +30,7 @@ def three_point_pose(rays, sides, mirror, rotation_frame, depths):
         depths: (3,) mm, filled with the depths of the points.
 
     Returns:
-        False where the points of the triangle lie in line.
+        False where the points of the triangle lie in line, or all rays are one.
 
     Source: Alter 1994, "3-D Pose from 3 Points Using Weak-Perspective"; the correction is that of POSIT (DeMenthon and
     Davis 1995).
@@ -48,6 +48,8 @@ def three_point_pose(rays, sides, mirror, rotation_frame, depths):
         b = d01 * (r02 + r12 - r01) + d02 * (r01 + r12 - r02) + d12 * (r01 + r02 - r12)
         c = 2 * (d01 * (d02 + d12) + d02 * d12) - d01 * d01 - d02 * d02 - d12 * d12
         scale2 = (b + np.sqrt(max(b * b - a * c, 0.0))) / a
+        if not scale2 > 0:
+            return False
         h1, h2 = np.sqrt(max(scale2 * r01 - d01, 0.0)), np.sqrt(max(scale2 * r02 - d02, 0.0))
         same_side = d01 + d02 - d12 <= scale2 * (r01 + r02 - r12)
         z1, z2 = 1 + mirror * h1, 1 + mirror * (h2 if same_side else -h2)

@@ -12,6 +12,8 @@ from imgcal.rig import CameraRig
 from imgcal.transforms import RigidTransform
 
 Status = Literal["unique", "by_prior", "by_tracking", "ambiguous", "refused"]
+"""How a labelling was decided: by the blobs alone (`unique`, or `ambiguous` where the object's symmetry allows others),
+by a pose that the user gave (`by_prior`), by that of an earlier snapshot (`by_tracking`)."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,7 @@ class Identity:
     alternatives: int  # labellings that explain the blobs equally well: the object's symmetry order, 1 = unique
     margin: float  # natural logarithm of the odds against the best different labelling; inf = none is left
     reason: str  # one line: why it was refused, or what decided
+    explained: float = 0.0  # labelled part of what could be seen: in each camera, the smaller of blobs and fiducials
     undecided: bool = False  # refused because a different labelling explains the blobs nearly as well
 
     @property

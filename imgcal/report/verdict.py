@@ -19,7 +19,7 @@ FEW_OBSERVATIONS = 15  # of a camera: fewer than its parameters
 IDENTITY = {
     "coded": "The fiducials came labelled with the input.",
     "unique": "Every fiducial was recognized, and only one labelling explains what the cameras saw.",
-    "by_prior": "The object can be turned into itself; the known pose decided which way round it is.",
+    "by_prior": "The pose that was given decided between look-alike orientations of the object.",
     "by_tracking": "The labels were carried from snapshot to snapshot; the motion excluded look-alike positions.",
     "ambiguous": (
         "The object can be turned into itself, so its absolute orientation is not known. All cameras use the same "

@@ -54,3 +54,44 @@ def test_observations_are_dense(seen, o10, asymmetric8):
     assert int(observations.seen.sum()) == 4 * 79 and not observations.seen[:, 3, 5].any()
     row = np.flatnonzero((seen.snapshot == 2) & (seen.camera == 7) & (seen.fiducial == 1))[0]
     assert np.array_equal(observations.uv[2, 7, 1].numpy(), seen.uv[row])
+
+
+def test_rows_that_come_three_times_and_in_any_order_change_nothing(seen, o10, asymmetric8):
+    rows = np.random.default_rng(0).permutation(np.repeat(np.arange(len(seen)), 3))
+    labelled = label(without_labels(seen.select(rows)), o10, asymmetric8)
+    once = label(without_labels(seen), o10, asymmetric8)
+    assert labelled.used == once.used
+    observed = [to_observations(found.detections, o10, asymmetric8) for found in (labelled, once)]
+    assert torch.equal(observed[0].seen, observed[1].seen) and torch.equal(observed[0].uv, observed[1].uv)
+
+
+@pytest.mark.parametrize("fiducials", [slice(0, 1), slice(0, 2)])
+def test_blobs_all_in_few_places_are_refused(fiducials, seen, o10, asymmetric8):
+    few = seen.select(np.isin(seen.fiducial, np.arange(8)[fiducials]) & (seen.snapshot == 0))
+    many = without_labels(few.select(np.repeat(np.arange(len(few)), 40)))
+    with pytest.raises(RefusedError, match="too few blobs"):
+        label(many, o10, asymmetric8)
+
+
+def test_tens_of_thousands_of_snapshots_are_split_in_one_pass(seen, o10, asymmetric8, monkeypatch):
+    """Effort is counted in comparisons of whole columns: a few, not a few for each snapshot."""
+    snapshots = 20_000
+    number = np.repeat(np.arange(snapshots), len(seen) // 4).view(Counted)
+    long = seen.select(np.tile(np.flatnonzero(seen.snapshot == 0), snapshots))
+    names = tuple(map(str, range(snapshots)))
+    monkeypatch.setattr(Counted, "comparisons", 0)
+    labelled = label(replace(long, snapshot=number, snapshot_names=names), o10, asymmetric8)
+    assert len(labelled.used) == snapshots
+    assert Counted.comparisons < 10
+
+
+class Counted(np.ndarray):
+    """An array that counts how often it is compared as a whole."""
+
+    comparisons = 0
+
+    def __eq__(self, other):
+        Counted.comparisons += 1
+        return super().__eq__(other)
+
+    __hash__ = None

@@ -19,8 +19,9 @@ from imgcal.formats import (
     write_frame,
 )
 from imgcal.observations import Detections
+from imgcal.rotations import vector_from_rotation
 from imgcal.simulation import simulate_truth, true_detections
-from imgcal.synthesis import RelativeDrift
+from imgcal.synthesis import PhysicalDrift, RelativeDrift
 
 KEYS = {
     "status", "reason", "identity", "rms_px_before", "rms_px_after", "chi2_per_dof", "snapshots_used",
@@ -267,3 +268,27 @@ def test_a_drift_beyond_the_prior_is_said_and_its_spread_is_honest(workplace, tm
     found, std = load_rig(tmp_path / "out" / "rig.yaml"), load_rig_covariance(tmp_path / "out" / "rig.yaml").std
     error = relative_difference(found, truth.rig)[:, 6:10] / std[:, 6:10]
     assert error.square().mean().sqrt() < 1.6
+
+
+def test_a_start_pose_says_which_way_round_a_cube_is(o10, tmp_path, workplace):
+    cube = load_object("cube8")
+    truth = simulate_truth(o10, cube, 1, torch.Generator().manual_seed(0), PhysicalDrift())
+    blobs = true_detections(truth)
+    save_detections(replace(blobs, fiducial=np.full(len(blobs), -1)), tmp_path / "blobs.csv")
+    pose = truth.rig_from_object[0]
+    numbers = [f"{x:.6f}" for x in (*vector_from_rotation(pose.rotation).tolist(), *pose.translation.tolist())]
+
+    def identity(*more):
+        arguments = [str(tmp_path / "blobs.csv"), "--rig", "O10", "--object", "cube8", "--out", str(tmp_path / "out")]
+        assert main(["calibrate", *arguments, "--no-report", *more]) == 0
+        result = json.loads((tmp_path / "out" / "result.json").read_text())
+        return result["identity"], result["identity_alternatives"]
+
+    assert identity() == ("ambiguous", 24)
+    assert identity("--start-pose", *numbers) == ("by_prior", 1)
+
+
+def test_a_start_pose_that_is_no_number_is_explained(workplace, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert calibrate(workplace, workplace.capture, out, "--start-pose", *"00000", "nan") == 2
+    assert "--start-pose: found" in one_line(capsys)
