@@ -19,8 +19,9 @@ def require_cameras(seen: NDArray[np.bool_], rig: CameraRig, options: PipelineOp
     blind = [rig.camera_names[i] for i in np.flatnonzero(~seen.any(axis=(0, 2)))]
     if blind and (not options.blind_cameras or len(blind) == rig.cameras):
         raise RefusedError(
-            f"camera {', '.join(blind)}: found no fiducial in any snapshot, expected some; nothing can be said of it "
-            "(--without leaves a camera out, --blind-cameras keeps its factory values)"
+            f"camera {', '.join(blind)}: found no fiducial in any snapshot, expected some; nothing can be said of it",
+            python="rig.select leaves a camera out, PipelineOptions(blind_cameras=True) keeps its factory values",
+            command="--without leaves a camera out, --blind-cameras keeps its factory values",
         )
 
 

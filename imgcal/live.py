@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from types import TracebackType
@@ -19,11 +19,12 @@ from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import estimate
 from imgcal.identity.assignment import distances_to_nearest, mutual_nearest
 from imgcal.identity.rivals import lattice_shifts
-from imgcal.labelling import Follower, Labelled, PipelineOptions, SnapshotIdentity, matched_to_rig, to_observations
+from imgcal.labelling import Follower, Labelled, PipelineOptions, SnapshotIdentity, to_observations
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections
 from imgcal.pipeline import Calibration, fit_labelled
 from imgcal.rig import CameraRig
+from imgcal.sources import checked_detections, checked_frames
 from imgcal.transforms import RigidTransform
 
 MOST_FOLLOWED = 64
@@ -112,11 +113,16 @@ class Recalibrator:
         if isinstance(source, Detections):
             if len(source.snapshot_names) != 1:
                 raise InputError(f"detections: found {len(source.snapshot_names)} snapshots, expected one")
-            return replace(matched_to_rig(source, self.rig), snapshot_names=(name,))
-        unknown = [camera for camera in source if camera not in self.rig.camera_names]
-        if unknown:
-            raise InputError(f"frames: found camera {unknown[0]}, expected one of {', '.join(self.rig.camera_names)}")
-        frames = {camera: source.get(camera) for camera in self.rig.camera_names}
+            if len(np.unique(source.snapshot)) <= 1:  # its number in a longer table does not matter
+                source = replace(source, snapshot=np.zeros_like(source.snapshot))
+            return replace(checked_detections(source, self.rig, self.obj), snapshot_names=(name,))
+        given = checked_frames(source, self.rig)
+        frames: dict[str, Frame | None] = {}
+        for camera in self.rig.camera_names:
+            frame = given.get(camera)
+            if isinstance(frame, Sequence):
+                raise InputError(f"camera {camera}: found {len(frame)} frames, expected one of this moment, or None")
+            frames[camera] = frame
         return _table(detect_snapshot(frames, self.detection, pool=self._pool), name, self.rig)
 
     def _follow(self, blobs: Detections, name: str) -> Calibration | None:

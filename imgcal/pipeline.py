@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -15,25 +15,23 @@ import torch
 from torch import Tensor
 
 from imgcal.checks import require_cameras, require_fit, require_most_labels, require_near_prior
-from imgcal.detection import DetectionOptions, detect
-from imgcal.detection.options import Frame
+from imgcal.detection import DetectionOptions
 from imgcal.errors import RefusedError
 from imgcal.estimation import Estimate, estimate, initial_pose
 from imgcal.estimation.estimate import conclude, make_problem, make_start
 from imgcal.first_guess import FirstGuess, Guesser, residual_of
-from imgcal.labelling import Labelled, PipelineOptions, Progress, label, matched_to_rig, to_observations
+from imgcal.labelling import Labelled, PipelineOptions, Progress, label, to_observations
 from imgcal.networks.prediction import Prediction
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections, Observations
 from imgcal.pose_support import UndeterminedPosesError, require_poses, without_snapshots
 from imgcal.rig import CameraRig, RigPrior
 from imgcal.settling import settle
+from imgcal.sources import Frames, blobs_of
 from imgcal.transforms import RigidTransform
 
 LEAST_KEPT = 0.8
 """Share of the snapshots that must keep a pose when outliers have been left out."""
-
-Frames = Mapping[str, Frame | Sequence[Frame | None] | None]
 
 
 @dataclass(frozen=True)
@@ -91,11 +89,10 @@ def calibrate(
 
     Raises:
         RefusedError: the data cannot decide; the message says why.
-        InputError: the data do not belong to this rig or object.
+        InputError: the data do not belong to this rig or object: other cameras, frames of another size.
     """
     started = time.perf_counter()
-    detections = source if isinstance(source, Detections) else detect(source, detection)
-    detections = matched_to_rig(detections, rig)
+    detections = blobs_of(source, rig, obj, detection)
     found = time.perf_counter()
     labelled = label(detections, rig, obj, options, progress)
     identified = time.perf_counter()
@@ -242,26 +239,29 @@ class Score:
 
 
 def score(
-    detections: Detections,
+    source: Detections | Frames,
     rig: CameraRig,
     obj: CalibrationObject,
     options: PipelineOptions = PipelineOptions(),
     progress: Progress | None = None,
+    *,
+    detection: DetectionOptions = DetectionOptions(),
 ) -> Score:
     """Measure how well a rig explains what its cameras saw.
 
     Args:
-        detections: blobs, labelled or not.
+        source: blobs, labelled or not, or frames in memory (see `imgcal.detect`).
         rig: the rig to be scored; its prior is used for identity only.
         obj: the calibration object.
         options: how sure identity must be.
         progress: wraps the loop over snapshots.
+        detection: how blobs are found in frames.
 
     Raises:
         RefusedError: no snapshot could be decided.
+        InputError: the data do not belong to this rig or object: other cameras, frames of another size.
     """
-    detections = matched_to_rig(detections, rig)
-    labelled = label(detections, rig, obj, options, progress)
+    labelled = label(blobs_of(source, rig, obj, detection), rig, obj, options, progress)
     observations, poses = _used(labelled, rig, obj)
     fixed = torch.zeros(*rig.distortion.shape[:-1], 15, dtype=rig.distortion.dtype)
     # What is reported is an RMS in pixels: centres count alike, however well each was measured.

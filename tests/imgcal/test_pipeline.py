@@ -63,6 +63,13 @@ def test_a_camera_of_another_moment_is_refused(o10, asymmetric8):
         calibrate(replace(table, snapshot=late), o10, asymmetric8)
 
 
+def test_a_refusal_names_what_python_offers(o10, asymmetric8):
+    _, table = capture(o10, asymmetric8)
+    with pytest.raises(RefusedError, match=r"PipelineOptions\(blind_cameras=True\)") as refusal:
+        calibrate(table.select(table.camera != 3), o10, asymmetric8)
+    assert "--" not in str(refusal.value) and "--blind-cameras" in refusal.value.for_command
+
+
 def test_a_score_needs_no_prior(o10, asymmetric8):
     truth, table = capture(o10, asymmetric8, noise=0.0)
     assert score(table, truth, asymmetric8).distances.max() < 1e-6

@@ -98,9 +98,10 @@ def test_a_camera_that_sees_nothing_is_refused_unless_allowed(workplace, tmp_pat
     (out).mkdir()
     (out / "rig.yaml").write_text("of an earlier run")
     assert calibrate(workplace, table, out) == 3
-    assert "cam02" in one_line(capsys)
+    line = one_line(capsys)
+    assert "cam02" in line and "--blind-cameras" in line and "PipelineOptions" not in line
     result = json.loads((out / "result.json").read_text())
-    assert result["status"] == "refused" and "cam02" in result["reason"]
+    assert result["status"] == "refused" and "cam02" in result["reason"] and "--without" in result["reason"]
     assert not (out / "rig.yaml").exists()
     assert (out / "report.html").exists()
     assert calibrate(workplace, table, out, "--blind-cameras", "--no-report") == 0
