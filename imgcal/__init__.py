@@ -9,6 +9,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from imgcal.accuracy import PredictedError, predicted_error
     from imgcal.detection import DetectionOptions, detect
     from imgcal.errors import InputError, RefusedError
     from imgcal.estimation import Estimate, EstimationOptions, estimate
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from imgcal.transforms import RigidTransform
 
 _NAMES = {
+    "imgcal.accuracy": ("PredictedError", "predicted_error"),
     "imgcal.detection": ("DetectionOptions", "detect"),
     "imgcal.errors": ("InputError", "RefusedError"),
     "imgcal.estimation": ("Estimate", "EstimationOptions", "estimate"),
@@ -54,6 +56,7 @@ __all__ = [
     "InputError",
     "Observations",
     "PipelineOptions",
+    "PredictedError",
     "Projection",
     "Recalibrator",
     "RefusedError",
@@ -65,6 +68,7 @@ __all__ = [
     "load_detections",
     "load_object",
     "load_rig",
+    "predicted_error",
     "save_detections",
     "save_rig",
     "score",

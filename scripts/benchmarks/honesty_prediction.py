@@ -1,0 +1,149 @@
+"""Is the predicted error of a rig the true one? Held-out points of simulated captures, true error over predicted."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+
+from imgcal import InputError, PipelineOptions, RefusedError, calibrate, load_object, load_rig, predicted_error
+from imgcal.evaluation.true_error import true_error
+from imgcal.objects import CalibrationObject
+from imgcal.observations import Detections
+from imgcal.rig import CameraRig, RigPrior
+from imgcal.simulation import Truth, simulate_volume, true_detections
+from imgcal.synthesis import PoseRange, sample_rig_from_object
+from scripts.output import ROOT, command, markdown, surroundings, write_json
+
+RIGS = {"O10": "asymmetric8", "U7": "asymmetric8", "T4": "asymmetric8", "room10": "wand4"}
+SNAPSHOTS = (1, 5, 20)
+NOISE = 0.02  # px, each axis: of blobs
+HELD_OUT = 100  # points, even in the working volume, at which each calibration is judged
+GATE = (0.9, 1.1)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A kind of capture: drift as the rig's prior says, labels known."""
+
+    rig: CameraRig  # factory calibration, with its prior
+    obj: CalibrationObject
+    snapshots: int
+    noise: float = NOISE
+
+    def draw(self, generator: torch.Generator) -> tuple[CameraRig, Detections]:
+        """Draw a true rig, and what it sees."""
+        rig = self.rig
+        spread = (rig.prior or RigPrior()).std(rig)
+        true_rig = rig.moved(spread * torch.randn(spread.shape, generator=generator, dtype=spread.dtype))
+        if rig.working_distance is None:
+            truth = simulate_volume(true_rig, self.obj, self.snapshots, generator, None)
+        else:
+            centroid = self.obj.points.mean(0)
+            poses = sample_rig_from_object(self.snapshots, rig.working_distance, centroid, PoseRange(), generator)
+            seen = true_rig.expand(self.snapshots).project(poses.apply(self.obj.points), self.obj.radius)
+            truth = Truth(true_rig, poses, seen.uv, seen.visible)
+        table = true_detections(truth)
+        noise = torch.randn(table.uv.shape, generator=generator, dtype=torch.float64).numpy()
+        return true_rig, replace(table, uv=table.uv + self.noise * noise, sigma=np.full(len(table), self.noise))
+
+
+def judge(case: Case, captures: int, seed: int, options: PipelineOptions) -> dict[str, Any]:
+    """Calibrate captures, and compare true and predicted errors at points that took no part.
+
+    Returns:
+        For px and mm: RMS over captures and points of the true error over the predicted one (`ratio`), its standard
+        error (`ratio_std`), and the median predicted error; `refused`, captures without a result.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    squares: dict[str, list[float]] = {"px": [], "mm": []}
+    sizes: dict[str, list[float]] = {"px": [], "mm": []}
+    refused = 0
+    for _ in range(captures):
+        truth, table = case.draw(generator)
+        shares = torch.rand(HELD_OUT, 3, generator=generator, dtype=torch.float64)
+        try:
+            predicted = predicted_error(calibrate(table, case.rig, case.obj, options))
+        except RefusedError:
+            refused += 1
+            continue
+        volume, uncertainty = predicted.volume, predicted.uncertainty
+        points = torch.lerp(volume.low, volume.high, shares)
+        seen = uncertainty.rig.project(points).visible
+        expected = (uncertainty.pixel_error(points), uncertainty.point_error(points, seen))
+        for unit, true, stated in zip(squares, true_error(uncertainty, truth, points), expected, strict=True):
+            ratio = (true / stated).square()
+            squares[unit].append(float(ratio[ratio.isfinite()].mean()))
+        sizes["px"].append(predicted.median_px)
+        sizes["mm"].append(predicted.median_mm)
+    return {"captures": captures, "refused": refused} | {
+        unit: _ratio(np.array(squares[unit])) | {"median": float(np.nanmedian(sizes[unit]))} for unit in squares
+    }
+
+
+def _ratio(squares: np.ndarray) -> dict[str, float]:
+    squares = squares[np.isfinite(squares)]
+    ratio = float(np.sqrt(squares.mean()))
+    return {"ratio": ratio, "ratio_std": float(squares.std() / np.sqrt(len(squares)) / (2 * ratio))}
+
+
+def measure(
+    captures: int = 200, snapshots: Sequence[int] = SNAPSHOTS, rigs: Mapping[str, str] = RIGS, seed: int = 1
+) -> dict[str, Any]:
+    """Run all rigs and numbers of snapshots: rig -> snapshots -> what `judge` returns."""
+    options = PipelineOptions(blind_cameras=True)  # a wand in one snapshot is not in view of every camera
+    rows: dict[str, Any] = {}
+    for number, (rig, obj) in enumerate(rigs.items()):
+        for count in snapshots:
+            case = Case(load_rig(rig), load_object(obj), count)
+            rows.setdefault(rig, {})[str(count)] = judge(case, captures, seed + 1000 * number + count, options)
+            print(rig, count, rows[rig][str(count)], file=sys.stderr, flush=True)
+    return {"noise_px": NOISE, "held_out_points": HELD_OUT, "gate": list(GATE), "rigs": rows}
+
+
+def table(result: Mapping[str, Any]) -> str:
+    """Markdown."""
+    head = ["rig", "snapshots", "median predicted, px", "true / predicted", "median predicted, mm", "true / predicted"]
+    rows = []
+    for rig, sizes in result["rigs"].items():
+        for count, row in sizes.items():
+            cells = [f"{row[u]['median']:.2g}|{row[u]['ratio']:.2f} ± {row[u]['ratio_std']:.2f}" for u in ("px", "mm")]
+            rows.append([rig, count, *"|".join(cells).split("|")])
+    return markdown(head, rows)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Compare predicted with true errors over simulated captures."""
+
+    captures: int = 200
+    snapshots: tuple[int, ...] = SNAPSHOTS
+    rigs: tuple[str, ...] = tuple(RIGS)
+    out: Path = ROOT / "docs" / "benchmarks" / "honesty_prediction.json"
+
+
+def main() -> None:
+    """Measure, write, print.
+
+    Raises:
+        InputError: unknown rig.
+    """
+    options = tyro.cli(Options, description=__doc__)
+    if unknown := [name for name in options.rigs if name not in RIGS]:
+        raise InputError(f"--rigs: found {', '.join(unknown)}, expected some of {', '.join(RIGS)}")
+    torch.set_num_threads(1)
+    began, before = time.monotonic(), surroundings()
+    result = measure(options.captures, options.snapshots, {name: RIGS[name] for name in options.rigs})
+    write_json(options.out, before | {"seconds": round(time.monotonic() - began)} | result)
+    print(table(result))
+
+
+if __name__ == "__main__":
+    command(main)

@@ -1,0 +1,43 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from imgcal.evaluation.true_error import true_error
+from imgcal.rotations import rotation_from_vector
+from imgcal.transforms import RigidTransform
+from imgcal.uncertainty import rig_uncertainty
+
+F64 = torch.float64
+
+
+@pytest.fixture(scope="module")
+def uncertainty(o10):
+    generator = torch.Generator().manual_seed(0)
+    points = 80 * torch.randn(50, 3, generator=generator, dtype=F64) + torch.tensor([0.0, 0.0, 850.0], dtype=F64)
+    unit = torch.tensor([1e-3] * 3 + [1.0] * 3 + [2.0] * 4 + [2e-3] * 5, dtype=F64).repeat(10)
+    return rig_uncertainty(o10, torch.diag(unit**2), points)
+
+
+def test_a_rig_in_another_frame_is_the_same_rig(o10, uncertainty):
+    turn = rotation_from_vector(torch.tensor([[0.4, -1.2, 2.0]], dtype=F64))
+    elsewhere = RigidTransform(turn, torch.tensor([[500.0, -90.0, 70.0]], dtype=F64))
+    truth = replace(o10, cam_from_rig=o10.cam_from_rig @ elsewhere)
+    px, mm = true_error(uncertainty, truth, uncertainty.points[:7] + 10)
+    assert px.max() < 1e-7 and mm.max() < 1e-7
+
+
+def test_a_larger_rig_is_not(o10, uncertainty):
+    transform = o10.cam_from_rig
+    truth = replace(o10, cam_from_rig=RigidTransform(transform.rotation, 1.01 * transform.translation))
+    points = uncertainty.points + 5
+    _, mm = true_error(uncertainty, truth, points)
+    # All distances are a hundredth too short, about the middle of the points by which the rigs are compared.
+    expected = 0.01 * (points - points.mean(0)).norm(dim=1)
+    assert mm.median() == pytest.approx(float(expected.median()), rel=0.1)
+
+
+def test_what_is_not_seen_has_no_error(o10, uncertainty):
+    behind = torch.tensor([[0.0, 0.0, -500.0]], dtype=F64)
+    px, mm = true_error(uncertainty, o10, behind)
+    assert px.isnan().all() and mm.isnan().all()

@@ -1,0 +1,25 @@
+import torch
+
+from imgcal.formats import load_object, load_rig
+from imgcal.labelling import PipelineOptions
+from scripts.benchmarks.honesty_prediction import Case, judge, measure, table
+
+
+def test_predicted_errors_are_the_true_ones():
+    row = judge(Case(load_rig("U7"), load_object("asymmetric8"), 5), 12, 0, PipelineOptions())
+    assert row["refused"] == 0
+    assert 0.85 < row["px"]["ratio"] < 1.15
+    assert 0.75 < row["mm"]["ratio"] < 1.25
+
+
+def test_true_rigs_spread_as_the_prior_says():
+    case = Case(load_rig("T4"), load_object("asymmetric8"), 1)
+    generator = torch.Generator().manual_seed(0)
+    drift = torch.stack([case.draw(generator)[0].difference(case.rig) for _ in range(50)])
+    assert abs(float((drift / case.rig.prior.std(case.rig)).square().mean()) - 1) < 0.1
+
+
+def test_all_kinds_run():
+    result = measure(1, (2,))
+    assert list(result["rigs"]) == ["O10", "U7", "T4", "room10"]
+    assert table(result).count("\n") == 5
