@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from imgcal.checks import require_cameras, require_fit, require_most_labels, require_near_prior
+from imgcal.checks import require_cameras, require_fit, require_most_labels, require_near_prior, require_views
 from imgcal.detection import DetectionOptions
 from imgcal.errors import RefusedError
 from imgcal.estimation import Estimate, estimate, initial_pose
@@ -28,6 +28,7 @@ from imgcal.pose_support import UndeterminedPosesError, require_poses, without_s
 from imgcal.rig import CameraRig, RigPrior
 from imgcal.settling import settle
 from imgcal.sources import Frames, blobs_of
+from imgcal.tally import Tally, tally
 from imgcal.transforms import RigidTransform
 
 LEAST_KEPT = 0.8
@@ -59,6 +60,11 @@ class Calibration(Estimate):
             self.rig_from_object,
             spread=torch.zeros_like(self.problem.spread[0]),
         )
+
+    @cached_property
+    def tally(self) -> Tally:
+        """What each camera saw in each snapshot, and how much of it is explained."""
+        return tally(self.labelled, self.observations.seen.numpy(), self.rig_from_object, self.factory, self.obj)
 
     @property
     def identity(self) -> str:
@@ -96,7 +102,9 @@ def calibrate(
     found = time.perf_counter()
     labelled = label(detections, rig, obj, options, progress)
     identified = time.perf_counter()
+    _require_any_view(labelled, rig, obj)
     fit = fit_labelled(labelled, rig, obj, options, guesser)
+    require_views(fit.tally, rig)
     seconds = {
         "detection": found - started,
         "identity": identified - found,
@@ -185,6 +193,14 @@ def _fit_labelled(
         first_guess=guess,
         guess_used=guess_used,
     )
+
+
+def _require_any_view(labelled: Labelled, rig: CameraRig, obj: CalibrationObject) -> None:
+    """Refuse where a camera sees the object, and identity could not label any of it: worse than seeing nothing."""
+    labelled = _with_poses(labelled, rig, obj)
+    observations, poses = _used(labelled, rig, obj)
+    poses = poses or initial_pose(observations, rig, obj)
+    require_views(tally(labelled, observations.seen.numpy(), poses, rig, obj), rig, least_share=0.0)
 
 
 def _nearer(guess: FirstGuess, factory: Prediction, observations: Observations, obj: CalibrationObject) -> bool:
