@@ -114,8 +114,9 @@ def require_most_labels(labels: NDArray[np.bool_], kept: NDArray[np.bool_], rig:
     if bad:
         which = [rig.camera_names[i] for i in bad]
         raise RefusedError(
-            f"estimation: camera {', '.join(which)}: {before[bad[0]] - after[bad[0]]} of {before[bad[0]]} labels in {which[0]} do "
-            "not fit what the other cameras see: its frames may be of another moment, or its labels of other fiducials",
+            f"estimation: camera {', '.join(which)}: {before[bad[0]] - after[bad[0]]} of {before[bad[0]]} labels in "
+            f"{which[0]} do not fit what the other cameras see: its frames may be of another moment, or its labels of "
+            "other fiducials",
             python="put that right, or leave the camera out of the rig (rig.select) and of the detections",
             command=f"put that right, or leave it out: --without {' '.join(which)}",
         )
@@ -123,9 +124,9 @@ def require_most_labels(labels: NDArray[np.bool_], kept: NDArray[np.bool_], rig:
     bad = np.flatnonzero((before >= 6) & (after < 0.5 * before)).tolist()
     if bad:
         raise RefusedError(
-            f"estimation: fiducial {', '.join(map(str, bad))} (row of the object file): {before[bad[0]] - after[bad[0]]} "
-            f"of {before[bad[0]]} labels of fiducial {bad[0]} do not fit: it has moved on the object, or labels are "
-            "swapped",
+            f"estimation: fiducial {', '.join(map(str, bad))} (row of the object file): "
+            f"{before[bad[0]] - after[bad[0]]} of {before[bad[0]]} labels of fiducial {bad[0]} do not fit: it "
+            "has moved on the object, or labels are swapped",
             python="measure it anew, or leave it out of the object",
             command="measure it anew, or take its row out of the object file",
         )
