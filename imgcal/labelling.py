@@ -21,6 +21,10 @@ from imgcal.transforms import RigidTransform
 MOST_REMEMBERED = 64
 """Snapshots that take part in refits of the rig while identity goes on: later ones add little to it."""
 
+NOT_TRIED = "not tried: nothing could be decided in many snapshots before"
+MOST_IN_VAIN = 8_000_000
+"""Hypotheses without any success, after which only a choice of the other snapshots is tried: as many once more."""
+
 LEAST_CERTAIN_FIRST = ("ambiguous", "by_prior", "unique", "coded", "by_tracking")
 
 Progress = Callable[[Iterable[int], int], Iterable[int]]
@@ -106,13 +110,21 @@ def label(
         results[s] = follower.decide(detections.select(rows[s]), detections.snapshot_names[s], labels)
 
     order: Iterable[int] = range(count)
-    for s in progress(order, count) if progress else order:
-        decide(s)
-    again = [s for s in range(count) if not coded[s] and _incomplete(*results[s], detections.camera[rows[s]])]
-    if again and any(results[s][0].status != "refused" for s in range(count)):
-        for s in again:
-            first = results[s][0]
+    patience = Patience(count)
+    for number, s in enumerate(progress(order, count) if progress else order):
+        if coded[s] or patience.tries(number, follower.in_vain):
             decide(s)
+        else:
+            results[s] = SnapshotIdentity(detections.snapshot_names[s], "refused", NOT_TRIED, 0, None), rows[s] * 0 - 1
+    again = [s for s in range(count) if not coded[s] and _incomplete(*results[s], detections.camera[rows[s]])]
+    accepted = np.array([s for s in range(count) if results[s][0].status != "refused"])
+    if len(accepted):
+        patience, follower.in_vain = Patience(len(again)), 0
+        # Those nearest to where the object was seen first: they are the likeliest to show it.
+        for number, s in enumerate(sorted(again, key=lambda s: _gap(s, accepted))):
+            first = results[s][0]
+            if patience.tries(number, follower.in_vain):
+                decide(s)
             if first.status != "refused" and results[s][0].status != "refused":
                 # The rig that it helped to find labels more of it, but says nothing new of how sure it is.
                 retold = replace(results[s][0], status=first.status, alternatives=first.alternatives)
@@ -123,15 +135,41 @@ def label(
             fiducial[rows[s]] = results[s][1]
     labelled = Labelled(replace(detections, fiducial=fiducial), tuple(results[s][0] for s in range(count)))
     if not labelled.used:
-        reasons = Counter(snapshot.reason for snapshot in labelled.snapshots).most_common(1)
-        why = f"{reasons[0][0]} ({reasons[0][1]} of {count} snapshots)" if count else "found no snapshot"
+        reasons = Counter(snapshot.reason for snapshot in labelled.snapshots if snapshot.reason != NOT_TRIED)
+        reason, times = reasons.most_common(1)[0] if count else ("found no snapshot", 0)
+        why = f"{reason} ({times} of {reasons.total()} snapshots)" if count else reason
         raise RefusedError(f"identity: {why}")
     return labelled
+
+
+def _gap(snapshot: int, accepted: NDArray[np.int64]) -> int:
+    """Snapshots to the nearest of the accepted ones, which are in ascending order."""
+    near = int(np.searchsorted(accepted, snapshot))
+    return int(np.abs(accepted[max(near - 1, 0) : near + 1] - snapshot).min())
 
 
 def _incomplete(snapshot: SnapshotIdentity, labels: NDArray[np.int64], camera: NDArray[np.int64]) -> bool:
     """Tell whether another try may help: the snapshot was refused, or no blob of some camera (M,) has a label."""
     return snapshot.status == "refused" or not np.isin(camera, camera[labels >= 0]).all()
+
+
+@dataclass
+class Patience:
+    """Bounds the effort for snapshots in which nothing is found, however many: a wrong object, clutter alone."""
+
+    count: int  # snapshots
+    first_left_out: int = -1
+    stride: int = 1
+
+    def tries(self, number: int, in_vain: int) -> bool:
+        """Tell whether the next snapshot is worth the effort, after so many hypotheses without any success."""
+        if in_vain <= MOST_IN_VAIN:
+            self.first_left_out = -1
+            return True
+        if self.first_left_out < 0:
+            self.first_left_out = number
+            self.stride = max(1, round((self.count - number) * in_vain / max(number, 1) / MOST_IN_VAIN))
+        return (number - self.first_left_out) % self.stride == self.stride - 1
 
 
 class Follower:
@@ -143,6 +181,7 @@ class Follower:
         self.spread = (rig.prior or RigPrior()).std(rig)
         self.pose = None if options.start_pose is None else _checked_pose(options.start_pose, rig)
         self.alternatives = 0  # that the accepted snapshots leave open, 0 = none was accepted yet
+        self.in_vain = 0  # hypotheses that were tried since something was accepted
         self.accepted: list[tuple[Detections, NDArray[np.int64], RigidTransform]] = []
 
     def decide(
@@ -182,13 +221,14 @@ class Follower:
         found = identify(blobs, self.rig, self.obj, self.spread, known, self.options.identity, guesses)
         pose = found.rig_from_object
         if not found.accepted or pose is None:
+            self.in_vain += found.hypotheses
             return found
         if self.alternatives == 0 and self.pose is not None and found.status != "unique":
             found = oriented(found, self.obj, self.pose)
         elif found.status == "by_tracking":
             status, alternatives = self.follow(pose)
             found = replace(found, status=status, alternatives=alternatives)
-        self.alternatives = found.alternatives
+        self.alternatives, self.in_vain = found.alternatives, 0
         return found
 
     def _remember(self, blobs: Detections, labels: NDArray[np.int64], pose: RigidTransform) -> None:

@@ -12,7 +12,7 @@ from itertools import permutations
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, cKDTree
 
 from imgcal.identity.blobs import Blobs
 from imgcal.identity.p3p import FAST, three_point_pose
@@ -94,27 +94,42 @@ def _orders(count: int) -> int:
     return count * (count - 1) * (count - 2)
 
 
-def blob_triples(
-    blobs: Blobs, camera: int, count: int, outer: bool, generator: np.random.Generator
-) -> NDArray[np.int64]:
-    """Draw triples of blobs (count, 3) that are likely to be fiducials: close to other blobs, and not too narrow.
+def likely_blobs(blobs: Blobs, camera: int, outer: bool) -> NDArray[np.int64]:
+    """List the blobs of a camera that are likely to be fiducials: those close to others.
 
     Args:
         blobs: the snapshot.
-        camera: index of the camera.
-        count: number of triples.
+        camera: index of the camera, which has four blobs at least.
         outer: take the outermost blobs only, see `many`.
-        generator: source of randomness.
     """
     uv = blobs.ideal[camera, : blobs.count[camera]].astype(np.float64)
-    gaps = np.sort(np.hypot(*(uv[:, None] - uv[None]).transpose(2, 0, 1)), axis=1)[:, min(3, len(uv) - 1)]
+    gaps = cKDTree(uv).query(uv, k=4)[0][:, -1]
     dense = np.flatnonzero(gaps <= (4 if outer else 2) * np.sort(gaps)[len(uv) // 4])  # sparser at the rim
     if len(dense) < 4:
         dense = np.argsort(gaps)[:4]
-    if outer:
-        dense = dense[ConvexHull(uv[dense], qhull_options="QJ").vertices]
-    drawn = dense[generator.random((DRAWS * count, len(dense))).argpartition(2, axis=1)[:, :3]]
-    a, b = uv[drawn[:, 1]] - uv[drawn[:, 0]], uv[drawn[:, 2]] - uv[drawn[:, 0]]
+    return dense[ConvexHull(uv[dense], qhull_options="QJ").vertices] if outer else dense
+
+
+def blob_triples(
+    uv: NDArray[np.floating], likely: NDArray[np.int64], count: int, generator: np.random.Generator
+) -> NDArray[np.int64]:
+    """Draw triples of blobs (count, 3) that are not too narrow.
+
+    Args:
+        uv: (M, 2) pixels, the blobs of a camera.
+        likely: (L >= 3,) those to draw from.
+        count: number of triples.
+        generator: source of randomness.
+    """
+    # Three different ones: numbers among those that are left, moved past the ones that are taken.
+    drawn = generator.integers(0, len(likely) - np.arange(3), (DRAWS * count, 3))
+    drawn[:, 1] += drawn[:, 1] >= drawn[:, 0]
+    taken = np.sort(drawn[:, :2], axis=1)
+    drawn[:, 2] += drawn[:, 2] >= taken[:, 0]
+    drawn[:, 2] += drawn[:, 2] >= taken[:, 1]
+    drawn = likely[drawn]
+    at = uv.astype(np.float64)[drawn]
+    a, b = at[:, 1] - at[:, 0], at[:, 2] - at[:, 0]
     area = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).reshape(DRAWS, count)
     return drawn.reshape(DRAWS, count, 3)[area.argmax(0), np.arange(count)]
 

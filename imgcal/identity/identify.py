@@ -12,16 +12,14 @@ from torch import Tensor
 from imgcal.identity.assignment import spacing
 from imgcal.identity.blobs import Spread, gather, spread_of
 from imgcal.identity.hypotheses import (
-    FiducialTriples,
     Poses,
-    blob_triples,
     fiducial_triples,
+    likely_blobs,
     many,
-    single_camera_poses,
 )
-from imgcal.identity.planar import planar_poses
 from imgcal.identity.result import Identity, IdentityOptions, Status
-from imgcal.identity.rivals import Motion, conflicts, differ, displacement, lattice_shifts, moved, near_turns
+from imgcal.identity.rivals import Motion, differ, displacement, lattice_shifts, moved, near_turns
+from imgcal.identity.search import VERIFIED, Search
 from imgcal.identity.verify import (
     STAGES,
     Fits,
@@ -41,11 +39,10 @@ from imgcal.observations import Detections
 from imgcal.rig import CameraRig
 from imgcal.transforms import RigidTransform
 
-TRIPLES = 10  # of blobs in a round, over all cameras
 FIRST_HYPOTHESES = 8_000  # in the first round: large objects get fewer triples of blobs; then twice as many each time
 MOST_HYPOTHESES = 400_000  # in a round
-KEPT = 8  # poses of each
-MANY = 40  # fiducials of a planar object, above which triples are too many
+MOST_FALSE = 40  # blobs a fiducial, above which three of them drawn in all rounds are hardly ever fiducials
+MOST_PAIRS = 30_000_000  # of fiducials and blobs: what memory allows
 PATIENCE = 3  # rounds that end with two good labellings
 MOST_STEPS = 6  # from one labelling to a better one of the moved object
 APPROXIMATE = 0.02  # rad, what poses from three points are off by, even for a perfect camera
@@ -54,7 +51,6 @@ LEAST_ALONE = 6  # labels from which one camera can be fitted by itself
 # Explained part near a known pose, below which it is asked whether another pose explains more: an object shifted by its
 # own edge still explains half.
 CONVINCING = 0.6
-VERIFIED = 2  # different labellings that are fitted, the best of a round
 
 
 def identify(
@@ -106,6 +102,8 @@ def track(
 ) -> Identity:
     """Label the blobs of one snapshot near a pose; arguments as in `identify`, `pose_known` = it is no mere guess."""
     scene = Scene(gather(detections, rig), obj, rig, std)
+    if scene.blobs.uv[..., 0].size * obj.fiducials > MOST_PAIRS:
+        return _refused(scene, _too_many(scene))
     poses = Poses(rig_from_object.rotation.numpy()[None], rig_from_object.translation.numpy()[None])
     predicted = predict_ideal(rig, scene.obj.points.numpy(), poses)
     distance = float(np.median(_distances(rig, poses, obj)))
@@ -135,70 +133,26 @@ def bootstrap(
         return _refused(
             scene, f"too few blobs: at most {scene.blobs.count.max()} in a camera, expected at least 4 in one"
         )
-    tolerance, gate = _bounds(scene, rig.working_distance or _guess_distance(scene), pose_known=False)
+    likely = {camera: likely_blobs(scene.blobs, camera, many(obj)) for camera in cameras.tolist()}
+    hopeful = {camera: rows for camera, rows in likely.items() if len(rows) <= MOST_FALSE * obj.fiducials}
+    if not hopeful or scene.blobs.uv[..., 0].size * obj.fiducials > MOST_PAIRS:
+        return _refused(scene, _too_many(scene))
+    bounds = _bounds(scene, rig.working_distance or _guess_distance(scene), pose_known=False)
     generator = np.random.default_rng(options.seed)
-    triples = fiducial_triples(obj, generator)
+    search = Search(scene, hopeful, fiducial_triples(obj, generator), bounds)
     fits: Fits | None = None
     result = _refused(scene, "no pose of the object explains the blobs")
     undecided = 0
     for number in range(options.rounds):
-        hypotheses = min(FIRST_HYPOTHESES << number, MOST_HYPOTHESES)
-        fresh = _round(scene, cameras, triples, hypotheses, (tolerance, gate), generator)
-        if fresh is None:
-            continue
-        fits = fresh if fits is None else _best(scene, join(fits, fresh), 2 * VERIFIED)
-        result = _decide(scene, fits, options, known_pose=False)
-        # Where two labellings explain enough, more hypotheses will not tell them apart.
-        undecided += result.undecided
-        if result.accepted or undecided == PATIENCE:
+        fresh = search.round(min(FIRST_HYPOTHESES << number, MOST_HYPOTHESES), generator)
+        if fresh is not None:
+            fits = fresh if fits is None else _best(scene, join(fits, fresh), 2 * VERIFIED)
+            result = _decide(scene, fits, options, known_pose=False)
+            # Where two labellings explain enough, more hypotheses will not tell them apart.
+            undecided += result.undecided
+        if result.accepted or undecided == PATIENCE or search.hypotheses > options.most_hypotheses:
             break
-    return result
-
-
-def _round(
-    scene: Scene,
-    cameras: NDArray[np.int64],
-    triples: FiducialTriples,
-    hypotheses: int,
-    bounds: tuple[float, float],
-    generator: np.random.Generator,
-) -> Fits | None:
-    """Make so many hypotheses, let the rig vote within the bounds (see `_bounds`), fit the best."""
-    tolerance, gate = bounds
-    if scene.obj.planar and scene.obj.fiducials > MANY:
-        cameras = generator.permutation(cameras)[:2]
-        poses = planar_poses(scene.blobs, scene.rig, cameras[0], scene.obj)
-        for camera in cameras[1:]:
-            poses = poses + planar_poses(scene.blobs, scene.rig, camera, scene.obj)
-    else:
-        number = int(np.clip(hypotheses // len(triples.triples), 1, TRIPLES))
-        cameras = generator.permutation(cameras)[:number]
-        each, outer = -(-number // len(cameras)), many(scene.obj)
-        chosen = [blob_triples(scene.blobs, camera, each, outer, generator) for camera in cameras]
-        camera = np.repeat(cameras, [len(rows) for rows in chosen])
-        poses = single_camera_poses(scene.blobs, scene.rig, camera, np.concatenate(chosen), triples, tolerance, KEPT)
-    if len(poses) == 0:
-        return None
-    predicted = predict_ideal(scene.rig, triples.points, poses)
-    votes = vote(scene.blobs, predicted, tolerance, gate)
-    best = np.argsort(-votes.count.sum(1), kind="stable")[: 4 * VERIFIED]
-    labels = match(scene.blobs, predicted[best], votes.shift[best], 1.25 * tolerance)
-    best, labels = _different(scene.obj, best, labels)
-    return refine(scene, start(scene, poses.select(best), labels))
-
-
-def _different(
-    obj: CalibrationObject, rows: NDArray[np.int64], labels: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Keep the fullest of labellings (K, C, N) that differ in most labels, `VERIFIED` at most."""
-    order = np.argsort(-(labels >= 0).sum((1, 2)), kind="stable")
-    kept: list[int] = []
-    for k in order:
-        if all(conflicts(obj, labels[other], labels[k]) > 0.5 for other in kept):
-            kept.append(int(k))
-        if len(kept) == VERIFIED:
-            break
-    return rows[kept], labels[kept]
+    return replace(result, hypotheses=search.hypotheses)
 
 
 def _best(scene: Scene, fits: Fits, count: int) -> Fits:
@@ -340,6 +294,14 @@ def _preferred(
 
 def _one(pose: RigidTransform) -> Poses:
     return Poses(pose.rotation.numpy()[None], pose.translation.numpy()[None])
+
+
+def _too_many(scene: Scene) -> str:
+    name = scene.rig.camera_names[int(scene.blobs.count.argmax())]
+    return (
+        f"too many blobs: found {scene.blobs.count.max()} in camera {name}, where an object of {scene.obj.fiducials} "
+        "fiducials is expected; raise the detection threshold, or mask what is no marker"
+    )
 
 
 def _refused(scene: Scene, reason: str) -> Identity:

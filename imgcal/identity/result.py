@@ -28,6 +28,7 @@ class Identity:
     margin: float  # natural logarithm of the odds against the best different labelling; inf = none is left
     reason: str  # one line: why it was refused, or what decided
     explained: float = 0.0  # labelled part of what could be seen: in each camera, the smaller of blobs and fiducials
+    hypotheses: int = 0  # that were tried where no pose was known
     undecided: bool = False  # refused because a different labelling explains the blobs nearly as well
 
     @property
@@ -47,4 +48,5 @@ class IdentityOptions:
         0.45  # explained part of what could be seen: the smaller of blobs and fiducials, camera by camera
     )
     rounds: int = 24  # of hypotheses before giving up
+    most_hypotheses: int = 6_000_000  # the same in hypotheses: a large object has many a round
     seed: int = 0  # of the random choice of blob triples

@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+from imgcal import labelling
 from imgcal.errors import InputError, RefusedError
+from imgcal.identity import identify
 from imgcal.labelling import label, matched_to_rig, to_observations
+from imgcal.objects import CalibrationObject
 from imgcal.simulation import simulate_truth, true_detections
 from imgcal.synthesis import PhysicalDrift
 
@@ -95,3 +98,36 @@ class Counted(np.ndarray):
         return super().__eq__(other)
 
     __hash__ = None
+
+
+@pytest.mark.parametrize("count", [8, 60])
+def test_a_wrong_object_is_refused_with_an_effort_that_does_not_grow_with_the_capture(count, seen, o10, monkeypatch):
+    points = 80 * np.random.default_rng(0).standard_normal((8, 3))
+    wrong = CalibrationObject(torch.from_numpy(points), torch.ones(8, 3, dtype=torch.float64))
+    spent = []
+
+    def counted(*arguments, **options):
+        spent.append(identify(*arguments, **options))
+        return spent[-1]
+
+    monkeypatch.setattr(labelling, "MOST_IN_VAIN", 250_000)
+    monkeypatch.setattr(labelling, "identify", counted)
+    rows = np.concatenate([np.flatnonzero(seen.snapshot == s % 4) for s in range(count)])
+    names = tuple(map(str, range(count)))
+    long = replace(seen.select(rows), snapshot=np.repeat(np.arange(count), len(seen) // 4), snapshot_names=names)
+    with pytest.raises(RefusedError, match=r"explains .* snapshots\)"):
+        label(without_labels(long), o10, wrong)
+    effort = [found.hypotheses for found in spent]
+    assert min(effort) > 0
+    assert sum(effort) <= 2 * 250_000 + 2 * max(effort)
+
+
+def test_what_comes_late_in_a_long_capture_is_still_found(seen, o10, asymmetric8, monkeypatch):
+    """Snapshots of clutter use up the patience long before the object comes into view."""
+    monkeypatch.setattr(labelling, "MOST_IN_VAIN", 200_000)
+    once = np.flatnonzero(seen.snapshot == 0)
+    long = seen.select(np.tile(once, 24))
+    number, names = np.repeat(np.arange(24), len(once)), tuple(map(str, range(24)))
+    clutter = np.random.default_rng(0).uniform(0, 1, long.uv.shape) * (2048, 1088)
+    long = replace(long, uv=np.where(number[:, None] < 16, clutter, long.uv), snapshot=number, snapshot_names=names)
+    assert label(without_labels(long), o10, asymmetric8).used == list(range(16, 24))

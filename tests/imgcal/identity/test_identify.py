@@ -6,7 +6,7 @@ import torch
 
 from imgcal.errors import InputError
 from imgcal.formats import load_object, load_rig
-from imgcal.identity import bootstrap, identify, track
+from imgcal.identity import IdentityOptions, bootstrap, identify, track
 from imgcal.objects import CalibrationObject
 from imgcal.observations import BlobFlag, Detections
 from imgcal.resources import data_path
@@ -275,3 +275,29 @@ def test_a_centre_that_is_off_costs_its_own_label_only(o10, asymmetric):
     good = identity.labels == blobs.fiducial
     assert ((identity.labels == -1) | good).all()
     assert good.sum() >= len(blobs) - 3 - 3
+
+
+@pytest.mark.parametrize(("cameras", "blobs"), [(3, 2_000), (10, 20_000)])
+def test_blobs_without_number_are_refused_at_once(cameras, blobs, o10, asymmetric) -> None:
+    rig, random = o10.select(list(range(cameras))), np.random.default_rng(0)
+    uv = random.random((cameras * blobs, 2)) * [2048, 1088]
+    found = identify(detections(uv, np.repeat(np.arange(cameras), blobs), rig), rig, asymmetric, rig.prior.std(rig))
+    assert found.status == "refused" and found.hypotheses == 0
+    assert f"too many blobs: found {blobs} in camera cam01" in found.reason
+
+
+def test_a_known_pose_finds_the_object_among_thousands_of_blobs(o10, asymmetric) -> None:
+    made, [(blobs, truth)] = snapshots(o10, asymmetric, 1, 8, 500)
+    rig = made.rig[0]
+    found = track(blobs, rig, asymmetric, 0.02 * DRIFT.std(rig), made.rig_from_object[0])
+    assert found.accepted
+    assert agreements(found.labels, truth, asymmetric)[1] == 0
+
+
+def test_a_large_object_has_a_bounded_number_of_hypotheses(o10, asymmetric) -> None:
+    _, [(blobs, _)] = snapshots(o10, asymmetric, 1, 8, 0)
+    points = np.random.default_rng(0).standard_normal((30, 3)) * 80
+    options = IdentityOptions(most_hypotheses=100_000)
+    found = bootstrap(blobs, o10, make_object(points), DRIFT.std(o10), options)
+    assert found.status == "refused"
+    assert 100_000 < found.hypotheses < 100_000 + 10 * 30 * 29 * 28
