@@ -19,7 +19,7 @@ GRID = 11
 """Points along each side of the working volume; odd, so that there is a middle."""
 ANCHORS = 7
 """The same, of the points by which true and estimated rig are laid upon one another."""
-MAP_SIZE = (12, 16)
+MAP_SIZE = (16, 24)
 """Rows and columns of each camera's map, which covers the whole image."""
 MAP_DEPTHS = (0.05, 0.5, 0.95)
 """Depths of the maps: these quantiles of the depths at which a camera sees the working volume."""
@@ -84,6 +84,11 @@ class PredictedError:
         return _quantile(self.mm, 0.95)
 
     @property
+    def median_mm_with_noise(self) -> float:
+        """Median of what one measurement of a point is off, noise of its pixels included."""
+        return _quantile(self.mm_with_noise, 0.5)
+
+    @property
     def camera_px(self) -> tuple[float, ...]:
         """Median of each camera over what it sees of the volume, C; nan for one that sees nothing."""
         return tuple(_quantile(camera, 0.5) for camera in self.px)
@@ -107,7 +112,7 @@ class PredictedError:
             "median_mm": _known(self.median_mm),
             "p95_mm": _known(self.p95_mm),
             "noise_px": self.noise,
-            "median_mm_with_noise": _known(_quantile(self.mm_with_noise, 0.5)),
+            "median_mm_with_noise": _known(self.median_mm_with_noise),
             "worst_camera": self.camera_names[worst],
             "worst_camera_px": _known(self.camera_px[worst]),
             "per_camera_px": {n: _known(px) for n, px in zip(self.camera_names, self.camera_px, strict=True)},
@@ -128,7 +133,7 @@ def predicted_error(
 
     Raises:
         InputError: an estimate with batch axes.
-        RefusedError: the information is singular, or the cameras see next to nothing of the volume.
+        RefusedError: the information is singular.
     """
     if calibration.rig.batch_shape:
         raise InputError(

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from imgcal.accuracy import PredictedError, predicted_error
 from imgcal.checks import require_cameras, require_fit, require_most_labels, require_near_prior, require_views
 from imgcal.detection import DetectionOptions
 from imgcal.errors import RefusedError
@@ -65,6 +66,11 @@ class Calibration(Estimate):
     def tally(self) -> Tally:
         """What each camera saw in each snapshot, and how much of it is explained."""
         return tally(self.labelled, self.observations.seen.numpy(), self.rig_from_object, self.factory, self.obj)
+
+    @cached_property
+    def predicted_error(self) -> PredictedError:
+        """How good the rig is over the working volume."""
+        return predicted_error(self)
 
     @property
     def identity(self) -> str:

@@ -34,7 +34,7 @@ class RigUncertainty:
     points: Tensor  # (P, 3) mm, over which is aligned
     px_weight: Tensor  # (C, P) of each pixel in the alignment, 0 where the camera does not see the point
     mm_weight: Tensor  # (P,) of each triangulated point, 0 where fewer than two cameras see it
-    px_covariance: Tensor  # (15 C, 15 C) after the alignment in pixels
+    px_covariance: Tensor  # (15 C, 15 C) after the alignment in pixels; nan where too little is seen for one
     mm_covariance: Tensor  # (15 C, 15 C) after the alignment in mm; nan where cameras share too little for one
 
     def pixel_error(self, points: Tensor) -> Tensor:
@@ -77,9 +77,6 @@ def rig_uncertainty(rig: CameraRig, covariance: Tensor, points: Tensor) -> RigUn
         rig: C cameras, no batch axes.
         covariance: (15 C, 15 C) of all cameras' parameters, as `estimation.camera_covariance`.
         points: (P, 3) mm over which estimated and true rig are laid upon one another.
-
-    Raises:
-        RefusedError: the cameras see so few of the points that no rigid motion is determined.
     """
     seen = rig.project(points).visible
     motion = rigid_motion(rig, points.mean(0))
@@ -89,7 +86,7 @@ def rig_uncertainty(rig: CameraRig, covariance: Tensor, points: Tensor) -> RigUn
     px_covariance = mm_covariance = covariance
     for _ in range(ROUNDS):
         metric = torch.block_diag(*torch.einsum("cp,cpai,cpaj->cij", px_weight, pixels, pixels))
-        px_covariance = aligned_covariance(covariance, motion, metric)
+        px_covariance = _aligned_if_possible(covariance, motion, metric)
         rows = (mm_weight.sqrt()[:, None, None] * triangulation).flatten(0, 1)
         mm_covariance = _aligned_if_possible(covariance, motion, rows.mT @ rows)
         found = RigUncertainty(rig, points, px_weight, mm_weight, px_covariance, mm_covariance)

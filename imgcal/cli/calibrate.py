@@ -145,6 +145,7 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         "snapshots_rejected": len(snapshots) - len(used),
         "rejected": {s.name: s.reason for s in snapshots if s.status == "refused"},
         "per_camera": per_camera,
+        "predicted_error": calibration.predicted_error.summary(),
         "seconds": seconds,
     }
 
@@ -175,8 +176,21 @@ def refused_summary(reason: str, snapshot_names: tuple[str, ...], seconds: dict[
         "snapshots_rejected": len(snapshot_names),
         "rejected": {},
         "per_camera": {},
+        "predicted_error": None,
         "seconds": seconds,
     }
+
+
+def predicted_line(predicted: dict[str, Any]) -> str:
+    """Say in one line how good the rig is where it is used."""
+    lengths = [
+        f"{value:.2g} {unit} (95 %: {p95:.2g})"
+        for unit in ("mm", "px")
+        if (value := predicted[f"median_{unit}"]) is not None and (p95 := predicted[f"p95_{unit}"]) is not None
+    ]
+    worst = predicted["worst_camera_px"]
+    words = f"predicted error in the working volume {', '.join(lengths) or 'unknown'}"
+    return words if worst is None else f"{words}, worst camera {predicted['worst_camera']} {worst:.2g} px"
 
 
 def _print(result: dict[str, Any], out: Path, report: bool) -> None:
@@ -186,6 +200,7 @@ def _print(result: dict[str, Any], out: Path, report: bool) -> None:
     print(f"reprojection error before {before:.3f} px, {network}after {after:.4f} px (RMS)")
     if guess is not None and not guess["used"]:
         print("note: the network's guess was no better than the factory calibration: not used", file=sys.stderr)
+    print(predicted_line(result["predicted_error"]))
     print(
         f"identity {result['identity']}, {result['snapshots_used']} snapshots used, "
         f"{result['snapshots_rejected']} rejected"

@@ -92,6 +92,7 @@ def describe(
         std=std.numpy(),
         prior_std=relative_prior_std(rig, reference),
         reference=reference,
+        predicted=calibration.predicted_error,
         object_points=obj.points.double().numpy(),
         rig_from_object=_poses(calibration),
         frames=tuple(pictures.get(name) for name in rig.camera_names) if pictures else (),

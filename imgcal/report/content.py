@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from imgcal.accuracy import PredictedError
 from imgcal.estimation.covariance import relative_difference, relative_jacobian
 from imgcal.observations import Detections
 from imgcal.rig import PARAMETERS, CameraRig, RigPrior
@@ -59,6 +60,7 @@ class ReportContent:
     std: Array | None = None  # (C, 15) posterior standard deviation
     prior_std: Array | None = None  # (C, 15) standard deviation before the data; see `relative_prior_std`
     reference: int = 0  # index of the reference camera
+    predicted: PredictedError | None = None  # over the working volume
     object_points: Array | None = None  # (N, 3) mm
     rig_from_object: RigidTransform | None = None  # (S) in the recalibrated rig's frame; nan for rejected snapshots
     frames: tuple[NDArray[np.uint8] | NDArray[np.uint16] | None, ...] = ()  # C grey images (H, W) of one snapshot

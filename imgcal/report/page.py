@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import math
 from collections import Counter
 from dataclasses import dataclass
 from functools import cache
@@ -17,7 +18,7 @@ from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
 from imgcal.formats.atomic import write_text
-from imgcal.report import charts, overlay, scene, svg, tables
+from imgcal.report import accuracy, charts, overlay, scene, svg, tables
 from imgcal.report.content import MOVED, UNDETERMINED, ReportContent
 from imgcal.report.verdict import judge
 from imgcal.rig import PARAMETER_NAMES
@@ -56,6 +57,7 @@ def render(content: ReportContent) -> str:
         snapshots=_snapshots(content),
         residuals=_residuals(content),
         coverage=_coverage(content),
+        accuracy=_accuracy(content),
         rig=_rig(content),
         overlays=_overlays(content),
         rows=tables.camera_rows(content),
@@ -150,6 +152,36 @@ def _coverage(content: ReportContent) -> dict[str, object]:
         for i, name in enumerate(content.cameras)
     ]
     return {"panels": panels, "limits": [f"{x:.2g}" for x in limits]}
+
+
+def _accuracy(content: ReportContent) -> dict[str, object] | None:
+    """Maps of the predicted error; None where nothing is predicted."""
+    predicted = content.predicted
+    if predicted is None or not bool(predicted.px.isfinite().any()):
+        return None
+    px, mm = accuracy.limits(predicted.px.numpy()), accuracy.limits(predicted.mm.numpy())
+    panels = [
+        Panel(
+            name,
+            accuracy.camera_map(predicted, i, content.image_size[i], px),
+            f"{svg.pixels(error)} px" if math.isfinite(error) else "",
+        )
+        for i, (name, error) in enumerate(zip(content.cameras, predicted.camera_px, strict=True))
+    ]
+    size = (predicted.volume.high - predicted.volume.low).tolist()
+    slice_, where = accuracy.volume_slice(predicted, mm) if predicted.seen_share else (None, "")
+    return {
+        "sentences": accuracy.sentences(content),
+        "advice": accuracy.advice(content),
+        "panels": panels,
+        "px_limits": [f"{x:g}" for x in px],
+        "mm_limits": [f"{x:g}" for x in mm],
+        "slice": slice_,
+        "where": where,
+        "volume": " × ".join(f"{side:.0f}" for side in size),
+        "with_noise": accuracy.length(predicted.median_mm_with_noise),
+        "noise": svg.pixels(predicted.noise),
+    }
 
 
 def _rig(content: ReportContent) -> dict[str, object]:

@@ -8,12 +8,14 @@ from typing import Literal
 
 import numpy as np
 
+from imgcal.report.accuracy import advice, length, sentences
 from imgcal.report.charts import duration
 from imgcal.report.content import MOVED, ReportContent
 from imgcal.report.svg import grouped, pixels
 
 GOOD_CHI2 = 1.5  # above, the residuals are larger than the stated noise
 SMALL_CHI2 = 0.5  # below, the noise was overstated
+MOST_FIGURES = 6  # at the top of the page: one row
 FEW_OBSERVATIONS = 15  # of a camera: fewer than its parameters
 
 IDENTITY = {
@@ -55,16 +57,16 @@ def judge(content: ReportContent) -> Verdict:
         return _refused(content)
     reservations = _reservations(content)
     identity = IDENTITY.get(content.identity, f"Identity: {content.identity}.")
-    found = (_improvement(content), *_movement(content), identity)
+    found = (_improvement(content), *sentences(content), *_movement(content), identity)
     if content.reason:
         found = (*found, content.reason)
     if reservations:
         return Verdict(
             "caution", "Recalibrated, with reservations", found, tuple(r for r, _ in reservations),
-            (*dict.fromkeys(step for _, step in reservations if step), _CHECK), _figures(content),
+            (*dict.fromkeys(step for _, step in reservations if step), *advice(content), _CHECK), _figures(content),
         )  # fmt: skip
     headline = "Recalibrated: the result explains the images as well as the measurement noise allows"
-    return Verdict("good", headline, found, (), (_CHECK, _KEEP), _figures(content))
+    return Verdict("good", headline, found, (), (*advice(content), _CHECK, _KEEP), _figures(content))
 
 
 _CHECK = "Check the new rig on snapshots that took no part here: imgcal score CAPTURE --rig rig.yaml --object OBJECT."
@@ -158,9 +160,13 @@ def _figures(content: ReportContent) -> tuple[KeyFigure, ...]:
         KeyFigure(f"{used} / {total}", "snapshots used"),
         KeyFigure(f"{grouped(int(content.used.sum()))} / {grouped(len(content.detections))}", "blobs used"),
     ]
+    predicted = content.predicted
+    if predicted is not None and math.isfinite(predicted.median_mm):
+        note = f"predicted; 95 %: {length(predicted.p95_mm)}"
+        figures.insert(1, KeyFigure(length(predicted.median_mm), "error in the volume", note))
     if len(content.cameras) > 1:
         figures.append(KeyFigure(f"{moved} / {len(content.cameras) - 1}", "cameras moved", f"beyond {MOVED:g} std"))
-    if content.seconds:
+    if content.seconds and len(figures) < MOST_FIGURES:
         figures.append(KeyFigure(duration(sum(content.seconds.values())), "computing time"))
     return tuple(figures)
 

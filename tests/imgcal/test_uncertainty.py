@@ -4,7 +4,7 @@ import torch
 from imgcal.errors import RefusedError
 from imgcal.evaluation.true_error import true_error
 from imgcal.transforms import RigidTransform
-from imgcal.uncertainty import pixel_jacobian, rig_uncertainty, rigid_motion
+from imgcal.uncertainty import aligned_covariance, pixel_jacobian, rig_uncertainty, rigid_motion
 
 F64 = torch.float64
 
@@ -113,6 +113,12 @@ def test_points_of_one_camera_have_no_place(rig, points):
     assert found.point_error(points, seen).isnan().nonzero().squeeze(-1).tolist() == [4]
 
 
-def test_nothing_in_view_is_refused(rig, points):
+def test_nothing_in_view_says_nothing(rig, points):
+    covariance, _ = covariance_of(rig)
+    behind = points - torch.tensor([0.0, 0.0, 2000.0], dtype=F64)
+    found = rig_uncertainty(rig, covariance, behind)
+    assert found.pixel_error(points).isnan().all()
+    assert found.point_error(points, torch.ones(3, len(points), dtype=torch.bool)).isnan().all()
+    motion = rigid_motion(rig, points.mean(0))
     with pytest.raises(RefusedError, match="too little of the working volume"):
-        rig_uncertainty(rig, covariance_of(rig)[0], points - torch.tensor([0.0, 0.0, 2000.0], dtype=F64))
+        aligned_covariance(covariance, motion, torch.zeros_like(covariance))

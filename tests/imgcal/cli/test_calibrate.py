@@ -25,7 +25,7 @@ from imgcal.synthesis import PhysicalDrift, RelativeDrift
 
 KEYS = {
     "status", "reason", "identity", "rms_px_before", "rms_px_after", "chi2_per_dof", "snapshots_used",
-    "snapshots_rejected", "per_camera", "seconds",
+    "snapshots_rejected", "per_camera", "predicted_error", "seconds",
 }  # fmt: skip
 
 
@@ -53,6 +53,9 @@ def test_frames_to_recalibrated_rig(workplace, tmp_path, capsys):
     assert result["rms_px_after"] < 0.05 < result["rms_px_before"]
     assert (out / "report.html").stat().st_size > 100_000
     printed = capsys.readouterr().out
+    predicted = result["predicted_error"]
+    assert 0 < predicted["median_px"] < predicted["p95_px"] and 0 < predicted["median_mm"] < predicted["p95_mm"]
+    assert f"in the working volume {predicted['median_mm']:.2g} mm (95 %: {predicted['p95_mm']:.2g})" in printed
     assert f"before {result['rms_px_before']:.3f} px" in printed and str(out / "report.html") in printed
 
     truth, factory = load_rig(workplace.capture / "truth" / "rig.yaml"), load_rig(workplace.rig)

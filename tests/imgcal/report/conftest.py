@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from imgcal.accuracy import predicted_error
 from imgcal.estimation import EstimationOptions, estimate, relative_covariance
 from imgcal.formats import load_object, load_rig
 from imgcal.observations import Detections, Observations
@@ -113,6 +114,7 @@ def calibrated(
         predicted_after=predicted(after.residual),
         std=covariance.diagonal().clamp_min(0).sqrt().reshape(cameras, PARAMETERS).numpy(),
         prior_std=relative_prior_std(factory),
+        predicted=predicted_error(after),
         object_points=obj.points.numpy(),
         rig_from_object=after.rig_from_object,
         frames=tuple(_frame(detections, c, factory) for c in range(cameras)) if frames else (),
@@ -133,7 +135,7 @@ def refused(content: ReportContent) -> ReportContent:
         content, title="O10, refused", status="refused", identity="refused", recalibrated=None,
         reason="No labelling wins clearly: the best two explain 31 and 30 of 80 blobs.",
         labels=np.full_like(content.labels, -1), predicted_before=None, predicted_after=None, std=None, prior_std=None,
-        rig_from_object=None, chi2_per_dof=float("nan"), rms_before=float("nan"), rms_after=float("nan"),
+        rig_from_object=None, predicted=None, chi2_per_dof=float("nan"), rms_before=float("nan"), rms_after=float("nan"),
         snapshots=tuple(SnapshotSummary(s.name, s.found, 0, rejected) for s in content.snapshots),
     )  # fmt: skip
 

@@ -20,7 +20,7 @@ from imgcal.errors import InputError
 from imgcal.report import ReportContent, SnapshotSummary, overlay, render, write_report
 
 KINDS = ("content", "refused_content", "single_content", "plain_content", "empty_content")
-SECTIONS = ["status", "residuals", "coverage", "rig", "overlays", "cameras", "knowledge", "run"]
+SECTIONS = ["status", "residuals", "coverage", "accuracy", "rig", "overlays", "cameras", "knowledge", "run"]
 VOID = {"meta", "input", "br", "hr", "img", "link"}
 HOSTILE = "<img src=x onerror=alert(1)></script>&amp;\"'{{7*7}}"
 

@@ -1,0 +1,171 @@
+"""How good the rig is where it is used: one map a camera, one slice through the working volume, one plain sentence."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from markupsafe import Markup
+
+from imgcal.accuracy import MAP_DEPTHS, MAP_SIZE, PredictedError
+from imgcal.report import svg
+from imgcal.report.charts import RESIDUAL_CLASSES
+from imgcal.report.content import ReportContent
+from imgcal.report.svg import Array, Axes
+
+EXCEPTIONAL = 2.0
+"""Times the other cameras' error from which a camera is named as an exception."""
+MOST_NAMED = 3
+"""Cameras named in the sentence."""
+MORE_SNAPSHOTS = (5, 10, 20, 50, 100)
+"""Numbers that are advised."""
+UNSEEN_ADVICE = 20
+"""The same, for a camera that has seen nothing."""
+MAP = len(MAP_DEPTHS) // 2
+"""The map that is drawn: the one in the middle of the depths."""
+
+
+def sentences(content: ReportContent) -> tuple[str, ...]:
+    """Say in plain words how well the working volume is known, and where it is not; nothing if nothing is known."""
+    predicted = content.predicted
+    if predicted is None or not math.isfinite(predicted.median_px):
+        return ()
+    known = [px for px in predicted.camera_px if math.isfinite(px)]
+    usual = float(np.median(known))
+    worst = [camera for camera in _by_error(predicted) if predicted.camera_px[camera] > EXCEPTIONAL * usual]
+    if math.isfinite(predicted.median_mm):
+        words = (
+            f"You know this volume to {length(predicted.median_mm)} (95 % of it to {length(predicted.p95_mm)}), and "
+            f"its images to {svg.pixels(usual)} px"
+        )
+    else:
+        words = f"You know the images of this volume to {svg.pixels(usual)} px"
+    if worst:
+        named = [f"{content.cameras[i]} ({svg.pixels(predicted.camera_px[i])} px)" for i in worst[:MOST_NAMED]]
+        others = len(worst) - len(named)
+        words += f", except through {', '.join(named)}" + (f" and {others} more" if others else "")
+    found = [words + "."]
+    if 0 < predicted.seen_share < 0.95:
+        found.append(f"{100 * (1 - predicted.seen_share):.0f} % of the volume are seen by fewer than two cameras.")
+    return tuple(found)
+
+
+def advice(content: ReportContent) -> tuple[str, ...]:
+    """What would make the exceptions as good as the rest: snapshots in their view."""
+    predicted = content.predicted
+    if predicted is None:
+        return ()
+    usual = float(np.median([px for px in predicted.camera_px if math.isfinite(px)] or [math.nan]))
+    steps: dict[int, list[str]] = {}
+    for camera in _by_error(predicted)[:MOST_NAMED]:
+        if predicted.camera_px[camera] > EXCEPTIONAL * usual:
+            wanted = more_snapshots(_snapshots_seen(content, camera), predicted.camera_px[camera] / usual)
+            steps.setdefault(wanted, []).append(content.cameras[camera])
+    return tuple(f"Take {n} more snapshots in the view of {', '.join(names)}." for n, names in steps.items())
+
+
+def more_snapshots(seen: int, ratio: float) -> int:
+    """How many more snapshots bring a camera to the others: its variance falls with the number that it has seen.
+
+    Args:
+        seen: snapshots that took part, in which the camera saw the object.
+        ratio: its error over that of the others.
+    """
+    if seen == 0:
+        return UNSEEN_ADVICE
+    wanted = seen * (ratio**2 - 1)
+    return next((n for n in MORE_SNAPSHOTS if n >= wanted), MORE_SNAPSHOTS[-1])
+
+
+def length(mm: float) -> str:
+    """Write a length to two digits: "0.31 mm", "12 mm"."""
+    return f"{mm:.2g} mm" if mm < 99.5 else f"{mm:.0f} mm"
+
+
+def limits(values: Array) -> Array:
+    """Upper limits of the classes, of the series 1, 2, 5, 10; the last class is open: (classes - 1,).
+
+    The median lies in the second class.
+    """
+    known = values[np.isfinite(values)]
+    middle = max(float(np.median(known)), 1e-9) if len(known) else 1.0
+    series = [digit * 10.0**power for power in range(-10, 8) for digit in (1, 2, 5)]
+    first = next(i for i, value in enumerate(series) if value >= middle) - 1
+    return np.array(series[first : first + RESIDUAL_CLASSES - 1])
+
+
+def camera_map(predicted: PredictedError, camera: int, image_size: Array, limits: Array) -> Markup:
+    """Draw one camera's errors over its image at the middle depth; what lies outside the volume is pale."""
+    width, height = (float(x) for x in image_size)
+    scale = 240 / width
+    rows, columns = MAP_SIZE
+    error, inside = predicted.maps[camera, MAP].numpy(), predicted.map_inside[camera, MAP].numpy()
+    parts = [svg.box(1, 1, 240, height * scale, "panel")]
+    for kind, chosen in (("pale", ~inside), ("", inside)):
+        parts.append(_cells(error, chosen, 1, 1, 240 / columns, height * scale / rows, limits, kind))
+    if not np.isfinite(error).any():
+        parts.append(svg.text(121, height * scale / 2 + 4, "sees nothing of the volume"))
+    title = f"Predicted error over the image of {predicted.camera_names[camera]}"
+    return svg.drawing(242, height * scale + 2, title, *parts)
+
+
+def volume_slice(predicted: PredictedError, limits: Array) -> tuple[Markup, str]:
+    """Draw the slice through the middle of the volume over which the error changes most, and say which it is."""
+    mm = predicted.mm.numpy()
+    middle = mm.shape[0] // 2
+    slices = [mm.take(middle, axis=normal) for normal in range(3)]
+    normal = int(np.argmax([_range(part) for part in slices]))
+    across, up = (axis for axis in range(3) if axis != normal)
+    low, high = predicted.volume.low.numpy(), predicted.volume.high.numpy()
+    width, height = float(high[across] - low[across]), float(high[up] - low[up])
+    scale = 300 / max(width, height)
+    axes = Axes(
+        56, 56 + width * scale, 12, 12 + height * scale,
+        (float(low[across]), float(high[across])), (float(low[up]), float(high[up])),
+    )  # fmt: skip
+    error = slices[normal].T[::-1]  # rows from the top
+    step = (axes.right - axes.left) / error.shape[1], (axes.bottom - axes.top) / error.shape[0]
+    cells = _cells(error, np.isfinite(error), axes.left, axes.top, *step, limits, "")
+    names = "xyz"
+    positions = predicted.uncertainty.rig.positions.numpy()
+    place = np.clip(positions, low, high)
+    marks = svg.dots(axes.x(place[:, across]), axes.y(place[:, up]), "camera-mark")
+    value = (low[normal] + high[normal]) / 2
+    words = f"Slice at {names[normal]} = {value:.0f} mm in the rig's frame"
+    drawn = svg.drawing(
+        axes.right + 24, axes.bottom + 42, f"Predicted error of triangulated points. {words}", cells,
+        svg.grid(axes, f"{names[across]} (mm)", f"{names[up]} (mm)", count=4), marks,
+    )  # fmt: skip
+    return drawn, words
+
+
+def _cells(error: Array, chosen: Array, left: float, top: float, dx: float, dy: float, limits: Array, kind: str) -> str:
+    """Rectangles of the chosen cells (rows, columns), neighbours of one class together, one path a class."""
+    group = np.where(chosen & np.isfinite(error), np.searchsorted(limits, np.nan_to_num(error)), -1)
+    steps: dict[int, list[str]] = {}
+    for row, line in enumerate(group):
+        ends = [0, *(np.flatnonzero(np.diff(line)) + 1).tolist(), len(line)]
+        for start, end in zip(ends[:-1], ends[1:], strict=True):
+            if line[start] >= 0:
+                x, y, width = left + start * dx, top + row * dy, svg.number((end - start) * dx)
+                box = f"M{svg.number(x)} {svg.number(y)}h{width}v{svg.number(dy)}h-{width}z"
+                steps.setdefault(int(line[start]), []).append(box)
+    paths = (f'<path class="cell c{i} {kind}" d="{"".join(parts)}"/>' for i, parts in sorted(steps.items()))
+    return "".join(paths)
+
+
+def _range(values: Array) -> float:
+    """How much values change: the ratio of large to small ones."""
+    known = values[np.isfinite(values)]
+    return float(np.quantile(known, 0.95) / max(np.quantile(known, 0.05), 1e-300)) if len(known) else 0.0
+
+
+def _by_error(predicted: PredictedError) -> list[int]:
+    """Cameras, the worst first; those that see nothing of the volume left out."""
+    known = [i for i, px in enumerate(predicted.camera_px) if math.isfinite(px)]
+    return sorted(known, key=lambda i: -predicted.camera_px[i])
+
+
+def _snapshots_seen(content: ReportContent, camera: int) -> int:
+    rows = content.used & (content.detections.camera == camera)
+    return len(np.unique(content.detections.snapshot[rows]))
