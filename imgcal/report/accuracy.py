@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 from markupsafe import Markup
@@ -145,7 +146,7 @@ def _cells(error: Array, chosen: Array, left: float, top: float, dx: float, dy: 
     steps: dict[int, list[str]] = {}
     for row, line in enumerate(group):
         ends = [0, *(np.flatnonzero(np.diff(line)) + 1).tolist(), len(line)]
-        for start, end in zip(ends[:-1], ends[1:], strict=True):
+        for start, end in pairwise(ends):
             if line[start] >= 0:
                 x, y, width = left + start * dx, top + row * dy, svg.number((end - start) * dx)
                 box = f"M{svg.number(x)} {svg.number(y)}h{width}v{svg.number(dy)}h-{width}z"

@@ -135,7 +135,8 @@ def refused(content: ReportContent) -> ReportContent:
         content, title="O10, refused", status="refused", identity="refused", recalibrated=None,
         reason="No labelling wins clearly: the best two explain 31 and 30 of 80 blobs.",
         labels=np.full_like(content.labels, -1), predicted_before=None, predicted_after=None, std=None, prior_std=None,
-        rig_from_object=None, predicted=None, chi2_per_dof=float("nan"), rms_before=float("nan"), rms_after=float("nan"),
+        rig_from_object=None, predicted=None, chi2_per_dof=float("nan"), rms_before=float("nan"),
+        rms_after=float("nan"),
         snapshots=tuple(SnapshotSummary(s.name, s.found, 0, rejected) for s in content.snapshots),
     )  # fmt: skip
 
