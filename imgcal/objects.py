@@ -35,12 +35,31 @@ class CalibrationObject:
     radius: Tensor | None = None  # (N,) mm of spherical fiducials; None = points
     name: str = "object"
     fiducial_names: tuple[str, ...] = field(default=())
+    tolerance: Tensor | None = None  # (N,) mm, one standard deviation of each coordinate; None = exact
+    scale_tolerance: float = 0.0  # relative, one standard deviation of all distances together
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3 or len(self.points) < 4:
             raise InputError(
                 f"object {self.name}: found points of shape {tuple(self.points.shape)}, expected (N >= 4, 3)"
             )
+
+        if self.tolerance is not None and (
+            self.tolerance.shape != (len(self.points),)
+            or not bool(((self.tolerance >= 0) & self.tolerance.isfinite()).all())
+        ):
+            raise InputError(
+                f"object {self.name}: expected a tolerance >= 0 (mm) for each of {len(self.points)} fiducials"
+            )
+        if not 0 <= self.scale_tolerance < 1:
+            raise InputError(
+                f"object {self.name}: found a scale tolerance of {self.scale_tolerance}, expected a share from 0 to 1"
+            )
+
+    @property
+    def exact(self) -> bool:
+        """Tell whether the fiducials are where the object says, without any tolerance."""
+        return self.scale_tolerance == 0 and (self.tolerance is None or not bool(self.tolerance.any()))
 
     @property
     def fiducials(self) -> int:

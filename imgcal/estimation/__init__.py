@@ -3,6 +3,7 @@
 from imgcal.estimation.covariance import (
     camera_covariance,
     camera_std,
+    object_covariance,
     pose_covariance,
     relative_covariance,
     relative_difference,
@@ -17,6 +18,7 @@ __all__ = [
     "camera_std",
     "estimate",
     "initial_pose",
+    "object_covariance",
     "pose_covariance",
     "relative_covariance",
     "relative_difference",

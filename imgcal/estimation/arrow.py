@@ -6,6 +6,8 @@
     [                D_1           ]      One kind of block is eliminated (Schur complement), the other solved densely.
     [ W^T                ...  D_S  ]
 
+A few more unknowns that couple to everything (the object's) are kept, behind the others: the border.
+
 Source: Triggs et al., "Bundle Adjustment - A Modern Synthesis", section 6.
 """
 
@@ -18,49 +20,76 @@ from torch import Tensor
 
 
 @dataclass(frozen=True)
+class Border:
+    """Unknowns that couple to every block, M of them."""
+
+    eliminated: Tensor  # (B, P, p, M) coupling with the blocks to eliminate
+    kept: Tensor  # (B, Q, q, M) coupling with the blocks to keep
+    own: Tensor  # (B, M, M)
+
+
+@dataclass(frozen=True)
 class Reduced:
     """A Cholesky factorization of the arrow with one kind of block eliminated."""
 
     eliminated: Tensor  # (B, P, p, p) lower factors of the eliminated blocks
-    whitened: Tensor  # (B, P, p, Q q) those factors' inverses times the couplings
-    kept: Tensor  # (B, Q q, Q q) lower factor of the Schur complement
+    whitened: Tensor  # (B, P, p, Q q + M) those factors' inverses times the couplings
+    kept: Tensor  # (B, Q q + M, Q q + M) lower factor of the Schur complement
     failed: Tensor  # (B,) bool: not positive definite
 
 
-def reduce(blocks: Tensor, coupling: Tensor, kept: Tensor) -> Reduced:
+def reduce(blocks: Tensor, coupling: Tensor, kept: Tensor, border: Border | None = None) -> Reduced:
     """Eliminate `blocks` from the arrow.
 
     Args:
         blocks: (B, P, p, p) symmetric blocks to eliminate.
         coupling: (B, P, Q, p, q).
         kept: (B, Q, q, q) symmetric blocks to keep.
+        border: further unknowns to keep.
     """
     count, size = kept.shape[1], kept.shape[2]
+    wide = count * size
     factor, info = torch.linalg.cholesky_ex(blocks)
     right = coupling.transpose(2, 3).flatten(3)  # (B, P, p, Q q)
+    if border is not None:
+        right = torch.cat((right, border.eliminated), dim=-1)
     whitened = torch.linalg.solve_triangular(factor, right, upper=False)
     tall = whitened.flatten(1, 2)
     schur = -(tall.mT @ tall)
-    diagonal = schur.unflatten(-1, (count, size)).unflatten(-3, (count, size)).diagonal(dim1=1, dim2=3)
-    diagonal += kept.permute(0, 2, 3, 1)
+    square = schur[:, :wide, :wide].unflatten(-1, (count, size)).unflatten(-3, (count, size))
+    square.diagonal(dim1=1, dim2=3).add_(kept.permute(0, 2, 3, 1))
+    if border is not None:
+        across = border.kept.flatten(1, 2)
+        schur[:, :wide, wide:] += across
+        schur[:, wide:, :wide] += across.mT
+        schur[:, wide:, wide:] += border.own
     schur_factor, schur_info = torch.linalg.cholesky_ex(schur)
     return Reduced(factor, whitened, schur_factor, (info != 0).any(-1) | (schur_info != 0))
 
 
-def solve(reduced: Reduced, right_eliminated: Tensor, right_kept: Tensor) -> tuple[Tensor, Tensor]:
+def solve(
+    reduced: Reduced, right_eliminated: Tensor, right_kept: Tensor, right_border: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor | None]:
     """Solve the arrow for one right-hand side.
 
     Args:
         reduced: from `reduce`.
         right_eliminated: (B, P, p).
         right_kept: (B, Q, q).
+        right_border: (B, M), None without a border.
 
     Returns:
-        The solution in the same two shapes.
+        The solution in the same shapes.
     """
     first = torch.linalg.solve_triangular(reduced.eliminated, right_eliminated[..., None], upper=False)
-    right = right_kept.flatten(1)[..., None] - (reduced.whitened.mT @ first).sum(1)
+    right = right_kept.flatten(1)
+    wide = right.shape[1]
+    if right_border is not None:
+        right = torch.cat((right, right_border), dim=1)
+    right = right[..., None] - (reduced.whitened.mT @ first).sum(1)
     kept = torch.cholesky_solve(right, reduced.kept)
     second = first - reduced.whitened @ kept.unsqueeze(1)
     eliminated = torch.linalg.solve_triangular(reduced.eliminated.mT, second, upper=True)
-    return eliminated.squeeze(-1), kept.squeeze(-1).view_as(right_kept)
+    kept = kept.squeeze(-1)
+    border = None if right_border is None else kept[:, wide:]
+    return eliminated.squeeze(-1), kept[:, :wide].reshape(right_kept.shape), border

@@ -1,6 +1,7 @@
 """Posterior covariance of an estimate: of each camera, of the cameras relative to one another, of the poses.
 
-All are Laplace approximations: the inverse of the Gauss-Newton information at the minimum, prior included.
+All begin with the Laplace approximation: the inverse of the Gauss-Newton information at the minimum, prior included.
+Those of the cameras and of the object add what the curvature of the posterior does to second order: `curvature.py`.
 """
 
 # Compiled functions take their types from their arguments.
@@ -18,9 +19,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.errors import RefusedError
-from imgcal.estimation import arrow
+from imgcal.estimation.curvature import curvature_covariance
 from imgcal.estimation.estimate import Estimate
-from imgcal.estimation.linearize import POSE_PARAMETERS
+from imgcal.estimation.linearize import POSE_PARAMETERS, points_at
 from imgcal.estimation.solver import Solution, factorize
 from imgcal.rig import PARAMETERS, CameraRig
 from imgcal.rotations import cross_matrix, left_jacobian
@@ -31,8 +32,12 @@ MOST_DENSE = 60
 """Pose parameters up to which `remaining_variance` needs no library."""
 
 
-def camera_covariance(estimate: Estimate) -> Tensor:
+def camera_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
     """Joint covariance of all cameras' parameters.
+
+    Args:
+        estimate: the estimate.
+        curved: add the second order; without, it is the inverse of the information.
 
     Returns:
         (*B, 15 C, 15 C) in the units and order of `rig.PARAMETER_NAMES`, camera after camera; rotations are small left
@@ -49,18 +54,23 @@ def camera_covariance(estimate: Estimate) -> Tensor:
     per_camera = scale.unflatten(1, (cameras, PARAMETERS))
     physical = torch.einsum("bcij,bcjdk,bdlk->bcidl", per_camera, blocks, per_camera)
     size = cameras * PARAMETERS
-    return physical.reshape(*estimate.chi2.shape, size, size)
+    result = physical.reshape(*estimate.chi2.shape, size, size)
+    if not curved:
+        return result
+    centre = estimate.rig.reshape(len(covariance)).map_tensors(lambda tensor, _: tensor.unsqueeze(1))
+    return result + curvature_covariance(estimate, lambda rigs, _: rigs.difference(centre).flatten(-2))
 
 
 def _camera_blocks(solution: Solution) -> Tensor:
     """Joint covariance of all cameras' whitened offsets: (B, 15 C, 15 C)."""
     equations = solution.equations
-    reduced, cameras_first = factorize(equations)
+    factorization = factorize(equations)
+    reduced, cameras = factorization.reduced, equations.camera.shape[1]
     if bool(reduced.failed.any()):
         raise RefusedError(UNDETERMINED)
-    if not cameras_first:
-        return torch.cholesky_inverse(reduced.kept)
-    cameras = equations.camera.shape[1]
+    if not factorization.cameras_first:
+        size = PARAMETERS * cameras
+        return torch.cholesky_inverse(reduced.kept)[:, :size, :size]
     inverse = torch.cholesky_inverse(reduced.eliminated)
     half = torch.linalg.solve_triangular(reduced.eliminated.mT, reduced.whitened, upper=True).flatten(1, 2)
     spread = torch.linalg.solve_triangular(reduced.kept, half.mT, upper=False)
@@ -86,7 +96,8 @@ def remaining_variance(solution: Solution) -> NDArray[np.float64]:
     """
     equations = solution.equations
     snapshots, cameras = equations.coupling.shape[1:3]
-    if equations.cost.device.type == "cpu" and POSE_PARAMETERS * snapshots <= MOST_DENSE:
+    exact = equations.object is None
+    if equations.cost.device.type == "cpu" and POSE_PARAMETERS * snapshots <= MOST_DENSE and exact:
         variance = np.empty((len(equations.cost), cameras, PARAMETERS))
         camera, coupling, pose = (
             block.detach().double().numpy() for block in (equations.camera, equations.coupling, equations.pose)
@@ -176,9 +187,14 @@ def relative_covariance(estimate: Estimate, reference: int = 0) -> Tensor:
         (*B, 15 C, 15 C) like `camera_covariance`; the rotation is that of cam_from_reference, the position that of the
         camera in the reference camera's frame. The reference's own six entries are zero.
     """
-    covariance = camera_covariance(estimate)
+    covariance = camera_covariance(estimate, curved=False)
     jacobian = relative_jacobian(estimate.rig, reference)
-    return jacobian @ covariance @ jacobian.mT
+    centre = estimate.rig.reshape(estimate.chi2.numel()).map_tensors(lambda tensor, _: tensor.unsqueeze(1))
+
+    def relative(rigs: CameraRig, _: Tensor) -> Tensor:
+        return relative_difference(rigs, centre, reference).flatten(-2)
+
+    return jacobian @ covariance @ jacobian.mT + curvature_covariance(estimate, relative)
 
 
 def relative_jacobian(rig: CameraRig, reference: int) -> Tensor:
@@ -229,13 +245,42 @@ def pose_covariance(estimate: Estimate) -> Tensor:
     """Covariance of each snapshot's pose: (*B, S, 6, 6), rotation (rad, left, about the centroid) and centroid (mm)."""
     equations = estimate.solution.equations
     snapshots = equations.pose.shape[1]
-    reduced = arrow.reduce(equations.camera, equations.coupling.transpose(1, 2), equations.pose)
+    reduced = factorize(equations, cameras_first=True).reduced
     if bool(reduced.failed.any()):
         raise RefusedError(UNDETERMINED)
-    full = torch.cholesky_inverse(reduced.kept)
+    size = POSE_PARAMETERS * snapshots
+    full = torch.cholesky_inverse(reduced.kept)[:, :size, :size]
     blocks = full.unflatten(1, (snapshots, POSE_PARAMETERS)).unflatten(-1, (snapshots, POSE_PARAMETERS))
     own = blocks.diagonal(dim1=1, dim2=3).permute(0, 3, 1, 2)
     unit = estimate.solution.state.centre.norm(dim=-1).clamp_min(1.0)
     scale = torch.ones_like(own[..., 0])
     scale[..., 3:] = unit[..., None]
     return (own * scale[..., None] * scale[..., None, :]).reshape(*estimate.chi2.shape, snapshots, 6, 6)
+
+
+def object_covariance(estimate: Estimate) -> Tensor:
+    """Joint covariance of the estimated fiducials' coordinates: (*B, 3 N, 3 N) mm^2, in the object's frame.
+
+    Zero where the object was given as exact. A common motion of all fiducials is known only as well as their tolerances
+    know it; see `imgcal.estimation.shape` for what does not depend on that.
+
+    Raises:
+        RefusedError: the information is singular.
+    """
+    problem, equations = estimate.problem, estimate.solution.equations
+    fiducials = len(problem.points)
+    batch = estimate.chi2.shape
+    if equations.object is None or problem.object_spread is None:
+        return problem.points.new_zeros(*batch, 3 * fiducials, 3 * fiducials)
+    reduced = factorize(equations).reduced
+    if bool(reduced.failed.any()):
+        raise RefusedError(UNDETERMINED)
+    size = 3 * fiducials + 1
+    whitened = torch.cholesky_inverse(reduced.kept)[:, -size:, -size:]
+    spread = problem.object_spread
+    jacobian = torch.cat(
+        (torch.diag_embed(spread[:, :-1]), (problem.points.flatten() * spread[:, -1:])[..., None]), dim=-1
+    )
+    flat = (jacobian @ whitened @ jacobian.mT).reshape(*batch, 3 * fiducials, 3 * fiducials)
+    centre = points_at(problem, estimate.solution.state).unsqueeze(1)
+    return flat + curvature_covariance(estimate, lambda _, points: (points - centre).flatten(-2))

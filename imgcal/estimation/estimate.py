@@ -11,7 +11,7 @@ from torch import Tensor
 
 from imgcal.errors import InputError
 from imgcal.estimation import fused, implicit, solver
-from imgcal.estimation.linearize import Problem, State, pose_at, rig_at
+from imgcal.estimation.linearize import Problem, State, points_at, pose_at, rig_at
 from imgcal.estimation.pose import initial_pose
 from imgcal.estimation.robust import LOSSES, Loss
 from imgcal.objects import CalibrationObject
@@ -47,6 +47,7 @@ class Estimate:
     dof: Tensor  # (*B) expected chi2: 2 observations - 6 snapshots (each prior pays for its parameter)
     converged: Tensor  # (*B) bool
     iterations: int
+    points_object: Tensor  # (*B, N, 3) mm, the fiducials as estimated; as given where the object is exact
     problem: Problem  # (B,) flattened, as solved
     solution: solver.Solution  # (B,) flattened: state and normal equations at the minimum
 
@@ -80,7 +81,8 @@ def estimate(
     Args:
         observations: (*B, S, C, N).
         rig: the factory rig, (*B) or without batch axes.
-        obj: N fiducials; a radius makes their images ellipses, whose centres are what is observed.
+        obj: N fiducials; a radius makes their images ellipses, whose centres are what is observed. Where it has
+            tolerances, its shape is estimated too, one shape for all snapshots.
         rig_from_object: (*B, S) first guess of the poses; None = `initial_pose`.
         spread: (*B, C, 15) standard deviation of each factory value in the order of `rig.PARAMETER_NAMES`; zero keeps a
             value fixed; None = the rig's own prior, or `RigPrior()`.
@@ -118,16 +120,16 @@ def minimize(problem: Problem, start: State, options: EstimationOptions) -> solv
     left = options.max_iterations - first.iterations
     if left <= 0 or not len(rows):
         return first
-    slow = _problem_of(problem, rows)
+    slow = problem.select(rows)
     coarse = replace(options, tolerance=COARSE_TOLERANCE, max_iterations=min(options.max_iterations, 2 * PATIENCE))
-    state, spent = _state_of(start, rows), first.iterations
+    state, spent = solver.taken(start, rows), first.iterations
     for factor in COARSER:
         stage = _solve(replace(slow, root_weight=slow.root_weight / factor), state, coarse)
         state, spent = stage.state, spent + stage.iterations
     second = _solve(slow, state, options)
     spent += second.iterations
     if not bool((second.converged & (second.equations.cost <= first.equations.cost[rows])).all()):
-        further = _solve(slow, _state_of(first.state, rows), replace(options, max_iterations=left))
+        further = _solve(slow, solver.taken(first.state, rows), replace(options, max_iterations=left))
         spent += further.iterations
         second = solver.better(second, further)
     return solver.replaced(first, rows, second, spent)
@@ -139,16 +141,6 @@ def _solve(problem: Problem, start: State, options: EstimationOptions) -> solver
             limits = (options.loss, options.threshold, options.max_iterations, options.tolerance)
             return fused.minimize(problem, start, *limits)
         return solver.minimize(problem, start, _loss(options), options.max_iterations, options.tolerance)
-
-
-def _problem_of(problem: Problem, rows: Tensor) -> Problem:
-    """Keep some rigs."""
-    factory, spread = problem.factory[rows], problem.spread[rows]
-    return replace(problem, uv=problem.uv[rows], root_weight=problem.root_weight[rows], factory=factory, spread=spread)
-
-
-def _state_of(state: State, rows: Tensor) -> State:
-    return State(state.offset[rows], state.rotation[rows], state.centre[rows])
 
 
 def conclude(problem: Problem, solution: solver.Solution, state: State, batch: torch.Size = torch.Size()) -> Estimate:
@@ -166,6 +158,7 @@ def conclude(problem: Problem, solution: solver.Solution, state: State, batch: t
         dof=dof.reshape(batch),
         converged=solution.converged.reshape(batch),
         iterations=solution.iterations,
+        points_object=(points_at(problem, state) + problem.centroid).reshape(*batch, -1, 3),
         problem=problem,
         solution=solution,
     )
@@ -191,6 +184,7 @@ def make_problem(observations: Observations, rig: CameraRig, obj: CalibrationObj
     points = obj.points.to(uv)
     centroid = points.mean(0)
     return Problem(
+        object_spread=_object_spread(obj, uv, count),
         uv=torch.where(seen[..., None], uv, 0.0).mT.contiguous(),
         root_weight=torch.where(seen, 1 / torch.where(seen, sigma, 1.0), 0.0),
         points=points - centroid,
@@ -203,6 +197,15 @@ def make_problem(observations: Observations, rig: CameraRig, obj: CalibrationObj
     )
 
 
+def _object_spread(obj: CalibrationObject, like: Tensor, count: int) -> Tensor | None:
+    """Prior standard deviation of the object's own parameters, in the order of `State`: (B, M); None = exact."""
+    if obj.exact:
+        return None
+    tolerance = torch.zeros(obj.fiducials) if obj.tolerance is None else obj.tolerance
+    spread = torch.cat((tolerance.to(like).repeat_interleave(3), like.new_tensor([obj.scale_tolerance])))
+    return spread.expand(count, -1)
+
+
 def make_start(problem: Problem, rig_from_object: RigidTransform, first_guess: CameraRig | None) -> State:
     """Turn a first guess into a state of the problem."""
     count, snapshots = problem.uv.shape[:2]
@@ -213,4 +216,5 @@ def make_start(problem: Problem, rig_from_object: RigidTransform, first_guess: C
         guess = first_guess.to(problem.uv.dtype)
         difference = guess.reshape(-1).difference(problem.factory).detach()
         offset = torch.where(problem.spread > 0, difference / problem.spread.clamp_min(1e-30), 0.0)
-    return State(offset.detach(), rotation, translation + rotation @ problem.centroid)
+    own = None if problem.object_spread is None else torch.zeros_like(problem.object_spread)
+    return State(offset.detach(), rotation, translation + rotation @ problem.centroid, own)

@@ -14,7 +14,7 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from imgcal.estimation.linearize import NormalEquations, Problem, State
+from imgcal.estimation.linearize import NormalEquations, ObjectEquations, Problem, State
 from imgcal.estimation.solver import (
     FIRST_GROWTH,
     GREATEST_RELAX,
@@ -47,18 +47,22 @@ def minimize(
     """
     batch, snapshots, cameras, _, fiducials = problem.uv.shape
     new = problem.uv.new_empty
-    state = State(start.offset.clone(), start.rotation.clone(), start.centre.clone())
+    own_spread = new(batch, 0) if problem.object_spread is None else problem.object_spread
+    own_offset = torch.zeros_like(own_spread) if start.object_offset is None else start.object_offset.clone()
+    state = State(start.offset.clone(), start.rotation.clone(), start.centre.clone(), own_offset)
+    own = own_spread.shape[1]  # M, 0 = the object is exact
     cameras_first = 6 * snapshots <= 15 * cameras
-    shape = (cameras, 15, 6 * snapshots) if cameras_first else (snapshots, 6, 15 * cameras)
+    shape = (cameras, 15, 6 * snapshots + own) if cameras_first else (snapshots, 6, 15 * cameras + own)
     camera, coupling, pose = new(batch, cameras, 15, 15), new(batch, *shape), new(batch, snapshots, 6, 6)
-    camera_gradient, pose_gradient = new(batch, cameras, 15), new(batch, snapshots, 6)
+    camera_gradient, pose_gradient, own_gradient = new(batch, cameras, 15), new(batch, snapshots, 6), new(batch, own)
+    border = new(batch, own, shape[-1])
     cost, residual = new(batch), new(batch, snapshots, cameras, 2, fiducials)
     converged = np.zeros(batch, dtype=np.bool_)
     iterations = np.zeros(batch, dtype=np.int64)
     radius_squared = problem.points.new_zeros(fiducials) if problem.radius_squared is None else problem.radius_squared
     factory = problem.factory
-    state_tensors = (state.offset, state.rotation, state.centre)
-    block_tensors = (camera, coupling, pose, camera_gradient, pose_gradient, residual)
+    state_tensors = (state.offset, state.rotation, state.centre, own_offset)
+    block_tensors = (camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual)
     rig = (
         factory.cam_from_rig.rotation,
         factory.positions,
@@ -66,7 +70,8 @@ def minimize(
         factory.principal_point,
         factory.distortion,
     )
-    arrays = _arrays((problem.uv, problem.root_weight, *rig, problem.spread, *state_tensors, *block_tensors, cost))
+    given = (problem.uv, problem.root_weight, *rig, problem.spread, own_spread)
+    arrays = _arrays((*given, *state_tensors, *block_tensors, cost))
     limits = (cameras_first, LOSS_CODES[loss], threshold, max_iterations)
     tolerances = (tolerance + pixel_rounding(problem)).numpy()
     shared = _arrays((problem.points, radius_squared))
@@ -80,11 +85,21 @@ def minimize(
         numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
         _minimize_all(*shared, *arrays, converged, iterations, *limits, tolerances)  # type: ignore[call-arg]
         torch.set_num_threads(threads)
+    wide = shape[-1] - own
+    across = border[..., :wide]
     if cameras_first:
-        blocks = coupling.unflatten(-1, (snapshots, 6)).permute(0, 3, 1, 2, 4)
+        blocks = coupling[..., :wide].unflatten(-1, (snapshots, 6)).permute(0, 3, 1, 2, 4)
+        parts = (coupling[..., wide:], across.unflatten(-1, (snapshots, 6)).permute(0, 2, 3, 1))
     else:
-        blocks = coupling.unflatten(-1, (cameras, 15)).permute(0, 1, 3, 4, 2)
+        blocks = coupling[..., :wide].unflatten(-1, (cameras, 15)).permute(0, 1, 3, 4, 2)
+        parts = (across.unflatten(-1, (cameras, 15)).permute(0, 2, 3, 1), coupling[..., wide:])
     equations = NormalEquations(cost, camera, blocks, pose, camera_gradient, pose_gradient, residual)
+    if own:
+        lower = border[..., wide:]
+        square = lower.tril() + lower.tril(-1).mT
+        equations = replace(equations, object=ObjectEquations(*parts, square, own_gradient))
+    else:
+        state = replace(state, object_offset=None)
     return Solution(state, equations, torch.from_numpy(converged), int(iterations.max()))
 
 
@@ -111,36 +126,45 @@ def _arrays(tensors: tuple[Tensor, ...]) -> list[np.ndarray]:
 
 @njit(parallel=True, cache=True, fastmath=_FAST)
 def _minimize_all(
-    points, radius_squared, uv, root_weight, rotation0, position0, focal0, principal0, distortion0, spread,
-    offset, rotation, centre, camera, coupling, pose, camera_gradient, pose_gradient, residual,
+    points, radius_squared, uv, root_weight, rotation0, position0, focal0, principal0, distortion0, spread, own_spread,
+    offset, rotation, centre, own_offset,
+    camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual,
     cost, converged, iterations, cameras_first, loss, threshold, max_iterations, tolerances,
 ):  # fmt: skip
     for b in prange(uv.shape[0]):
         _minimize_rig(
             points, radius_squared, uv[b], root_weight[b],
-            rotation0[b], position0[b], focal0[b], principal0[b], distortion0[b], spread[b],
-            offset[b], rotation[b], centre[b], camera[b], coupling[b], pose[b], camera_gradient[b], pose_gradient[b],
-            residual[b], cost[b : b + 1], converged[b : b + 1], iterations[b : b + 1],
+            rotation0[b], position0[b], focal0[b], principal0[b], distortion0[b], spread[b], own_spread[b],
+            offset[b], rotation[b], centre[b], own_offset[b], camera[b], coupling[b], pose[b], border[b],
+            camera_gradient[b], pose_gradient[b], own_gradient[b], residual[b],
+            cost[b : b + 1], converged[b : b + 1], iterations[b : b + 1],
             cameras_first, loss, threshold, max_iterations, tolerances[b],
         )  # fmt: skip
 
 
 @njit(cache=True, fastmath=_FAST)
 def _minimize_rig(
-    points, radius_squared, uv, root_weight, rotation0, position0, focal0, principal0, distortion0, spread,
-    offset, rotation, centre, camera, coupling, pose, camera_gradient, pose_gradient, residual,
+    points, radius_squared, uv, root_weight, rotation0, position0, focal0, principal0, distortion0, spread, own_spread,
+    offset, rotation, centre, own_offset,
+    camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual,
     cost, converged, iterations, cameras_first, loss, threshold, max_iterations, tolerance,
 ):  # fmt: skip
     """Levenberg-Marquardt on one rig; the outputs hold the best state and its normal equations."""
-    given = (points, radius_squared, uv, root_weight, rotation0, position0, focal0, principal0, distortion0, spread)
-    state, blocks = (offset, rotation, centre), (camera, coupling, pose, camera_gradient, pose_gradient, residual)
+    given = (
+        points, radius_squared, uv, root_weight,
+        rotation0, position0, focal0, principal0, distortion0, spread, own_spread,
+    )  # fmt: skip
+    state = (offset, rotation, centre, own_offset)
+    blocks = (camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual)
     best, best_blocks = state, blocks
-    trial = (np.empty_like(offset), np.empty_like(rotation), np.empty_like(centre))
+    trial = (np.empty_like(offset), np.empty_like(rotation), np.empty_like(centre), np.empty_like(own_offset))
     trial_blocks = (
-        np.empty_like(camera), np.empty_like(coupling), np.empty_like(pose),
-        np.empty_like(camera_gradient), np.empty_like(pose_gradient), np.empty_like(residual),
+        np.empty_like(camera), np.empty_like(coupling), np.empty_like(pose), np.empty_like(border),
+        np.empty_like(camera_gradient), np.empty_like(pose_gradient), np.empty_like(own_gradient),
+        np.empty_like(residual),
     )  # fmt: skip
     camera_step, pose_step = np.empty_like(camera_gradient), np.empty_like(pose_gradient)
+    own_step = np.empty_like(own_gradient)
     factor = np.empty_like(camera) if cameras_first else np.empty_like(pose)
     whitened, size = np.empty_like(coupling), coupling.shape[2]
     schur = np.empty((size, size), dtype=uv.dtype)
@@ -150,14 +174,14 @@ def _minimize_rig(
     swapped, relax = False, RELAX
     for iteration in range(max_iterations):
         iterations[0] = iteration + 1
-        a, w, d, ga, gd, _ = best_blocks
+        a, w, d, e, ga, gd, ge, _ = best_blocks
         if cameras_first:
-            gain = _solve(a, w, d, ga, gd, damping, factor, whitened, schur, camera_step, pose_step)
+            gain = _solve(a, w, d, e, ga, gd, ge, damping, factor, whitened, schur, camera_step, pose_step, own_step)
         else:
-            gain = _solve(d, w, a, gd, ga, damping, factor, whitened, schur, pose_step, camera_step)
+            gain = _solve(d, w, a, e, gd, ga, ge, damping, factor, whitened, schur, pose_step, camera_step, own_step)
         better, small = False, False
         if np.isfinite(gain):
-            _move(best, camera_step, pose_step, trial)
+            _move(best, camera_step, pose_step, own_step, trial)
             trial_cost = _linearize(given, trial, trial_blocks, cameras_first, loss, threshold)
             small = gain <= tolerance + rounding * cost[0]
             if trial_cost < cost[0]:
@@ -175,20 +199,26 @@ def _minimize_rig(
         _copy(offset, best[0])
         _copy(rotation, best[1])
         _copy(centre, best[2])
+        _copy(own_offset, best[3])
         _copy(camera, best_blocks[0])
         _copy(coupling, best_blocks[1])
         _copy(pose, best_blocks[2])
-        _copy(camera_gradient, best_blocks[3])
-        _copy(pose_gradient, best_blocks[4])
-        _copy(residual, best_blocks[5])
+        _copy(border, best_blocks[3])
+        _copy(camera_gradient, best_blocks[4])
+        _copy(pose_gradient, best_blocks[5])
+        _copy(own_gradient, best_blocks[6])
+        _copy(residual, best_blocks[7])
 
 
 @njit(cache=True, fastmath=_FAST)
 def _linearize(given, state, blocks, cameras_first, loss, threshold):
     """Fill the blocks of the normal equations and return the cost."""
-    points, radius_squared, uv, root_weight, rotation0, position0, focal0, principal0, distortion0, spread = given
-    offset, rotation, centre = state
-    camera, _, pose, camera_gradient, pose_gradient, residual = blocks
+    (
+        points, radius_squared, uv, root_weight,
+        rotation0, position0, focal0, principal0, distortion0, spread, own_spread,
+    ) = given  # fmt: skip
+    offset, rotation, centre, own_offset = state
+    camera, _, pose, _, camera_gradient, pose_gradient, _, residual = blocks
     snapshots, cameras, fiducials = root_weight.shape
     kind = uv.dtype
     pose[:] = 0
@@ -204,7 +234,12 @@ def _linearize(given, state, blocks, cameras_first, loss, threshold):
     parameters = np.empty(15, dtype=kind)
     rotated, point = np.empty(3, dtype=kind), np.empty(3, dtype=kind)
     derivative, back = np.empty((2, 3), dtype=kind), np.empty(3, dtype=kind)
+    bent, scale = len(own_spread) > 0, 1.0
+    rows_own = np.empty((2, 4), dtype=kind)
     cost = 0.0
+    if bent:
+        cost = _start_object(own_offset, blocks)
+        scale += own_offset[-1] * own_spread[-1]
     for c in range(cameras):
         for i in range(15):
             parameters[i] = offset[c, i] * spread[c, i]
@@ -227,12 +262,13 @@ def _linearize(given, state, blocks, cameras_first, loss, threshold):
             gradient[:] = 0
             unit = max(1.0, np.sqrt(centre[s, 0] ** 2 + centre[s, 1] ** 2 + centre[s, 2] ** 2))
             for n in range(fiducials):
+                at_x, at_y, at_z = points[n, 0], points[n, 1], points[n, 2]
+                if bent:
+                    at_x = scale * at_x + own_offset[3 * n] * own_spread[3 * n]
+                    at_y = scale * at_y + own_offset[3 * n + 1] * own_spread[3 * n + 1]
+                    at_z = scale * at_z + own_offset[3 * n + 2] * own_spread[3 * n + 2]
                 for i in range(3):
-                    rotated[i] = (
-                        rotation[s, i, 0] * points[n, 0]
-                        + rotation[s, i, 1] * points[n, 1]
-                        + rotation[s, i, 2] * points[n, 2]
-                    )
+                    rotated[i] = rotation[s, i, 0] * at_x + rotation[s, i, 1] * at_y + rotation[s, i, 2] * at_z
                 rx = rotated[0] + centre[s, 0] - position0[c, 0] - parameters[3]
                 ry = rotated[1] + centre[s, 1] - position0[c, 1] - parameters[4]
                 rz = rotated[2] + centre[s, 2] - position0[c, 2] - parameters[5]
@@ -272,6 +308,18 @@ def _linearize(given, state, blocks, cameras_first, loss, threshold):
                     rows[r, 15] = rotated[1] * back[2] - rotated[2] * back[1]
                     rows[r, 16] = rotated[2] * back[0] - rotated[0] * back[2]
                     rows[r, 17] = rotated[0] * back[1] - rotated[1] * back[0]
+                    if bent:
+                        for i in range(3):
+                            rows_own[r, i] = (
+                                rotation[s, 0, i] * back[0] + rotation[s, 1, i] * back[1] + rotation[s, 2, i] * back[2]
+                            )
+                        rows_own[r, 3] = own_spread[-1] * (
+                            rows_own[r, 0] * points[n, 0]
+                            + rows_own[r, 1] * points[n, 1]
+                            + rows_own[r, 2] * points[n, 2]
+                        )
+                        for i in range(3):
+                            rows_own[r, i] *= own_spread[3 * n + i]
                 rows[0, 6], rows[1, 7] = xd * weight, yd * weight
                 rows[0, 8], rows[1, 9] = weight, weight
                 rows[0, 10], rows[1, 10] = fx_w * x * rr, fy_w * y * rr
@@ -283,12 +331,59 @@ def _linearize(given, state, blocks, cameras_first, loss, threshold):
                     rows[0, i] *= spread[c, i]
                     rows[1, i] *= spread[c, i]
                 ru, rv = ru * weight, rv * weight
+                if bent:
+                    _add_object(rows, rows_own, ru, rv, c, s, n, blocks, cameras_first)
                 for i in range(21):
                     gradient[i] += rows[0, i] * ru + rows[1, i] * rv
                     for j in range(i + 1):
                         products[i, j] += rows[0, i] * rows[0, j] + rows[1, i] * rows[1, j]
             _distribute(products, gradient, c, s, blocks, cameras_first)
     return cost
+
+
+@njit(cache=True, fastmath=_FAST)
+def _start_object(own_offset, blocks):
+    """Clear the object's part of the blocks, put its prior there, and return the prior's cost."""
+    _, coupling, _, border, _, _, own_gradient, _ = blocks
+    size, wide = border.shape
+    first, cost = wide - size, 0.0
+    for p in range(coupling.shape[0]):
+        for i in range(coupling.shape[1]):
+            for j in range(first, wide):
+                coupling[p, i, j] = 0
+    for i in range(size):
+        for j in range(wide):
+            border[i, j] = 1.0 if j == first + i else 0.0
+        own_gradient[i] = own_offset[i]
+        cost += 0.5 * own_offset[i] ** 2
+    return cost
+
+
+@njit(cache=True, fastmath=_FAST)
+def _add_object(rows, rows_own, ru, rv, c, s, n, blocks, cameras_first):
+    """Add what one observation says of its fiducial's coordinates and of the object's scale."""
+    _, coupling, _, border, _, _, own_gradient, _ = blocks
+    size, wide = border.shape
+    first, last = wide - size, size - 1
+    for k in range(4):
+        own = 3 * n + k if k < 3 else last
+        mine_u, mine_v = rows_own[0, k], rows_own[1, k]
+        own_gradient[own] += mine_u * ru + mine_v * rv
+        for i in range(15):
+            product = rows[0, i] * mine_u + rows[1, i] * mine_v
+            if cameras_first:
+                coupling[c, i, first + own] += product
+            else:
+                border[own, 15 * c + i] += product
+        for i in range(6):
+            product = rows[0, 15 + i] * mine_u + rows[1, 15 + i] * mine_v
+            if cameras_first:
+                border[own, 6 * s + i] += product
+            else:
+                coupling[s, i, first + own] += product
+        for j in range(k + 1):
+            other = 3 * n + j if j < 3 else last
+            border[own, first + other] += rows_own[0, j] * mine_u + rows_own[1, j] * mine_v
 
 
 @njit(cache=True, fastmath=_FAST)
@@ -318,7 +413,7 @@ def lens(px, py, depth, radius_squared, k1, k2, p1, p2, k3):
 @njit(cache=True, fastmath=_FAST)
 def _distribute(products, gradient, c, s, blocks, cameras_first):
     """Add the lower triangle of one camera's products with one snapshot to the blocks."""
-    camera, coupling, pose, camera_gradient, pose_gradient, _ = blocks
+    camera, coupling, pose, _, camera_gradient, pose_gradient, _, _ = blocks
     for i in range(15):
         camera_gradient[c, i] += gradient[i]
         for j in range(i + 1):
@@ -337,10 +432,14 @@ def _distribute(products, gradient, c, s, blocks, cameras_first):
 
 
 @njit(cache=True, fastmath=_FAST)
-def _solve(blocks, coupling, kept, right_blocks, right_kept, damping, factor, whitened, schur, step_blocks, step_kept):
+def _solve(
+    blocks, coupling, kept, border, right_blocks, right_kept, right_border, damping, factor, whitened, schur,
+    step_blocks, step_kept, step_border,
+):  # fmt: skip
     """Solve the damped arrow for minus the gradients; return the predicted decrease, nan if a factorization fails."""
     count, size, wide = coupling.shape
     size_kept = kept.shape[1]
+    first_border = wide - len(border)
     _copy(factor, blocks)
     _copy(whitened, coupling)
     schur[:] = 0
@@ -350,6 +449,10 @@ def _solve(blocks, coupling, kept, right_blocks, right_kept, damping, factor, wh
             for j in range(size_kept):
                 schur[first + i, first + j] = kept[q, i, j]
             schur[first + i, first + i] *= 1 + damping
+    for i in range(len(border)):
+        for j in range(first_border + i + 1):
+            schur[first_border + i, j] = border[i, j]
+        schur[first_border + i, first_border + i] *= 1 + damping
     for p in range(count):
         for i in range(size):
             factor[p, i, i] *= 1 + damping
@@ -368,9 +471,9 @@ def _solve(blocks, coupling, kept, right_blocks, right_kept, damping, factor, wh
                 whitened[p, i, j] *= inverse
     tall = whitened.reshape(count * size, wide)
     _subtract_gram(schur, tall)
-    flat, right = step_kept.reshape(-1), right_kept.reshape(-1)
+    flat, right = np.empty(wide, dtype=schur.dtype), right_kept.reshape(-1)
     for j in range(wide):
-        flat[j] = -right[j]
+        flat[j] = -right[j] if j < first_border else -right_border[j - first_border]
     for r in range(count * size):
         forward = step_blocks[r // size, r % size]
         for j in range(wide):
@@ -391,8 +494,13 @@ def _solve(blocks, coupling, kept, right_blocks, right_kept, damping, factor, wh
                 value -= factor[p, k, i] * step_blocks[p, k]
             step_blocks[p, i] = value / factor[p, i, i]
             gain -= 0.5 * right_blocks[p, i] * step_blocks[p, i]
-    for j in range(wide):
+    flat_kept = step_kept.reshape(-1)
+    for j in range(first_border):
+        flat_kept[j] = flat[j]
         gain -= 0.5 * right[j] * flat[j]
+    for j in range(len(border)):
+        step_border[j] = flat[first_border + j]
+        gain -= 0.5 * right_border[j] * step_border[j]
     return gain
 
 
@@ -442,10 +550,12 @@ def _back_substitute_both(lower, right):
 
 
 @njit(cache=True, fastmath=_FAST)
-def _move(state, camera_step, pose_step, new):
+def _move(state, camera_step, pose_step, own_step, new):
     """Write the state plus a step to `new`, like linearize.moved."""
-    offset, rotation, centre = state
-    new_offset, new_rotation, new_centre = new
+    offset, rotation, centre, own_offset = state
+    new_offset, new_rotation, new_centre, new_own_offset = new
+    for i in range(len(own_offset)):
+        new_own_offset[i] = own_offset[i] + own_step[i]
     for c in range(len(offset)):
         for i in range(15):
             new_offset[c, i] = offset[c, i] + camera_step[c, i]

@@ -1,8 +1,10 @@
 """Reprojection residuals with analytic Jacobians, summed into the blocks of the normal equations.
 
 The unknowns are, for each camera, 15 offsets from the factory values, *whitened*: divided by the prior's standard
-deviation, so that the prior is the unit matrix and a parameter of zero spread stays fixed; and for each snapshot, 6
-local offsets of the object: a rotation (left, about its centroid) and a translation in units of the object's depth.
+deviation, so that the prior is the unit matrix and a parameter of zero spread stays fixed; for each snapshot, 6
+local offsets of the object: a rotation (left, about its centroid) and a translation in units of the object's depth;
+and, where the object is known within tolerances only, its own M = 3 N + 1 offsets, whitened as well: of each
+fiducial's coordinates (mm, in the object's frame), and one scale of all distances.
 
 Axes: B rigs, S snapshots, C cameras, N fiducials. Components stand before fiducials, so that every step works on long
 contiguous rows.
@@ -11,7 +13,8 @@ contiguous rows.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -35,6 +38,19 @@ class Problem:
     radius_squared: Tensor | None  # (N,) mm^2
     factory: CameraRig  # (B,)
     spread: Tensor  # (B, C, 15) prior standard deviation of each parameter
+    object_spread: Tensor | None = None  # (B, M) prior standard deviation of the object's parameters; None = exact
+
+    def select(self, rows: Tensor) -> Problem:
+        """Keep the given rigs, (R,) indices."""
+        spread = None if self.object_spread is None else self.object_spread[rows]
+        return replace(
+            self,
+            uv=self.uv[rows],
+            root_weight=self.root_weight[rows],
+            factory=self.factory[rows],
+            spread=self.spread[rows],
+            object_spread=spread,
+        )
 
 
 @dataclass(frozen=True)
@@ -44,6 +60,17 @@ class State:
     offset: Tensor  # (B, C, 15) whitened: (parameter - factory) / spread
     rotation: Tensor  # (B, S, 3, 3) rig_from_object
     centre: Tensor  # (B, S, 3) mm, the object's centroid in the rig frame
+    object_offset: Tensor | None = None  # (B, M) whitened; None = the object is exact
+
+
+@dataclass(frozen=True)
+class ObjectEquations:
+    """The object's part of the normal equations; `own` includes the prior's unit matrix, `gradient` its pull."""
+
+    camera: Tensor  # (B, C, 15, M) coupling with the cameras
+    pose: Tensor  # (B, S, 6, M) coupling with the poses
+    own: Tensor  # (B, M, M)
+    gradient: Tensor  # (B, M)
 
 
 @dataclass(frozen=True)
@@ -57,6 +84,7 @@ class NormalEquations:
     camera_gradient: Tensor  # (B, C, 15)
     pose_gradient: Tensor  # (B, S, 6)
     residual: Tensor  # (B, S, C, 2, N) pixels, predicted minus observed
+    object: ObjectEquations | None = None  # None = the object is exact
 
 
 def rig_at(problem: Problem, offset: Tensor) -> CameraRig:
@@ -69,11 +97,37 @@ def pose_at(problem: Problem, state: State) -> RigidTransform:
     return RigidTransform(state.rotation, state.centre - state.rotation @ problem.centroid)
 
 
-def moved(problem: Problem, state: State, camera_step: Tensor, pose_step: Tensor) -> State:
-    """Add a step: camera_step (B, C, 15) whitened, pose_step (B, S, 6)."""
+def points_at(problem: Problem, state: State) -> Tensor:
+    """Fiducials about the centroid of the object as it is given: (B, N, 3) mm in the object's frame."""
+    points = problem.points.expand(len(state.offset), -1, -1)
+    if state.object_offset is None or problem.object_spread is None:
+        return points
+    offset = state.object_offset * problem.object_spread
+    return points * (1 + offset[:, -1, None, None]) + offset[:, :-1].unflatten(-1, (-1, 3))
+
+
+class Step(NamedTuple):
+    """A change of a state, or a vector that is paired with one, such as a gradient."""
+
+    camera: Tensor  # (B, C, 15) whitened
+    pose: Tensor  # (B, S, 6)
+    object: Tensor | None = None  # (B, M) whitened; None = the object is exact
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Step:
+        """Apply a function to every part that there is."""
+        return Step(function(self.camera), function(self.pose), None if self.object is None else function(self.object))
+
+
+def moved(
+    problem: Problem, state: State, camera_step: Tensor, pose_step: Tensor, object_step: Tensor | None = None
+) -> State:
+    """Add a step; see `Step`."""
     rotation = rotation_from_vector(pose_step[..., :3]) @ state.rotation
     depth = _depth_unit(state)
-    return State(state.offset + camera_step, rotation, state.centre + pose_step[..., 3:] * depth)
+    offset = state.object_offset
+    if offset is not None and object_step is not None:
+        offset = offset + object_step
+    return State(state.offset + camera_step, rotation, state.centre + pose_step[..., 3:] * depth, offset)
 
 
 def linearize(problem: Problem, state: State, loss: Callable[[Tensor], tuple[Tensor, Tensor]]) -> NormalEquations:
@@ -87,19 +141,24 @@ def linearize(problem: Problem, state: State, loss: Callable[[Tensor], tuple[Ten
     Returns:
         The blocks. The cost is infinite where a seen fiducial lies behind its camera.
     """
-    jacobian, residual, behind = _jacobian(problem, state)
+    at = jacobian_at(problem, state)
+    residual = at.residual
     squared = (residual * problem.root_weight.unsqueeze(-2)).square().sum(-2)
     value, slope = loss(squared)
     cost = 0.5 * value.sum((1, 2, 3)) + 0.5 * state.offset.square().sum((1, 2))
-    cost = torch.where(behind, torch.inf, cost)
+    cost = torch.where(at.behind, torch.inf, cost)
 
     root_weight = (problem.root_weight * slope.sqrt())[..., None, None, :]
-    rows = (jacobian * root_weight).flatten(-2)  # (B, S, C, 22, 2N): 15 camera, 6 pose, 1 residual
+    rows = (at.by_rig * root_weight).flatten(-2)  # (B, S, C, 22, 2N): 15 camera, 6 pose, 1 residual
     products = rows @ rows.mT
     k, last = PARAMETERS, PARAMETERS + POSE_PARAMETERS
     over_snapshots = products[..., :k, :].sum(1)
     over_cameras = products[..., k:, k:].sum(2)
     eye = torch.eye(k, dtype=rows.dtype, device=rows.device)
+    own = None
+    if at.by_fiducial is not None and state.object_offset is not None:
+        cost = cost + 0.5 * state.object_offset.square().sum(1)
+        own = _object_equations(problem, state.object_offset, at.by_rig * root_weight, at.by_fiducial * root_weight)
     return NormalEquations(
         cost=cost,
         camera=over_snapshots[..., :k] + eye,
@@ -108,6 +167,51 @@ def linearize(problem: Problem, state: State, loss: Callable[[Tensor], tuple[Ten
         camera_gradient=over_snapshots[..., last] + state.offset,
         pose_gradient=over_cameras[..., :POSE_PARAMETERS, POSE_PARAMETERS],
         residual=residual,
+        object=own,
+    )
+
+
+def with_scale(problem: Problem, by_fiducial: Tensor) -> Tensor:
+    """Append the derivative by the object's scale: (B, S, C, 3, 2, N) -> (B, S, C, 4, 2, N)."""
+    by_scale = (by_fiducial * problem.points.mT[:, None]).sum(-3, keepdim=True)
+    return torch.cat((by_fiducial, by_scale), dim=-3)
+
+
+def object_columns(sums: Tensor) -> Tensor:
+    """Order sums (..., 4, N) as the object's parameters (..., M): coordinates fiducial by fiducial, then the scale."""
+    return torch.cat((sums[..., :3, :].mT.flatten(-2), sums[..., 3, :].sum(-1, keepdim=True)), dim=-1)
+
+
+def _object_equations(problem: Problem, offset: Tensor, rows: Tensor, by_fiducial: Tensor) -> ObjectEquations:
+    """Sum up what the object's parameters add.
+
+    Args:
+        problem: what is given.
+        offset: (B, M) the object's state.
+        rows: (B, S, C, 22, 2, N) weighted Jacobian and residual, as `_jacobian` orders them.
+        by_fiducial: (B, S, C, 3, 2, N) weighted derivative of each pixel by its own fiducial's coordinates (mm).
+    """
+    fiducials = rows.shape[-1]
+    each = with_scale(problem, by_fiducial)
+    to_rest = torch.einsum("bscirn,bscjrn->bscijn", rows, each)  # (B, S, C, 22, 4, N)
+    spread = problem.object_spread
+    assert spread is not None
+
+    among = torch.einsum("bscirn,bscjrn->bijn", each, each)  # (B, 4, 4, N)
+    size = 3 * fiducials + 1
+    own = among.new_zeros(len(among), size, size)
+    blocks = own[:, :-1, :-1].unflatten(1, (fiducials, 3)).unflatten(-1, (fiducials, 3))
+    blocks.diagonal(dim1=1, dim2=3).copy_(among[:, :3, :3])
+    own[:, -1, :-1] = own[:, :-1, -1] = among[:, :3, 3].mT.flatten(1)
+    own[:, -1, -1] = among[:, 3, 3].sum(-1)
+    own = own * spread[:, :, None] * spread[:, None]
+    wide = spread[:, None, None]
+    last = PARAMETERS + POSE_PARAMETERS
+    return ObjectEquations(
+        camera=object_columns(to_rest[..., :PARAMETERS, :, :].sum(1)) * wide,
+        pose=object_columns(to_rest[..., PARAMETERS:last, :, :].sum(2)) * wide,
+        own=own + torch.eye(size, dtype=own.dtype, device=own.device),
+        gradient=object_columns(to_rest[..., last, :, :].sum((1, 2))) * spread + offset,
     )
 
 
@@ -116,12 +220,23 @@ def _depth_unit(state: State) -> Tensor:
     return state.centre.norm(dim=-1, keepdim=True).clamp_min(1.0)
 
 
-def _jacobian(problem: Problem, state: State) -> tuple[Tensor, Tensor, Tensor]:
-    """Jacobian and residual: (B, S, C, 22, 2, N) with the residual as last row, (B, S, C, 2, N), behind (B,) bool.
+@dataclass(frozen=True)
+class Jacobian:
+    """Derivatives of the pixels at a state."""
+
+    by_rig: Tensor  # (B, S, C, 22, 2, N): by 15 whitened camera and 6 pose parameters; the residual as last row
+    by_fiducial: Tensor | None  # (B, S, C, 3, 2, N) by the fiducial's own coordinates (mm); None = the object is exact
+    residual: Tensor  # (B, S, C, 2, N) pixels, predicted minus observed
+    behind: Tensor  # (B,) bool: a seen fiducial lies behind its camera
+
+
+def jacobian_at(problem: Problem, state: State) -> Jacobian:
+    """Differentiate all pixels by what they depend on.
 
     With p = R (q + centre - position) the point in the camera and q the rotated fiducial, the derivative of a pixel
     with respect to a left rotation of the camera is p x d, with respect to the position -R^T d, with respect to a
-    rotation of the object q x R^T d, where d is the pixel's derivative with respect to p.
+    rotation of the object q x R^T d, where d is the pixel's derivative with respect to p; with respect to the
+    fiducial's coordinates in the object's frame it is Q^T R^T d, where Q is the object's rotation.
     """
     parameters = state.offset * problem.spread
     turn = parameters[..., :3]
@@ -132,7 +247,7 @@ def _jacobian(problem: Problem, state: State) -> tuple[Tensor, Tensor, Tensor]:
     principal = (factory.principal_point + parameters[..., 8:10])[:, None, :, :, None]
     distortion = (factory.distortion + parameters[..., 10:15])[:, None, :, :, None]
 
-    rotated = (state.rotation @ problem.points.mT).unsqueeze(2)  # (B, S, 1, 3, N)
+    rotated = (state.rotation @ points_at(problem, state).mT.unsqueeze(1)).unsqueeze(2)  # (B, S, 1, 3, N)
     points = rotation @ (rotated + state.centre[:, :, None, :, None] - position)  # (B, S, C, 3, N)
     behind = ((points[..., 2, :] <= NEAREST_DEPTH) & (problem.root_weight > 0)).flatten(1).any(-1)
 
@@ -151,7 +266,11 @@ def _jacobian(problem: Problem, state: State) -> tuple[Tensor, Tensor, Tensor]:
     torch.linalg.cross(rotated.unsqueeze(-2).expand_as(by_centre), by_centre, dim=-3, out=jacobian[..., 15:18, :, :])
     torch.mul(by_centre, _depth_unit(state)[:, :, None, :, None, None], out=jacobian[..., 18:21, :, :])
     jacobian[..., 21, :, :] = residual
-    return jacobian, residual, behind
+    by_fiducial = None
+    if problem.object_spread is not None:
+        turned = state.rotation.mT.unsqueeze(2) @ by_centre.flatten(-2)
+        by_fiducial = turned.unflatten(-1, by_centre.shape[-2:])
+    return Jacobian(jacobian, by_fiducial, residual, behind)
 
 
 @dataclass(frozen=True)

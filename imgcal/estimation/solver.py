@@ -9,7 +9,16 @@ import torch
 from torch import Tensor
 
 from imgcal.estimation import arrow
-from imgcal.estimation.linearize import POSE_PARAMETERS, NormalEquations, Problem, State, linearize, moved
+from imgcal.estimation.linearize import (
+    POSE_PARAMETERS,
+    NormalEquations,
+    ObjectEquations,
+    Problem,
+    State,
+    Step,
+    linearize,
+    moved,
+)
 from imgcal.estimation.robust import Loss
 from imgcal.rig import PARAMETERS
 
@@ -21,7 +30,7 @@ GREATEST_RELAX = 2.0
 FIRST_GROWTH = 4.0
 """Of the damping, after the first of a series of rejected steps; doubled with each further one."""
 
-Record = TypeVar("Record", State, NormalEquations)
+Record = TypeVar("Record", State, NormalEquations, ObjectEquations)
 
 
 @dataclass(frozen=True)
@@ -60,9 +69,9 @@ def minimize(problem: Problem, start: State, loss: Loss, max_iterations: int, to
     iteration = 0
     while iteration < max_iterations and not bool(converged.all()):
         iteration += 1
-        camera_step, pose_step, gain, failed = damped_step(equations, damping)
+        step, gain, failed = damped_step(equations, damping)
         small = (gain <= tolerances + rounding * equations.cost) & ~failed
-        trial_state = moved(problem, state, camera_step, pose_step)
+        trial_state = moved(problem, state, *step)
         trial = linearize(problem, trial_state, loss)
         before = equations.cost
         better = (trial.cost < before) & ~failed & ~converged
@@ -86,7 +95,7 @@ def pixel_rounding(problem: Problem) -> Tensor:
     return (4 * torch.finfo(whitened.dtype).eps) ** 2 * whitened.square().flatten(1).sum(1)
 
 
-def damped_step(equations: NormalEquations, damping: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def damped_step(equations: NormalEquations, damping: Tensor) -> tuple[Step, Tensor, Tensor]:
     """Solve the damped normal equations.
 
     Args:
@@ -94,35 +103,66 @@ def damped_step(equations: NormalEquations, damping: Tensor) -> tuple[Tensor, Te
         damping: (B,) relative addition to the diagonals.
 
     Returns:
-        camera_step (B, C, 15), pose_step (B, S, 6), predicted decrease of the cost (B,), failed factorization (B,).
+        The step, the predicted decrease of the cost (B,), failed factorization (B,).
     """
-    reduced, cameras_first = factorize(equations, damping)
-    camera_right, pose_right = -equations.camera_gradient, -equations.pose_gradient
-    if cameras_first:
-        camera_step, pose_step = arrow.solve(reduced, camera_right, pose_right)
-    else:
-        pose_step, camera_step = arrow.solve(reduced, pose_right, camera_right)
-    gain = 0.5 * ((camera_right * camera_step).sum((1, 2)) + (pose_right * pose_step).sum((1, 2)))
-    return camera_step, pose_step, gain, reduced.failed | ~torch.isfinite(gain)
+    right = Step(-equations.camera_gradient, -equations.pose_gradient, None)
+    if equations.object is not None:
+        right = right._replace(object=-equations.object.gradient)
+    factorization = factorize(equations, damping)
+    step = factorization.solve(right)
+    gain = 0.5 * ((right.camera * step.camera).sum((1, 2)) + (right.pose * step.pose).sum((1, 2)))
+    if right.object is not None and step.object is not None:
+        gain = gain + 0.5 * (right.object * step.object).sum(1)
+    return step, gain, factorization.reduced.failed | ~torch.isfinite(gain)
 
 
-def factorize(equations: NormalEquations, damping: Tensor | None = None) -> tuple[arrow.Reduced, bool]:
-    """Factorize the arrow, eliminating whichever kind of block leaves the smaller dense system.
+@dataclass(frozen=True)
+class Factorization:
+    """The normal equations' arrow, factorized."""
 
-    Returns:
-        The factorization, and whether the cameras were eliminated (else the snapshots).
+    reduced: arrow.Reduced
+    cameras_first: bool  # the cameras were eliminated, else the snapshots
+
+    def solve(self, right: Step) -> Step:
+        """Solve for a right-hand side."""
+        if self.cameras_first:
+            camera, pose, border = arrow.solve(self.reduced, right.camera, right.pose, right.object)
+        else:
+            pose, camera, border = arrow.solve(self.reduced, right.pose, right.camera, right.object)
+        return Step(camera, pose, border)
+
+
+def factorize(
+    equations: NormalEquations, damping: Tensor | None = None, cameras_first: bool | None = None
+) -> Factorization:
+    """Factorize the arrow.
+
+    Args:
+        equations: the blocks.
+        damping: (B,) relative addition to the diagonals.
+        cameras_first: what to eliminate; None = whichever leaves the smaller dense system.
     """
-    camera, pose = equations.camera, equations.pose
+    camera, pose, own = equations.camera, equations.pose, equations.object
     if damping is not None:
-        factor = 1 + damping[:, None, None]
-        camera = camera.clone()
-        camera.diagonal(dim1=-2, dim2=-1).mul_(factor)
-        pose = pose.clone()
-        pose.diagonal(dim1=-2, dim2=-1).mul_(factor)
+        camera, pose = _damped(camera, damping), _damped(pose, damping)
     coupling = equations.coupling  # (B, S, C, 15, 6)
-    if POSE_PARAMETERS * pose.shape[1] <= PARAMETERS * camera.shape[1]:
-        return arrow.reduce(camera, coupling.transpose(1, 2), pose), True
-    return arrow.reduce(pose, coupling.mT, camera), False
+    if cameras_first is None:
+        cameras_first = POSE_PARAMETERS * pose.shape[1] <= PARAMETERS * camera.shape[1]
+    border = None
+    if own is not None:
+        square = own.own if damping is None else _damped(own.own.unsqueeze(1), damping).squeeze(1)
+        pair = (own.camera, own.pose) if cameras_first else (own.pose, own.camera)
+        border = arrow.Border(*pair, square)
+    if cameras_first:
+        return Factorization(arrow.reduce(camera, coupling.transpose(1, 2), pose, border), True)
+    return Factorization(arrow.reduce(pose, coupling.mT, camera, border), False)
+
+
+def _damped(blocks: Tensor, damping: Tensor) -> Tensor:
+    """Enlarge the diagonals of blocks (B, P, p, p) by a relative addition (B,)."""
+    blocks = blocks.clone()
+    blocks.diagonal(dim1=-2, dim2=-1).mul_(1 + damping[:, None, None])
+    return blocks
 
 
 def better(first: Solution, second: Solution) -> Solution:
@@ -141,22 +181,32 @@ def replaced(solution: Solution, rows: Tensor, by: Solution, iterations: int) ->
     index = torch.zeros(len(solution.converged), dtype=torch.long, device=rows.device)
     chosen = torch.ones_like(index, dtype=torch.bool)
     index[rows], chosen[rows] = torch.arange(len(rows), device=rows.device), False
-
-    def spread_out(record: Record) -> Record:
-        return replace(record, **{field.name: getattr(record, field.name)[index] for field in fields(record)})
-
     return Solution(
-        _where(chosen, solution.state, spread_out(by.state)),
-        _where(chosen, solution.equations, spread_out(by.equations)),
+        _where(chosen, solution.state, taken(by.state, index)),
+        _where(chosen, solution.equations, taken(by.equations, index)),
         torch.where(chosen, solution.converged, by.converged[index]),
         iterations,
     )
 
 
+def taken(record: Record, index: Tensor) -> Record:
+    """Index axis B of a record of tensors; what is None, such as the part of an exact object, stays so."""
+    values = {field.name: getattr(record, field.name) for field in fields(record)}
+    chosen: dict[str, object] = {
+        name: taken(value, index) if isinstance(value, ObjectEquations) else value[index]
+        for name, value in values.items()
+        if value is not None
+    }
+    return replace(record, **chosen)  # type: ignore[arg-type]
+
+
 def _where(choose: Tensor, first: Record, second: Record) -> Record:
     """Choose rig by rig between two records of tensors with leading axis B."""
-    chosen = {}
+    chosen: dict[str, object] = {}
     for field in fields(first):
         a, b = getattr(first, field.name), getattr(second, field.name)
-        chosen[field.name] = torch.where(choose.view(-1, *[1] * (a.ndim - 1)), a, b)
-    return replace(first, **chosen)
+        if isinstance(a, ObjectEquations):
+            chosen[field.name] = _where(choose, a, b)
+        elif a is not None:
+            chosen[field.name] = torch.where(choose.view(-1, *[1] * (a.ndim - 1)), a, b)
+    return replace(first, **chosen)  # type: ignore[arg-type]

@@ -26,6 +26,7 @@ class Case:
     poses: RigidTransform  # (*B, S)
     observations: Observations  # (*B, S, C, N)
     spread: Tensor  # (C, 15)
+    shape: Tensor  # (*B, N, 3) mm, the fiducials as they truly are
 
     def problem(self) -> Problem:
         """Flatten and whiten."""
@@ -62,6 +63,9 @@ def simulate(o10: CameraRig, asymmetric8: CalibrationObject) -> Simulate:
         drift: Drift = PhysicalDrift(),
         missing: float = 0.0,
         radius: float | None = None,
+        tolerance: float | None = None,
+        bent: float = 0.0,
+        scale_tolerance: float = 0.0,
         seed: int = 0,
     ) -> Case:
         generator = torch.Generator().manual_seed(seed)
@@ -70,12 +74,21 @@ def simulate(o10: CameraRig, asymmetric8: CalibrationObject) -> Simulate:
         obj = replace(
             asymmetric8, points=asymmetric8.points[:fiducials], colours=asymmetric8.colours[:fiducials], radius=radii
         )
+        given = obj
+        if tolerance is not None or scale_tolerance:
+            spread = None if tolerance is None else torch.full((fiducials,), tolerance, dtype=torch.float64)
+            given = replace(obj, tolerance=spread, scale_tolerance=scale_tolerance)
         truth = drift.apply(factory, generator, *batch)
         count = torch.Size((*batch, snapshots)).numel()
         centroid, distance = obj.points.mean(0), factory.working_distance
         assert distance is not None
         poses = sample_rig_from_object(count, distance, centroid, PoseRange(), generator).reshape(*batch, snapshots)
-        points = poses.apply(obj.points)  # (*B, S, N, 3)
+        own = torch.Generator().manual_seed(seed)
+        offset = bent * torch.randn(*batch, 1, fiducials, 3, generator=own, dtype=torch.float64)
+        scale = scale_tolerance * torch.randn(*batch, 1, 1, 1, generator=own, dtype=torch.float64)
+        shape = obj.points + scale * (obj.points - obj.points.mean(0)) + offset
+        shape = shape.expand(*batch, snapshots, fiducials, 3)
+        points = poses.apply(shape)  # (*B, S, N, 3)
         repeated = None if radii is None else radii.repeat(snapshots)
         uv = truth.project(points.flatten(-3, -2), repeated).uv
         uv = uv.unflatten(-2, (snapshots, fiducials)).movedim(-3, -4).contiguous()  # (*B, S, C, N, 2)
@@ -83,6 +96,6 @@ def simulate(o10: CameraRig, asymmetric8: CalibrationObject) -> Simulate:
         seen = torch.rand(uv.shape[:-1], generator=generator) >= missing
         uv = torch.where(seen[..., None], uv, -1e6)
         observations = Observations(uv, torch.full_like(uv[..., 0], sigma), seen)
-        return Case(factory, obj, truth, poses, observations, drift.std(factory))
+        return Case(factory, given, truth, poses, observations, drift.std(factory), shape[..., 0, :, :])
 
     return make

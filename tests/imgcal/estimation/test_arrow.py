@@ -34,11 +34,11 @@ def test_solution_equals_the_dense_one(batch: int, first: int, second: int, p: i
         right[:, first * p :].unflatten(1, (second, q)),
     )
     expected = torch.linalg.solve(dense, right)
-    eliminated, kept_part = arrow.solve(arrow.reduce(blocks, coupling, kept), right_blocks, right_kept)
+    eliminated, kept_part, _ = arrow.solve(arrow.reduce(blocks, coupling, kept), right_blocks, right_kept)
     torch.testing.assert_close(torch.cat((eliminated.flatten(1), kept_part.flatten(1)), 1), expected)
     # The other kind eliminated.
     other = arrow.reduce(kept, coupling.permute(0, 2, 1, 4, 3), blocks)
-    kept_part, eliminated = arrow.solve(other, right_kept, right_blocks)
+    kept_part, eliminated, _ = arrow.solve(other, right_kept, right_blocks)
     torch.testing.assert_close(torch.cat((eliminated.flatten(1), kept_part.flatten(1)), 1), expected)
     assert not other.failed.any()
 
@@ -48,3 +48,24 @@ def test_what_is_not_positive_definite_is_reported() -> None:
     blocks[1, 0] = -blocks[1, 0]
     kept[2, 1] = 0
     assert arrow.reduce(blocks, coupling, kept).failed.tolist() == [False, True, True]
+
+
+@pytest.mark.parametrize(("batch", "first", "second", "p", "q"), SHAPES)
+def test_a_border_is_solved_with_the_rest(batch: int, first: int, second: int, p: int, q: int) -> None:
+    """Three unknowns that couple to everything, whichever kind of block is eliminated."""
+    blocks, coupling, kept, dense = system(batch, first, second, p, q)
+    generator = torch.Generator().manual_seed(2)
+    split, size = first * p, dense.shape[-1]
+    across = torch.randn(batch, size, 3, generator=generator, dtype=torch.float64)
+    own = 50 * size * torch.eye(3).double().expand(batch, 3, 3)
+    whole = torch.cat((torch.cat((dense, across), 2), torch.cat((across.mT, own), 2)), 1)
+    right = torch.randn(batch, size + 3, generator=generator, dtype=torch.float64)
+    expected = torch.linalg.solve(whole, right)
+    parts = across[:, :split].unflatten(1, (first, p)), across[:, split:].unflatten(1, (second, q))
+    rights = right[:, :split].unflatten(1, (first, p)), right[:, split:size].unflatten(1, (second, q))
+    reduced = arrow.reduce(blocks, coupling, kept, arrow.Border(*parts, own))
+    a, b, c = arrow.solve(reduced, *rights, right[:, size:])
+    torch.testing.assert_close(torch.cat((a.flatten(1), b.flatten(1), c), 1), expected)
+    reduced = arrow.reduce(kept, coupling.permute(0, 2, 1, 4, 3), blocks, arrow.Border(*parts[::-1], own))
+    b, a, c = arrow.solve(reduced, *rights[::-1], right[:, size:])
+    torch.testing.assert_close(torch.cat((a.flatten(1), b.flatten(1), c), 1), expected)

@@ -13,6 +13,7 @@ from imgcal.estimation import (
     camera_covariance,
     camera_std,
     estimate,
+    object_covariance,
     pose_covariance,
     relative_covariance,
     relative_difference,
@@ -31,7 +32,11 @@ def run(case) -> Estimate:
 
 
 def dense_inverse(found: Estimate) -> torch.Tensor:
-    """Inverse of the whole information in whitened units: (B, 15 C + 6 S, .)."""
+    """Inverse of the whole information in whitened units, without the object: (B, 15 C + 6 S, .)."""
+    return torch.from_numpy(np.linalg.inv(dense_information(found).numpy()))
+
+
+def dense_information(found: Estimate) -> torch.Tensor:
     equations = found.solution.equations
     count, snapshots, cameras = equations.coupling.shape[:3]
     split = 15 * cameras
@@ -43,7 +48,7 @@ def dense_inverse(found: Estimate) -> torch.Tensor:
             dense[:, columns, columns] = equations.pose[:, s]
             dense[:, rows, columns] = equations.coupling[:, s, c]
             dense[:, columns, rows] = equations.coupling[:, s, c].mT
-    return torch.from_numpy(np.linalg.inv(dense.numpy()))
+    return dense
 
 
 @pytest.mark.parametrize("snapshots", [1, 3, 10, 12])  # compiled, compiled, cameras kept, and many snapshots
@@ -80,9 +85,9 @@ def test_equals_the_dense_inverse(simulate, snapshots: int) -> None:
     jacobian = torch.autograd.functional.jacobian(physical, zero).movedim(1, 0).flatten(2)  # (B, 45, 45)
     expected = jacobian @ inverse[:, :45, :45] @ jacobian.mT
     scale = expected.diagonal(dim1=-2, dim2=-1).sqrt()
-    difference = (camera_covariance(found) - expected) / (scale[..., None] * scale[:, None])
+    difference = (camera_covariance(found, curved=False) - expected) / (scale[..., None] * scale[:, None])
     assert difference.abs().max() < 1e-6
-    torch.testing.assert_close(camera_std(found), scale.unflatten(1, (3, 15)), rtol=1e-6, atol=0)
+    torch.testing.assert_close(camera_std(found), scale.unflatten(1, (3, 15)), rtol=1e-2, atol=0)
 
     depth = state.centre.norm(dim=-1, keepdim=True)
     unit = torch.cat((torch.ones_like(depth).expand(-1, -1, 3), depth.expand(-1, -1, 3)), -1)
@@ -91,6 +96,41 @@ def test_equals_the_dense_inverse(simulate, snapshots: int) -> None:
         scale = block.diagonal(dim1=-2, dim2=-1).sqrt()
         difference = (pose_covariance(found)[:, s] - block) / (scale[..., None] * scale[:, None])
         assert difference.abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("snapshots", [1, 12])  # cameras are eliminated, snapshots are
+def test_with_an_object_equals_the_dense_inverse(simulate, snapshots: int) -> None:
+    case = simulate(2, snapshots=snapshots, cameras=3, missing=0.1, tolerance=0.5, scale_tolerance=0.02)
+    found = run(case)
+    equations, problem = found.solution.equations, found.problem
+    own = equations.object
+    inner = dense_information(found)
+    across = torch.cat((own.camera.flatten(1, 2), own.pose.flatten(1, 2)), 1)
+    whole = torch.cat((torch.cat((inner, across), 2), torch.cat((across.mT, own.own), 2)), 1)
+    inverse = torch.linalg.inv(whole)
+    np.testing.assert_allclose(
+        remaining_variance(found.solution),
+        inverse.diagonal(dim1=-2, dim2=-1)[:, :45].unflatten(-1, (3, 15)),
+        rtol=1e-5,
+    )
+    spread = problem.object_spread[0]
+    by_offset = torch.cat((torch.diag(spread[:-1]), (problem.points.flatten() * spread[-1])[:, None]), 1)
+    expected = by_offset @ inverse[:, -25:, -25:] @ by_offset.T
+    torch.testing.assert_close(object_covariance(found), expected, rtol=1e-2, atol=1e-3)
+    poses = inverse[:, 45 : 45 + 6 * snapshots, 45 : 45 + 6 * snapshots]
+    torch.testing.assert_close(pose_covariance(found)[:, 0, :3, :3], poses[:, :3, :3], rtol=1e-5, atol=1e-12)
+
+
+def test_the_estimated_object_is_as_uncertain_as_it_says(simulate) -> None:
+    case = simulate(200, snapshots=6, cameras=4, tolerance=0.3, bent=0.3, scale_tolerance=0.01, seed=5)
+    found = run(case)
+    error = (found.points_object - case.shape).flatten(1)
+    values, vectors = torch.linalg.eigh(object_covariance(found))
+    normalized = ((vectors.mT @ error[..., None]).squeeze(-1).square() / values).mean()
+    assert normalized == pytest.approx(1, abs=0.08)
+    cameras = found.rig.difference(case.truth).flatten(1)
+    solved = torch.linalg.solve(camera_covariance(found), cameras[..., None]).squeeze(-1)
+    assert float((cameras * solved).sum(1).mean()) / 60 == pytest.approx(1, abs=0.08)
 
 
 @pytest.mark.parametrize("batch", [(), (1,), (2, 3)])
@@ -162,6 +202,24 @@ def test_matches_the_spread_of_samples(simulate) -> None:
     )
     normalized = relative[:, 1:].flatten(1).square() / variance[:, 15:]
     assert normalized.mean() == pytest.approx(1, abs=0.05)
+
+
+@pytest.mark.parametrize("kept", [1.0, 0.4])
+@pytest.mark.parametrize("relative", [False, True])
+def test_one_snapshot_with_a_wide_prior_is_honest(simulate, kept: float, relative: bool) -> None:
+    """Open directions bend the image: the flat posterior is up to seven times too narrow where others are sharp."""
+    drift = PhysicalDrift(rotation_deg=0.57, position=10, focal_length=0.02, principal_point=10, distortion=0.05)
+    case = simulate(60, snapshots=1, missing=1 - kept, drift=drift)
+    found = run(case)
+    if relative:
+        error, covariance = relative_difference(found.rig, case.truth).flatten(1), relative_covariance(found)
+        error, covariance = error[:, 15:], covariance[:, 15:, 15:]
+    else:
+        error, covariance = found.rig.difference(case.truth).flatten(1), camera_covariance(found)
+    scale = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    values, vectors = torch.linalg.eigh(covariance / (scale[..., None] * scale[:, None]))
+    along = (vectors.mT @ (error / scale)[..., None]).squeeze(-1)
+    assert float((along.square() / values).mean()) == pytest.approx(1, abs=0.2)
 
 
 def test_undetermined_pose_is_refused(simulate) -> None:

@@ -76,6 +76,18 @@ def test_gradient_by_observations_when_snapshots_are_eliminated(simulate) -> Non
     assert torch.autograd.gradcheck(solve, uv, eps=1e-4, atol=1e-4, rtol=1e-3, fast_mode=True)
 
 
+def test_gradient_through_an_object_that_is_estimated_too(simulate) -> None:
+    case = simulate(1, snapshots=3, cameras=2, fiducials=5, noise=0.05, tolerance=0.3, bent=0.3, scale_tolerance=0.01)
+    uv = case.observations.uv.clone().requires_grad_()
+
+    def solve(uv: Tensor) -> Tensor:
+        observations = replace(case.observations, uv=uv)
+        found = estimate(observations, case.factory, case.obj, case.poses, spread=case.spread, options=EXACT["squared"])
+        return torch.cat((scaled(case, found), found.points_object.flatten()))
+
+    assert torch.autograd.gradcheck(solve, uv, eps=1e-4, atol=1e-4, rtol=1e-3, fast_mode=True)
+
+
 def test_value_is_the_same_with_and_without_gradient(simulate) -> None:
     case = simulate(2, cameras=3)
     plain = estimate(case.observations, case.factory, case.obj, spread=case.spread)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from imgcal.estimation.implicit import map_cost
-from imgcal.estimation.linearize import Problem, State, linearize, moved, pose_at, rig_at
+from imgcal.estimation.linearize import Problem, State, linearize, moved, points_at, pose_at, rig_at
 from imgcal.estimation.robust import cauchy, squared
 
 CASES = [((), 1, 3, 5), ((1,), 2, 4, 6), ((2, 3), 2, 3, 5), ((4,), 1, 4, 4)]
@@ -63,6 +63,49 @@ def test_normal_equations_match_autograd(
         found.camera_gradient.flatten(1), (camera_rows.mT @ residual[..., None]).squeeze(-1) + state.offset.flatten(1)
     )
     torch.testing.assert_close(found.pose_gradient.flatten(1), (pose_rows.mT @ residual[..., None]).squeeze(-1))
+
+
+@pytest.mark.parametrize(("batch", "snapshots", "cameras", "fiducials"), CASES)
+def test_equations_of_the_object_match_autograd(
+    simulate, batch: tuple[int, ...], snapshots: int, cameras: int, fiducials: int
+) -> None:
+    case = simulate(
+        *batch, snapshots=snapshots, cameras=cameras, fiducials=fiducials, radius=15.0, missing=0.2, noise=0.5,
+        tolerance=0.7, scale_tolerance=0.02,
+    )  # fmt: skip
+    problem = case.problem()
+    state = disturbed(problem, case.start(problem))
+    generator = torch.Generator().manual_seed(2)
+    own = torch.randn(problem.object_spread.shape, generator=generator, dtype=torch.float64)
+    state = replace(state, object_offset=own)
+    found = linearize(problem, state, squared).object
+
+    def cost(*step: Tensor) -> Tensor:
+        return map_cost(problem, moved(problem, state, *step), squared).sum()
+
+    def whitened(*step: Tensor) -> Tensor:
+        """Residuals of the data: (B, -1)."""
+        there = moved(problem, state, *step)
+        rig, shape = rig_at(problem, there.offset), points_at(problem, there) + problem.centroid
+        points = pose_at(problem, there).apply(shape.unsqueeze(1))
+        radii = problem.radius_squared.sqrt().repeat(snapshots)
+        uv = rig.project(points.flatten(1, 2), radii).uv.unflatten(2, (snapshots, fiducials)).permute(0, 2, 1, 4, 3)
+        return ((uv - problem.uv) * problem.root_weight.unsqueeze(-2)).flatten(1).sum(0)
+
+    zero = (torch.zeros_like(state.offset), torch.zeros(len(own), snapshots, 6).double(), torch.zeros_like(own))
+    rows = torch.autograd.functional.jacobian(whitened, zero, vectorize=True)
+    by_camera, by_pose, by_object = (part.movedim(1, 0).flatten(2) for part in rows)  # (B, rows, .)
+    eye = torch.eye(3 * fiducials + 1).double()
+    for name, block, expected in (
+        ("own", found.own, by_object.mT @ by_object + eye),
+        ("camera", found.camera.flatten(1, 2), by_camera.mT @ by_object),
+        ("pose", found.pose.flatten(1, 2), by_pose.mT @ by_object),
+        ("gradient", found.gradient, torch.func.grad(cost, argnums=2)(*zero)),
+    ):
+        limit = 1e-9 * float(expected.abs().max())
+        torch.testing.assert_close(
+            block, expected, rtol=1e-9, atol=limit, msg=lambda text, name=name: f"{name}: {text}"
+        )
 
 
 @pytest.mark.parametrize("loss", [squared, cauchy])

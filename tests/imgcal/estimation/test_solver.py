@@ -16,7 +16,7 @@ def test_damped_step_equals_the_dense_solution(simulate, snapshots: int) -> None
     problem = case.problem()
     equations = linearize(problem, case.start(problem), squared)
     damping = torch.tensor([0.0, 0.1], dtype=torch.float64)
-    camera, pose, gain, failed = damped_step(equations, damping)
+    (camera, pose, _), gain, failed = damped_step(equations, damping)
     size = 45 + 6 * snapshots
     for b in range(2):
         dense = torch.zeros(size, size, dtype=torch.float64)

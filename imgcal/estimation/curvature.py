@@ -1,0 +1,134 @@
+"""What the Laplace approximation leaves out: the posterior is curved, and its ellipsoid is flat.
+
+Where the data leave some directions wide open (one snapshot, a wide prior), moving along them bends the image by more
+than the noise, and the directions that the data determine well must follow. To second order, a step x of the
+posterior's own size is followed by
+
+    d(x) = -H^-1 J^T W q(x),      q(x) = (r(x) + r(-x)) / 2 - r(0),
+
+where r are the residuals, J their Jacobian and W their weights at the minimum, H the information. d is even in x, so
+that it adds its own mean square to the covariance. It is averaged over pairs x, -x drawn from the flat posterior.
+
+Source: the bias of nonlinear least squares, Box, "Bias in nonlinear estimation" (J. R. Stat. Soc. B 1971), and
+parameter curvature, Bates and Watts (J. R. Stat. Soc. B 1980), by sampling instead of second derivatives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from imgcal.estimation.estimate import Estimate
+from imgcal.estimation.linearize import (
+    POSE_PARAMETERS,
+    Problem,
+    State,
+    Step,
+    jacobian_at,
+    moved,
+    object_columns,
+    points_at,
+    pose_at,
+    rig_at,
+    with_scale,
+)
+from imgcal.estimation.solver import Factorization, factorize, taken
+from imgcal.projection_compiled import project
+from imgcal.rig import PARAMETERS, CameraRig
+
+MOST_PAIRS, LEAST_PAIRS = 256, 64
+"""Drawn for one snapshot; for many, where the posterior is narrow and hardly curved."""
+AT_ONCE = 16
+"""Pairs that are projected together."""
+
+
+def curvature_covariance(estimate: Estimate, quantity: Callable[[CameraRig, Tensor], Tensor]) -> Tensor:
+    """Mean square of what second order adds to a quantity.
+
+    Args:
+        estimate: with batch axes *B.
+        quantity: maps rigs (B, K) and their fiducials about the object's centroid (B, K, N, 3) mm to numbers (B, K, Q),
+            zero for the estimate itself.
+
+    Returns:
+        (*B, Q, Q), symmetric and not negative: to be added to the covariance of the flat posterior.
+    """
+    problem, solution = estimate.problem, estimate.solution
+    factorization = factorize(solution.equations, cameras_first=True)
+    pairs = max(LEAST_PAIRS, MOST_PAIRS // problem.uv.shape[1])
+    generator = torch.Generator(problem.uv.device).manual_seed(0)  # the same estimate has the same covariance
+    x = _draw(factorization, solution.state, pairs, generator)
+    follow = _follow(problem, solution.state, factorization, x)
+    there, back = (quantity(*_moved_rigs(problem, solution.state, x, follow, sign)) for sign in (1, -1))
+    even = 0.5 * (there + back)
+    result = even.mT @ even / pairs
+    return result.reshape(*estimate.chi2.shape, *result.shape[1:])
+
+
+def _moved_rigs(problem: Problem, state: State, x: Step, follow: Step, sign: int) -> tuple[CameraRig, Tensor]:
+    """Rigs (B, K) and fiducials (B, K, N, 3) mm after steps of the cameras and of the object."""
+    factory = problem.factory.map_tensors(lambda tensor, _: tensor.unsqueeze(1))
+    many = replace(problem, factory=factory, spread=problem.spread.unsqueeze(1))
+    rigs = rig_at(many, state.offset.unsqueeze(1) + sign * x.camera + follow.camera)
+    points = points_at(problem, state).unsqueeze(1).expand(-1, x.camera.shape[1], -1, -1)
+    if x.object is not None and follow.object is not None and problem.object_spread is not None:
+        step = (sign * x.object + follow.object) * problem.object_spread.unsqueeze(1)
+        points = points + problem.points * step[..., -1, None, None] + step[..., :-1].unflatten(-1, (-1, 3))
+    return rigs, points
+
+
+def _draw(factorization: Factorization, state: State, pairs: int, generator: torch.Generator) -> Step:
+    """Draw steps from the flat posterior: camera (B, K, C, 15), pose (B, K, S, 6), object (B, K, M)."""
+    reduced = factorization.reduced
+    batch, cameras, size, wide = reduced.whitened.shape
+    kept, eliminated = (
+        torch.randn(shape, generator=generator, dtype=reduced.kept.dtype, device=reduced.kept.device)
+        for shape in ((batch, wide, pairs), (batch, cameras, size, pairs))
+    )
+    kept = torch.linalg.solve_triangular(reduced.kept.mT, kept, upper=True)
+    eliminated = eliminated - reduced.whitened @ kept.unsqueeze(1)
+    eliminated = torch.linalg.solve_triangular(reduced.eliminated.mT, eliminated, upper=True)
+    poses = 6 * state.centre.shape[1]
+    pose = kept[:, :poses].mT.unflatten(-1, (-1, 6))
+    own = kept[:, poses:].mT if wide > poses else None
+    return Step(eliminated.permute(0, 3, 1, 2), pose, own)
+
+
+def _follow(problem: Problem, state: State, factorization: Factorization, x: Step) -> Step:
+    """d(x) for steps (B, K, ...)."""
+    at = jacobian_at(problem, state)
+    squared = problem.root_weight.square()[..., None, None, :]
+    by_rig = at.by_rig[..., : PARAMETERS + POSE_PARAMETERS, :, :] * squared
+    by_object = None if at.by_fiducial is None else with_scale(problem, at.by_fiducial) * squared
+    steps = []
+    for first in range(0, x.camera.shape[1], AT_ONCE):
+        some = Step(*(part if part is None else part[:, first : first + AT_ONCE] for part in x))  # type: ignore[arg-type]
+        there, back = (_residual(problem, state, some, sign) for sign in (1, -1))
+        bend = 0.5 * (there + back) - at.residual.unsqueeze(1)  # (B, K, S, C, 2, N)
+        right = -torch.einsum("bscirn,bkscrn->bksci", by_rig, bend)
+        camera, pose, own = right[..., :PARAMETERS].sum(2), right[..., PARAMETERS:].sum(3), None
+        if by_object is not None and problem.object_spread is not None:
+            sums = torch.einsum("bscirn,bkscrn->bkin", by_object, bend)
+            own = -object_columns(sums) * problem.object_spread.unsqueeze(1)
+        for k in range(camera.shape[1]):
+            steps.append(factorization.solve(Step(camera[:, k], pose[:, k], None if own is None else own[:, k])))
+    cameras, poses = (torch.stack([step[i] for step in steps], dim=1) for i in (0, 1))  # type: ignore[misc]
+    objects = [step.object for step in steps if step.object is not None]
+    return Step(cameras, poses, torch.stack(objects, dim=1) if objects else None)
+
+
+def _residual(problem: Problem, state: State, step: Step, sign: int) -> Tensor:
+    """Residuals (B, K, S, C, 2, N) px after steps (B, K, ...)."""
+    batch, pairs = step.camera.shape[:2]
+    rows = torch.arange(batch, device=step.camera.device).repeat_interleave(pairs)
+    many = problem.select(rows)
+    there = moved(many, taken(state, rows), *step.map(lambda part: sign * part.flatten(0, 1)))
+    points = pose_at(many, there).apply((points_at(many, there) + problem.centroid).unsqueeze(1))  # (B K, S, N, 3)
+    snapshots, fiducials = points.shape[1:3]
+    radius = None if problem.radius_squared is None else problem.radius_squared.sqrt().repeat(snapshots)
+    uv = project(rig_at(many, there.offset), points.flatten(1, 2), radius).uv  # (B K, C, S N, 2)
+    uv = uv.unflatten(2, (snapshots, fiducials)).permute(0, 2, 1, 4, 3).unflatten(0, (batch, pairs))
+    return uv - problem.uv.unsqueeze(1)
