@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import EstimationOptions, camera_std, estimate
 from imgcal.identity import Identity, IdentityOptions, Status, identify, oriented
+from imgcal.limits import check_object, check_rig
+from imgcal.messages import listed
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections, Observations
 from imgcal.rig import CameraRig, RigPrior
@@ -176,6 +178,8 @@ class Follower:
     """Carries what earlier snapshots say, the pose and the rig, to the next one."""
 
     def __init__(self, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions) -> None:
+        check_rig(rig)
+        check_object(obj)
         self.factory, self.obj, self.options = rig, obj, options
         self.rig = rig
         self.spread = (rig.prior or RigPrior()).std(rig)
@@ -275,8 +279,8 @@ def matched_to_rig(detections: Detections, rig: CameraRig) -> Detections:
     unknown = [name for name in detections.camera_names if name not in rig.camera_names]
     if unknown:
         raise InputError(
-            f"detections: found camera {', '.join(unknown)}, expected cameras of rig {rig.name}: "
-            f"{', '.join(rig.camera_names)}"
+            f"detections: found camera {listed(unknown)}, expected cameras of rig {rig.name}: "
+            f"{listed(rig.camera_names)}"
         )
     index = np.array([rig.camera_names.index(name) for name in detections.camera_names], dtype=np.int64)
     camera = index[detections.camera] if len(detections) else detections.camera

@@ -15,6 +15,7 @@ from imgcal.detection.options import Frame
 from imgcal.errors import InputError
 from imgcal.formats.detections_csv import MARGIN
 from imgcal.labelling import matched_to_rig
+from imgcal.limits import BLOB_RADIUS, SIGMA
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections
 from imgcal.rig import CameraRig
@@ -85,8 +86,14 @@ def checked_detections(detections: Detections, rig: CameraRig, obj: CalibrationO
     _require(
         detections,
         "sigma",
-        (detections.sigma > 0) & np.isfinite(detections.sigma),
-        "a standard deviation > 0 in pixels",
+        (detections.sigma >= SIGMA.low) & (detections.sigma <= SIGMA.high),
+        f"a standard deviation > 0, {SIGMA}",
+    )
+    _require(
+        detections,
+        "radius",
+        np.isnan(detections.radius) | ((detections.radius >= 0) & (detections.radius <= BLOB_RADIUS.high)),
+        f"a radius, {BLOB_RADIUS}, or nan",
     )
     detections = matched_to_rig(detections, rig)
     size = rig.image_size.numpy()[detections.camera]

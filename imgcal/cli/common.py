@@ -20,6 +20,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from imgcal.detection import Blobs, DetectionOptions, detect_snapshot
 from imgcal.errors import InputError
 from imgcal.formats import Capture, Frame
+from imgcal.messages import listed
 from imgcal.observations import Detections
 from imgcal.rig import CameraRig
 from imgcal.rotations import rotation_from_vector
@@ -111,9 +112,9 @@ def without_cameras(rig: CameraRig, names: tuple[str, ...]) -> CameraRig:
     """Leave cameras out of a rig."""
     unknown = [name for name in names if name not in rig.camera_names]
     if unknown:
-        raise InputError(
-            f"--without: found {', '.join(unknown)}, expected cameras of the rig: {', '.join(rig.camera_names)}"
-        )
+        raise InputError(f"--without: found {listed(unknown)}, expected cameras of the rig: {listed(rig.camera_names)}")
+    if set(rig.camera_names) <= set(names):
+        raise InputError(f"--without: found all {rig.cameras} cameras of the rig, expected at least one to be left")
     return rig.select([i for i, name in enumerate(rig.camera_names) if name not in names])
 
 

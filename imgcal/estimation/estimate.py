@@ -14,6 +14,7 @@ from imgcal.estimation import fused, implicit, solver
 from imgcal.estimation.linearize import Problem, State, points_at, pose_at, rig_at
 from imgcal.estimation.pose import initial_pose
 from imgcal.estimation.robust import LOSSES, Loss
+from imgcal.limits import check_observations
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Observations
 from imgcal.rig import PARAMETERS, CameraRig, RigPrior
@@ -93,10 +94,11 @@ def estimate(
         The estimate. `converged` must be looked at: a rig that has not converged is returned where it ended.
 
     Raises:
-        InputError: shapes that do not belong together.
+        InputError: shapes that do not belong together; something seen with a sigma of zero or less.
     """
     batch = observations.seen.shape[:-3]
     problem = make_problem(observations, rig, obj, spread)
+    check_observations(observations)
     if rig_from_object is None:
         with torch.no_grad():
             rig_from_object = initial_pose(observations, first_guess or rig, obj)

@@ -19,8 +19,9 @@ from imgcal.errors import InputError
 from imgcal.formats.atomic import write_text
 from imgcal.formats.detections_csv import load_detections
 from imgcal.formats.frames import IMAGE_SUFFIXES, TIFF_SUFFIXES, VIDEO_SUFFIXES, Frame, Video, count_frames, read_frame
-from imgcal.formats.names import natural_key, nearest
+from imgcal.formats.names import is_file_name, natural_key, nearest
 from imgcal.formats.yaml_file import StrictModel, read_yaml, validated, yaml_text
+from imgcal.messages import listed
 from imgcal.observations import Detections
 from imgcal.rig import CameraRig
 
@@ -120,7 +121,7 @@ def open_capture(folder: str | Path, rig: CameraRig | None = None) -> Capture:
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder, expected a capture that holds frames/<camera name>/")
     if not frames.is_dir():
-        found = ", ".join(path.name for path in _listing(folder)[:5]) or "an empty folder"
+        found = listed(path.name for path in _listing(folder)) or "an empty folder"
         raise InputError(f"{folder}: found {found}, expected a capture that holds frames/<camera name>/")
     files: dict[str, dict[str, tuple[Path, int]]] = {}
     for path in _listing(frames):
@@ -136,7 +137,7 @@ def open_capture(folder: str | Path, rig: CameraRig | None = None) -> Capture:
     masks = folder / "masks"
     for path in _listing(masks) if masks.is_dir() else ():
         if path.stem not in names or path.suffix.lower() != ".png":
-            raise InputError(f"{path}: expected masks named <camera name>.png, cameras: {', '.join(names)}")
+            raise InputError(f"{path}: expected masks named <camera name>.png, cameras: {listed(names)}")
     settings = folder / "capture.yaml"
     return Capture(
         folder=folder,
@@ -153,10 +154,9 @@ def open_input(path: str | Path, rig: CameraRig | None = None, fiducials: int | 
     path = Path(path)
     if path.is_dir():
         return open_capture(path, rig)
-    if not path.exists():
-        raise InputError(
-            f"{path}: no such file or folder, expected a capture folder or a detections file (.csv, .csv.gz)"
-        )
+    if not path.is_file():
+        found = "found a device or pipe" if path.exists() else "no such file or folder"
+        raise InputError(f"{path}: {found}, expected a capture folder or a detections file (.csv, .csv.gz)")
     suffix = path.suffix.lower()
     if suffix in IMAGE_SUFFIXES | VIDEO_SUFFIXES:
         raise InputError(f"{path}: found one image or video, expected the capture folder that holds frames/")
@@ -175,7 +175,10 @@ def save_capture_settings(folder: str | Path, bit_depth: int, note: str | None =
 
 def _listing(folder: Path) -> list[Path]:
     """Entries in natural order, without hidden files."""
-    entries = (path for path in folder.iterdir() if not path.name.startswith("."))
+    entries = [path for path in folder.iterdir() if not path.name.startswith(".")]
+    for path in entries:
+        if not is_file_name(path.name):
+            raise InputError(f"{path}: found a name that is no text, or too long, expected one that can be shown")
     return sorted(entries, key=lambda path: natural_key(path.name))
 
 
@@ -210,8 +213,8 @@ def _check_cameras(frames: Path, found: Iterable[str], rig: CameraRig) -> None:
     if unknown:
         hint = f"; put the snapshots into {frames / rig.camera_names[0]}" if rig.cameras == 1 else ""
         raise InputError(
-            f"{frames}: found {', '.join(unknown[:5])}, expected the cameras of rig {rig.name}: "
-            f"{', '.join(rig.camera_names)}{nearest(unknown[0], rig.camera_names)}{hint}"
+            f"{frames}: found {listed(unknown)}, expected the cameras of rig {rig.name}: "
+            f"{listed(rig.camera_names)}{nearest(unknown[0], rig.camera_names)}{hint}"
         )
 
 

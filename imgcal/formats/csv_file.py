@@ -7,7 +7,7 @@ import gzip
 import io
 import itertools
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
@@ -17,12 +17,17 @@ from numpy.typing import NDArray
 
 from imgcal.errors import InputError
 from imgcal.formats.names import nearest
+from imgcal.limits import Range
 from imgcal.messages import shortened
 
 Numbers = NDArray[np.float64]
 
 CHUNK = 1000  # rows: larger ones leave the processor cache and wake the garbage collector, half as fast
 GZIP_MAGIC = b"\x1f\x8b"
+
+MOST_ROWS = 10_000_000
+LONGEST_LINE = 2**20  # characters
+BOMB = 2**24, 100  # bytes, and times its compressed size: what unpacks to more is no table of measurements
 
 
 @dataclass(frozen=True)
@@ -40,13 +45,14 @@ class Chunk:
         """Raise the error of a row of this chunk."""
         fail_row(self.path, self.first_row + row, problem)
 
-    def numbers(self, name: str, good: Callable[[Numbers], NDArray[np.bool_]], expected: str) -> Numbers:
-        """Convert a column to finite numbers.
+    def numbers(self, name: str, plausible: Range, expected: str, whole: bool = False) -> Numbers:
+        """Convert a column to numbers.
 
         Args:
             name: of the column.
-            good: tells which values are acceptable.
+            plausible: which values are acceptable.
             expected: says so in words.
+            whole: only whole numbers.
 
         Raises:
             InputError: with the line of the first value that is not.
@@ -57,7 +63,9 @@ class Chunk:
         except ValueError:
             row = next(i for i, text in enumerate(column) if not _is_float(text))
             self.fail(row, f"{name}: found {shortened(column[row])!r}, expected {expected}")
-        wrong = ~(np.isfinite(values) & good(values))
+        wrong = ~((values >= plausible.low) & (values <= plausible.high))
+        if whole:
+            wrong |= values != np.trunc(values)
         if wrong.any():
             row = int(wrong.argmax())
             self.fail(row, f"{name}: found {shortened(column[row])}, expected {expected}")
@@ -78,13 +86,15 @@ def read_chunks(path: Path, required: Sequence[str], optional: Sequence[str]) ->
     Raises:
         InputError: unreadable, truncated or binary file, wrong header, a row of another length.
     """
-    with _Text(path) as rows:
+    text = _Text(path)
+    with text as rows:
         header = [cell.strip() for cell in next(rows, [])]
         _check_header(path, header, required, optional)
         for first in itertools.count(0, CHUNK):
             chunk = list(itertools.islice(rows, CHUNK))
             if not chunk:
                 return
+            text.check_size(first + len(chunk))
             lengths = np.fromiter(map(len, chunk), dtype=np.int64, count=len(chunk))
             if (lengths != len(header)).any():
                 row = int((lengths != len(header)).argmax())
@@ -105,10 +115,23 @@ class _Text:
             self.file.seek(0)
         except OSError as error:
             raise InputError(f"{self.path}: cannot be read: {error.strerror or error}") from error
-        binary = gzip.GzipFile(fileobj=self.file) if magic == GZIP_MAGIC else self.file
+        self.binary = gzip.GzipFile(fileobj=self.file) if magic == GZIP_MAGIC else self.file
         # utf-8-sig: spreadsheets put a byte order mark in front of the header.
-        self.reader = csv.reader(io.TextIOWrapper(binary, encoding="utf-8-sig", newline=""), strict=True)
+        self.text = io.TextIOWrapper(self.binary, encoding="utf-8-sig", newline="")
+        self.reader = csv.reader(_lines(self.text), strict=True)
         return filter(None, self.reader)
+
+    def check_size(self, rows: int) -> None:
+        """Stop before a file fills the memory: `rows` have been read of it."""
+        if rows > MOST_ROWS:
+            raise InputError(f"{self.path}: found more than {MOST_ROWS:,} rows, expected fewer: split the file")
+        packed, unpacked = max(self.file.tell(), 1), self.binary.tell()
+        least, times = BOMB
+        if unpacked > max(least, times * packed):
+            raise InputError(
+                f"{self.path}: found {unpacked:,} bytes and more, compressed to {packed:,}, expected at most {times} "
+                "times as many"
+            )
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self.file.close()
@@ -124,6 +147,13 @@ class _Text:
             case _:
                 return
         raise InputError(f"{self.path}: {problem}, expected CSV with a header line") from error
+
+
+def _lines(text: io.TextIOWrapper) -> Iterator[str]:
+    while line := text.readline(LONGEST_LINE):
+        if len(line) == LONGEST_LINE and not line.endswith("\n"):
+            raise csv.Error(f"a line of more than {LONGEST_LINE:,} characters")
+        yield line
 
 
 def _check_header(path: Path, header: list[str], required: Sequence[str], optional: Sequence[str]) -> None:

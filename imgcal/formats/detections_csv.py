@@ -18,11 +18,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from imgcal import limits
 from imgcal.errors import InputError
 from imgcal.formats.atomic import replacing
 from imgcal.formats.csv_file import Chunk, fail_row, read_chunks
-from imgcal.formats.names import nearest
-from imgcal.messages import shortened
+from imgcal.formats.names import is_file_name, nearest
+from imgcal.messages import listed, shortened
 from imgcal.observations import BlobFlag, Detections
 from imgcal.rig import CameraRig
 
@@ -121,16 +122,17 @@ def _indices(chunk: Chunk, column: str, known: dict[str, int], allowed: tuple[st
     names = chunk.columns[column]
     if allowed is None:
         for name in dict.fromkeys(names):
+            if name not in known and not is_file_name(name):
+                found = repr(shortened(name)) if name else "an empty cell"
+                chunk.fail(names.index(name), f"{column}: found {found}, expected a name that can be a file name")
             known.setdefault(name, len(known))
-        if "" in known:
-            chunk.fail(names.index(""), f"{column}: found an empty cell, expected a name")
     else:
         unknown = next((name for name in dict.fromkeys(names) if name not in known), None)
         if unknown is not None:
             chunk.fail(
                 names.index(unknown),
                 f"camera: found {shortened(unknown)!r} (this file: {shortened(', '.join(dict.fromkeys(names)))}), "
-                f"expected a camera of the rig: {', '.join(allowed)}{nearest(unknown, allowed)}",
+                f"expected a camera of the rig: {listed(allowed)}{nearest(unknown, allowed)}",
             )
     return np.fromiter(map(known.__getitem__, names), dtype=np.int64, count=len(names))
 
@@ -138,34 +140,25 @@ def _indices(chunk: Chunk, column: str, known: dict[str, int], allowed: tuple[st
 def _numbers(chunk: Chunk, fiducials: int | None) -> dict[str, NDArray[np.float64]]:
     """Convert the numeric columns; absent ones get their defaults."""
     count = len(chunk)
-
-    def finite(values: NDArray[np.float64]) -> NDArray[np.bool_]:
-        return np.isfinite(values)
-
-    result = {axis: chunk.numbers(axis, finite, "a finite pixel coordinate") for axis in "uv"}
+    result = {axis: chunk.numbers(axis, limits.PIXEL, f"a finite pixel coordinate, {limits.PIXEL}") for axis in "uv"}
     result["sigma"] = np.full(count, DEFAULT_SIGMA)
     if "sigma" in chunk.columns:
-        result["sigma"] = chunk.numbers("sigma", lambda v: v > 0, "a standard deviation > 0 in pixels")
+        result["sigma"] = chunk.numbers("sigma", limits.SIGMA, f"a standard deviation > 0, {limits.SIGMA}")
     result["fiducial"] = np.full(count, -1.0)
     if "fiducial" in chunk.columns:
-        limit = 2**31 if fiducials is None else fiducials
-        expected = (
-            "a row of the object, 0 or more" if fiducials is None else f"a row of the object, 0 to {fiducials - 1}"
-        )
+        last = limits.MOST_FIDUCIALS if fiducials is None else fiducials - 1
         filled = _filled(chunk, "fiducial", "-1")
         result["fiducial"] = filled.numbers(
-            "fiducial", lambda v: (v >= -1) & (v < limit) & (v == np.trunc(v)), expected
+            "fiducial", limits.Range(-1, last, ""), f"a row of the object, 0 to {last}", whole=True
         )
     result["radius"] = np.full(count, np.nan)
     if "radius" in chunk.columns:
-        radius = _filled(chunk, "radius", "0").numbers("radius", lambda v: v >= 0, "a radius >= 0 in pixels")
+        radius = _filled(chunk, "radius", "0").numbers("radius", limits.BLOB_RADIUS, f"a radius, {limits.BLOB_RADIUS}")
         result["radius"] = np.where(radius > 0, radius, np.nan)
     result["flags"] = np.zeros(count)
     if "flags" in chunk.columns:
-        limit = 2 * max(BlobFlag)
-        result["flags"] = chunk.numbers(
-            "flags", lambda v: (v >= 0) & (v < limit) & (v == np.trunc(v)), f"a sum of flag bits, 0 to {limit - 1}"
-        )
+        bits = limits.Range(0, 2 * max(BlobFlag) - 1, "")
+        result["flags"] = chunk.numbers("flags", bits, f"a sum of flag bits, {bits}", whole=True)
     return result
 
 

@@ -11,6 +11,7 @@ from imgcal.errors import InputError
 from imgcal.resources import data_path, shipped_names
 
 MOST_NAMES = 8  # that a message lists
+LONGEST_NAME = 200  # bytes: file systems end at 255, and something is put behind
 
 
 def natural_key(name: str) -> tuple[list[str | int], str]:
@@ -23,6 +24,18 @@ def nearest(name: str, known: Iterable[str]) -> str:
     names = {candidate.lower(): candidate for candidate in known}
     matches = difflib.get_close_matches(name.lower(), names, n=1)
     return f", nearest: {names[matches[0]]}" if matches else ""
+
+
+def is_file_name(name: str) -> bool:
+    """Tell whether the name of a camera or a snapshot can be a file name, which stays in its folder, and a CSV cell."""
+    sound = name.isprintable() and name == name.strip() and not name.startswith(".") and not set(name) & set("/\\")
+    return sound and 0 < len(name.encode()) <= LONGEST_NAME
+
+
+def title_of(path: Path) -> str:
+    """Make a name of a file name, which need not be text."""
+    name = "".join(c if c.isprintable() else "?" for c in path.stem)
+    return name[:LONGEST_NAME]
 
 
 def find_file(path: str | Path, kind: str, suffix: str) -> Path:
@@ -43,7 +56,7 @@ def find_file(path: str | Path, kind: str, suffix: str) -> Path:
     if str(path) in shipped:
         return data_path(kind, str(path) + suffix)
     if path.exists():
-        raise InputError(f"{path}: found a folder, expected a file")
+        raise InputError(f"{path}: found a {'folder' if path.is_dir() else 'device or pipe'}, expected a file")
     some = difflib.get_close_matches(path.stem, shipped, n=MOST_NAMES, cutoff=0.3) or shipped[:MOST_NAMES]
     names = shipped if len(shipped) <= MOST_NAMES else [*some, f"... {len(shipped)} in all"]
     raise InputError(

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from imgcal import limits
 from imgcal.errors import InputError
 from imgcal.formats.atomic import write_text
 from imgcal.formats.csv_file import Chunk, read_chunks
-from imgcal.formats.names import find_file
+from imgcal.formats.names import LONGEST_NAME, find_file, title_of
 from imgcal.messages import shortened
 from imgcal.objects import CalibrationObject
 from renderers.palette import palette
 
 # Nearer than this to one line, in units of the object's size, no pose can be found.
 COLLINEAR = 1e-6
+SMALLEST = 1e-3  # mm, extent of an object
 
 
 def load_object(path: str | Path) -> CalibrationObject:
@@ -32,22 +35,25 @@ def load_object(path: str | Path) -> CalibrationObject:
         InputError: one line with the file, the line, what was found and what was expected.
     """
     path = find_file(path, "objects", ".csv")
-    chunks = list(read_chunks(path, ("x", "y", "z"), ("name", "radius")))
+    chunks = list(islice(read_chunks(path, ("x", "y", "z"), ("name", "radius")), 2))
     count = sum(map(len, chunks))
-    if count < 4 or len(chunks) > 1:
-        raise InputError(f"{path}: found {count} points, expected 4 to a few hundred")
+    if not 4 <= count <= limits.MOST_FIDUCIALS:
+        found = count if count < 4 else f"more than {limits.MOST_FIDUCIALS}"
+        raise InputError(f"{path}: found {found} points, expected 4 to {limits.MOST_FIDUCIALS}")
     chunk = chunks[0]
-    axes = [chunk.numbers(axis, lambda v: np.abs(v) < 1e9, "a finite coordinate in mm") for axis in "xyz"]
+    axes = [chunk.numbers(axis, limits.COORDINATE, f"a finite coordinate, {limits.COORDINATE}") for axis in "xyz"]
     points = np.stack(axes, axis=1)
     _check_points(chunk, points)
     radius = None
     if "radius" in chunk.columns:
-        radius = torch.from_numpy(chunk.numbers("radius", lambda v: v > 0, "a radius > 0 in mm"))
+        radius = torch.from_numpy(
+            chunk.numbers("radius", limits.FIDUCIAL_RADIUS, f"a radius > 0, {limits.FIDUCIAL_RADIUS}")
+        )
     names = tuple(name.strip() for name in chunk.columns.get("name", ()))
     for row, name in enumerate(names):
-        if not name or name in names[:row]:
+        if not name or len(name) > LONGEST_NAME or not name.isprintable() or name in names[:row]:
             chunk.fail(row, f"name: found {shortened(name)!r}, expected a different name for every point")
-    return CalibrationObject(torch.from_numpy(points), palette(count).double(), radius, path.stem, names)
+    return CalibrationObject(torch.from_numpy(points), palette(count).double(), radius, title_of(path), names)
 
 
 def save_object(obj: CalibrationObject, path: str | Path) -> None:
@@ -72,5 +78,7 @@ def _check_points(chunk: Chunk, points: np.ndarray) -> None:
         original = int(first[groups.ravel()][row])
         chunk.fail(row, f"found the same point as in row {original + 1}, expected different points")
     singular = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    if singular[0] < SMALLEST:
+        raise InputError(f"{chunk.path}: found all {len(points)} points at one place, expected coordinates in mm")
     if singular[1] < COLLINEAR * singular[0]:
         raise InputError(f"{chunk.path}: found all {len(points)} points on one line, expected a plane or a solid")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -11,10 +12,12 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
+from imgcal import limits
 from imgcal.errors import InputError
 from imgcal.formats.atomic import write_text
-from imgcal.formats.names import find_file
+from imgcal.formats.names import LONGEST_NAME, find_file, is_file_name, title_of
 from imgcal.formats.yaml_file import Flow, FlowMap, StrictModel, read_yaml, validated, yaml_text
+from imgcal.messages import listed, quoted
 from imgcal.rig import PARAMETER_NAMES, PARAMETERS, CameraRig, RigPrior
 from imgcal.rotations import rotation_from_vector, vector_from_rotation
 from imgcal.transforms import RigidTransform
@@ -25,12 +28,24 @@ ENTRY_NAMES = {"cameras": "camera"}
 # How far the distortion may move a point at half the image diagonal, in units of its distance from the centre.
 LARGEST_DISTORTION = 10.0
 
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(allow_inf_nan=False, gt=0)]
-NotNegative = Annotated[float, Field(allow_inf_nan=False, ge=0)]
-Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
-Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
-Five = Annotated[list[Number], Field(min_length=5, max_length=5)]
+
+def _within(plausible: limits.Range) -> Any:
+    return Field(allow_inf_nan=False, ge=plausible.low, le=plausible.high)
+
+
+def _exactly(count: int) -> Any:
+    return Field(min_length=count, max_length=count)
+
+
+Focal = Annotated[float, _within(limits.FOCAL_LENGTH)]
+Pixel = Annotated[float, _within(limits.PIXEL)]
+Coefficient = Annotated[float, _within(limits.DISTORTION)]
+Shift = Annotated[float, _within(limits.TRANSLATION)]
+Angle = Annotated[float, Field(allow_inf_nan=False, ge=-1e6, le=1e6)]
+Spread = Annotated[float, Field(allow_inf_nan=False, ge=0, le=1e12)]
+Covariance = Annotated[float, Field(allow_inf_nan=False, ge=-1e24, le=1e24)]
+Side = Annotated[int, Field(gt=0, le=limits.LONGEST_SIDE)]
+Name = Annotated[str, Field(max_length=LONGEST_NAME)]
 
 
 @dataclass(frozen=True)
@@ -49,8 +64,8 @@ class RigCovariance:
 
 
 class _Transform(StrictModel):
-    rotation_vector: Triple
-    translation: Triple
+    rotation_vector: Annotated[list[Angle], _exactly(3)]
+    translation: Annotated[list[Shift], _exactly(3)]
 
     @model_validator(mode="after")
     def _in_radians(self) -> _Transform:
@@ -61,28 +76,29 @@ class _Transform(StrictModel):
 
 
 class _Std(StrictModel):
-    rotation: Annotated[list[NotNegative], Field(min_length=3, max_length=3)]
-    position: Annotated[list[NotNegative], Field(min_length=3, max_length=3)]
-    focal_length: Annotated[list[NotNegative], Field(min_length=2, max_length=2)]
-    principal_point: Annotated[list[NotNegative], Field(min_length=2, max_length=2)]
-    distortion: Annotated[list[NotNegative], Field(min_length=5, max_length=5)]
+    rotation: Annotated[list[Spread], _exactly(3)]
+    position: Annotated[list[Spread], _exactly(3)]
+    focal_length: Annotated[list[Spread], _exactly(2)]
+    principal_point: Annotated[list[Spread], _exactly(2)]
+    distortion: Annotated[list[Spread], _exactly(5)]
 
 
 class _Camera(StrictModel):
     name: str
-    image_size: Annotated[list[Annotated[int, Field(gt=0, le=2**20)]], Field(min_length=2, max_length=2)]
-    focal_length: Annotated[list[Positive], Field(min_length=2, max_length=2)]
-    principal_point: Pair
-    distortion: Five
+    image_size: Annotated[list[Side], _exactly(2)]
+    focal_length: Annotated[list[Focal], _exactly(2)]
+    principal_point: Annotated[list[Pixel], _exactly(2)]
+    distortion: Annotated[list[Coefficient], _exactly(5)]
     cam_from_rig: _Transform
     std: _Std | None = None
 
     @model_validator(mode="after")
     def _sound(self) -> _Camera:
-        name = self.name
         # The name is also a file name in a capture and a cell of a CSV file.
-        if not name.isprintable() or name != name.strip() or not name or name.startswith(".") or set(name) & set("/\\"):
-            raise ValueError(f"found the camera name {name!r}, expected a name that can be a file name")
+        if not is_file_name(self.name):
+            raise ValueError(f"found the camera name {quoted(self.name)!r}, expected a name that can be a file name")
+        if math.prod(self.image_size) > limits.MOST_PIXELS:
+            raise ValueError(f"image_size: found {self.image_size}, expected at most {limits.MOST_PIXELS:,} pixels")
         radius = math.hypot(*self.image_size) / 2 / min(self.focal_length)
         k1, k2, p1, p2, k3 = (abs(k) for k in self.distortion)
         shift = k1 * radius**2 + k2 * radius**4 + k3 * radius**6 + 3 * (p1 + p2) * radius
@@ -95,36 +111,39 @@ class _Camera(StrictModel):
 
 
 class _Prior(StrictModel):
-    focal_length: Positive = RigPrior.focal_length
-    principal_point: Positive = RigPrior.principal_point
-    distortion: Positive = RigPrior.distortion
-    rotation: Positive = RigPrior.rotation
-    position: Positive = RigPrior.position
+    focal_length: Annotated[float, _within(limits.PRIOR_FOCAL_LENGTH)] = RigPrior.focal_length
+    principal_point: Annotated[float, _within(limits.PRIOR_PRINCIPAL_POINT)] = RigPrior.principal_point
+    distortion: Annotated[float, _within(limits.PRIOR_DISTORTION)] = RigPrior.distortion
+    rotation: Annotated[float, _within(limits.PRIOR_ROTATION)] = RigPrior.rotation
+    position: Annotated[float, _within(limits.PRIOR_POSITION)] = RigPrior.position
 
 
 class _Covariance(StrictModel):
-    reference_camera: str | None = None
-    parameters: list[str]
-    matrix: list[list[Number]] | None = None
+    reference_camera: Name | None = None
+    parameters: Annotated[list[Name], Field(max_length=PARAMETERS)]
+    # One wrong value of millions is enough to know.
+    matrix: (
+        Annotated[list[Annotated[list[Covariance], Field(fail_fast=True)]], Field(min_length=1, fail_fast=True)] | None
+    ) = None
 
 
 class _RigFile(StrictModel):
     format: Literal["imgcal-rig/1"]
-    name: str | None = None
-    working_distance: Positive | None = None
-    cameras: Annotated[list[_Camera], Field(min_length=1)]
+    name: Name | None = None
+    working_distance: Annotated[float, _within(limits.DISTANCE)] | None = None
+    cameras: Annotated[list[_Camera], Field(min_length=1, max_length=limits.MOST_CAMERAS)]
     prior: _Prior | None = None
     covariance: _Covariance | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> _RigFile:
         names = [camera.name for camera in self.cameras]
-        twice = sorted({name for name in names if names.count(name) > 1})
-        if twice:
-            raise ValueError(f"found the camera name {twice[0]} more than once, expected different names")
+        twice, times = Counter(names).most_common(1)[0]
+        if times > 1:
+            raise ValueError(f"found the camera name {twice} more than once, expected different names")
         given = [camera.name for camera in self.cameras if camera.std is not None]
         if given and len(given) < len(names):
-            raise ValueError(f"found `std` for {', '.join(given)} only, expected it for all cameras or none")
+            raise ValueError(f"found `std` for {listed(given)} only, expected it for all cameras or none")
         if bool(given) != (self.covariance is not None):
             raise ValueError(
                 "expected `std` of the cameras and the block `covariance` together, found only one of them"
@@ -162,7 +181,7 @@ def load_rig(path: str | Path) -> CameraRig:
         ),
         image_size=torch.tensor([camera.image_size for camera in cameras]),
         camera_names=tuple(camera.name for camera in cameras),
-        name=content.name if content.name is not None else path.stem,
+        name=content.name if content.name is not None else title_of(path),
         working_distance=content.working_distance,
         prior=None if content.prior is None else RigPrior(**content.prior.model_dump()),
     )
@@ -253,7 +272,7 @@ def _std_tensor(content: _RigFile) -> Tensor:
 def _check_covariance(covariance: _Covariance, names: list[str], std: Tensor) -> None:
     if covariance.reference_camera is not None and covariance.reference_camera not in names:
         found = covariance.reference_camera
-        raise ValueError(f"covariance: found reference_camera {found}, expected one of {', '.join(names)}")
+        raise ValueError(f"covariance: found reference_camera {found}, expected one of {listed(names)}")
     if tuple(covariance.parameters) != PARAMETER_NAMES:
         raise ValueError(f"covariance: found other parameters than {', '.join(PARAMETER_NAMES)}, or another order")
     if covariance.matrix is None:

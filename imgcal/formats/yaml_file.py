@@ -13,9 +13,11 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from imgcal.errors import InputError
 from imgcal.formats.names import nearest
+from imgcal.formats.yaml_values import read_values
+from imgcal.messages import shortened
 
-# libyaml's parser reads a full covariance in tenths of a second; the pure Python one needs seconds.
-_BaseLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+MOST_BYTES = 2**26
+MOST_PROBLEMS = 1000  # that are looked at one by one
 _BaseDumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 
@@ -70,8 +72,8 @@ def validated(
 def parse_yaml(text: str, where: str) -> Any:
     """Read a value from YAML text that does not come from a file; errors begin with `where`."""
     try:
-        return yaml.load(text, Loader=_Loader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        return read_values(text.encode(errors="replace"))
+    except yaml.YAMLError as error:
         raise InputError(f"{where}: found {reprlib.repr(text)}, expected a value in YAML") from error
 
 
@@ -82,37 +84,23 @@ def yaml_text(content: dict[str, Any]) -> str:
     )
 
 
-class _Loader(_BaseLoader):
-    """YAML 1.2 numbers (1e-5 is one), keys that stay text (`false: 0.1`), no silent overwriting of one by a second."""
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        seen: set[str] = set()
-        for key, _ in node.value:
-            if isinstance(key, yaml.ScalarNode) and key.value in seen:
-                raise yaml.MarkedYAMLError(problem=f"key `{key.value}` given twice", problem_mark=key.start_mark)
-            seen.add(str(key.value))
-            if key.tag == "tag:yaml.org,2002:bool":
-                key.tag = "tag:yaml.org,2002:str"
-        mapping: dict[Any, Any] = super().construct_mapping(node, deep=deep)
-        return mapping
-
-
 class _Dumper(_BaseDumper):
     """Flow style for `Flow` and `FlowMap`, block style for the rest."""
 
 
-for _side in (_Loader, _Dumper):  # the writer, too: it puts quotes around a name that looks like a number
-    _side.add_implicit_resolver(
-        "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"), list("-+0123456789.")
-    )
+# 1e-5 is a number to the reader: the writer puts quotes around a name that looks like it.
+_Dumper.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"), list("-+0123456789.")
+)
 _Dumper.add_representer(Flow, lambda d, v: d.represent_sequence("tag:yaml.org,2002:seq", v, flow_style=True))
 _Dumper.add_representer(FlowMap, lambda d, v: d.represent_mapping("tag:yaml.org,2002:map", v.items(), flow_style=True))
 
 
 def _parse(path: Path) -> Any:
     try:
-        with open(path, "rb") as file:
-            return yaml.load(file, Loader=_Loader)
+        if path.stat().st_size > MOST_BYTES:
+            raise InputError(f"{path}: found {path.stat().st_size:,} bytes, expected at most {MOST_BYTES:,}")
+        return read_values(path.read_bytes())
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
     except yaml.MarkedYAMLError as error:
@@ -121,12 +109,13 @@ def _parse(path: Path) -> Any:
         raise InputError(f"{path}: not valid YAML{line}: {error.problem or error.context}") from error
     except yaml.YAMLError as error:
         raise InputError(f"{path}: not a YAML text file: {str(error).splitlines()[0]}") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not valid YAML: {reprlib.repr(str(error))}") from error
 
 
 def _summary(error: ValidationError, content: Any, model: type[BaseModel], entry_names: Mapping[str, str]) -> str:
     """Put the first problem into words; a misspelt key comes before the missing key that follows from it."""
+    if error.error_count() > MOST_PROBLEMS:
+        keys = ", ".join(model.model_fields)
+        return f"found {error.error_count():,} values that do not belong there, expected the keys {keys}"
     problems = sorted(error.errors(), key=lambda problem: problem["type"] != "extra_forbidden")
     first = problems[0]
     more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
@@ -135,7 +124,7 @@ def _summary(error: ValidationError, content: Any, model: type[BaseModel], entry
     context = first.get("ctx", {})
     match first["type"]:
         case "extra_forbidden":
-            key = str(location[-1])
+            key = shortened(str(location[-1]))
             known = _record(model, location[:-1]).model_fields
             before = _place(location[:-1], content, entry_names)
             return f"{before}unknown key `{key}`{nearest(key, known) or ', expected one of ' + ', '.join(known)}{more}"
@@ -161,11 +150,11 @@ def _place(location: tuple[str | int, ...], content: Any, entry_names: Mapping[s
             content = None
         if isinstance(step, int) and previous in entry_names:
             name = content.get("name") if isinstance(content, dict) else None
-            words[-1] = f"{entry_names[previous]} {name if isinstance(name, str) else f'number {step + 1}'}"
+            words[-1] = f"{entry_names[previous]} {shortened(name) if isinstance(name, str) else f'number {step + 1}'}"
         elif isinstance(step, int):
             words[-1] += f"[{step}]"
         else:
-            words.append(step)
+            words.append(shortened(step))
         previous = str(step)
     return "".join(word + ": " for word in words)
 

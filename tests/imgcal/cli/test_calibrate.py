@@ -296,3 +296,11 @@ def test_a_start_pose_that_is_no_number_is_explained(workplace, tmp_path, capsys
     out = tmp_path / "out"
     assert calibrate(workplace, workplace.capture, out, "--start-pose", *"00000", "nan") == 2
     assert "--start-pose: found" in one_line(capsys)
+
+
+def test_leaving_out_all_cameras_is_one_line(workplace, tmp_path, capsys):
+    assert (
+        calibrate(workplace, workplace.capture, tmp_path / "out", "--without", *load_rig(workplace.rig).camera_names)
+        == 2
+    )
+    assert "--without: found all 4 cameras" in one_line(capsys)

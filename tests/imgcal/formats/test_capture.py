@@ -1,3 +1,4 @@
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -74,6 +75,22 @@ def test_one_file_a_camera(tmp_path: Path) -> None:
     assert seen["10"] == [10, 30, None]
     assert seen["11"] == [11, None, None]
     assert [int(f["b"][0, 0]) for _, f in capture.snapshots(3, 5) if f["b"] is not None] == [23, 24]
+
+
+@pytest.mark.parametrize("name", [b"frames/a/\xff.png", b"frames/\xff/0.png", b"frames/a/0\x1b[31m.png"])
+def test_names_that_are_no_text(name: bytes, tmp_path: Path) -> None:
+    put(tmp_path, "frames/a/1.png")
+    path = tmp_path / os.fsdecode(name)
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes((tmp_path / "frames/a/1.png").read_bytes())
+    with pytest.raises(InputError, match="a name that is no text"):
+        open_capture(tmp_path)
+
+
+def test_a_pipe_is_no_input(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.csv")
+    with pytest.raises(InputError, match="device or pipe"):
+        open_input(tmp_path / "pipe.csv")
 
 
 def test_frames_are_read_only_when_asked_for(tmp_path: Path) -> None:

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from imgcal.errors import InputError
-from imgcal.formats.csv_file import CHUNK
+from imgcal.formats import csv_file
+from imgcal.formats.csv_file import CHUNK, Chunk
 from imgcal.formats.detections_csv import DEFAULT_SIGMA, load_detections, save_detections
 from imgcal.formats.rig_yaml import load_rig
 from imgcal.observations import Detections
@@ -49,8 +50,8 @@ def test_round_trip_is_exact(name: str, count: int, tmp_path: Path) -> None:
 
 
 @settings(max_examples=30, deadline=None)
-@given(st.lists(st.tuples(*[st.floats(allow_nan=False, allow_infinity=False)] * 2), min_size=6, max_size=12))
-def test_any_finite_coordinate_survives(
+@given(st.lists(st.tuples(*[st.floats(-1e6, 1e6)] * 2), min_size=6, max_size=12))
+def test_any_plausible_coordinate_survives(
     tmp_path_factory: pytest.TempPathFactory, uv: list[tuple[float, float]]
 ) -> None:
     detections = replace(make_detections(len(uv), labelled=False), uv=np.array(uv))
@@ -109,6 +110,13 @@ HEAD = "snapshot,camera,u,v,sigma,fiducial\n0,cam01,1,2,0.1,0\n"
         (HEAD + "0,cam1,1,2,0.1,1\n", r"line 3: camera: found 'cam1' \(this file: cam01, cam1\).*cam02.*nearest"),
         (HEAD + "0,,1,2,0.1,1\n", "line 3: camera: found ''"),
         (HEAD + ",cam01,1,2,0.1,1\n", "line 3: snapshot: found an empty cell"),
+        *[(HEAD + f"{name},cam01,1,2,0.1,1\n", "line 3: snapshot: found .*expected a name that can be a file name")
+          for name in ("../../x", "/abs/x", "a/b", "..", ".hidden", "a\\b", " a", "a\x1b[31m", "x" * 300)],
+        (HEAD + "0,cam01,1e7,2,0.1,1\n", r"line 3: u: found 1e7"),
+        (HEAD + "0,cam01,1,2,1e-300,1\n", r"line 3: sigma: found 1e-300"),
+        (HEAD + "0,cam01,1,2,1e300,1\n", r"line 3: sigma: found 1e300"),
+        (HEAD + "0" * 2_000_000 + ",cam01,1,2,0.1,1\n", "a line of more than"),
+        (HEAD + "," * 100_000 + "\n", "found 100001 cells"),
         (HEAD + "0,cam01,1,2,0.1,8\n", "line 3: fiducial: found 8, expected a row of the object, 0 to 7"),
         (HEAD + "0,cam01,1,2,0.1,-2\n", "line 3: fiducial: found -2"),
         (HEAD + "0,cam01,1,2,0.1,inf\n", "line 3: fiducial: found inf"),
@@ -126,6 +134,24 @@ def test_bad_files_give_one_clear_line(content: str | bytes, message: str, tmp_p
         load_detections(path, load_rig("O10"), fiducials=8)
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
+
+
+def test_a_compressed_file_that_unpacks_to_a_flood_is_left_soon(tmp_path: Path, monkeypatch) -> None:
+    path = tmp_path / "d.csv.gz"
+    path.write_bytes(gzip.compress(b"snapshot,camera,u,v\n" + b"0,cam01,1.5,2.5\n" * 2_000_000))
+    read = []
+    numbers = Chunk.numbers
+    monkeypatch.setattr(Chunk, "numbers", lambda *given: read.append(1) or numbers(*given))
+    with pytest.raises(InputError, match=r"bytes and more, compressed to [\d,]+, expected at most 100 times"):
+        load_detections(path)
+    assert len(read) * CHUNK < 2_500_000  # of 4,000,000 numbers
+
+
+def test_more_rows_than_can_be(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(csv_file, "MOST_ROWS", 3 * CHUNK)
+    (tmp_path / "d.csv").write_text("snapshot,camera,u,v\n" + "0,cam01,1.5,2.5\n" * 4 * CHUNK)
+    with pytest.raises(InputError, match="more than 3,000 rows"):
+        load_detections(tmp_path / "d.csv")
 
 
 def test_line_numbers_are_right_in_later_chunks(tmp_path: Path) -> None:
