@@ -18,10 +18,8 @@ EXCEPTIONAL = 2.0
 """Times the other cameras' error from which a camera is named as an exception."""
 MOST_NAMED = 3
 """Cameras named in the sentence."""
-MORE_SNAPSHOTS = (5, 10, 20, 50, 100)
+MORE_SNAPSHOTS = (5, 10, 20, 30, 50, 100)
 """Numbers that are advised."""
-UNSEEN_ADVICE = 20
-"""The same, for a camera that has seen nothing."""
 MAP = len(MAP_DEPTHS) // 2
 """The map that is drawn: the one in the middle of the depths."""
 
@@ -57,24 +55,27 @@ def advice(content: ReportContent) -> tuple[str, ...]:
     if predicted is None:
         return ()
     usual = float(np.median([px for px in predicted.camera_px if math.isfinite(px)] or [math.nan]))
+    seen = [_snapshots_seen(content, camera) for camera in range(len(content.cameras))]
     steps: dict[int, list[str]] = {}
     for camera in _by_error(predicted)[:MOST_NAMED]:
         if predicted.camera_px[camera] > EXCEPTIONAL * usual:
-            wanted = more_snapshots(_snapshots_seen(content, camera), predicted.camera_px[camera] / usual)
+            wanted = more_snapshots(seen[camera], int(np.median(seen)), predicted.camera_px[camera] / usual)
             steps.setdefault(wanted, []).append(content.cameras[camera])
     return tuple(f"Take {n} more snapshots in the view of {', '.join(names)}." for n, names in steps.items())
 
 
-def more_snapshots(seen: int, ratio: float) -> int:
-    """How many more snapshots bring a camera to the others: its variance falls with the number that it has seen.
+def more_snapshots(seen: int, usual: int, ratio: float) -> int:
+    """How many more snapshots bring a camera to the others.
+
+    As many as it has seen less than they; or fewer, if its variance, which falls with their number, is there before.
 
     Args:
         seen: snapshots that took part, in which the camera saw the object.
+        usual: the same, of the others.
         ratio: its error over that of the others.
     """
-    if seen == 0:
-        return UNSEEN_ADVICE
-    wanted = seen * (ratio**2 - 1)
+    by_variance = seen * (ratio**2 - 1)
+    wanted = min(by_variance, usual - seen) if 0 < seen < usual else by_variance or usual
     return next((n for n in MORE_SNAPSHOTS if n >= wanted), MORE_SNAPSHOTS[-1])
 
 

@@ -46,7 +46,7 @@ def test_a_camera_that_saw_nothing_is_brought_the_object(content):
     blind = content.detections.camera == 6
     assert bad.predicted_after is not None
     unseen = np.where(blind[:, None], np.nan, bad.predicted_after)
-    assert advice(replace(bad, predicted_after=unseen)) == ("Take 20 more snapshots in the view of cam07.",)
+    assert advice(replace(bad, predicted_after=unseen)) == ("Take 10 more snapshots in the view of cam07.",)
 
 
 def test_a_volume_that_is_hardly_seen_says_so(content):
@@ -67,9 +67,11 @@ def test_nothing_is_said_of_a_refused_run(refused_content):
     assert "nothing can be predicted" in render(refused_content)
 
 
-@pytest.mark.parametrize(("seen", "ratio", "expected"), [(0, 99, 20), (1, 2, 5), (5, 2, 20), (5, 3, 50), (20, 9, 100)])
+@pytest.mark.parametrize(
+    ("seen", "ratio", "expected"), [(0, 99, 30), (1, 2, 5), (5, 2, 20), (5, 9, 30), (30, 1.4, 30), (60, 2, 100)]
+)
 def test_number_of_snapshots(seen, ratio, expected):
-    assert more_snapshots(seen, ratio) == expected
+    assert more_snapshots(seen, 30, ratio) == expected
 
 
 def test_classes_are_round_and_the_median_is_in_the_second():
