@@ -15,7 +15,6 @@ import tyro
 from imgcal.cli.common import (
     StartPose,
     check_folder,
-    make_folder,
     only_cameras,
     progress,
     read_detections,
@@ -27,11 +26,13 @@ from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import relative_covariance
 from imgcal.first_guess import load_guesser
-from imgcal.formats import RigCovariance, load_object, load_rig, open_input, save_rig, write_text
+from imgcal.formats import RigCovariance, load_object, load_rig, open_input, publishing, save_rig, write_text
 from imgcal.labelling import PipelineOptions
 from imgcal.pipeline import Calibration, calibrate, rms_length
 from imgcal.report import write_report
 from imgcal.rig import CameraRig
+
+WRITTEN = ("report.html", "rig.yaml", "result.json")
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,8 @@ class Calibrate:
 
     Writes OUT/rig.yaml (the recalibrated rig, with the standard deviation of every parameter), OUT/result.json and
     OUT/report.html. If the data cannot decide, the reason is in result.json and report.html, no rig.yaml is written
-    and the exit code is 3. Example: imgcal calibrate my_capture --rig factory.yaml --object object.csv --out result
+    and the exit code is 3. OUT changes when all is written; any other failure leaves it as it was.
+    Example: imgcal calibrate my_capture --rig factory.yaml --object object.csv --out result
     """
 
     input: Annotated[Path, tyro.conf.Positional]  #: capture folder or detections file
@@ -63,7 +65,7 @@ class Calibrate:
     def run(self) -> None:
         """Calibrate and write."""
         started = time.perf_counter()
-        check_folder(self.out)
+        self._check_out()
         complete, obj = load_rig(self.rig), load_object(self.object)
         rig = without_cameras(complete, self.without)
         reference = self._reference(rig)
@@ -74,39 +76,41 @@ class Calibrate:
         detections, frames = read_detections(source, self.snapshots, self.detection)
         detections = only_cameras(detections, rig)
         seconds = {"loading": loaded - started, "reading and detection": time.perf_counter() - loaded}
-        out = make_folder(self.out)
 
         def bar(snapshots: Iterable[int], total: int) -> Iterable[int]:
             return progress(snapshots, total, "identifying")
 
-        refusal: RefusedError | None = None
-        calibration: Calibration | None = None
+        outcome: Calibration | RefusedError
         try:
-            calibration = calibrate(detections, rig, obj, options, guesser=guesser, progress=bar)
+            outcome = calibrate(detections, rig, obj, options, guesser=guesser, progress=bar)
+            seconds |= {name: value for name, value in outcome.seconds.items() if name != "detection"}
         except RefusedError as error:
-            refusal = error
-        seconds |= {} if calibration is None else {k: v for k, v in calibration.seconds.items() if k != "detection"}
-        if calibration is None:
-            # A rig of an earlier run beside a refusal would be taken for the result of this one.
-            (out / "rig.yaml").unlink(missing_ok=True)
-            result = refused_summary(refusal.for_command, detections.snapshot_names, seconds)
-        else:
-            covariance = RigCovariance.from_matrix(
-                relative_covariance(calibration, reference), rig.camera_names[reference]
-            )
-            save_rig(calibration.rig, out / "rig.yaml", covariance, full=self.full_covariance)
-            result = summary(calibration, seconds)
-        if self.report:
-            content = (
-                describe_refusal(refusal.for_command, detections, rig, obj, frames, seconds)
-                if calibration is None
-                else describe(calibration, rig, obj, frames, reference, seconds)
-            )
-            write_report(content, out / "report.html")
-        write_text(out / "result.json", json.dumps(result, indent=2) + "\n")
-        if refusal is not None:
-            raise refusal
-        _print(result, out, self.report)
+            outcome = error
+        with publishing(self.out, WRITTEN, mark="result.json") as out:
+            if isinstance(outcome, RefusedError):
+                result = refused_summary(outcome.for_command, detections.snapshot_names, seconds)
+                content = describe_refusal(outcome.for_command, detections, rig, obj, frames, seconds)
+            else:
+                covariance = RigCovariance.from_matrix(
+                    relative_covariance(outcome, reference), rig.camera_names[reference]
+                )
+                save_rig(outcome.rig, out / "rig.yaml", covariance, full=self.full_covariance)
+                result = summary(outcome, seconds)
+                content = describe(outcome, rig, obj, frames, reference, seconds)
+            if self.report:
+                write_report(content, out / "report.html")
+            write_text(out / "result.json", json.dumps(result, indent=2) + "\n")
+        if isinstance(outcome, RefusedError):
+            raise outcome
+        _print(result, self.out, self.report)
+
+    def _check_out(self) -> None:
+        """The inputs must survive: a refusal would remove the very rig that it started from."""
+        check_folder(self.out)
+        for name in WRITTEN:
+            for option, given in (("--rig", self.rig), ("--object", self.object), ("INPUT", self.input)):
+                if (self.out / name).exists() and Path(given).exists() and (self.out / name).samefile(given):
+                    raise InputError(f"--out: {self.out / name} is what {option} reads, expected another folder")
 
     def _reference(self, rig: CameraRig) -> int:
         if self.reference is None:

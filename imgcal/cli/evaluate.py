@@ -14,9 +14,9 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from imgcal.cli.common import check_folder, make_folder
+from imgcal.cli.common import check_folder
 from imgcal.errors import InputError
-from imgcal.formats import load_object, load_rig
+from imgcal.formats import load_object, load_rig, publishing
 
 if TYPE_CHECKING:
     from imgcal.evaluation import Conditions, Method, Protocol
@@ -96,7 +96,7 @@ class Compare:
 def _run(paths: tuple[Path, ...], setting: Setting, baselines: bool, out: Path | None) -> None:
     # Imported late: what brings networks and plots along takes seconds, which the other commands should not wait.
     from imgcal.evaluation import BASELINES, Protocol
-    from imgcal.evaluation.report import write
+    from imgcal.evaluation.report import PLOTS, RESULT, TABLES, write
 
     if out is not None:
         check_folder(out)
@@ -108,8 +108,10 @@ def _run(paths: tuple[Path, ...], setting: Setting, baselines: bool, out: Path |
     report = replace(report, facts={model.name: model.facts for model in models})
     _print(report)
     if out is not None:
-        for path in write(report, make_folder(out)):
-            print(f"wrote {path}", file=sys.stderr)
+        with publishing(out, (*PLOTS, TABLES, RESULT), mark=RESULT) as folder:
+            written = write(report, folder)
+        for path in written:
+            print(f"wrote {out / path.name}", file=sys.stderr)
 
 
 def _load(paths: tuple[Path, ...], setting: Setting) -> list[Model]:

@@ -12,9 +12,10 @@ import numpy as np
 import torch
 import tyro
 
-from imgcal.cli.common import check_folder, make_folder, progress, read_detections
+from imgcal.cli.common import check_folder, progress, read_detections
 from imgcal.detection import DetectionOptions
-from imgcal.formats import load_object, load_rig, open_input, write_image
+from imgcal.errors import InputError
+from imgcal.formats import load_object, load_rig, open_input, publishing, write_image
 from imgcal.labelling import label, matched_to_rig, to_observations
 from imgcal.networks.rendering import LEVELS, ImageOptions, render_views
 
@@ -41,6 +42,8 @@ class Render:
         options = ImageOptions(self.size, self.dot)
         check_folder(self.out)
         rig, obj = load_rig(self.rig), load_object(self.object)
+        if any((self.out / camera).exists() for camera in rig.camera_names):
+            raise InputError(f"{self.out}: found images of these cameras there already, expected a new folder")
         detections, _ = read_detections(open_input(self.input, rig, obj.fiducials), self.snapshots, self.detection)
 
         def bar(snapshots: Iterable[int], total: int) -> Iterable[int]:
@@ -49,14 +52,15 @@ class Render:
         labelled = label(matched_to_rig(detections, rig), rig, obj, progress=bar)
         kept = labelled.detections.select(np.isin(labelled.detections.snapshot, labelled.used))
         observations = to_observations(kept, rig, obj)
-        for camera in rig.camera_names:
-            make_folder(self.out / camera)
-        for row, snapshot in enumerate(progress(labelled.used, len(labelled.used), "rendering")):
-            name = labelled.snapshots[snapshot].name
-            images = render_views(observations.uv[row], observations.seen[row], rig.image_size, obj, options)
-            pixels = (images * LEVELS).round().to(torch.uint8).permute(0, 2, 3, 1).numpy()
-            for camera, image in zip(rig.camera_names, pixels, strict=True):
-                write_image(self.out / camera / f"{name}.png", image)
+        with publishing(self.out, rig.camera_names, mark=rig.camera_names[-1]) as out:
+            for camera in rig.camera_names:
+                (out / camera).mkdir()
+            for row, snapshot in enumerate(progress(labelled.used, len(labelled.used), "rendering")):
+                name = labelled.snapshots[snapshot].name
+                images = render_views(observations.uv[row], observations.seen[row], rig.image_size, obj, options)
+                pixels = (images * LEVELS).round().to(torch.uint8).permute(0, 2, 3, 1).numpy()
+                for camera, image in zip(rig.camera_names, pixels, strict=True):
+                    write_image(out / camera / f"{name}.png", image)
         refused = len(labelled.snapshots) - len(labelled.used)
         print(
             f"{len(labelled.used)} snapshots written to {self.out}, {refused} left out (identity refused)",

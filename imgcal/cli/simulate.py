@@ -10,11 +10,12 @@ from typing import Literal
 
 import torch
 
-from imgcal.cli.common import check_folder, make_folder, progress
+from imgcal.cli.common import check_folder, progress
 from imgcal.errors import InputError
 from imgcal.formats import (
     load_object,
     load_rig,
+    publishing,
     save_capture_settings,
     save_detections,
     save_object,
@@ -22,10 +23,14 @@ from imgcal.formats import (
     write_frame,
     write_text,
 )
+from imgcal.objects import CalibrationObject
+from imgcal.rig import CameraRig
 from imgcal.rotations import vector_from_rotation
 from imgcal.simulation import FrameModel, Truth, simulate_frames, simulate_truth, true_detections
 from imgcal.synthesis import Drift, PhysicalDrift, PoseRange, RelativeDrift
 from renderers import ClutterModel, SensorModel
+
+WRITTEN = ("capture.yaml", "rig.yaml", "object.csv", "truth", "frames")
 
 
 @dataclass(frozen=True)
@@ -64,24 +69,29 @@ class Simulate:
             if not low <= high:
                 raise InputError(f"--{name.replace('_', '-')}: found {low} {high}, expected the smaller angle first")
         check_folder(self.out)
-        if (self.out / "frames").exists():
+        if any((self.out / name).exists() for name in ("frames", "truth")):
             raise InputError(f"{self.out}: found a capture there already, expected a new folder")
         rig, obj = load_rig(self.rig), load_object(self.object)
         generator = torch.Generator().manual_seed(self.seed)
         truth = simulate_truth(rig, obj, self.snapshots, generator, self._drift(), self._pose_range())
-        out = make_folder(self.out)
+        with publishing(self.out, WRITTEN, mark="frames") as out:
+            self._write(truth, rig, obj, generator, out)
+        print(f"{self.snapshots} snapshots of {rig.cameras} cameras written to {self.out}", file=sys.stderr)
+
+    def _write(
+        self, truth: Truth, rig: CameraRig, obj: CalibrationObject, generator: torch.Generator, out: Path
+    ) -> None:
         save_capture_settings(out, self.sensor.bit_depth, note=f"simulated, seed {self.seed}")
         save_rig(rig, out / "rig.yaml")
         save_object(obj, out / "object.csv")
         _write_truth(truth, out / "truth")
         model = FrameModel(self.sensor, self.clutter_model if self.clutter else None, self.marker_radius)
         for camera in rig.camera_names:
-            make_folder(out / "frames" / camera)
+            (out / "frames" / camera).mkdir(parents=True)
         frames = simulate_frames(truth, obj, model, generator)
         for snapshot, images in enumerate(progress(frames, self.snapshots, "rendering frames")):
             for camera, image in images.items():
                 write_frame(out / "frames" / camera / f"{snapshot:05d}.png", image)
-        print(f"{self.snapshots} snapshots of {rig.cameras} cameras written to {out}", file=sys.stderr)
 
     def _drift(self) -> Drift | None:
         kinds: dict[str, Drift | None] = {
@@ -99,7 +109,7 @@ class Simulate:
 
 
 def _write_truth(truth: Truth, folder: Path) -> None:
-    make_folder(folder)
+    folder.mkdir()
     save_rig(replace(truth.rig, name=f"{truth.rig.name} drifted", prior=None), folder / "rig.yaml")
     save_detections(true_detections(truth), folder / "detections.csv")
     poses = torch.cat((vector_from_rotation(truth.rig_from_object.rotation), truth.rig_from_object.translation), dim=-1)

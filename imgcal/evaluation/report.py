@@ -15,12 +15,13 @@ from rich.table import Table as RichTable
 
 from imgcal.evaluation.latency import Latency
 from imgcal.evaluation.protocol import REFERENCE, Conditions, Evaluation, Row, Scores
-from imgcal.evaluation.sweep import Sweep
+from imgcal.evaluation.sweep import AXES, Sweep
 from imgcal.formats import write_text
 from imgcal.synthesis import RelativeDrift
 
 FORMAT = "imgcal-evaluation/1"
 RESULT, TABLES = "evaluation.json", "evaluation.md"
+PLOTS = (*(f"error-{axis}.png" for axis in AXES), "training.png", "latency.png")
 MISSING = "–"
 HUGE = 1e4  # pixels and so on, above which a table does not say how much
 

@@ -5,6 +5,7 @@ from imgcal.formats.capture import Capture, open_capture, open_input, save_captu
 from imgcal.formats.detections_csv import load_detections, save_detections
 from imgcal.formats.frames import Frame, read_frame, write_frame, write_image
 from imgcal.formats.object_csv import load_object, save_object
+from imgcal.formats.publishing import publishing
 from imgcal.formats.rig_yaml import RigCovariance, load_rig, load_rig_covariance, save_rig
 
 __all__ = [
@@ -17,6 +18,7 @@ __all__ = [
     "load_rig_covariance",
     "open_capture",
     "open_input",
+    "publishing",
     "read_frame",
     "replacing",
     "save_capture_settings",

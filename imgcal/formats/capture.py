@@ -20,6 +20,7 @@ from imgcal.formats.atomic import write_text
 from imgcal.formats.detections_csv import load_detections
 from imgcal.formats.frames import IMAGE_SUFFIXES, TIFF_SUFFIXES, VIDEO_SUFFIXES, Frame, Video, count_frames, read_frame
 from imgcal.formats.names import is_file_name, natural_key, nearest
+from imgcal.formats.publishing import is_unfinished
 from imgcal.formats.yaml_file import StrictModel, read_yaml, validated, yaml_text
 from imgcal.messages import listed
 from imgcal.observations import Detections
@@ -120,6 +121,8 @@ def open_capture(folder: str | Path, rig: CameraRig | None = None) -> Capture:
     frames = folder / "frames"
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder, expected a capture that holds frames/<camera name>/")
+    if not frames.is_dir() and is_unfinished(folder):
+        raise InputError(f"{folder}: found a capture that was not finished, expected one whose making came to its end")
     if not frames.is_dir():
         found = listed(path.name for path in _listing(folder)) or "an empty folder"
         raise InputError(f"{folder}: found {found}, expected a capture that holds frames/<camera name>/")

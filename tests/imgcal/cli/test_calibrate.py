@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from imgcal.cli.main import main
+from imgcal.errors import InputError
 from imgcal.estimation import relative_difference
 from imgcal.formats import (
     load_detections,
@@ -304,3 +305,55 @@ def test_leaving_out_all_cameras_is_one_line(workplace, tmp_path, capsys):
         == 2
     )
     assert "--without: found all 4 cameras" in one_line(capsys)
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.fixture
+def blind(workplace, tmp_path):
+    """Detections that are refused: one camera sees nothing."""
+    blobs = load_detections(workplace.capture / "truth" / "detections.csv")
+    table = tmp_path / "blind.csv"
+    save_detections(blobs.select(blobs.camera != 1), table)
+    return table
+
+
+def test_a_report_that_cannot_be_written_leaves_the_earlier_result(workplace, blind, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    assert calibrate(workplace, workplace.capture, out) == 0
+    before = contents(out)
+
+    def full(_, path):
+        raise InputError(f"{path}: cannot be written: No space left on device")
+
+    monkeypatch.setattr("imgcal.cli.calibrate.write_report", full)
+    for source in (workplace.capture / "truth" / "detections.csv", blind):
+        capsys.readouterr()
+        assert calibrate(workplace, source, out) == 2
+        assert f"{out / 'report.html'}: cannot be written" in one_line(capsys)
+        assert contents(out) == before
+    assert calibrate(workplace, workplace.capture, tmp_path / "new") == 2
+    assert not (tmp_path / "new").exists()
+
+
+def test_nothing_of_an_earlier_result_stays_beside_a_later_one(workplace, blind, tmp_path):
+    out = tmp_path / "out"
+    assert calibrate(workplace, workplace.capture, out) == 0
+    assert calibrate(workplace, blind, out) == 3
+    assert set(contents(out)) == {"report.html", "result.json"}
+    assert json.loads((out / "result.json").read_text())["status"] == "refused"
+    assert "cam02" in (out / "report.html").read_text()
+    assert calibrate(workplace, workplace.capture, out, "--no-report") == 0
+    assert set(contents(out)) == {"rig.yaml", "result.json"}
+
+
+def test_the_rig_to_start_from_is_not_overwritten(workplace, blind, tmp_path, capsys):
+    out = tmp_path / "out"
+    out.mkdir()
+    shutil.copy(workplace.rig, out / "rig.yaml")
+    arguments = ["calibrate", str(blind), "--rig", str(out / "rig.yaml"), "--object", str(workplace.object)]
+    assert main([*arguments, "--out", str(out)]) == 2
+    assert "rig.yaml is what --rig reads" in one_line(capsys)
+    assert (out / "rig.yaml").read_bytes() == workplace.rig.read_bytes()

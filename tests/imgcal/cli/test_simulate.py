@@ -1,3 +1,7 @@
+import signal
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -60,3 +64,45 @@ def test_impossible_values(arguments, expected, tmp_path, capsys):
 def test_an_existing_capture_is_not_overwritten(workplace, capsys):
     assert simulate(workplace.capture) == 2
     assert "expected a new folder" in capsys.readouterr().err
+
+
+KILLED = """
+import os, signal, sys
+from imgcal.cli import simulate
+from imgcal.cli.main import main
+
+written = []
+
+def write_frame(path, image, write=simulate.write_frame):
+    written.append(path)
+    if len(written) == 6:
+        os.kill(os.getpid(), signal.SIGKILL)
+    write(path, image)
+
+simulate.write_frame = write_frame
+main(sys.argv[1:])
+"""
+
+
+def test_a_killed_simulation_is_no_capture(workplace, tmp_path, capsys):
+    out = tmp_path / "capture"
+    command = ["simulate", "--rig", str(workplace.rig), "--object", str(workplace.object), "--out", str(out)]
+    done = subprocess.run([sys.executable, "-c", KILLED, *command, "--snapshots", "3"], check=False)
+    assert done.returncode == -signal.SIGKILL
+    for command in ("calibrate", "score", "detect", "render"):
+        options = [] if command == "detect" else ["--rig", str(workplace.rig), "--object", str(workplace.object)]
+        options += [] if command == "score" else ["--out", str(tmp_path / command)]
+        assert main([command, str(out), *options]) == 2
+        assert f"{out}: found a capture that was not finished" in capsys.readouterr().err
+        assert not (tmp_path / command).exists()
+    assert simulate(out) == 0
+    assert sorted(path.name for path in (out / "frames" / "cam01").iterdir()) == ["00000.png"]
+
+
+def test_an_interrupted_simulation_leaves_nothing(tmp_path, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("imgcal.cli.simulate.write_frame", interrupted)
+    assert simulate(tmp_path / "a") == 130
+    assert not (tmp_path / "a").exists()
