@@ -17,7 +17,7 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from imgcal.detection import Blobs, DetectionOptions, detect_snapshot
+from imgcal.detection import Blobs, DetectionOptions, detect_snapshot, without_dim
 from imgcal.errors import InputError
 from imgcal.formats import Capture, Frame
 from imgcal.messages import listed
@@ -72,7 +72,8 @@ def _detect_capture(
     with ThreadPoolExecutor() as pool:
         for _, frames in progress(capture.snapshots(first, last), len(names), "detecting blobs"):
             shown = shown or dict(frames)
-            found.append(detect_snapshot(frames, options, masks=masks, pool=pool))
+            found.append(detect_snapshot(frames, options, masks=masks, pool=pool, whole_capture=True))
+    found = without_dim(found, options)
     columns = {
         name: np.concatenate([getattr(blobs, name) for blobs in found]) for name in ("uv", "sigma", "radius", "flags")
     }

@@ -3,5 +3,6 @@
 from imgcal.detection.detector import detect, detect_frame, detect_snapshot
 from imgcal.detection.measuring import Blobs
 from imgcal.detection.options import DetectionOptions
+from imgcal.detection.populations import without_dim
 
-__all__ = ["Blobs", "DetectionOptions", "detect", "detect_frame", "detect_snapshot"]
+__all__ = ["Blobs", "DetectionOptions", "detect", "detect_frame", "detect_snapshot", "without_dim"]

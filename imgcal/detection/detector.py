@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from imgcal.detection.finding import outline, screen
 from imgcal.detection.measuring import Blobs, measure
 from imgcal.detection.options import DetectionOptions, Frame, checked_frame, checked_mask, full_scale
+from imgcal.detection.populations import without_dim
 from imgcal.errors import InputError
 from imgcal.observations import BlobFlag, Detections
 
@@ -43,8 +44,10 @@ def detect(
     if not snapshots:
         raise InputError("frames: found no snapshot, expected at least one frame for each camera")
     with ThreadPoolExecutor(_workers(len(names))) as pool:
-        blobs = [detect_snapshot(snapshot, options, masks=masks, pool=pool) for snapshot in snapshots]
-    return _table(blobs, names)
+        blobs = [
+            detect_snapshot(snapshot, options, masks=masks, pool=pool, whole_capture=True) for snapshot in snapshots
+        ]
+    return _table(without_dim(blobs, options), names)
 
 
 def detect_snapshot(
@@ -53,6 +56,7 @@ def detect_snapshot(
     *,
     masks: Mapping[str, Mask] | None = None,
     pool: ThreadPoolExecutor | None = None,
+    whole_capture: bool = False,
 ) -> Blobs:
     """Detect the blobs of one snapshot; `Blobs.camera` counts the cameras in the order of `frames`.
 
@@ -61,10 +65,11 @@ def detect_snapshot(
         options: what counts as a blob.
         masks: camera name -> (H, W).
         pool: threads that live on between snapshots; None = a pool for this call.
+        whole_capture: the blobs of all snapshots will go through `without_dim` together; nothing is left out here.
     """
     if pool is None:
         with ThreadPoolExecutor(_workers(len(frames))) as own_pool:
-            return detect_snapshot(frames, options, masks=masks, pool=own_pool)
+            return detect_snapshot(frames, options, masks=masks, pool=own_pool, whole_capture=whole_capture)
     present = [(camera, name) for camera, name in enumerate(frames) if frames[name] is not None]
     images = [checked_frame(frames[name], name) for _, name in present]
     covered = [
@@ -75,13 +80,15 @@ def detect_snapshot(
     # OpenCV and the compiled functions release the interpreter: frames are worked on in parallel.
     found = list(pool.map(_detect_one, images, names, covered, [options] * len(images)))
     camera = np.repeat([camera for camera, _ in present], [len(blobs.uv) for blobs in found]).astype(np.int64)
-    return Blobs(
+    blobs = Blobs(
         np.concatenate([np.zeros((0, 2)), *(blobs.uv for blobs in found)]),
         np.concatenate([np.zeros(0), *(blobs.sigma for blobs in found)]),
         np.concatenate([np.zeros(0), *(blobs.radius for blobs in found)]),
         np.concatenate([np.zeros(0, np.uint8), *(blobs.flags for blobs in found)]),
         camera,
+        np.concatenate([np.zeros(0), *(blobs.contrast for blobs in found)]),
     )
+    return blobs if whole_capture else without_dim([blobs], options)[0]
 
 
 def detect_frame(frame: Frame, options: DetectionOptions, mask: Mask | None = None) -> Blobs:

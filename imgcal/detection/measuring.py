@@ -28,6 +28,7 @@ class Blobs:
     radius: NDArray[np.float64]  # (K,) pixels
     flags: NDArray[np.uint8]  # (K,) BlobFlag bits
     camera: NDArray[np.int64]  # (K,) which of the frames
+    contrast: NDArray[np.float64]  # (K,) brightest pixel above the background, share of full scale
 
     def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Blobs:
         """Keep the given rows."""
@@ -47,8 +48,9 @@ def measure(frame: Frame, candidates: Candidates, options: DetectionOptions, sca
     count = len(boxes)
     half = half_sizes(boxes)
     blobs = Blobs(
-        np.zeros((count, 2)), np.zeros(count), np.zeros(count), np.zeros(count, np.uint8), np.zeros(count, np.int64)
-    )
+        np.zeros((count, 2)), np.zeros(count), np.zeros(count), np.zeros(count, np.uint8), np.zeros(count, np.int64),
+        np.zeros(count),
+    )  # fmt: skip
     kept = np.zeros(count, np.bool_)
     saturation = 0.995 * scale if options.saturation is None else options.saturation
     least = 0.0 if options.threshold is None else options.threshold
@@ -56,8 +58,9 @@ def measure(frame: Frame, candidates: Candidates, options: DetectionOptions, sca
     measure_all(
         frame, candidates.tile, candidates.labels, boxes, candidates.label, half,
         scale if options.polarity == "dark" else -1, saturation, limits,
-        blobs.uv, blobs.sigma, blobs.radius, blobs.flags, kept,
+        blobs.uv, blobs.sigma, blobs.radius, blobs.contrast, blobs.flags, kept,
     )  # fmt: skip
+    blobs.contrast[:] /= scale
     last = np.array(frame.shape[::-1]) - 1
     blobs.flags[((boxes[:, :2] <= 1) | (boxes[:, 2:] >= last - 1)).any(1)] |= np.uint8(BlobFlag.BORDER)
     return blobs.select(_first(blobs, kept))

@@ -23,6 +23,7 @@ class DetectionOptions:
 
     polarity: Polarity = "bright"  # markers brighter or darker than what is around them
     threshold: float | None = None  # least peak above the local background, grey levels; None = from the noise
+    dim_blobs: bool = False  # keep blobs far dimmer than the others, too, which a given threshold always does
     min_radius: float = 0.9  # px; a single hot pixel measures 0.56
     max_radius: float = 16.0  # px
     max_elongation: float = 4.0  # ratio of the axes of the ellipse of equal moments
@@ -76,6 +77,8 @@ def full_scale(frame: Frame, bit_depth: int | None, camera: str) -> int:
             return 255
         brightest = int(frame.max())
         return next(2**bits - 1 for bits in (10, 12, 16) if brightest < 2**bits)
+    if frame.dtype == np.uint8 and bit_depth > 8:
+        raise InputError(f"camera {camera}: found a frame of 8 bit, expected {bit_depth} bit, as the bit depth says")
     scale = 2**bit_depth - 1
     if frame.dtype == np.uint16 and (brightest := int(frame.max())) > scale:
         raise InputError(

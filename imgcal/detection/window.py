@@ -39,7 +39,7 @@ _FAR = 200  # px^2; with two distances added to it still within 8 bit
 
 @njit(cache=True, nogil=True)
 def measure_all(
-    frame, tile, labels, boxes, label, half_size, invert, saturation, limits, uv, sigma, radius, flags, kept
+    frame, tile, labels, boxes, label, half_size, invert, saturation, limits, uv, sigma, radius, contrast, flags, kept
 ):  # fmt: skip
     """Fill the columns of all candidates of a frame."""
     side = 2 * half_size.max() + 1 + 2 * MARGIN if len(half_size) else 0
@@ -62,7 +62,7 @@ def measure_all(
         saddle = _claim(own, other, crowded, smooth, weight)
         scale = _weigh(smooth, noise, weight)
         peak, peak_mean, brightness = _find_peaks(grey, smooth, weight)
-        radius[k] = np.sqrt(brightness / peak / np.pi)
+        radius[k], contrast[k] = np.sqrt(brightness / peak / np.pi), peak
         x, y = offsets[0, :pixels], offsets[1, :pixels]
         elongation, two_peaked, middle, moments = find_shape(grey, weight, x, y, peak_mean / 2)
         kept[k] = (

@@ -262,3 +262,10 @@ def test_unusable_masks_and_options_are_explained():
     ):  # fmt: skip
         with pytest.raises(InputError, match=r"found .*, expected"):
             DetectionOptions(**wrong)
+
+
+@pytest.mark.parametrize("polarity", ["bright", "dark"])
+def test_frames_of_8_bit_do_not_hold_12(polarity):
+    frame, _ = scene()
+    with pytest.raises(InputError, match="camera a: found a frame of 8 bit, expected 12 bit"):
+        detect({"a": frame}, DetectionOptions(polarity=polarity, bit_depth=12))
