@@ -70,7 +70,8 @@ class Capture:
                         frames[camera] = None
                         continue
                     if path.suffix.lower() not in VIDEO_SUFFIXES:
-                        frame = _read_image(path, index, alone=path.parent != self.folder / "frames")
+                        alone = path.parent != self.folder / "frames"
+                        frame = _read_image(path, index, alone, self.image_size.get(camera))
                     else:
                         if path not in videos:
                             videos[path] = stack.enter_context(Video(path))
@@ -88,7 +89,7 @@ class Capture:
         path = self.folder / "masks" / f"{camera}.png"
         if not path.is_file():
             return None
-        mask = read_frame(path)
+        mask = read_frame(path, size=self.image_size.get(camera))
         _check_size(mask, path, camera, self.image_size.get(camera))
         return np.asarray(mask > 0)
 
@@ -205,10 +206,10 @@ def _file_snapshots(path: Path) -> dict[str, tuple[Path, int]]:
     return {str(index): (path, index) for index in range(count_frames(path))}
 
 
-def _read_image(path: Path, page: int, alone: bool) -> Frame:
+def _read_image(path: Path, page: int, alone: bool, size: tuple[int, int] | None) -> Frame:
     if alone and path.suffix.lower() in TIFF_SUFFIXES and (pages := count_frames(path)) != 1:
         raise InputError(f"{path}: found {pages} pages, expected 1 in a file of one snapshot")
-    return read_frame(path, page)
+    return read_frame(path, page, size)
 
 
 def _check_cameras(frames: Path, found: Iterable[str], rig: CameraRig) -> None:

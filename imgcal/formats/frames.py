@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import struct
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,17 +16,21 @@ from numpy.typing import NDArray
 
 from imgcal.errors import InputError
 from imgcal.formats.atomic import write_bytes
+from imgcal.formats.image_headers import PNG_SIGNATURE, Size, check_pixels, is_of_kind, size_of, tiff_pages
+from imgcal.formats.silence import silenced
 
 Frame = NDArray[np.uint8] | NDArray[np.uint16]  # (H, W) grey
 
 TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
 IMAGE_SUFFIXES = frozenset({".png", ".bmp", ".pgm", ".jpg", ".jpeg"}) | TIFF_SUFFIXES
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov"})
+VIDEO_PROPERTIES = (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
 
 LOSSY_SUFFIXES = frozenset({".jpg", ".jpeg"}) | VIDEO_SUFFIXES
 LOSSY_TOLERANCE = 4  # grey levels by which lossy compression may tear the channels of a grey frame apart
 
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+LARGEST_IMAGE_FILE = 2**30  # bytes
+LEAST_OF_A_FRAME = 4  # bytes that a frame takes in a video, at least
 
 
 def count_frames(path: Path) -> int:
@@ -36,37 +41,44 @@ def count_frames(path: Path) -> int:
     """
     suffix = path.suffix.lower()
     if suffix in TIFF_SUFFIXES:
-        return _count_pages(path)
+        try:
+            return len(tiff_pages(path))
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
     if suffix in VIDEO_SUFFIXES:
         with Video(path) as video:
             return video.count
     return 1
 
 
-def read_frame(path: str | Path, page: int = 0) -> Frame:
+def read_frame(path: str | Path, page: int = 0, size: Size | None = None) -> Frame:
     """Read a grey image of 8 or 16 bit.
 
     Args:
         path: image file.
         page: of a TIFF with several.
+        size: width and height that it must have, known before anything is decoded; None = any plausible.
 
     Returns:
         (H, W) uint8 or uint16.
 
     Raises:
-        InputError: unreadable or truncated file, true colours, transparency, or values that are not 8 or 16 bit.
+        InputError: unreadable or truncated file, another size or kind of image, true colours, transparency, or values
+            that are not 8 or 16 bit.
     """
     path = Path(path)
     image: Any = None
     try:
         if path.suffix.lower() in TIFF_SUFFIXES:
-            _count_pages(path)
+            pages = tiff_pages(path)
+            if page < len(pages):
+                _require_size(path, pages[page], size)
             with _quiet_opencv():
-                found, pages = cv2.imreadmulti(str(path), start=page, count=1, flags=cv2.IMREAD_UNCHANGED)
-            image = pages[0] if found and pages else None
+                found, images = cv2.imreadmulti(str(path), start=page, count=1, flags=cv2.IMREAD_UNCHANGED)
+            image = images[0] if found and images else None
         else:
-            content = path.read_bytes()
-            _check_complete(path, content)
+            content = _content(path)
+            _require_size(path, size_of(path.suffix.lower(), content), size)
             with _quiet_opencv():
                 image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     except OSError as error:
@@ -116,13 +128,28 @@ class Video:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        try:
+            with open(path, "rb") as file:
+                start = file.read(8)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+        if not is_of_kind(path.suffix.lower(), start):  # a list of other files, for example, would be followed
+            raise InputError(f"{path}: found a damaged or empty file, expected a video")
         with _quiet_opencv():
             self._capture = cv2.VideoCapture(str(path))
-            self.count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)) if self._capture.isOpened() else 0
-        self._next = 0
-        if self.count <= 0:
+            announced, *size = (self._capture.get(name) for name in VIDEO_PROPERTIES)
+        try:
+            self.count = int(announced) if self._capture.isOpened() and math.isfinite(announced) else 0
+            if self.count <= 0:
+                raise InputError(f"{path}: found a damaged or empty file, expected a video")
+            if self.count > path.stat().st_size // LEAST_OF_A_FRAME:
+                found = f"{self.count:,} frames announced in {path.stat().st_size:,} bytes"
+                raise InputError(f"{path}: found {found}, expected a video")
+            check_pixels(path, (int(size[0]), int(size[1])))
+        except InputError:
             self._capture.release()
-            raise InputError(f"{path}: found a damaged or empty file, expected a video")
+            raise
+        self._next = 0
 
     def __enter__(self) -> Video:
         return self
@@ -162,15 +189,36 @@ def _grey(image: Any, path: Path) -> Frame:
     return np.asarray(green)
 
 
-def _check_complete(path: Path, content: bytes) -> None:
-    """Walk the chunks of a PNG: some decoders fill the missing part of a truncated one and say nothing."""
+def _content(path: Path) -> bytes:
+    """Read an image file of the kind that its name says."""
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: found a folder, device or pipe, expected an image file")
+    if path.stat().st_size > LARGEST_IMAGE_FILE:
+        raise InputError(f"{path}: found {path.stat().st_size:,} bytes, expected at most {LARGEST_IMAGE_FILE:,}")
+    content = path.read_bytes()
+    suffix = path.suffix.lower()
     if not content:
         raise InputError(f"{path}: found an empty file, expected an image")
-    if path.suffix.lower() != ".png":
-        return
-    if not content.startswith(PNG_SIGNATURE):
-        raise InputError(f"{path}: found a file of another kind, expected a PNG image")
-    position, kind = len(PNG_SIGNATURE), b""
+    if not is_of_kind(suffix, content):
+        raise InputError(f"{path}: found a file of another kind, expected a {suffix[1:].upper()} image")
+    return _necessary_chunks(path, content) if suffix == ".png" else content
+
+
+def _require_size(path: Path, found: Size | None, expected: Size | None) -> None:
+    if found is None:
+        raise InputError(f"{path}: found a damaged or truncated header, expected a {path.suffix[1:].upper()} image")
+    if expected is not None and found != expected:
+        raise InputError(f"{path}: found {found[0]}x{found[1]} pixels, expected {expected[0]}x{expected[1]}")
+    check_pixels(path, found)
+
+
+def _necessary_chunks(path: Path, content: bytes) -> bytes:
+    """Walk the chunks of a PNG: some decoders fill the missing part of a truncated one and say nothing.
+
+    Returns:
+        The PNG without the chunks that are not needed for its pixels: remarks, profiles, animations.
+    """
+    position, kind, kept = len(PNG_SIGNATURE), b"", [PNG_SIGNATURE]
     while kind != b"IEND":
         header = content[position : position + 8]
         if len(header) < 8:
@@ -182,53 +230,19 @@ def _check_complete(path: Path, content: bytes) -> None:
             raise InputError(f"{path}: found a truncated PNG of {len(content)} bytes, expected {end + 4} or more")
         if zlib.crc32(memoryview(content)[position + 4 : end]) != int.from_bytes(checksum, "big"):
             raise InputError(f"{path}: found a damaged PNG (checksum of chunk {kind!r} is wrong)")
+        if kind[:1].isupper() or kind == b"tRNS":
+            kept.append(content[position : end + 4])
         position = end + 4
-
-
-def _count_pages(path: Path) -> int:
-    """Walk the directories of a TIFF or BigTIFF: OpenCV counts only the pages before a truncation and says nothing.
-
-    Source: TIFF 6.0, section 2; BigTIFF has 8-byte offsets and 20-byte entries.
-    """
-    try:
-        with open(path, "rb") as file:
-            magic = file.read(4)
-            order = {b"II": "<", b"MM": ">"}.get(magic[:2], "")
-            version = struct.unpack(order + "H", magic[2:])[0] if order and len(magic) == 4 else 0
-            if version not in (42, 43):
-                raise InputError(
-                    f"{path}: found {'a file of another kind' if magic else 'an empty file'}, expected TIFF"
-                )
-            big = version == 43
-            if big:
-                file.read(4)
-            offset_format, count_format, entry = (
-                (order + "Q", order + "Q", 20) if big else (order + "I", order + "H", 12)
-            )
-            offset, seen = _unpack(file, offset_format, path), set[int]()
-            while offset and offset not in seen:
-                seen.add(offset)
-                file.seek(offset)
-                file.seek(entry * _unpack(file, count_format, path), 1)
-                offset = _unpack(file, offset_format, path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-    return len(seen)
-
-
-def _unpack(file: BinaryIO, number_format: str, path: Path) -> int:
-    content = file.read(struct.calcsize(number_format))
-    if len(content) < struct.calcsize(number_format):
-        raise InputError(f"{path}: found a truncated TIFF of {path.stat().st_size} bytes, expected more")
-    return int(struct.unpack(number_format, content)[0])
+    return b"".join(kept)
 
 
 @contextlib.contextmanager
 def _quiet_opencv() -> Iterator[None]:
-    """Keep OpenCV from printing about a bad file: our error says it, in one line."""
+    """Keep OpenCV and the libraries below it from printing about a bad file: our error says it, in one line."""
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        yield
+        with silenced():
+            yield
     finally:
         cv2.utils.logging.setLogLevel(level)

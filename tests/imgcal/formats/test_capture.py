@@ -115,7 +115,7 @@ def test_masks(tmp_path: Path) -> None:
     assert np.argwhere(found).tolist() == [[3, 4]]
     assert capture.mask("b") is None
     put(tmp_path, "masks/a.png", mask[:, :30])
-    with pytest.raises(InputError, match=r"a\.png: found 30x24 pixels, expected 32x24 for camera a"):
+    with pytest.raises(InputError, match=r"a\.png: found 30x24 pixels, expected 32x24"):
         capture.mask("a")
     put(tmp_path, "masks/c.png", mask)
     with pytest.raises(InputError, match=r"c\.png: expected masks named <camera name>\.png, cameras: a, b"):
@@ -171,7 +171,7 @@ def _write(name: str, text: str) -> Callable[[Path], None]:
     [
         (_put("frames/cam3/0.png"), r"frames: found cam3, expected the cameras of rig rig: a, b"),
         (_put("frames/a.png"), r"frames: found camera a more than once"),
-        (_put("frames/b/0.png", grey()[:, :-1]), r"b/0\.png: found 31x24 pixels, expected 32x24 for camera b"),
+        (_put("frames/b/0.png", grey()[:, :-1]), r"b/0\.png: found 31x24 pixels, expected 32x24"),
         (_put("frames/a/1.png", grey(0, np.uint16)), r"a/1\.png: found 16-bit pixels, expected 8 bit as in the first"),
         (_mixed, r"a/1\.png: found a 16-bit frame saved as 8-bit, expected 16 bit as in the first frame of a"),
         (_settings(16), r"a/0\.png: found a 16-bit frame saved as 8-bit, expected 16 bit as stated in capture\.yaml"),
