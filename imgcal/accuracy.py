@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -23,6 +24,9 @@ MAP_SIZE = (16, 24)
 """Rows and columns of each camera's map, which covers the whole image."""
 MAP_DEPTHS = (0.05, 0.5, 0.95)
 """Depths of the maps: these quantiles of the depths at which a camera sees the working volume."""
+
+EXCEPTIONAL = 2.0
+"""Times the median camera's error beyond which a camera is an exception."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +103,20 @@ class PredictedError:
         return int(torch.tensor(self.camera_px).nan_to_num(-1.0).argmax())
 
     @property
+    def exceptions(self) -> tuple[int, ...]:
+        """Indices of the cameras that are known much worse than the others, the worst first."""
+        known = torch.tensor(self.camera_px)
+        usual = _quantile(known, 0.5)
+        return tuple(int(i) for i in known.nan_to_num(-1.0).argsort(descending=True) if known[i] > EXCEPTIONAL * usual)
+
+    @cached_property
+    def mm_without_exceptions(self) -> Tensor:
+        """`mm` when the exceptions take no part in triangulation: (X, Y, Z)."""
+        others = self.uncertainty.without(self.exceptions)
+        points = self.volume.grid().flatten(0, -2)
+        return others.point_error(points, others.rig.project(points).visible).view(self.mm.shape)
+
+    @property
     def seen_share(self) -> float:
         """Share of the volume that two cameras see."""
         return float(self.mm.isfinite().double().mean())
@@ -115,6 +133,8 @@ class PredictedError:
             "median_mm_with_noise": _known(self.median_mm_with_noise),
             "worst_camera": self.camera_names[worst],
             "worst_camera_px": _known(self.camera_px[worst]),
+            "exceptions": [self.camera_names[i] for i in self.exceptions],
+            "median_mm_without_exceptions": _known(_quantile(self.mm_without_exceptions, 0.5)),
             "per_camera_px": {n: _known(px) for n, px in zip(self.camera_names, self.camera_px, strict=True)},
             "volume_mm": {"low": self.volume.low.tolist(), "high": self.volume.high.tolist()},
             "seen_by_two_cameras": self.seen_share,

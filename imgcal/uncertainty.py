@@ -7,6 +7,7 @@ of the parameters' covariance, see `aligned_covariance`; docs/method.md has the 
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import torch
@@ -31,11 +32,18 @@ class RigUncertainty:
     """
 
     rig: CameraRig  # C cameras, no batch axes
+    covariance: Tensor  # (15 C, 15 C) before any alignment
     points: Tensor  # (P, 3) mm, over which is aligned
     px_weight: Tensor  # (C, P) of each pixel in the alignment, 0 where the camera does not see the point
     mm_weight: Tensor  # (P,) of each triangulated point, 0 where fewer than two cameras see it
     px_covariance: Tensor  # (15 C, 15 C) after the alignment in pixels; nan where too little is seen for one
     mm_covariance: Tensor  # (15 C, 15 C) after the alignment in mm; nan where cameras share too little for one
+
+    def without(self, cameras: Collection[int]) -> RigUncertainty:
+        """Leave cameras out, and align the others anew."""
+        kept = [i for i in range(self.rig.cameras) if i not in cameras]
+        rows = torch.tensor([PARAMETERS * i + j for i in kept for j in range(PARAMETERS)], device=self.points.device)
+        return rig_uncertainty(self.rig.select(kept), self.covariance[rows[:, None], rows], self.points)
 
     def pixel_error(self, points: Tensor) -> Tensor:
         """Predicted error of each camera's pixel of points: (C, P) px, expected (RMS) length of the difference.
@@ -89,7 +97,7 @@ def rig_uncertainty(rig: CameraRig, covariance: Tensor, points: Tensor) -> RigUn
         px_covariance = _aligned_if_possible(covariance, motion, metric)
         rows = (mm_weight.sqrt()[:, None, None] * triangulation).flatten(0, 1)
         mm_covariance = _aligned_if_possible(covariance, motion, rows.mT @ rows)
-        found = RigUncertainty(rig, points, px_weight, mm_weight, px_covariance, mm_covariance)
+        found = RigUncertainty(rig, covariance, points, px_weight, mm_weight, px_covariance, mm_covariance)
         px_weight = _weight(found.pixel_error(points), seen)
         mm_weight = _weight(found.point_error(points, seen), seen.sum(0) >= 2)
     return found

@@ -14,8 +14,8 @@ from imgcal.report.charts import RESIDUAL_CLASSES
 from imgcal.report.content import ReportContent
 from imgcal.report.svg import Array, Axes
 
-EXCEPTIONAL = 2.0
-"""Times the other cameras' error from which a camera is named as an exception."""
+WORTH_SAYING = 0.8
+"""Of the error in mm: without the exceptions it must be less to be mentioned."""
 MOST_NAMED = 3
 """Cameras named in the sentence."""
 MORE_SNAPSHOTS = (5, 10, 20, 30, 50, 100)
@@ -29,20 +29,19 @@ def sentences(content: ReportContent) -> tuple[str, ...]:
     predicted = content.predicted
     if predicted is None or not math.isfinite(predicted.median_px):
         return ()
-    known = [px for px in predicted.camera_px if math.isfinite(px)]
-    usual = float(np.median(known))
-    worst = [camera for camera in _by_error(predicted) if predicted.camera_px[camera] > EXCEPTIONAL * usual]
+    usual = float(np.nanmedian(predicted.camera_px))
+    names = [content.cameras[i] for i in predicted.exceptions]
+    words = "You know the images of this volume"
     if math.isfinite(predicted.median_mm):
-        words = (
-            f"You know this volume to {length(predicted.median_mm)} (95 % of it to {length(predicted.p95_mm)}), and "
-            f"its images to {svg.pixels(usual)} px"
-        )
-    else:
-        words = f"You know the images of this volume to {svg.pixels(usual)} px"
-    if worst:
-        named = [f"{content.cameras[i]} ({svg.pixels(predicted.camera_px[i])} px)" for i in worst[:MOST_NAMED]]
-        others = len(worst) - len(named)
-        words += f", except through {', '.join(named)}" + (f" and {others} more" if others else "")
+        words = f"You know this volume to {length(predicted.median_mm)} (95 % of it to {length(predicted.p95_mm)}), "
+        without = float(predicted.mm_without_exceptions.nanmedian())
+        if without < WORTH_SAYING * predicted.median_mm:
+            words += f"to {length(without)} without {_listed(names)}, "
+        words += "and its images"
+    words += f" to {svg.pixels(usual)} px"
+    if names:
+        worst = [f"{content.cameras[i]} ({svg.pixels(predicted.camera_px[i])} px)" for i in predicted.exceptions]
+        words += f", except through {_listed(worst)}"
     found = [words + "."]
     if 0 < predicted.seen_share < 0.95:
         found.append(f"{100 * (1 - predicted.seen_share):.0f} % of the volume are seen by fewer than two cameras.")
@@ -54,13 +53,12 @@ def advice(content: ReportContent) -> tuple[str, ...]:
     predicted = content.predicted
     if predicted is None:
         return ()
-    usual = float(np.median([px for px in predicted.camera_px if math.isfinite(px)] or [math.nan]))
+    usual = float(np.nanmedian(predicted.camera_px)) if predicted.exceptions else math.nan
     seen = [_snapshots_seen(content, camera) for camera in range(len(content.cameras))]
     steps: dict[int, list[str]] = {}
-    for camera in _by_error(predicted)[:MOST_NAMED]:
-        if predicted.camera_px[camera] > EXCEPTIONAL * usual:
-            wanted = more_snapshots(seen[camera], int(np.median(seen)), predicted.camera_px[camera] / usual)
-            steps.setdefault(wanted, []).append(content.cameras[camera])
+    for camera in predicted.exceptions[:MOST_NAMED]:
+        wanted = more_snapshots(seen[camera], int(np.median(seen)), predicted.camera_px[camera] / usual)
+        steps.setdefault(wanted, []).append(content.cameras[camera])
     return tuple(f"Take {n} more snapshots in the view of {', '.join(names)}." for n, names in steps.items())
 
 
@@ -162,10 +160,9 @@ def _range(values: Array) -> float:
     return float(np.quantile(known, 0.95) / max(np.quantile(known, 0.05), 1e-300)) if len(known) else 0.0
 
 
-def _by_error(predicted: PredictedError) -> list[int]:
-    """Cameras, the worst first; those that see nothing of the volume left out."""
-    known = [i for i, px in enumerate(predicted.camera_px) if math.isfinite(px)]
-    return sorted(known, key=lambda i: -predicted.camera_px[i])
+def _listed(names: list[str]) -> str:
+    shown = ", ".join(names[:MOST_NAMED])
+    return shown if len(names) <= MOST_NAMED else f"{shown} and {len(names) - MOST_NAMED} more"
 
 
 def _snapshots_seen(content: ReportContent, camera: int) -> int:

@@ -7,6 +7,7 @@ import torch
 
 from imgcal import InputError, PipelineOptions, calibrate, estimate, predicted_error
 from imgcal.accuracy import GRID, MAP_DEPTHS, MAP_SIZE, WorkingVolume, joint_covariance, working_volume
+from imgcal.cli.common import only_cameras
 from imgcal.observations import Observations
 from imgcal.projection import undistort
 from imgcal.simulation import simulate_truth, true_detections
@@ -45,6 +46,7 @@ def test_the_summary_is_plain_and_in_order(predicted):
     assert 0 < summary["median_px"] < summary["p95_px"]
     assert 0 < summary["median_mm"] < summary["p95_mm"]
     assert summary["median_mm"] < summary["median_mm_with_noise"]
+    assert summary["exceptions"] == [] and summary["median_mm_without_exceptions"] == summary["median_mm"]
     assert summary["noise_px"] == pytest.approx(0.05)
     assert summary["worst_camera_px"] == max(summary["per_camera_px"].values())
     assert summary["per_camera_px"][summary["worst_camera"]] == summary["worst_camera_px"]
@@ -120,3 +122,10 @@ def test_a_blind_camera_has_the_factorys_errors(o10, asymmetric8):
     px = np.array(found.camera_px)
     assert found.camera_names[found.worst_camera] == "cam07"
     assert px[6] > 5 and (np.delete(px, 6) < 0.1).all()
+    # All cameras alike in the triangulation: the blind one spoils it, and without it all is well.
+    assert [found.camera_names[i] for i in found.exceptions] == ["cam07"]
+    nine = o10.select([i for i in range(10) if i != 6])
+    others = predicted_error(calibrate(only_cameras(table, nine), nine, asymmetric8))
+    without = float(found.mm_without_exceptions.median())
+    assert without == pytest.approx(others.median_mm, rel=0.02)
+    assert without < found.median_mm / 10

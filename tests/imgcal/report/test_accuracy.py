@@ -32,6 +32,9 @@ def test_exceptions_are_named_with_what_helps(content):
     assert re.search(r", except through cam07 \([\d.]+ px\)\.$", words)
     # Six snapshots, a variance six times too large: 31 more would do.
     assert advice(bad) == ("Take 50 more snapshots in the view of cam07.",)
+    assert "without" not in words
+    spoilt = replace(bad, predicted=replace(bad.predicted, mm=3 * bad.predicted.mm))
+    assert re.search(r"mm\), to [\d.]+ mm without cam07, and its images", sentences(spoilt)[0])
     verdict = judge(bad)
     assert words in verdict.found and advice(bad)[0] in verdict.next_steps
 
