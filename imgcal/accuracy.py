@@ -185,8 +185,13 @@ def predicted_error(
 
 
 def joint_covariance(calibration: Estimate) -> Tensor:
-    """Covariance of all cameras' parameters that the prediction starts from: (15 C, 15 C)."""
-    return camera_covariance(calibration)
+    """Covariance of all cameras' parameters that the prediction starts from: (15 C, 15 C).
+
+    The flat one: what `camera_covariance` adds by second order is mostly that a motion of the whole rig, of which
+    nothing but the prior is known, bends the parameters. That is no error, and a linear projection cannot take it out
+    again; for the rest, first order is enough (docs/benchmarks.md, "Honesty").
+    """
+    return camera_covariance(calibration, curved=False)
 
 
 def working_volume(calibration: Estimate) -> WorkingVolume:

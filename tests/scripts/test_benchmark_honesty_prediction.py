@@ -1,3 +1,4 @@
+import pytest
 import torch
 
 from imgcal.formats import load_object, load_rig
@@ -6,10 +7,11 @@ from scripts.benchmarks.honesty_prediction import GATE, PAGE, RESULT, RIGS, SNAP
 from scripts.output import read_json
 
 
-def test_predicted_errors_are_the_true_ones():
-    row = judge(Case(load_rig("U7"), load_object("asymmetric8"), 5), 12, 0, PipelineOptions())
+@pytest.mark.parametrize(("rig", "snapshots"), [("U7", 5), ("T4", 20)])
+def test_predicted_errors_are_the_true_ones(rig, snapshots):
+    row = judge(Case(load_rig(rig), load_object("asymmetric8"), snapshots), 12, 0, PipelineOptions())
     assert row["refused"] == 0
-    assert 0.85 < row["px"]["ratio"] < 1.15
+    assert 0.92 < row["px"]["ratio"] < 1.08
     assert 0.75 < row["mm"]["ratio"] < 1.25
 
 
