@@ -89,9 +89,12 @@ def save_detections(detections: Detections, path: str | Path) -> None:
         path: the file to write.
 
     Raises:
-        InputError: the file cannot be written.
+        InputError: the file cannot be written, or a name could not be read again.
     """
     path = Path(path)
+    for name in (*detections.camera_names, *detections.snapshot_names):
+        if not is_file_name(name):
+            raise InputError(f"{path}: not written: found {shortened(name)!r}, expected a name that can be a file name")
     labelled, known = detections.fiducial >= 0, np.isfinite(detections.radius)
     columns = {
         "snapshot": map(detections.snapshot_names.__getitem__, detections.snapshot.tolist()),

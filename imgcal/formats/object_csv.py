@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 from itertools import islice
 from pathlib import Path
 
@@ -20,6 +22,7 @@ from renderers.palette import palette
 # Nearer than this to one line, in units of the object's size, no pose can be found.
 COLLINEAR = 1e-6
 SMALLEST = 1e-3  # mm, extent of an object
+NAME = "a different name for every point"
 
 
 def load_object(path: str | Path) -> CalibrationObject:
@@ -51,23 +54,38 @@ def load_object(path: str | Path) -> CalibrationObject:
         )
     names = tuple(name.strip() for name in chunk.columns.get("name", ()))
     for row, name in enumerate(names):
-        if not name or len(name) > LONGEST_NAME or not name.isprintable() or name in names[:row]:
-            chunk.fail(row, f"name: found {shortened(name)!r}, expected a different name for every point")
+        if not _is_name(name) or name in names[:row]:
+            chunk.fail(row, f"name: found {shortened(name)!r}, expected {NAME}")
     return CalibrationObject(torch.from_numpy(points), palette(count).double(), radius, title_of(path), names)
 
 
 def save_object(obj: CalibrationObject, path: str | Path) -> None:
-    """Write a calibration object in one step; every number in its shortest exact form."""
+    """Write a calibration object in one step; every number in its shortest exact form.
+
+    Raises:
+        InputError: the file cannot be written, or a name could not be read again.
+    """
+    names = obj.fiducial_names
+    for row, name in enumerate(names):
+        if not _is_name(name) or name in names[:row]:
+            raise InputError(f"{path}: not written: found the name {shortened(name)!r}, expected {NAME}")
     columns: list[list[str]] = [[f"{value!r}" for value in axis] for axis in obj.points.double().T.tolist()]
     header = ["x", "y", "z"]
-    if obj.fiducial_names:
+    if names:
         header.append("name")
-        columns.append([f'"{name}"' if "," in name else name for name in obj.fiducial_names])
+        columns.append(list(names))
     if obj.radius is not None:
         header.append("radius")
         columns.append([f"{value!r}" for value in obj.radius.double().tolist()])
-    rows = [",".join(row) for row in zip(*columns, strict=True)]
-    write_text(path, "\n".join([",".join(header), *rows]) + "\n")
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(zip(*columns, strict=True))
+    write_text(path, text.getvalue())
+
+
+def _is_name(name: str) -> bool:
+    return 0 < len(name) <= LONGEST_NAME and name.isprintable() and name == name.strip()
 
 
 def _check_points(chunk: Chunk, points: np.ndarray) -> None:

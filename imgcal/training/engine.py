@@ -39,6 +39,8 @@ from imgcal.training.state import State, load_state, random_states, restore_rand
 
 RESULT, STATE, RESOLVED, BAD_BATCH = "model.safetensors", "state.safetensors", "resolved.yaml", "bad_batch.safetensors"
 
+WINDOW = ("losses", "passes")  # names of `Run.window`'s columns in the state
+
 # Seeds of what must not depend on how long the training takes: validation rigs.
 VALIDATION_SEED = 20_000_003
 
@@ -116,10 +118,12 @@ def train(
             seconds, stop = _agreed(run, should_stop())
             due = experiment.training
             last = stop or finished(run, seconds)
-            if last or run.step % due.log_every == 0:
-                logged = _log(run, log, logged, seconds)
-            if run.validation and (last or run.step % due.validate_every == 0):
-                validate(run, log)
+            extra = run.step % due.log_every != 0
+            if last or not extra:
+                logged = _log(run, log, logged, seconds, extra)
+            extra = run.step % due.validate_every != 0
+            if run.validation and (last or not extra):
+                validate(run, log, extra)
             if last or run.step % due.save_every == 0:
                 save(run, log.last)
     return run
@@ -239,8 +243,8 @@ def evaluate(network: nn.Module, batches: Iterable[Batch], obj: CalibrationObjec
     return torch.cat(errors)
 
 
-def validate(run: Run, log: Log) -> None:
-    """Log the error of the weights as they would be the result, on rigs that are always the same."""
+def validate(run: Run, log: Log, extra: bool) -> None:
+    """Log the error of the weights as they would be the result, on rigs that are always the same; see `Log.write`."""
     check_finite(run)
     if not run.accelerator.is_main_process:
         return
@@ -248,7 +252,7 @@ def validate(run: Run, log: Log) -> None:
     batches = (run.source.show(made, generator) for made in run.validation)
     errors = evaluate(run.best_weights, batches, run.source.obj, run.experiment)
     mean, median = float(errors.mean()), float(errors.median())
-    log.write({"step": run.step, "validation_re_px": mean, "validation_re_median_px": median})
+    log.write({"step": run.step, "validation_re_px": mean, "validation_re_median_px": median}, extra)
     log.say_summary()
 
 
@@ -277,6 +281,10 @@ def save(run: Run, metrics: dict[str, Any]) -> None:
         "average": {} if run.average is None else run.average.state_dict(),
         "optimizer": optimizer_tensors(run.optimizer),
         "random": gathered,
+        "window": {
+            name: run.accelerator.gather(torch.stack(column)[None])
+            for name, column in zip(WINDOW, zip(*run.window, strict=True), strict=False)
+        },
     }
     if run.accelerator.is_main_process:
         save_state(run.folder / STATE, State(tensors, values, run.experiment))
@@ -303,6 +311,9 @@ def load(run: Run) -> None:
     run.schedule.restore(values["schedule"])
     restore_random_states(run.generator, {name: rows[index] for name, rows in tensors["random"].items()})
     run.step, run.elapsed, run.began = values["step"], values["elapsed"], monotonic()
+    if "window" in tensors:
+        columns = (tensors["window"][name][index].to(run.accelerator.device).unbind() for name in WINDOW)
+        run.window = list(zip(*columns, strict=True))
     if values["judged"] is not None:
         run.judged = torch.tensor(values["judged"], device=run.accelerator.device)
 
@@ -344,10 +355,11 @@ def _agreed(run: Run, stop: bool) -> tuple[float, bool]:
     return seconds, bool(stopping)
 
 
-def _log(run: Run, log: Log, logged: tuple[int, float], seconds: float) -> tuple[int, float]:
-    """Write the means since the last time; returns where the next means begin."""
+def _log(run: Run, log: Log, logged: tuple[int, float], seconds: float, extra: bool) -> tuple[int, float]:
+    """Write the means since the last time; returns where the next means begin. See `Log.write` for `extra`."""
     totals, passes = (torch.stack(column) for column in zip(*run.window, strict=True))
-    run.window.clear()
+    if not extra:
+        run.window.clear()
     numbers = run.accelerator.reduce(torch.cat((totals.mean()[None], passes.mean(0))), "mean").tolist()
     steps, duration = run.step - logged[0], seconds - logged[1]
     row: dict[str, Any] = {"step": run.step, "loss": numbers[0], "re_px": numbers[-1]}
@@ -355,7 +367,7 @@ def _log(run: Run, log: Log, logged: tuple[int, float], seconds: float) -> tuple
     row["lr"] = max(group["lr"] for group in run.optimizer.param_groups)
     row["rigs_per_s"] = steps * run.experiment.training.batch_size / max(duration, 1e-9)
     row["seconds"] = seconds
-    log.write(row)
+    log.write(row, extra)
     log.show(progress(run, seconds))
     return run.step, seconds
 

@@ -15,18 +15,22 @@ from torch.utils.tensorboard import SummaryWriter
 from imgcal.errors import InputError
 from imgcal.formats import write_text
 
+EXTRA = "extra"  # key of a row that a longer run does not have
+
 
 class Log:
     """Writes and shows numbers; a log that is not `active` (a second process) does nothing."""
 
     def __init__(self, folder: Path, step: int, active: bool) -> None:
-        """Open the logs of a run that stands at `step`; what an earlier run logged after that is dropped."""
+        """Open the logs of a run that stands at `step`; what it would not have logged without a stop is dropped."""
         self.active = active
         self.last: dict[str, Any] = {}
         if not active:
             return
         self.path = folder / "metrics.jsonl"
-        kept = [row for row in read_metrics(self.path) if row["step"] <= step] if step else []
+        kept = [row for row in read_metrics(self.path) if row["step"] <= step and not row.get(EXTRA)] if step else []
+        for row in kept:
+            self.last |= row
         write_text(self.path, "".join(json.dumps(row) + "\n" for row in kept))
         self.board = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1 if step else None)
         self.console = Console(file=sys.stderr)
@@ -46,18 +50,19 @@ class Log:
             self.bar.stop()
             self.board.close()
 
-    def write(self, row: dict[str, Any]) -> None:
-        """Append plain values; `step` is one of them."""
+    def write(self, row: dict[str, Any], extra: bool = False) -> None:
+        """Append plain values; `step` is one of them. An `extra` row is not due: the run ends here, for now."""
         if not self.active:
             return
         self.last |= row
+        row = row | {EXTRA: True} if extra else row
         try:
             with open(self.path, "a") as file:
                 file.write(json.dumps(row) + "\n")
         except OSError as error:
             raise InputError(f"{self.path}: cannot be written: {error.strerror or error}") from error
         for name, value in row.items():
-            if name != "step" and isinstance(value, float | int):
+            if name not in ("step", EXTRA) and isinstance(value, float | int):
                 self.board.add_scalar(name, value, row["step"])
 
     def show(self, progress: float) -> None:

@@ -27,7 +27,7 @@ FREE = {("name",), ("description",), ("paper",)} | {
 class State:
     """Everything that the rest of a run depends on."""
 
-    tensors: dict[str, dict[str, Tensor]]  # by part: network, average, optimizer, random
+    tensors: dict[str, dict[str, Tensor]]  # by part: network, average, optimizer, random, window
     values: dict[str, Any]  # plain values: step, elapsed, processes, settings of the optimizer, schedule, judged
     experiment: Experiment
 

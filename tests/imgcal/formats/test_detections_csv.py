@@ -166,3 +166,13 @@ def test_line_numbers_are_right_in_later_chunks(tmp_path: Path) -> None:
 def test_missing_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none\.csv: cannot be read: No such file"):
         load_detections(tmp_path / "none.csv")
+
+
+@pytest.mark.parametrize("names", [(("a\nb",), ("0",)), (("a",), ("../0",))])
+def test_names_that_could_not_be_read_again_are_not_written(
+    names: tuple[tuple[str], tuple[str]], tmp_path: Path
+) -> None:
+    detections = replace(make_detections(2), camera_names=names[0], snapshot_names=names[1])
+    with pytest.raises(InputError, match=r"new\.csv: not written: found"):
+        save_detections(detections, tmp_path / "new.csv")
+    assert not (tmp_path / "new.csv").exists()

@@ -1,10 +1,14 @@
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 import torch
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
 from imgcal.errors import InputError
-from imgcal.formats.object_csv import load_object
+from imgcal.formats.object_csv import load_object, save_object
+from imgcal.objects import CalibrationObject
 from renderers.palette import palette
 
 GOOD = "x,y,z\n0,0,0\n1.5,0,0\n0,1,0\n0,0,1\n"
@@ -68,3 +72,26 @@ def test_bad_files_give_one_clear_line(text: str, message: str, tmp_path: Path) 
 def test_unknown_name_offers_the_nearest() -> None:
     with pytest.raises(InputError, match=r"cube9: no such file.*nearest: cube8"):
         load_object("cube9")
+
+
+def named(*names: str) -> CalibrationObject:
+    points = torch.cat((torch.zeros(1, 3), torch.eye(3)))[: len(names)].double()
+    return CalibrationObject(points, palette(len(names)).double(), None, "o", names)
+
+
+@settings(deadline=None)
+@given(st.lists(st.text(st.characters(exclude_categories=["C", "Z"]), min_size=1), min_size=4, max_size=4, unique=True))
+@example(["a,b", 'c"d', '"e"', "f'g"])
+@example(["a b", '"', "'", ","])
+def test_names_come_back_whatever_they_are(names: list[str]) -> None:
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "o.csv"
+        save_object(named(*names), path)
+        assert load_object(path).fiducial_names == tuple(names)
+
+
+@pytest.mark.parametrize("name", ["a\nb", "a\rb", "", " a", "x" * 1000, "p"])
+def test_names_that_could_not_be_read_again_are_not_written(name: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"o\.csv: not written: found the name"):
+        save_object(named("p", "q", "r", name), tmp_path / "o.csv")
+    assert not list(tmp_path.iterdir())

@@ -23,6 +23,15 @@ def same(a, b):
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
+def timeless(row):
+    """What does not depend on how fast the machine is."""
+    return {name: value for name, value in row.items() if name not in ("seconds", "rigs_per_s")}
+
+
+def logged(folder):
+    return [timeless(row) for row in read_metrics(folder / "metrics.jsonl")]
+
+
 def stopping_at(step):
     """A wish to stop after so many steps of this session."""
     asked = iter(range(1, 10**6))
@@ -75,8 +84,22 @@ def test_a_resumed_run_ends_bit_for_bit_the_same(experiment, tmp_path, schedule)
     assert second.step == 40
     assert second.elapsed > 0
     assert same(weights(tmp_path / "whole"), weights(tmp_path / "parts"))
-    rows = [read_metrics(tmp_path / name / "metrics.jsonl") for name in ("whole", "parts")]
-    assert rows[0][-1]["validation_re_px"] == rows[1][-1]["validation_re_px"]
+    assert logged(tmp_path / "whole") == logged(tmp_path / "parts")
+
+
+@pytest.mark.parametrize("stop", [17, 20, 30, 35])
+def test_a_run_that_is_killed_and_resumed_logs_what_a_whole_one_logs(experiment, tmp_path, stop):
+    setup = experiment("training.steps=40", "training.log_every=4", "training.validate_every=6")
+    train(setup, tmp_path / "whole")
+    train(setup, tmp_path / "parts", should_stop=stopping_at(stop))
+    state = (tmp_path / "parts" / STATE).read_bytes()
+    train(setup, tmp_path / "parts", resume=True, should_stop=stopping_at(3))
+    (tmp_path / "parts" / STATE).write_bytes(state)  # as a kill before the next state leaves it
+    train(setup, tmp_path / "parts", resume=True)
+    assert logged(tmp_path / "whole") == logged(tmp_path / "parts")
+    assert {row["step"] for row in logged(tmp_path / "parts")} == {*range(4, 41, 4), *range(6, 41, 6)}
+    found = [load_checkpoint(tmp_path / name / RESULT).metrics for name in ("whole", "parts")]
+    assert timeless(found[0]) == timeless(found[1])
 
 
 def test_a_cut_off_log_is_repaired(experiment, tmp_path):
