@@ -10,6 +10,11 @@ import numpy as np
 from numba import njit
 
 TWO_PEAKED = 0.515  # bimodality coefficient
+WAIST = 0.92  # of the mass to either side along the major axis: two blobs in one are narrower between their middles
+LONGEST_PATCH = 3.0  # elongation of a flat square at 70 degrees; longer ones are seams and edges
+PART = 0.4  # of the largest mass in a bin: less is a speck of noise beside the blob, no second blob
+PROFILE = 24  # bins of the mass along the major axis, at most
+LEAST_WIDE = 1.6  # px, standard deviation along the minor axis: a waist of narrower blobs is lost in the blur
 
 
 @njit(cache=True, nogil=True, fastmath=True)
@@ -50,12 +55,38 @@ def find_centroid(grey, weight, ramp, x, y):
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def find_shape(grey, weight, x, y, most):
+def find_waist(grey, weight, x, y, most, axis, middle, spread):
+    """Least mass along an axis between two parts with more, over the lesser of these: 1 = there is no waist.
+
+    The axis is given by its cosine and sine, the blob's middle and standard deviation (px) along it, the rest as in
+    `find_shape`.
+    """
+    value, part = grey.reshape(-1), weight.reshape(-1)
+    profile, width = np.zeros(PROFILE), max(1.0, spread / 3.5)
+    for p in range(len(value)):
+        mass = min(max(part[p] * value[p], np.float32(0)), most)
+        at = (x[p] * axis[0] + y[p] * axis[1] - middle) / width + PROFILE / 2
+        if mass > 0 and 0 <= at < PROFILE - 1:
+            left = int(at)
+            profile[left] += mass * (left + 1 - at)
+            profile[left + 1] += mass * (at - left)
+    least, before, most_mass = 1.0, 0.0, profile.max()
+    for i in range(1, PROFILE - 1):
+        before = max(before, profile[i - 1])
+        sides = min(before, profile[i + 1 :].max())
+        if sides > PART * most_mass:
+            least = min(least, profile[i] / sides)
+    return least
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def find_shape(grey, weight, x, y, most, patch):
     """Tell the elongation of a blob whose masses are cut at `most`, whether it has two parts along its major axis, its
-    middle, and its moments xx, xy, yy.
+    middle, and its moments xx, xy, yy. A flat `patch` may be a square.
 
     Source: Sarle's bimodality coefficient, (skewness ** 2 + 1) / kurtosis: 0.50 for any filled ellipse and less when it
-    is blurred, 0.60 for two discs that touch and 0.51 to 0.57 when they are blurred, 0.56 for a uniform rod.
+    is blurred, 0.60 for two discs that touch and 0.51 to 0.57 when they are blurred, 0.56 for a uniform rod, which a
+    waist tells from them.
     """
     value, part, zero, most = grey.reshape(-1), weight.reshape(-1), np.float32(0), np.float32(most)
     t = sx = sy = sxx = syy = sxy = cube = fourth = zero
@@ -78,4 +109,8 @@ def find_shape(grey, weight, x, y, most):
         cube, fourth = cube + moment * along, fourth + moment * along * along
     third, fourth = cube / total, fourth / total
     bimodality = (third**2 / max(major, 1e-6) ** 3 + 1) * major**2 / max(fourth, 1e-6)
-    return elongation, bimodality > TWO_PEAKED and elongation > 1.3, (x0, y0), (xx, xy, yy)
+    two_peaked = bimodality > TWO_PEAKED and elongation > 1.3
+    if two_peaked and patch and minor > LEAST_WIDE**2 and elongation < LONGEST_PATCH:
+        # Squares seen at an angle are as flat as two discs that touch, but have no waist.
+        two_peaked = find_waist(grey, weight, x, y, most, (cosine, sine), start, np.sqrt(major)) < WAIST
+    return elongation, two_peaked, (x0, y0), (xx, xy, yy)

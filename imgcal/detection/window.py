@@ -64,7 +64,9 @@ def measure_all(
         peak, peak_mean, brightness = _find_peaks(grey, smooth, weight)
         radius[k], contrast[k] = np.sqrt(brightness / peak / np.pi), peak
         x, y = offsets[0, :pixels], offsets[1, :pixels]
-        elongation, two_peaked, middle, moments = find_shape(grey, weight, x, y, peak_mean / 2)
+        # What was found of a flat patch is all of it.
+        patch = (boxes[k, 2] - boxes[k, 0] + 1) * (boxes[k, 3] - boxes[k, 1] + 1) > brightness / peak
+        elongation, two_peaked, middle, moments = find_shape(grey, weight, x, y, peak_mean / 2, patch)
         kept[k] = (
             smallest <= radius[k] <= largest and peak >= least
             and peak_mean > SIGNIFICANT / 3 * noise and elongation <= longest

@@ -51,6 +51,28 @@ def draw_discs(
     return frame
 
 
+def draw_patches(
+    shape: tuple[int, int],
+    corners: NDArray[np.float64],
+    *,
+    contrast: float = 150.0,
+    background: float = 20.0,
+    blur: float = 0.7,
+) -> NDArray[np.float64]:
+    """Draw flat patches with the corners (M, K, 2), blurred by a Gaussian of `blur` px: (H, W) without noise."""
+    covered = np.zeros(shape)
+    for outline in corners:
+        first = np.floor(outline.min(0) - 6).astype(int)
+        width, height = np.ceil(outline.max(0) + 6).astype(int) - first
+        fine = np.zeros((height * FINE, width * FINE), np.uint8)
+        at = ((outline - first + 0.5) * FINE - 0.5) * 16
+        cv2.fillPoly(fine, [np.rint(at).astype(np.int32)], 255, shift=4)
+        soft = cv2.GaussianBlur(fine.astype(np.float32) / 255, (0, 0), blur * FINE)
+        place = slice(first[1], first[1] + height), slice(first[0], first[0] + width)
+        covered[place] += soft.reshape(height, FINE, width, FINE).mean((1, 3))
+    return background + contrast * covered
+
+
 def scattered(shape: tuple[int, int], pitch: int, rng: np.random.Generator) -> NDArray[np.float64]:
     """Spread centres (M, 2) on a lattice of `pitch` px, each at its own sub-pixel position."""
     v, u = np.mgrid[pitch // 2 : shape[0] - pitch // 2 : pitch, pitch // 2 : shape[1] - pitch // 2 : pitch]

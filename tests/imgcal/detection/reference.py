@@ -65,7 +65,8 @@ def measure(frame, labels, label, box, half, saturation, invert=None):
         return None
     brightness, top = (weight * grey).sum(), smooth[core].max()
     radius = np.sqrt(brightness / grey[core].max() / np.pi)
-    elongation, two_peaked, middle, moments = shape(np.clip(weight * grey, 0, top / 2), x, y)
+    patch = (box[2] - box[0] + 1) * (box[3] - box[1] + 1) > brightness / grey[core].max()
+    elongation, two_peaked, middle, moments = shape(np.clip(weight * grey, 0, top / 2), x, y, patch)
     clipped = bool((raw[core] >= saturation).any())
     flags = BlobFlag.SATURATED if clipped else BlobFlag.NONE
     x0 = y0 = known = residual = 0.0
@@ -155,7 +156,7 @@ def background(ring, x, y):
     return plane, noise, noise / np.sqrt((normal[1, 1] + normal[2, 2]) / 2)
 
 
-def shape(mass, x, y):
+def shape(mass, x, y, patch):
     """Ratio of the axes of the ellipse of equal moments, whether there are two parts along the longer one, the middle
     (2,), and the moments xx, xy, yy.
     """
@@ -169,7 +170,19 @@ def shape(mass, x, y):
     kurtosis = (mass * along**4).sum() / major**2
     elongation = np.sqrt(major / max(minor, 1 / 12))
     two_peaked = (skewness**2 + 1) / kurtosis > moments_of.TWO_PEAKED and elongation > 1.3
+    if patch and minor > moments_of.LEAST_WIDE**2 and elongation < moments_of.LONGEST_PATCH:
+        two_peaked = two_peaked and waist(mass, along, np.sqrt(major)) < moments_of.WAIST
     return elongation, two_peaked, middle, (moments[0, 0], moments[0, 1], moments[1, 1])
+
+
+def waist(mass, along, spread):
+    """Least share of the mass at a place along the axis, of what lies on either side of it."""
+    at = along / max(1.0, spread / 3.5) + moments_of.PROFILE / 2
+    bins = np.arange(moments_of.PROFILE)
+    profile = (mass[..., None] * np.clip(1 - abs(at[..., None] - bins), 0, None)).sum((0, 1))
+    sides = np.array([min(profile[:i].max(), profile[i + 1 :].max()) for i in bins[1:-1]])
+    inside = sides > moments_of.PART * profile.max()
+    return min(1.0, (profile[1:-1][inside] / sides[inside]).min(initial=1.0))
 
 
 def phi(t):

@@ -8,7 +8,7 @@ import pytest
 from imgcal.detection import DetectionOptions, detect, detect_frame
 from imgcal.errors import InputError
 from imgcal.observations import BlobFlag
-from tests.imgcal.detection.discs import draw_discs, exposed, nearest, scattered
+from tests.imgcal.detection.discs import draw_discs, draw_patches, exposed, nearest, scattered
 
 SHAPE = (480, 640)
 GRADIENT = np.linspace(15, 40, SHAPE[1])[None, :] + np.linspace(0, 10, SHAPE[0])[:, None]
@@ -175,6 +175,23 @@ def test_discs_seen_at_an_angle_are_not_merged(squeeze):
     blobs = detect_frame(exposed(draw_discs(SHAPE, uv, 6.0, squeeze=squeeze), 2.0, rng), DetectionOptions())
     assert len(blobs.uv) == len(uv)
     assert (blobs.flags == 0).all()
+
+
+@pytest.mark.parametrize("side", [14.0, 19.0, 25.0])
+@pytest.mark.parametrize("noise", [2.0, 6.0])
+def test_square_patches_seen_at_an_angle_are_not_merged(side, noise):
+    rng, shape = np.random.default_rng(8), (960, 1260)
+    uv = scattered(shape, 60, rng)
+    angles, tilt = rng.uniform(0, 2 * np.pi, (2, len(uv))), np.radians(rng.uniform(0, 65, len(uv)))
+    square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * side / 2
+    turn, roll = (np.stack([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]).transpose(2, 0, 1) for a in angles)
+    corners = square @ turn.mT
+    corners[..., 1] *= np.cos(tilt)[:, None]
+    frame = exposed(draw_patches(shape, corners @ roll.mT + uv[:, None], contrast=150.0), noise, rng)
+    blobs = detect_frame(frame, DetectionOptions())
+    rows, distance = nearest(blobs.uv, uv)
+    assert len(uv) >= 300 and distance.max() < 0.2
+    assert ((blobs.flags[rows] & BlobFlag.MERGED) > 0).mean() <= 0.01
 
 
 def test_masked_blobs_are_flagged_and_kept():
