@@ -37,7 +37,7 @@ PAGE = ROOT / "docs" / "benchmarks.md"
 
 @dataclass(frozen=True)
 class Case:
-    """A kind of capture: drift as the rig's prior says, labels known."""
+    """A kind of capture: the rig drifted as its prior says, the object off as its tolerance says, labels known."""
 
     rig: CameraRig  # factory calibration, with its prior
     obj: CalibrationObject
@@ -46,19 +46,29 @@ class Case:
 
     def draw(self, generator: torch.Generator) -> tuple[CameraRig, Detections]:
         """Draw a true rig, and what it sees."""
-        rig = self.rig
+        rig, obj = self.rig, self.true_object(generator)
         spread = (rig.prior or RigPrior()).std(rig)
         true_rig = rig.moved(spread * torch.randn(spread.shape, generator=generator, dtype=spread.dtype))
         if rig.working_distance is None:
-            truth = simulate_volume(true_rig, self.obj, self.snapshots, generator, None)
+            truth = simulate_volume(true_rig, obj, self.snapshots, generator, None)
         else:
-            centroid = self.obj.points.mean(0)
+            centroid = obj.points.mean(0)
             poses = sample_rig_from_object(self.snapshots, rig.working_distance, centroid, PoseRange(), generator)
-            seen = true_rig.expand(self.snapshots).project(poses.apply(self.obj.points), self.obj.radius)
+            seen = true_rig.expand(self.snapshots).project(poses.apply(obj.points), obj.radius)
             truth = Truth(true_rig, poses, seen.uv, seen.visible)
         table = true_detections(truth)
         noise = torch.randn(table.uv.shape, generator=generator, dtype=torch.float64).numpy()
         return true_rig, replace(table, uv=table.uv + self.noise * noise, sigma=np.full(len(table), self.noise))
+
+    def true_object(self, generator: torch.Generator) -> CalibrationObject:
+        """Draw an object from the tolerances of this one."""
+        obj = self.obj
+        if obj.exact:
+            return obj
+        tolerance = torch.zeros(obj.fiducials) if obj.tolerance is None else obj.tolerance
+        shift = tolerance[:, None] * torch.randn(obj.points.shape, generator=generator, dtype=obj.points.dtype)
+        scale = 1 + obj.scale_tolerance * torch.randn(1, generator=generator, dtype=obj.points.dtype)
+        return replace(obj, points=scale * obj.points + shift)
 
 
 def judge(case: Case, captures: int, seed: int, options: PipelineOptions) -> dict[str, Any]:
