@@ -9,7 +9,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from imgcal.accuracy import PredictedError, predicted_error
+    from imgcal.accuracy import PredictedError, WorkingVolume, predicted_error
     from imgcal.detection import DetectionOptions, detect
     from imgcal.errors import InputError, RefusedError
     from imgcal.estimation import Estimate, EstimationOptions, estimate
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from imgcal.transforms import RigidTransform
 
 _NAMES = {
-    "imgcal.accuracy": ("PredictedError", "predicted_error"),
+    "imgcal.accuracy": ("PredictedError", "WorkingVolume", "predicted_error"),
     "imgcal.detection": ("DetectionOptions", "detect"),
     "imgcal.errors": ("InputError", "RefusedError"),
     "imgcal.estimation": ("Estimate", "EstimationOptions", "estimate"),
@@ -62,6 +62,7 @@ __all__ = [
     "RefusedError",
     "RigPrior",
     "RigidTransform",
+    "WorkingVolume",
     "calibrate",
     "detect",
     "estimate",
