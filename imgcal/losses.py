@@ -30,8 +30,8 @@ LEAST_DEPTH, LARGEST_DIFFERENCE = 50.0, 1e6
 # Parameters of smaller spread (rad, mm, pixels, pixels, 1) are fixed: float32 cannot tell their offsets from rounding.
 LEAST_SPREAD = (1e-6,) * 3 + (1e-3,) * 3 + (1e-3,) * 2 + (1e-3,) * 2 + (1e-7,) * 5
 
-Weight = Annotated[float, Field(allow_inf_nan=False, ge=0)]
-Positive = Annotated[float, Field(allow_inf_nan=False, gt=0)]
+Weight = Annotated[float, Field(allow_inf_nan=False, ge=0, le=1e9)]
+Positive = Annotated[float, Field(allow_inf_nan=False, gt=0, le=1e9)]
 
 
 class RobustLoss(StrictModel):

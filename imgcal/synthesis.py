@@ -20,6 +20,8 @@ from imgcal.rig import PARAMETERS, CameraRig, RigPrior
 from imgcal.rotations import euler_from_rotation, rotation_from_euler
 from imgcal.transforms import RigidTransform, rotate
 
+LARGEST_SPREAD = 1e6  # of a drift, in any unit
+
 
 @dataclass(frozen=True)
 class PoseRange:
@@ -103,8 +105,10 @@ class PhysicalDrift:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not (math.isfinite(value) and value >= 0):
-                raise InputError(f"{name}: found {value}, expected a standard deviation >= 0")
+            if not 0 <= value <= LARGEST_SPREAD:
+                raise InputError(
+                    f"{name}: found {value}, expected a standard deviation >= 0, at most {LARGEST_SPREAD:g}"
+                )
 
     def apply(self, rig: CameraRig, generator: torch.Generator, *batch: int) -> CameraRig:
         """Disturb every parameter of every camera independently: (*batch, *B) rigs."""

@@ -15,6 +15,12 @@ REACH_SIGMAS = 5.0
 # Slabs that an ellipse is cut into: thin against the blur, and enough for a round outline without blur.
 SLABS_PER_BLUR = 6.0
 SLABS = (48, 512)
+LARGEST_LEVEL = 1000.0  # of anything that is a share of full scale
+SENSOR_LIMITS = (
+    ("blur", 0, 100), ("read_noise", 0, 65535), ("shot_noise", 0, 65535), ("hot_pixels", 0, 1),
+    ("exposure", 0, LARGEST_LEVEL), ("saturation", 0, LARGEST_LEVEL), ("background", -LARGEST_LEVEL, LARGEST_LEVEL),
+    ("contrast", -LARGEST_LEVEL, LARGEST_LEVEL), ("hot_pixel_seed", 0, 2**63 - 1),
+)  # fmt: skip
 SHARP = 0.05  # blur below which the optics count as this sharp, in pixels
 
 
@@ -38,6 +44,15 @@ class BlobRange:
     aspect: tuple[float, float]  # semi-major over semi-minor axis
     intensity: tuple[float, float]
 
+    def __post_init__(self) -> None:
+        """Refuse what no frame shows."""
+        if not 0 <= self.count <= 10_000:
+            raise ValueError(f"count must be from 0 to 10000, found {self.count}")
+        for name, least, most in (("radius", 0.1, 1000.0), ("aspect", 0.01, 100.0), ("intensity", 0.0, LARGEST_LEVEL)):
+            low, high = getattr(self, name)
+            if not least <= low <= high <= most:
+                raise ValueError(f"{name} must be an interval within {least} to {most}, found {low} to {high}")
+
 
 @dataclass(frozen=True)
 class ClutterModel:
@@ -47,6 +62,12 @@ class ClutterModel:
     blobs: BlobRange = BlobRange(4, (1.0, 6.0), (1.0, 1.5), (0.2, 1.0))
     occluded: float = 0.05  # probability that a dark body partly covers a marker
     occluded_diameter: tuple[float, float] = (0.1, 0.7)  # share of the marker's diameter that it covers
+
+    def __post_init__(self) -> None:
+        """Refuse shares that are none."""
+        low, high = self.occluded_diameter
+        if not (0 <= self.occluded <= 1 and 0 <= low <= high <= 1):
+            raise ValueError(f"occluded, occluded_diameter must be shares, found {self.occluded}, {low} to {high}")
 
 
 @dataclass(frozen=True)
@@ -80,9 +101,11 @@ class SensorModel:
             raise ValueError(f"bit_depth must be 8, 12 or 16, found {self.bit_depth}")
         if self.polarity not in ("bright", "dark"):
             raise ValueError(f"polarity must be 'bright' or 'dark', found {self.polarity!r}")
-        for name in ("blur", "read_noise", "shot_noise", "hot_pixels", "exposure", "saturation"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be finite and not negative, found {getattr(self, name)}")
+        for name, low, high in SENSOR_LIMITS:
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"{name} must be from {low} to {high}, found {getattr(self, name)}")
+        if not all(-LARGEST_LEVEL <= change <= LARGEST_LEVEL for change in self.gradient):
+            raise ValueError(f"gradient must be from {-LARGEST_LEVEL} to {LARGEST_LEVEL}, found {self.gradient}")
 
     @property
     def full_scale(self) -> int:

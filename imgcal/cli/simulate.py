@@ -23,6 +23,8 @@ from imgcal.formats import (
     write_frame,
     write_text,
 )
+from imgcal.limits import FIDUCIAL_RADIUS
+from imgcal.messages import shortened
 from imgcal.objects import CalibrationObject
 from imgcal.rig import CameraRig
 from imgcal.rotations import vector_from_rotation
@@ -31,6 +33,8 @@ from imgcal.synthesis import Drift, PhysicalDrift, PoseRange, RelativeDrift
 from renderers import ClutterModel, SensorModel
 
 WRITTEN = ("capture.yaml", "rig.yaml", "object.csv", "truth", "frames")
+
+MOST_SNAPSHOTS = 100_000
 
 
 @dataclass(frozen=True)
@@ -60,14 +64,19 @@ class Simulate:
 
     def run(self) -> None:
         """Simulate and write."""
-        if self.snapshots < 1:
-            raise InputError(f"--snapshots: found {self.snapshots}, expected at least 1")
-        if not 0 < self.marker_radius < math.inf:
-            raise InputError(f"--marker-radius: found {self.marker_radius}, expected mm, more than 0")
+        for name, least, most in (("snapshots", 1, MOST_SNAPSHOTS), ("seed", 0, 2**63 - 1)):
+            if not least <= getattr(self, name) <= most:
+                found = shortened(str(getattr(self, name)))
+                raise InputError(f"--{name}: found {found}, expected at least {least} and at most {most}")
+        if not FIDUCIAL_RADIUS.low <= self.marker_radius <= FIDUCIAL_RADIUS.high:
+            raise InputError(f"--marker-radius: found {self.marker_radius}, expected {FIDUCIAL_RADIUS}")
         for name in ("theta_deg", "phi_deg", "alpha_deg"):
             low, high = getattr(self, name)
-            if not low <= high:
-                raise InputError(f"--{name.replace('_', '-')}: found {low} {high}, expected the smaller angle first")
+            if not -360 <= low <= high <= 360:
+                option = name.replace("_", "-")
+                raise InputError(
+                    f"--{option}: found {low} {high}, expected two from -360 to 360, the smaller angle first"
+                )
         check_folder(self.out)
         if any((self.out / name).exists() for name in ("frames", "truth")):
             raise InputError(f"{self.out}: found a capture there already, expected a new folder")

@@ -15,6 +15,7 @@ from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import Estimate
 from imgcal.evaluation.methods import Given, Method
 from imgcal.evaluation.metrics import KINDS, Errors, concatenate, cramer_rao, errors
+from imgcal.messages import shortened
 from imgcal.networks.prediction import Prediction, Views
 from imgcal.objects import CalibrationObject
 from imgcal.refinement import as_prediction, refine_points
@@ -57,9 +58,11 @@ class Protocol:
     bound_count: int = 512  # rigs of a trial whose Cramer-Rao bounds are evaluated, where there is noise
 
     def __post_init__(self) -> None:
-        for name in ("count", "trials", "batch"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name}: found {getattr(self, name)}, expected at least 1")
+        for name, least, most in (
+            ("count", 1, 10**7), ("trials", 1, 1000), ("batch", 1, 10**5), ("seed", 0, 2**47 - 1),
+        ):  # fmt: skip
+            if not least <= getattr(self, name) <= most:
+                raise InputError(f"{name}: found {shortened(str(getattr(self, name)))}, expected {least} to {most}")
 
 
 class Statistics(TypedDict):

@@ -9,8 +9,12 @@ from pydantic import Field, model_validator
 
 from imgcal.formats.names import nearest
 from imgcal.formats.yaml_file import StrictModel
+from imgcal.messages import shortened
+from imgcal.networks.backbone_options import MOST_WEIGHTS, check_options
 
-Count = Annotated[int, Field(ge=1)]
+Width = Annotated[int, Field(ge=1, le=4096)]
+Count = Annotated[int, Field(ge=1, le=64)]
+Widths = Annotated[tuple[Width, ...], Field(max_length=8)]
 Encoder = Literal["transformer", "cnn1d"]
 Attending = TypeVar("Attending", "PaperPoints", "TrunkConfig")
 
@@ -18,6 +22,8 @@ Attending = TypeVar("Attending", "PaperPoints", "TrunkConfig")
 def _with_whole_heads(config: Attending) -> Attending:
     if config.encoder == "transformer" and config.width % config.heads:
         raise ValueError(f"found width {config.width} and {config.heads} heads, expected a multiple of the heads")
+    if 13 * config.width**2 * config.depth > MOST_WEIGHTS:  # of either encoder, about
+        raise ValueError(f"found width {config.width} and depth {config.depth}, expected a network that fits in memory")
     return config
 
 
@@ -25,11 +31,11 @@ class PaperPoints(StrictModel):
     """The paper's point variant; camera by camera outputs, not offsets."""
 
     encoder: Encoder = "transformer"
-    width: Count = 512
+    width: Width = 512
     depth: Count = 8
     heads: Count = 4
     camera_identity: bool = True  # the paper's CIE
-    head_widths: tuple[Count, ...] = (1024, 1024)
+    head_widths: Widths = (1024, 1024)
 
     @model_validator(mode="after")
     def _divisible(self) -> PaperPoints:
@@ -39,18 +45,23 @@ class PaperPoints(StrictModel):
 class PaperImages(StrictModel):
     """The paper's image variant: one pooled feature an image."""
 
-    backbone: str = "vit_base_patch16_224"
+    backbone: Annotated[str, Field(max_length=200)] = "vit_base_patch16_224"
     pretrained: bool = False
-    options: dict[str, Any] = Field(default={})  # further arguments of timm.create_model
-    bottleneck: Count = 128
-    head_widths: tuple[Count, ...] = (128,)
+    options: dict[str, Any] = Field(default={})  # further arguments of timm.create_model: backbone_options
+    bottleneck: Width = 128
+    head_widths: Widths = (128,)
+
+    @model_validator(mode="after")
+    def _harmless(self) -> PaperImages:
+        check_options(self.options)
+        return self
 
 
 class TrunkConfig(StrictModel):
     """Our network from positions to a rig."""
 
     encoder: Encoder = "transformer"
-    width: Count = 128
+    width: Width = 128
     heads: Count = 4
     depth: Count = 5  # blocks of the first pass
     later_depth: Count = 2  # blocks of every later pass, which share their weights
@@ -71,12 +82,17 @@ class Points(StrictModel):
 class Images(StrictModel):
     """Our image variant: an encoder that also says where each fiducial is, then the same trunk."""
 
-    backbone: str = "vit_tiny_patch16_224"
+    backbone: Annotated[str, Field(max_length=200)] = "vit_tiny_patch16_224"
     pretrained: bool = False
-    options: dict[str, Any] = Field(default={})  # further arguments of timm.create_model
-    bottleneck: Count = 128
+    options: dict[str, Any] = Field(default={})  # further arguments of timm.create_model: backbone_options
+    bottleneck: Width = 128
     positions: bool = True  # hand the trunk each fiducial's position; otherwise the pooled feature alone
     trunk: TrunkConfig = TrunkConfig()
+
+    @model_validator(mode="after")
+    def _harmless(self) -> Images:
+        check_options(self.options)
+        return self
 
 
 Variant = PaperPoints | PaperImages | Points | Images
@@ -109,7 +125,8 @@ class NetworkConfig(StrictModel):
     @model_validator(mode="after")
     def _known(self) -> NetworkConfig:
         if self.preset not in PRESETS:
-            raise ValueError(f"found preset `{self.preset}`{nearest(self.preset, PRESETS) or one_of(PRESETS)}")
+            hint = nearest(self.preset, PRESETS) or one_of(PRESETS)
+            raise ValueError(f"found preset `{shortened(self.preset)}`{hint}")
         self.variant()
         return self
 
@@ -132,7 +149,8 @@ def _merged(values: dict[str, Any], change: dict[str, Any], where: str) -> dict[
     merged = dict(values)
     for name, value in change.items():
         if name not in values:
-            raise ValueError(f"found `{name}` in the changes of {where}{nearest(name, values) or one_of(values)}")
+            hint = nearest(name, values) or one_of(values)
+            raise ValueError(f"found `{shortened(name)}` in the changes of {where}{hint}")
         inner = isinstance(values[name], dict) and isinstance(value, dict) and name != "options"
         merged[name] = _merged(values[name], value, f"{where}: {name}") if inner else value
     return merged

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, cast
 
-import timm
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from imgcal.errors import InputError
-from imgcal.formats.names import nearest
+from imgcal.networks.backbone import Backbone
 from imgcal.networks.config import Images, PaperImages
 from imgcal.networks.decode import Decoder
 from imgcal.networks.points import PaperHeads
@@ -19,36 +16,6 @@ from imgcal.networks.positions import soft_positions
 from imgcal.networks.prediction import Prediction, Views
 from imgcal.networks.rendering import ImageOptions
 from imgcal.networks.trunk import Trunk
-
-SIZE = 224  # pixels, width and height that the encoders take
-
-
-class Backbone(nn.Module):
-    """A timm model without its classifier: a pooled feature, and a map of features over the image."""
-
-    def __init__(self, name: str, pretrained: bool, options: Mapping[str, Any]) -> None:
-        super().__init__()
-        self.model: Any = make_backbone(name, pretrained, options)
-        self.map_width = cast(int, self.model.num_features)
-        self.pooled_width = cast(int, getattr(self.model, "head_hidden_size", None) or self.map_width)
-
-    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Encode images (I, 3, H, W); other sizes than the encoder's are resized.
-
-        Returns:
-            The pooled feature (I, pooled_width) and the map (I, map_width, h, w).
-        """
-        if images.shape[-2:] != (SIZE, SIZE):
-            images = functional.interpolate(images, (SIZE, SIZE), mode="bilinear", antialias=True, align_corners=False)
-        features = self.model.forward_features(images)
-        pooled = self.model.forward_head(features, pre_logits=True)
-        if features.ndim == 3:  # tokens: those before the patches (class token) do not belong to the map
-            patches = features[:, int(getattr(self.model, "num_prefix_tokens", 0)) :]
-            side = round(patches.shape[1] ** 0.5)
-            features = patches.mT.unflatten(-1, (side, -1))
-        elif getattr(self.model, "output_fmt", "NCHW") == "NHWC":
-            features = features.movedim(-1, 1)
-        return pooled, features
 
 
 class PaperImageNetwork(nn.Module):
@@ -59,9 +26,9 @@ class PaperImageNetwork(nn.Module):
 
     def __init__(self, config: PaperImages, decoder: Decoder) -> None:
         super().__init__()
-        self.image_options: ImageOptions = ImageOptions(size=SIZE)
         self.decoder = decoder
         self.backbone = Backbone(config.backbone, config.pretrained, config.options)
+        self.image_options: ImageOptions = ImageOptions(size=max(self.backbone.size))
         self.bottleneck = nn.Linear(self.backbone.pooled_width, config.bottleneck)
         self.heads = PaperHeads(config.bottleneck, config.head_widths)
 
@@ -91,10 +58,10 @@ class ImageNetwork(nn.Module):
 
     def __init__(self, config: Images, decoder: Decoder, colours: Tensor) -> None:
         super().__init__()
-        self.image_options: ImageOptions = ImageOptions(size=SIZE)
         self.decoder = decoder
         self.register_buffer("colours", colours.to(decoder.focal_length), persistent=False)
         self.backbone = Backbone(config.backbone, config.pretrained, config.options)
+        self.image_options: ImageOptions = ImageOptions(size=max(self.backbone.size))
         self.bottleneck = nn.Linear(self.backbone.pooled_width, config.bottleneck)
         self.positions = config.positions
         if config.positions:
@@ -124,32 +91,6 @@ class ImageNetwork(nn.Module):
         """Parameters that may have their own learning rates."""
         heads = [*self.bottleneck.parameters(), *(self.belief.parameters() if self.positions else ())]
         return {"encoder": self.backbone.parameters(), "heads": heads, "trunk": self.trunk.parameters()}
-
-
-def make_backbone(name: str, pretrained: bool, options: Mapping[str, Any]) -> nn.Module:
-    """Make a timm model without a classifier.
-
-    Args:
-        name: as `timm.list_models()` has it.
-        pretrained: load the published weights; needs network access or a filled cache.
-        options: further arguments of `timm.create_model`.
-
-    Raises:
-        InputError: no such model, options that it does not take, or no way to its weights.
-    """
-    if not timm.is_model(name):
-        raise InputError(f"backbone: found `{name}`, expected a timm model{nearest(name, timm.list_models())}")
-    try:
-        return timm.create_model(name, pretrained=pretrained, num_classes=0, **options)
-    except TypeError as error:
-        raise InputError(f"backbone {name}: found options {dict(options)} that it does not take: {error}") from error
-    except (OSError, RuntimeError) as error:
-        if not pretrained:
-            raise InputError(f"backbone {name}: cannot be made: {str(error).splitlines()[0]}") from error
-        raise InputError(
-            f"backbone {name}: its pretrained weights cannot be loaded ({str(error).splitlines()[0]}); go online, "
-            "put them into timm's cache (HF_HOME), or set pretrained: false"
-        ) from error
 
 
 def images_of(views: Views) -> Tensor:

@@ -15,6 +15,8 @@ from torch import Tensor, nn
 from imgcal import networks
 from imgcal.errors import InputError
 from imgcal.formats import load_object, load_rig, save_object, save_rig
+from imgcal.formats.json_text import read_json
+from imgcal.formats.names import title_of
 from imgcal.formats.safetensors_file import read_tensors, read_texts, write_tensors
 from imgcal.formats.yaml_file import validated
 from imgcal.networks.rendering import ImageOptions
@@ -182,7 +184,9 @@ def _fill(path: str | Path, network: nn.Module, tensors: dict[str, Tensor]) -> N
 
 def _read_records(path: str | Path, texts: dict[str, str]) -> tuple[Experiment, dict[str, Any]]:
     try:
-        content, metrics = json.loads(texts["experiment"]), json.loads(texts["metrics"])
+        content, metrics = read_json(texts["experiment"]), read_json(texts["metrics"])
+        if not isinstance(content, dict) or not isinstance(metrics, dict):
+            raise ValueError("no mapping")
     except (KeyError, ValueError) as error:
         raise InputError(f"{path}: found no readable experiment in it, expected one: the file is damaged") from error
     return validated(content, Experiment, f"{path}: experiment"), metrics
@@ -203,7 +207,8 @@ def _from_texts(path: str | Path, texts: dict[str, str]) -> tuple[CameraRig, Cal
         try:
             rig_file.write_text(texts["rig"], "utf-8")
             object_file.write_text(texts["object"], "utf-8")
-            return load_rig(rig_file), replace(load_object(object_file), name=texts["object_name"])
+            name = title_of(Path(texts["object_name"]))
+            return load_rig(rig_file), replace(load_object(object_file), name=name)
         except (KeyError, InputError) as error:
             raise InputError(f"{path}: found no readable rig and object in it, expected both: {error}") from error
 

@@ -14,6 +14,7 @@ from imgcal.formats import load_object, load_rig, write_text
 from imgcal.formats.names import find_file
 from imgcal.formats.yaml_file import Flow, StrictModel, parse_yaml, read_yaml, validated, yaml_text
 from imgcal.losses import LossConfig
+from imgcal.messages import quoted
 from imgcal.networks import NetworkConfig
 from imgcal.objects import CalibrationObject
 from imgcal.rig import CameraRig
@@ -22,10 +23,10 @@ from imgcal.synthesis import Drift, PhysicalDrift, PoseRange, RelativeDrift
 FORMAT = "imgcal-experiment/1"
 
 Kappa = Annotated[float, Field(ge=0, lt=1)]
-Spread = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Spread = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Count = Annotated[int, Field(ge=1)]
+Positive = Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1, le=10**9)]
 Interval = Annotated[list[Annotated[float, Field(ge=-360, le=360)]], Field(min_length=2, max_length=2)]
 
 
@@ -110,7 +111,7 @@ class OptimizerConfig(StrictModel):
     kind: Literal["adam", "adamw"] = "adamw"
     lr: Positive = 1e-3
     learning_rates: dict[str, Positive] = Field(
-        default={}
+        default={}, max_length=64
     )  # by group of the network (encoder, trunk, heads), instead of `lr`
     betas: Annotated[list[Annotated[float, Field(ge=0, lt=1)]], Field(min_length=2, max_length=2)] = Field(
         default=[0.9, 0.99]
@@ -127,7 +128,7 @@ class ScheduleConfig(StrictModel):
     warmup: Fraction = 0.02  # cosine: part of the run
     final: Fraction = 0.0  # cosine: part of the learning rate that is left at the end
     every: Count = 100  # plateau: steps over which the loss is averaged before it is judged
-    patience: Annotated[int, Field(ge=0)] = 10  # plateau: judgements without improvement
+    patience: Annotated[int, Field(ge=0, le=10**9)] = 10  # plateau: judgements without improvement
     factor: Annotated[float, Field(gt=0, lt=1)] = 0.5  # plateau
     threshold: Fraction = 1e-3  # plateau: relative improvement that counts
 
@@ -137,15 +138,15 @@ class TrainingConfig(StrictModel):
 
     steps: Count | None = None  # the run ends after this many steps ...
     minutes: Positive | None = None  # ... or minutes of training, whichever comes first
-    batch_size: Count = 64  # rigs a step, over all processes
+    batch_size: Annotated[int, Field(ge=1, le=2**16)] = 64  # rigs a step, over all processes
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     precision: Literal["float32", "bf16"] = "float32"  # of the encoder and trunk; geometry is always float32
     device: Literal["auto", "cpu"] = "auto"
-    threads: Count | None = None  # of the CPU; None = as the environment says
+    threads: Annotated[int, Field(ge=1, le=1024)] | None = None  # of the CPU; None = as the environment says
     init_from: str | None = None  # a checkpoint to start the weights from
     log_every: Count = 50  # steps
     validate_every: Count = 500  # steps
-    validation_rigs: Annotated[int, Field(ge=0)] = 512  # 0 = no validation
+    validation_rigs: Annotated[int, Field(ge=0, le=10**6)] = 512  # 0 = no validation
     save_every: Count = 500  # steps
 
     @model_validator(mode="after")
@@ -159,8 +160,8 @@ class Experiment(StrictModel):
     """What an experiment file holds."""
 
     format: Literal["imgcal-experiment/1"]
-    name: Annotated[str, Field(min_length=1)]
-    description: str = ""
+    name: Annotated[str, Field(min_length=1, max_length=200)]
+    description: Annotated[str, Field(max_length=10_000)] = ""
     paper: PaperRow | None = None
     rig: str  # shipped name or path
     object: str  # shipped name or path
@@ -204,7 +205,7 @@ def changed(experiment: Experiment, *changes: str) -> Experiment:
     content = as_written(experiment)
     for change in changes:
         _apply(content, change)
-    return validated(content, Experiment, f"--set {' '.join(changes)}")
+    return validated(content, Experiment, f"--set {quoted(' '.join(changes))}")
 
 
 def as_written(experiment: Experiment) -> dict[str, Any]:
@@ -236,7 +237,7 @@ def _plain(value: Any) -> Any:
 
 
 def _apply(content: dict[str, Any], change: str) -> None:
-    where = f"--set {change}"
+    where = f"--set {quoted(change)}"
     key, equals, text = change.partition("=")
     steps = key.strip().split(".")
     if not equals or not all(steps):
@@ -247,5 +248,7 @@ def _apply(content: dict[str, Any], change: str) -> None:
             record[step] = {}
         record = record[step]
         if not isinstance(record, dict):
-            raise InputError(f"{where}: found the value {record!r} at `{step}`, expected a group of keys")
+            raise InputError(
+                f"{where}: found the value {quoted(repr(record))} at `{quoted(step)}`, expected a group of keys"
+            )
     record[steps[-1]] = parse_yaml(text, where)

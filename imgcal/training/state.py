@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from imgcal.errors import InputError
+from imgcal.formats.json_text import read_json
 from imgcal.formats.safetensors_file import read_tensors, write_tensors
 from imgcal.training.experiment import Experiment
 
@@ -51,7 +52,9 @@ def load_state(path: str | Path, experiment: Experiment) -> State:
     """
     tensors, texts = read_tensors(path, FORMAT)
     try:
-        values, saved = json.loads(texts["values"]), json.loads(texts["experiment"])
+        values, saved = read_json(texts["values"]), read_json(texts["experiment"])
+        if not isinstance(values, dict) or not isinstance(saved, dict):
+            raise ValueError("no mapping")
     except (KeyError, ValueError) as error:
         raise InputError(f"{path}: found no readable state in it: the file is damaged") from error
     difference = first_difference(saved, experiment.model_dump())

@@ -226,7 +226,7 @@ def test_unusable_arguments_are_named() -> None:
         SensorModel(bit_depth=10)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="polarity must be"):
         SensorModel(polarity="grey")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="read_noise must be finite"):
+    with pytest.raises(ValueError, match="read_noise must be from 0"):
         SensorModel(read_noise=math.nan)
     with pytest.raises(ValueError, match=r"blobs need \(2, N, 2\)"):
         render_blobs(blobs(torch.zeros(2, 3, 2), torch.ones(2, 4, 2, 2)), SIZE, 0.7)

@@ -170,6 +170,75 @@ def test_any_backbone_fits(backbone, options):
         assert len(network(views(network, snapshots(network)))) == network.trunk.passes
 
 
+@pytest.mark.parametrize(
+    ("backbone", "options", "size"),
+    [
+        ("vit_tiny_patch16_384", {"depth": 1}, 384),
+        ("vit_small_patch14_dinov2", {"depth": 1}, 518),
+        ("vit_small_patch14_reg4_dinov2", {"depth": 1, "img_size": 224}, 224),
+        ("eva02_tiny_patch14_336", {"depth": 1}, 336),
+    ],
+)
+def test_a_backbone_gets_images_of_its_own_size(backbone, options, size):
+    network = make("vit", backbone=backbone, options=options)
+    assert network.backbone.size == (size, size) and network.image_options.size == size
+    with torch.no_grad():
+        assert len(network(views(network, snapshots(network)))) == network.trunk.passes
+
+
+@pytest.mark.parametrize("preset", ["paper-vit", "vit"])
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"checkpoint_path": "/tmp/evil.pth"}, "checkpoint_path"),
+        ({"pretrained_cfg": {"file": "/tmp/evil.pth"}}, "pretrained_cfg"),
+        ({"pretrained_cfg_overlay": {"file": "/tmp/evil.pth"}}, "pretrained_cfg_overlay"),
+        ({"cache_dir": "/tmp"}, "cache_dir"),
+        ({"scriptable": True}, "scriptable"),
+        ({"depth": 10_000_000}, "up to 128"),
+        ({"embed_dim": 10**9}, "up to 8192"),
+        ({"embed_dim": float("nan")}, "up to 8192"),
+        ({"depths": [[3]]}, "up to 128"),
+        ({"act_layer": "os.system"}, "short word"),
+        ({"drop_rate": -1}, "0 to 1"),
+        ({"x" * 1000: 1}, "x{37}\\.\\.\\.`"),
+    ],
+)
+def test_options_that_are_not_of_a_shape_are_refused(preset, options, message, monkeypatch):
+    monkeypatch.setattr("imgcal.networks.backbone.timm.create_model", None)
+    with pytest.raises(ValueError, match=message):
+        NetworkConfig(preset=preset, change={"options": options})
+
+
+@pytest.mark.parametrize(
+    "backbone", ["local-dir:/tmp/evil", "hf-hub:evil/vit", "/tmp/evil", "../vit_tiny_patch16_224", "x" * 150]
+)
+def test_a_backbone_is_no_place(backbone, monkeypatch):
+    monkeypatch.setattr("imgcal.networks.backbone.timm.create_model", None)
+    with pytest.raises(InputError, match="expected a timm model"):
+        make("vit", backbone=backbone, options={})
+
+
+def test_options_that_do_not_go_together_are_one_line():
+    for options in ({"embed_dim": 100, "num_heads": 3}, {"patch_size": 0}, {"dims": [8]}, {"depth": [1, 2]}):
+        with pytest.raises(InputError, match="backbone vit_tiny_patch16_224") as caught:
+            make("vit", options=options)
+        assert "\n" not in str(caught.value) and len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize(
+    "change", [{"width": 4096, "depth": 64}, {"depth": 10**7}, {"width": 10**6}, {"passes": 10**6}]
+)
+def test_a_network_that_fits_in_no_memory_is_refused_before_it_is_built(change):
+    with pytest.raises(ValueError, match=r"fits in memory|less than or equal"):
+        NetworkConfig(preset="points", change={"trunk": change})
+
+
+def test_the_weights_of_a_backbone_are_counted_before_they_are_made(monkeypatch):
+    with pytest.raises(InputError, match=r"1,842,\d+,\d+ weights, expected at most"):
+        make("vit", backbone="vit_gigantic_patch14_224", options={})
+
+
 def test_an_unknown_backbone_is_refused():
     with pytest.raises(InputError, match="nearest: vit_tiny_patch16_224"):
         make("vit", backbone="vit_tiny_patch16_225")
@@ -179,7 +248,7 @@ def test_pretrained_weights_that_cannot_be_loaded_say_what_to_do(monkeypatch, tm
     def offline(*_, **__):
         raise OSError("no route to host")
 
-    monkeypatch.setattr("imgcal.networks.images.timm.create_model", offline)
+    monkeypatch.setattr("imgcal.networks.backbone.timm.create_model", offline)
     with pytest.raises(InputError, match="HF_HOME"):
         make("vit", pretrained=True)
 

@@ -1,9 +1,11 @@
+import json
 import pickle
 import re
 from dataclasses import replace
 
 import pytest
 import torch
+from safetensors.torch import save
 
 from imgcal import networks
 from imgcal.errors import InputError
@@ -43,6 +45,53 @@ def test_a_network_comes_back(made, path):
     assert found.experiment == experiment
     assert found.obj.name == "asymmetric8"
     torch.testing.assert_close(found.drift_std, experiment.drift.drift().std(load_rig("T4")), rtol=1e-9, atol=1e-12)
+
+
+DEEP = '{"a":' * 200 + "1" + "}" * 200
+
+
+@pytest.mark.parametrize(
+    ("key", "text", "message"),
+    [
+        ("experiment", "[" * 100_000, "no readable experiment"),
+        ("experiment", DEEP, "no readable experiment"),
+        ("experiment", "[]", "no readable experiment"),
+        ("experiment", "7" * 5000, "no readable experiment"),
+        ("metrics", DEEP, "no readable experiment"),
+        ("metrics", "1", "no readable experiment"),
+        ("rig", "[" * 100_000, "no readable rig"),
+        ("rig", "", "no readable rig"),
+        ("object", "x,y,z\n0,0,1e200\n" * 4, "no readable rig and object"),
+        ("format", "imgcal-network/2", "expected imgcal-network/1"),
+    ],
+)
+def test_damaged_texts_are_one_line(path, key, text, message):
+    tensors, texts = read_tensors(path, FORMAT)
+    path.write_bytes(save(tensors, {**texts, key: text}))
+    with pytest.raises(InputError, match=message) as caught:
+        load_checkpoint(path)
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 1000
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"preset": "vit", "change": {"options": {"checkpoint_path": "/tmp/evil.pth"}}},
+        {"preset": "vit", "change": {"backbone": "local-dir:/tmp/evil"}},
+        {"preset": "points", "change": {"trunk": {"depth": 10**7}}},
+        {"preset": "points", "change": {"trunk": {"width": 10**7}}},
+    ],
+)
+def test_a_model_file_asks_for_nothing_but_its_own_network(path, change, monkeypatch):
+    tensors, texts = read_tensors(path, FORMAT)
+    experiment = json.loads(texts["experiment"])
+    experiment["network"] = change
+    experiment["training"]["init_from"] = "/tmp/evil.pth"
+    path.write_bytes(save(tensors, {**texts, "experiment": json.dumps(experiment)}))
+    monkeypatch.undo()  # the real networks
+    monkeypatch.setattr("timm.create_model", None)
+    with pytest.raises(InputError, match=r"model\.safetensors: experiment: network|expected a timm model"):
+        load_checkpoint(path)
 
 
 def test_published_weights_are_not_asked_for_where_trained_ones_replace_them(experiment, tmp_path, monkeypatch):

@@ -1,0 +1,106 @@
+"""Any timm model as an encoder of images: a pooled feature, and a map of features over the image."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, cast
+
+import timm
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from imgcal.errors import InputError
+from imgcal.formats.names import nearest
+from imgcal.messages import quoted, shortened
+from imgcal.networks.backbone_options import MOST_WEIGHTS, check_options
+
+SIZE = 224  # pixels, width and height of images for encoders that take any
+
+
+class Backbone(nn.Module):
+    """A timm model without its classifier: a pooled feature, and a map of features over the image."""
+
+    def __init__(self, name: str, pretrained: bool, options: Mapping[str, Any]) -> None:
+        super().__init__()
+        self.model: Any = make_backbone(name, pretrained, options)
+        self.size = input_size(self.model)
+        self.map_width = cast(int, self.model.num_features)
+        self.pooled_width = cast(int, getattr(self.model, "head_hidden_size", None) or self.map_width)
+
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Encode images (I, 3, H, W); other sizes than the encoder's are resized.
+
+        Returns:
+            The pooled feature (I, pooled_width) and the map (I, map_width, h, w).
+        """
+        if images.shape[-2:] != self.size:
+            images = functional.interpolate(images, self.size, mode="bilinear", antialias=True, align_corners=False)
+        features = self.model.forward_features(images)
+        pooled = self.model.forward_head(features, pre_logits=True)
+        if features.ndim == 3:  # tokens: those before the patches (class token) do not belong to the map
+            patches = features[:, int(getattr(self.model, "num_prefix_tokens", 0)) :]
+            side = round(patches.shape[1] ** 0.5)
+            features = patches.mT.unflatten(-1, (side, -1))
+        elif getattr(self.model, "output_fmt", "NCHW") == "NHWC":
+            features = features.movedim(-1, 1)
+        return pooled, features
+
+
+def make_backbone(name: str, pretrained: bool, options: Mapping[str, Any]) -> nn.Module:
+    """Make a timm model without a classifier.
+
+    Args:
+        name: as `timm.list_models()` has it.
+        pretrained: load the published weights; needs network access or a filled cache.
+        options: further arguments of `timm.create_model`, of those in `backbone_options.ALLOWED`.
+
+    Raises:
+        InputError: no such model, options that it does not take, a model that is too large, or no way to its weights.
+    """
+    if not timm.is_model(name):
+        known = nearest(name, timm.list_models()) if len(name) < 100 else ""
+        raise InputError(f"backbone: found `{shortened(name)}`, expected a timm model{known}")
+    try:
+        check_options(options)
+        _check_weights(name, options)
+        return timm.create_model(name, pretrained=pretrained, num_classes=0, **options)
+    except InputError:
+        raise
+    except TypeError as error:
+        raise InputError(
+            f"backbone {name}: found options {quoted(repr(dict(options)))} that it does not take: {quoted(str(error))}"
+        ) from error
+    except (OSError, RuntimeError) as error:
+        if not pretrained:
+            raise InputError(f"backbone {name}: cannot be made: {_first_line(error)}") from error
+        raise InputError(
+            f"backbone {name}: its pretrained weights cannot be loaded ({_first_line(error)}); go online, "
+            "put them into timm's cache (HF_HOME), or set pretrained: false"
+        ) from error
+    except Exception as error:  # timm asserts, divides and looks up what the options give it
+        found = f"{type(error).__name__} {_first_line(error)}".strip()
+        raise InputError(f"backbone {name}: cannot be made of {quoted(repr(dict(options)))}: {found}") from error
+
+
+def input_size(model: Any) -> tuple[int, int]:
+    """Height and width (pixels) of the images that a timm model takes; `SIZE` where it takes any."""
+    of_patches = getattr(getattr(model, "patch_embed", None), "img_size", None)
+    config = model.pretrained_cfg
+    if of_patches is None and config.get("fixed_input_size"):
+        of_patches = config["input_size"][-2:]
+    height, width = of_patches or (SIZE, SIZE)
+    return int(height), int(width)
+
+
+def _check_weights(name: str, options: Mapping[str, Any]) -> None:
+    """Count the weights of a model that has no memory yet."""
+    with torch.device("meta"):
+        outline = timm.create_model(name, pretrained=False, num_classes=0, **options)
+    weights = sum(parameter.numel() for parameter in outline.parameters())
+    if weights > MOST_WEIGHTS:
+        raise InputError(f"backbone {name}: found {weights:,} weights, expected at most {MOST_WEIGHTS:,}")
+
+
+def _first_line(error: Exception) -> str:
+    return quoted((str(error).splitlines() or [""])[0])
