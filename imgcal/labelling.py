@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from imgcal.errors import InputError, RefusedError
-from imgcal.estimation import EstimationOptions, camera_std, estimate
+from imgcal.estimation import EstimationOptions, estimate, flat_std
 from imgcal.identity import Identity, IdentityOptions, Status, identify, oriented
 from imgcal.limits import check_object, check_rig
 from imgcal.messages import listed
@@ -177,10 +177,12 @@ class Patience:
 class Follower:
     """Carries what earlier snapshots say, the pose and the rig, to the next one."""
 
-    def __init__(self, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions) -> None:
+    def __init__(
+        self, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions, remembered: int = MOST_REMEMBERED
+    ) -> None:
         check_rig(rig)
         check_object(obj)
-        self.factory, self.obj, self.options = rig, obj, options
+        self.factory, self.obj, self.options, self.remembered = rig, obj, options, remembered
         self.rig = rig
         self.spread = (rig.prior or RigPrior()).std(rig)
         self.pose = None if options.start_pose is None else _checked_pose(options.start_pose, rig)
@@ -238,7 +240,7 @@ class Follower:
     def _remember(self, blobs: Detections, labels: NDArray[np.int64], pose: RigidTransform) -> None:
         """Keep the pose; refit the rig after 1, 2, 4, 8, ... accepted snapshots."""
         self.pose = pose
-        if len(self.accepted) == MOST_REMEMBERED:
+        if len(self.accepted) >= self.remembered:
             return
         self.accepted.append((blobs, labels, pose))
         count = len(self.accepted)
@@ -251,7 +253,7 @@ class Follower:
         fit = estimate(observations, self.factory, self.obj, poses, options=self.options.estimation)
         if bool(fit.converged):
             prior = (self.factory.prior or RigPrior()).std(self.factory)
-            self.rig, self.spread = fit.rig, torch.minimum(2 * camera_std(fit), prior)
+            self.rig, self.spread = fit.rig, torch.minimum(2 * flat_std(fit), prior)
 
 
 def _checked_pose(pose: RigidTransform, rig: CameraRig) -> RigidTransform:

@@ -6,36 +6,66 @@ import os
 from collections import deque
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, field, fields, replace
 from types import TracebackType
+from typing import Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from imgcal.detection import Blobs, DetectionOptions, detect_snapshot
 from imgcal.detection.options import Frame
 from imgcal.errors import InputError, RefusedError
-from imgcal.estimation import estimate
-from imgcal.identity.assignment import distances_to_nearest, mutual_nearest
+from imgcal.estimation import flat_std
+from imgcal.following import astray, found_again, near_prediction, spare_blobs, widened, without_strays
+from imgcal.gauge import aligned
 from imgcal.identity.rivals import lattice_shifts
-from imgcal.labelling import Follower, Labelled, PipelineOptions, SnapshotIdentity, to_observations
+from imgcal.labelling import Follower, PipelineOptions, SnapshotIdentity
+from imgcal.motion import measured_move
+from imgcal.moved import MovedCamera
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections
-from imgcal.pipeline import Calibration, fit_labelled
-from imgcal.rig import CameraRig
+from imgcal.pipeline import Calibration
+from imgcal.rig import CameraRig, RigPrior
 from imgcal.sources import checked_detections, checked_frames
 from imgcal.transforms import RigidTransform
+from imgcal.window import RELEARNT, SIGNIFICANT, USUAL, Kept, Window, WindowFit
 
 MOST_FOLLOWED = 64
 """Fiducials of a lattice up to which a snapshot may be labelled by the last prediction alone; a larger one could have
 slipped by a pitch unnoticed."""
-TOO_NEAR = 0.6
-"""Distance (px) between two predictions below which nearness does not tell which is which."""
-MOST_APART = 5.0
-"""Times the median distance that a blob may be from its fiducial, once the pose has been fitted with the last rig."""
 LEAST_FOLLOWED = 0.9
 """Share of the last snapshot's labels that must be found again, and fit."""
+REMEMBERED = 8
+"""Latest snapshots that are compared with a new one which does not fit, however small the window."""
+
+CameraState = Literal["seen", "recent", "kept", "factory", "astray"]
+
+
+@dataclass(frozen=True)
+class LiveCalibration(Calibration):
+    """A calibration from the latest snapshots, and what each camera's values are made from.
+
+    States of a camera: `seen` in this snapshot; `recent`, in an earlier one of the window; `kept`, in none of them: it
+    has the values that it had last, with their standard deviation; `factory`, it has seen nothing yet: the factory's
+    values and prior; `astray`, it sees what may be the object, but not where its values put it: they are its last ones,
+    and hold no more.
+    """
+
+    cameras: Mapping[str, CameraState] = field(default_factory=dict)
+    moved: tuple[MovedCamera, ...] = ()  # noticed with this snapshot; again when a camera that was lost is found
+    restarted: bool = False  # older snapshots did not go with this one, nothing said why, and they were given up
+
+
+@dataclass(frozen=True)
+class _Last:
+    """What was known of a camera when it was last seen."""
+
+    rig: CameraRig
+    std: Tensor  # (15,)
+    seen: frozenset[int]  # cameras in the window of that time
 
 
 class Recalibrator:
@@ -58,18 +88,28 @@ class Recalibrator:
         Args:
             rig: the factory calibration, without batch axes.
             obj: the calibration object.
-            options: how sure each result must be.
+            options: how sure each result must be. Cameras that see nothing are always accepted.
             detection: how blobs are found.
             window: number of latest snapshots that a calibration is made from; more know the rig better and follow it
-                more slowly.
+                more slowly. Of a camera that moves, those before the move are left out.
         """
         if window < 1:
             raise InputError(f"window: found {window}, expected at least 1 snapshot")
-        self.rig, self.obj, self.options, self.detection = rig, obj, options, detection
-        self._follower = Follower(rig, obj, options)
-        self._recent: deque[tuple[Detections, SnapshotIdentity]] = deque(maxlen=window)
-        self._latest: Calibration | None = None
-        self._count = 0
+        self.rig, self.obj, self.detection, self.window = rig, obj, detection, window
+        self.options = replace(options, blind_cameras=True)
+        self._follower = Follower(rig, obj, self.options, remembered=0)
+        self._fit = WindowFit(rig, obj, self.options, window)
+        self._recent: deque[Kept] = deque(maxlen=max(window, REMEMBERED))
+        self._spread = (rig.prior or RigPrior()).std(rig)
+        self._latest: LiveCalibration | None = None
+        self._fitted: Calibration | None = None  # the same without what is kept of cameras that are not in the window
+        self._last: dict[int, _Last] = {}
+        self._missed: dict[int, int] = {}  # camera -> snapshots in a row in which it was astray
+        self._gone: frozenset[int] = frozenset()  # cameras that have moved and were not found again
+        self._follows = False  # the last snapshot says where the object is now
+        self._spare: deque[NDArray[np.int64]] = deque(maxlen=15)
+        self._usual: deque[float] = deque(maxlen=200)
+        self._count = self._refused = 0
         self._slips = obj.fiducials > MOST_FOLLOWED and bool(lattice_shifts(obj))
         self._pool = ThreadPoolExecutor(min(rig.cameras, os.cpu_count() or 1))
 
@@ -83,16 +123,19 @@ class Recalibrator:
         """End the threads."""
         self._pool.shutdown()
 
-    def update(self, source: Mapping[str, Frame | None] | Detections) -> Calibration:
+    def update(self, source: Mapping[str, Frame | None] | Detections) -> LiveCalibration:
         """Recalibrate from a new snapshot.
 
         Args:
             source: frames by camera, (H, W), None = no frame; or blobs that were found elsewhere, labelled or not.
 
+        Returns:
+            The calibration from the latest snapshots. Cameras that see nothing stay in it: see `LiveCalibration`.
+
         Raises:
             RefusedError: this snapshot cannot decide; the next one is tried afresh.
-            InputError: a frame is no grey image, or is of a camera that the rig does not have; blobs of more than one
-                snapshot.
+            InputError: a frame is no grey image, of another size than the rig says, or of a camera that the rig does
+                not have; blobs of more than one snapshot.
         """
         name = f"{self._count:05d}"
         self._count += 1
@@ -102,12 +145,8 @@ class Recalibrator:
         followed = self._follow(usable, name) if coded is None else None
         if followed is not None:
             return followed
-        self._latest = None
-        snapshot, labels = self._follower.decide(usable, name, coded)
-        if snapshot.status == "refused":
-            raise RefusedError(f"identity: {snapshot.reason}")
-        usable = replace(usable, fiducial=labels)
-        return self._keep(usable, snapshot, self._fit(usable, snapshot))
+        self._follows = False
+        return self._concluded(*self._decided(usable, name, coded))
 
     def _blobs(self, source: Mapping[str, Frame | None] | Detections, name: str) -> Detections:
         if isinstance(source, Detections):
@@ -125,87 +164,177 @@ class Recalibrator:
             frames[camera] = frame
         return _table(detect_snapshot(frames, self.detection, pool=self._pool), name, self.rig)
 
-    def _follow(self, blobs: Detections, name: str) -> Calibration | None:
+    def _follow(self, blobs: Detections, name: str) -> LiveCalibration | None:
         """Label blobs by the last result's prediction, where the object has moved little; None = not to be trusted.
 
         What is accepted here has been fitted: as many labels as before, hardly any of them an outlier.
         """
         latest = self._latest
-        if latest is None or self._slips:
+        if latest is None or not self._follows or self._slips:
             return None
         points = latest.rig_from_object[-1].apply(self.obj.points)
         predicted = latest.rig.project(points, self.obj.radius).uv.numpy()  # (C, N, 2)
-        blobs, pose = self._without_strays(replace(blobs, fiducial=_nearest(blobs, predicted)), latest)
+        named = replace(blobs, fiducial=near_prediction(blobs, predicted))
+        blobs, pose = without_strays(named, latest.rig, self.obj, latest.rig_from_object[-1], self.options)
         before = int(latest.observations.seen[-1].sum())
-        if (blobs.fiducial >= 0).sum() < LEAST_FOLLOWED * before:
+        if (blobs.fiducial >= 0).sum() < LEAST_FOLLOWED * before or self._astray(blobs, pose).any():
             return None
         snapshot = SnapshotIdentity(name, "by_tracking", "near the last prediction", 1, pose)
         try:
-            result = self._fit(blobs, snapshot, latest)
+            return self._concluded(blobs, snapshot, least=LEAST_FOLLOWED * before)
         except RefusedError:
             return None
-        if int(result.observations.seen[-1].sum()) < LEAST_FOLLOWED * before:
-            return None
-        status, alternatives = self._follower.follow(result.rig_from_object[-1])
-        return self._keep(blobs, replace(snapshot, status=status, alternatives=alternatives), result)
 
-    def _without_strays(self, blobs: Detections, latest: Calibration) -> tuple[Detections, RigidTransform]:
-        """Fit the pose with the last rig, and drop labels that are off: two markers in one, a reflection beside one."""
-        seen = to_observations(blobs, self.rig, self.obj)
-        even = replace(seen, sigma=torch.full_like(seen.sigma, self.options.identity_error))
-        held, robust = torch.zeros_like(latest.problem.spread[0]), replace(self.options.estimation, loss="cauchy")
-        fit = estimate(even, latest.rig, self.obj, latest.rig_from_object[-1:], spread=held, options=robust)
-        distance = fit.residual[0].norm(dim=-1)  # (C, N)
-        usual = distance[seen.seen[0]].median() if bool(seen.seen.any()) else torch.inf
-        stray = (distance > self.options.identity_error + MOST_APART * usual).numpy()
-        fiducial = np.where(stray[blobs.camera, blobs.fiducial], -1, blobs.fiducial)
-        return replace(blobs, fiducial=fiducial), fit.rig_from_object[0]
+    def _decided(
+        self, usable: Detections, name: str, coded: NDArray[np.int64] | None
+    ) -> tuple[Detections, SnapshotIdentity]:
+        """Label a snapshot by itself, with what is known of the rig."""
+        prior, follower = (self.rig.prior or RigPrior()).std(self.rig), self._follower
+        follower.rig, follower.spread = self.rig, prior
+        if self._latest is not None:
+            follower.rig, follower.spread = self._latest.rig, torch.minimum(2 * flat_std(self._latest), prior)
+        snapshot, labels = follower.decide(usable, name, coded)
+        again = self._latest is not None and self._refused & (self._refused - 1) == 0
+        if snapshot.status == "refused" and coded is None and again:
+            # What was known may hold no more. Another try is dear: after 1, 2, 4, 8, ... refusals in a row.
+            follower.rig, follower.spread = self.rig, prior
+            snapshot, labels = follower.decide(usable, name, coded)
+        if snapshot.status == "refused":
+            self._refused += 1
+            raise RefusedError(f"identity: {snapshot.reason}")
+        self._refused = 0
+        return replace(usable, fiducial=labels), snapshot
 
-    def _fit(self, blobs: Detections, snapshot: SnapshotIdentity, latest: Calibration | None = None) -> Calibration:
-        """Fit the latest snapshots and a new one, which is not kept yet: it may be what spoils the fit."""
-        window = self._recent.maxlen or 1
-        recent = [*self._recent, (blobs, snapshot)][-window:]
-        result = fit_labelled(_joined(recent, self.rig), self.rig, self.obj, self.options, latest=latest)
-        if (now := result.labelled.snapshots[-1]).status == "refused":
-            raise RefusedError(f"estimation: {now.reason}")
-        return result
+    def _astray(self, blobs: Detections, pose: RigidTransform) -> NDArray[np.bool_]:
+        """Find cameras, of which something is known, that see what may be the object where it should not be: (C,)."""
+        if self._latest is None:
+            return np.zeros(self.rig.cameras, dtype=bool)
+        usual = np.median(self._spare, axis=0) if self._spare else np.zeros(self.rig.cameras)
+        return astray(blobs, usual, self._latest.rig, self.obj, pose)
 
-    def _keep(self, blobs: Detections, snapshot: SnapshotIdentity, result: Calibration) -> Calibration:
-        self._recent.append((blobs, snapshot))
-        self._latest = result
-        return result
+    def _concluded(self, blobs: Detections, snapshot: SnapshotIdentity, least: float = 0.0) -> LiveCalibration:
+        """Fit the window, find out what moved, and keep what the next snapshot needs.
+
+        Args:
+            blobs: labelled.
+            snapshot: how they were.
+            least: number of labels that must fit.
+        """
+        window, found, missed = self._searched(Window((*self._recent, Kept(blobs, snapshot)), self._spread))
+        enough = len(self._usual) >= 2 * self.rig.cameras
+        excess = float(np.median(self._usual)) / USUAL if enough else None
+        fitted = self._fit(window, self._fitted, excess, doubtful=bool(found))
+        result, window = fitted.result, fitted.window
+        if int(result.observations.seen[-1].sum()) < least:
+            raise RefusedError("estimation: too few labels fit")
+        self._missed = {camera: self._missed.get(camera, 0) + 1 for camera in missed}
+        gone = self._gone | {camera for camera, times in self._missed.items() if times > 1}
+        live = self._completed(result, window, missed, gone)
+        self._gone = frozenset(gone - _seen(result, -1))
+        self._usual.extend(fitted.usual)
+        self._recent.clear()
+        self._recent.extend(window.kept)
+        self._spread = window.spread
+        self._spare.append(spare_blobs(window.kept[-1].blobs, self.rig.cameras))
+        self._latest, self._fitted, self._follows = live, result, True
+        self._follower.follow(result.rig_from_object[-1])
+        return live
+
+    def _searched(self, window: Window) -> tuple[Window, list[int], list[int]]:
+        """Look for the object in cameras that do not see it where it should be: also says in which, or in vain."""
+        newest, latest, found, missed = window.kept[-1], self._latest, [], []
+        pose = newest.snapshot.rig_from_object
+        cameras = [] if latest is None or pose is None else np.flatnonzero(self._astray(newest.blobs, pose)).tolist()
+        if latest is None or pose is None or not cameras:
+            return window, [], []
+        std = torch.minimum(2 * flat_std(latest), self._spread)
+        for camera in cameras:
+            wide = widened(self._spread, latest.rig, [camera], pose, self.obj, RELEARNT)
+            labelled = found_again(newest.blobs, camera, latest.rig, self.obj, pose, std, self.options)
+            if labelled is None:
+                missed.append(camera)
+                if self._missed.get(camera) == 1:  # twice in a row is no chance
+                    window = window.after_move(camera, len(window.kept), wide)
+                continue
+            found.append(camera)
+            newest = replace(newest, blobs=labelled)
+            window = replace(window, kept=(*window.kept[:-1], newest))
+            if not any(kept.sees(camera) for kept in window.kept[:-1]):
+                # Nothing that is remembered contradicts, but the prior may: it is of the place before.
+                window = window.after_move(camera, len(window.kept) - 1, wide)
+        return window, found, missed
+
+    def _completed(
+        self, result: Calibration, window: Window, missed: list[int], gone: frozenset[int] | set[int]
+    ) -> LiveCalibration:
+        """Give cameras that are not in the window what was last known of them, and say what holds for each."""
+        inside, now = _seen(result), _seen(result, -1)
+        if self._fitted is not None and self._latest is not None and (left := _seen(self._fitted) - inside):
+            std = flat_std(self._latest)
+            self._last |= {c: _Last(self._latest.rig, std[c], _seen(self._fitted)) for c in left}
+        states: dict[str, CameraState] = {}
+        rig, factory = result.rig, result.problem.factory
+        spread = result.problem.spread.clone()
+        for camera, name in enumerate(self.rig.camera_names):
+            if camera in missed or (camera in gone and camera not in now):
+                states[name] = "astray"
+            elif camera in inside:
+                states[name] = "seen" if camera in now else "recent"
+            else:
+                states[name] = "kept" if camera in self._last else "factory"
+            if camera in inside or camera not in self._last:
+                continue
+            last = self._last[camera]
+            there = aligned(last.rig, rig, _places(result), sorted(last.seen & inside))
+            rig, factory = _with_camera(rig, there, camera), _with_camera(factory, there.expand(1), camera)
+            spread[0, camera] = torch.maximum(last.std, window.spread[camera]) if camera in gone else last.std
+        values = {entry.name: getattr(result, entry.name) for entry in fields(Calibration)}
+        values |= {"rig": rig, "problem": replace(result.problem, factory=factory, spread=spread)}
+        return LiveCalibration(**values, cameras=states, moved=self._moves(result, window), restarted=window.restarted)
+
+    def _moves(self, result: Calibration, window: Window) -> tuple[MovedCamera, ...]:
+        """Say which cameras moved, and how far where it can be told."""
+        before, moves = self._latest, []
+        for camera, first in window.moved.items():
+            name = self.rig.camera_names[camera]
+            if not first or before is None:
+                moves.append(MovedCamera(name, first or window.kept[-1].snapshot.name, "unknown"))
+            else:
+                move, surely = measured_move(before, result, camera, first, window.spread[camera, :6])
+                if surely > SIGNIFICANT:
+                    moves.append(move)
+        return tuple(moves)
 
 
-def _joined(recent: list[tuple[Detections, SnapshotIdentity]], rig: CameraRig) -> Labelled:
-    """Put labelled snapshots into one table."""
-    tables, snapshots = zip(*recent, strict=True)
-    columns = {
-        name: np.concatenate([getattr(table, name) for table in tables])
-        for name in ("uv", "sigma", "camera", "fiducial", "radius", "flags")
-    }
-    number = np.repeat(np.arange(len(tables)), [len(table) for table in tables])
-    names = tuple(snapshot.name for snapshot in snapshots)
-    joined = Detections(**columns, snapshot=number, camera_names=rig.camera_names, snapshot_names=names)
-    return Labelled(joined, snapshots)
+def _seen(result: Calibration, snapshot: int | None = None) -> frozenset[int]:
+    """Cameras whose labels take part in a fit, or in one snapshot of it."""
+    seen = result.observations.seen if snapshot is None else result.observations.seen[[snapshot]]
+    return frozenset(seen.any(-1).any(0).nonzero().flatten().tolist())
 
 
-def _nearest(blobs: Detections, predicted: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Fiducial (M,) whose prediction (C, N, 2) is nearest to each blob, -1 where that is not mutual or not near enough.
+def _places(result: Calibration) -> Tensor:
+    """Where fiducials were while the window was filled: (M, 3) mm, some hundred."""
+    points = result.rig_from_object.apply(result.points_object).reshape(-1, 3)
+    return points[:: max(1, len(points) // 200)]
 
-    Near is a quarter of the distance between predictions: a pattern that has moved less keeps its labels. Fiducials
-    whose predictions all but coincide get none.
-    """
-    labels = np.full(len(blobs), -1, dtype=np.int64)
-    gaps = distances_to_nearest(predicted)
-    reach = 0.25 * float(np.median(gaps))
-    order = np.argsort(blobs.camera, kind="stable")
-    ends = np.searchsorted(blobs.camera[order], np.arange(len(predicted) + 1))
-    for places, crowded, begin, end in zip(predicted, gaps < TOO_NEAR, ends[:-1], ends[1:], strict=True):
-        rows, found = order[begin:end], np.empty(len(places), dtype=np.int64)
-        mutual_nearest(places, blobs.uv[rows], reach, found)
-        named = np.flatnonzero((found >= 0) & ~crowded)
-        labels[rows[found[named]]] = named
-    return labels
+
+def _with_camera(rig: CameraRig, other: CameraRig, camera: int) -> CameraRig:
+    """Replace the values of a camera by those that it has in another rig (of the same batch axes)."""
+    chosen = torch.arange(rig.cameras) == camera
+
+    def put(tensor: Tensor, source: Tensor, axes: int) -> Tensor:
+        return torch.where(chosen.reshape(-1, *(1,) * (axes - 1)), source, tensor)
+
+    return replace(
+        rig,
+        focal_length=put(rig.focal_length, other.focal_length, 2),
+        principal_point=put(rig.principal_point, other.principal_point, 2),
+        distortion=put(rig.distortion, other.distortion, 2),
+        cam_from_rig=RigidTransform(
+            put(rig.cam_from_rig.rotation, other.cam_from_rig.rotation, 3),
+            put(rig.cam_from_rig.translation, other.cam_from_rig.translation, 2),
+        ),
+    )
 
 
 def _table(blobs: Blobs, name: str, rig: CameraRig) -> Detections:

@@ -127,6 +127,7 @@ def fit_labelled(
     guesser: Guesser | None = None,
     *,
     latest: Calibration | None = None,
+    spread: Tensor | None = None,
 ) -> Calibration:
     """Estimate the rig from all labelled snapshots, leaving out what does not fit, and check that the rest does.
 
@@ -137,6 +138,7 @@ def fit_labelled(
         options: how sure the result must be.
         guesser: network whose first guess is the start, where it is nearer to the images than the factory calibration.
         latest: what the snapshot before gave, from the same factory calibration: a start that saves time.
+        spread: (C, 15) how far the factory values may be off; None = as the rig says.
 
     Raises:
         RefusedError: a camera saw nothing, the estimate has no minimum, or the residuals do not fit.
@@ -144,7 +146,7 @@ def fit_labelled(
     labelled = given = _with_poses(labelled, rig, obj)
     while True:
         try:
-            return _fit_labelled(labelled, rig, obj, options, guesser, latest)
+            return _fit_labelled(labelled, rig, obj, options, guesser, latest, spread)
         except UndeterminedPosesError as error:
             labelled = without_snapshots(labelled, error.rows)
             if len(labelled.used) < LEAST_KEPT * len(given.used):
@@ -161,12 +163,13 @@ def _fit_labelled(
     options: PipelineOptions,
     guesser: Guesser | None,
     latest: Calibration | None,
+    spread: Tensor | None,
 ) -> Calibration:
     """Do the work of `fit_labelled` for snapshots that all have a pose."""
     observations, poses = _used(labelled, rig, obj)
     variance, labels = observations.sigma.numpy() ** 2, observations.seen.numpy()
     require_cameras(labels, rig, options)
-    prior = (rig.prior or RigPrior()).std(rig)
+    prior = (rig.prior or RigPrior()).std(rig) if spread is None else spread
     problem = make_problem(observations, rig, obj, prior)
     poses = poses or initial_pose(observations, rig, obj)
     guess = None if guesser is None else guesser.guess(observations, rig, obj)
@@ -176,7 +179,9 @@ def _fit_labelled(
         state = make_start(problem, guess.rig_from_object, guess.rig)
     starts = [(state, options.identity_error)]
     if latest is not None and not latest.widened:
-        starts.insert(0, (replace(state, offset=latest.solution.state.offset), latest.model_error))
+        change = latest.problem.spread * latest.solution.state.offset
+        offset = torch.where(prior > 0, change / prior.clamp_min(1e-30), 0.0)
+        starts.insert(0, (replace(state, offset=offset), latest.model_error))
     found = settle(problem, starts, variance, labels, options)
     fit = conclude(found.problem, found.solution, found.solution.state)
     outliers = int(labels.sum() - found.seen.sum())

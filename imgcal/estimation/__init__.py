@@ -3,6 +3,7 @@
 from imgcal.estimation.covariance import (
     camera_covariance,
     camera_std,
+    flat_std,
     object_covariance,
     pose_covariance,
     relative_covariance,
@@ -17,6 +18,7 @@ __all__ = [
     "camera_covariance",
     "camera_std",
     "estimate",
+    "flat_std",
     "initial_pose",
     "object_covariance",
     "pose_covariance",

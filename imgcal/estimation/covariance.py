@@ -86,6 +86,13 @@ def camera_std(estimate: Estimate) -> Tensor:
     return variance.clamp_min(0).sqrt().unflatten(-1, (estimate.rig.cameras, PARAMETERS))
 
 
+def flat_std(estimate: Estimate) -> Tensor:
+    """`camera_std` without the second order, in a hundredth of the time: (*B, C, 15)."""
+    left = torch.from_numpy(remaining_variance(estimate.solution)).to(estimate.problem.spread)
+    std = left.clamp_min(0).sqrt() * estimate.problem.spread
+    return std.reshape(*estimate.chi2.shape, *std.shape[1:])
+
+
 def remaining_variance(solution: Solution) -> NDArray[np.float64]:
     """Part of each factory value's prior variance that the observations leave: (B, C, 15), 1 = they say nothing.
 
