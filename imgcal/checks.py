@@ -15,7 +15,7 @@ from imgcal.labelling import PipelineOptions
 from imgcal.rig import PARAMETER_NAMES, CameraRig
 from imgcal.tally import Tally
 
-LEAST_EXPLAINED = 1 / 3
+LEAST_EXPLAINED = 0.5
 """Of what a camera sees of the object, the share that must be where the rest of the rig expects it."""
 LEAST_SIGHT = 0.4
 """Blobs that may be fiducials, in parts of the fiducials in view, from which a camera is said to see the object."""

@@ -48,6 +48,7 @@ class PipelineOptions:
     largest_drift: float = 10.0  # prior standard deviations that one factory value may be off
     widest_prior: float = 4.0  # factor by which a kind of factory values may have drifted more than the prior says
     blind_cameras: bool = False  # accept cameras that saw nothing; they keep their factory values
+    after_last_move: bool = False  # where a camera moved during the capture, use the snapshots since then
     start_pose: RigidTransform | None = (
         None  # rig_from_object of the first snapshot, roughly: decides which way round a symmetric object is
     )
@@ -299,6 +300,20 @@ def to_observations(detections: Detections, rig: CameraRig, obj: CalibrationObje
     uv[where], sigma[where], seen[where] = detections.uv[rows], detections.sigma[rows], True
     dtype = rig.focal_length.dtype
     return Observations(torch.from_numpy(uv).to(dtype), torch.from_numpy(sigma).to(dtype), torch.from_numpy(seen))
+
+
+def observations_of(
+    labelled: Labelled, rig: CameraRig, obj: CalibrationObject
+) -> tuple[Observations, RigidTransform | None]:
+    """Observations of the accepted snapshots, and their poses where identity found all of them."""
+    used = labelled.used
+    detections = labelled.detections
+    observations = to_observations(
+        detections.select(np.isin(detections.snapshot, used) & (detections.fiducial >= 0)), rig, obj
+    )
+    poses = [labelled.snapshots[s].rig_from_object for s in used]
+    known = [pose for pose in poses if pose is not None]
+    return observations, RigidTransform.joined(known, torch.stack) if len(known) == len(used) else None
 
 
 def _rows_by_snapshot(detections: Detections, count: int) -> list[NDArray[np.int64]]:

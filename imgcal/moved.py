@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from imgcal.errors import RefusedError
+
 Kind = Literal["rotation", "position", "focal_length", "unknown"]
+
+MOST_TOLD = 4  # moves in one message
 
 UNITS: dict[Kind, str] = {"rotation": "deg", "position": "mm", "focal_length": "px", "unknown": ""}
 
@@ -42,3 +47,23 @@ class MovedCamera:
         if self.size is None or self.sigma is None:
             return where
         return f"{where} ({self.kind.replace('_', ' ')} {self.size:.3g} +- {self.sigma:.1g} {self.unit})"
+
+
+class MovedError(RefusedError):
+    """Raise where cameras moved during a capture: one rig cannot be right for all of it."""
+
+    def __init__(self, moved: Sequence[MovedCamera], since: int, total: int) -> None:
+        """Say which, and what can be had instead.
+
+        Args:
+            moved: in the order of time.
+            since: snapshots after the last move.
+            total: snapshots.
+        """
+        shown = "; ".join(map(str, moved[:MOST_TOLD])) + ("; ..." if len(moved) > MOST_TOLD else "")
+        super().__init__(
+            f"{shown}: no rig is right for all {total} snapshots",
+            python=f"PipelineOptions(after_last_move=True) calibrates from the {since} since then",
+            command=f"--after-last-move calibrates from the {since} since then",
+        )
+        self.moved = tuple(moved)

@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,7 +20,8 @@ from imgcal.errors import RefusedError
 from imgcal.estimation import Estimate, estimate, initial_pose
 from imgcal.estimation.estimate import conclude, make_problem, make_start
 from imgcal.first_guess import FirstGuess, Guesser, residual_of
-from imgcal.labelling import Labelled, PipelineOptions, Progress, label, to_observations
+from imgcal.labelling import Labelled, PipelineOptions, Progress, label, observations_of
+from imgcal.moved import MovedCamera
 from imgcal.networks.prediction import Prediction
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections, Observations
@@ -29,8 +29,8 @@ from imgcal.pose_support import UndeterminedPosesError, require_poses, without_s
 from imgcal.rig import CameraRig, RigPrior
 from imgcal.settling import settle
 from imgcal.sources import Frames, blobs_of
+from imgcal.steadiness import steady_part
 from imgcal.tally import Tally, tally
-from imgcal.transforms import RigidTransform
 
 LEAST_KEPT = 0.8
 """Share of the snapshots that must keep a pose when outliers have been left out."""
@@ -50,6 +50,7 @@ class Calibration(Estimate):
     first_guess: FirstGuess | None = None  # what a network said, where one was asked
     guess_used: bool = False  # its guess was nearer to the images than the factory calibration
     seconds: Mapping[str, float] = field(default_factory=dict)  # by stage
+    moved: tuple[MovedCamera, ...] = ()  # during the capture; snapshots used are those since then
 
     @cached_property
     def before(self) -> Estimate:
@@ -109,6 +110,7 @@ def calibrate(
     labelled = label(detections, rig, obj, options, progress)
     identified = time.perf_counter()
     _require_any_view(labelled, rig, obj)
+    labelled, moved = steady_part(_with_poses(labelled, rig, obj), detections, rig, obj, options)
     fit = fit_labelled(labelled, rig, obj, options, guesser)
     require_views(fit.tally, rig)
     seconds = {
@@ -116,7 +118,7 @@ def calibrate(
         "identity": identified - found,
         "estimation": time.perf_counter() - identified,
     }
-    return replace(fit, seconds=seconds)
+    return replace(fit, seconds=seconds, moved=moved)
 
 
 def fit_labelled(
@@ -166,7 +168,7 @@ def _fit_labelled(
     spread: Tensor | None,
 ) -> Calibration:
     """Do the work of `fit_labelled` for snapshots that all have a pose."""
-    observations, poses = _used(labelled, rig, obj)
+    observations, poses = observations_of(labelled, rig, obj)
     variance, labels = observations.sigma.numpy() ** 2, observations.seen.numpy()
     require_cameras(labels, rig, options)
     prior = (rig.prior or RigPrior()).std(rig) if spread is None else spread
@@ -209,7 +211,7 @@ def _fit_labelled(
 def _require_any_view(labelled: Labelled, rig: CameraRig, obj: CalibrationObject) -> None:
     """Refuse where a camera sees the object, and identity could not label any of it: worse than seeing nothing."""
     labelled = _with_poses(labelled, rig, obj)
-    observations, poses = _used(labelled, rig, obj)
+    observations, poses = observations_of(labelled, rig, obj)
     poses = poses or initial_pose(observations, rig, obj)
     require_views(tally(labelled, observations.seen.numpy(), poses, rig, obj), rig, least_share=0.0)
 
@@ -223,22 +225,10 @@ def _nearer(guess: FirstGuess, factory: Prediction, observations: Observations, 
 def _with_poses(labelled: Labelled, rig: CameraRig, obj: CalibrationObject) -> Labelled:
     """Refuse the snapshots whose labels lie on one line."""
     try:
-        require_poses(_used(labelled, rig, obj)[0].seen.numpy(), obj.points)
+        require_poses(observations_of(labelled, rig, obj)[0].seen.numpy(), obj.points)
     except UndeterminedPosesError as error:
         return without_snapshots(labelled, error.rows)
     return labelled
-
-
-def _used(labelled: Labelled, rig: CameraRig, obj: CalibrationObject) -> tuple[Observations, RigidTransform | None]:
-    """Observations of the accepted snapshots, and their poses where identity found all of them."""
-    used = labelled.used
-    detections = labelled.detections
-    observations = to_observations(
-        detections.select(np.isin(detections.snapshot, used) & (detections.fiducial >= 0)), rig, obj
-    )
-    poses = [labelled.snapshots[s].rig_from_object for s in used]
-    known = [pose for pose in poses if pose is not None]
-    return observations, RigidTransform.joined(known, torch.stack) if len(known) == len(used) else None
 
 
 def rms_length(residual: Tensor, seen: Tensor) -> float | None:
@@ -289,7 +279,7 @@ def score(
         InputError: the data do not belong to this rig or object: other cameras, frames of another size.
     """
     labelled = label(blobs_of(source, rig, obj, detection), rig, obj, options, progress)
-    observations, poses = _used(labelled, rig, obj)
+    observations, poses = observations_of(labelled, rig, obj)
     fixed = torch.zeros(*rig.distortion.shape[:-1], 15, dtype=rig.distortion.dtype)
     # What is reported is an RMS in pixels: centres count alike, however well each was measured.
     even = replace(observations, sigma=torch.full_like(observations.sigma, options.identity_error))

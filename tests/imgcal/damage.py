@@ -9,6 +9,7 @@ import torch
 
 from imgcal.formats import load_object, load_rig
 from imgcal.observations import Detections
+from imgcal.rig import RigPrior
 from imgcal.simulation import Truth, simulate_truth, simulate_volume, true_detections
 from imgcal.synthesis import PhysicalDrift
 
@@ -99,3 +100,26 @@ def longer_lens(rig, camera, factor=2.0):
     focal = rig.focal_length.clone()
     focal[camera] *= factor
     return replace(rig, focal_length=focal)
+
+
+def turned(rig, camera, degrees, axis=0):
+    """The rig with one camera turned about one of its axes."""
+    step = torch.zeros_like(RigPrior().std(rig))
+    step[camera, axis] = np.radians(degrees)
+    return rig.moved(step)
+
+
+def shifted(rig, camera, millimetres, axis=0):
+    """The rig with one camera moved along an axis of the rig."""
+    step = torch.zeros_like(RigPrior().std(rig))
+    step[camera, 3 + axis] = millimetres
+    return rig.moved(step)
+
+
+def changed_from(truth, obj, camera, first, change):
+    """The truth with one camera changed from a snapshot on; the rig is that before."""
+    after = with_camera(truth, obj, camera, change)
+    later = torch.arange(len(truth.uv)) >= first
+    uv = torch.where(later[:, None, None, None], after.uv, truth.uv)
+    before = torch.ones_like(after.visible) if truth.visible is None else truth.visible
+    return Truth(truth.rig, truth.rig_from_object, uv, torch.where(later[:, None, None], after.visible, before))
