@@ -19,6 +19,7 @@ class BlobFlag(IntFlag):
     MERGED = 2  # two or more blobs in one
     SATURATED = 4  # clipped grey values; the centre is less certain, its sigma says by how much
     MASKED = 8  # inside a mask of known reflections
+    OUTLIER = 16  # labelled, and not where the calibrated rig has this fiducial
 
 
 UNUSABLE = BlobFlag.BORDER | BlobFlag.MERGED | BlobFlag.MASKED

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -24,7 +25,7 @@ from imgcal.labelling import Labelled, PipelineOptions, Progress, label, observa
 from imgcal.moved import MovedCamera
 from imgcal.networks.prediction import Prediction
 from imgcal.objects import CalibrationObject
-from imgcal.observations import Detections, Observations
+from imgcal.observations import BlobFlag, Detections, Observations
 from imgcal.pose_support import UndeterminedPosesError, require_poses, without_snapshots
 from imgcal.rig import CameraRig, RigPrior
 from imgcal.settling import settle
@@ -67,6 +68,18 @@ class Calibration(Estimate):
     def tally(self) -> Tally:
         """What each camera saw in each snapshot, and how much of it is explained."""
         return tally(self.labelled, self.observations.seen.numpy(), self.rig_from_object, self.factory, self.obj)
+
+    @property
+    def labelled_detections(self) -> Detections:
+        """All blobs with the labels that they got; those left out as outliers have the flag `BlobFlag.OUTLIER`."""
+        detections, used = self.labelled.detections, self.labelled.used
+        row = np.full(len(self.labelled.snapshots), -1)
+        row[used] = np.arange(len(used))
+        s, c, n = row[detections.snapshot], detections.camera, detections.fiducial
+        outlier = (s >= 0) & (n >= 0)
+        outlier[outlier] = ~self.observations.seen.numpy()[s[outlier], c[outlier], n[outlier]]
+        marked = detections.flags | np.where(outlier, int(BlobFlag.OUTLIER), 0).astype(np.uint8)
+        return replace(detections, flags=marked)
 
     @cached_property
     def predicted_error(self) -> PredictedError:

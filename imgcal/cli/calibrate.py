@@ -21,13 +21,25 @@ from imgcal.cli.common import (
     start_pose,
     without_cameras,
 )
+from imgcal.cli.counts import blobs_by_camera, counts_by_camera, counts_by_snapshot, doubtful_cameras
 from imgcal.cli.describe import describe, describe_refusal
 from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import relative_covariance
 from imgcal.first_guess import load_guesser
-from imgcal.formats import RigCovariance, load_object, load_rig, open_input, publishing, save_rig, write_text
+from imgcal.formats import (
+    RigCovariance,
+    load_object,
+    load_rig,
+    open_input,
+    publishing,
+    save_detections,
+    save_rig,
+    write_text,
+)
 from imgcal.labelling import PipelineOptions
+from imgcal.moved import MovedError
+from imgcal.observations import Detections
 from imgcal.pipeline import Calibration, calibrate, rms_length
 from imgcal.report import write_report
 from imgcal.rig import CameraRig
@@ -53,6 +65,9 @@ class Calibrate:
     first_guess: str = "none"  #: where to start: none (factory rig), points, vit or cnn (shipped networks), or a file
     without: tuple[str, ...] = ()  #: cameras to leave out
     blind_cameras: bool = False  #: accept cameras that see nothing; they keep their factory values
+    after_last_move: bool = False  #: where a camera moved during the capture, use the snapshots since then
+    labelled: Path | None = None
+    """file for all blobs with the labels that they got, a table like the input; labels that do not fit have flag 16"""
     start_pose: StartPose | None = None
     """rig_from_object of the first snapshot, roughly: rotation vector (3 numbers, rad) and translation (3, mm); decides
     which way round a symmetric object is"""
@@ -69,7 +84,11 @@ class Calibrate:
         complete, obj = load_rig(self.rig), load_object(self.object)
         rig = without_cameras(complete, self.without)
         reference = self._reference(rig)
-        options = PipelineOptions(blind_cameras=self.blind_cameras, start_pose=start_pose(self.start_pose))
+        options = PipelineOptions(
+            blind_cameras=self.blind_cameras,
+            after_last_move=self.after_last_move,
+            start_pose=start_pose(self.start_pose),
+        )
         source = open_input(self.input, complete, obj.fiducials)
         guesser = None if self.first_guess == "none" else load_guesser(self.first_guess, rig, obj)
         loaded = time.perf_counter()
@@ -88,7 +107,7 @@ class Calibrate:
             outcome = error
         with publishing(self.out, WRITTEN, mark="result.json") as out:
             if isinstance(outcome, RefusedError):
-                result = refused_summary(outcome.for_command, detections.snapshot_names, seconds)
+                result = refused_summary(outcome, detections, rig, seconds)
                 content = describe_refusal(outcome.for_command, detections, rig, obj, frames, seconds)
             else:
                 covariance = RigCovariance.from_matrix(
@@ -102,11 +121,23 @@ class Calibrate:
             write_text(out / "result.json", json.dumps(result, indent=2) + "\n")
         if isinstance(outcome, RefusedError):
             raise outcome
+        if self.labelled is not None:
+            save_detections(outcome.labelled_detections, self.labelled)
+        for move in outcome.moved:
+            print(f"{move}: only the snapshots since then are used")
         _print(result, self.out, self.report)
+        for note in doubtful_cameras(outcome):
+            print(f"note: {note}; see the report", file=sys.stderr)
 
     def _check_out(self) -> None:
         """The inputs must survive: a refusal would remove the very rig that it started from."""
         check_folder(self.out)
+        if self.labelled is not None:
+            if not self.labelled.parent.is_dir() or self.labelled.is_dir():
+                raise InputError(f"--labelled: found {self.labelled}, expected a file in an existing folder")
+            for option, given in (("--rig", self.rig), ("--object", self.object), ("INPUT", self.input)):
+                if self.labelled.exists() and Path(given).exists() and self.labelled.samefile(given):
+                    raise InputError(f"--labelled: {self.labelled} is what {option} reads, expected another file")
         for name in WRITTEN:
             for option, given in (("--rig", self.rig), ("--object", self.object), ("INPUT", self.input)):
                 if (self.out / name).exists() and Path(given).exists() and (self.out / name).samefile(given):
@@ -131,6 +162,7 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
             "points": points,
             "rms_px_before": rms_length(calibration.before.residual[:, camera], seen[:, camera]),
             "rms_px_after": rms_length(calibration.residual[:, camera], seen[:, camera]),
+            **counts_by_camera(calibration.tally, camera),
         }
     alternatives = max(snapshots[s].alternatives for s in used)
     return {
@@ -148,7 +180,9 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         "snapshots_used": len(used),
         "snapshots_rejected": len(snapshots) - len(used),
         "rejected": {s.name: s.reason for s in snapshots if s.status == "refused"},
+        "moved": [move.as_values() for move in calibration.moved],
         "per_camera": per_camera,
+        "per_snapshot": counts_by_snapshot(calibration),
         "predicted_error": calibration.predicted_error.summary(),
         "seconds": seconds,
     }
@@ -162,11 +196,14 @@ def _guess_summary(calibration: Calibration) -> dict[str, Any] | None:
     return {"network": guess.name, "rms_px": rms, "used": calibration.guess_used}
 
 
-def refused_summary(reason: str, snapshot_names: tuple[str, ...], seconds: dict[str, float]) -> dict[str, Any]:
+def refused_summary(
+    refusal: RefusedError, detections: Detections, rig: CameraRig, seconds: dict[str, float]
+) -> dict[str, Any]:
     """Say why there is no result, with the same keys."""
+    moved = refusal.moved if isinstance(refusal, MovedError) else ()
     return {
         "status": "refused",
-        "reason": reason,
+        "reason": refusal.for_command,
         "identity": None,
         "identity_alternatives": None,
         "rms_px_before": None,
@@ -177,9 +214,11 @@ def refused_summary(reason: str, snapshot_names: tuple[str, ...], seconds: dict[
         "outliers": None,
         "prior_too_narrow": {},
         "snapshots_used": 0,
-        "snapshots_rejected": len(snapshot_names),
+        "snapshots_rejected": len(detections.snapshot_names),
         "rejected": {},
-        "per_camera": {},
+        "moved": [move.as_values() for move in moved],
+        "per_camera": blobs_by_camera(detections, rig),
+        "per_snapshot": {},
         "predicted_error": None,
         "seconds": seconds,
     }

@@ -93,6 +93,8 @@ def describe(
         prior_std=relative_prior_std(rig, reference),
         reference=reference,
         predicted=calibration.predicted_error,
+        moves=tuple(map(str, calibration.moved)),
+        unexplained=calibration.tally.unexplained.sum(0),
         object_points=obj.points.double().numpy(),
         rig_from_object=_poses(calibration),
         frames=tuple(pictures.get(name) for name in rig.camera_names) if pictures else (),

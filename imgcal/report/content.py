@@ -61,6 +61,8 @@ class ReportContent:
     prior_std: Array | None = None  # (C, 15) standard deviation before the data; see `relative_prior_std`
     reference: int = 0  # index of the reference camera
     predicted: PredictedError | None = None  # over the working volume
+    moves: tuple[str, ...] = ()  # cameras that moved during the capture, in words; earlier snapshots are rejected
+    unexplained: NDArray[np.int64] | None = None  # (C,) blobs that may be fiducials in view, not where these should be
     object_points: Array | None = None  # (N, 3) mm
     rig_from_object: RigidTransform | None = None  # (S) in the recalibrated rig's frame; nan for rejected snapshots
     frames: tuple[NDArray[np.uint8] | NDArray[np.uint16] | None, ...] = ()  # C grey images (H, W) of one snapshot

@@ -11,6 +11,7 @@ import numpy as np
 from imgcal.report.accuracy import advice, length, sentences
 from imgcal.report.charts import duration
 from imgcal.report.content import MOVED, ReportContent
+from imgcal.report.sightings import sightings
 from imgcal.report.svg import grouped, pixels
 
 GOOD_CHI2 = 1.5  # above, the residuals are larger than the stated noise
@@ -101,7 +102,7 @@ def _movement(content: ReportContent) -> tuple[str, ...]:
 
 def _reservations(content: ReportContent) -> list[tuple[str, str]]:
     """What speaks against the result, each with what helps against it."""
-    notes = []
+    notes = sightings(content)
     if content.chi2_per_dof > GOOD_CHI2:
         larger = math.sqrt(content.chi2_per_dof)
         notes.append((

@@ -1,0 +1,48 @@
+"""How many blobs there were, how many got a label and how many labels do not fit, in the form that scripts read."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from imgcal.observations import Detections
+from imgcal.pipeline import Calibration
+from imgcal.rig import CameraRig
+from imgcal.tally import Tally
+
+DOUBTFUL = 0.1
+"""Share of what a camera sees of the object that is not where it should be, from which on it is said."""
+
+
+def counts_by_camera(counts: Tally, camera: int) -> dict[str, int]:
+    """Count over all snapshots."""
+    return _counts(counts, np.s_[:, camera])
+
+
+def counts_by_snapshot(calibration: Calibration) -> dict[str, dict[str, int]]:
+    """Count over all cameras: snapshot name -> numbers."""
+    snapshots = calibration.labelled.snapshots
+    return {snapshot.name: _counts(calibration.tally, np.s_[s]) for s, snapshot in enumerate(snapshots)}
+
+
+def blobs_by_camera(detections: Detections, rig: CameraRig) -> dict[str, dict[str, Any]]:
+    """What is known of each camera where nothing could be decided."""
+    found = np.bincount(detections.camera, minlength=len(detections.camera_names)).tolist()
+    blobs = dict(zip(detections.camera_names, found, strict=True))
+    return {name: {"blobs": blobs.get(name, 0), "labelled": None, "outliers": None} for name in rig.camera_names}
+
+
+def doubtful_cameras(calibration: Calibration) -> list[str]:
+    """Say of which cameras a part of what they see of the object is not where it should be."""
+    kept, unexplained = calibration.tally.kept.sum(0), calibration.tally.unexplained.sum(0)
+    doubtful = np.flatnonzero(unexplained > DOUBTFUL * np.maximum(kept + unexplained, 1))
+    return [
+        f"camera {calibration.rig.camera_names[c]}: {unexplained[c]} blobs may be fiducials and are not where these "
+        f"should be, {kept[c]} are"
+        for c in doubtful
+    ]
+
+
+def _counts(counts: Tally, part: Any) -> dict[str, int]:
+    return {name: int(getattr(counts, name)[part].sum()) for name in ("blobs", "labelled", "outliers")}

@@ -1,0 +1,41 @@
+"""What cameras saw that nobody can explain, and whether they stood still: sentences for the verdict."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from imgcal.report.content import ReportContent
+
+DOUBTFUL = 0.1
+"""Share of what a camera sees of the object that is not where it should be, from which on it is said."""
+CROWDED = 1.0
+"""Blobs that belong to nothing, in parts of those that are used, from which on it is said."""
+
+
+def sightings(content: ReportContent) -> list[tuple[str, str]]:
+    """What speaks against the result, each with what helps against it."""
+    notes = [
+        (
+            f"During the capture {move}: only the snapshots since the last move are used.",
+            "Fasten what has moved. For a better known rig, capture more snapshots now.",
+        )
+        for move in content.moves
+    ]
+    used = np.bincount(content.detections.camera[content.used], minlength=len(content.cameras))
+    blobs = np.bincount(content.detections.camera, minlength=len(content.cameras))
+    if content.unexplained is not None:
+        for camera in np.flatnonzero(content.unexplained > DOUBTFUL * np.maximum(content.unexplained + used, 1)):
+            name = content.cameras[camera]
+            notes.append((
+                f"{name}: {content.unexplained[camera]} blobs may be fiducials and are not where these should be; "
+                f"{used[camera]} are.",
+                f"Look at the overlay of {name}: reflections where the object is hidden are harmless; a pattern beside "
+                "its place means that the camera has moved, or is late.",
+            ))  # fmt: skip
+    crowded = [content.cameras[i] for i in np.flatnonzero(blobs - used > CROWDED * np.maximum(used, 10))]
+    if crowded:
+        notes.append((
+            f"More blobs without a label than with one in {', '.join(crowded[:4])}{' and more' * (len(crowded) > 4)}.",
+            "Cover or mask reflections there.",
+        ))  # fmt: skip
+    return notes

@@ -1,0 +1,117 @@
+"""What `calibrate` tells about blobs, labels, outliers and cameras that moved."""
+
+import json
+
+import numpy as np
+import pytest
+
+from imgcal.cli.main import main
+from imgcal.formats import load_detections, save_detections, save_object, save_rig
+from imgcal.observations import BlobFlag
+from tests.imgcal import damage
+
+CAMERA = 3
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    """Folder with rig and object; function that writes blobs there and calibrates."""
+    folder = tmp_path_factory.mktemp("room")
+    rig, wand, truth = damage.wand_in_a_room(20, 1)
+    save_rig(rig, folder / "rig.yaml")
+    save_object(wand, folder / "wand.csv")
+
+    def run(table, *more):
+        save_detections(table, folder / "blobs.csv")
+        arguments = ["calibrate", str(folder / "blobs.csv"), "--rig", str(folder / "rig.yaml")]
+        code = main([*arguments, "--object", str(folder / "wand.csv"), "--out", str(folder / "out"), *more])
+        return code, json.loads((folder / "out" / "result.json").read_text())
+
+    moved = damage.changed_from(truth, wand, CAMERA, 12, lambda r: damage.turned(r, CAMERA, 0.3))
+    return folder, run, truth, moved
+
+
+def test_blobs_labels_and_outliers_are_counted(room):
+    _, run, truth, _ = room
+    table = damage.blobs(truth, labelled=True)
+    bad = np.flatnonzero((table.camera == CAMERA) & (table.fiducial >= 0) & (table.snapshot % 5 == 0))
+    table.uv[bad] += (9.0, -7.0)
+    code, result = run(table, "--no-report")
+    assert code == 0 and result["moved"] == []
+    own = result["per_camera"]["cam04"]
+    assert own["blobs"] == int((table.camera == CAMERA).sum())
+    assert own["labelled"] == int(((table.camera == CAMERA) & (table.fiducial >= 0)).sum())
+    assert own["outliers"] == len(bad) and own["points"] == own["labelled"] - own["outliers"]
+    assert list(result["per_snapshot"]) == [f"{s:05d}" for s in range(20)]
+    assert result["per_snapshot"]["00005"]["outliers"] == int((table.snapshot[bad] == 5).sum())
+    for name in ("blobs", "labelled", "outliers"):
+        sums = (sum(part[name] for part in result[key].values()) for key in ("per_camera", "per_snapshot"))
+        assert len(set(sums)) == 1
+
+
+def test_labels_can_be_written_and_read_again(room):
+    folder, run, truth, _ = room
+    table = damage.blobs(truth)
+    code, first = run(table, "--no-report", "--labelled", str(folder / "labelled.csv.gz"))
+    assert code == 0
+    found = load_detections(folder / "labelled.csv.gz")
+    assert len(found) == len(table)
+    assert (found.fiducial >= 0).sum() == sum(part["labelled"] for part in first["per_camera"].values())
+    code, second = run(found, "--no-report")
+    assert code == 0 and second["identity"] == "coded"
+    assert second["rms_px_after"] == pytest.approx(first["rms_px_after"], rel=1e-6)
+
+
+def test_outliers_are_marked_in_the_table(room):
+    folder, run, truth, _ = room
+    table = damage.blobs(truth, labelled=True)
+    bad = np.flatnonzero(table.fiducial >= 0)[::97]
+    table.uv[bad] += (9.0, -7.0)
+    assert run(table, "--no-report", "--labelled", str(folder / "labelled.csv"))[0] == 0
+    found = load_detections(folder / "labelled.csv")
+    assert np.array_equal(np.flatnonzero(found.flags & BlobFlag.OUTLIER), bad)
+    assert found.usable.all()
+
+
+@pytest.mark.parametrize(("file", "expected"), [("nowhere/x.csv", "an existing folder"), ("blobs.csv", "another file")])
+def test_a_table_that_cannot_be_written_is_said_before_any_work(room, file, expected, capsys):
+    folder, run, truth, _ = room
+    run(damage.blobs(truth), "--no-report")
+    capsys.readouterr()
+    assert run(damage.blobs(truth), "--no-report", "--labelled", str(folder / file))[0] == 2
+    assert expected in capsys.readouterr().err
+
+
+def test_a_camera_that_moved_is_in_the_result_of_the_refusal(room, capsys):
+    _, run, _, moved = room
+    code, result = run(damage.blobs(moved), "--no-report")
+    assert code == 3 and result["status"] == "refused"
+    (move,) = result["moved"]
+    assert (move["camera"], move["snapshot"], move["kind"], move["unit"]) == ("cam04", "00012", "rotation", "deg")
+    assert abs(move["size"] - 0.3) < 5 * move["sigma"] + 0.01
+    said = capsys.readouterr().err
+    assert "camera cam04 moved before snapshot 00012" in said and "--after-last-move" in said
+    assert "PipelineOptions" not in said and "PipelineOptions" not in result["reason"]
+    assert result["per_camera"]["cam04"]["blobs"] > 0
+
+
+def test_the_rig_since_the_last_move(room, capsys):
+    folder, run, _, moved = room
+    code, result = run(damage.blobs(moved), "--after-last-move")
+    assert code == 0 and result["status"] == "ok"
+    assert result["snapshots_used"] == 8 and result["snapshots_rejected"] == 12
+    assert result["rejected"]["00011"] == "taken before a camera moved"
+    assert [move["camera"] for move in result["moved"]] == ["cam04"]
+    assert "camera cam04 moved before snapshot 00012" in capsys.readouterr().out
+    assert "During the capture camera cam04 moved before snapshot 00012" in (folder / "out" / "report.html").read_text()
+
+
+def test_a_camera_with_blobs_beside_their_places_is_noted(room, capsys):
+    folder, run, truth, _ = room
+    table = damage.blobs(truth, labelled=True)
+    astray = (table.camera == CAMERA) & (table.snapshot % 5 == 0)
+    table.uv[astray] = np.random.default_rng(0).uniform(100, 900, (int(astray.sum()), 2))
+    table.fiducial[:] = -1
+    assert run(table)[0] == 0
+    assert "note: camera cam04: " in capsys.readouterr().err
+    assert "cam04: 1" in (folder / "out" / "report.html").read_text()
