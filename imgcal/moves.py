@@ -36,6 +36,8 @@ ERROR = 1e-5
 """Probability of naming a camera in a capture in which none has moved, as far as noise is what it is said to be."""
 LEAST_MOVE = 0.15
 """Pixels, in the image of the camera: smaller ones do no harm, and slow drifts of every rig reach them."""
+MOST_UNEXPLAINED = 0.5
+"""Of what does not fit in a camera that stands still, the part that may be left where it has several places."""
 LEAST_LEAD = 0.8
 """Of the clearest camera's statistic: another one that explains as much may be the one that moved."""
 
@@ -102,14 +104,22 @@ class Places:
 
     def costs(self, place: int) -> Array:
         """What each snapshot's labels would cost if their camera stood at one of its places: (S,) half chi-squared."""
+        loss, _ = huber(self._squared(place, self.places_of(self.camera[place])), CLIP)
+        return 0.5 * loss.sum(-1).numpy()
+
+    def misfit(self, camera: int) -> float:
+        """Chi-squared of a camera's labels, each clipped, beyond what noise makes it."""
+        own = [self._squared(place, [place]) for place in self.places_of(camera)]
+        labels = [(self.problem.root_weight[0][:, place] > 0).sum() for place in self.places_of(camera)]
+        return float(sum(part.clamp_max(CLIP**2).sum() for part in own) - 2 * sum(labels))
+
+    def _squared(self, place: int, labels: list[int]) -> Tensor:
+        """Squared whitened residuals (S, N) of the labels of some places of a camera, if it stood at one of them."""
         rig, poses = rig_at(self.problem, self.state.offset)[0], pose_at(self.problem, self.state)[0]
         points = poses.apply(points_at(self.problem, self.state)[0] + self.problem.centroid)
         uv = rig.select([place]).expand(len(points)).project(points, self._radius).uv[:, 0]
-        own = self.places_of(self.camera[place])
-        weight = self.problem.root_weight[0][:, own].sum(1)  # (S, N), of whichever place holds the label
-        residual = uv - self.problem.uv[0, :, place].mT
-        loss, _ = huber((residual * weight[..., None]).square().sum(-1), CLIP)
-        return 0.5 * loss.sum(-1).numpy()
+        weight = self.problem.root_weight[0][:, labels].sum(1)  # of whichever place holds the label
+        return ((uv - self.problem.uv[0, :, place].mT) * weight[..., None]).square().sum(-1)
 
     @property
     def _radius(self) -> Tensor | None:
@@ -154,7 +164,7 @@ def find_moves(
         In the order of time. Where two cameras explain a motion alike, both are named: "cam01 or cam02".
     """
     cameras = len(camera_names)
-    places = Places(problem, state, tuple(range(cameras)), (0,) * cameras)
+    places = still = Places(problem, state, tuple(range(cameras)), (0,) * cameras)
     noise, doubts = 1.0, {}
     for _ in range(2 * cameras):
         step = likeliest_step(places.blocks, places.seen)
@@ -173,7 +183,10 @@ def find_moves(
             break
         doubts[new] = _doubts(places, step)
         places, noise = divided, left
-    return _told(places, doubts, noise, camera_names, snapshot_names)
+    moving = {places.camera[v] for v in doubts}
+    # Labels that are wrong in many snapshots pull hither and thither, and no few places explain them.
+    steady = {c for c in moving if places.misfit(c) > MOST_UNEXPLAINED * still.misfit(c)}
+    return _told(places, doubts, moving - steady, noise, camera_names, snapshot_names)
 
 
 def _located(places: Places, step: Step, options: EstimationOptions) -> Places | None:
@@ -201,11 +214,10 @@ def _doubts(places: Places, step: Step) -> set[int]:
 
 
 def _told(
-    places: Places, doubts: dict[int, set[int]], noise: float,
+    places: Places, doubts: dict[int, set[int]], moving: set[int], noise: float,
     camera_names: tuple[str, ...], snapshot_names: tuple[str, ...],
 ) -> tuple[MovedCamera, ...]:  # fmt: skip
     moves = []
-    moving = {places.camera[v] for v in doubts}
     for camera in sorted(moving):
         numbers = places.places_of(camera)
         for before, after in pairwise(numbers):

@@ -147,3 +147,10 @@ def test_after_a_move_what_is_left_must_decide():
     table = table.select((table.snapshot < 10) | (table.camera != 7))
     with pytest.raises(RefusedError, match="cam08"):
         calibrate(table, rig, obj, AFTER)
+
+
+def test_a_camera_that_is_off_now_and_then_has_not_moved():
+    rig, obj, truth = damage.wand_in_a_room(20, 1)
+    table = damage.blobs(truth, labelled=True)
+    table.uv[(table.camera == CAMERA) & (table.fiducial >= 0) & (table.snapshot % 5 == 0)] += (9.0, -7.0)
+    assert moves_of(label(table, rig, obj), rig, obj, PipelineOptions()) == ()
