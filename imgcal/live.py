@@ -290,7 +290,8 @@ class Recalibrator:
             spread[0, camera] = torch.maximum(last.std, window.spread[camera]) if camera in gone else last.std
         values = {entry.name: getattr(result, entry.name) for entry in fields(Calibration)}
         values |= {"rig": rig, "problem": replace(result.problem, factory=factory, spread=spread)}
-        return LiveCalibration(**values, cameras=states, moved=self._moves(result, window), restarted=window.restarted)
+        values["moved"] = self._moves(result, window)
+        return LiveCalibration(**values, cameras=states, restarted=window.restarted)
 
     def _moves(self, result: Calibration, window: Window) -> tuple[MovedCamera, ...]:
         """Say which cameras moved, and how far where it can be told."""
