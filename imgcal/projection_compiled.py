@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.projection import NEAREST_DEPTH, Projection
 from imgcal.rig import CameraRig
+from renderers.compiling import njit
 
 Array = NDArray[np.floating[Any]]
 
@@ -39,7 +39,7 @@ def project(rig: CameraRig, points_rig: Tensor, radius: Tensor | None = None) ->
     radius_squared = np.zeros(fiducials, kind) if radius is None else radius.detach().numpy().astype(kind) ** 2
     image = np.empty((count, rig.cameras, 4, fiducials), kind)  # u, v, depth, visible
     arrays = [np.ascontiguousarray(tensor.detach().numpy()) for tensor in given]
-    _project(points, radius_squared, *arrays, rig.image_size.numpy(), image)  # type: ignore[call-arg]
+    _project(points, radius_squared, *arrays, np.ascontiguousarray(rig.image_size.numpy()), image)  # type: ignore[call-arg]
     uv, depth, visible = image[:, :, :2].swapaxes(2, 3), image[:, :, 2], image[:, :, 3] > 0
     return Projection(torch.from_numpy(uv), torch.from_numpy(depth), torch.from_numpy(visible))
 

@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
 from renderers import adding
 from renderers.adding import Splats
+from renderers.compiling import njit
 
 Array = NDArray[np.floating[Any]]
 Flags = NDArray[np.bool_]

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Protocol, Union
 
 import tyro
 
+from imgcal.cli.compiling import tells_of_compiling
 from imgcal.cli.interruption import ends_at_once
 from imgcal.errors import InputError, RefusedError
 from imgcal.messages import one_line, quoted
@@ -52,6 +53,7 @@ COMMANDS = {
         "imgcal.cli.evaluate",
         "Compare networks side by side on the same random rigs: accuracy alone and refined, time, parameters, size.",
     ),
+    "warmup": ("imgcal.cli.warmup", "Compile ahead of time what the first calibration would wait for"),
 }
 """Module and summary of each command; the class has the command's name. Imported only when it is asked for."""
 
@@ -74,7 +76,9 @@ def main(arguments: list[str] | None = None) -> int:
     given = sys.argv[1:] if arguments is None else arguments
     debug = DEBUG in given
     try:
-        parse([argument for argument in given if argument != DEBUG]).run()
+        command = parse([argument for argument in given if argument != DEBUG])
+        with tells_of_compiling() if "warmup" not in given[:2] else contextlib.nullcontext():
+            command.run()
     except SystemExit as stop:  # help was asked for
         return DONE if stop.code is None else int(stop.code)
     except BrokenPipeError:  # the reader of our output has seen enough

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from imgcal.detection.options import DetectionOptions, Frame
+from renderers.compiling import njit
 
 BLOCK = 4  # px, side of a block; a 4 x 4 mean is close to the matched filter of a small blob
 NOISE_FACTOR = 5.0  # candidates stand out of the block means by this many standard deviations

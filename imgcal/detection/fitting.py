@@ -13,7 +13,8 @@ contrast. Symmetric about its centre, it does not move the centre of other symme
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from renderers.compiling import njit
 
 # A, c, Qxx, Qxy, Qyy, and last the centre x, y: the last corner of the Cholesky factor is what is known of it alone.
 PARAMETERS = 7

@@ -7,7 +7,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from renderers.compiling import njit
 
 TWO_PEAKED = 0.515  # bimodality coefficient
 WAIST = 0.92  # of the mass to either side along the major axis: two blobs in one are narrower between their middles

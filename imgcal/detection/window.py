@@ -12,12 +12,12 @@ plain NumPy.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from imgcal.detection.finding import BLOCK
 from imgcal.detection.fitting import BAND, FARTHEST, MOST, PARAMETERS, ROWS, fit_centre, start_of
 from imgcal.detection.moments import find_centroid, find_ramp, find_shape
 from imgcal.observations import BlobFlag
+from renderers.compiling import njit
 
 RING = 2  # px, width of the frame of a window from which the background is taken
 CLIP = (4.0, 9.0)  # standard deviations of a 3 x 3 mean below which a pixel is background: weak blob, bright blob

@@ -14,7 +14,6 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -26,6 +25,7 @@ from imgcal.estimation.solver import Solution, factorize
 from imgcal.rig import PARAMETERS, CameraRig
 from imgcal.rotations import cross_matrix, left_jacobian
 from imgcal.transforms import RigidTransform
+from renderers.compiling import njit
 
 UNDETERMINED = "covariance: the observations do not determine the object's pose in every snapshot"
 MOST_DENSE = 60

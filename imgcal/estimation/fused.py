@@ -11,7 +11,7 @@ from dataclasses import replace
 import numba
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 
 from imgcal.estimation.linearize import NormalEquations, ObjectEquations, Problem, State
@@ -27,6 +27,7 @@ from imgcal.estimation.solver import (
 from imgcal.projection import NEAREST_DEPTH
 from imgcal.rig import CameraRig
 from imgcal.transforms import RigidTransform
+from renderers.compiling import njit
 
 LOSS_CODES = {"squared": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3}
 _FAST = {"contract", "reassoc", "nsz"}  # nan and inf keep their meaning: a bad step must show

@@ -7,9 +7,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
+
+from renderers.compiling import njit
 
 
 @njit(cache=True)

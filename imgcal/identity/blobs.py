@@ -9,13 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.errors import InputError
 from imgcal.observations import Detections
 from imgcal.rig import CameraRig
+from renderers.compiling import njit
 
 FAR = 1e6
 """Pixel coordinate of padding: no gate reaches it."""

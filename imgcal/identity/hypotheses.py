@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from itertools import permutations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, cKDTree
 
@@ -18,6 +17,7 @@ from imgcal.identity.blobs import Blobs
 from imgcal.identity.p3p import FAST, three_point_pose
 from imgcal.objects import CalibrationObject
 from imgcal.rig import CameraRig
+from renderers.compiling import njit
 
 MOST_FIDUCIAL_TRIPLES = 300_000
 DRAWS = 3  # blob triples of which the widest is taken

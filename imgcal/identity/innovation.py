@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from imgcal.estimation.fused import _exponential, _multiply, lens
@@ -17,6 +16,7 @@ from imgcal.estimation.linearize import Problem
 from imgcal.estimation.solver import Solution
 from imgcal.identity.blobs import Blobs
 from imgcal.projection import NEAREST_DEPTH
+from renderers.compiling import njit
 
 FAST = {"contract", "reassoc", "nsz"}
 THRESHOLD = 3.0

@@ -7,7 +7,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from renderers.compiling import njit
 
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 

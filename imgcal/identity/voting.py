@@ -13,13 +13,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from imgcal.identity.assignment import mutual_nearest
 from imgcal.identity.blobs import Blobs
 from imgcal.identity.hypotheses import Poses
 from imgcal.rig import CameraRig
+from renderers.compiling import njit
 
 MOST_BINS = 200  # across a camera's range of shifts; the tolerance grows where it asks for more
 

@@ -1,0 +1,71 @@
+"""Compiled functions: numba's `njit`, with one place for what it compiles.
+
+Machine code is kept in NUMBA_CACHE_DIR where that is set, else in `imgcal/<version>` in the user's cache folder: an
+installation may be read-only, and code of an earlier version is never mistaken for that of this one. A folder that can
+be read but not written, such as that of an image that was warmed up when it was built, is used as it is.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numba
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def njit(**options: Any) -> Callable[[Function], Function]:
+    """Do what `numba.njit` does, with the cache of this package; options as there."""
+    # Compiled code is called from Python or from compiled code; the third way in costs a tenth of the compilation.
+    options = {"cache": True, "no_cfunc_wrapper": True} | options
+
+    def decorate(function: Function) -> Function:
+        # Numba chooses the folder when it decorates. Only then: what others compile is theirs to keep.
+        before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, cache_folder()  # type: ignore[attr-defined]
+        try:
+            return cast(Function, numba.njit(**options)(function))
+        except RuntimeError:  # nowhere to write: compiled anew in every process
+            return cast(Function, numba.njit(**(options | {"cache": False}))(function))
+        finally:
+            numba.config.CACHE_DIR = before  # type: ignore[attr-defined]
+
+    return decorate
+
+
+@cache
+def cache_folder() -> str:
+    """Say where compiled code is kept; empty = where numba finds a place."""
+    given = numba.config.CACHE_DIR  # type: ignore[attr-defined]
+    folder = Path(given) if given else _user_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        writable = os.access(folder, os.W_OK)
+    except OSError:
+        return given
+    return str(folder) if writable else _linked(folder)
+
+
+def _user_folder() -> Path:
+    user = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or Path("~/.cache").expanduser()
+    try:
+        release = version("imgcal")
+    except PackageNotFoundError:  # a checkout that is not installed
+        release = "0"
+    return Path(user) / "imgcal" / release
+
+
+def _linked(folder: Path) -> str:
+    """Make a folder of this process, which numba takes because it can be written, with links to all that is there."""
+    links = Path(tempfile.mkdtemp(prefix="imgcal-compiled-"))
+    shutil.copytree(folder, links, copy_function=os.symlink, dirs_exist_ok=True)
+    process = os.getpid()
+    atexit.register(lambda: shutil.rmtree(links, ignore_errors=True) if os.getpid() == process else None)
+    return str(links)

@@ -1,0 +1,95 @@
+import os
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import numba
+import pytest
+
+from renderers import compiling
+
+# A function is called in a process of its own, which prints how often something was compiled.
+SCRIPT = """
+import os, sys
+if "read-only" in sys.argv:
+    os.access = lambda path, mode: mode != os.W_OK
+import numpy as np
+from numba import config
+from numba.core import event
+
+class Count(event.Listener):
+    times = 0
+    def on_start(self, happening):
+        Count.times += 1
+    def on_end(self, happening):
+        pass
+
+event.register("numba:compile", Count())
+from renderers.adding_compiled import _widest
+from renderers.compiling import cache_folder
+
+_widest(np.ones((1, 2), np.dtype(sys.argv[1])), np.ones((1, 2), bool))
+print(Count.times, repr(config.CACHE_DIR), cache_folder(), sep="|")
+"""
+
+
+def run(*arguments: str, **environment: str) -> tuple[int, str, Path]:
+    given = {name: value for name, value in os.environ.items() if name not in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")}
+    command = [sys.executable, "-c", SCRIPT, *arguments]
+    done = subprocess.run(command, env=given | environment, capture_output=True, text=True, check=True)
+    times, config, folder = done.stdout.strip().split("|")
+    return int(times), config, Path(folder)
+
+
+def kept(folder: Path) -> set[str]:
+    return {path.name.split(".")[0] for path in folder.rglob("*.nbc")}
+
+
+def test_compiled_code_is_kept_by_version_in_the_users_cache_and_only_ours(tmp_path: Path) -> None:
+    times, config, folder = run("float32", XDG_CACHE_HOME=str(tmp_path))
+    assert times > 0 and config == "''"
+    assert folder == tmp_path / "imgcal" / version("imgcal")
+    assert kept(folder) == {"adding_compiled"}
+    assert run("float32", XDG_CACHE_HOME=str(tmp_path))[0] == 0
+
+
+def test_a_folder_that_the_user_names_goes_before(tmp_path: Path) -> None:
+    _, config, folder = run("float32", NUMBA_CACHE_DIR=str(tmp_path / "mine"), XDG_CACHE_HOME=str(tmp_path / "user"))
+    assert folder == tmp_path / "mine" and config == repr(str(folder))
+    assert kept(folder) and not (tmp_path / "user").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_read(tmp_path: Path) -> None:
+    run("float32", NUMBA_CACHE_DIR=str(tmp_path))
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    for kind, compiles in (("float32", False), ("float64", True)):
+        times, _, folder = run(kind, "read-only", NUMBA_CACHE_DIR=str(tmp_path))
+        assert (times > 0) == compiles
+        assert folder != tmp_path and not folder.exists()
+    assert before == {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+
+
+def test_where_nothing_can_be_written_functions_are_compiled_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    def njit(*functions: object, **options: object) -> object:
+        if options.get("cache"):
+            raise RuntimeError("cannot cache function 'twice': no locator available for file 'a.py'")
+        return original(*functions, **options)
+
+    original = numba.njit
+    monkeypatch.setattr(numba, "njit", njit)
+
+    @compiling.njit()
+    def twice(x: float) -> float:
+        return 2 * x
+
+    assert twice(1.5) == 3.0
+
+
+def test_a_users_cache_that_cannot_be_made_leaves_the_choice_to_numba(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
+    assert compiling.cache_folder.__wrapped__() == ""
