@@ -34,7 +34,7 @@ class Range:
         return f"{self.low:g} to {self.high:g} {self.unit}"
 
 
-MOST_CAMERAS = 1000
+MOST_CAMERAS = 256
 MOST_FIDUCIALS = 1000
 LONGEST_SIDE = 2**16  # px
 MOST_PIXELS = 2**27  # of one image

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import struct
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +24,9 @@ IMAGE_SUFFIXES = frozenset({".png", ".bmp", ".pgm", ".jpg", ".jpeg"}) | TIFF_SUF
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov"})
 VIDEO_PROPERTIES = (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
 
-LOSSY_SUFFIXES = frozenset({".jpg", ".jpeg"}) | VIDEO_SUFFIXES
+JPEG_SUFFIXES = frozenset({".jpg", ".jpeg"})
+JPEG_END, END_OF_JPEG = b"\xff\xd9", 2**16  # some cameras write a few bytes behind it
+LOSSY_SUFFIXES = JPEG_SUFFIXES | VIDEO_SUFFIXES
 LOSSY_TOLERANCE = 4  # grey levels by which lossy compression may tear the channels of a grey frame apart
 
 LARGEST_IMAGE_FILE = 2**30  # bytes
@@ -73,13 +73,13 @@ def read_frame(path: str | Path, page: int = 0, size: Size | None = None) -> Fra
             pages = tiff_pages(path)
             if page < len(pages):
                 _require_size(path, pages[page], size)
-            with _quiet_opencv():
+            with silenced():
                 found, images = cv2.imreadmulti(str(path), start=page, count=1, flags=cv2.IMREAD_UNCHANGED)
             image = images[0] if found and images else None
         else:
             content = _content(path)
             _require_size(path, size_of(path.suffix.lower(), content), size)
-            with _quiet_opencv():
+            with silenced():
                 image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
@@ -135,7 +135,7 @@ class Video:
             raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
         if not is_of_kind(path.suffix.lower(), start):  # a list of other files, for example, would be followed
             raise InputError(f"{path}: found a damaged or empty file, expected a video")
-        with _quiet_opencv():
+        with silenced():
             self._capture = cv2.VideoCapture(str(path))
             announced, *size = (self._capture.get(name) for name in VIDEO_PROPERTIES)
         try:
@@ -162,7 +162,7 @@ class Video:
         if index < self._next:
             raise ValueError(f"{self.path}: frame {index} after frame {self._next - 1}; a video is read forwards")
         good, image = True, None
-        with _quiet_opencv():
+        with silenced():
             while good and self._next < index:
                 good = self._capture.grab()
                 self._next += 1
@@ -201,6 +201,8 @@ def _content(path: Path) -> bytes:
         raise InputError(f"{path}: found an empty file, expected an image")
     if not is_of_kind(suffix, content):
         raise InputError(f"{path}: found a file of another kind, expected a {suffix[1:].upper()} image")
+    if suffix in JPEG_SUFFIXES and JPEG_END not in content[-END_OF_JPEG:]:
+        raise InputError(f"{path}: found a truncated JPEG of {len(content)} bytes, expected its end")
     return _necessary_chunks(path, content) if suffix == ".png" else content
 
 
@@ -218,7 +220,7 @@ def _necessary_chunks(path: Path, content: bytes) -> bytes:
     Returns:
         The PNG without the chunks that are not needed for its pixels: remarks, profiles, animations.
     """
-    position, kind, kept = len(PNG_SIGNATURE), b"", [PNG_SIGNATURE]
+    position, kind, kept = len(PNG_SIGNATURE), b"", [memoryview(PNG_SIGNATURE)]
     while kind != b"IEND":
         header = content[position : position + 8]
         if len(header) < 8:
@@ -231,18 +233,6 @@ def _necessary_chunks(path: Path, content: bytes) -> bytes:
         if zlib.crc32(memoryview(content)[position + 4 : end]) != int.from_bytes(checksum, "big"):
             raise InputError(f"{path}: found a damaged PNG (checksum of chunk {kind!r} is wrong)")
         if kind[:1].isupper() or kind == b"tRNS":
-            kept.append(content[position : end + 4])
+            kept.append(memoryview(content)[position : end + 4])
         position = end + 4
-    return b"".join(kept)
-
-
-@contextlib.contextmanager
-def _quiet_opencv() -> Iterator[None]:
-    """Keep OpenCV and the libraries below it from printing about a bad file: our error says it, in one line."""
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        with silenced():
-            yield
-    finally:
-        cv2.utils.logging.setLogLevel(level)
+    return content if sum(map(len, kept)) == len(content) else b"".join(kept)

@@ -137,6 +137,8 @@ class _RigFile(StrictModel):
 
     @model_validator(mode="after")
     def _consistent(self) -> _RigFile:
+        if self.name is not None and not self.name.isprintable():
+            raise ValueError(f"name: found {self.name!r}, expected text that can be shown")
         names = [camera.name for camera in self.cameras]
         twice, times = Counter(names).most_common(1)[0]
         if times > 1:

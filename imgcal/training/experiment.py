@@ -142,7 +142,7 @@ class TrainingConfig(StrictModel):
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     precision: Literal["float32", "bf16"] = "float32"  # of the encoder and trunk; geometry is always float32
     device: Literal["auto", "cpu"] = "auto"
-    threads: Annotated[int, Field(ge=1, le=1024)] | None = None  # of the CPU; None = as the environment says
+    threads: Annotated[int, Field(ge=1, le=256)] | None = None  # of the CPU; None = as the environment says
     init_from: str | None = None  # a checkpoint to start the weights from
     log_every: Count = 50  # steps
     validate_every: Count = 500  # steps
