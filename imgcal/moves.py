@@ -36,6 +36,10 @@ ERROR = 1e-5
 """Probability of naming a camera in a capture in which none has moved, as far as noise is what it is said to be."""
 LEAST_MOVE = 0.15
 """Pixels, in the image of the camera: smaller ones do no harm, and slow drifts of every rig reach them."""
+LEAST_GAIN = 60.0
+"""Chi-squared of the kind of values that explains a step best."""
+LEAST_MOTION = 0.82
+"""Of the chi-squared of a step of all values, the part that a motion alone explains."""
 MOST_UNEXPLAINED = 0.5
 """Of what does not fit in a camera that stands still, the part that may be left where it has several places."""
 LEAST_LEAD = 0.8
@@ -47,6 +51,8 @@ KINDS: dict[Kind, tuple[slice, float]] = {
     "focal_length": (slice(6, 8), 0.5**0.5),
 }
 """Which values of a camera, and the factor from their length to what is told: degrees, mm, px along one axis."""
+
+MOTION = slice(0, 6)  # rotation and position
 
 Array = NDArray[np.float64]
 
@@ -126,25 +132,44 @@ class Places:
         squared = self.problem.radius_squared
         return None if squared is None else squared.sqrt()
 
-    def size(self, before: int, after: int, noise: float) -> tuple[Kind, float, float]:
-        """Kind, size and standard deviation of the step between two places, by the one kind that explains it best."""
+    def change(self, before: int, after: int, noise: float) -> Change:
+        """Difference between two places of a camera, with what is known of it."""
         offset, spread = self.state.offset[0].numpy(), self.problem.spread[0, before].numpy()
         covariance = self.blocks.covariance.reshape(len(self.camera), PARAMETERS, len(self.camera), PARAMETERS)
         joint = covariance[before, :, before] + covariance[after, :, after]
         joint = joint - covariance[before, :, after] - covariance[after, :, before]
-        # A value that cannot change has no variance: what is left of the inverse says that it did not.
-        information = np.linalg.inv(noise * joint + 1e-12 * np.eye(PARAMETERS))
-        pull = information @ (offset[after] - offset[before])
-        found: dict[Kind, tuple[float, float, float]] = {}
-        for kind, (part, unit) in KINDS.items():
-            alone = np.linalg.inv(information[part, part])  # all other kinds stay
-            change, scale = alone @ pull[part], unit * spread[part]
-            length = float(np.linalg.norm(change * scale))
-            direction = change * scale / max(length, 1e-30)
-            variance = float(direction @ (alone * scale * scale[:, None]) @ direction)
-            found[kind] = float(pull[part] @ change), length, variance**0.5
-        best = max(found, key=lambda kind: found[kind][0])
-        return best, *found[best][1:]
+        information: Array = np.linalg.inv(noise * joint + 1e-12 * np.eye(PARAMETERS)).astype(np.float64)
+        return Change(information, information @ (offset[after] - offset[before]), spread)
+
+
+@dataclass(frozen=True)
+class Change:
+    """A difference of a camera's values, whitened by the prior."""
+
+    information: Array  # (15, 15)
+    pull: Array  # (15,) information times the difference
+    spread: Array  # (15,) standard deviations of the prior
+
+    def gain(self, part: slice) -> float:
+        """Chi-squared of the difference where only a part of the values may differ."""
+        return float(self.pull[part] @ np.linalg.solve(self.information[part, part], self.pull[part]))
+
+    @property
+    def is_physical(self) -> bool:
+        """Tell whether a motion, or another focal length, explains it: errors of the lens would take all values."""
+        kinds = max(self.gain(part) for part, _ in KINDS.values())
+        motion = max(self.gain(MOTION), self.gain(KINDS["focal_length"][0]))
+        return kinds >= LEAST_GAIN and motion >= LEAST_MOTION * self.gain(slice(None))
+
+    def size(self) -> tuple[Kind, float, float]:
+        """Kind, size and standard deviation, by the one kind of values that explains the difference best."""
+        kind = max(KINDS, key=lambda name: self.gain(KINDS[name][0]))
+        part, unit = KINDS[kind]
+        alone, scale = np.linalg.inv(self.information[part, part]), unit * self.spread[part]
+        change = alone @ self.pull[part] * scale
+        length = float(np.linalg.norm(change))
+        direction = change / max(length, 1e-30)
+        return kind, length, float(direction @ (alone * scale * scale[:, None]) @ direction) ** 0.5
 
 
 def find_moves(
@@ -166,23 +191,27 @@ def find_moves(
     cameras = len(camera_names)
     places = still = Places(problem, state, tuple(range(cameras)), (0,) * cameras)
     noise, doubts = 1.0, {}
-    for _ in range(2 * cameras):
-        step = likeliest_step(places.blocks, places.seen)
+    left_out: set[int] = set()
+    for _ in range(3 * cameras):
+        seen = places.seen & ~np.isin(places.camera, list(left_out))
+        step = likeliest_step(places.blocks, seen)
         candidates = int(places.seen.sum())
         if step is None or not is_significant(step.statistic, candidates, ERROR):
             break
         divided = _located(places, step, options)
-        if divided is None:
-            break
-        # What is left when the step has been explained says how much of it correlated errors may feign.
-        left = dispersion(divided.blocks, divided.seen)
-        if not is_significant(step.statistic / left, candidates, ERROR):
-            break
-        new = len(divided.camera) - 1
-        if divided.shift(step.camera, new) < LEAST_MOVE:
-            break
-        doubts[new] = _doubts(places, step)
-        places, noise = divided, left
+        if divided is not None:
+            # What is left when the step has been explained says how much of it correlated errors may feign.
+            left = dispersion(divided.blocks, divided.seen)
+            new = len(divided.camera) - 1
+            if (
+                is_significant(step.statistic / left, candidates, ERROR)
+                and divided.shift(step.camera, new) >= LEAST_MOVE
+                and divided.change(step.camera, new, left).is_physical
+            ):
+                doubts[new] = _doubts(places, step)
+                places, noise = divided, left
+                continue
+        left_out.add(places.camera[step.camera])
     moving = {places.camera[v] for v in doubts}
     # Labels that are wrong in many snapshots pull hither and thither, and no few places explain them.
     steady = {c for c in moving if places.misfit(c) > MOST_UNEXPLAINED * still.misfit(c)}
@@ -221,7 +250,7 @@ def _told(
     for camera in sorted(moving):
         numbers = places.places_of(camera)
         for before, after in pairwise(numbers):
-            kind, size, sigma = places.size(before, after, noise)
+            kind, size, sigma = places.change(before, after, noise).size()
             others = sorted(doubts.get(after, set()) - moving)
             name = " or ".join(camera_names[i] for i in (camera, *others))
             row = places.first[after]

@@ -123,3 +123,18 @@ def changed_from(truth, obj, camera, first, change):
     uv = torch.where(later[:, None, None, None], after.uv, truth.uv)
     before = torch.ones_like(after.visible) if truth.visible is None else truth.visible
     return Truth(truth.rig, truth.rig_from_object, uv, torch.where(later[:, None, None], after.visible, before))
+
+
+def with_lens_errors(truth, seed=0, size=0.15):
+    """The truth seen through lenses that the camera model does not know: smooth errors over each image, px."""
+    draw, where = np.random.default_rng(seed), truth.uv / truth.rig.image_size.double()[:, None]
+    shape = (truth.uv.shape[1], 1, 2)
+    slope, phase = (torch.from_numpy(draw.uniform(low, high, shape)) for low, high in ((2, 5), (0, 6)))
+    return replace(truth, uv=truth.uv + size * (slope * where.flip(-1) + phase).sin())
+
+
+def from_one_end_to_the_other(truth):
+    """The same snapshots with the object carried along one axis: place and time go together."""
+    order = truth.rig_from_object.translation[:, 0].argsort()
+    visible = None if truth.visible is None else truth.visible[order]
+    return replace(truth, uv=truth.uv[order], visible=visible, rig_from_object=truth.rig_from_object[order])

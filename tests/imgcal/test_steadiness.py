@@ -124,11 +124,7 @@ def test_a_steady_rig_is_left_alone(kind, fault):
     for seed, snapshots in enumerate((5, 8, 12, 25)):
         rig, obj, truth = MAKE[kind](snapshots, seed)
         if fault == "slow":  # errors of the lens that go with the place, and so with time
-            order = truth.rig_from_object.translation[:, 0].argsort()
-            size = rig.image_size.double()[:, None]
-            uv = truth.uv[order] + 0.15 * (4 * truth.uv[order].flip(-1) / size).sin()
-            visible = None if truth.visible is None else truth.visible[order]
-            truth = Truth(truth.rig, truth.rig_from_object[order], uv, visible)
+            truth = damage.from_one_end_to_the_other(damage.with_lens_errors(truth, seed))
         table, draw = damage.blobs(truth, seed, labelled=True), np.random.default_rng(seed)
         if fault == "heavy tails":
             table.uv[:] += 0.15 * draw.standard_t(2.5, table.uv.shape)
@@ -147,6 +143,14 @@ def test_after_a_move_what_is_left_must_decide():
     table = table.select((table.snapshot < 10) | (table.camera != 7))
     with pytest.raises(RefusedError, match="cam08"):
         calibrate(table, rig, obj, AFTER)
+
+
+@pytest.mark.parametrize("seed", [0, 4, 12, 16, 17, 29, 39])
+def test_errors_of_the_lens_that_go_with_time_are_no_motion(seed):
+    rig, obj, truth = damage.wand_in_a_room(35, seed)
+    truth = damage.from_one_end_to_the_other(damage.with_lens_errors(truth, seed))
+    labelled = label(damage.blobs(truth, seed, labelled=True), rig, obj)
+    assert moves_of(labelled, rig, obj, PipelineOptions()) == ()
 
 
 def test_a_camera_that_is_off_now_and_then_has_not_moved():
