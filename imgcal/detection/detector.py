@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +13,13 @@ from numpy.typing import NDArray
 from imgcal.detection.finding import outline, screen
 from imgcal.detection.measuring import Blobs, measure
 from imgcal.detection.options import DetectionOptions, Frame, checked_frame, checked_mask, full_scale
-from imgcal.detection.populations import without_dim
+from imgcal.detection.populations import usable, usual_size, without_dim
 from imgcal.errors import InputError
 from imgcal.observations import BlobFlag, Detections
+
+LARGER = 32.0  # px, radius up to which blobs show when they are looked for with the usual limit
+LARGEST = 48.0  # px, radius that the windows hold
+FEW = 4  # usable blobs of a frame below which much larger ones are looked for
 
 Mask = NDArray[np.bool_] | NDArray[np.uint8]  # (H, W) non-zero inside known reflections
 
@@ -100,11 +105,33 @@ def _detect_one(frame: Frame, name: str, mask: NDArray[np.bool_] | None, options
     """Detect the blobs of one checked frame; their camera is 0."""
     scale = full_scale(frame, options.bit_depth, name)
     contiguous = frame if frame.flags.c_contiguous else frame.copy()
-    candidates = outline(contiguous, screen(contiguous, options, scale), options, scale)
-    blobs = measure(contiguous, candidates, options, scale)
+    blobs = (
+        _of_any_size(contiguous, options, scale) if options.max_radius is None else _find(contiguous, options, scale)
+    )
     if mask is not None:
         blobs.flags[_inside(mask, blobs.uv)] |= np.uint8(BlobFlag.MASKED)
     return blobs
+
+
+def _of_any_size(frame: Frame, options: DetectionOptions, scale: int) -> Blobs:
+    """Find blobs of the usual sizes, and larger ones where there are several of one size.
+
+    What is found first shows most of the larger ones, too. A frame with hardly any blob, or with something large and
+    bright, is searched again.
+    """
+    limit, screening = options.radius_limit, screen(frame, options, scale)
+    blobs = measure(frame, outline(frame, screening, options, scale), replace(options, max_radius=LARGER), scale)
+    blobs = blobs.select(usual_size(blobs, limit))
+    enough = usable(blobs).sum() >= FEW
+    if enough and screening.bulk(LARGER, 2 * LARGEST) < 0.5 * scale * np.median(blobs.contrast):
+        return blobs
+    wide = _find(frame, replace(options, max_radius=LARGEST), scale)
+    wide = wide.select(usual_size(wide, limit))
+    return wide if (wide.radius > limit).any() else blobs
+
+
+def _find(frame: Frame, options: DetectionOptions, scale: int) -> Blobs:
+    return measure(frame, outline(frame, screen(frame, options, scale), options, scale), options, scale)
 
 
 def _inside(mask: NDArray[np.bool_], uv: NDArray[np.float64]) -> NDArray[np.bool_]:

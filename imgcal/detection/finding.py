@@ -22,6 +22,8 @@ LEAST_CONTRAST = 0.006  # of full scale: below this, block means tell quantizati
 LEVELS = 5  # components that are too large are tried again at higher levels
 LEVEL_STEP = 1.6  # from one level to the next
 EDGE = 0.3  # of the level: what the blocks at the edge of a blob hold
+SPLIT_AT = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9)  # of a clipped peak: levels at which several are looked for
+LEAST_CLIPPED = 4  # pixels of a peak in the midst of clipped ones
 PEAK_FRACTION = 0.3  # of the local peak: keeps the skirts of neighbours apart
 
 
@@ -32,7 +34,19 @@ class Screening:
     blocks: NDArray[np.int64]  # (K,) flat indices of blocks, ascending
     base: NDArray[np.floating]  # (K,) grey levels of the background
     excess: NDArray[np.floating]  # (K,) grey levels above the base that a pixel of a blob exceeds
-    shape: tuple[int, int]  # blocks in a column and in a row of the frame
+    means: Frame  # (R, Q) grey levels of all blocks, inverted for dark blobs
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Blocks in a column and in a row of the frame."""
+        return self.means.shape[0], self.means.shape[1]
+
+    def bulk(self, least: float, most: float) -> float:
+        """Grey levels of the brightest thing that is wider than `least` (px) and narrower than `most`."""
+        cells = cv2.resize(self.means, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+        sides = (math.ceil(width / (4 * BLOCK)) for width in (least, most))
+        wide, wider = (cv2.morphologyEx(cells, cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) for side in sides)
+        return float(cv2.subtract(wide, wider).max())
 
 
 @dataclass(frozen=True)
@@ -43,6 +57,12 @@ class Candidates:
     labels: NDArray[np.int32]  # (K + 1, 4, 4) component of each pixel of a tile, 0 = none
     boxes: NDArray[np.int64]  # (M, 4) left, top, right, bottom pixel (included)
     label: NDArray[np.int32]  # (M,) number of the component in `labels`
+    whole: NDArray[np.int64]  # (M, 4) box of what the component is a part of: its own where it is whole
+
+    @property
+    def parted(self) -> NDArray[np.bool_]:
+        """Mark the components that are parts of a larger one: (M,)."""
+        return (self.whole != self.boxes).any(1)
 
 
 def screen(frame: Frame, options: DetectionOptions, scale: int) -> Screening:
@@ -57,7 +77,7 @@ def screen(frame: Frame, options: DetectionOptions, scale: int) -> Screening:
     if options.polarity == "dark":
         means = scale - means
     # An opening follows steps of the background (paper on a table), which a median would smear; blobs are smaller.
-    side = math.ceil((2 * options.max_radius + 6) / BLOCK) + 1
+    side = math.ceil((2 * options.radius_limit + 6) / BLOCK) + 1
     background = cv2.morphologyEx(means, cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
     contrast = cv2.subtract(means, background)
     floor, level = _levels(contrast, options, scale)
@@ -67,7 +87,7 @@ def screen(frame: Frame, options: DetectionOptions, scale: int) -> Screening:
     local_peak = local_peak.ravel()[blocks] - floor
     # The mean of the 3 x 3 pixels around a pixel has 4/3 of the noise of a block mean.
     excess = np.maximum(level * 4 / 3, PEAK_FRACTION * local_peak)
-    return Screening(blocks, background.ravel()[blocks] + floor, excess, (means.shape[0], means.shape[1]))
+    return Screening(blocks, background.ravel()[blocks] + floor, excess, means)
 
 
 def outline(frame: Frame, screening: Screening, options: DetectionOptions, scale: int) -> Candidates:
@@ -83,7 +103,7 @@ def outline(frame: Frame, screening: Screening, options: DetectionOptions, scale
     tile = np.zeros((screening.shape[0] + 2, screening.shape[1] + 2), np.int32)
     smooth = _smooth_tiles(frame, screening.blocks, tile, scale if options.polarity == "dark" else -1)
     labels = np.empty((count + 1, BLOCK, BLOCK), np.int32)
-    largest = 4 * options.max_radius + 8  # merged blobs pass: they are to be reported
+    largest = 4 * options.radius_limit + 8  # merged blobs pass: they are to be reported
     level = screening.base + screening.excess
     raised, excess = np.arange(count), screening.excess
     for _ in range(LEVELS):
@@ -95,7 +115,47 @@ def outline(frame: Frame, screening: Screening, options: DetectionOptions, scale
         oversize = np.append(~small, False)[labels[raised + 1] - 1].any((1, 2))  # label 0, of no component: the last
         raised, excess = raised[oversize], LEVEL_STEP * excess[oversize]
         level[raised] = screening.base[raised] + excess
-    return Candidates(tile, labels, boxes[small], np.flatnonzero(small).astype(np.int32) + 1)
+    whole, merged = boxes, labels.copy()
+    saturation = 0.995 * scale if options.saturation is None else options.saturation
+    if _split(screening, tile, smooth, level, merged, saturation):
+        _threshold(smooth, level, labels)
+        boxes = _connect(screening.blocks, tile, labels)
+        whole = whole[_parents(merged, labels, len(boxes))]
+        small = (boxes[:, 2:] - boxes[:, :2]).max(1, initial=0) < largest
+    return Candidates(tile, labels, boxes[small], np.flatnonzero(small).astype(np.int32) + 1, whole[small])
+
+
+def _split(
+    screening: Screening,
+    tile: NDArray[np.int32],
+    smooth: NDArray[np.float32],
+    level: NDArray[np.floating],
+    labels: NDArray[np.int32],
+    saturation: float,
+) -> bool:
+    """Raise levels (K,) where that parts a component into several clipped peaks, which the light around them joins.
+
+    Returns:
+        Whether there is any.
+    """
+    count = int(labels.max(initial=0))
+    tops = _heights(smooth, screening.base, labels, count, saturation)  # above the base, 0 = not clipped
+    if not tops.any():
+        return False
+    trial, top = np.empty_like(labels), tops[labels[1:]].max((1, 2))
+    # What the highest level parts, and the lowest level that parts it as much.
+    most, chosen = np.ones(count + 1, np.int64), np.zeros(count + 1)
+    for part in SPLIT_AT[::-1]:
+        _threshold(smooth, np.maximum(level, screening.base + part * top), trial)
+        pieces = len(_connect(screening.blocks, tile, trial))
+        peaks = _peaks(smooth, labels, trial, pieces, count, saturation)
+        most = np.maximum(most, peaks)
+        chosen[(peaks == most) & (most > 1)] = part
+        if not (peaks > 1).any():
+            break
+    height = (chosen * tops)[labels[1:]].max((1, 2), initial=0)
+    level[:] = np.where(height > 0, np.maximum(level, screening.base + height), level)
+    return bool(chosen.any())
 
 
 def _block_means(frame: Frame) -> Frame:
@@ -163,6 +223,45 @@ def _threshold(smooth, level, labels):
         for i in range(BLOCK):
             for j in range(BLOCK):
                 labels[k + 1, i, j] = -1 if smooth[k, i, j] > level[k] else 0
+
+
+@njit(cache=True, nogil=True)
+def _heights(smooth, base, labels, count, saturation):
+    """Height (count + 1,) above the base of each component that is clipped, 0 of all others."""
+    heights = np.zeros(count + 1)
+    for k in range(len(smooth)):
+        for i in range(BLOCK):
+            for j in range(BLOCK):
+                if labels[k + 1, i, j] > 0 and smooth[k, i, j] >= saturation:
+                    heights[labels[k + 1, i, j]] = max(heights[labels[k + 1, i, j]], smooth[k, i, j] - base[k])
+    return heights
+
+
+@njit(cache=True, nogil=True)
+def _peaks(smooth, labels, parts, pieces, count, saturation):
+    """Number of clipped peaks (count + 1,) in each component of `labels`, of the `parts` into which a level cuts it."""
+    clipped, parent = np.zeros(pieces + 1, np.int64), np.zeros(pieces + 1, np.int64)
+    for k in range(len(smooth)):
+        for i in range(BLOCK):
+            for j in range(BLOCK):
+                parent[parts[k + 1, i, j]] = labels[k + 1, i, j]
+                clipped[parts[k + 1, i, j]] += smooth[k, i, j] >= saturation
+    peaks = np.zeros(count + 1, np.int64)
+    for piece in range(1, pieces + 1):
+        peaks[parent[piece]] += clipped[piece] >= LEAST_CLIPPED
+    return peaks
+
+
+@njit(cache=True, nogil=True)
+def _parents(merged, labels, count):
+    """Component (counted from 0) of `merged` that each of the `count` components of `labels` is a part of."""
+    parents = np.zeros(count, np.int64)
+    for k in range(1, len(labels)):
+        for i in range(BLOCK):
+            for j in range(BLOCK):
+                if labels[k, i, j] > 0:
+                    parents[labels[k, i, j] - 1] = merged[k, i, j] - 1
+    return parents
 
 
 @njit(cache=True, nogil=True)

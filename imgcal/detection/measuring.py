@@ -46,7 +46,7 @@ def measure(frame: Frame, candidates: Candidates, options: DetectionOptions, sca
     """
     boxes = candidates.boxes
     count = len(boxes)
-    half = half_sizes(boxes)
+    half = half_sizes(boxes, candidates.whole)
     blobs = Blobs(
         np.zeros((count, 2)), np.zeros(count), np.zeros(count), np.zeros(count, np.uint8), np.zeros(count, np.int64),
         np.zeros(count),
@@ -54,9 +54,9 @@ def measure(frame: Frame, candidates: Candidates, options: DetectionOptions, sca
     kept = np.zeros(count, np.bool_)
     saturation = 0.995 * scale if options.saturation is None else options.saturation
     least = 0.0 if options.threshold is None else options.threshold
-    limits = (least, options.min_radius, options.max_radius, options.max_elongation)
+    limits = (least, options.min_radius, options.radius_limit, options.max_elongation)
     measure_all(
-        frame, candidates.tile, candidates.labels, boxes, candidates.label, half,
+        frame, candidates.tile, candidates.labels, boxes, candidates.label, candidates.parted, half,
         scale if options.polarity == "dark" else -1, saturation, limits,
         blobs.uv, blobs.sigma, blobs.radius, blobs.contrast, blobs.flags, kept,
     )  # fmt: skip
@@ -66,9 +66,13 @@ def measure(frame: Frame, candidates: Candidates, options: DetectionOptions, sca
     return blobs.select(_first(blobs, kept))
 
 
-def half_sizes(boxes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Half sizes (K,) of the windows around boxes (K, 4): the smallest of `HALF_SIZES` that hold them."""
-    reach = (boxes[:, 2:] - (boxes[:, :2] + boxes[:, 2:]) // 2).max(1, initial=0) + REACH
+def half_sizes(boxes: NDArray[np.int64], whole: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Half sizes (K,) of windows around boxes (K, 4): the smallest that hold what they are parts of.
+
+    Only around that is the background.
+    """
+    middle = (boxes[:, :2] + boxes[:, 2:]) // 2
+    reach = np.maximum(whole[:, 2:] - middle, middle - whole[:, :2]).max(1, initial=0) + REACH
     return np.array(HALF_SIZES)[np.searchsorted(HALF_SIZES[:-1], reach)]
 
 

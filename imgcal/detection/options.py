@@ -12,6 +12,8 @@ from imgcal.errors import InputError
 
 Polarity = Literal["bright", "dark"]
 Frame = NDArray[np.uint8] | NDArray[np.uint16]  # (H, W) grey values
+USUAL_RADIUS = 16.0
+"""Largest radius (px) of markers that nothing is known of."""
 
 
 @dataclass(frozen=True)
@@ -25,17 +27,22 @@ class DetectionOptions:
     threshold: float | None = None  # least peak above the local background, grey levels; None = from the noise
     dim_blobs: bool = False  # keep blobs far dimmer than the others, too, which a given threshold always does
     min_radius: float = 0.9  # px; a single hot pixel measures 0.56
-    max_radius: float = 16.0  # px
+    max_radius: float | None = None  # px; None = 16, and more where a frame shows several blobs of one larger size
     max_elongation: float = 4.0  # ratio of the axes of the ellipse of equal moments
     bit_depth: int | None = None  # None = 8 for uint8 frames; 10, 12 or 16 for uint16, by the brightest pixel
     saturation: float | None = None  # first clipped grey value; None = 0.5 % below full scale
 
+    @property
+    def radius_limit(self) -> float:
+        """Largest radius (px) of blobs that may stand alone."""
+        return USUAL_RADIUS if self.max_radius is None else self.max_radius
+
     def __post_init__(self) -> None:
         if self.polarity not in get_args(Polarity):
             raise InputError(f"polarity: found {self.polarity!r}, expected one of {', '.join(get_args(Polarity))}")
-        if not 0 < self.min_radius < self.max_radius <= 500:
+        if not 0 < self.min_radius < self.radius_limit <= 500:
             raise InputError(
-                f"radius limits: found {self.min_radius} to {self.max_radius}, expected 0 < min < max <= 500 px"
+                f"radius limits: found {self.min_radius} to {self.radius_limit}, expected 0 < min < max <= 500 px"
             )
         if self.threshold is not None and not 0 < self.threshold < 65536:
             raise InputError(f"threshold: found {self.threshold}, expected grey levels above zero, or none")

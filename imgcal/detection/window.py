@@ -28,6 +28,10 @@ MARGIN = SPREAD + 1  # px around the area: distances are asked for in the pixels
 SIGNIFICANT = 6.0  # standard deviations of a 3 x 3 mean that the brightest one of a blob must reach
 MISFIT = 0.05  # of the peak, beyond the noise: RMS residual from which a blob is no ellipse and keeps its centroid
 CROWDED = 0.6  # of the peak: a border this bright with a neighbour is no border
+CROWDED_CLIPPED = 0.9  # the same between clipped peaks that were parted: the light around them adds up there
+# Of the radius, times that part to the power 1.5: how far a neighbour's light moves the centre of a clipped blob. By
+# simulation of bright lamps with halos.
+SHARED = 0.1
 SMALLEST_SIGMA = 0.0005  # px, what sampling by pixels leaves without any noise
 # px * sqrt(px): position lost where clipping turns a soft edge into a step, over sqrt(radius); the worst case of the
 # exposures (2 to 15 times full scale) in the tests.
@@ -39,7 +43,8 @@ _FAR = 200  # px^2; with two distances added to it still within 8 bit
 
 @njit(cache=True, nogil=True)
 def measure_all(
-    frame, tile, labels, boxes, label, half_size, invert, saturation, limits, uv, sigma, radius, contrast, flags, kept
+    frame, tile, labels, boxes, label, parted, half_size, invert, saturation, limits,
+    uv, sigma, radius, contrast, flags, kept,
 ):  # fmt: skip
     """Fill the columns of all candidates of a frame."""
     side = 2 * half_size.max() + 1 + 2 * MARGIN if len(half_size) else 0
@@ -74,14 +79,16 @@ def measure_all(
         if not kept[k]:
             continue
         clipped = brightest >= saturation and _is_saturated(frame, first, invert, saturation, weight)
-        flags[k] = clipped * _SATURATED + (two_peaked or saddle > CROWDED * peak_mean) * _MERGED
+        shared = min(saddle / peak_mean, 1.0)  # light, where others are as near
+        merged = two_peaked or shared > (CROWDED_CLIPPED if clipped and parted[k] else CROWDED)
+        flags[k] = clipped * _SATURATED + merged * _MERGED
         known = x0 = y0 = residual = 0.0
         if not flags[k] & _MERGED:
             start = start_of(peak, radius[k], clipped, moments, middle)
             count = _gather(grey, x, y, own, other, spare, plane, saturation if clipped else 1e9, start, fit)
             if count > PARAMETERS:
                 x0, y0, known, residual = fit_centre(fit, count, start, clipped, noise)
-        fits = known > 0 and residual - noise**2 < (MISFIT * peak) ** 2
+        fits = known * radius[k] ** 2 > max(noise**2, residual) and residual - noise**2 < (MISFIT * peak) ** 2
         if fits and (x0 - middle[0]) ** 2 + (y0 - middle[1]) ** 2 < FARTHEST**2:
             variance = max(noise**2, residual) / known + (slope * brightness / known) ** 2
             variance += clipped * CLIPPED_FIT**2 / max(radius[k], 1.0)
@@ -91,6 +98,7 @@ def measure_all(
             # Each pixel's noise moves the centroid by its lever arm over the brightness; mean of both axes.
             variance = (noise**2 * lever / 2 + (slope * tilt / 2) ** 2) / brightness**2
             variance += clipped * CLIPPED_SIGMA**2 / max(radius[k], 1.0)
+        variance += clipped * shared**3 * (SHARED * radius[k]) ** 2
         uv[k, 0], uv[k, 1], sigma[k] = u + x0, v + y0, np.sqrt(variance + SMALLEST_SIGMA**2)
 
 

@@ -199,7 +199,7 @@ def of_frames(width: int, height: int, seconds: float) -> dict[str, float]:
     scale = width / 2048
     quick, exact = (opencv_live.detector((6.0 * scale, 24.0 * scale), number) for number in (1, 10))
     usual = DetectionOptions()
-    options = replace(usual, max_radius=usual.max_radius * max(scale, 1.0))
+    options = replace(usual, max_radius=usual.radius_limit * max(scale, 1.0))
     with Recalibrator(rig, obj, detection=options) as live, ThreadPoolExecutor(1) as pool:
         cases: dict[str, Callable[[], object]] = {
             DETECTION: lambda: detect_snapshot(frames, options, pool=pool),

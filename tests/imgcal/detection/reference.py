@@ -32,7 +32,7 @@ def boxes_of(labels):
     return np.array(boxes, np.int64).reshape(-1, 4)
 
 
-def measure(frame, labels, label, box, half, saturation, invert=None):
+def measure(frame, labels, label, box, half, saturation, invert=None, parted=False):
     """Centre u, v, sigma, radius, elongation and flags (without the border's) of one component.
 
     Returns None where the brightest pixels do not stand out.
@@ -70,20 +70,21 @@ def measure(frame, labels, label, box, half, saturation, invert=None):
     clipped = bool((raw[core] >= saturation).any())
     flags = BlobFlag.SATURATED if clipped else BlobFlag.NONE
     x0 = y0 = known = residual = 0.0
-    if two_peaked or saddle > window.CROWDED * top:
+    if two_peaked or saddle > (window.CROWDED_CLIPPED if clipped and parted else window.CROWDED) * top:
         flags |= BlobFlag.MERGED
     else:
         start = fitting.start_of(grey[core].max(), radius, clipped, moments, middle)
         rows = territory & (quadratic(start, x, y) >= max(start[1] - fitting.BAND, 0) ** 2 - 1)
         rows &= (raw < saturation) | (not clipped)
         x0, y0, known, residual = fit(x[rows], y[rows], grey[rows], start, clipped, noise)
-    fits = known > 0 and residual - noise**2 < (window.MISFIT * grey[core].max()) ** 2
+    fits = known * radius**2 > max(noise**2, residual) and residual - noise**2 < (window.MISFIT * grey[core].max()) ** 2
     if fits and np.hypot(x0 - middle[0], y0 - middle[1]) < window.FARTHEST:
         variance = max(noise**2, residual) / known + (slope * brightness / known) ** 2
         variance += clipped * window.CLIPPED_FIT**2 / max(radius, 1)
     else:
         x0, y0, variance = centroid(grey, weight, clip, noise, slope, x, y)
         variance += clipped * window.CLIPPED_SIGMA**2 / max(radius, 1)
+    variance += clipped * min(saddle / top, 1) ** 3 * (window.SHARED * radius) ** 2
     sigma = np.sqrt(variance + window.SMALLEST_SIGMA**2)
     return centre[0] + x0, centre[1] + y0, sigma, radius, elongation, flags
 

@@ -78,3 +78,4 @@ def test_dot_grid(captures, view):
     assert len(cells) == 100 if view != 2 else len(cells) >= 99
     assert np.count_nonzero(cut) == 0 or view == 2
     assert large.sum() < 115
+    assert blobs.sigma.max() < 5

@@ -66,3 +66,22 @@ def test_dim_markers_are_kept(contrast, radius):
     found = detect_frame(frame, DetectionOptions())
     assert nearest(found.uv, uv)[1].max() < 0.5
     assert len(found.uv) == 12
+
+
+@pytest.mark.parametrize("radius", [14.0, 20.0, 27.0, 36.0])
+def test_markers_larger_than_usual_are_found_where_there_are_several(radius):
+    rng = np.random.default_rng(5)
+    uv = scattered((600, 800), 160, rng)[:9]
+    frame = exposed(draw_discs((600, 800), uv, radius * rng.uniform(0.9, 1.1, 9)), 2.0, rng)
+    found = detect_frame(frame, DetectionOptions())
+    assert len(found.uv) == 9
+    assert nearest(found.uv, uv)[1].max() < 0.1
+    assert (found.flags == 0).all()
+
+
+def test_two_large_lamps_beside_small_markers_are_none():
+    rng = np.random.default_rng(6)
+    uv = scattered((600, 800), 160, rng)
+    frame = exposed(draw_discs((600, 800), uv, np.append([24.0, 24.0], np.full(len(uv) - 2, 4.0))), 2.0, rng)
+    assert len(detect_frame(frame, DetectionOptions()).uv) == len(uv) - 2
+    assert len(detect_frame(frame, DetectionOptions(max_radius=30.0)).uv) == len(uv)

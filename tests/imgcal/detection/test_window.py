@@ -71,10 +71,10 @@ def test_measures_are_those_of_the_reference(bits, peak, polarity):
         frame, invert = (scale - frame.astype(np.int64)).astype(frame.dtype), scale
     _, found = candidates_of(frame, options, scale)
     blobs = measure(frame, found, options, scale)
-    labels, halves = image_of(found, frame.shape), half_sizes(found.boxes)
+    labels, halves = image_of(found, frame.shape), half_sizes(found.boxes, found.whole)
     expected, pixels = [], set()
-    for label, box, half in zip(found.label, found.boxes, halves, strict=True):
-        one = reference.measure(frame, labels, label, box, half, 0.995 * scale, invert)
+    for label, box, half, parted in zip(found.label, found.boxes, halves, found.parted, strict=True):
+        one = reference.measure(frame, labels, label, box, half, 0.995 * scale, invert, parted)
         pixel = None if one is None else (round(one[0]), round(one[1]))
         if one is not None and 1.2 <= one[3] <= 16 and one[4] <= 4 and pixel not in pixels:
             pixels.add(pixel)
