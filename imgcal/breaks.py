@@ -21,6 +21,8 @@ from imgcal.transforms import RigidTransform
 
 FARTHEST = 6.0
 """Standard deviations at which a residual is clipped: a few wrong labels look like no move of the camera."""
+MEDIAN = 5.348
+"""Of chi-squared with six degrees of freedom."""
 LEAST_LABELS = 3
 """On either side of a break."""
 
@@ -72,6 +74,11 @@ class Breaks:
         """Number of the first snapshot after the clearest break, camera, and statistic."""
         row, camera = np.unravel_index(int(self.statistic.argmax()), self.statistic.shape)
         return int(row) + 1, int(camera), float(self.statistic[row, camera])
+
+    def excess(self, most: float) -> float:
+        """How much larger than by noise alone the test is, in spite of one camera that may have moved."""
+        others = np.delete(self.statistic, self.most_significant()[1], axis=1)
+        return min(most, float(np.median(others[others > 0])) / MEDIAN) if (others > 0).any() else 1.0
 
 
 def find_breaks(series: Series) -> Breaks:

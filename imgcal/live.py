@@ -15,11 +15,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from imgcal.breaks import MEDIAN, information, series_of
 from imgcal.detection import Blobs, DetectionOptions, detect_snapshot
 from imgcal.detection.options import Frame
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import flat_std
-from imgcal.following import astray, found_again, near_prediction, spare_blobs, widened, without_strays
+from imgcal.following import LEAST_EXPLAINED, astray, found_again, near_prediction, spare_blobs, widened, without_strays
 from imgcal.gauge import aligned
 from imgcal.identity.rivals import lattice_shifts
 from imgcal.labelling import Follower, PipelineOptions, SnapshotIdentity
@@ -28,10 +29,11 @@ from imgcal.moved import MovedCamera
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections
 from imgcal.pipeline import Calibration
+from imgcal.resection import resected
 from imgcal.rig import CameraRig, RigPrior
 from imgcal.sources import checked_detections, checked_frames
 from imgcal.transforms import RigidTransform
-from imgcal.window import RELEARNT, SIGNIFICANT, USUAL, Kept, Window, WindowFit
+from imgcal.window import RELEARNT, SIGNIFICANT, Kept, Usual, Window, WindowFit
 
 MOST_FOLLOWED = 64
 """Fiducials of a lattice up to which a snapshot may be labelled by the last prediction alone; a larger one could have
@@ -40,6 +42,8 @@ LEAST_FOLLOWED = 0.9
 """Share of the last snapshot's labels that must be found again, and fit."""
 REMEMBERED = 8
 """Latest snapshots that are compared with a new one which does not fit, however small the window."""
+
+NEAR = "near the last prediction"
 
 CameraState = Literal["seen", "recent", "kept", "factory", "astray"]
 
@@ -108,7 +112,8 @@ class Recalibrator:
         self._gone: frozenset[int] = frozenset()  # cameras that have moved and were not found again
         self._follows = False  # the last snapshot says where the object is now
         self._spare: deque[NDArray[np.int64]] = deque(maxlen=15)
-        self._usual: deque[float] = deque(maxlen=200)
+        self._tests: deque[float] = deque(maxlen=200)
+        self._model_errors: deque[float] = deque(maxlen=10)
         self._count = self._refused = 0
         self._slips = obj.fiducials > MOST_FOLLOWED and bool(lattice_shifts(obj))
         self._pool = ThreadPoolExecutor(min(rig.cameras, os.cpu_count() or 1))
@@ -179,7 +184,7 @@ class Recalibrator:
         before = int(latest.observations.seen[-1].sum())
         if (blobs.fiducial >= 0).sum() < LEAST_FOLLOWED * before or self._astray(blobs, pose).any():
             return None
-        snapshot = SnapshotIdentity(name, "by_tracking", "near the last prediction", 1, pose)
+        snapshot = SnapshotIdentity(name, "by_tracking", NEAR, 1, pose)
         try:
             return self._concluded(blobs, snapshot, least=LEAST_FOLLOWED * before)
         except RefusedError:
@@ -205,6 +210,12 @@ class Recalibrator:
         self._refused = 0
         return replace(usable, fiducial=labels), snapshot
 
+    def _usual(self) -> Usual:
+        """What earlier fits looked like."""
+        enough = len(self._tests) >= self.rig.cameras
+        excess = float(np.median(self._tests)) / MEDIAN if enough else None
+        return Usual(excess, max(self._model_errors)) if self._model_errors else Usual(excess)
+
     def _astray(self, blobs: Detections, pose: RigidTransform) -> NDArray[np.bool_]:
         """Find cameras, of which something is known, that see what may be the object where it should not be: (C,)."""
         if self._latest is None:
@@ -221,17 +232,20 @@ class Recalibrator:
             least: number of labels that must fit.
         """
         window, found, missed = self._searched(Window((*self._recent, Kept(blobs, snapshot)), self._spread))
-        enough = len(self._usual) >= 2 * self.rig.cameras
-        excess = float(np.median(self._usual)) / USUAL if enough else None
-        fitted = self._fit(window, self._fitted, excess, doubtful=bool(found))
+        # A larger window is compared with its newest snapshot whenever it is fitted.
+        doubtful = self.window == 1 and (bool(found) or self._contradicted(window.kept[-1]))
+        fitted = self._fit(window, self._fitted, self._usual(), doubtful)
         result, window = fitted.result, fitted.window
         if int(result.observations.seen[-1].sum()) < least:
             raise RefusedError("estimation: too few labels fit")
+        missed += sorted(_all_out(window.kept[-1].blobs, result) - set(missed))
         self._missed = {camera: self._missed.get(camera, 0) + 1 for camera in missed}
         gone = self._gone | {camera for camera, times in self._missed.items() if times > 1}
         live = self._completed(result, window, missed, gone)
         self._gone = frozenset(gone - _seen(result, -1))
-        self._usual.extend(fitted.usual)
+        if fitted.tests or not window.moved:
+            self._tests.extend(fitted.tests)
+            self._model_errors.append(result.model_error)
         self._recent.clear()
         self._recent.extend(window.kept)
         self._spread = window.spread
@@ -239,6 +253,18 @@ class Recalibrator:
         self._latest, self._fitted, self._follows = live, result, True
         self._follower.follow(result.rig_from_object[-1])
         return live
+
+    def _contradicted(self, newest: Kept) -> bool:
+        """Tell whether most labels of some camera are not where the last snapshot's rig puts them."""
+        pose, latest = newest.snapshot.rig_from_object, self._latest
+        if latest is None or pose is None or newest.snapshot.reason == NEAR:
+            return False
+        fitting, _ = without_strays(newest.blobs, latest.rig, self.obj, pose, self.options)
+        given, left = (
+            np.bincount(blobs.camera[blobs.fiducial >= 0], minlength=self.rig.cameras)
+            for blobs in (newest.blobs, fitting)
+        )
+        return bool(((given >= 3) & (left < 0.5 * given)).any())
 
     def _searched(self, window: Window) -> tuple[Window, list[int], list[int]]:
         """Look for the object in cameras that do not see it where it should be: also says in which, or in vain."""
@@ -251,6 +277,7 @@ class Recalibrator:
         for camera in cameras:
             wide = widened(self._spread, latest.rig, [camera], pose, self.obj, RELEARNT)
             labelled = found_again(newest.blobs, camera, latest.rig, self.obj, pose, std, self.options)
+            labelled = self._resected(window, camera, latest) if labelled is None else labelled
             if labelled is None:
                 missed.append(camera)
                 if self._missed.get(camera) == 1:  # twice in a row is no chance
@@ -264,6 +291,22 @@ class Recalibrator:
                 window = window.after_move(camera, len(window.kept) - 1, wide)
         return window, found, missed
 
+    def _resected(self, window: Window, camera: int, latest: Calibration) -> Detections | None:
+        """Look for a camera anywhere, by all snapshots since it was lost: after 1, 2, 4, 8, ... of them."""
+        times = self._missed.get(camera, 0)
+        if not times or times & (times - 1):
+            return None
+        since = window.kept[-1 - times :]
+        places = self._fit.rough(window)[0].rig_from_object[-len(since) :].apply(latest.points_object)
+        rows = [np.flatnonzero(kept.blobs.camera == camera) for kept in since]
+        seen = [kept.blobs.uv[r] for kept, r in zip(since, rows, strict=True)]
+        labels = resected(seen, places, latest.rig.select([camera]), np.random.default_rng(times))
+        if labels is None:
+            return None
+        fiducial = since[-1].blobs.fiducial.copy()
+        fiducial[rows[-1]] = labels
+        return replace(since[-1].blobs, fiducial=fiducial)
+
     def _completed(
         self, result: Calibration, window: Window, missed: list[int], gone: frozenset[int] | set[int]
     ) -> LiveCalibration:
@@ -276,7 +319,7 @@ class Recalibrator:
         rig, factory = result.rig, result.problem.factory
         spread = result.problem.spread.clone()
         for camera, name in enumerate(self.rig.camera_names):
-            if camera in missed or (camera in gone and camera not in now):
+            if camera in missed or (camera in gone and camera not in inside):
                 states[name] = "astray"
             elif camera in inside:
                 states[name] = "seen" if camera in now else "recent"
@@ -298,12 +341,17 @@ class Recalibrator:
         before, moves = self._latest, []
         for camera, first in window.moved.items():
             name = self.rig.camera_names[camera]
-            if not first or before is None:
+            if not first or before is None or self._fitted is None:
                 moves.append(MovedCamera(name, first or window.kept[-1].snapshot.name, "unknown"))
+                continue
+            if camera in _seen(self._fitted):
+                known = information(series_of(self._fitted, self._fitted.observations, self.obj.radius))[camera]
             else:
-                move, surely = measured_move(before, result, camera, first, window.spread[camera, :6])
-                if surely > SIGNIFICANT:
-                    moves.append(move)
+                std = self._last[camera].std if camera in self._last else self._spread[camera]
+                known = np.diag(std[:6].numpy() ** -2.0)
+            move, surely = measured_move(before.rig, known, result, camera, first, window.spread[camera, :6])
+            if surely > SIGNIFICANT:
+                moves.append(move)
         return tuple(moves)
 
 
@@ -311,6 +359,13 @@ def _seen(result: Calibration, snapshot: int | None = None) -> frozenset[int]:
     """Cameras whose labels take part in a fit, or in one snapshot of it."""
     seen = result.observations.seen if snapshot is None else result.observations.seen[[snapshot]]
     return frozenset(seen.any(-1).any(0).nonzero().flatten().tolist())
+
+
+def _all_out(blobs: Detections, result: Calibration) -> set[int]:
+    """Cameras in which the newest labels do not fit, or hardly any."""
+    given = np.bincount(blobs.camera[blobs.fiducial >= 0], minlength=result.rig.cameras)
+    fit = result.observations.seen[-1].sum(-1).numpy()
+    return set(np.flatnonzero((given >= 3) & (fit < LEAST_EXPLAINED * given)).tolist())
 
 
 def _places(result: Calibration) -> Tensor:

@@ -15,10 +15,11 @@ from imgcal.estimation import EstimationOptions, estimate
 from imgcal.moved import Kind, MovedCamera
 from imgcal.observations import Observations
 from imgcal.pipeline import Calibration
+from imgcal.rig import CameraRig
 
 
 def measured_move(
-    before: Calibration, after: Calibration, camera: int, snapshot: str, wide: Tensor
+    before: CameraRig, known: NDArray[np.float64], after: Calibration, camera: int, snapshot: str, wide: Tensor
 ) -> tuple[MovedCamera, float]:
     """Measure a camera's move: its rotation and position alone are fitted to what it saw afterwards.
 
@@ -27,7 +28,8 @@ def measured_move(
     known.
 
     Args:
-        before: with what the camera saw before.
+        before: the rig before the move.
+        known: (6, 6) how well the camera's rotation (rad) and position (mm) were known: inverse covariance.
         after: with what it saw afterwards, and nothing older.
         camera: its number.
         snapshot: name of the first one after the move.
@@ -38,15 +40,14 @@ def measured_move(
     """
     rows = after.observations.seen[:, camera].any(-1).nonzero().flatten()
     given = Observations(*(getattr(after.observations, name)[rows] for name in ("uv", "sigma", "seen")))
-    spread = torch.zeros_like(before.problem.spread[0])
+    spread = torch.zeros_like(after.problem.spread[0])
     spread[camera, :6] = wide
     obj = replace(after.obj, points=after.points_object, tolerance=None, scale_tolerance=0.0)
     robust = EstimationOptions(loss="cauchy")
-    fit = estimate(given, before.rig, obj, after.rig_from_object[rows], spread=spread, options=robust)
+    fit = estimate(given, before, obj, after.rig_from_object[rows], spread=spread, options=robust)
     change = (fit.solution.state.offset[0, camera, :6] * wide).numpy()
-    known = [information(series_of(c, c.observations, c.obj.radius))[camera] for c in (before,)]
-    known.append(information(series_of(fit, given, obj.radius))[camera])
-    weight = np.linalg.inv(np.linalg.inv(known[0]) + np.linalg.inv(known[1]))
+    found = information(series_of(fit, given, obj.radius))[camera]
+    weight = np.linalg.inv(np.linalg.inv(known) + np.linalg.inv(found))
     pull = weight @ change
     turned, shifted = (_alone(weight[part, part], pull[part]) for part in (slice(0, 3), slice(3, 6)))
     kind: Kind = "rotation" if turned[2] >= shifted[2] else "position"

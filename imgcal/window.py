@@ -12,8 +12,8 @@ from torch import Tensor
 
 from imgcal.breaks import Series, find_breaks, series_of
 from imgcal.errors import RefusedError
-from imgcal.estimation import estimate, initial_pose
-from imgcal.following import widened
+from imgcal.estimation import Estimate, estimate, initial_pose
+from imgcal.following import near_prediction, widened
 from imgcal.labelling import Labelled, PipelineOptions, SnapshotIdentity, to_observations
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections, Observations
@@ -23,8 +23,8 @@ from imgcal.transforms import RigidTransform
 
 SIGNIFICANT = 50.0
 """Chi-squared, six degrees of freedom: a camera that stands still exceeds it once in 200 million tests."""
-USUAL = 5.348
-"""Median of chi-squared with six degrees of freedom."""
+MOST_EXCESS = 4.0
+"""How much larger than by noise alone the test is taken to be usually, where only the tested snapshots can tell."""
 RELEARNT = 0.1
 """Radians, standard deviation of the rotation of a camera that has moved: what it starts afresh from."""
 
@@ -71,12 +71,20 @@ class Window:
 
 
 @dataclass(frozen=True)
+class Usual:
+    """What fits of a rig look like while nothing moves."""
+
+    excess: float | None = None  # how much larger than by noise alone the test for moves is; None = not known yet
+    model_error: float = float("inf")  # px
+
+
+@dataclass(frozen=True)
 class Fitted:
     """A calibration from a window."""
 
     result: Calibration
     window: Window  # without what is out of date
-    usual: tuple[float, ...]  # what the test for moves says of the newest snapshot where nothing has moved
+    tests: tuple[float, ...]  # what the test for moves says of the newest snapshot, camera by camera; () = moved
 
 
 @dataclass(frozen=True)
@@ -88,91 +96,113 @@ class WindowFit:
     options: PipelineOptions
     size: int  # number of latest snapshots that a calibration is made from
 
-    def __call__(
-        self, window: Window, latest: Calibration | None, excess: float | None = None, doubtful: bool = False
-    ) -> Fitted:
+    def __call__(self, window: Window, latest: Calibration | None, usual: Usual, doubtful: bool = False) -> Fitted:
         """Fit the latest snapshots; of cameras that moved meanwhile, only what they saw afterwards.
 
         Args:
             window: with the new snapshot.
             latest: what the window before gave: a start that saves time.
-            excess: how much larger than by noise alone the test for moves usually is; None = ask the snapshots.
+            usual: what fits of this rig look like while nothing moves.
             doubtful: compare the new snapshot with those before also where these take no part in the calibration.
 
         Raises:
             RefusedError: the new snapshot cannot even be fitted by itself.
         """
         for _ in range(self.rig.cameras):
-            result, kept = None, window.kept[-self.size :]
-            try:
-                result = self._fit(kept, window.spread, latest)
-            except RefusedError:
-                if len(window.kept) == 1:
-                    raise
-            if result is not None and len(kept) > 1:
-                used = result.labelled.used
-                everything = self._observations(result.labelled)
-                labels = replace(everything, sigma=result.observations.sigma)
-                series = series_of(result, labels, self.obj.radius)
-            elif len(window.kept) > 1 and (result is None or doubtful):
-                kept, doubtful = window.kept, False
-                series, used = self._rough_series(window)
-            else:
-                break
-            if len(used) < 2:
+            result = self._tried(window, latest)
+            series, first = self._series(window, result, usual, doubtful)
+            if series is None:
                 break
             breaks = find_breaks(series)
-            first, camera, statistic = breaks.most_significant()
-            newest = breaks.statistic[-1][breaks.statistic[-1] > 0]
-            if statistic <= SIGNIFICANT * max(1.0, _excess(breaks.statistic) if excess is None else excess):
-                if result is not None:
-                    return Fitted(result, window, tuple(newest.tolist()))
+            number, camera, statistic = breaks.most_significant()
+            # What a robust fit says after a refusal is coarse, and something is wrong.
+            excess = 1.0 if result is None or doubtful else usual.excess or breaks.excess(MOST_EXCESS)
+            if statistic <= SIGNIFICANT * max(1.0, excess):
+                if result is not None and not window.moved and not doubtful:
+                    return Fitted(result, window, tuple(breaks.statistic[-1][breaks.statistic[-1] > 0].tolist()))
                 break
-            number = len(window.kept) - len(kept) + used[first]
             wide = widened(window.spread, series.rig, [camera], series.rig_from_object[-1], self.obj, RELEARNT)
-            window = window.after_move(camera, number, wide)
+            window, doubtful = window.after_move(camera, first[number], wide), False
         if result is not None:
-            return Fitted(result, window, ())
+            return self._relabelled(result, window)
         # The new snapshot does not go with the older ones, and nothing says why: it begins a new window.
         alone = replace(window, kept=window.kept[-1:], restarted=True)
-        return Fitted(self._fit(alone.kept, alone.spread, None), alone, ())
+        return Fitted(self._fit(alone, None), alone, ())
 
-    def _fit(self, kept: tuple[Kept, ...], spread: Tensor, latest: Calibration | None) -> Calibration:
-        labelled = joined(kept, self.rig)
-        result = fit_labelled(labelled, self.rig, self.obj, self.options, latest=latest, spread=spread)
+    def _tried(self, window: Window, latest: Calibration | None) -> Calibration | None:
+        """Fit; None = refused, where the older snapshots may be the reason."""
+        try:
+            return self._fit(window, latest)
+        except RefusedError:
+            if len(window.kept) == 1:
+                raise
+            return None
+
+    def _series(
+        self, window: Window, result: Calibration | None, usual: Usual, doubtful: bool
+    ) -> tuple[Series | None, list[int]]:
+        """What the test for moves needs, and the number in the window of each of its snapshots; None = no test."""
+        kept = window.kept[-self.size :]
+        if result is not None and not doubtful:
+            if len(result.labelled.used) < 2:
+                return None, []
+            labels = self._observations(result.labelled)
+            # A move is no noise, though a fit takes it for that: what is usual, or as much as the blobs' own, counts.
+            noise = labels.sigma.square()
+            model = noise.clamp_min(usual.model_error**2).clamp_max(result.model_error**2)
+            labels = replace(labels, sigma=(noise + model).sqrt())
+            first = len(window.kept) - len(kept)
+            return series_of(result, labels, self.obj.radius), [first + used for used in result.labelled.used]
+        if len(window.kept) < 2:
+            return None, []
+        return series_of(*self.rough(window), self.obj.radius), list(range(len(window.kept)))
+
+    def _relabelled(self, result: Calibration, window: Window) -> Fitted:
+        """Label the newest snapshot again in cameras that moved: they are known now, and were not when it was done."""
+        moved = [camera for camera, first in window.moved.items() if first]
+        if not moved:
+            return Fitted(result, window, ())
+        newest = window.kept[-1]
+        points = result.rig_from_object[-1].apply(result.points_object)
+        predicted = result.rig.project(points, self.obj.radius).uv.numpy()
+        named = near_prediction(newest.blobs, predicted)
+        again = np.where(np.isin(newest.blobs.camera, moved), named, newest.blobs.fiducial)
+        better = replace(newest, blobs=replace(newest.blobs, fiducial=again))
+        more = replace(window, kept=(*window.kept[:-1], better))
+        try:
+            second = self._fit(more, result)
+        except RefusedError:
+            return Fitted(result, window, ())
+        if int(second.observations.seen[-1].sum()) <= int(result.observations.seen[-1].sum()):
+            return Fitted(result, window, ())
+        return Fitted(second, more, ())
+
+    def _fit(self, window: Window, latest: Calibration | None) -> Calibration:
+        labelled = joined(window.kept[-self.size :], self.rig)
+        result = fit_labelled(labelled, self.rig, self.obj, self.options, latest=latest, spread=window.spread)
         if (now := result.labelled.snapshots[-1]).status == "refused":
             raise RefusedError(f"estimation: {now.reason}")
         return result
 
-    def _rough_series(self, window: Window) -> tuple[Series, list[int]]:
-        """Fit all snapshots in a way that no minority of wrong labels can spoil, for the test alone."""
-        labelled = joined(window.kept, self.rig)
-        observations = self._observations(labelled)
-        observations = replace(
-            observations, sigma=observations.sigma.square().add(self.options.identity_error**2).sqrt()
-        )
+    def rough(self, window: Window) -> tuple[Estimate, Observations]:
+        """Fit all snapshots that are kept, in a way that no minority of wrong labels can spoil."""
+        labels = self._observations(joined(window.kept, self.rig))
+        labels = replace(labels, sigma=labels.sigma.square().add(self.options.identity_error**2).sqrt())
         known = [kept.snapshot.rig_from_object for kept in window.kept]
         poses = [pose for pose in known if pose is not None]
         start = (
             RigidTransform.joined(poses, torch.stack)
             if len(poses) == len(known)
-            else initial_pose(observations, self.rig, self.obj)
+            else initial_pose(labels, self.rig, self.obj)
         )
         robust = replace(self.options.estimation, loss="cauchy")
-        fit = estimate(observations, self.rig, self.obj, start, spread=window.spread, options=robust)
-        return series_of(fit, observations, self.obj.radius), labelled.used
+        return estimate(labels, self.rig, self.obj, start, spread=window.spread, options=robust), labels
 
     def _observations(self, labelled: Labelled) -> Observations:
         """All labels of the used snapshots."""
         detections = labelled.detections
         rows = np.isin(detections.snapshot, labelled.used) & (detections.fiducial >= 0)
         return to_observations(detections.select(rows), self.rig, self.obj)
-
-
-def _excess(statistic: NDArray[np.float64]) -> float:
-    """How much larger than by noise alone a test (S - 1, C) is, in spite of one camera that may have moved."""
-    usual = np.delete(statistic, int(statistic.max(0).argmax()), axis=1)
-    return float(np.median(usual[usual > 0])) / USUAL if (usual > 0).any() else 1.0
 
 
 def joined(kept: tuple[Kept, ...], rig: CameraRig) -> Labelled:

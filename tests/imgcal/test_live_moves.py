@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 import torch
 
+from imgcal.errors import RefusedError
+from imgcal.formats import load_object, load_rig
 from imgcal.live import Recalibrator
 from imgcal.rotations import rotation_from_vector
+from imgcal.simulation import FrameModel, simulate_frames, simulate_truth
+from imgcal.synthesis import PhysicalDrift
 from tests.imgcal.streams import Stream
 
 
@@ -14,7 +18,7 @@ def run(stream, live, snapshots, rig=None, **seen):
     return [live.update(stream.blobs(s, rig, **seen)[0]) for s in snapshots]
 
 
-@pytest.mark.parametrize("window", [2, 5])
+@pytest.mark.parametrize("window", [1, 2, 5])
 @pytest.mark.parametrize(
     ("turn_deg", "shift_mm"), [(0.1, 0.0), (0.5, 0.0), (2.0, 0.0), (10.0, 0.0), (0.0, 3.0), (0.0, 30.0)]
 )
@@ -32,12 +36,41 @@ def test_a_bumped_camera_is_named_at_once_and_its_old_labels_are_gone(window, tu
             if s > window + 1:
                 assert not result.moved
                 continue
+            if window == 1 and turn_deg == 0.1:
+                continue  # a single snapshot before and one after hardly show it, and nothing is out of date
             (move,) = result.moved
             assert move.camera == stream.rig.camera_names[camera]
             assert move.snapshot == result.labelled.snapshots[-1].name
             if (turn_deg >= 0.5) or shift_mm > 10:
                 assert move.kind == ("rotation" if turn_deg else "position")
                 assert abs(move.size - (turn_deg or shift_mm)) < 5 * move.sigma
+
+
+@pytest.mark.parametrize("turn_deg", [0.05, 1.0, 10.0])
+def test_a_bump_in_the_second_snapshot_of_all(turn_deg):
+    stream = Stream("T4", "asymmetric8", 6, seed=1)
+    after = stream.bumped([0, 3], turn_deg)
+    with Recalibrator(stream.rig, stream.obj, window=5) as live:
+        run(stream, live, range(1))
+        for s in range(1, 6):
+            result = live.update(stream.blobs(s, after)[0])
+            assert stream.errors(result.rig, s, after).max() < 0.3
+
+
+@pytest.mark.parametrize("window", [1, 5])
+def test_a_camera_turned_far_is_found_again_by_several_snapshots(window):
+    """Four fiducials in one camera say too little when it may be anywhere; where they were is known, though."""
+    stream = Stream("room10", "wand4", 12)
+    camera = int(stream.rig.project(stream.poses[8].apply(stream.obj.points)).visible.all(-1).nonzero()[0])
+    after = stream.bumped([camera], 10.0)
+    name = stream.rig.camera_names[camera]
+    with Recalibrator(stream.rig, stream.obj, window=window) as live:
+        run(stream, live, range(8))
+        first, *later = run(stream, live, range(8, 12), after)
+    assert first.cameras[name] == "astray" and later[-1].cameras[name] == "seen"
+    (move,) = [move for result in later for move in result.moved]
+    assert move.camera == name and move.kind == "rotation" and abs(move.size - 10.0) < 5 * move.sigma
+    assert stream.errors(later[-1].rig, 11, after)[camera] < 1.0
 
 
 def test_a_slight_bump_is_named_within_a_few_snapshots():
@@ -103,6 +136,27 @@ def test_a_camera_that_is_out_keeps_its_last_values():
         kept = result.problem.spread[0, 1]
     assert torch.allclose(result.rig.focal_length[1], last.rig.focal_length[1], atol=2.0)
     assert (kept <= last.problem.spread[0, 1]).all() and (kept[6:8] < 0.5 * last.problem.spread[0, 1, 6:8]).all()
+
+
+def test_one_camera_without_frames_stops_nothing():
+    rig = load_rig("T4").resized(torch.tensor([1024, 544]))
+    obj, generator = load_object("asymmetric8"), torch.Generator().manual_seed(4)
+    truth = simulate_truth(rig, obj, 1, generator, PhysicalDrift())
+    frames = next(simulate_frames(truth, obj, FrameModel(), generator))
+    black = np.zeros_like(frames["cam03"])
+    with Recalibrator(rig, obj, window=2) as live:
+        whole = live.update(frames)
+        for out in (
+            {**frames, "cam03": None},
+            {**frames, "cam03": black},
+            {n: frames[n] for n in frames if n != "cam03"},
+        ):
+            result = live.update(out)
+        assert result.cameras == {"cam01": "seen", "cam02": "seen", "cam03": "kept", "cam04": "seen"}
+        assert torch.allclose(result.rig.focal_length[2], whole.rig.focal_length[2], atol=0.1)
+        with pytest.raises(RefusedError):
+            live.update(dict.fromkeys(frames))
+        assert live.update(frames).cameras["cam03"] == "seen"
 
 
 def test_a_camera_that_has_seen_nothing_has_the_factory_values_and_prior():
