@@ -42,9 +42,12 @@ from imgcal.moved import MovedError
 from imgcal.observations import Detections
 from imgcal.pipeline import Calibration, calibrate, rms_length
 from imgcal.report import write_report
-from imgcal.rig import CameraRig
+from imgcal.rig import PARAMETER_NAMES, CameraRig
 
 WRITTEN = ("report.html", "rig.yaml", "result.json")
+
+
+WORST_STD = 1e6  # in any unit: what is known so badly is not known
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,7 @@ class Calibrate:
         outcome: Calibration | RefusedError
         try:
             outcome = calibrate(detections, rig, obj, options, guesser=guesser, progress=bar)
+            covariance = trusted_covariance(outcome, reference)
             seconds |= {name: value for name, value in outcome.seconds.items() if name != "detection"}
         except RefusedError as error:
             outcome = error
@@ -110,9 +114,6 @@ class Calibrate:
                 result = refused_summary(outcome, detections, rig, seconds)
                 content = describe_refusal(outcome.for_command, detections, rig, obj, frames, seconds)
             else:
-                covariance = RigCovariance.from_matrix(
-                    relative_covariance(outcome, reference), rig.camera_names[reference]
-                )
                 save_rig(outcome.rig, out / "rig.yaml", covariance, full=self.full_covariance)
                 result = summary(outcome, seconds)
                 content = describe(outcome, rig, obj, frames, reference, seconds)
@@ -149,6 +150,25 @@ class Calibrate:
         if self.reference not in rig.camera_names:
             raise InputError(f"--reference: found {self.reference}, expected one of {', '.join(rig.camera_names)}")
         return rig.camera_names.index(self.reference)
+
+
+def trusted_covariance(calibration: Calibration, reference: int) -> RigCovariance:
+    """Covariance of a rig relative to one of its cameras.
+
+    Raises:
+        RefusedError: some camera is known so badly that the approximation behind the figures breaks down.
+    """
+    names = calibration.rig.camera_names
+    covariance = RigCovariance.from_matrix(relative_covariance(calibration, reference), names[reference])
+    bad = ~(covariance.std <= WORST_STD)
+    if bool(bad.any()):
+        camera, parameter = bad.nonzero()[0].tolist()
+        raise RefusedError(
+            f"covariance: {PARAMETER_NAMES[parameter]} of camera {names[camera]} is known to "
+            f"{float(covariance.std[camera, parameter]):.2g} only: the blobs say next to nothing (their sigma may be "
+            "too large, or all of them at one place)"
+        )
+    return covariance
 
 
 def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, Any]:
