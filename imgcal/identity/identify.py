@@ -11,6 +11,7 @@ from torch import Tensor
 
 from imgcal.identity.assignment import spacing
 from imgcal.identity.blobs import Spread, gather, spread_of
+from imgcal.identity.few import compare_all, few
 from imgcal.identity.hypotheses import (
     Poses,
     fiducial_triples,
@@ -133,6 +134,9 @@ def bootstrap(
         return _refused(
             scene, f"too few blobs: at most {scene.blobs.count.max()} in a camera, expected at least 4 in one"
         )
+    compared = compare_all(scene, options) if few(scene) else None
+    if compared is not None and compared.accepted:
+        return compared
     likely = {camera: likely_blobs(scene.blobs, camera, many(obj)) for camera in cameras.tolist()}
     hopeful = {camera: rows for camera, rows in likely.items() if len(rows) <= MOST_FALSE * obj.fiducials}
     if not hopeful or scene.blobs.uv[..., 0].size * obj.fiducials > MOST_PAIRS:
@@ -152,6 +156,8 @@ def bootstrap(
             undecided += result.undecided
         if result.accepted or undecided == PATIENCE or search.hypotheses > options.most_hypotheses:
             break
+    if compared is not None and not result.accepted:
+        result = compared
     return replace(result, hypotheses=search.hypotheses)
 
 
@@ -177,14 +183,11 @@ def _decide(scene: Scene, fits: Fits, options: IdentityOptions, known_pose: bool
             share = _share(scene, chosen)
         if margin < options.least_margin:
             refusal = (
-                f"another labelling explains the blobs nearly as well: margin {margin:.1f}, "
-                f"expected {options.least_margin:.0f}"
+                f"another labelling explains the blobs nearly as well, or chance does: margin {margin:.1f}, expected "
+                f"{options.least_margin:.0f}; show more of the object, to more cameras"
             )
     if share < options.least_share:
-        refusal = (
-            f"the best pose explains {100 * share:.0f} % of what could be seen, "
-            f"expected {100 * options.least_share:.0f} %"
-        )
+        refusal = _too_little(_share(scene, best), share, options.least_share)
     rig, pose = rig_and_pose(scene, chosen, 0)
     if refusal is not None:
         undecided = share >= options.least_share
@@ -193,6 +196,20 @@ def _decide(scene: Scene, fits: Fits, options: IdentityOptions, known_pose: bool
     status: Status = "by_tracking" if known_pose else "ambiguous" if order > 1 else "unique"
     reason = f"explains {100 * share:.0f} % of what could be seen, margin {margin:.0f}"
     return Identity(scene.blobs.to_rows(chosen.labels[0]), pose, rig, status, order, margin, reason, share)
+
+
+def _too_little(fitted: float, certain_share: float, least: float) -> str:
+    """Say why too few labels are certain: nothing fits, or what fits could be something else."""
+    if fitted >= least:
+        return (
+            f"the best pose explains {100 * fitted:.0f} % of what could be seen, but labels are certain of only "
+            f"{100 * certain_share:.0f} %, expected {100 * least:.0f} %: too few blobs, or too many that are no "
+            "fiducials; show more of the object, to more cameras"
+        )
+    return (
+        f"the best pose explains {100 * fitted:.0f} % of what could be seen, expected {100 * least:.0f} %; check that "
+        "object and rig are those in the images, and that the blobs are its fiducials (polarity, threshold, radius)"
+    )
 
 
 def _share(scene: Scene, fits: Fits) -> float:

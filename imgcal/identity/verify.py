@@ -116,9 +116,9 @@ def start(scene: Scene, poses: Poses, labels: NDArray[np.int64]) -> Fits:
 def refine(scene: Scene, fits: Fits, stages: tuple[float, ...] = STAGES) -> Fits:
     """Fit and label again through all stages; the last labels are fitted too."""
     for sigma in stages:
-        fits = _fit(scene, replace(fits, sigma=np.full(len(fits.labels), sigma)))
+        fits = fit(scene, replace(fits, sigma=np.full(len(fits.labels), sigma)))
         fits = replace(fits, sigma=_residual_sigma(scene, fits), labels=_assign(fits))
-    return settle(scene, _fit(scene, fits), rounds=1)
+    return settle(scene, fit(scene, fits), rounds=1)
 
 
 def settle(scene: Scene, fits: Fits, rounds: int = 4) -> Fits:
@@ -127,7 +127,7 @@ def settle(scene: Scene, fits: Fits, rounds: int = 4) -> Fits:
         labels = _assign(fits)
         if np.array_equal(labels, fits.labels):
             break
-        fits = _fit(scene, replace(fits, sigma=_residual_sigma(scene, fits), labels=labels))
+        fits = fit(scene, replace(fits, sigma=_residual_sigma(scene, fits), labels=labels))
     return fits
 
 
@@ -156,7 +156,7 @@ def certain(scene: Scene, fits: Fits, odds: float, least_odds: float) -> Fits:
         good &= (good.sum(-1) >= enough)[..., None]
         if np.array_equal(good, fits.labels >= 0):
             break
-        fits = _fit(scene, replace(fits, labels=np.where(good, fits.labels, -1)))
+        fits = fit(scene, replace(fits, labels=np.where(good, fits.labels, -1)))
     return fits
 
 
@@ -177,7 +177,7 @@ def predictions(fits: Fits) -> NDArray[np.float64]:
 
 def rig_and_pose(scene: Scene, fits: Fits, row: int) -> tuple[CameraRig, RigidTransform]:
     """Give the rig and rig_from_object of one labelling, without batch axes."""
-    problem = _problem(scene, fits)
+    problem = problem_of(scene, fits)
     return fused.rig_at(problem, fits.state.offset)[row], pose_at(problem, fits.state)[row, 0]
 
 
@@ -196,7 +196,8 @@ def _blob_noise(scene: Scene, fits: Fits) -> NDArray[np.float64]:
     return scene.blobs.sigma[np.arange(fits.labels.shape[1])[:, None], np.maximum(fits.labels, 0)] ** 2
 
 
-def _problem(scene: Scene, fits: Fits) -> Problem:
+def problem_of(scene: Scene, fits: Fits) -> Problem:
+    """Put labellings into the form that estimation knows."""
     count, cameras, _ = fits.labels.shape
     seen = fits.labels >= 0
     uv = np.where(seen[..., None], scene.blobs.uv[np.arange(cameras)[:, None], np.maximum(fits.labels, 0)], 0.0)
@@ -211,14 +212,15 @@ def _problem(scene: Scene, fits: Fits) -> Problem:
     return replace(problem, factory=scene.rig.expand(count), spread=scene.std.expand(count, -1, -1))
 
 
-def _fit(scene: Scene, fits: Fits) -> Fits:
+def fit(scene: Scene, fits: Fits) -> Fits:
+    """Fit labellings as they are."""
     # One after the other: starting threads for a few small fits takes longer than the fits on a busy machine.
     bare = replace(fits, innovations=None)
     return reduce(join, [_fit_one(scene, bare.select(np.array([k]))) for k in range(len(fits.labels))])
 
 
 def _fit_one(scene: Scene, fits: Fits) -> Fits:
-    problem = _problem(scene, fits)
+    problem = problem_of(scene, fits)
     solution = fused.minimize(problem, fits.state, "cauchy", THRESHOLD, 8, 1e-3)
     found = innovations(scene.blobs, fits.labels, fits.sigma, problem, solution)
     return replace(fits, state=solution.state, cost=solution.equations.cost.numpy(), innovations=found)
