@@ -129,7 +129,7 @@ def _reduced(series: Series) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     r = residual.reshape(*shape[:2], -1, 1)
     at, bt = a.swapaxes(-1, -2), b.swapaxes(-1, -2)
     pose = (bt @ b).sum(1, keepdims=True)  # (S, 1, 6, 6)
-    pose = pose + (1e-9 * np.einsum("...ii->...", pose)[..., None, None] + 1e-30) * np.eye(6)
+    pose = pose * (1 + 1e-9 * np.eye(6)) + 1e-30 * np.eye(6)
     coupling = at @ b  # (S, C, 6, 6)
     carried = np.linalg.solve(pose, coupling.swapaxes(-1, -2)).swapaxes(-1, -2)
     pull = at @ r - carried @ (bt @ r).sum(1, keepdims=True)
