@@ -87,7 +87,7 @@ class Capture:
             (H, W) bool, True where the image is to be ignored; None when the camera has no mask.
         """
         path = self.folder / "masks" / f"{camera}.png"
-        if not path.is_file():
+        if not path.exists():
             return None
         mask = read_frame(path, size=self.image_size.get(camera))
         _check_size(mask, path, camera, self.image_size.get(camera))
@@ -139,7 +139,7 @@ def open_capture(folder: str | Path, rig: CameraRig | None = None) -> Capture:
         raise InputError(f"{frames}: found no frames, expected images or videos of the cameras")
     names = tuple(files) if rig is None else rig.camera_names
     masks = folder / "masks"
-    for path in _listing(masks) if masks.is_dir() else ():
+    for path in _listing(masks) if masks.exists() else ():
         if path.stem not in names or path.suffix.lower() != ".png":
             raise InputError(f"{path}: expected masks named <camera name>.png, cameras: {listed(names)}")
     settings = folder / "capture.yaml"
@@ -179,6 +179,8 @@ def save_capture_settings(folder: str | Path, bit_depth: int, note: str | None =
 
 def _listing(folder: Path) -> list[Path]:
     """Entries in natural order, without hidden files."""
+    if not folder.is_dir():
+        raise InputError(f"{folder}: found a file, expected a folder")
     entries = [path for path in folder.iterdir() if not path.name.startswith(".")]
     for path in entries:
         if not is_file_name(path.name):

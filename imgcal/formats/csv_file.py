@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.errors import InputError
-from imgcal.formats.names import nearest
+from imgcal.formats.names import check_regular, nearest
 from imgcal.limits import Range
 from imgcal.messages import shortened
 
@@ -86,15 +86,13 @@ def read_chunks(path: Path, required: Sequence[str], optional: Sequence[str]) ->
     Raises:
         InputError: unreadable, truncated or binary file, wrong header, a row of another length.
     """
-    text = _Text(path)
-    with text as rows:
+    with _Text(path) as rows:
         header = [cell.strip() for cell in next(rows, [])]
         _check_header(path, header, required, optional)
         for first in itertools.count(0, CHUNK):
             chunk = list(itertools.islice(rows, CHUNK))
             if not chunk:
                 return
-            text.check_size(first + len(chunk))
             lengths = np.fromiter(map(len, chunk), dtype=np.int64, count=len(chunk))
             if (lengths != len(header)).any():
                 row = int((lengths != len(header)).argmax())
@@ -109,6 +107,7 @@ class _Text:
         self.path = path
 
     def __enter__(self) -> Iterator[list[str]]:
+        check_regular(self.path)
         try:
             self.file = open(self.path, "rb")
             magic = self.file.read(2)
@@ -118,12 +117,23 @@ class _Text:
         self.binary = gzip.GzipFile(fileobj=self.file) if magic == GZIP_MAGIC else self.file
         # utf-8-sig: spreadsheets put a byte order mark in front of the header.
         self.text = io.TextIOWrapper(self.binary, encoding="utf-8-sig", newline="")
-        self.reader = csv.reader(_lines(self.text), strict=True)
+        self.reader = csv.reader(self._lines(), strict=True)
         return filter(None, self.reader)
 
-    def check_size(self, rows: int) -> None:
-        """Stop before a file fills the memory: `rows` have been read of it."""
-        if rows > MOST_ROWS:
+    def _lines(self) -> Iterator[str]:
+        for number in itertools.count(1):
+            line = self.text.readline(LONGEST_LINE)
+            if not line:
+                return
+            if len(line) == LONGEST_LINE and not line.endswith("\n"):
+                raise csv.Error(f"a line of more than {LONGEST_LINE:,} characters")
+            if number % CHUNK == 0:
+                self._check_size(number)
+            yield line
+
+    def _check_size(self, lines: int) -> None:
+        """Stop before a file fills the memory, or the day: `lines` have been read of it, blank ones included."""
+        if lines > MOST_ROWS:
             raise InputError(f"{self.path}: found more than {MOST_ROWS:,} rows, expected fewer: split the file")
         packed, unpacked = max(self.file.tell(), 1), self.binary.tell()
         least, times = BOMB
@@ -147,13 +157,6 @@ class _Text:
             case _:
                 return
         raise InputError(f"{self.path}: {problem}, expected CSV with a header line") from error
-
-
-def _lines(text: io.TextIOWrapper) -> Iterator[str]:
-    while line := text.readline(LONGEST_LINE):
-        if len(line) == LONGEST_LINE and not line.endswith("\n"):
-            raise csv.Error(f"a line of more than {LONGEST_LINE:,} characters")
-        yield line
 
 
 def _check_header(path: Path, header: list[str], required: Sequence[str], optional: Sequence[str]) -> None:

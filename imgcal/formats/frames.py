@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from imgcal.errors import InputError
 from imgcal.formats.atomic import write_bytes
 from imgcal.formats.image_headers import PNG_SIGNATURE, Size, check_pixels, is_of_kind, size_of, tiff_pages
+from imgcal.formats.names import check_regular
 from imgcal.formats.silence import silenced
 
 Frame = NDArray[np.uint8] | NDArray[np.uint16]  # (H, W) grey
@@ -128,6 +129,7 @@ class Video:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        check_regular(path)
         try:
             with open(path, "rb") as file:
                 start = file.read(8)
@@ -191,8 +193,7 @@ def _grey(image: Any, path: Path) -> Frame:
 
 def _content(path: Path) -> bytes:
     """Read an image file of the kind that its name says."""
-    if path.exists() and not path.is_file():
-        raise InputError(f"{path}: found a folder, device or pipe, expected an image file")
+    check_regular(path)
     if path.stat().st_size > LARGEST_IMAGE_FILE:
         raise InputError(f"{path}: found {path.stat().st_size:,} bytes, expected at most {LARGEST_IMAGE_FILE:,}")
     content = path.read_bytes()

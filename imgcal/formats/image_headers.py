@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from imgcal.errors import InputError
+from imgcal.formats.names import check_regular
 from imgcal.limits import MOST_PIXELS
 
 Size = tuple[int, int]  # width, height in pixels
@@ -79,6 +80,7 @@ def tiff_pages(path: Path) -> tuple[Size, ...]:
 
     Source: TIFF 6.0, section 2; BigTIFF has 8-byte offsets and 20-byte entries.
     """
+    check_regular(path)
     state = path.stat()
     return _tiff_pages(path, state.st_size, state.st_mtime_ns)
 

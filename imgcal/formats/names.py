@@ -38,6 +38,12 @@ def title_of(path: Path) -> str:
     return name[:LONGEST_NAME]
 
 
+def check_regular(path: Path) -> None:
+    """Raise `InputError` at a folder, a device or a pipe: reading one may wait for ever."""
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: found a folder, device or pipe, expected a file")
+
+
 def find_file(path: str | Path, kind: str, suffix: str) -> Path:
     """Find a file by its path or, when there is none, by the bare name of a shipped one.
 
@@ -55,8 +61,7 @@ def find_file(path: str | Path, kind: str, suffix: str) -> Path:
     shipped = shipped_names(kind, suffix)
     if str(path) in shipped:
         return data_path(kind, str(path) + suffix)
-    if path.exists():
-        raise InputError(f"{path}: found a {'folder' if path.is_dir() else 'device or pipe'}, expected a file")
+    check_regular(path)
     some = difflib.get_close_matches(path.stem, shipped, n=MOST_NAMES, cutoff=0.3) or shipped[:MOST_NAMES]
     names = shipped if len(shipped) <= MOST_NAMES else [*some, f"... {len(shipped)} in all"]
     raise InputError(

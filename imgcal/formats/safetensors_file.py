@@ -13,6 +13,7 @@ from torch import Tensor
 
 from imgcal.errors import InputError
 from imgcal.formats.atomic import write_bytes
+from imgcal.formats.names import check_regular
 
 # First bytes of what torch.save and pickle.dump write.
 PICKLES = (b"PK\x03\x04", b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")
@@ -61,6 +62,7 @@ def read_tensors(path: str | Path, file_format: str) -> tuple[dict[str, Tensor],
 def read_texts(path: str | Path, file_format: str) -> dict[str, str]:
     """Read only the texts; errors as for `read_tensors`, but damaged tensors go unnoticed."""
     path = Path(path)
+    check_regular(path)
     try:
         with open(path, "rb") as raw:
             start = raw.read(4)

@@ -12,7 +12,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from imgcal.errors import InputError
-from imgcal.formats.names import nearest
+from imgcal.formats.names import check_regular, nearest
 from imgcal.formats.yaml_values import read_values
 from imgcal.messages import shortened
 
@@ -97,6 +97,7 @@ _Dumper.add_representer(FlowMap, lambda d, v: d.represent_mapping("tag:yaml.org,
 
 
 def _parse(path: Path) -> Any:
+    check_regular(path)
     try:
         if path.stat().st_size > MOST_BYTES:
             raise InputError(f"{path}: found {path.stat().st_size:,} bytes, expected at most {MOST_BYTES:,}")

@@ -113,12 +113,14 @@ for name, text in texts.items():
     (folder / name).write_text(text)
 header = gzip.compress(b"snapshot,camera,u,v\\n")
 (folder / "rows.csv.gz").write_bytes(header + gzip.compress(b"0,cam01,1.5,2.5\\n" * 1_000_000, 1) * 30)
+(folder / "blank.csv.gz").write_bytes(header + gzip.compress(b"\\n" * 10_000_000, 1) * 50)
 (folder / "line.csv.gz").write_bytes(header + gzip.compress(b"1" * 10_000_000, 1) * 50)
 (folder / "deep.safetensors").write_bytes(model.replace(b'\\\\"steps\\\\": 1,', b'\\\\"steps\\\\": ' + b"[" * 5 + b","))
 (folder / "wide.safetensors").write_bytes(model.replace(b'\\\\"width\\\\": 16,', b'\\\\"width\\\\": 10000000,'))
 worst = []
 commands = [["score", obj, "--rig", str(folder / name), "--object", obj] for name in texts]
-commands += [["score", str(folder / name), "--rig", rig, "--object", obj] for name in ("rows.csv.gz", "line.csv.gz")]
+tables = ("rows.csv.gz", "blank.csv.gz", "line.csv.gz")
+commands += [["score", str(folder / name), "--rig", rig, "--object", obj] for name in tables]
 commands += [["evaluate", str(folder / name), "--count", "1"] for name in ("deep.safetensors", "wide.safetensors")]
 for command in commands:
     began = time.monotonic()

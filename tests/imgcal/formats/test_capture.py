@@ -93,6 +93,26 @@ def test_a_pipe_is_no_input(tmp_path: Path) -> None:
         open_input(tmp_path / "pipe.csv")
 
 
+@pytest.mark.parametrize(
+    "name", ["capture.yaml", "frames/a/2.png", "frames/a/2.tif", "frames/b.tif", "frames/b.avi", "masks/a.png"]
+)
+def test_a_pipe_in_a_capture_is_not_waited_for(name: str, tmp_path: Path) -> None:
+    put(tmp_path, "frames/a/1.png")
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(InputError, match=f"{name}: found a folder, device or pipe"):
+        capture = open_capture(tmp_path)
+        capture.mask("a")
+        list(capture.snapshots())
+
+
+def test_masks_are_a_folder(tmp_path: Path) -> None:
+    put(tmp_path, "frames/a/1.png")
+    (tmp_path / "masks").write_text("x")
+    with pytest.raises(InputError, match="masks: found a file, expected a folder"):
+        open_capture(tmp_path)
+
+
 def test_frames_are_read_only_when_asked_for(tmp_path: Path) -> None:
     put(tmp_path, "frames/a/0.png")
     put(tmp_path, "frames/a/1.png")

@@ -147,6 +147,13 @@ def test_a_compressed_file_that_unpacks_to_a_flood_is_left_soon(tmp_path: Path, 
     assert len(read) * CHUNK < 2_500_000  # of 4,000,000 numbers
 
 
+def test_a_flood_of_blank_lines_is_left_soon(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(csv_file, "MOST_ROWS", 3 * CHUNK)
+    (tmp_path / "d.csv").write_text("snapshot,camera,u,v\n0,cam01,1.5,2.5\n" + "\n" * 4 * CHUNK)
+    with pytest.raises(InputError, match="more than 3,000 rows"):
+        load_detections(tmp_path / "d.csv")
+
+
 def test_more_rows_than_can_be(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(csv_file, "MOST_ROWS", 3 * CHUNK)
     (tmp_path / "d.csv").write_text("snapshot,camera,u,v\n" + "0,cam01,1.5,2.5\n" * 4 * CHUNK)

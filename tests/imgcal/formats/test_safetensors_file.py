@@ -1,3 +1,5 @@
+import os
+
 import pytest
 import torch
 
@@ -52,3 +54,9 @@ def test_foreign_safetensors_have_no_format(tmp_path):
     save_file({"weight": torch.ones(4)}, tmp_path / "a.safetensors")
     with pytest.raises(InputError, match="found no format version, expected imgcal-test/1"):
         read_tensors(tmp_path / "a.safetensors", FORMAT)
+
+
+def test_a_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "model.safetensors")
+    with pytest.raises(InputError, match="found a folder, device or pipe"):
+        read_texts(tmp_path / "model.safetensors", "x/1")
