@@ -108,8 +108,7 @@ class Recalibrator:
         self._latest: LiveCalibration | None = None
         self._fitted: Calibration | None = None  # the same without what is kept of cameras that are not in the window
         self._last: dict[int, _Last] = {}
-        self._missed: dict[int, int] = {}  # camera -> snapshots in a row in which it was astray
-        self._gone: frozenset[int] = frozenset()  # cameras that have moved and were not found again
+        self._lost: dict[int, tuple[int, int]] = {}  # camera -> when it went astray, how often since
         self._follows = False  # the last snapshot says where the object is now
         self._spare: deque[NDArray[np.int64]] = deque(maxlen=15)
         self._tests: deque[float] = deque(maxlen=200)
@@ -239,10 +238,12 @@ class Recalibrator:
         if int(result.observations.seen[-1].sum()) < least:
             raise RefusedError("estimation: too few labels fit")
         missed += sorted(_all_out(window.kept[-1].blobs, result) - set(missed))
-        self._missed = {camera: self._missed.get(camera, 0) + 1 for camera in missed}
-        gone = self._gone | {camera for camera, times in self._missed.items() if times > 1}
-        live = self._completed(result, window, missed, gone)
-        self._gone = frozenset(gone - _seen(result, -1))
+        found_now = _seen(result, -1) - set(missed)
+        self._lost = {camera: lost for camera, lost in self._lost.items() if camera not in found_now}
+        for camera in missed:
+            first, times = self._lost.get(camera, (self._count - 1, 0))
+            self._lost[camera] = first, times + 1
+        live = self._completed(result, window)
         if fitted.tests or not window.moved:
             self._tests.extend(fitted.tests)
             self._model_errors.append(result.model_error)
@@ -280,7 +281,7 @@ class Recalibrator:
             labelled = self._resected(window, camera, latest) if labelled is None else labelled
             if labelled is None:
                 missed.append(camera)
-                if self._missed.get(camera) == 1:  # twice in a row is no chance
+                if self._lost.get(camera, (0, 0))[1] == 1:  # twice is no chance
                     window = window.after_move(camera, len(window.kept), wide)
                 continue
             found.append(camera)
@@ -293,10 +294,10 @@ class Recalibrator:
 
     def _resected(self, window: Window, camera: int, latest: Calibration) -> Detections | None:
         """Look for a camera anywhere, by all snapshots since it was lost: after 1, 2, 4, 8, ... of them."""
-        times = self._missed.get(camera, 0)
+        first, times = self._lost.get(camera, (0, 0))
         if not times or times & (times - 1):
             return None
-        since = window.kept[-1 - times :]
+        since = [kept for kept in window.kept if int(kept.snapshot.name) >= first]
         places = self._fit.rough(window)[0].rig_from_object[-len(since) :].apply(latest.points_object)
         rows = [np.flatnonzero(kept.blobs.camera == camera) for kept in since]
         seen = [kept.blobs.uv[r] for kept, r in zip(since, rows, strict=True)]
@@ -307,9 +308,7 @@ class Recalibrator:
         fiducial[rows[-1]] = labels
         return replace(since[-1].blobs, fiducial=fiducial)
 
-    def _completed(
-        self, result: Calibration, window: Window, missed: list[int], gone: frozenset[int] | set[int]
-    ) -> LiveCalibration:
+    def _completed(self, result: Calibration, window: Window) -> LiveCalibration:
         """Give cameras that are not in the window what was last known of them, and say what holds for each."""
         inside, now = _seen(result), _seen(result, -1)
         if self._fitted is not None and self._latest is not None and (left := _seen(self._fitted) - inside):
@@ -319,7 +318,7 @@ class Recalibrator:
         rig, factory = result.rig, result.problem.factory
         spread = result.problem.spread.clone()
         for camera, name in enumerate(self.rig.camera_names):
-            if camera in missed or (camera in gone and camera not in inside):
+            if camera in self._lost:
                 states[name] = "astray"
             elif camera in inside:
                 states[name] = "seen" if camera in now else "recent"
@@ -330,7 +329,7 @@ class Recalibrator:
             last = self._last[camera]
             there = aligned(last.rig, rig, _places(result), sorted(last.seen & inside))
             rig, factory = _with_camera(rig, there, camera), _with_camera(factory, there.expand(1), camera)
-            spread[0, camera] = torch.maximum(last.std, window.spread[camera]) if camera in gone else last.std
+            spread[0, camera] = torch.maximum(last.std, window.spread[camera]) if camera in self._lost else last.std
         values = {entry.name: getattr(result, entry.name) for entry in fields(Calibration)}
         values |= {"rig": rig, "problem": replace(result.problem, factory=factory, spread=spread)}
         values["moved"] = self._moves(result, window)

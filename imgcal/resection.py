@@ -96,8 +96,8 @@ def _hypotheses(
                 points[s, fiducials], seen[s][rows], np.eye(3), None, flags=cv2.SOLVEPNP_AP3P
             )
             found += [np.hstack((cv2.Rodrigues(r)[0], t)) for r, t in zip(turns, shifts, strict=True)]
-    poses = np.array(found).reshape(-1, 3, 4)
-    return poses[np.isfinite(poses).all((1, 2))]
+    poses: NDArray[np.float64] = np.array(found, dtype=np.float64).reshape(-1, 3, 4)
+    return np.asarray(poses[np.isfinite(poses).all((1, 2))])
 
 
 def _ordered_triples(count: int, wanted: int, generator: np.random.Generator) -> NDArray[np.int64]:

@@ -67,6 +67,7 @@ class Window:
         spread = self.spread.clone()
         spread[camera, :6] = torch.maximum(spread[camera, :6], wide[camera, :6])
         name = self.kept[first].snapshot.name if first < len(self.kept) else ""
+        kept = tuple(k for k in kept if (k.blobs.fiducial >= 0).any())  # of others, nothing is left
         return replace(self, kept=kept, spread=spread, moved={**self.moved, camera: name})
 
 

@@ -73,6 +73,32 @@ def test_a_camera_turned_far_is_found_again_by_several_snapshots(window):
     assert stream.errors(later[-1].rig, 11, after)[camera] < 1.0
 
 
+def test_snapshots_that_only_the_moved_camera_saw_are_forgotten():
+    stream = Stream("T4", "asymmetric8", 12)
+    after = stream.bumped([1], 1.0)
+    with Recalibrator(stream.rig, stream.obj, window=8) as live:
+        run(stream, live, range(3))
+        run(stream, live, range(3, 5), hidden=[0, 2, 3])
+        run(stream, live, range(5, 7))
+        result = live.update(stream.blobs(7, after)[0])
+        assert [move.camera for move in result.moved] == ["cam02"]
+        assert len(result.labelled.snapshots) == 6
+        assert stream.errors(result.rig, 7, after).max() < 0.3
+
+
+def test_a_camera_once_astray_stays_so_until_it_fits_again():
+    stream = Stream("T4", "asymmetric8", 12)
+    with Recalibrator(stream.rig, stream.obj, window=4) as live:
+        run(stream, live, range(5))
+        blobs, _ = stream.blobs(5)
+        rows = blobs.camera == 2
+        blobs.uv[rows] = np.random.default_rng(5).random((rows.sum(), 2)) * 900 + 50
+        assert live.update(blobs).cameras["cam03"] == "astray"
+        for result in run(stream, live, range(6, 8), hidden=[2]):
+            assert result.cameras["cam03"] == "astray"
+        assert live.update(stream.blobs(8)[0]).cameras["cam03"] == "seen"
+
+
 def test_a_slight_bump_is_named_within_a_few_snapshots():
     stream = Stream("T4", "asymmetric8", 20)
     after = stream.bumped([2], 0.02)
