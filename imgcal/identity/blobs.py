@@ -76,13 +76,14 @@ def gather(detections: Detections, rig: CameraRig) -> Blobs:
     uv[camera, slot], row[camera, slot], sigma[camera, slot] = detections.uv[rows], rows, detections.sigma[rows]
     radius[camera, slot] = detections.radius[rows]
     lens = (rig.focal_length.numpy(), rig.principal_point.numpy(), rig.distortion.numpy())
-    return Blobs(uv, _ideal(uv, count, *lens), sigma, radius, row, count, len(detections))
+    ideal = np.full(uv.shape, FAR, dtype=np.float32)
+    _undistort(uv, count, *lens, ideal)
+    return Blobs(uv, ideal, sigma, radius, row, count, len(detections))
 
 
 @njit(cache=True)
-def _ideal(uv, count, focal, principal, distortion):
+def _undistort(uv, count, focal, principal, distortion, ideal):
     """Remove the distortion by fixed-point iteration: good to far less than a pixel, which is all that is needed."""
-    ideal = np.full(uv.shape, FAR, dtype=np.float32)
     for c in range(len(uv)):
         k1, k2, p1, p2, k3 = distortion[c]
         for m in range(count[c]):
@@ -97,7 +98,6 @@ def _ideal(uv, count, focal, principal, distortion):
                 )
             mean = (focal[c, 0] + focal[c, 1]) / 2
             ideal[c, m, 0], ideal[c, m, 1] = mean * x, mean * y
-    return ideal
 
 
 @dataclass(frozen=True)

@@ -202,10 +202,16 @@ def _search(
                     place = len(score[q]) - 1
                     while place > 0 and score[q, place - 1] < value:
                         score[q, place] = score[q, place - 1]
-                        rotation[q, place], translation[q, place] = rotation[q, place - 1], translation[q, place - 1]
+                        for i in range(3):
+                            translation[q, place, i] = translation[q, place - 1, i]
+                            for j in range(3):
+                                rotation[q, place, i, j] = rotation[q, place - 1, i, j]
                         place -= 1
-                    score[q, place], rotation[q, place] = value, turn
+                    score[q, place] = value
                     translation[q, place, 0], translation[q, place, 1], translation[q, place, 2] = x, y, z
+                    for i in range(3):
+                        for j in range(3):
+                            rotation[q, place, i, j] = turn[i, j]
 
 
 @njit(cache=True, fastmath=FAST)
@@ -242,10 +248,13 @@ def _rasterize(uv, count, cell):
     for c in range(cameras):
         if count[c] == 0:
             continue
-        low_u, low_v = uv[c, : count[c], 0].min(), uv[c, : count[c], 1].min()
+        low_u, low_v, high_u, high_v = uv[c, 0, 0], uv[c, 0, 1], uv[c, 0, 0], uv[c, 0, 1]
+        for m in range(1, count[c]):
+            low_u, high_u = min(low_u, uv[c, m, 0]), max(high_u, uv[c, m, 0])
+            low_v, high_v = min(low_v, uv[c, m, 1]), max(high_v, uv[c, m, 1])
         origin[c, 0], origin[c, 1] = low_u - (reach + 1) * cell, low_v - (reach + 1) * cell
-        width = max(width, int((uv[c, : count[c], 0].max() - low_u) / cell) + 2 * reach + 4)
-        height = max(height, int((uv[c, : count[c], 1].max() - low_v) / cell) + 2 * reach + 4)
+        width = max(width, int((high_u - low_u) / cell) + 2 * reach + 4)
+        height = max(height, int((high_v - low_v) / cell) + 2 * reach + 4)
     raster = np.zeros((cameras, height, width), dtype=np.float32)
     for c in range(cameras):
         for m in range(count[c]):

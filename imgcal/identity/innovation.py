@@ -62,20 +62,21 @@ def innovations(
     residual, freedom, uv = np.zeros(shape), np.zeros(shape), np.zeros((*shape, 2))
     complexity = np.full(count, np.inf)
     equations, state = solution.equations, solution.state
-    factory = problem.factory
+    factory, step = problem.factory, state.offset * problem.spread
     given = [
-        tensor.numpy()
+        np.ascontiguousarray(tensor.numpy())
         for tensor in (
             factory.cam_from_rig.rotation,
-            factory.positions,
-            factory.focal_length,
-            factory.principal_point,
-            factory.distortion,
+            step[..., :3],
+            factory.positions + step[..., 3:6],
+            factory.focal_length + step[..., 6:8],
+            factory.principal_point + step[..., 8:10],
+            factory.distortion + step[..., 10:],
             problem.spread,
-            state.offset,
+            problem.points @ state.rotation[:, 0].mT,
+            state.centre[:, 0],
         )
     ]
-    turn, centre, points = state.rotation.numpy(), state.centre.numpy(), problem.points.numpy()
     for k in np.flatnonzero(np.isfinite(equations.cost.numpy())):
         # Lower factors of the cameras' blocks, of the couplings' and of the pose's: see arrow.reduce.
         eliminated = equations.camera[k].numpy().copy()
@@ -84,7 +85,7 @@ def innovations(
         complexity[k] = _factorize(eliminated, whitened, kept)
         if np.isfinite(complexity[k]):
             _compare(  # type: ignore[call-arg]
-                *(array[k] for array in given), turn[k, 0], centre[k, 0], points, radius_squared,
+                *(array[k] for array in given), radius_squared,
                 eliminated, whitened, kept, blobs.uv, noise, typical, blobs.count, labels[k], sigma[k] ** 2,
                 squared[k], log_det[k], own[k], residual[k], freedom[k], uv[k],
             )  # fmt: skip
@@ -109,7 +110,9 @@ def _contest(labels, squared, log_det, own, undecided, result):
     for k in range(len(labels)):
         for c in range(labels.shape[1]):
             mine = labels[k, c]
-            for i in np.flatnonzero(mine >= 0):
+            for i in range(len(mine)):
+                if mine[i] < 0:
+                    continue
                 for j in range(len(mine)):
                     change = squared[k, c, j, mine[i]] + log_det[k, c, j] - own[k, c, i] - log_det[k, c, i]
                     if mine[j] >= 0:  # in exchange
@@ -129,9 +132,10 @@ def _factorize(blocks, coupling, kept):
             return np.inf
         log_det += part
         for i in range(15):
-            for k in range(i):
-                coupling[c, i] -= blocks[c, i, k] * coupling[c, k]
-            coupling[c, i] /= blocks[c, i, i]
+            for j in range(6):
+                for k in range(i):
+                    coupling[c, i, j] -= blocks[c, i, k] * coupling[c, k, j]
+                coupling[c, i, j] /= blocks[c, i, i]
         for i in range(6):
             for j in range(6):
                 for k in range(15):
@@ -159,7 +163,7 @@ def _cholesky(matrix):
 
 @njit(cache=True, fastmath=FAST)
 def _compare(
-    rotation0, position0, focal0, principal0, distortion0, spread, offset, turn, centre, points, radius_squared,
+    rotation0, turn, position, focal, principal, distortion, spread, rotated, centre, radius_squared,
     eliminated, whitened, kept, blob_uv, blob_noise, typical_noise, blob_count, labels, extra,
     squared, log_det, own, residual, freedom, uv,
 ):  # fmt: skip
@@ -168,19 +172,14 @@ def _compare(
     rotation, exponential, left = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     unit = max(1.0, np.sqrt(centre[0] ** 2 + centre[1] ** 2 + centre[2] ** 2))
     for c in range(len(rotation0)):
-        step = offset[c] * spread[c]
-        _exponential(step[:3], exponential, left)
+        _exponential(turn[c], exponential, left)
         _multiply(exponential, rotation0[c], rotation)
-        position, focal, principal = position0[c] + step[3:6], focal0[c] + step[6:8], principal0[c] + step[8:10]
-        distortion = distortion0[c] + step[10:15]
-        for n in range(len(points)):
-            rotated = turn @ points[n]
+        for n in range(len(rotated)):
             _rows(
-                rotated, rotation, left, rotated + centre - position,
-                focal, principal, distortion, spread[c], radius_squared[n], unit, rows, uv[c, n],
+                rotated[n], rotation, left, centre, position[c],
+                focal[c], principal[c], distortion[c], spread[c], radius_squared[n], unit, rows, uv[c, n],
             )  # fmt: skip
-            _whiten(rows, eliminated[c], whitened[c], kept, parts)
-            uu, uv_, vv = (parts[0] * parts[0]).sum(), (parts[0] * parts[1]).sum(), (parts[1] * parts[1]).sum()
+            uu, uv_, vv = _whiten(rows, eliminated[c], whitened[c], kept, parts)
             label = labels[c, n]
             noise = (blob_noise[c, label] if label >= 0 else typical_noise) + extra
             at_u, at_v = uv[c, n, 0], uv[c, n, 1]
@@ -217,43 +216,54 @@ def _compare(
 
 
 @njit(cache=True, fastmath=FAST)
-def _rows(rotated, rotation, left, arm, focal, principal, distortion, spread, radius_squared, unit, rows, uv):
+def _rows(
+    rotated, rotation, left, centre, position, focal, principal, distortion, spread, radius_squared, unit, rows, uv
+):  # fmt: skip
     """Fill the Jacobian (2, 21) of a pixel by 15 whitened camera and 6 pose parameters, and the pixel.
 
     To the last digit that of the fit (`fused._linearize`): where a label alone decides a parameter, nothing is left of
     it but the difference of two almost equal numbers.
     """
-    point = rotation @ arm
+    ax, ay, az = rotated[0], rotated[1], rotated[2]
+    ox, oy, oz = ax + centre[0] - position[0], ay + centre[1] - position[1], az + centre[2] - position[2]
+    px = rotation[0, 0] * ox + rotation[0, 1] * oy + rotation[0, 2] * oz
+    py = rotation[1, 0] * ox + rotation[1, 1] * oy + rotation[1, 2] * oz
+    pz = rotation[2, 0] * ox + rotation[2, 1] * oy + rotation[2, 2] * oz
     per_depth, log_slope, x, y, rr, xd, yd, jxx, jxy, jyy = lens(
-        point[0], point[1], max(point[2], NEAREST_DEPTH), radius_squared,
+        px, py, max(pz, NEAREST_DEPTH), radius_squared,
         distortion[0], distortion[1], distortion[2], distortion[3], distortion[4],
     )  # fmt: skip
     uv[0], uv[1] = focal[0] * xd + principal[0], focal[1] * yd + principal[1]
-    slope = np.empty((2, 3))
-    slope[0, 0], slope[0, 1], slope[0, 2] = per_depth * jxx, per_depth * jxy, log_slope * (jxx * x + jxy * y)
-    slope[1, 0], slope[1, 1], slope[1, 2] = per_depth * jxy, per_depth * jyy, log_slope * (jxy * x + jyy * y)
-    slope[0] *= focal[0]
-    slope[1] *= focal[1]
-    back = slope @ rotation
     for r in range(2):
-        rows[r, :3] = _cross(point, slope[r]) @ left
-        rows[r, 3:6] = -back[r]
-        rows[r, 6:10] = 0
-        rows[r, 15:18] = _cross(rotated, back[r])
-        rows[r, 18:21] = back[r] * unit
-    rows[0, 6], rows[1, 7], rows[0, 8], rows[1, 9] = xd, yd, 1.0, 1.0
-    rows[0, 10], rows[1, 10] = focal[0] * x * rr, focal[1] * y * rr
-    rows[0, 11], rows[1, 11] = rows[0, 10] * rr, rows[1, 10] * rr
-    rows[0, 12], rows[1, 12] = focal[0] * 2 * x * y, focal[1] * (rr + 2 * y * y)
-    rows[0, 13], rows[1, 13] = focal[0] * (rr + 2 * x * x), focal[1] * 2 * x * y
-    rows[0, 14], rows[1, 14] = rows[0, 11] * rr, rows[1, 11] * rr
+        along_x, along_y = (jxx, jxy) if r == 0 else (jxy, jyy)
+        sx, sy = focal[r] * per_depth * along_x, focal[r] * per_depth * along_y
+        sz = focal[r] * log_slope * (along_x * x + along_y * y)
+        tx, ty, tz = py * sz - pz * sy, pz * sx - px * sz, px * sy - py * sx
+        bx = sx * rotation[0, 0] + sy * rotation[1, 0] + sz * rotation[2, 0]
+        by = sx * rotation[0, 1] + sy * rotation[1, 1] + sz * rotation[2, 1]
+        bz = sx * rotation[0, 2] + sy * rotation[1, 2] + sz * rotation[2, 2]
+        for i in range(3):
+            rows[r, i] = (tx * left[0, i] + ty * left[1, i] + tz * left[2, i]) * spread[i]
+        rows[r, 3], rows[r, 4], rows[r, 5] = -bx * spread[3], -by * spread[4], -bz * spread[5]
+        rows[r, 15], rows[r, 16], rows[r, 17] = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+        rows[r, 18], rows[r, 19], rows[r, 20] = bx * unit, by * unit, bz * unit
     for r in range(2):
-        rows[r, :15] *= spread
+        at, along, mixed = (x, xd, 12) if r == 0 else (y, yd, 13)
+        rows[r, 6 + r], rows[r, 7 - r] = along * spread[6 + r], 0.0
+        rows[r, 8 + r], rows[r, 9 - r] = spread[8 + r], 0.0
+        power = focal[r] * at * rr
+        rows[r, 10], rows[r, 11], rows[r, 14] = (
+            power * spread[10],
+            power * rr * spread[11],
+            power * rr * rr * spread[14],
+        )
+        rows[r, mixed] = focal[r] * 2 * x * y * spread[mixed]
+        rows[r, 25 - mixed] = focal[r] * (rr + 2 * at * at) * spread[25 - mixed]
 
 
 @njit(cache=True, fastmath=FAST)
 def _whiten(rows, eliminated, whitened, kept, parts):
-    """Apply the inverse of the arrow's triangular factor: covariance = parts @ parts.T."""
+    """Apply the inverse of the arrow's triangular factor; return the covariance parts @ parts.T: uu, uv, vv."""
     for r in range(2):
         for i in range(15):
             value = rows[r, i]
@@ -267,8 +277,9 @@ def _whiten(rows, eliminated, whitened, kept, parts):
             for j in range(i):
                 value -= kept[i, j] * parts[r, 15 + j]
             parts[r, 15 + i] = value / kept[i, i]
-
-
-@njit(cache=True, fastmath=FAST)
-def _cross(a, b):
-    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    uu, uv, vv = 0.0, 0.0, 0.0
+    for i in range(21):
+        uu += parts[0, i] * parts[0, i]
+        uv += parts[0, i] * parts[1, i]
+        vv += parts[1, i] * parts[1, i]
+    return uu, uv, vv

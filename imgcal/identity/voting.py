@@ -36,24 +36,34 @@ def predict_ideal(rig: CameraRig, points: NDArray[np.float64], poses: Poses) -> 
     """Project fiducials (N, 3) without distortion, from the principal point: (K, C, N, 2) px, -1e7 behind a camera."""
     transform = rig.cam_from_rig
     focal = rig.focal_length.mean(-1).numpy()
-    return _predict(
-        transform.rotation.numpy(), transform.translation.numpy(), focal, points, poses.rotation, poses.translation
+    uv = np.full((len(poses.rotation), rig.cameras, len(points), 2), -1e7)
+    given = (
+        transform.rotation.numpy(),
+        transform.translation.numpy(),
+        focal,
+        points,
+        poses.rotation,
+        poses.translation,
     )
+    _predict(*map(np.ascontiguousarray, given), uv)
+    return uv
 
 
 @njit(cache=True)
-def _predict(rotation, translation, focal, points, turn, offset):
-    uv = np.full((len(turn), len(rotation), len(points), 2), -1e7)
+def _predict(rotation, translation, focal, points, turn, offset, uv):
     for k in range(len(turn)):
+        turned = turn[k]
         for n in range(len(points)):
-            at = turn[k] @ points[n] + offset[k]
+            px, py, pz = points[n, 0], points[n, 1], points[n, 2]
+            x = turned[0, 0] * px + turned[0, 1] * py + turned[0, 2] * pz + offset[k, 0]
+            y = turned[1, 0] * px + turned[1, 1] * py + turned[1, 2] * pz + offset[k, 1]
+            z = turned[2, 0] * px + turned[2, 1] * py + turned[2, 2] * pz + offset[k, 2]
             for c in range(len(rotation)):
                 r, t = rotation[c], translation[c]
-                depth = r[2, 0] * at[0] + r[2, 1] * at[1] + r[2, 2] * at[2] + t[2]
+                depth = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2]
                 if depth > 1:
-                    uv[k, c, n, 0] = focal[c] * (r[0, 0] * at[0] + r[0, 1] * at[1] + r[0, 2] * at[2] + t[0]) / depth
-                    uv[k, c, n, 1] = focal[c] * (r[1, 0] * at[0] + r[1, 1] * at[1] + r[1, 2] * at[2] + t[1]) / depth
-    return uv
+                    uv[k, c, n, 0] = focal[c] * (r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0]) / depth
+                    uv[k, c, n, 1] = focal[c] * (r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1]) / depth
 
 
 def vote(blobs: Blobs, predicted: NDArray[np.float64], tolerance: float, gate: float) -> Votes:
@@ -97,10 +107,13 @@ def _vote_one(predicted, ideal, number, width, gate, count, shift):
                     windows[i + 1, j] += 1
                     windows[i, j + 1] += 1
                     windows[i + 1, j + 1] += 1
-        best = int(windows.argmax())
-        i, j = best // (bins + 1), best % (bins + 1)
-        count[c] = min(windows[i, j], predicted.shape[1])
-        shift[c, 0], shift[c, 1] = i * width - gate, j * width - gate
+        most, best_i, best_j = 0, 0, 0
+        for i in range(bins + 1):
+            for j in range(bins + 1):
+                if windows[i, j] > most:
+                    most, best_i, best_j = windows[i, j], i, j
+        count[c] = min(most, predicted.shape[1])
+        shift[c, 0], shift[c, 1] = best_i * width - gate, best_j * width - gate
 
 
 def match(
