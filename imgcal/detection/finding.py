@@ -200,7 +200,8 @@ def _smooth_tiles(frame, blocks, tile, invert):
     `invert` is the grey value from which dark frames are subtracted, -1 = bright.
     """
     height, width = frame.shape
-    smooth = np.full((len(blocks), BLOCK, BLOCK), np.float32(-1))
+    smooth = np.empty((len(blocks), BLOCK, BLOCK), np.float32)
+    smooth[:] = -1
     for k in range(len(blocks)):
         row, column = blocks[k] // (tile.shape[1] - 2), blocks[k] % (tile.shape[1] - 2)
         tile[row + 1, column + 1] = k + 1

@@ -57,7 +57,9 @@ def fit_centre(rows, pixels, start, clipped, noise):
         # What is left moves the centre by much less than the noise does: no need to draw it again.
         settled = moved and normal[5, 5] * step[5] ** 2 + normal[6, 6] * step[6] ** 2 < SETTLED * noise**2
         if settled:
-            now, cost = trial, cost - np.dot(normal[PARAMETERS, :PARAMETERS], step)
+            now = trial
+            for i in range(PARAMETERS):
+                cost -= normal[PARAMETERS, i] * step[i]
             break
         after = _draw(rows, pixels, trial) if _is_blob(trial) else np.inf
         if after < cost:

@@ -71,10 +71,14 @@ def find_waist(grey, weight, x, y, most, axis, middle, spread):
             left = int(at)
             profile[left] += mass * (left + 1 - at)
             profile[left + 1] += mass * (at - left)
-    least, before, most_mass = 1.0, 0.0, profile.max()
+    after = np.empty(PROFILE)  # the most from here on
+    after[PROFILE - 1] = profile[PROFILE - 1]
+    for i in range(PROFILE - 2, -1, -1):
+        after[i] = max(profile[i], after[i + 1])
+    least, before, most_mass = 1.0, 0.0, after[0]
     for i in range(1, PROFILE - 1):
         before = max(before, profile[i - 1])
-        sides = min(before, profile[i + 1 :].max())
+        sides = min(before, after[i + 1])
         if sides > PART * most_mass:
             least = min(least, profile[i] / sides)
     return least

@@ -47,7 +47,10 @@ def measure_all(
     uv, sigma, radius, contrast, flags, kept,
 ):  # fmt: skip
     """Fill the columns of all candidates of a frame."""
-    side = 2 * half_size.max() + 1 + 2 * MARGIN if len(half_size) else 0
+    widest = 0
+    for k in range(len(half_size)):
+        widest = max(widest, half_size[k])
+    side = 2 * widest + 1 + 2 * MARGIN
     scratch, ring = np.empty((4, side * side), np.float32), np.empty((4, 4 * RING * side), np.float32)
     fit = np.empty((ROWS, MOST), np.float32)
     distances, offsets = np.empty((3, side * side), np.uint8), np.empty((2, side * side), np.float32)
@@ -265,7 +268,7 @@ def _spread(squared, scratch):
     Rows are taken as one: what leaves a row on one side and enters the next does not get past the margin.
     """
     flat, along = squared.reshape(-1), scratch.reshape(-1)
-    _lower(flat, along, 1)
+    _lower(flat, along, np.int64(1))
     _lower(along, flat, squared.shape[1])
 
 

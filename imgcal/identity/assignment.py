@@ -23,7 +23,9 @@ def mutual_nearest(places, blobs, reach, labels):
         reach: pixels; pairs this far apart or farther are not made.
         labels: (N,), filled with the blob of each place, -1 = none.
     """
-    back, nearest = np.full(len(blobs), -1), np.full(len(blobs), np.inf)
+    back, nearest = np.empty(len(blobs), np.int64), np.empty(len(blobs))
+    for m in range(len(blobs)):
+        back[m], nearest[m] = -1, np.inf
     for n in range(len(places)):
         labels[n], least = -1, np.inf
         for m in range(len(blobs)):
@@ -47,7 +49,8 @@ def spacing(places: NDArray[np.float64]) -> float:
 @njit(cache=True)
 def distances_to_nearest(places):
     """Distance (px) from each place (C, N, 2) to the nearest other one in the same camera: (C, N)."""
-    gaps = np.full(places.shape[:2], np.inf)
+    gaps = np.empty(places.shape[:2])
+    gaps[:] = np.inf
     for c in range(len(places)):
         for i in range(places.shape[1]):
             for j in range(i):
@@ -85,9 +88,9 @@ def assign(cost: NDArray[np.floating], gate: float) -> NDArray[np.int64]:
 @njit(cache=True)
 def _cheapest(cost, gate, labels):
     """Give each fiducial its cheapest blob, and tell where two would share one: (B,)."""
-    contested = np.zeros(len(cost), dtype=np.bool_)
+    contested, taken = np.empty(len(cost), np.bool_), np.empty(cost.shape[2], np.bool_)
     for b in range(len(cost)):
-        taken = np.zeros(cost.shape[2], dtype=np.bool_)
+        contested[b], taken[:] = False, False
         for n in range(cost.shape[1]):
             least = gate
             for m in range(cost.shape[2]):

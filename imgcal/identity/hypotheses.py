@@ -158,7 +158,8 @@ def single_camera_poses(
     rays = blobs.ideal[cameras[:, None], triples].astype(np.float64) / focal[cameras, None, None]
     seen = blobs.ideal[blobs.row >= 0]
     cell = max(tolerance / CELLS, float(np.ptp(seen, axis=0).max()) / MOST_CELLS)
-    raster, origin = _rasterize(blobs.ideal, blobs.count, cell)
+    origin = np.zeros((len(blobs.count), 2))
+    raster = _rasterize(blobs.ideal, blobs.count, cell, origin)
     score = np.zeros((len(triples), keep))
     rotation, translation = np.zeros((len(triples), keep, 3, 3)), np.zeros((len(triples), keep, 3))
     _search(
@@ -236,14 +237,13 @@ def _explained(turn, x, y, z, points, order, focal, raster, origin, per_pixel, l
 
 
 @njit(cache=True)
-def _rasterize(uv, count, cell):
+def _rasterize(uv, count, cell, origin):
     """Raster 1 - (distance to the nearest blob / tolerance)^2 for each camera, so that looking up replaces searching.
 
     Returns:
-        raster (C, H, W) and the pixel coordinates (C, 2) of its corner.
+        raster (C, H, W); `origin` gets the pixel coordinates (C, 2) of its corner.
     """
     cameras, reach = len(uv), CELLS
-    origin = np.zeros((cameras, 2))
     height, width = 1, 1
     for c in range(cameras):
         if count[c] == 0:
@@ -264,4 +264,4 @@ def _rasterize(uv, count, cell):
                     away = ((column + 0.5 - u) ** 2 + (row + 0.5 - v) ** 2) / (CELLS * CELLS)
                     if 1 - away > raster[c, row, column]:
                         raster[c, row, column] = 1 - away
-    return raster, origin
+    return raster

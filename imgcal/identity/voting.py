@@ -10,6 +10,7 @@ prior's bounds and everything else is not.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,21 +82,21 @@ def vote(blobs: Blobs, predicted: NDArray[np.float64], tolerance: float, gate: f
     width = max(tolerance, 2 * gate / MOST_BINS)
     count = np.zeros(predicted.shape[:2], dtype=np.int64)
     shift = np.zeros((*predicted.shape[:2], 2))
-    _vote(predicted, blobs.ideal, blobs.count, width, gate, count, shift)
+    bins = math.ceil(2 * gate / width)
+    # Every vote counts in two by two overlapping windows, so that no peak is split by a border.
+    windows = np.zeros((bins + 1, bins + 1), dtype=np.int32)
+    _vote(predicted, blobs.ideal, blobs.count, width, gate, windows, count, shift)
     return Votes(count, shift)
 
 
 @njit(cache=True)
-def _vote(predicted, ideal, number, width, gate, count, shift):
+def _vote(predicted, ideal, number, width, gate, windows, count, shift):
     for k in range(len(predicted)):
-        _vote_one(predicted[k], ideal, number, width, gate, count[k], shift[k])
+        _vote_one(predicted[k], ideal, number, width, gate, windows, count[k], shift[k])
 
 
 @njit(cache=True)
-def _vote_one(predicted, ideal, number, width, gate, count, shift):
-    bins = int(np.ceil(2 * gate / width))
-    # Every vote counts in two by two overlapping windows, so that no peak is split by a border.
-    windows = np.zeros((bins + 1, bins + 1), dtype=np.int32)
+def _vote_one(predicted, ideal, number, width, gate, windows, count, shift):
     for c in range(len(predicted)):
         windows[:] = 0
         for n in range(predicted.shape[1]):
@@ -108,8 +109,8 @@ def _vote_one(predicted, ideal, number, width, gate, count, shift):
                     windows[i, j + 1] += 1
                     windows[i + 1, j + 1] += 1
         most, best_i, best_j = 0, 0, 0
-        for i in range(bins + 1):
-            for j in range(bins + 1):
+        for i in range(windows.shape[0]):
+            for j in range(windows.shape[1]):
                 if windows[i, j] > most:
                     most, best_i, best_j = windows[i, j], i, j
         count[c] = min(most, predicted.shape[1])
