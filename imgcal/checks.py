@@ -6,17 +6,23 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.errors import RefusedError
 from imgcal.estimation import Estimate
 from imgcal.labelling import PipelineOptions
+from imgcal.objects import CalibrationObject
+from imgcal.observations import Observations
+from imgcal.projection_compiled import project
 from imgcal.rig import PARAMETER_NAMES, CameraRig
 from imgcal.tally import Tally
 
 LEAST_EXPLAINED = 0.5
 """Of what a camera sees of the object, the share that must be where the rest of the rig expects it."""
+SAME_PIXEL = 1e-3
+"""Pixels up to which two ways of projecting may differ."""
 LEAST_SIGHT = 0.4
 """Blobs that may be fiducials, in parts of the fiducials in view, from which a camera is said to see the object."""
 
@@ -73,6 +79,23 @@ def require_fit(model_error: float, outlier_share: float, rms: float, options: P
             f"{100 * options.most_outliers:.0f} %: labels are wrong, or something moved during the capture",
             python="calibrate from fewer snapshots (Detections.of_snapshots) to find which ones fit",
             command="calibrate from fewer snapshots (--snapshots A:B) to find which ones fit",
+        )
+
+
+def require_same_residuals(
+    fit: Estimate, observations: Observations, seen: NDArray[np.bool_], obj: CalibrationObject
+) -> None:
+    """Project the object with the rig that is about to be returned: the residuals must be those about to be reported.
+
+    Shares nothing with the solver. Should they differ, the solver's state and its report do not belong together.
+    """
+    points = fit.rig_from_object.apply(fit.points_object.unsqueeze(-3)).to(fit.rig.focal_length)
+    uv = project(fit.rig.expand(len(points)), points, obj.radius).uv  # (S, C, N, 2)
+    difference = (uv - observations.uv - fit.residual)[torch.from_numpy(seen)]
+    if not bool((difference.abs() < SAME_PIXEL).all()):
+        raise RefusedError(
+            "estimation: the rig that was found and its residuals do not belong together (up to "
+            f"{float(difference.abs().max()):.2g} px apart): please report this with the data"
         )
 
 

@@ -221,7 +221,8 @@ class Follower:
         return ("ambiguous" if self.alternatives > 1 else "by_tracking"), max(self.alternatives, 1)
 
     def _identify(self, blobs: Detections) -> Identity:
-        blobs = replace(blobs, sigma=np.hypot(blobs.sigma, self.options.identity_error))
+        error = np.hypot(self.options.identity_error, self._tolerance_px(blobs))
+        blobs = replace(blobs, sigma=np.hypot(blobs.sigma, error))
         known = [] if self.pose is None else [self.pose]
         # Many captures are taken with the object at the origin of the rig's frame; it costs little to look there first.
         guesses = [] if known else [RigidTransform.identity(dtype=self.rig.focal_length.dtype)]
@@ -237,6 +238,23 @@ class Follower:
             found = replace(found, status=status, alternatives=alternatives)
         self.alternatives, self.in_vain = found.alternatives, 0
         return found
+
+    def _tolerance_px(self, blobs: Detections) -> float:
+        """What the object's tolerances are in the image, roughly."""
+        obj = self.obj
+        if obj.exact:
+            return 0.0
+        tolerance = 0.0 if obj.tolerance is None else float(obj.tolerance.max())
+        tolerance = float(np.hypot(tolerance, obj.scale_tolerance * obj.size))
+        distance = self.rig.working_distance
+        if distance is None and self.pose is not None:
+            centre = self.pose.apply(obj.points.mean(0, keepdim=True))[0]
+            distance = float((self.rig.positions - centre).norm(dim=-1).median())
+        if distance is not None:
+            return tolerance * float(self.rig.focal_length.mean()) / distance
+        cameras = [blobs.uv[blobs.camera == c] for c in np.unique(blobs.camera)]
+        extents = [np.linalg.norm(uv - np.median(uv, axis=0), axis=1).mean() for uv in cameras]
+        return tolerance * float(np.median(extents)) / obj.size if extents else 0.0
 
     def _remember(self, blobs: Detections, labels: NDArray[np.int64], pose: RigidTransform) -> None:
         """Keep the pose; refit the rig after 1, 2, 4, 8, ... accepted snapshots."""

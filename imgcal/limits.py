@@ -48,6 +48,7 @@ TRANSLATION = Range(-1e7, 1e7, "mm")
 DISTANCE = Range(1e-3, 1e7, "mm")
 COORDINATE = Range(-1e6, 1e6, "mm")  # of a fiducial in its object
 FIDUCIAL_RADIUS = Range(1e-6, 1e5, "mm")
+TOLERANCE = Range(0.0, 1e3, "mm")  # of a fiducial's coordinates
 
 # Of what a rig file says about the drift to be expected; one standard deviation.
 PRIOR_FOCAL_LENGTH = Range(1e-9, 10.0, "of the focal length")

@@ -176,10 +176,10 @@ class Recalibrator:
         latest = self._latest
         if latest is None or not self._follows or self._slips:
             return None
-        points = latest.rig_from_object[-1].apply(self.obj.points)
+        points = latest.rig_from_object[-1].apply(latest.points_object)
         predicted = latest.rig.project(points, self.obj.radius).uv.numpy()  # (C, N, 2)
         named = replace(blobs, fiducial=near_prediction(blobs, predicted))
-        blobs, pose = without_strays(named, latest.rig, self.obj, latest.rig_from_object[-1], self.options)
+        blobs, pose = without_strays(named, latest.rig, latest.object, latest.rig_from_object[-1], self.options)
         before = int(latest.observations.seen[-1].sum())
         if (blobs.fiducial >= 0).sum() < LEAST_FOLLOWED * before or self._astray(blobs, pose).any():
             return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -60,6 +60,10 @@ class CalibrationObject:
     def exact(self) -> bool:
         """Tell whether the fiducials are where the object says, without any tolerance."""
         return self.scale_tolerance == 0 and (self.tolerance is None or not bool(self.tolerance.any()))
+
+    def taken_as_exact(self) -> CalibrationObject:
+        """Return the object without its tolerances."""
+        return self if self.exact else replace(self, tolerance=None, scale_tolerance=0.0)
 
     @property
     def fiducials(self) -> int:

@@ -15,15 +15,26 @@ import torch
 from torch import Tensor
 
 from imgcal.accuracy import PredictedError, predicted_error
-from imgcal.checks import require_cameras, require_fit, require_most_labels, require_near_prior, require_views
+from imgcal.checks import (
+    require_cameras,
+    require_fit,
+    require_most_labels,
+    require_near_prior,
+    require_same_residuals,
+    require_views,
+)
 from imgcal.detection import DetectionOptions
 from imgcal.errors import RefusedError
 from imgcal.estimation import Estimate, estimate, initial_pose
-from imgcal.estimation.estimate import conclude, make_problem, make_start
+from imgcal.estimation.blocks import BlockScatter, block_scatter
+from imgcal.estimation.covariance import whitened_covariance
+from imgcal.estimation.estimate import conclude, make_loss, make_problem, make_start
+from imgcal.estimation.shape import FiducialOffset
 from imgcal.first_guess import FirstGuess, Guesser, residual_of
 from imgcal.labelling import Labelled, PipelineOptions, Progress, label, observations_of
 from imgcal.moved import MovedCamera
 from imgcal.networks.prediction import Prediction
+from imgcal.object_checks import displaced, object_offsets
 from imgcal.objects import CalibrationObject
 from imgcal.observations import BlobFlag, Detections, Observations
 from imgcal.pose_support import UndeterminedPosesError, require_poses, without_snapshots
@@ -47,7 +58,10 @@ class Calibration(Estimate):
     outliers: int  # labelled blobs left out
     widened: Mapping[str, float]  # by kind of value: factor by which the prior was too narrow, where it was
     factory: CameraRig
-    obj: CalibrationObject
+    obj: CalibrationObject  # as it was given
+    shape: tuple[FiducialOffset, ...] = ()  # where each fiducial is instead; empty = the object was taken as exact
+    scale_sigma: float | None = None  # relative: an error of the object's scale three times as large would be noticed
+    block_length: int = 0  # snapshots in the blocks whose scatter the covariance follows; 0 = that of the noise
     first_guess: FirstGuess | None = None  # what a network said, where one was asked
     guess_used: bool = False  # its guess was nearer to the images than the factory calibration
     seconds: Mapping[str, float] = field(default_factory=dict)  # by stage
@@ -59,10 +73,20 @@ class Calibration(Estimate):
         return estimate(
             self.observations,
             self.factory,
-            self.obj,
+            self.obj.taken_as_exact(),
             self.rig_from_object,
             spread=torch.zeros_like(self.problem.spread[0]),
         )
+
+    @property
+    def object(self) -> CalibrationObject:
+        """The object as it was estimated: its fiducials in their estimated places, taken as exact."""
+        return replace(self.obj.taken_as_exact(), points=self.points_object.detach())
+
+    @property
+    def displaced(self) -> tuple[FiducialOffset, ...]:
+        """Fiducials that are surely not in their places."""
+        return displaced(self.shape, self.obj)
 
     @cached_property
     def tally(self) -> Tally:
@@ -197,8 +221,15 @@ def _fit_labelled(
         change = latest.problem.spread * latest.solution.state.offset
         offset = torch.where(prior > 0, change / prior.clamp_min(1e-30), 0.0)
         starts.insert(0, (replace(state, offset=offset), latest.model_error))
-    found = settle(problem, starts, variance, labels, options)
+    found = settle(problem, starts, variance, labels, options, examine=latest is None)
     fit = conclude(found.problem, found.solution, found.solution.state)
+    require_same_residuals(fit, observations, found.seen, obj)
+    shape = object_offsets(fit, found.shape, obj)
+    scatter = BlockScatter()
+    if latest is None:
+        covariance = whitened_covariance(found.solution)[0]
+        scatter = block_scatter(found.problem, found.solution, covariance, make_loss(options.estimation))
+        fit = replace(fit, inflation=scatter.factor)
     outliers = int(labels.sum() - found.seen.sum())
     require_cameras(found.seen, rig, options)
     require_near_prior(fit, prior, rig, found.widened, options)
@@ -216,6 +247,9 @@ def _fit_labelled(
         widened=found.widened,
         factory=rig,
         obj=obj,
+        shape=shape,
+        scale_sigma=None if found.shape is None else found.shape.scale_error[1],
+        block_length=scatter.length,
         first_guess=guess,
         guess_used=guess_used,
     )
@@ -296,7 +330,7 @@ def score(
     fixed = torch.zeros(*rig.distortion.shape[:-1], 15, dtype=rig.distortion.dtype)
     # What is reported is an RMS in pixels: centres count alike, however well each was measured.
     even = replace(observations, sigma=torch.full_like(observations.sigma, options.identity_error))
-    fit = estimate(even, rig, obj, poses, spread=fixed, options=options.estimation)
+    fit = estimate(even, rig, obj.taken_as_exact(), poses, spread=fixed, options=options.estimation)
     if not bool(fit.converged):
         raise RefusedError(f"score: no pose of the object fits (RMS {2**0.5 * float(fit.rms):.3g} px)")
     return Score(labelled, fit.residual, observations.seen)

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from imgcal.errors import RefusedError
 from imgcal.estimation.covariance import remaining_variance
-from imgcal.estimation.estimate import minimize
-from imgcal.estimation.linearize import Problem, State
+from imgcal.estimation.estimate import make_loss, minimize
+from imgcal.estimation.linearize import Problem, State, points_at
+from imgcal.estimation.robust import Loss
+from imgcal.estimation.shape import ShapeEvidence, learnt_tolerances, pull_scatter, shape_evidence
 from imgcal.estimation.solver import Solution
 from imgcal.labelling import PipelineOptions
 from imgcal.pose_support import require_poses
@@ -24,11 +26,22 @@ KINDS = {
     "principal_point": slice(8, 10),
     "distortion": slice(10, 15),
 }
+ROUNDS = 40
+"""Of fits at most: noise, outliers, object and prior follow each other, and most captures need three to six."""
+BENT = 5.0
+"""Standard deviations from which the object is not what its file says."""
+WRONG_SCALE = 4.5
+"""Standard deviations of the cameras' positions, all moved together, from which the object's scale is wrong."""
+
+GROSS_SCALE = 0.05
+"""Relative error of the scale that is named at once: it spoils noise and labels of any fit."""
+MOST_SCALE = 0.5
+"""Relative error of the scale above which something else is wrong: exchanged cameras, for one."""
 
 
 @dataclass(frozen=True)
 class SettledFit:
-    """A fit whose noise, outliers and prior agree with its residuals."""
+    """A fit whose noise, outliers, object and prior agree with its residuals."""
 
     problem: Problem
     solution: Solution
@@ -36,6 +49,7 @@ class SettledFit:
     seen: NDArray[np.bool_]  # (S, C, N) labels that fit
     model_error: float  # px
     widened: Mapping[str, float]
+    shape: ShapeEvidence | None = None  # what the residuals say about the object; None = not asked
 
 
 def settle(
@@ -44,8 +58,9 @@ def settle(
     variance: NDArray[np.floating],
     labels: NDArray[np.bool_],
     options: PipelineOptions,
+    examine: bool = True,
 ) -> SettledFit:
-    """Fit, ask the residuals for the model error, the outliers and the prior's width, and fit again until they stay.
+    """Fit, ask the residuals for noise, outliers, the object and the prior's width, and fit again until they stay.
 
     Args:
         problem: with the prior to begin with.
@@ -54,17 +69,26 @@ def settle(
         variance: (S, C, N) px^2, the blobs' own.
         labels: (S, C, N) bool, what was labelled.
         options: how sure the result must be.
+        examine: ask about the object, too, and free the fiducials that are not where its file says.
 
     Raises:
-        RefusedError: no minimum was found.
+        RefusedError: no minimum was found, or noise, outliers, object and prior do not come to rest.
         UndeterminedPosesError: without outliers some snapshots do not say where the object is.
     """
     (state, model_error), *later = starts
+    loss = make_loss(options.estimation)
     widened: dict[str, float] = {}
-    kept = labels
-    for _ in range(8):
+    kept, unexamined, shape = labels, examine, None
+    for _ in range(ROUNDS):
         seen, noise = kept, variance + model_error**2
         problem, solution, squared = _fit(problem, state, noise, seen, options)
+        if unexamined and not later and bool(solution.converged):
+            # Before outliers are left out: all labels of a fiducial that is off its place may be among them.
+            unexamined = False
+            shape, free = _examine(problem, solution, loss, options, GROSS_SCALE)
+            if free is not None:
+                (problem, state), kept = free, labels
+                continue
         # Judged by the sigma of this fit: what a coarse fit leaves says little about fine outliers. Where a fiducial
         # was left out there is no residual: it stays out.
         kept = seen & (squared <= options.outlier**2 * noise)
@@ -82,12 +106,89 @@ def settle(
         previous, model_error = model_error, _model_error(squared[seen], variance[seen], taken)
         if abs(model_error - previous) > 0.02 * previous or (kept != seen).any():
             continue
+        if examine:
+            shape, free = _examine(problem, solution, loss, options, 0.0)
+            if free is not None:
+                (problem, state), kept = free, labels
+                continue
         too_narrow = _too_narrow(state.offset[0].numpy(), remaining)
+        if not too_narrow or max(widened.values(), default=1.0) > options.widest_prior:
+            return SettledFit(problem, solution, np.sqrt(noise), seen, model_error, widened, shape)
         widened |= {kind: widened.get(kind, 1.0) * factor for kind, factor in too_narrow.items()}
-        if not too_narrow or max(widened.values()) > options.widest_prior:
-            break
         problem, state = _widen(problem, state, too_narrow)
-    return SettledFit(problem, solution, np.sqrt(noise), seen, model_error, widened)
+    raise RefusedError(
+        f"estimation: noise, outliers and prior have not come to rest after {ROUNDS} fits: the rig has changed far "
+        "more than its prior allows, or many labels are wrong",
+        python="give the rig a wider prior where it may have changed so much: replace(rig, prior=RigPrior(...))",
+        command="write larger values under `prior` in the rig file where the rig may have changed so much",
+    )
+
+
+def _examine(
+    problem: Problem, solution: Solution, loss: Loss, options: PipelineOptions, least_scale: float
+) -> tuple[ShapeEvidence | None, tuple[Problem, State] | None]:
+    """Ask a fit about the object; errors of its scale count from `least_scale`, relative.
+
+    Returns:
+        What it says, and a problem in which fiducials that are not in their places have tolerances, with a state to go
+        on from; None = they are where they should be, as far as the fit can tell.
+
+    Raises:
+        RefusedError: the object has another scale.
+    """
+    shape = shape_evidence(problem, solution, loss)
+    if shape is None:
+        return None, None
+    free = _free_object(shape, problem, solution, loss, options) if shape.bent_sigma() >= BENT else None
+    if free is None:
+        _require_scale(shape, problem, solution, least_scale)
+    return shape, free
+
+
+def _free_object(
+    shape: ShapeEvidence, problem: Problem, solution: Solution, loss: Loss, options: PipelineOptions
+) -> tuple[Problem, State] | None:
+    spread = learnt_tolerances(shape)
+    if not (spread > 1.01 * shape.tolerance).any():
+        return None
+    before = problem.object_spread
+    scale = problem.points.new_zeros(1) if before is None else before[0, -1:]
+    free = torch.cat((torch.from_numpy(spread).to(problem.uv).repeat_interleave(3), scale))
+    # The displacements stay, in new units; where a tolerance is still zero there was none.
+    displaced = (points_at(problem, solution.state)[0] - problem.points).flatten()
+    whitened = torch.where(free > 0, torch.cat((displaced, torch.zeros_like(scale))) / free.clamp_min(1e-30), 0.0)
+    problem = replace(problem, object_spread=free[None])
+    state = replace(solution.state, object_offset=whitened[None])
+    found = minimize(problem, state, options.estimation)
+    # Where snapshots disagree about the fiducials, something else than the object is behind it.
+    if not bool(found.converged) or shape.bent_sigma(pull_scatter(problem, found.state, loss)) < BENT:
+        return None
+    return problem, found.state
+
+
+def _require_scale(shape: ShapeEvidence, problem: Problem, solution: Solution, least: float) -> None:
+    """Refuse where the cameras have moved together as a wrong scale of the object would make them.
+
+    How far they have moved otherwise says how far the prior can be trusted to know them.
+    """
+    position = KINDS["position"]
+    offset, spread = (tensor[0, :, position].numpy() for tensor in (solution.state.offset, problem.spread))
+    places = problem.factory.positions[0].numpy() + offset * spread
+    direction = np.where(spread > 0, (places - places.mean(0)) / np.maximum(spread, 1e-30), 0.0).ravel()
+    along = float(direction @ offset.ravel()) ** 2 / max(float(direction @ direction), 1e-30)
+    freedom = float((1 - remaining_variance(solution)[0, :, position]).sum())
+    usual = max(1.0, (float(np.square(offset).sum()) - along) / max(freedom, 1.0))
+    error, deviation = shape.scale_error
+    granted = 0.0 if problem.object_spread is None else float(problem.object_spread[0, -1])
+    if MOST_SCALE > abs(error) > max(least, WRONG_SCALE * np.hypot(deviation * usual**0.5, granted)):
+        size = "larger" if error > 0 else "smaller"
+        raise RefusedError(
+            f"object: all cameras have moved together, as if it were {100 * abs(error):.2g} +- {100 * deviation:.1g} % "
+            f"{size} than its file says",
+            python="measure it anew, look at its unit, or let its scale be estimated: "
+            "replace(obj, scale_tolerance=0.05)",
+            command="measure it anew, look at its unit, or let its scale be estimated: --object-scale-tolerance 0.05",
+        )
 
 
 def _fit(

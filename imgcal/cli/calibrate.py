@@ -6,12 +6,14 @@ import json
 import sys
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
+import torch
 import tyro
 
+from imgcal import limits
 from imgcal.cli.common import (
     StartPose,
     check_folder,
@@ -34,17 +36,19 @@ from imgcal.formats import (
     open_input,
     publishing,
     save_detections,
+    save_object,
     save_rig,
     write_text,
 )
 from imgcal.labelling import PipelineOptions
 from imgcal.moved import MovedError
 from imgcal.observations import Detections
+from imgcal.objects import CalibrationObject
 from imgcal.pipeline import Calibration, calibrate, rms_length
 from imgcal.report import write_report
 from imgcal.rig import PARAMETER_NAMES, CameraRig
 
-WRITTEN = ("report.html", "rig.yaml", "result.json")
+WRITTEN = ("report.html", "rig.yaml", "object.csv", "result.json")
 
 
 WORST_STD = 1e6  # in any unit: what is known so badly is not known
@@ -55,8 +59,9 @@ class Calibrate:
     """Recalibrate a rig from captured frames (or a table of blobs) of a known object.
 
     Writes OUT/rig.yaml (the recalibrated rig, with the standard deviation of every parameter), OUT/result.json and
-    OUT/report.html. If the data cannot decide, the reason is in result.json and report.html, no rig.yaml is written
-    and the exit code is 3. OUT changes when all is written; any other failure leaves it as it was.
+    OUT/report.html; where the object's fiducials were estimated, too, also OUT/object.csv. If the data cannot decide,
+    the reason is in result.json and report.html, no rig.yaml is written and the exit code is 3. OUT changes when all is
+    written; any other failure leaves it as it was.
     Example: imgcal calibrate my_capture --rig factory.yaml --object object.csv --out result
     """
 
@@ -74,6 +79,11 @@ class Calibrate:
     start_pose: StartPose | None = None
     """rig_from_object of the first snapshot, roughly: rotation vector (3 numbers, rad) and translation (3, mm); decides
     which way round a symmetric object is"""
+    object_tolerance: float = 0.0
+    """mm: how far each fiducial may be from its place in the object file (one standard deviation of each coordinate),
+    where that has no column `tolerance`; 0 = exact, unless the images say otherwise"""
+    object_scale_tolerance: float = 0.0
+    """how far all distances of the object may be off together, one standard deviation (0.01 is 1 %%); 0 = exact"""
     full_covariance: bool = False  #: write the whole covariance matrix to rig.yaml, too
     report: bool = True  #: write report.html
     reference: str | None = None
@@ -84,7 +94,7 @@ class Calibrate:
         """Calibrate and write."""
         started = time.perf_counter()
         self._check_out()
-        complete, obj = load_rig(self.rig), load_object(self.object)
+        complete, obj = load_rig(self.rig), self._object()
         rig = without_cameras(complete, self.without)
         reference = self._reference(rig)
         options = PipelineOptions(
@@ -115,6 +125,8 @@ class Calibrate:
                 content = describe_refusal(outcome.for_command, detections, rig, obj, frames, seconds)
             else:
                 save_rig(outcome.rig, out / "rig.yaml", covariance, full=self.full_covariance)
+                if outcome.shape:
+                    save_object(outcome.object, out / "object.csv")
                 result = summary(outcome, seconds)
                 content = describe(outcome, rig, obj, frames, reference, seconds)
             if self.report:
@@ -143,6 +155,20 @@ class Calibrate:
             for option, given in (("--rig", self.rig), ("--object", self.object), ("INPUT", self.input)):
                 if (self.out / name).exists() and Path(given).exists() and (self.out / name).samefile(given):
                     raise InputError(f"--out: {self.out / name} is what {option} reads, expected another folder")
+
+    def _object(self) -> CalibrationObject:
+        """The object with its tolerances."""
+        obj = load_object(self.object)
+        if not limits.TOLERANCE.low <= self.object_tolerance <= limits.TOLERANCE.high:
+            raise InputError(f"--object-tolerance: found {self.object_tolerance}, expected {limits.TOLERANCE}")
+        if not 0 <= self.object_scale_tolerance < 1:
+            raise InputError(
+                f"--object-scale-tolerance: found {self.object_scale_tolerance}, expected a share from 0 to 1"
+            )
+        tolerance = obj.tolerance
+        if tolerance is None and self.object_tolerance > 0:
+            tolerance = torch.full_like(obj.points[:, 0], self.object_tolerance)
+        return replace(obj, tolerance=tolerance, scale_tolerance=self.object_scale_tolerance)
 
     def _reference(self, rig: CameraRig) -> int:
         if self.reference is None:
@@ -203,6 +229,17 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         "moved": [move.as_values() for move in calibration.moved],
         "per_camera": per_camera,
         "per_snapshot": counts_by_snapshot(calibration),
+        "object": [
+            {"fiducial": offset.fiducial, "offset_mm": offset.distance, "sigma_mm": offset.sigma}
+            for offset in calibration.shape
+        ],
+        "object_displaced": [offset.fiducial for offset in calibration.displaced],
+        "object_scale_sigma": calibration.scale_sigma,
+        "covariance": {
+            "from": "scatter between blocks of snapshots" if calibration.block_length else "noise of the blobs",
+            "block_length": calibration.block_length,
+            "inflation": calibration.inflation,
+        },
         "predicted_error": calibration.predicted_error.summary(),
         "seconds": seconds,
     }
@@ -239,6 +276,10 @@ def refused_summary(
         "moved": [move.as_values() for move in moved],
         "per_camera": blobs_by_camera(detections, rig),
         "per_snapshot": {},
+        "object": [],
+        "object_displaced": [],
+        "object_scale_sigma": None,
+        "covariance": None,
         "predicted_error": None,
         "seconds": seconds,
     }
@@ -271,7 +312,16 @@ def _print(result: dict[str, Any], out: Path, report: bool) -> None:
     for kind, factor in result["prior_too_narrow"].items():
         kind = kind.replace("_", " ")
         print(f"note: {kind} drifted {factor:.1f} times as far as the rig's prior allows: widened", file=sys.stderr)
+    for offset in result["object"]:
+        if offset["fiducial"] in result["object_displaced"]:
+            print(
+                f"note: fiducial {offset['fiducial']} of the object is {offset['offset_mm']:.3g} +- "
+                f"{offset['sigma_mm']:.1g} mm off its place",
+                file=sys.stderr,
+            )
     print(f"rig     {out / 'rig.yaml'}")
+    if result["object"]:
+        print(f"object  {out / 'object.csv'}")
     print(f"result  {out / 'result.json'}")
     if report:
         print(f"report  {out / 'report.html'}")

@@ -76,7 +76,7 @@ def describe(
     return ReportContent(
         title=f"Recalibration of {rig.name}",
         status="ok",
-        reason="",
+        reason=_about_object(calibration),
         identity=calibration.identity,
         factory=rig,
         detections=detections,
@@ -95,7 +95,7 @@ def describe(
         predicted=calibration.predicted_error,
         moves=tuple(map(str, calibration.moved)),
         unexplained=calibration.tally.unexplained.sum(0),
-        object_points=obj.points.double().numpy(),
+        object_points=calibration.points_object.double().numpy(),
         rig_from_object=_poses(calibration),
         frames=tuple(pictures.get(name) for name in rig.camera_names) if pictures else (),
         chi2_per_dof=float(calibration.chi2_per_dof),
@@ -105,6 +105,15 @@ def describe(
         command=_command(),
         versions=_versions(),
     )
+
+
+def _about_object(calibration: Calibration) -> str:
+    """Name the fiducials that are not in their places."""
+    if not calibration.displaced:
+        return ""
+    parts = [f"fiducial {d.fiducial} is {d.distance:.3g} ± {d.sigma:.1g} mm off" for d in calibration.displaced]
+    words = "The object is not quite what its file says: "
+    return f"{words}{', '.join(parts)}. It was estimated with the rig; object.csv beside this page holds it."
 
 
 def _by_blob(calibration: Calibration, residual: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

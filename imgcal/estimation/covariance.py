@@ -37,7 +37,8 @@ def camera_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
 
     Args:
         estimate: the estimate.
-        curved: add the second order; without, it is the inverse of the information.
+        curved: add the second order; without, it is the inverse of the information, and of the scatter between blocks
+            of snapshots where that was larger.
 
     Returns:
         (*B, 15 C, 15 C) in the units and order of `rig.PARAMETER_NAMES`, camera after camera; rotations are small left
@@ -48,7 +49,11 @@ def camera_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
         RefusedError: the information is singular (a snapshot with too few fiducials).
     """
     cameras = estimate.rig.cameras
-    covariance = _camera_blocks(estimate.solution)
+    covariance = whitened_covariance(estimate.solution)
+    if estimate.inflation > 1:
+        # The prior's unit information contributes the covariance's square; only the rest comes from the observations.
+        by_prior = covariance @ covariance
+        covariance = by_prior + estimate.inflation**2 * (covariance - by_prior)
     scale = _unwhitening(estimate).flatten(1, 2)  # (B, 15 C, 15): one block a camera
     blocks = covariance.unflatten(1, (cameras, PARAMETERS)).unflatten(-1, (cameras, PARAMETERS))
     per_camera = scale.unflatten(1, (cameras, PARAMETERS))
@@ -61,7 +66,7 @@ def camera_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
     return result + curvature_covariance(estimate, lambda rigs, _: rigs.difference(centre).flatten(-2))
 
 
-def _camera_blocks(solution: Solution) -> Tensor:
+def whitened_covariance(solution: Solution) -> Tensor:
     """Joint covariance of all cameras' whitened offsets: (B, 15 C, 15 C)."""
     equations = solution.equations
     factorization = factorize(equations)
@@ -113,7 +118,7 @@ def remaining_variance(solution: Solution) -> NDArray[np.float64]:
             wide = coupling[b].transpose(1, 2, 0, 3).reshape(cameras, PARAMETERS, -1)
             _diagonal(camera[b].copy(), wide.copy(), pose[b], variance[b])
     else:
-        diagonal = _camera_blocks(solution).diagonal(dim1=-2, dim2=-1)
+        diagonal = whitened_covariance(solution).diagonal(dim1=-2, dim2=-1)
         variance = diagonal.unflatten(-1, (cameras, PARAMETERS)).cpu().numpy()
     if not np.isfinite(variance).all():
         raise RefusedError(UNDETERMINED)
@@ -265,11 +270,15 @@ def pose_covariance(estimate: Estimate) -> Tensor:
     return (own * scale[..., None] * scale[..., None, :]).reshape(*estimate.chi2.shape, snapshots, 6, 6)
 
 
-def object_covariance(estimate: Estimate) -> Tensor:
+def object_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
     """Joint covariance of the estimated fiducials' coordinates: (*B, 3 N, 3 N) mm^2, in the object's frame.
 
     Zero where the object was given as exact. A common motion of all fiducials is known only as well as their tolerances
     know it; see `imgcal.estimation.shape` for what does not depend on that.
+
+    Args:
+        estimate: the estimate.
+        curved: add the second order, as in `camera_covariance`.
 
     Raises:
         RefusedError: the information is singular.
@@ -289,5 +298,7 @@ def object_covariance(estimate: Estimate) -> Tensor:
         (torch.diag_embed(spread[:, :-1]), (problem.points.flatten() * spread[:, -1:])[..., None]), dim=-1
     )
     flat = (jacobian @ whitened @ jacobian.mT).reshape(*batch, 3 * fiducials, 3 * fiducials)
+    if not curved:
+        return flat
     centre = points_at(problem, estimate.solution.state).unsqueeze(1)
     return flat + curvature_covariance(estimate, lambda _, points: (points - centre).flatten(-2))

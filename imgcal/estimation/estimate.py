@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Literal
 
@@ -51,6 +51,8 @@ class Estimate:
     points_object: Tensor  # (*B, N, 3) mm, the fiducials as estimated; as given where the object is exact
     problem: Problem  # (B,) flattened, as solved
     solution: solver.Solution  # (B,) flattened: state and normal equations at the minimum
+    inflation: float = field(default=1.0, kw_only=True)
+    """Factor on what noise adds to standard deviations, where blocks of snapshots scatter more: `block_scatter`."""
 
     @property
     def chi2_per_dof(self) -> Tensor:
@@ -103,10 +105,11 @@ def estimate(
         with torch.no_grad():
             rig_from_object = initial_pose(observations, first_guess or rig, obj)
     solution = minimize(problem, make_start(problem, rig_from_object, first_guess), options)
-    return conclude(problem, solution, implicit.attach_gradient(problem, solution, _loss(options)), batch)
+    return conclude(problem, solution, implicit.attach_gradient(problem, solution, make_loss(options)), batch)
 
 
-def _loss(options: EstimationOptions) -> Loss:
+def make_loss(options: EstimationOptions) -> Loss:
+    """Return the robust loss that the options name."""
     loss = LOSSES[options.loss]
     return loss if options.loss == "squared" else partial(loss, threshold=options.threshold)  # type: ignore[call-arg]
 
@@ -142,7 +145,7 @@ def _solve(problem: Problem, start: State, options: EstimationOptions) -> solver
         if problem.uv.device.type == "cpu":
             limits = (options.loss, options.threshold, options.max_iterations, options.tolerance)
             return fused.minimize(problem, start, *limits)
-        return solver.minimize(problem, start, _loss(options), options.max_iterations, options.tolerance)
+        return solver.minimize(problem, start, make_loss(options), options.max_iterations, options.tolerance)
 
 
 def conclude(problem: Problem, solution: solver.Solution, state: State, batch: torch.Size = torch.Size()) -> Estimate:

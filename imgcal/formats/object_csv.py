@@ -1,4 +1,4 @@
-"""Calibration objects: CSV with the header `x,y,z` (mm), optional columns `name` and `radius` (mm)."""
+"""Calibration objects: CSV with the header `x,y,z` (mm), optional columns `name`, `radius` and `tolerance` (mm)."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def load_object(path: str | Path) -> CalibrationObject:
         InputError: one line with the file, the line, what was found and what was expected.
     """
     path = find_file(path, "objects", ".csv")
-    chunks = list(islice(read_chunks(path, ("x", "y", "z"), ("name", "radius")), 2))
+    chunks = list(islice(read_chunks(path, ("x", "y", "z"), ("name", "radius", "tolerance")), 2))
     count = sum(map(len, chunks))
     if not 4 <= count <= limits.MOST_FIDUCIALS:
         found = count if count < 4 else f"more than {limits.MOST_FIDUCIALS}"
@@ -52,11 +52,16 @@ def load_object(path: str | Path) -> CalibrationObject:
         radius = torch.from_numpy(
             chunk.numbers("radius", limits.FIDUCIAL_RADIUS, f"a radius > 0, {limits.FIDUCIAL_RADIUS}")
         )
+    tolerance = None
+    if "tolerance" in chunk.columns:
+        tolerance = torch.from_numpy(chunk.numbers("tolerance", limits.TOLERANCE, f"a tolerance, {limits.TOLERANCE}"))
     names = tuple(name.strip() for name in chunk.columns.get("name", ()))
     for row, name in enumerate(names):
         if not _is_name(name) or name in names[:row]:
             chunk.fail(row, f"name: found {shortened(name)!r}, expected {NAME}")
-    return CalibrationObject(torch.from_numpy(points), palette(count).double(), radius, title_of(path), names)
+    return CalibrationObject(
+        torch.from_numpy(points), palette(count).double(), radius, title_of(path), names, tolerance
+    )
 
 
 def save_object(obj: CalibrationObject, path: str | Path) -> None:
@@ -77,6 +82,9 @@ def save_object(obj: CalibrationObject, path: str | Path) -> None:
     if obj.radius is not None:
         header.append("radius")
         columns.append([f"{value!r}" for value in obj.radius.double().tolist()])
+    if obj.tolerance is not None:
+        header.append("tolerance")
+        columns.append([f"{value!r}" for value in obj.tolerance.double().tolist()])
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)

@@ -32,6 +32,18 @@ def test_optional_columns_in_any_order(tmp_path: Path) -> None:
     assert obj.fiducial_names == ("p", "q", "r", "s")
 
 
+def test_tolerances_are_read_and_written(tmp_path: Path) -> None:
+    path = tmp_path / "o.csv"
+    path.write_text("x,y,z,tolerance\n0,0,0,0.2\n1,0,0,0\n0,1,0,0.1\n0,0,1,0.1\n")
+    obj = load_object(path)
+    assert obj.tolerance.tolist() == [0.2, 0, 0.1, 0.1] and not obj.exact
+    save_object(obj, tmp_path / "again.csv")
+    assert load_object(tmp_path / "again.csv").tolerance.tolist() == obj.tolerance.tolist()
+    path.write_text("x,y,z,tolerance\n0,0,0,-0.2\n1,0,0,0\n0,1,0,0.1\n0,0,1,0.1\n")
+    with pytest.raises(InputError, match=r"line 2: tolerance: found -0\.2, expected a tolerance, 0 to 1000 mm"):
+        load_object(path)
+
+
 def test_planar_object_is_fine(tmp_path: Path) -> None:
     (tmp_path / "o.csv").write_text("\ufeffx,y,z\r\n0,0,0\r\n1,0,0\r\n0,1,0\r\n1,1,0\r\n", encoding="utf-8")
     assert load_object(tmp_path / "o.csv").planar

@@ -1,0 +1,80 @@
+"""What a calibration says about the object, and where the data cannot carry it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from imgcal.errors import RefusedError
+from imgcal.estimation import Estimate
+from imgcal.estimation.shape import FiducialOffset, ShapeEvidence, offsets
+from imgcal.objects import CalibrationObject
+from imgcal.settling import BENT
+
+CERTAIN = 4.0
+"""Standard deviations from which a fiducial is named as displaced."""
+MOST_DISPLACED = 0.15
+"""Of the object's size: a fiducial that is farther from its place belongs to another object."""
+LEAST_KNOWN = 0.005
+"""Of the object's size: standard deviation of a displaced fiducial above which the data cannot carry it."""
+IN_PLACE = 1e-4
+"""Of the object's size: a fiducial that is nearer to its place is in it."""
+
+
+def object_offsets(fit: Estimate, shape: ShapeEvidence | None, obj: CalibrationObject) -> tuple[FiducialOffset, ...]:
+    """Say how far each fiducial is from its place, and refuse where the data do not carry that.
+
+    Args:
+        fit: the estimate.
+        shape: what its residuals still say about the object; None = not asked.
+        obj: the object as its file has it.
+
+    Returns:
+        One offset a fiducial; empty where the object was taken as exact.
+
+    Raises:
+        RefusedError: the object is not what its file says, and what it is instead cannot be said.
+    """
+    measure = {
+        "python": "measure it anew, or take more snapshots; where fiducials may be off, say so: "
+        "replace(obj, tolerance=...)",
+        "command": "measure it anew, or take more snapshots; where fiducials may be off, say so: "
+        "--object-tolerance MM, or a column `tolerance`",
+    }
+    if shape is not None and shape.bent_sigma() >= 2 * BENT and fit.problem.object_spread is None:
+        raise RefusedError(
+            "estimation: the object is not as its file says, and other places of its fiducials do not explain the "
+            "images either",
+            **measure,
+        )
+    if fit.problem.object_spread is None:
+        return ()
+    found = offsets(fit, obj.points.double().numpy())
+    learnt = fit.problem.object_spread[0, :-1:3].numpy()
+    granted = np.zeros(obj.fiducials) if obj.tolerance is None else obj.tolerance.double().numpy()
+    for offset in found:
+        if learnt[offset.fiducial] <= 1.01 * granted[offset.fiducial]:
+            continue
+        which = f"estimation: fiducial {offset.fiducial} (row of the object file)"
+        if offset.distance > MOST_DISPLACED * obj.size:
+            raise RefusedError(
+                f"{which} would be {offset.distance:.3g} mm from its place: labels are swapped, or this is not the "
+                "object of the file",
+                **measure,
+            )
+        if offset.sigma > LEAST_KNOWN * obj.size:
+            raise RefusedError(
+                f"{which} is not in its place, and the snapshots do not say where it is "
+                f"({offset.distance:.2g} +- {offset.sigma:.1g} mm)",
+                **measure,
+            )
+    return found
+
+
+def displaced(found: tuple[FiducialOffset, ...], obj: CalibrationObject) -> tuple[FiducialOffset, ...]:
+    """Choose the fiducials that are farther from their places than chance and three times their tolerance explain."""
+    granted = np.zeros(obj.fiducials) if obj.tolerance is None else obj.tolerance.double().numpy()
+    return tuple(
+        offset
+        for offset in found
+        if offset.distance > CERTAIN * offset.sigma + 3 * granted[offset.fiducial] + IN_PLACE * obj.size
+    )

@@ -1,0 +1,78 @@
+"""Covariance by the scatter between blocks of snapshots: silent for white noise, right for errors of places."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+
+from imgcal.estimation import camera_covariance, camera_std, estimate
+from imgcal.estimation.blocks import BlockScatter, block_scatter
+from imgcal.estimation.covariance import whitened_covariance
+from imgcal.estimation.robust import huber
+from imgcal.transforms import RigidTransform
+
+LOSS = partial(huber, threshold=3.0)
+
+
+def scatter(found) -> BlockScatter:
+    return block_scatter(found.problem, found.solution, whitened_covariance(found.solution)[0], LOSS)
+
+
+@pytest.mark.parametrize("snapshots", [6, 40])
+def test_white_noise_makes_no_more_scatter_than_it_should(simulate, snapshots: int) -> None:
+    for seed in range(6):
+        case = simulate(snapshots=snapshots, cameras=4, missing=0.2, seed=seed)
+        found = estimate(case.observations, case.factory, case.obj, spread=case.spread)
+        assert scatter(found) == BlockScatter()
+
+
+def test_too_few_snapshots_say_nothing(simulate) -> None:
+    case = simulate(snapshots=5, cameras=4)
+    assert scatter(estimate(case.observations, case.factory, case.obj, spread=case.spread)).length == 0
+
+
+def wandering(simulate, blocks: int, each: int):
+    """One rig, an object that wanders slowly sideways, and lens errors that change over some 70 px: (blocks, each)."""
+    case = simulate(blocks, snapshots=each, cameras=4, noise=0.0, seed=2)
+    count = blocks * each
+    period = torch.tensor([17.0, 23.0, 29.0], dtype=torch.float64)
+    path = 60 * torch.sin(2 * torch.pi * torch.arange(count)[:, None] / period).view(blocks, each, 3)
+    poses = RigidTransform(case.poses.rotation[:1, :1].expand(blocks, each, 3, 3), case.poses.translation + path)
+    truth = case.truth[0]
+    points = poses.reshape(count).apply(case.obj.points)
+    uv = truth.expand(count).project(points).uv.view(blocks, each, 4, 8, 2)
+    generator = torch.Generator().manual_seed(3)
+    noise = 0.03 * torch.randn(uv.shape, generator=generator, dtype=uv.dtype)
+    uv = uv + 0.1 * torch.sin(uv.flip(-1) / 60 + torch.arange(4)[:, None, None]) + noise
+    return replace(case, observations=replace(case.observations, uv=uv), poses=poses), truth
+
+
+def test_blocks_of_a_capture_scatter_as_the_published_covariance_says(simulate) -> None:
+    case, _ = wandering(simulate, 8, 48)
+    focal, flat, published = [], [], []
+    for row in range(8):
+        one = replace(case.observations, **{k: v[row] for k, v in vars(case.observations).items()})
+        one = replace(one, sigma=torch.full_like(one.sigma, 0.075))  # what the residuals show
+        found = estimate(one, case.factory, case.obj, case.poses[row], spread=case.spread)
+        measured = replace(found, inflation=scatter(found).factor)
+        focal.append(found.rig.focal_length.flatten())
+        flat.append(camera_std(found)[:, 6:8].flatten())
+        published.append(camera_std(measured)[:, 6:8].flatten())
+    spread = torch.stack(focal) - torch.stack(focal).mean(0)
+    by_noise, by_blocks = (float((spread / torch.stack(std)).square().sum() / (7 * 8)) for std in (flat, published))
+    assert by_noise > 2.0
+    assert by_blocks < 0.7 * by_noise and by_blocks < 2.0
+
+
+def test_inflation_leaves_the_prior_and_the_relations_alone(simulate) -> None:
+    case = simulate(snapshots=10, cameras=3)
+    case.observations.seen[:, 2] = False
+    found = estimate(case.observations, case.factory, case.obj, spread=case.spread)
+    plain, larger = (camera_covariance(replace(found, inflation=f), curved=False) for f in (1.0, 2.0))
+    std, more = (torch.as_tensor(np.sqrt(c.diagonal().numpy())).view(3, 15) for c in (plain, larger))
+    torch.testing.assert_close(more[2], std[2])  # a camera that saw nothing knows what its prior knows
+    assert (more[:2, 6:8] > 1.8 * std[:2, 6:8]).all()
+    scale = larger.diagonal().sqrt()
+    assert torch.linalg.eigvalsh(larger / (scale[:, None] * scale)).min() > 0
