@@ -42,8 +42,8 @@ from imgcal.formats import (
 )
 from imgcal.labelling import PipelineOptions
 from imgcal.moved import MovedError
-from imgcal.observations import Detections
 from imgcal.objects import CalibrationObject
+from imgcal.observations import Detections
 from imgcal.pipeline import Calibration, calibrate, rms_length
 from imgcal.report import write_report
 from imgcal.rig import PARAMETER_NAMES, CameraRig

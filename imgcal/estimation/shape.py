@@ -25,6 +25,7 @@ from imgcal.estimation.solver import Solution, factorize
 from imgcal.rig import PARAMETERS
 
 Array = NDArray[np.float64]
+Floats = NDArray[np.floating]
 
 UNSURE = 1e-9
 """Of the largest information, below which a direction of the shape counts as undetermined (a rigid motion, for one)."""
@@ -52,11 +53,12 @@ class ShapeEvidence:
     freedom: float  # its degrees of freedom
 
     @cached_property
-    def _directions(self) -> tuple[Array, Array, Array]:
+    def _directions(self) -> tuple[Floats, Floats, Floats]:
         """What the data determine: directions (3 N, D), the variance (D,) that noise gives them, displacements (D,)."""
         values, vectors = np.linalg.eigh(self.information)
         sure = values > UNSURE * values[-1]
-        return vectors[:, sure], 1 / values[sure], vectors[:, sure].T @ self.pull / values[sure]
+        vectors, variance = vectors[:, sure], 1 / values[sure]
+        return vectors, variance, variance * (vectors.T @ self.pull)
 
     def _covariance(self, tolerance: Array) -> Array:
         """Covariance (D, D) of those displacements, were the fiducials off by tolerances (N,) mm."""

@@ -1,0 +1,295 @@
+"""Does the estimate know how wrong it is? Errors over stated sigmas, and what happens to captures that are not as said.
+
+Run as `python -m scripts.benchmarks.honesty`; `--captures 20` for a look. Writes docs/benchmarks/honesty.json and the
+tables of docs/benchmarks.md that are made from it.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from torch import Tensor
+
+from imgcal import Calibration, PipelineOptions, RefusedError, calibrate, load_object, load_rig
+from imgcal.estimation import relative_covariance, relative_difference
+from imgcal.evaluation.true_error import true_error
+from imgcal.formats import write_text
+from imgcal.objects import CalibrationObject
+from imgcal.observations import Detections
+from imgcal.rig import CameraRig, RigPrior
+from imgcal.settling import KINDS
+from scripts.benchmarks.honesty_prediction import Case
+from scripts.output import ROOT, command, markdown, read_json, replaced, surroundings, write_json
+
+RIGS = {"O10": "asymmetric8", "U7": "asymmetric8", "T4": "asymmetric8", "room10": "wand4"}
+SNAPSHOTS = (1, 5, 20, 100)
+TOLERANCES = (0.0, 0.2)  # mm
+NOISE = 0.05  # px, each axis
+PRIOR = RigPrior(focal_length=0.01, principal_point=5.0, distortion=0.005, rotation=0.0087, position=2.0)
+WRONG = 3.0  # times the stated error in pixels: a result that is worse is wrong
+RESULT = ROOT / "docs" / "benchmarks" / "honesty.json"
+PAGE = ROOT / "docs" / "benchmarks.md"
+OPTIONS = PipelineOptions(blind_cameras=True)
+
+Damage = Callable[[np.random.Generator, CameraRig, CalibrationObject, Detections], Detections]
+
+
+@dataclass(frozen=True)
+class Attack:
+    """A kind of capture that is not what it is said to be."""
+
+    bend: Callable[[Tensor, np.random.Generator], Tensor] | None = None  # the fiducials (N, 3) as they truly are
+    damage: Damage | None = None  # what happens to the blobs
+    drift: float = 1.0  # times the prior
+
+
+def scaled(factor: float) -> Attack:
+    """An object of another scale than its file says."""
+    return Attack(lambda points, _: points.mean(0) + factor * (points - points.mean(0)))
+
+
+def stretched(factor: float) -> Attack:
+    """An object that is longer along its longest axis than its file says."""
+
+    def bend(points: Tensor, _: np.random.Generator) -> Tensor:
+        axis = int((points.amax(0) - points.amin(0)).argmax())
+        points[:, axis] *= factor
+        return points
+
+    return Attack(bend)
+
+
+def one_off(size: float) -> Attack:
+    """One fiducial somewhere else, in a random direction within the plane of flat objects."""
+
+    def bend(points: Tensor, random: np.random.Generator) -> Tensor:
+        direction = random.normal(size=3) * (np.ptp(points.numpy(), axis=0) > 0)
+        points[random.integers(len(points))] += torch.from_numpy(size * direction / np.linalg.norm(direction))
+        return points
+
+    return Attack(bend)
+
+
+def all_off(size: float) -> Attack:
+    """All fiducials off by a standard deviation (mm), with an object file that claims to be exact."""
+    return Attack(lambda points, random: points + torch.from_numpy(size * random.normal(size=points.shape)))
+
+
+def _outliers(random: np.random.Generator, rig: CameraRig, obj: CalibrationObject, table: Detections) -> Detections:
+    uv = table.uv + 0.05 * random.standard_t(2.5, size=table.uv.shape)
+    rows = random.choice(len(uv), int(random.uniform(0.05, 0.2) * len(uv)), replace=False)
+    uv[rows] += random.normal(size=(len(rows), 2)) * random.choice([3, 10, 50])
+    size = rig.image_size.numpy()[table.camera]
+    return replace(table, uv=np.clip(uv, 0, size - 1.0))
+
+
+def _missing(random: np.random.Generator, rig: CameraRig, obj: CalibrationObject, table: Detections) -> Detections:
+    return table.select(random.random(len(table)) > 0.6)
+
+
+def _mirrored(random: np.random.Generator, rig: CameraRig, obj: CalibrationObject, table: Detections) -> Detections:
+    camera = random.integers(rig.cameras)
+    uv, mine = table.uv.copy(), table.camera == camera
+    uv[mine, 0] = rig.image_size[camera, 0].item() - 1 - uv[mine, 0]
+    return replace(table, uv=uv)
+
+
+def _exchanged(random: np.random.Generator, rig: CameraRig, obj: CalibrationObject, table: Detections) -> Detections:
+    a, b = random.choice(rig.cameras, 2, replace=False)
+    camera = np.where(table.camera == a, b, np.where(table.camera == b, a, table.camera))
+    return replace(table, camera=camera)
+
+
+def _bumped(random: np.random.Generator, rig: CameraRig, obj: CalibrationObject, table: Detections) -> Detections:
+    """Shift what one camera sees from some moment on, as a turn of 0.5 degrees does."""
+    camera, count = random.integers(rig.cameras), len(table.snapshot_names)
+    shift = (
+        float(rig.focal_length[camera].mean())
+        * np.radians(0.5)
+        * np.array([np.cos(a := random.uniform(0, 7)), np.sin(a)])
+    )
+    late = (table.camera == camera) & (table.snapshot >= random.integers(max(1, count // 4), max(2, count)))
+    size = rig.image_size.numpy()[table.camera]
+    return replace(table, uv=np.clip(table.uv + late[:, None] * shift, 0, size - 1.0))
+
+
+ATTACKS: dict[str, Attack] = {
+    "as said": Attack(),
+    "twice the drift": Attack(drift=2.0),
+    "scale +5 %": scaled(1.05),
+    "scale -10 %": scaled(0.9),
+    "scale +30 %": scaled(1.3),
+    "stretched 1 %": stretched(1.01),
+    "stretched 15 %": stretched(1.15),
+    "stretched 30 %": stretched(1.3),
+    "one fiducial 1 mm": one_off(1.0),
+    "one fiducial 5 mm": one_off(5.0),
+    "all fiducials 0.2 mm": all_off(0.2),
+    "heavy tails, 5-20 % outliers": Attack(damage=_outliers),
+    "the same, four times the drift": Attack(damage=_outliers, drift=4.0),
+    "60 % missing": Attack(damage=_missing),
+    "a camera mirrored": Attack(damage=_mirrored),
+    "two cameras exchanged": Attack(damage=_exchanged),
+    "a camera turned 0.5 degrees": Attack(damage=_bumped),
+}
+
+
+def judged(case: Case, attack: Attack, captures: int, seed: int) -> dict[str, Any]:
+    """Calibrate captures; returns counts of what came out, and errors over sigmas for each kind of value.
+
+    An outcome is `refused`, `right`, or wrong: its error in pixels, over held-out points of the working volume, more
+    than `WRONG` times what it states; wrong and `said` if it names a displaced fiducial, a camera that moved, a prior
+    that was too narrow or a covariance that was widened; else `silent`.
+    """
+    generator, random = torch.Generator().manual_seed(seed), np.random.default_rng(seed)
+    prior = case.rig.prior or RigPrior()
+    wide = RigPrior(*(attack.drift * value for value in vars(prior).values()))
+    outcomes: Counter[str] = Counter()
+    squares: dict[str, list[float]] = {kind: [] for kind in (*KINDS, "joint")}
+    inside: list[float] = []
+    for _ in range(captures):
+        true = case.obj
+        if attack.bend is not None:
+            true = replace(true, points=attack.bend(case.obj.points.clone(), random))
+        drawn = replace(case, rig=replace(case.rig, prior=wide), obj=true)
+        truth, table = drawn.draw(generator)
+        if attack.damage is not None:
+            table = attack.damage(random, case.rig, case.obj, table)
+        points = torch.rand(60, 3, generator=generator, dtype=torch.float64)
+        try:
+            found = calibrate(table, case.rig, case.obj, OPTIONS)
+        except RefusedError:
+            outcomes["refused"] += 1
+            continue
+        outcomes[_outcome(found, truth, points)] += 1
+        _normalize(found, truth, squares, inside)
+    result: dict[str, Any] = {name: outcomes[name] for name in ("right", "said", "silent", "refused")}
+    if inside:
+        result |= {"nees": {kind: float(np.mean(values)) for kind, values in squares.items()}}
+        result |= {"within_95": float(np.mean(inside))}
+    return result
+
+
+def _outcome(found: Calibration, truth: CameraRig, shares: Tensor) -> str:
+    predicted = found.predicted_error
+    points = torch.lerp(predicted.volume.low, predicted.volume.high, shares)
+    stated = predicted.uncertainty.pixel_error(points)
+    wrong, _ = true_error(predicted.uncertainty, truth, points)
+    ratio = (wrong / stated).square()
+    if float(ratio[ratio.isfinite()].mean()) <= WRONG**2:
+        return "right"
+    return "said" if found.displaced or found.moved or found.widened or found.inflation > 1 else "silent"
+
+
+def _normalize(found: Calibration, truth: CameraRig, squares: dict[str, list[float]], inside: list[float]) -> None:
+    """Errors relative to the first camera in units of their standard deviations; its own extrinsics do not count."""
+    error = relative_difference(found.rig, truth).flatten()
+    covariance = relative_covariance(found)
+    std = covariance.diagonal().clamp_min(0).sqrt()
+    free = std > 1e-12
+    ratio = torch.where(free, error / std.clamp_min(1e-30), torch.nan).view(-1, 15)
+    for kind, part in KINDS.items():
+        squares[kind].append(float(ratio[:, part].square().nanmean()))
+    inside.append(float((ratio[ratio.isfinite()].abs() < 1.96).double().mean()))
+    correlation = (covariance / (std[:, None] * std))[free][:, free]
+    values, vectors = torch.linalg.eigh(correlation)
+    along = (vectors.mT @ (error / std)[free]).square() / values
+    squares["joint"].append(float(along[values > 1e-9].mean()))
+
+
+def _row(task: tuple[str, str, int, float, str, int, int]) -> dict[str, Any]:
+    """Run one row; a function of its own for the pool of processes."""
+    rig, obj, snapshots, tolerance, attack, captures, seed = task
+    torch.set_num_threads(1)
+    given = load_object(obj)
+    if tolerance:
+        given = replace(given, tolerance=torch.full_like(given.points[:, 0], tolerance))
+    case = Case(replace(load_rig(rig), prior=PRIOR), given, snapshots, NOISE)
+    began = time.perf_counter()
+    found = judged(case, ATTACKS[attack], captures, seed)
+    seconds = (time.perf_counter() - began) / captures
+    row = {
+        "rig": rig,
+        "snapshots": snapshots,
+        "tolerance_mm": tolerance,
+        "attack": attack,
+        "captures": captures,
+    } | found
+    print(*(f"{value}" for value in row.values()), f"{1e3 * seconds:.0f} ms", file=sys.stderr, flush=True)
+    return row
+
+
+@dataclass(frozen=True)
+class Options:
+    """Measure how honest calibrations are."""
+
+    captures: int = 200  #: for each row of sigmas; a quarter as many of 100 snapshots
+    attacked: int = 50  #: for each row of attacks
+    rigs: tuple[str, ...] = tuple(RIGS)
+    processes: int = 2
+    out: Path = RESULT
+
+
+def main() -> None:
+    """Measure, write, print."""
+    options = tyro.cli(Options, description=__doc__)
+    began, before = time.monotonic(), surroundings()
+    tasks = [
+        (rig, RIGS[rig], s, t, "as said", options.captures // (4 if s >= 100 else 1), 100 * number + s + int(10 * t))
+        for number, rig in enumerate(options.rigs)
+        for s in SNAPSHOTS
+        for t in TOLERANCES
+    ]
+    tasks += [
+        (rig, RIGS[rig], s, 0.0, attack, options.attacked, 7000 + 100 * number + s)
+        for attack in ATTACKS
+        for number, rig in enumerate(options.rigs)
+        for s in (1, 20)
+        if attack != "as said" and not (attack == "a camera turned 0.5 degrees" and s == 1)
+    ]
+    with get_context("spawn").Pool(options.processes) as pool:
+        rows = pool.map(_row, tasks, chunksize=1)
+    result = before | {"noise_px": NOISE, "seconds": round(time.monotonic() - began), "rows": rows}
+    write_json(options.out, result)
+    if options.out == RESULT:
+        write_text(PAGE, replaced(PAGE.read_text("utf-8"), tables(read_json(RESULT)), PAGE))
+    for text in tables(result).values():
+        print(text)
+
+
+def tables(result: Mapping[str, Any]) -> dict[str, str]:
+    """Markdown tables by the name of their markers."""
+    honest: list[list[Any]] = []
+    attacked: dict[str, dict[int, Counter[str]]] = {}
+    for row in result["rows"]:
+        if row["attack"] == "as said":
+            nees = row.get("nees", {})
+            cells = [f"{nees[kind]:.2f}" for kind in (*KINDS, "joint")] if nees else ["-"] * 6
+            honest.append([
+                row["rig"], row["snapshots"], f"{row['tolerance_mm']:g}", row["captures"], *cells,
+                f"{100 * row['within_95']:.1f} %" if nees else "-", row["silent"], row["refused"],
+            ])  # fmt: skip
+        else:
+            counts = attacked.setdefault(row["attack"], {1: Counter(), 20: Counter()})[row["snapshots"]]
+            counts.update({name: row[name] for name in ("right", "said", "silent", "refused")})
+    head = ["rig", "snapshots", "tolerance, mm", "captures", *(kind.replace("_", " ") for kind in KINDS), "joint"]
+    names = ("right", "said", "silent", "refused")
+    rows = [[name, *(" / ".join(str(by[s][n]) for n in names) for s in (1, 20))] for name, by in attacked.items()]
+    return {
+        "honesty sigmas": markdown([*head, "within 95 %", "silent", "refused"], honest),
+        "honesty attacks": markdown(["capture", "1 snapshot", "20 snapshots"], rows),
+    }
+
+
+if __name__ == "__main__":
+    command(main)
