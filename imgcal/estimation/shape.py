@@ -66,7 +66,7 @@ class ShapeEvidence:
         return (vectors.T * np.repeat(tolerance**2, 3)) @ vectors + np.diag(variance)
 
     @cached_property
-    def _determined(self) -> tuple[Array, Array, Array]:
+    def _determined(self) -> tuple[Floats, Floats, Floats]:
         """Directions (3 N, D), displacements along them (D,), and the inverse of their covariance (D, D)."""
         vectors, _, displacement = self._directions
         return vectors, displacement, np.linalg.inv(self._covariance(self.tolerance))
