@@ -248,7 +248,7 @@ def _fit_labelled(
         factory=rig,
         obj=obj,
         shape=shape,
-        scale_sigma=None if found.shape is None else found.shape.scale_error[1],
+        scale_sigma=None if found.shape is None else finite(found.shape.scale_error[1]),
         block_length=scatter.length,
         first_guess=guess,
         guess_used=guess_used,
@@ -276,6 +276,11 @@ def _with_poses(labelled: Labelled, rig: CameraRig, obj: CalibrationObject) -> L
     except UndeterminedPosesError as error:
         return without_snapshots(labelled, error.rows)
     return labelled
+
+
+def finite(value: float) -> float | None:
+    """None for what is not known."""
+    return value if np.isfinite(value) else None
 
 
 def rms_length(residual: Tensor, seen: Tensor) -> float | None:

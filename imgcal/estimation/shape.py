@@ -33,6 +33,8 @@ WIDE = 0.05
 """Of the object's size: how far off a fiducial is thought to be before the data have spoken."""
 NARROW = 1e-4
 """Of the object's size: a fiducial that is off by less is in its place."""
+MOST_FIDUCIALS = 64
+"""Of an object whose shape is asked about: boards and clouds with more are taken as they are measured."""
 COMPLEXITY = 3.0
 """Log evidence that each further tolerance must gain."""
 LEAST_SNAPSHOTS = 8
@@ -53,7 +55,7 @@ class ShapeEvidence:
     freedom: float  # its degrees of freedom
 
     @cached_property
-    def _directions(self) -> tuple[Floats, Floats, Floats]:
+    def directions(self) -> tuple[Floats, Floats, Floats]:
         """What the data determine: directions (3 N, D), the variance (D,) that noise gives them, displacements (D,)."""
         values, vectors = np.linalg.eigh(self.information)
         sure = values > UNSURE * values[-1]
@@ -62,28 +64,36 @@ class ShapeEvidence:
 
     def _covariance(self, tolerance: Array) -> Array:
         """Covariance (D, D) of those displacements, were the fiducials off by tolerances (N,) mm."""
-        vectors, variance, _ = self._directions
+        vectors, variance, _ = self.directions
         return (vectors.T * np.repeat(tolerance**2, 3)) @ vectors + np.diag(variance)
 
     @cached_property
     def _determined(self) -> tuple[Floats, Floats, Floats]:
         """Directions (3 N, D), displacements along them (D,), and the inverse of their covariance (D, D)."""
-        vectors, _, displacement = self._directions
+        vectors, variance, displacement = self.directions
+        if not self.tolerance.any():
+            return vectors, displacement, np.diag(1 / variance)
         return vectors, displacement, np.linalg.inv(self._covariance(self.tolerance))
 
     def log_evidence(self, tolerance: Array) -> float:
         """Log likelihood of what the data ask for, were the fiducials off by tolerances (N,) mm."""
-        covariance, displacement = self._covariance(tolerance), self._directions[2]
+        covariance, displacement = self._covariance(tolerance), self.directions[2]
         _, log_det = np.linalg.slogdet(covariance)
         return -0.5 * float(displacement @ np.linalg.solve(covariance, displacement) + log_det)
 
     @property
     def scale_error(self) -> tuple[float, float]:
         """Relative scale of the object that explains the data best, less one, and its standard deviation."""
-        vectors, displacement, precision = self._determined
-        scale = vectors.T @ self.places.ravel()
-        weight = float(scale @ precision @ scale)
-        return float(scale @ precision @ displacement) / weight, weight**-0.5
+        scale = self.places.ravel()
+        if self.tolerance.any():
+            vectors, displacement, precision = self._determined
+            pull = vectors.T @ scale @ precision
+            weight, found = float(pull @ (vectors.T @ scale)), float(pull @ displacement)
+        else:
+            weight, found = float(scale @ self.information @ scale), float(scale @ self.pull)
+        # One camera, wherever it is, cannot know how large the object is.
+        known = weight > UNSURE * float(np.abs(self.information).max()) * float(scale @ scale)
+        return (found / weight, weight**-0.5) if known else (0.0, np.inf)
 
     def bent_sigma(self, scatter: float = 1.0) -> float:
         """How sure it is that the object is bent, its scale left aside, in standard deviations of a normal variable.
@@ -92,7 +102,13 @@ class ShapeEvidence:
 
         Args:
             scatter: how much more the snapshots disagree than noise allows; see `pull_scatter`.
+
+        Returns:
+            Zero for an object of more than `MOST_FIDUCIALS`: what is left of a lens that the model does not know looks
+            like a deformed grid, too.
         """
+        if len(self.places) > MOST_FIDUCIALS:
+            return 0.0
         _, displacement, precision = self._determined
         error, deviation = self.scale_error
         explained = float(displacement @ precision @ displacement) - (error / deviation) ** 2
@@ -182,31 +198,40 @@ def learnt_tolerances(shape: ShapeEvidence) -> Array:
     """
     size = float(np.sqrt(np.square(shape.places).sum(1).mean()))
     floor = np.maximum(shape.tolerance, NARROW * size)
-    alone, common = (_learn(shape, floor, together) for together in (False, True))
-    alone, common = np.where(alone > 1.5 * floor, alone, shape.tolerance), np.maximum(common, shape.tolerance)
+    common = np.maximum(_learn_one(shape, size), shape.tolerance)
+    alone = _learn_each(shape, size, floor)
+    alone = np.where(alone > 1.5 * floor, alone, shape.tolerance)
     off = int((alone > shape.tolerance).sum())
     if shape.log_evidence(alone) - COMPLEXITY * off >= shape.log_evidence(common) - COMPLEXITY:
         return alone
     return common
 
 
-def _learn(shape: ShapeEvidence, floor: Array, together: bool) -> Array:
-    """Iterate tolerances (N,) mm that are as large as the displacements they allow; `together` = one for all."""
-    size = float(np.sqrt(np.square(shape.places).sum(1).mean()))
+def _learn_each(shape: ShapeEvidence, size: float, floor: Array) -> Array:
+    """Iterate tolerances (N,) mm that are as large as the displacements they allow, not below `floor`."""
     spread = np.maximum(WIDE * size, floor)
     for _ in range(ROUNDS):
         precision = np.repeat(spread**-2.0, 3)
         covariance = np.linalg.inv(shape.information + np.diag(precision))
         square = np.square(covariance @ shape.pull).reshape(-1, 3).sum(1)
         determined = 3 - (covariance.diagonal() * precision).reshape(-1, 3).sum(1)
-        if together:
-            mean = np.sqrt(square.mean() / max(determined.mean(), 1e-3))
-        else:
-            mean = np.sqrt(square / np.maximum(determined, 1e-3))
-        found = np.clip(mean, floor, 10 * WIDE * size)
-        settled = np.abs(found / spread - 1).max() < 0.01
-        spread = found
-        if settled:
+        previous = spread
+        spread = np.clip(np.sqrt(square / np.maximum(determined, 1e-3)), floor, 10 * WIDE * size)
+        if np.abs(spread / previous - 1).max() < 0.01:
+            break
+    return spread
+
+
+def _learn_one(shape: ShapeEvidence, size: float) -> float:
+    """Iterate one tolerance (mm) for all fiducials."""
+    _, variance, displacement = shape.directions
+    spread = WIDE * size
+    for _ in range(ROUNDS):
+        kept = spread**2 / (variance + spread**2)  # of each displacement
+        previous = spread
+        spread = float(np.sqrt(np.square(kept * displacement).sum() / max(kept.sum(), 1e-3)))
+        spread = min(max(spread, NARROW * size), 10 * WIDE * size)
+        if abs(spread / previous - 1) < 0.01:
             break
     return spread
 

@@ -87,3 +87,10 @@ def test_errors_that_belong_to_places_scatter_from_snapshot_to_snapshot(simulate
         uv = case.observations.uv + field * torch.sin(case.observations.uv.flip(-1) / 40)
         found = estimate(replace(case.observations, uv=uv), case.factory, case.obj, spread=case.spread)
         assert low <= pull_scatter(found.problem, found.solution.state, LOSS) < high
+
+
+def test_one_camera_does_not_know_the_scale(simulate) -> None:
+    case = simulate(snapshots=4, cameras=1)
+    found = estimate(case.observations, case.factory, case.obj, spread=case.spread)
+    error, deviation = shape_evidence(found.problem, found.solution, LOSS).scale_error
+    assert abs(error) < 4 * deviation and deviation > 0.01
