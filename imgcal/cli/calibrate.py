@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from collections.abc import Iterable
@@ -250,7 +251,8 @@ def _guess_summary(calibration: Calibration) -> dict[str, Any] | None:
     if guess is None:
         return None
     rms = rms_length(guess.residual, calibration.observations.seen)
-    return {"network": guess.name, "rms_px": rms, "used": calibration.guess_used}
+    known = rms is not None and math.isfinite(rms)  # a network may say anything
+    return {"network": guess.name, "rms_px": rms if known else None, "used": calibration.guess_used}
 
 
 def refused_summary(
@@ -299,7 +301,8 @@ def predicted_line(predicted: dict[str, Any]) -> str:
 
 def _print(result: dict[str, Any], out: Path, report: bool) -> None:
     guess = result["first_guess"]
-    network = "" if guess is None else f"network alone {guess['rms_px']:.3f} px, "
+    alone = None if guess is None else guess["rms_px"]
+    network = "" if alone is None else f"network alone {alone:.3f} px, "
     before, after = result["rms_px_before"], result["rms_px_after"]
     print(f"reprojection error before {before:.3f} px, {network}after {after:.4f} px (RMS)")
     if guess is not None and not guess["used"]:

@@ -20,7 +20,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from imgcal.detection import Blobs, DetectionOptions, detect_snapshot, without_dim
 from imgcal.errors import InputError
 from imgcal.formats import Capture, Frame
-from imgcal.messages import listed
+from imgcal.messages import listed, shortened
 from imgcal.observations import Detections
 from imgcal.rig import CameraRig
 from imgcal.rotations import rotation_from_vector
@@ -33,9 +33,11 @@ def parse_range(text: str | None) -> tuple[int, int | None]:
     """Read `A:B` (either may be left out) as numbers of snapshots, B excluded."""
     if text is None:
         return 0, None
-    match = re.fullmatch(r"(\d*):(\d*)", text)
+    match = re.fullmatch(r"(\d{0,18}):(\d{0,18})", text)
     if not match:
-        raise InputError(f"--snapshots: found {text!r}, expected A:B, numbers in file order from 0, B excluded")
+        raise InputError(
+            f"--snapshots: found {shortened(text)!r}, expected A:B, numbers in file order from 0, B excluded"
+        )
     first, last = int(match[1] or 0), int(match[2]) if match[2] else None
     if last is not None and last <= first:
         raise InputError(f"--snapshots: found the empty range {text!r}, expected A < B")

@@ -100,6 +100,8 @@ def parse(arguments: list[str]) -> Runnable:
         InputError: the command line is not understood.
         SystemExit: help was asked for.
     """
+    if any("\0" in argument for argument in arguments):
+        raise InputError("found a zero byte in the command line, expected text")
     drawn = io.StringIO()
     try:
         with contextlib.redirect_stderr(drawn):
@@ -143,8 +145,11 @@ def _undrawn(box: str) -> str:
 def _verdict(error: BaseException) -> tuple[int, str]:
     """Say what a failure means to the user: exit code and message."""
     match error:
-        case InputError() | OSError():
+        case InputError():
             return UNUSABLE, str(error)
+        case OSError():
+            place = f"{quoted(str(error.filename))}: " if error.filename else ""
+            return UNUSABLE, place + (error.strerror or quoted(str(error)))
         case RefusedError():
             return REFUSED, error.for_command
         case KeyboardInterrupt():

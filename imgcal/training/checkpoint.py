@@ -19,6 +19,7 @@ from imgcal.formats.json_text import read_json
 from imgcal.formats.names import title_of
 from imgcal.formats.safetensors_file import read_tensors, read_texts, write_tensors
 from imgcal.formats.yaml_file import validated
+from imgcal.messages import shortened
 from imgcal.networks.rendering import ImageOptions
 from imgcal.networks.trunk import Trunk
 from imgcal.objects import CalibrationObject
@@ -179,7 +180,11 @@ def _fill(path: str | Path, network: nn.Module, tensors: dict[str, Tensor]) -> N
         raise InputError(
             f"{path}: found other weights than its network has ({wrong[0]}{more}): another version of imgcal"
         )
-    network.load_state_dict({name: tensor.to(own[name].dtype) for name, tensor in tensors.items()})
+    weights = {name: tensor.to(own[name].dtype) for name, tensor in tensors.items()}
+    broken = next((name for name, tensor in weights.items() if not bool(tensor.isfinite().all())), None)
+    if broken is not None:
+        raise InputError(f"{path}: found weights that are not finite ({shortened(broken)}), expected a trained network")
+    network.load_state_dict(weights)
 
 
 def _read_records(path: str | Path, texts: dict[str, str]) -> tuple[Experiment, dict[str, Any]]:

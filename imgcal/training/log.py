@@ -14,6 +14,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from imgcal.errors import InputError
 from imgcal.formats import write_text
+from imgcal.formats.json_text import read_json
 
 EXTRA = "extra"  # key of a row that a longer run does not have
 
@@ -90,12 +91,15 @@ class Log:
 
 
 def read_metrics(path: str | Path) -> list[dict[str, Any]]:
-    """Read metrics.jsonl; a last line that was cut off by a kill is left out, and no file is no metrics."""
+    """Read metrics.jsonl up to the first line that is none, as one that a kill cut off; no file is no metrics."""
     path = Path(path)
-    rows = []
-    for line in path.read_text().splitlines() if path.is_file() else []:
+    rows: list[dict[str, Any]] = []
+    for line in path.read_text(errors="replace").splitlines() if path.is_file() else []:
         try:
-            rows.append(json.loads(line))
-        except json.JSONDecodeError:
+            row = read_json(line)
+        except ValueError:
             break
+        if not (isinstance(row, dict) and isinstance(row.get("step"), int)):
+            break
+        rows.append(row)
     return rows

@@ -13,6 +13,7 @@ from imgcal.formats import load_object, load_rig
 from imgcal.formats.safetensors_file import read_tensors, write_tensors
 from imgcal.networks.prediction import Views
 from imgcal.training.checkpoint import FORMAT, build_network, load_checkpoint, load_network, save_network, warm_start
+from imgcal.training.log import read_metrics
 from tests.imgcal.training.toy import Toy
 
 
@@ -71,6 +72,16 @@ def test_damaged_texts_are_one_line(path, key, text, message):
     with pytest.raises(InputError, match=message) as caught:
         load_checkpoint(path)
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 1000
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_weights_that_are_no_numbers_are_refused(path, value):
+    tensors, texts = read_tensors(path, FORMAT)
+    name = next(name for name, tensor in tensors.items() if tensor.is_floating_point())
+    tensors[name].view(-1)[0] = value
+    write_tensors(path, tensors, FORMAT, texts)
+    with pytest.raises(InputError, match=f"weights that are not finite .{name}"):
+        load_checkpoint(path)
 
 
 @pytest.mark.parametrize(
@@ -224,3 +235,9 @@ def test_warm_start_takes_what_fits(made, path, experiment):
     assert torch.equal(network.spread, spread)  # buffers belong to the new rig and drift
     with pytest.raises(InputError, match="no parameter that fits"):
         warm_start(path, torch.nn.Linear(3, 4))
+
+
+@pytest.mark.parametrize("line", ["[1]", "3", '{"step": "x"}', "[" * 100_000, "\xff\x00", "{"])
+def test_metrics_end_at_the_first_line_that_is_none(line, tmp_path):
+    (tmp_path / "metrics.jsonl").write_bytes(b'{"step": 1}\n' + line.encode("latin1") + b'\n{"step": 2}\n')
+    assert read_metrics(tmp_path / "metrics.jsonl") == [{"step": 1}]
