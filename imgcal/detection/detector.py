@@ -121,7 +121,8 @@ def _of_any_size(frame: Frame, options: DetectionOptions, scale: int) -> Blobs:
     """
     limit, screening = options.radius_limit, screen(frame, options, scale)
     blobs = measure(frame, outline(frame, screening, options, scale), replace(options, max_radius=LARGER), scale)
-    blobs = blobs.select(usual_size(blobs, limit))
+    kept = usual_size(blobs, limit)
+    blobs = blobs if kept.all() else blobs.select(kept)
     enough = usable(blobs).sum() >= FEW
     if enough and screening.bulk(LARGER, 2 * LARGEST) < 0.5 * scale * np.median(blobs.contrast):
         return blobs

@@ -47,6 +47,8 @@ def usable(blobs: Blobs) -> NDArray[np.bool_]:
 def usual_size(blobs: Blobs, limit: float) -> NDArray[np.bool_]:
     """Mark blobs (K,) up to a radius `limit` (px), and larger ones if several are alike in size and no dimmer."""
     small = blobs.radius <= limit
+    if small.all():
+        return small
     large = ~small & usable(blobs)
     if large.sum() >= LEAST_LARGE:
         ratio = blobs.radius / np.median(blobs.radius[large])
