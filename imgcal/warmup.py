@@ -6,8 +6,10 @@ import contextlib
 import math
 from collections.abc import Iterator
 
+import numpy as np
 import torch
 
+from imgcal.detection import detect
 from imgcal.errors import RefusedError
 from imgcal.formats import load_object, load_rig
 from imgcal.live import Recalibrator
@@ -41,6 +43,7 @@ def warm_up() -> None:
         calibrate(exact, rig, obj)
         score(exact, rig, obj)
     _of_a_plane(rig, generator)
+    _of_bloomed_lamps()
     seen = torch.ones(truth.uv.shape[:-1], dtype=torch.bool)
     for uv in (truth.uv, truth.uv.float()):  # of `imgcal render`, and of the networks
         render_views(uv, seen, rig.image_size, obj, ImageOptions(32, 1.5))
@@ -69,6 +72,13 @@ def _of_a_plane(rig: CameraRig, generator: torch.Generator) -> None:
     unlabelled = true_detections(truth)
     with _whatever_comes():
         calibrate(unlabelled, rig, plane)
+
+
+def _of_bloomed_lamps() -> None:
+    """Blobs that are clipped and joined by their light are parted."""
+    v, u = np.mgrid[:64, :96]
+    light = sum(400 * np.exp(-((u - at) ** 2 + (v - 32) ** 2) / 72) for at in (38, 58))
+    detect({"lamps": (5 + np.minimum(light, 250)).astype(np.uint8)})
 
 
 @contextlib.contextmanager
