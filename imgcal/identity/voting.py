@@ -46,7 +46,7 @@ def predict_ideal(rig: CameraRig, points: NDArray[np.float64], poses: Poses) -> 
         poses.rotation,
         poses.translation,
     )
-    _predict(*map(np.ascontiguousarray, given), uv)
+    _predict(*map(np.ascontiguousarray, given), uv)  # type: ignore[call-arg]
     return uv
 
 
