@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -49,14 +50,16 @@ def series_of(fit: Estimate, labels: Observations, radius: Tensor | None) -> Ser
         labels: (S, C, N) of the fitted snapshots, those that the fit left out included.
         radius: (N,) mm of spherical fiducials.
     """
-    points = fit.rig_from_object.apply(fit.points_object)
-    predicted = fit.rig.expand(len(labels.uv)).project(points, radius).uv
+    residual = fit.residual
+    if not torch.equal(fit.problem.root_weight[0] > 0, labels.seen):  # the fit knows no residuals of what it left out
+        points = fit.rig_from_object.apply(fit.points_object)
+        residual = fit.rig.expand(len(labels.uv)).project(points, radius).uv - labels.uv
     spread = fit.problem.spread[0, :, :6]
     return Series(
         rig=fit.rig,
         rig_from_object=fit.rig_from_object,
         points=fit.points_object.numpy(),
-        residual=(predicted - labels.uv).numpy(),
+        residual=residual.numpy(),
         sigma=labels.sigma.numpy(),
         labels=labels.seen.numpy(),
         spread=spread.numpy(),

@@ -28,6 +28,8 @@ LEAST_EXPLAINED = 1 / 3
 """Of what a camera sees of the object, the share that must have labels."""
 LEAST_SIGHT = 0.6
 """Blobs that may be fiducials, in parts of the fiducials in view, from which a camera is said to see the object."""
+LEAST_BLOBS = 3
+"""From which a camera is said to see the object at all."""
 TURNS = (0.02, 0.1, 0.4)
 """Radians, one standard deviation of each axis: how far a camera may have been turned when it is looked for again."""
 
@@ -93,16 +95,18 @@ def astray(
         obj: the calibration object.
         pose: rig_from_object of this snapshot.
     """
+    labelled = np.bincount(blobs.camera[blobs.fiducial >= 0], minlength=rig.cameras)
+    spare = np.maximum(spare_blobs(blobs, rig.cameras) - usual, 0)
+    if not ((spare >= LEAST_BLOBS) & (labelled <= LEAST_EXPLAINED * (labelled + spare))).any():
+        return np.zeros(rig.cameras, dtype=bool)  # whatever is in view
     projection = rig.project(pose.apply(obj.points), obj.radius)
     size = rig.image_size.numpy()[:, None]
     uv = projection.uv.numpy()
     inside = ((uv > MARGIN * size) & (uv < (1 - MARGIN) * size)).all(-1) & projection.visible.numpy()
     expected = inside.sum(-1)
-    labelled = np.bincount(blobs.camera[blobs.fiducial >= 0], minlength=rig.cameras)
-    spare = np.maximum(spare_blobs(blobs, rig.cameras) - usual, 0)
     unexplained = np.minimum(expected - labelled, spare)
     few = labelled <= LEAST_EXPLAINED * (labelled + unexplained)
-    return np.asarray(few & (unexplained >= np.maximum(3, LEAST_SIGHT * expected)))
+    return np.asarray(few & (unexplained >= np.maximum(LEAST_BLOBS, LEAST_SIGHT * expected)))
 
 
 def found_again(

@@ -368,9 +368,9 @@ def _all_out(blobs: Detections, result: Calibration) -> set[int]:
 
 
 def _places(result: Calibration) -> Tensor:
-    """Where fiducials were while the window was filled: (M, 3) mm, some hundred."""
+    """Where fiducials were while the window was filled: (M, 3) mm, some dozens."""
     points = result.rig_from_object.apply(result.points_object).reshape(-1, 3)
-    return points[:: max(1, len(points) // 200)]
+    return points[:: max(1, len(points) // 60)]
 
 
 def _with_camera(rig: CameraRig, other: CameraRig, camera: int) -> CameraRig:

@@ -147,9 +147,10 @@ class WindowFit:
         if result is not None and not doubtful:
             if len(result.labelled.used) < 2:
                 return None, []
-            labels = self._observations(result.labelled)
-            # A move is no noise, though a fit takes it for that: what is usual, or as much as the blobs' own, counts.
+            plain = result.outliers == 0 and result.model_error == 0
+            labels = result.observations if plain else self._observations(result.labelled)
             noise = labels.sigma.square()
+            # A move is no noise, though a fit takes it for that: what is usual, or as much as the blobs' own, counts.
             model = noise.clamp_min(usual.model_error**2).clamp_max(result.model_error**2)
             labels = replace(labels, sigma=(noise + model).sqrt())
             first = len(window.kept) - len(kept)
