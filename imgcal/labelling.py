@@ -140,7 +140,8 @@ def label(
     if not labelled.used:
         reasons = Counter(snapshot.reason for snapshot in labelled.snapshots if snapshot.reason != NOT_TRIED)
         reason, times = reasons.most_common(1)[0] if count else ("found no snapshot", 0)
-        why = f"{reason} ({times} of {reasons.total()} snapshots)" if count else reason
+        tried = f"{reasons.total()} snapshots" + (f" tried, {count} in all" if reasons.total() < count else "")
+        why = f"{reason} ({times} of {tried})" if count else reason
         raise RefusedError(f"identity: {why}")
     return labelled
 
