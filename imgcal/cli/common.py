@@ -94,7 +94,10 @@ def progress(items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
     """Show a progress bar on standard error, if that is a terminal, while going through `items`."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     console = Console(file=sys.stderr)
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    if not console.is_terminal:  # some versions of rich write a line even where it is disabled
+        yield from items
+        return
+    with Progress(*columns, console=console, transient=True) as bar:
         yield from bar.track(items, total=total, description=label)
 
 

@@ -175,7 +175,10 @@ def _bar(total: int) -> Iterator[Advance]:
     """Show a progress bar on standard error, if that is a terminal."""
     console = Console(file=sys.stderr)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    if not console.is_terminal:  # some versions of rich write a line even where it is disabled
+        yield lambda rigs: None
+        return
+    with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("evaluating", total=total)
         yield lambda rigs: bar.advance(task, rigs)
 
