@@ -10,7 +10,7 @@ from imgcal.estimation import estimate
 from imgcal.estimation.linearize import jacobian_at
 from imgcal.labelling import label, observations_of
 from imgcal.rig import PARAMETERS
-from tests.imgcal import damage
+from scripts.benchmarks import camera_faults as damage
 
 
 def fitted(make, snapshots, seed=0, change=None, first=0, camera=3):

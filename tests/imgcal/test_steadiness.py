@@ -11,7 +11,7 @@ from imgcal.pipeline import calibrate, score
 from imgcal.rig import RigPrior
 from imgcal.simulation import Truth
 from imgcal.steadiness import moves_of
-from tests.imgcal import damage
+from scripts.benchmarks import camera_faults as damage
 
 CAMERA = 3
 MAKE = {"room": damage.wand_in_a_room, "ring": damage.object_before_a_ring}

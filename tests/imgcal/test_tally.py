@@ -6,7 +6,7 @@ import pytest
 from imgcal.errors import RefusedError
 from imgcal.labelling import PipelineOptions
 from imgcal.pipeline import calibrate
-from tests.imgcal import damage
+from scripts.benchmarks import camera_faults as damage
 
 CAMERA = 3
 BLIND = PipelineOptions(

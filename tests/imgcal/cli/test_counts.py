@@ -8,7 +8,7 @@ import pytest
 from imgcal.cli.main import main
 from imgcal.formats import load_detections, save_detections, save_object, save_rig
 from imgcal.observations import BlobFlag
-from tests.imgcal import damage
+from scripts.benchmarks import camera_faults as damage
 
 CAMERA = 3
 

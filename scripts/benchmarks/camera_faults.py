@@ -2,34 +2,44 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from imgcal.formats import load_object, load_rig
+from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections
-from imgcal.rig import RigPrior
+from imgcal.rig import CameraRig, RigPrior
 from imgcal.simulation import Truth, simulate_truth, simulate_volume, true_detections
 from imgcal.synthesis import PhysicalDrift
 
 NOISE = 0.1  # px
 
+Scene = tuple[CameraRig, CalibrationObject, Truth]  # factory rig, object, truth
+Change = Callable[[CameraRig], CameraRig]
 
-def wand_in_a_room(snapshots, seed=0):
-    """Factory rig, object, truth."""
+
+def wand_in_a_room(snapshots: int, seed: int = 0) -> Scene:
+    """Carry a wand through a room with ten cameras."""
     rig, wand = load_rig("room10"), load_object("wand4")
     return rig, wand, simulate_volume(rig, wand, snapshots, torch.Generator().manual_seed(seed), PhysicalDrift())
 
 
-def object_before_a_ring(snapshots, seed=0, rig="O10"):
-    """Factory rig, object, truth."""
-    rig, obj = load_rig(rig), load_object("asymmetric8")
-    return rig, obj, simulate_truth(rig, obj, snapshots, torch.Generator().manual_seed(seed), PhysicalDrift())
+def object_before_a_ring(snapshots: int, seed: int = 0, rig: str = "O10") -> Scene:
+    """Turn an object in front of one of the reference rigs."""
+    factory, obj = load_rig(rig), load_object("asymmetric8")
+    return factory, obj, simulate_truth(factory, obj, snapshots, torch.Generator().manual_seed(seed), PhysicalDrift())
 
 
-def blobs(truth, seed=0, clutter=0.3, missed=0.02, crowded=None, labelled=False):
-    """What the cameras find: noise, a few false blobs a frame (many in camera `crowded[0]`), some fiducials missed."""
+def blobs(
+    truth: Truth, seed: int = 0, clutter: float = 0.3, missed: float = 0.02,
+    crowded: tuple[int, float] | None = None, labelled: bool = False,
+) -> Detections:  # fmt: skip
+    """Find blobs: noise, a few false ones a frame (`crowded`: a camera and how many there), some fiducials missed."""
     draw = np.random.default_rng(seed)
     found = true_detections(truth)
     found = found.select(draw.random(len(found)) >= missed)
@@ -51,20 +61,23 @@ def blobs(truth, seed=0, clutter=0.3, missed=0.02, crowded=None, labelled=False)
         flags=np.zeros(len(camera), dtype=np.uint8),
     )
     both = joined(found, false)
-    both = both.select(((both.uv >= -0.5) & (both.uv <= size[both.camera] - 0.5)).all(1))
+    inside = (both.uv >= -0.5) & (both.uv <= size[both.camera] - 0.5)
+    both = both.select(np.all(inside, axis=1))
     both = both.select(np.lexsort((draw.random(len(both)), both.snapshot)))
     return both if labelled else replace(both, fiducial=np.full(len(both), -1))
 
 
 def joined(*tables: Detections) -> Detections:
+    """Put tables of the same cameras and snapshots together."""
     columns = [f.name for f in fields(Detections) if not f.name.endswith("_names")]
-    return replace(tables[0], **{name: np.concatenate([getattr(t, name) for t in tables]) for name in columns})
+    together: dict[str, Any] = {name: np.concatenate([getattr(t, name) for t in tables]) for name in columns}
+    return replace(tables[0], **together)
 
 
-def mirrored(table, rig, camera, how):
+def mirrored(table: Detections, rig: CameraRig, camera: int, how: str) -> Detections:
     """Flip (u, v, both) or turn the image of one camera; what leaves it is lost."""
     width, height = rig.image_size[camera].tolist()
-    flips = {
+    flips: dict[str, Callable[..., tuple[np.ndarray, np.ndarray]]] = {
         "u": lambda u, v: (width - 1 - u, v),
         "v": lambda u, v: (u, height - 1 - v),
         "both": lambda u, v: (width - 1 - u, height - 1 - v),
@@ -75,66 +88,73 @@ def mirrored(table, rig, camera, how):
     return replace(table, uv=uv).select(~own | ((uv >= -0.5) & (uv <= np.array([width, height]) - 0.5)).all(1))
 
 
-def swapped(table, first, second):
+def swapped(table: Detections, first: int, second: int) -> Detections:
+    """Exchange two cameras."""
     camera = table.camera
     return replace(table, camera=np.where(camera == first, second, np.where(camera == second, first, camera)))
 
 
-def late(table, camera):
-    """One camera is one snapshot behind."""
+def late(table: Detections, camera: int) -> Detections:
+    """Let one camera be one snapshot behind."""
     count = len(table.snapshot_names)
     snapshot = np.where(table.camera == camera, (table.snapshot + 1) % count, table.snapshot)
     return replace(table, snapshot=snapshot)
 
 
-def with_camera(truth, obj, camera, change):
-    """The truth with one camera changed: `change` maps a rig to another."""
+def with_camera(truth: Truth, obj: CalibrationObject, camera: int, change: Change) -> Truth:
+    """Change one camera in all snapshots."""
     rig = replace(change(truth.rig), camera_names=truth.rig.camera_names)
     seen = rig.expand(len(truth.uv)).project(truth.rig_from_object.apply(obj.points), obj.radius)
-    uv, visible = truth.uv.clone(), torch.ones_like(seen.visible) if truth.visible is None else truth.visible.clone()
+    uv, visible = truth.uv.clone(), _visible(truth).clone()
     uv[:, camera], visible[:, camera] = seen.uv[:, camera], seen.visible[:, camera]
     return Truth(rig, truth.rig_from_object, uv, visible)
 
 
-def longer_lens(rig, camera, factor=2.0):
+def longer_lens(rig: CameraRig, camera: int, factor: float = 2.0) -> CameraRig:
+    """Change the focal length of one camera."""
     focal = rig.focal_length.clone()
     focal[camera] *= factor
     return replace(rig, focal_length=focal)
 
 
-def turned(rig, camera, degrees, axis=0):
-    """The rig with one camera turned about one of its axes."""
+def turned(rig: CameraRig, camera: int, degrees: float, axis: int = 0) -> CameraRig:
+    """Turn one camera about one of its axes."""
     step = torch.zeros_like(RigPrior().std(rig))
     step[camera, axis] = np.radians(degrees)
     return rig.moved(step)
 
 
-def shifted(rig, camera, millimetres, axis=0):
-    """The rig with one camera moved along an axis of the rig."""
+def shifted(rig: CameraRig, camera: int, millimetres: float, axis: int = 0) -> CameraRig:
+    """Move one camera along an axis of the rig."""
     step = torch.zeros_like(RigPrior().std(rig))
     step[camera, 3 + axis] = millimetres
     return rig.moved(step)
 
 
-def changed_from(truth, obj, camera, first, change):
-    """The truth with one camera changed from a snapshot on; the rig is that before."""
+def changed_from(truth: Truth, obj: CalibrationObject, camera: int, first: int, change: Change) -> Truth:
+    """Change one camera from a snapshot on; the rig of the truth is that before."""
     after = with_camera(truth, obj, camera, change)
     later = torch.arange(len(truth.uv)) >= first
     uv = torch.where(later[:, None, None, None], after.uv, truth.uv)
-    before = torch.ones_like(after.visible) if truth.visible is None else truth.visible
-    return Truth(truth.rig, truth.rig_from_object, uv, torch.where(later[:, None, None], after.visible, before))
+    return Truth(
+        truth.rig, truth.rig_from_object, uv, torch.where(later[:, None, None], _visible(after), _visible(truth))
+    )
 
 
-def with_lens_errors(truth, seed=0, size=0.15):
-    """The truth seen through lenses that the camera model does not know: smooth errors over each image, px."""
+def _visible(truth: Truth) -> Tensor:
+    return torch.ones_like(truth.uv[..., 0], dtype=torch.bool) if truth.visible is None else truth.visible
+
+
+def with_lens_errors(truth: Truth, seed: int = 0, size: float = 0.15) -> Truth:
+    """Look through lenses that the camera model does not know: smooth errors over each image, px."""
     draw, where = np.random.default_rng(seed), truth.uv / truth.rig.image_size.double()[:, None]
     shape = (truth.uv.shape[1], 1, 2)
     slope, phase = (torch.from_numpy(draw.uniform(low, high, shape)) for low, high in ((2, 5), (0, 6)))
     return replace(truth, uv=truth.uv + size * (slope * where.flip(-1) + phase).sin())
 
 
-def from_one_end_to_the_other(truth):
-    """The same snapshots with the object carried along one axis: place and time go together."""
+def from_one_end_to_the_other(truth: Truth) -> Truth:
+    """Take the same snapshots in the order of one coordinate: place and time go together."""
     order = truth.rig_from_object.translation[:, 0].argsort()
     visible = None if truth.visible is None else truth.visible[order]
     return replace(truth, uv=truth.uv[order], visible=visible, rig_from_object=truth.rig_from_object[order])
