@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imgcal.errors import RefusedError
 from imgcal.estimation import Estimate
@@ -16,6 +17,10 @@ MOST_DISPLACED = 0.15
 """Of the object's size: a fiducial that is farther from its place belongs to another object."""
 LEAST_KNOWN = 0.005
 """Of the object's size: standard deviation of a displaced fiducial above which the data cannot carry it."""
+LEAST_EXPECTED = 6
+"""Views of a fiducial from which its absence is no chance."""
+LOST = 0.5
+"""Share of what is usual, below which a fiducial counts as lost."""
 IN_PLACE = 1e-4
 """Of the object's size: a fiducial that is nearer to its place is in it."""
 
@@ -68,6 +73,20 @@ def object_offsets(fit: Estimate, shape: ShapeEvidence | None, obj: CalibrationO
                 **measure,
             )
     return found
+
+
+def lost_fiducials(seen: NDArray[np.bool_], in_view: NDArray[np.bool_]) -> tuple[int, ...]:
+    """Choose the fiducials that were hardly found where all the others were: missing, hidden, or somewhere else.
+
+    Args:
+        seen: (S, C, N) labels that fit.
+        in_view: (S, C, N) fiducials that the cameras should see.
+    """
+    looked = in_view & (seen.sum(-1, keepdims=True) > 0)
+    expected, found = looked.sum((0, 1)), (seen & looked).sum((0, 1))
+    share = found / np.maximum(expected, 1)
+    lost = (expected >= LEAST_EXPECTED) & (share < LOST * np.median(share))
+    return tuple(np.flatnonzero(lost).tolist())
 
 
 def displaced(found: tuple[FiducialOffset, ...], obj: CalibrationObject) -> tuple[FiducialOffset, ...]:

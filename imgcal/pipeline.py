@@ -34,7 +34,7 @@ from imgcal.first_guess import FirstGuess, Guesser, residual_of
 from imgcal.labelling import Labelled, PipelineOptions, Progress, label, observations_of
 from imgcal.moved import MovedCamera
 from imgcal.networks.prediction import Prediction
-from imgcal.object_checks import displaced, object_offsets
+from imgcal.object_checks import displaced, lost_fiducials, object_offsets
 from imgcal.objects import CalibrationObject
 from imgcal.observations import BlobFlag, Detections, Observations
 from imgcal.pose_support import UndeterminedPosesError, require_poses, without_snapshots
@@ -85,8 +85,15 @@ class Calibration(Estimate):
 
     @property
     def displaced(self) -> tuple[FiducialOffset, ...]:
-        """Fiducials that are surely not in their places."""
-        return displaced(self.shape, self.obj)
+        """Fiducials that are surely not in their places; what is known of lost ones rests on a few odd labels."""
+        return tuple(d for d in displaced(self.shape, self.obj) if d.fiducial not in self.lost)
+
+    @cached_property
+    def lost(self) -> tuple[int, ...]:
+        """Fiducials that were hardly found where the others were."""
+        points = self.rig_from_object.apply(self.points_object)
+        visible = self.rig.expand(len(points)).project(points, self.obj.radius).visible
+        return lost_fiducials(self.observations.seen.numpy(), visible.numpy())
 
     @cached_property
     def tally(self) -> Tally:

@@ -235,6 +235,7 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
             for offset in calibration.shape
         ],
         "object_displaced": [offset.fiducial for offset in calibration.displaced],
+        "object_lost": list(calibration.lost),
         "object_scale_sigma": calibration.scale_sigma,
         "covariance": {
             "from": "scatter between blocks of snapshots" if calibration.block_length else "noise of the blobs",
@@ -280,6 +281,7 @@ def refused_summary(
         "per_snapshot": {},
         "object": [],
         "object_displaced": [],
+        "object_lost": [],
         "object_scale_sigma": None,
         "covariance": None,
         "predicted_error": None,
@@ -322,6 +324,12 @@ def _print(result: dict[str, Any], out: Path, report: bool) -> None:
                 f"{offset['sigma_mm']:.1g} mm off its place",
                 file=sys.stderr,
             )
+    for fiducial in result["object_lost"]:
+        print(
+            f"note: fiducial {fiducial} of the object was hardly found where the others were: missing, hidden, or not "
+            "where the object file has it",
+            file=sys.stderr,
+        )
     print(f"rig     {out / 'rig.yaml'}")
     if result["object"]:
         print(f"object  {out / 'object.csv'}")

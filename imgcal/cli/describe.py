@@ -108,12 +108,21 @@ def describe(
 
 
 def _about_object(calibration: Calibration) -> str:
-    """Name the fiducials that are not in their places."""
-    if not calibration.displaced:
-        return ""
-    parts = [f"fiducial {d.fiducial} is {d.distance:.3g} ± {d.sigma:.1g} mm off" for d in calibration.displaced]
-    words = "The object is not quite what its file says: "
-    return f"{words}{', '.join(parts)}. It was estimated with the rig; object.csv beside this page holds it."
+    """Name the fiducials that are not in their places, and those that were not found."""
+    words = []
+    if calibration.displaced:
+        parts = [f"fiducial {d.fiducial} is {d.distance:.3g} ± {d.sigma:.1g} mm off" for d in calibration.displaced]
+        words.append(
+            f"The object is not quite what its file says: {', '.join(parts)}. It was estimated with the rig; "
+            "object.csv beside this page holds it."
+        )
+    if calibration.lost:
+        which = ", ".join(map(str, calibration.lost))
+        words.append(
+            f"Fiducial {which} was hardly found where the others were: missing, hidden, or not where the object file "
+            "has it."
+        )
+    return " ".join(words)
 
 
 def _by_blob(calibration: Calibration, residual: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -131,3 +131,12 @@ def test_granted_tolerances_make_the_errors_honest() -> None:
         normalized.append(float(((vectors.mT @ (error / scale)).square() / values).mean()))
         assert len(found.shape) == 8
     assert 0.8 < np.mean(normalized) < 1.2
+
+
+def test_a_fiducial_whose_blobs_cannot_be_labelled_is_named() -> None:
+    rig, obj, true_rig, true, table = capture("O10", 3, moved(7, (-3, 0, 4)))
+    found = calibrate(replace(table, fiducial=np.full(len(table), -1)), rig, obj)
+    assert found.lost == (7,) and found.displaced == ()
+    assert held_out(found.rig, true_rig, true) < 0.1
+    _, _, _, _, table = capture("O10", 3, right)
+    assert calibrate(table, rig, obj).lost == ()
