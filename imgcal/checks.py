@@ -23,7 +23,7 @@ LEAST_EXPLAINED = 0.5
 """Of what a camera sees of the object, the share that must be where the rest of the rig expects it."""
 SAME_PIXEL = 1e-3
 """Pixels up to which two ways of projecting may differ."""
-LEAST_SIGHT = 0.4
+LEAST_SIGHT = 0.3
 """Blobs that may be fiducials, in parts of the fiducials in view, from which a camera is said to see the object."""
 
 
