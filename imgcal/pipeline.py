@@ -153,8 +153,9 @@ def calibrate(
     found = time.perf_counter()
     labelled = label(detections, rig, obj, options, progress)
     identified = time.perf_counter()
+    labelled = _with_poses(labelled, rig, obj)
     _require_any_view(labelled, rig, obj)
-    labelled, moved = steady_part(_with_poses(labelled, rig, obj), detections, rig, obj, options)
+    labelled, moved = steady_part(labelled, detections, rig, obj, options)
     fit = fit_labelled(labelled, rig, obj, options, guesser)
     require_views(fit.tally, rig)
     seconds = {
@@ -217,7 +218,7 @@ def _fit_labelled(
     require_cameras(labels, rig, options)
     prior = (rig.prior or RigPrior()).std(rig) if spread is None else spread
     problem = make_problem(observations, rig, obj, prior)
-    poses = poses or initial_pose(observations, rig, obj)
+    assert poses is not None  # see `_with_poses`
     guess = None if guesser is None else guesser.guess(observations, rig, obj)
     guess_used = guess is not None and _nearer(guess, Prediction(rig, poses), observations, obj)
     state = make_start(problem, poses, None)
@@ -264,9 +265,8 @@ def _fit_labelled(
 
 def _require_any_view(labelled: Labelled, rig: CameraRig, obj: CalibrationObject) -> None:
     """Refuse where a camera sees the object, and identity could not label any of it: worse than seeing nothing."""
-    labelled = _with_poses(labelled, rig, obj)
     observations, poses = observations_of(labelled, rig, obj)
-    poses = poses or initial_pose(observations, rig, obj)
+    assert poses is not None
     require_views(tally(labelled, observations.seen.numpy(), poses, rig, obj), rig, least_share=0.0)
 
 
@@ -277,12 +277,18 @@ def _nearer(guess: FirstGuess, factory: Prediction, observations: Observations, 
 
 
 def _with_poses(labelled: Labelled, rig: CameraRig, obj: CalibrationObject) -> Labelled:
-    """Refuse the snapshots whose labels lie on one line."""
+    """Refuse the snapshots whose labels lie on one line; find the poses of those that came with labels."""
+    observations, poses = observations_of(labelled, rig, obj)
     try:
-        require_poses(observations_of(labelled, rig, obj)[0].seen.numpy(), obj.points)
+        require_poses(observations.seen.numpy(), obj.points)
     except UndeterminedPosesError as error:
-        return without_snapshots(labelled, error.rows)
-    return labelled
+        return _with_poses(without_snapshots(labelled, error.rows), rig, obj)
+    if poses is not None:
+        return labelled
+    poses, snapshots = initial_pose(observations, rig, obj), list(labelled.snapshots)
+    for row, snapshot in enumerate(labelled.used):
+        snapshots[snapshot] = replace(snapshots[snapshot], rig_from_object=poses[row])
+    return replace(labelled, snapshots=tuple(snapshots))
 
 
 def finite(value: float) -> float | None:
