@@ -64,7 +64,7 @@ def _left_behind(case: Case, code: object, before: set[Path]) -> str:
     if code == 2 and command not in ("train", "simulate") and new:
         return f"unusable input, but written: {sorted(map(str, new))[:5]}"
     result = out / "result.json"
-    if command != "calibrate" or case.arguments[case.arguments.index("--out") + 1] != str(out) or code == 2:
+    if command != "calibrate" or case.arguments[-case.arguments[::-1].index("--out")] != str(out) or code == 2:
         return ""
     try:
         content = json.loads(result.read_text(), parse_constant=_no_constant)
