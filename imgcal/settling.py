@@ -30,7 +30,7 @@ ROUNDS = 40
 """Of fits at most: noise, outliers, object and prior follow each other, and most captures need three to six."""
 BENT = 5.0
 """Standard deviations from which the object is not what its file says."""
-WRONG_SCALE = 4.5
+WRONG_SCALE = 4.0
 """Standard deviations of the cameras' positions, all moved together, from which the object's scale is wrong."""
 
 GROSS_SCALE = 0.05
@@ -177,7 +177,8 @@ def _require_scale(shape: ShapeEvidence, problem: Problem, solution: Solution, l
     direction = np.where(spread > 0, (places - places.mean(0)) / np.maximum(spread, 1e-30), 0.0).ravel()
     along = float(direction @ offset.ravel()) ** 2 / max(float(direction @ direction), 1e-30)
     freedom = float((1 - remaining_variance(solution)[0, :, position]).sum())
-    usual = max(1.0, (float(np.square(offset).sum()) - along) / max(freedom, 1.0))
+    usual = (float(np.square(offset).sum()) - along) / max(freedom, 1.0)
+    usual = usual if usual > 1 + 2 * (2 / max(freedom, 1.0)) ** 0.5 else 1.0
     error, deviation = shape.scale_error
     granted = 0.0 if problem.object_spread is None else float(problem.object_spread[0, -1])
     if MOST_SCALE > abs(error) > max(least, WRONG_SCALE * np.hypot(deviation * usual**0.5, granted)):
