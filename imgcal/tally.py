@@ -15,6 +15,10 @@ from imgcal.transforms import RigidTransform
 MARGIN = 0.05
 """Of the image's width and height, from its border: as far a camera that has drifted may miss what it should see."""
 
+DOUBTFUL = 0.25
+"""Share of what a camera sees of the object that is not where it should be, from which on it is said: partly hidden
+markers and false blobs beside them leave a tenth in good captures."""
+
 Counts = NDArray[np.int64]
 
 

@@ -9,10 +9,7 @@ import numpy as np
 from imgcal.observations import Detections
 from imgcal.pipeline import Calibration
 from imgcal.rig import CameraRig
-from imgcal.tally import Tally
-
-DOUBTFUL = 0.1
-"""Share of what a camera sees of the object that is not where it should be, from which on it is said."""
+from imgcal.tally import DOUBTFUL, Tally
 
 
 def counts_by_camera(counts: Tally, camera: int) -> dict[str, int]:

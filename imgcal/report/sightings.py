@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from imgcal.report.content import ReportContent
+from imgcal.tally import DOUBTFUL
 
-DOUBTFUL = 0.1
-"""Share of what a camera sees of the object that is not where it should be, from which on it is said."""
 CROWDED = 1.0
 """Blobs that belong to nothing, in parts of those that are used, from which on it is said."""
 

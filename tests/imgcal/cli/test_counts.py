@@ -1,6 +1,7 @@
 """What `calibrate` tells about blobs, labels, outliers and cameras that moved."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -109,9 +110,9 @@ def test_the_rig_since_the_last_move(room, capsys):
 def test_a_camera_with_blobs_beside_their_places_is_noted(room, capsys):
     folder, run, truth, _ = room
     table = damage.blobs(truth, labelled=True)
-    astray = (table.camera == CAMERA) & (table.snapshot % 5 == 0)
+    astray = (table.camera == CAMERA) & (table.snapshot % 3 == 0)
     table.uv[astray] = np.random.default_rng(0).uniform(100, 900, (int(astray.sum()), 2))
     table.fiducial[:] = -1
     assert run(table)[0] == 0
     assert "note: camera cam04: " in capsys.readouterr().err
-    assert "cam04: 1" in (folder / "out" / "report.html").read_text()
+    assert re.search(r"cam04: \d+ blobs may be fiducials", (folder / "out" / "report.html").read_text())
