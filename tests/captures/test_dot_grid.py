@@ -1,11 +1,13 @@
 """One camera, 15 views of a grid of 10 x 10 dark dots, from nominal intrinsics that are 2 % off."""
 
 import shutil
+from dataclasses import replace
 
 import pytest
 import torch
 
 import imgcal
+from imgcal.estimation import camera_std
 from imgcal.formats import read_frame, write_text
 from imgcal.rig import CameraRig
 from imgcal.transforms import RigidTransform
@@ -54,3 +56,16 @@ def test_every_other_view_predicts_the_rest(first, grid):
     found = imgcal.calibrate({"cam": frames[first::2]}, nominal(), obj, detection=dark)
     scored = imgcal.score(imgcal.detect({"cam": frames[1 - first :: 2]}, dark), found.rig, obj)
     assert scored.distances.square().mean().sqrt() <= HELD_OUT_LIMIT
+
+
+def test_the_halves_differ_by_as_much_as_they_say(grid):
+    """Errors of this lens go with places: by the noise of the dots alone, the halves are 8 to 9 sigma apart."""
+    obj = imgcal.load_object(grid / "object.csv")
+    frames = [read_frame(path) for path in sorted((grid / "frames" / "cam").glob("*.png"))]
+    dark = imgcal.DetectionOptions(polarity="dark")
+    halves = [imgcal.calibrate({"cam": frames[part::2]}, nominal(), obj, detection=dark) for part in (0, 1)]
+    difference = halves[0].rig.difference(halves[1].rig)[0, 6:10]
+    variance = sum(camera_std(half)[0, 6:10].square() for half in halves)
+    assert (difference.square() / variance).mean() < 4
+    alone = sum(camera_std(replace(half, inflation=1.0))[0, 6:10].square() for half in halves)
+    assert (difference.square() / alone).mean() > 20
