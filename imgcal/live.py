@@ -99,6 +99,7 @@ class Recalibrator:
         """
         if window < 1:
             raise InputError(f"window: found {window}, expected at least 1 snapshot")
+        rig = rig.to(torch.float64)
         self.rig, self.obj, self.detection, self.window = rig, obj, detection, window
         self.options = replace(options, blind_cameras=True)
         self._follower = Follower(rig, obj, self.options, remembered=0)

@@ -7,12 +7,14 @@ from numpy.typing import NDArray
 
 from imgcal.errors import RefusedError
 from imgcal.estimation import Estimate
-from imgcal.estimation.shape import FiducialOffset, ShapeEvidence, offsets
+from imgcal.estimation.shape import LEAST_SNAPSHOTS, FiducialOffset, ShapeEvidence, offsets
 from imgcal.objects import CalibrationObject
 from imgcal.settling import BENT
 
 CERTAIN = 4.0
 """Standard deviations from which a fiducial is named as displaced."""
+TOLERATED = 4.6
+"""Times the tolerance of each coordinate: a displacement within it is longer once in ten thousand."""
 MOST_DISPLACED = 0.15
 """Of the object's size: a fiducial that is farther from its place belongs to another object."""
 LEAST_KNOWN = 0.005
@@ -45,7 +47,9 @@ def object_offsets(fit: Estimate, shape: ShapeEvidence | None, obj: CalibrationO
         "command": "measure it anew, or take more snapshots; where fiducials may be off, say so: "
         "--object-tolerance MM, or a column `tolerance`",
     }
-    if shape is not None and shape.bent_sigma() >= 2 * BENT and fit.problem.object_spread is None:
+    # Of a few snapshots nobody can tell whether it is the lenses instead: then they would disagree.
+    few = fit.problem.uv.shape[1] < LEAST_SNAPSHOTS
+    if few and shape is not None and shape.bent_sigma() >= 2 * BENT:
         raise RefusedError(
             "estimation: the object is not as its file says, and other places of its fiducials do not explain the "
             "images either",
@@ -90,10 +94,10 @@ def lost_fiducials(seen: NDArray[np.bool_], in_view: NDArray[np.bool_]) -> tuple
 
 
 def displaced(found: tuple[FiducialOffset, ...], obj: CalibrationObject) -> tuple[FiducialOffset, ...]:
-    """Choose the fiducials that are farther from their places than chance and three times their tolerance explain."""
+    """Choose the fiducials that are farther from their places than chance and their tolerance explain."""
     granted = np.zeros(obj.fiducials) if obj.tolerance is None else obj.tolerance.double().numpy()
     return tuple(
         offset
         for offset in found
-        if offset.distance > CERTAIN * offset.sigma + 3 * granted[offset.fiducial] + IN_PLACE * obj.size
+        if offset.distance > CERTAIN * offset.sigma + TOLERATED * granted[offset.fiducial] + IN_PLACE * obj.size
     )

@@ -61,6 +61,7 @@ class Calibration(Estimate):
     obj: CalibrationObject  # as it was given
     shape: tuple[FiducialOffset, ...] = ()  # where each fiducial is instead; empty = the object was taken as exact
     scale_sigma: float | None = None  # relative: an error of the object's scale three times as large would be noticed
+    bent_sigma: float | None = None  # how sure it is that the object is not as estimated; None = not asked
     block_length: int = 0  # snapshots in the blocks whose scatter the covariance follows; 0 = that of the noise
     first_guess: FirstGuess | None = None  # what a network said, where one was asked
     guess_used: bool = False  # its guess was nearer to the images than the factory calibration
@@ -148,7 +149,7 @@ def calibrate(
         RefusedError: the data cannot decide; the message says why.
         InputError: the data do not belong to this rig or object: other cameras, frames of another size.
     """
-    started = time.perf_counter()
+    started, rig = time.perf_counter(), rig.to(torch.float64)
     detections = blobs_of(source, rig, obj, detection)
     found = time.perf_counter()
     labelled = label(detections, rig, obj, options, progress)
@@ -190,6 +191,7 @@ def fit_labelled(
     Raises:
         RefusedError: a camera saw nothing, the estimate has no minimum, or the residuals do not fit.
     """
+    rig = rig.to(torch.float64)
     labelled = given = _with_poses(labelled, rig, obj)
     while True:
         try:
@@ -216,8 +218,16 @@ def _fit_labelled(
     observations, poses = observations_of(labelled, rig, obj)
     variance, labels = observations.sigma.numpy() ** 2, observations.seen.numpy()
     require_cameras(labels, rig, options)
+    alike = labelled.identity == "ambiguous" and len(labelled.used) > 1
+    if alike and obj.tolerance is not None and bool(obj.tolerance.any()):
+        raise RefusedError(
+            "object: it can be turned into itself, and each snapshot may have the labels of another turn: where its "
+            "fiducials are within their tolerances cannot be estimated",
+            python="give labels (Detections.fiducial), use an object without symmetry, or one without tolerances",
+            command="give labels (a column `fiducial`), use an object without symmetry, or one without tolerances",
+        )
     prior = (rig.prior or RigPrior()).std(rig) if spread is None else spread
-    problem = make_problem(observations, rig, obj, prior)
+    problem = make_problem(observations, rig, _with_learnt(obj, latest), prior)
     assert poses is not None  # see `_with_poses`
     guess = None if guesser is None else guesser.guess(observations, rig, obj)
     guess_used = guess is not None and _nearer(guess, Prediction(rig, poses), observations, obj)
@@ -229,7 +239,7 @@ def _fit_labelled(
         change = latest.problem.spread * latest.solution.state.offset
         offset = torch.where(prior > 0, change / prior.clamp_min(1e-30), 0.0)
         starts.insert(0, (replace(state, offset=offset), latest.model_error))
-    found = settle(problem, starts, variance, labels, options, examine=latest is None)
+    found = settle(problem, starts, variance, labels, options, examine=latest is None, alike=alike)
     fit = conclude(found.problem, found.solution, found.solution.state)
     require_same_residuals(fit, observations, found.seen, obj)
     shape = object_offsets(fit, found.shape, obj)
@@ -257,10 +267,18 @@ def _fit_labelled(
         obj=obj,
         shape=shape,
         scale_sigma=None if found.shape is None else finite(found.shape.scale_error[1]),
+        bent_sigma=None if found.shape is None else found.shape.bent_sigma(),
         block_length=scatter.length,
         first_guess=guess,
         guess_used=guess_used,
     )
+
+
+def _with_learnt(obj: CalibrationObject, latest: Calibration | None) -> CalibrationObject:
+    """The object with the tolerances that the latest result has found necessary."""
+    if latest is None or latest.problem.object_spread is None:
+        return obj
+    return replace(obj, tolerance=latest.problem.object_spread[0, :-1:3])
 
 
 def _require_any_view(labelled: Labelled, rig: CameraRig, obj: CalibrationObject) -> None:
@@ -343,6 +361,7 @@ def score(
         RefusedError: no snapshot could be decided.
         InputError: the data do not belong to this rig or object: other cameras, frames of another size.
     """
+    rig = rig.to(torch.float64)
     labelled = label(blobs_of(source, rig, obj, detection), rig, obj, options, progress)
     observations, poses = observations_of(labelled, rig, obj)
     fixed = torch.zeros(*rig.distortion.shape[:-1], 15, dtype=rig.distortion.dtype)

@@ -59,6 +59,7 @@ def settle(
     labels: NDArray[np.bool_],
     options: PipelineOptions,
     examine: bool = True,
+    alike: bool = False,
 ) -> SettledFit:
     """Fit, ask the residuals for noise, outliers, the object and the prior's width, and fit again until they stay.
 
@@ -70,6 +71,8 @@ def settle(
         labels: (S, C, N) bool, what was labelled.
         options: how sure the result must be.
         examine: ask about the object, too, and free the fiducials that are not where its file says.
+        alike: each snapshot may have the labels of another turn of a symmetric object: it cannot be said which fiducial
+            is not in its place.
 
     Raises:
         RefusedError: no minimum was found, or noise, outliers, object and prior do not come to rest.
@@ -85,7 +88,7 @@ def settle(
         if unexamined and not later and bool(solution.converged):
             # Before outliers are left out: all labels of a fiducial that is off its place may be among them.
             unexamined = False
-            shape, free = _examine(problem, solution, loss, options, GROSS_SCALE)
+            shape, free = _examine(problem, solution, loss, options, GROSS_SCALE, alike)
             if free is not None:
                 (problem, state), kept = free, labels
                 continue
@@ -107,7 +110,7 @@ def settle(
         if abs(model_error - previous) > 0.02 * previous or (kept != seen).any():
             continue
         if examine:
-            shape, free = _examine(problem, solution, loss, options, 0.0)
+            shape, free = _examine(problem, solution, loss, options, 0.0, alike)
             if free is not None:
                 (problem, state), kept = free, labels
                 continue
@@ -125,7 +128,7 @@ def settle(
 
 
 def _examine(
-    problem: Problem, solution: Solution, loss: Loss, options: PipelineOptions, least_scale: float
+    problem: Problem, solution: Solution, loss: Loss, options: PipelineOptions, least_scale: float, alike: bool
 ) -> tuple[ShapeEvidence | None, tuple[Problem, State] | None]:
     """Ask a fit about the object; errors of its scale count from `least_scale`, relative.
 
@@ -134,11 +137,18 @@ def _examine(
         on from; None = they are where they should be, as far as the fit can tell.
 
     Raises:
-        RefusedError: the object has another scale.
+        RefusedError: the object has another scale; or it is bent, and symmetric.
     """
     shape = shape_evidence(problem, solution, loss)
     if shape is None:
         return None, None
+    if alike and shape.bent_sigma() >= BENT:
+        raise RefusedError(
+            "object: its fiducials are not where its file says, and because it can be turned into itself, nobody can "
+            "say which: each snapshot may have the labels of another turn",
+            python="measure it anew, give labels (Detections.fiducial), or use an object without symmetry",
+            command="measure it anew, give labels (a column `fiducial`), or use an object without symmetry",
+        )
     free = _free_object(shape, problem, solution, loss, options) if shape.bent_sigma() >= BENT else None
     if free is None:
         _require_scale(shape, problem, solution, least_scale)
@@ -186,9 +196,10 @@ def _require_scale(shape: ShapeEvidence, problem: Problem, solution: Solution, l
         raise RefusedError(
             f"object: all cameras have moved together, as if it were {100 * abs(error):.2g} +- {100 * deviation:.1g} % "
             f"{size} than its file says",
-            python="measure it anew, look at its unit, or let its scale be estimated: "
-            "replace(obj, scale_tolerance=0.05)",
-            command="measure it anew, look at its unit, or let its scale be estimated: --object-scale-tolerance 0.05",
+            python=f"measure it anew, look at its unit, or grant its scale a tolerance (now {granted:g}): "
+            "replace(obj, scale_tolerance=...)",
+            command=f"measure it anew, look at its unit, or grant its scale a tolerance (now {granted:g}): "
+            "--object-scale-tolerance",
         )
 
 

@@ -237,6 +237,7 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         "object_displaced": [offset.fiducial for offset in calibration.displaced],
         "object_lost": list(calibration.lost),
         "object_scale_sigma": calibration.scale_sigma,
+        "object_bent_sigma": calibration.bent_sigma,
         "covariance": {
             "from": "scatter between blocks of snapshots" if calibration.block_length else "noise of the blobs",
             "block_length": calibration.block_length,
@@ -283,6 +284,7 @@ def refused_summary(
         "object_displaced": [],
         "object_lost": [],
         "object_scale_sigma": None,
+        "object_bent_sigma": None,
         "covariance": None,
         "predicted_error": None,
         "seconds": seconds,

@@ -57,7 +57,7 @@ def curvature_covariance(estimate: Estimate, quantity: Callable[[CameraRig, Tens
         (*B, Q, Q), symmetric and not negative: to be added to the covariance of the flat posterior.
     """
     problem, solution = estimate.problem, estimate.solution
-    factorization = factorize(solution.equations, cameras_first=True)
+    factorization = factorize(solution.equations)
     pairs = max(LEAST_PAIRS, MOST_PAIRS // problem.uv.shape[1])
     generator = torch.Generator(problem.uv.device).manual_seed(0)  # the same estimate has the same covariance
     x = _draw(factorization, solution.state, pairs, generator)
@@ -83,18 +83,19 @@ def _moved_rigs(problem: Problem, state: State, x: Step, follow: Step, sign: int
 def _draw(factorization: Factorization, state: State, pairs: int, generator: torch.Generator) -> Step:
     """Draw steps from the flat posterior: camera (B, K, C, 15), pose (B, K, S, 6), object (B, K, M)."""
     reduced = factorization.reduced
-    batch, cameras, size, wide = reduced.whitened.shape
+    batch, count, size, wide = reduced.whitened.shape
     kept, eliminated = (
         torch.randn(shape, generator=generator, dtype=reduced.kept.dtype, device=reduced.kept.device)
-        for shape in ((batch, wide, pairs), (batch, cameras, size, pairs))
+        for shape in ((batch, wide, pairs), (batch, count, size, pairs))
     )
     kept = torch.linalg.solve_triangular(reduced.kept.mT, kept, upper=True)
     eliminated = eliminated - reduced.whitened @ kept.unsqueeze(1)
-    eliminated = torch.linalg.solve_triangular(reduced.eliminated.mT, eliminated, upper=True)
-    poses = 6 * state.centre.shape[1]
-    pose = kept[:, :poses].mT.unflatten(-1, (-1, 6))
-    own = kept[:, poses:].mT if wide > poses else None
-    return Step(eliminated.permute(0, 3, 1, 2), pose, own)
+    eliminated = torch.linalg.solve_triangular(reduced.eliminated.mT, eliminated, upper=True).permute(0, 3, 1, 2)
+    own = 0 if state.object_offset is None else state.object_offset.shape[1]
+    blocks, border = kept.mT[..., : wide - own], kept.mT[..., wide - own :]
+    if factorization.cameras_first:
+        return Step(eliminated, blocks.unflatten(-1, (-1, POSE_PARAMETERS)), border if own else None)
+    return Step(blocks.unflatten(-1, (-1, PARAMETERS)), eliminated, border if own else None)
 
 
 def _follow(problem: Problem, state: State, factorization: Factorization, x: Step) -> Step:

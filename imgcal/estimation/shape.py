@@ -50,6 +50,7 @@ class ShapeEvidence:
     information: Array  # (3 N, 3 N) mm^-2, of the fiducials' coordinates, rig and poses marginalized
     pull: Array  # (3 N,) mm^-1, information times the displacement from `places` that the data ask for
     places: Array  # (N, 3) mm, where the object's file puts the fiducials, about their centroid
+    points: Array  # (N, 3) mm, where the fit has them, about the same point
     tolerance: Array  # (N,) mm, granted to them in this fit
     chi2: float  # of the fit, data and priors
     freedom: float  # its degrees of freedom
@@ -84,16 +85,16 @@ class ShapeEvidence:
     @property
     def scale_error(self) -> tuple[float, float]:
         """Relative scale of the object that explains the data best, less one, and its standard deviation."""
-        scale = self.places.ravel()
+        scale = self.points.ravel()
+        weight, found = float(scale @ self.information @ scale), float(scale @ self.pull)
+        # One camera, wherever it is, cannot know how large the object is.
+        if weight <= UNSURE * float(np.abs(self.information).max()) * float(scale @ scale):
+            return 0.0, np.inf
         if self.tolerance.any():
             vectors, displacement, precision = self._determined
             pull = vectors.T @ scale @ precision
             weight, found = float(pull @ (vectors.T @ scale)), float(pull @ displacement)
-        else:
-            weight, found = float(scale @ self.information @ scale), float(scale @ self.pull)
-        # One camera, wherever it is, cannot know how large the object is.
-        known = weight > UNSURE * float(np.abs(self.information).max()) * float(scale @ scale)
-        return (found / weight, weight**-0.5) if known else (0.0, np.inf)
+        return found / weight, weight**-0.5
 
     def bent_sigma(self, scatter: float = 1.0) -> float:
         """How sure it is that the object is bent, its scale left aside, in standard deviations of a normal variable.
@@ -112,7 +113,7 @@ class ShapeEvidence:
         _, displacement, precision = self._determined
         error, deviation = self.scale_error
         explained = float(displacement @ precision @ displacement) - (error / deviation) ** 2
-        mine, rest = len(displacement) - 1, self.freedom - len(displacement)
+        mine, rest = len(displacement) - int(np.isfinite(deviation)), self.freedom - len(displacement)
         if mine <= 0 or rest <= 0:
             return 0.0
         left = max(self.chi2 - explained, 1e-12 * self.chi2) / rest
@@ -128,15 +129,16 @@ def shape_evidence(problem: Problem, solution: Solution, loss: Loss) -> ShapeEvi
     unit = torch.ones(1, size, dtype=points.dtype, device=points.device)
     free = replace(problem, points=points, object_spread=unit)
     equations = linearize(free, replace(state, object_offset=torch.zeros_like(unit)), loss)
-    reduced = factorize(replace(equations, object=None), cameras_first=True).reduced
-    if equations.object is None or bool(reduced.failed.any()):
+    factorization = factorize(replace(equations, object=None))
+    reduced, own = factorization.reduced, equations.object
+    if own is None or bool(reduced.failed.any()):
         return None
-    own = equations.object
-    camera = torch.linalg.solve_triangular(reduced.eliminated, own.camera, upper=False)  # (1, C, 15, M)
-    pose = own.pose.flatten(1, 2) - (reduced.whitened.mT @ camera).sum(1)
-    pose = torch.linalg.solve_triangular(reduced.kept, pose, upper=False)  # (1, 6 S, M)
-    camera = camera.flatten(1, 2)
-    square = (own.own - camera.mT @ camera - pose.mT @ pose)[0, :-1, :-1]
+    first, second = (own.camera, own.pose) if factorization.cameras_first else (own.pose, own.camera)
+    eliminated = torch.linalg.solve_triangular(reduced.eliminated, first, upper=False)
+    kept = second.flatten(1, 2) - (reduced.whitened.mT @ eliminated).sum(1)
+    kept = torch.linalg.solve_triangular(reduced.kept, kept, upper=False)
+    eliminated = eliminated.flatten(1, 2)
+    square = (own.own - eliminated.mT @ eliminated - kept.mT @ kept)[0, :-1, :-1]
     square.diagonal().sub_(1)  # the prior of `unit`
     information, gradient = square.cpu().double().numpy(), own.gradient[0, :-1].cpu().double().numpy()
     places = problem.points.cpu().double().numpy()
@@ -149,6 +151,7 @@ def shape_evidence(problem: Problem, solution: Solution, loss: Loss) -> ShapeEvi
         information=information,
         pull=information @ displaced - gradient,
         places=places,
+        points=points.cpu().double().numpy(),
         tolerance=tolerance,
         chi2=2 * cost,
         freedom=2 * int((problem.root_weight > 0).sum()) - 6 * problem.uv.shape[1],

@@ -8,6 +8,7 @@ import torch
 
 from imgcal.errors import RefusedError
 from imgcal.formats import load_object, load_rig
+from imgcal.live import Recalibrator
 from imgcal.pipeline import calibrate, score
 from imgcal.rig import RigPrior
 from imgcal.simulation import simulate_truth, simulate_volume, true_detections
@@ -111,6 +112,60 @@ def test_a_right_object_stays_exact_and_costs_nothing() -> None:
         found = calibrate(table, rig, obj)
         assert found.problem.object_spread is None and found.shape == () and found.displaced == ()
         assert torch.equal(found.points_object, obj.points)
+
+
+def jumping_cube(bend, seed: int = 0):
+    """Unlabelled views of a cube that jumps: identity takes another of its 24 turns each time."""
+    rig, obj = replace(load_rig("O10"), prior=PRIOR), load_object("cube8")
+    true = replace(obj, points=bend(obj.points.clone()))
+    truth = simulate_truth(rig, true, 3, torch.Generator().manual_seed(seed), DRIFT)
+    table = true_detections(truth)
+    table.uv[:] += 0.05 * np.random.default_rng(seed).standard_normal(table.uv.shape)
+    table.sigma[:], table.fiducial[:] = 0.05, -1
+    return rig, obj, table
+
+
+def test_of_a_symmetric_object_nobody_says_which_fiducial_is_off() -> None:
+    rig, obj, table = jumping_cube(right)
+    found = calibrate(table, rig, obj)
+    assert found.identity == "ambiguous" and found.displaced == () and found.problem.object_spread is None
+    with pytest.raises(RefusedError, match="turned into itself"):
+        calibrate(table, rig, replace(obj, tolerance=torch.full((8,), 0.2, dtype=torch.float64)))
+    rig, obj, table = jumping_cube(moved(1, (0.5, 0, 0)))
+    with pytest.raises(RefusedError, match="turned into itself"):
+        calibrate(table, rig, obj)
+
+
+def test_a_running_rig_remembers_that_its_object_is_bent() -> None:
+    rig, obj, _, _, table = capture("O10", 4, moved(1, (1.0, 0, 0)))
+    with Recalibrator(rig, obj) as live:
+        for s in range(4):
+            one = replace(table.of_snapshots(s, s + 1), snapshot_names=("now",))
+            result = live.update(replace(one, fiducial=np.full(len(one), -1)))
+            assert [d.fiducial for d in result.displaced] == [1], s
+            assert result.rms < 0.06
+
+
+def test_tolerated_displacements_are_not_named() -> None:
+    named = 0
+    for seed in range(12):
+        generator = torch.Generator().manual_seed(seed)
+        rig, obj, _, _, table = capture(
+            "T4", 3, lambda p, g=generator: p + 0.2 * torch.randn(p.shape, generator=g, dtype=p.dtype), seed
+        )
+        found = calibrate(table, rig, replace(obj, tolerance=torch.full((8,), 0.2, dtype=torch.float64)))
+        named += len(found.displaced)
+    assert named == 0
+
+
+@pytest.mark.parametrize("labelled", [True, False])
+def test_a_rig_in_single_precision_gives_the_same(labelled: bool) -> None:
+    rig, obj, _, _, table = capture("T4", 3, right)
+    if not labelled:
+        table = replace(table, fiducial=np.full(len(table), -1))
+    found, single = calibrate(table, rig, obj), calibrate(table, rig.to(torch.float32), obj)
+    assert (found.rig.focal_length - single.rig.focal_length).abs().max() < 0.05
+    assert score(table, rig.to(torch.float32), obj).distances.isfinite().all()
 
 
 def test_granted_tolerances_make_the_errors_honest() -> None:

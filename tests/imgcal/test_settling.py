@@ -66,7 +66,7 @@ def hard(seed):
     return rig, obj, table
 
 
-@pytest.mark.parametrize("seed", [44, 213, 0, 1])  # the first two came to no rest within eight fits
+@pytest.mark.parametrize("seed", [44, 213])  # came to no rest within eight fits
 def test_a_calibration_reports_the_residuals_of_the_rig_that_it_returns(seed) -> None:
     rig, obj, table = hard(seed)
     try:
