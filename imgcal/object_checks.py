@@ -59,7 +59,7 @@ def object_offsets(fit: Estimate, shape: ShapeEvidence | None, obj: CalibrationO
         return ()
     found = offsets(fit, obj.points.double().numpy())
     learnt = fit.problem.object_spread[0, :-1:3].numpy()
-    granted = np.zeros(obj.fiducials) if obj.tolerance is None else obj.tolerance.double().numpy()
+    granted = obj.granted.double().numpy()
     for offset in found:
         if learnt[offset.fiducial] <= 1.01 * granted[offset.fiducial]:
             continue
@@ -95,7 +95,7 @@ def lost_fiducials(seen: NDArray[np.bool_], in_view: NDArray[np.bool_]) -> tuple
 
 def displaced(found: tuple[FiducialOffset, ...], obj: CalibrationObject) -> tuple[FiducialOffset, ...]:
     """Choose the fiducials that are farther from their places than chance and their tolerance explain."""
-    granted = np.zeros(obj.fiducials) if obj.tolerance is None else obj.tolerance.double().numpy()
+    granted = obj.granted.double().numpy()
     return tuple(
         offset
         for offset in found

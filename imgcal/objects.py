@@ -61,6 +61,11 @@ class CalibrationObject:
         """Tell whether the fiducials are where the object says, without any tolerance."""
         return self.scale_tolerance == 0 and (self.tolerance is None or not bool(self.tolerance.any()))
 
+    @property
+    def granted(self) -> Tensor:
+        """Tolerance of each fiducial, (N,) mm: zero where none is given."""
+        return torch.zeros_like(self.points[:, 0]) if self.tolerance is None else self.tolerance
+
     def taken_as_exact(self) -> CalibrationObject:
         """Return the object without its tolerances."""
         return self if self.exact else replace(self, tolerance=None, scale_tolerance=0.0)

@@ -60,7 +60,7 @@ class Calibration(Estimate):
     factory: CameraRig
     obj: CalibrationObject  # as it was given
     shape: tuple[FiducialOffset, ...] = ()  # where each fiducial is instead; empty = the object was taken as exact
-    scale_sigma: float | None = None  # relative: an error of the object's scale three times as large would be noticed
+    scale_sigma: float | None = None  # relative: an error of the object's scale four times as large would be noticed
     bent_sigma: float | None = None  # how sure it is that the object is not as estimated; None = not asked
     block_length: int = 0  # snapshots in the blocks whose scatter the covariance follows; 0 = that of the noise
     first_guess: FirstGuess | None = None  # what a network said, where one was asked

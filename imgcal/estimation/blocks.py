@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from imgcal.estimation.linearize import Problem, jacobian_at
+from imgcal.estimation.linearize import Problem, jacobian_at, robust_weight
 from imgcal.estimation.robust import Loss
 from imgcal.estimation.solver import Solution
 from imgcal.rig import PARAMETERS
@@ -55,8 +55,7 @@ def block_scatter(problem: Problem, solution: Solution, covariance: Tensor, loss
     if snapshots < LEAST_BLOCKS:
         return BlockScatter()
     at = jacobian_at(problem, solution.state)
-    _, slope = loss((at.residual * problem.root_weight.unsqueeze(-2)).square().sum(-2))
-    weight = (problem.root_weight.square() * slope)[..., None, None, :]
+    weight = robust_weight(problem, at, loss)[..., None, None, :]
     pull = -(at.by_rig[..., :PARAMETERS, :, :] * at.residual.unsqueeze(-3) * weight).sum((-2, -1))[0].flatten(1)
     influence = (pull - pull.mean(0)) @ covariance  # (S, 15 C)
     by_noise = covariance - covariance @ covariance  # the rest is the prior's

@@ -206,8 +206,7 @@ def _object_spread(obj: CalibrationObject, like: Tensor, count: int) -> Tensor |
     """Prior standard deviation of the object's own parameters, in the order of `State`: (B, M); None = exact."""
     if obj.exact:
         return None
-    tolerance = torch.zeros(obj.fiducials) if obj.tolerance is None else obj.tolerance
-    spread = torch.cat((tolerance.to(like).repeat_interleave(3), like.new_tensor([obj.scale_tolerance])))
+    spread = torch.cat((obj.granted.to(like).repeat_interleave(3), like.new_tensor([obj.scale_tolerance])))
     return spread.expand(count, -1)
 
 

@@ -230,6 +230,12 @@ class Jacobian:
     behind: Tensor  # (B,) bool: a seen fiducial lies behind its camera
 
 
+def robust_weight(problem: Problem, at: Jacobian, loss: Callable[[Tensor], tuple[Tensor, Tensor]]) -> Tensor:
+    """Weight of each squared residual (px^-2) in the normal equations: (B, S, C, N)."""
+    _, slope = loss((at.residual * problem.root_weight.unsqueeze(-2)).square().sum(-2))
+    return problem.root_weight.square() * slope
+
+
 def jacobian_at(problem: Problem, state: State) -> Jacobian:
     """Differentiate all pixels by what they depend on.
 

@@ -19,7 +19,7 @@ from scipy.stats import norm
 
 from imgcal.estimation.covariance import object_covariance
 from imgcal.estimation.estimate import Estimate
-from imgcal.estimation.linearize import Problem, State, jacobian_at, linearize, points_at
+from imgcal.estimation.linearize import Problem, State, jacobian_at, linearize, points_at, robust_weight
 from imgcal.estimation.robust import Loss
 from imgcal.estimation.solver import Solution, factorize
 from imgcal.rig import PARAMETERS
@@ -173,8 +173,7 @@ def pull_scatter(problem: Problem, state: State, loss: Loss) -> float:
         return 1.0
     at = jacobian_at(problem, state)
     assert at.by_fiducial is not None
-    _, slope = loss((at.residual * problem.root_weight.unsqueeze(-2)).square().sum(-2))
-    weight = (problem.root_weight.square() * slope)[0, :, :, None, None, :]
+    weight = robust_weight(problem, at, loss)[0, :, :, None, None, :]
     by_pose, by_fiducial = at.by_rig[0, ..., PARAMETERS:-1, :, :], at.by_fiducial[0]  # (S, C, 6 or 3, 2, N)
     pull = (by_fiducial * weight * at.residual[0].unsqueeze(-3)).sum((1, 3)).mT.flatten(1)  # (S, 3 N)
     # The poses have adapted to each snapshot: what they took is no longer in its pull.
