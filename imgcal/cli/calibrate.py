@@ -84,7 +84,7 @@ class Calibrate:
     """mm: how far each fiducial may be from its place in the object file (one standard deviation of each coordinate),
     where that has no column `tolerance`; 0 = exact, unless the images say otherwise"""
     object_scale_tolerance: float = 0.0
-    """how far all distances of the object may be off together, one standard deviation (0.01 is 1 %%); 0 = exact"""
+    """how far all distances of the object may be off together, one standard deviation (0.01 is 1 %); 0 = exact"""
     full_covariance: bool = False  #: write the whole covariance matrix to rig.yaml, too
     report: bool = True  #: write report.html
     reference: str | None = None
@@ -129,7 +129,7 @@ class Calibrate:
                 if outcome.shape:
                     save_object(outcome.object, out / "object.csv")
                 result = summary(outcome, seconds)
-                content = describe(outcome, rig, obj, frames, reference, seconds)
+                content = describe(outcome, covariance.std, rig, frames, reference, seconds)
             if self.report:
                 write_report(content, out / "report.html")
             write_text(out / "result.json", json.dumps(result, indent=2) + "\n")

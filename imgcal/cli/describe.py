@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import imgcal
-from imgcal.estimation import relative_covariance
 from imgcal.formats import Frame
 from imgcal.labelling import matched_to_rig
 from imgcal.objects import CalibrationObject
 from imgcal.observations import Detections
 from imgcal.pipeline import Calibration, rms_length
 from imgcal.report import ReportContent, SnapshotSummary, relative_prior_std
-from imgcal.rig import PARAMETERS, CameraRig
+from imgcal.rig import CameraRig
 from imgcal.transforms import RigidTransform
 
 Pictures = Mapping[str, Frame | None]
@@ -58,20 +57,19 @@ def describe_refusal(
 
 def describe(
     calibration: Calibration,
+    std: Tensor,
     rig: CameraRig,
-    obj: CalibrationObject,
     pictures: Pictures,
     reference: int,
     seconds: dict[str, float],
 ) -> ReportContent:
-    """Lay a calibration out blob by blob."""
+    """Lay a calibration out blob by blob; `std` (C, 15) is that of the parameters, relative to the reference camera."""
     labelled, detections = calibration.labelled, calibration.labelled.detections
     before, sigma = _by_blob(calibration, calibration.before.residual)
     after, _ = _by_blob(calibration, calibration.residual)
     used = np.isfinite(after).all(1)
     found = np.bincount(detections.snapshot, minlength=len(labelled.snapshots))
     taken = np.bincount(detections.snapshot[used], minlength=len(labelled.snapshots))
-    std = relative_covariance(calibration, reference).diagonal().clamp_min(0).sqrt().view(rig.cameras, PARAMETERS)
     seen = calibration.observations.seen
     return ReportContent(
         title=f"Recalibration of {rig.name}",
