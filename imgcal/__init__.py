@@ -9,34 +9,34 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from imgcal.accuracy import PredictedError, WorkingVolume, predicted_error
+    from imgcal.association.options import PipelineOptions
     from imgcal.detection import DetectionOptions, detect
     from imgcal.errors import InputError, RefusedError
     from imgcal.estimation import Estimate, EstimationOptions, estimate
-    from imgcal.formats import load_detections, load_object, load_rig, save_detections, save_rig
-    from imgcal.labelling import PipelineOptions
-    from imgcal.live import Recalibrator
-    from imgcal.objects import CalibrationObject
-    from imgcal.observations import Detections, Observations
-    from imgcal.pipeline import Calibration, calibrate, score
-    from imgcal.projection import Projection
-    from imgcal.rig import CameraRig, RigPrior
-    from imgcal.transforms import RigidTransform
+    from imgcal.estimation.predicted_error import PredictedError, WorkingVolume, predicted_error
+    from imgcal.geometry.projection import Projection
+    from imgcal.geometry.transforms import RigidTransform
+    from imgcal.io import load_detections, load_object, load_rig, save_detections, save_rig
+    from imgcal.online.recalibrator import Recalibrator
+    from imgcal.pipeline.calibration import Calibration, calibrate, score
+    from imgcal.types.calibration_object import CalibrationObject
+    from imgcal.types.observations import Detections, Observations
+    from imgcal.types.rig import CameraRig, RigPrior
 
 _NAMES = {
-    "imgcal.accuracy": ("PredictedError", "WorkingVolume", "predicted_error"),
+    "imgcal.estimation.predicted_error": ("PredictedError", "WorkingVolume", "predicted_error"),
     "imgcal.detection": ("DetectionOptions", "detect"),
     "imgcal.errors": ("InputError", "RefusedError"),
     "imgcal.estimation": ("Estimate", "EstimationOptions", "estimate"),
-    "imgcal.formats": ("load_detections", "load_object", "load_rig", "save_detections", "save_rig"),
-    "imgcal.labelling": ("PipelineOptions",),
-    "imgcal.live": ("Recalibrator",),
-    "imgcal.objects": ("CalibrationObject",),
-    "imgcal.observations": ("Detections", "Observations"),
-    "imgcal.pipeline": ("Calibration", "calibrate", "score"),
-    "imgcal.projection": ("Projection",),
-    "imgcal.rig": ("CameraRig", "RigPrior"),
-    "imgcal.transforms": ("RigidTransform",),
+    "imgcal.io": ("load_detections", "load_object", "load_rig", "save_detections", "save_rig"),
+    "imgcal.association.options": ("PipelineOptions",),
+    "imgcal.online.recalibrator": ("Recalibrator",),
+    "imgcal.types.calibration_object": ("CalibrationObject",),
+    "imgcal.types.observations": ("Detections", "Observations"),
+    "imgcal.pipeline.calibration": ("Calibration", "calibrate", "score"),
+    "imgcal.geometry.projection": ("Projection",),
+    "imgcal.types.rig": ("CameraRig", "RigPrior"),
+    "imgcal.geometry.transforms": ("RigidTransform",),
 }
 _HOMES = {name: module for module, names in _NAMES.items() for name in names}
 

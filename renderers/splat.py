@@ -6,8 +6,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from renderers import adding, adding_compiled
-from renderers.adding import Splats, profile
+from renderers import additive_splatting, additive_splatting_cpu
+from renderers.additive_splatting import Splats, profile
 from renderers.compositing import Canvas, composite_windows, window_starts
 
 # A window of 5 standard deviations cuts the profile off at 4e-6 of its peak.
@@ -93,7 +93,7 @@ def splat(
 
 def _add(splats: Splats, shape: tuple[int, ...], out: Tensor | None) -> Tensor:
     """Sum the splats in any order."""
-    added = adding_compiled.added if splats.uv.device.type == "cpu" else adding.added
+    added = additive_splatting_cpu.added if splats.uv.device.type == "cpu" else additive_splatting.added
     image_size = (shape[-2], shape[-1])
     if out is None:
         return added(splats, image_size).view(shape)

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from imgcal.formats import load_object, load_rig
-from imgcal.objects import CalibrationObject
-from imgcal.rig import CameraRig
+from imgcal.io import load_object, load_rig
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.rig import CameraRig
 
 
 @pytest.fixture(scope="session")

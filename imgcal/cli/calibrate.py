@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import torch
 import tyro
 
-from imgcal import limits
+from imgcal.association.options import PipelineOptions
 from imgcal.cli.common import (
     StartPose,
     check_folder,
@@ -29,8 +29,7 @@ from imgcal.cli.describe import describe, describe_refusal
 from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import relative_covariance
-from imgcal.first_guess import load_guesser
-from imgcal.formats import (
+from imgcal.io import (
     RigCovariance,
     load_object,
     load_rig,
@@ -41,13 +40,14 @@ from imgcal.formats import (
     save_rig,
     write_text,
 )
-from imgcal.labelling import PipelineOptions
-from imgcal.moved import MovedError
-from imgcal.objects import CalibrationObject
-from imgcal.observations import Detections
-from imgcal.pipeline import Calibration, calibrate, rms_length
+from imgcal.pipeline.calibration import Calibration, calibrate, rms_length
+from imgcal.pipeline.initialization import load_guesser
 from imgcal.report import write_report
-from imgcal.rig import PARAMETER_NAMES, CameraRig
+from imgcal.types import limits
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.moved_camera import MovedError
+from imgcal.types.observations import Detections
+from imgcal.types.rig import PARAMETER_NAMES, CameraRig
 
 WRITTEN = ("report.html", "rig.yaml", "object.csv", "result.json")
 

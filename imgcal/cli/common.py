@@ -19,12 +19,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from imgcal.detection import Blobs, DetectionOptions, detect_snapshot, without_dim
 from imgcal.errors import InputError
-from imgcal.formats import Capture, Frame
+from imgcal.geometry.rotations import rotation_from_vector
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.io import Capture, Frame
 from imgcal.messages import listed, shortened
-from imgcal.observations import Detections
-from imgcal.rig import CameraRig
-from imgcal.rotations import rotation_from_vector
-from imgcal.transforms import RigidTransform
+from imgcal.types.observations import Detections
+from imgcal.types.rig import CameraRig
 
 Item = TypeVar("Item")
 

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from imgcal.observations import Detections
-from imgcal.pipeline import Calibration
-from imgcal.rig import CameraRig
-from imgcal.tally import DOUBTFUL, Tally
+from imgcal.pipeline.calibration import Calibration
+from imgcal.pipeline.tally import DOUBTFUL, Tally
+from imgcal.types.observations import Detections
+from imgcal.types.rig import CameraRig
 
 
 def counts_by_camera(counts: Tally, camera: int) -> dict[str, int]:

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import imgcal
-from imgcal.formats import Frame
-from imgcal.labelling import matched_to_rig
-from imgcal.objects import CalibrationObject
-from imgcal.observations import Detections
-from imgcal.pipeline import Calibration, rms_length
+from imgcal.association.series import matched_to_rig
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.io import Frame
+from imgcal.pipeline.calibration import Calibration, rms_length
 from imgcal.report import ReportContent, SnapshotSummary, relative_prior_std
-from imgcal.rig import CameraRig
-from imgcal.transforms import RigidTransform
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.observations import Detections
+from imgcal.types.rig import CameraRig
 
 Pictures = Mapping[str, Frame | None]
 

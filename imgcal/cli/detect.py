@@ -11,7 +11,7 @@ import tyro
 
 from imgcal.cli.common import read_detections
 from imgcal.detection import DetectionOptions
-from imgcal.formats import load_rig, open_capture, save_detections
+from imgcal.io import load_rig, open_capture, save_detections
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from imgcal.cli.common import check_folder
 from imgcal.errors import InputError
-from imgcal.formats import load_object, load_rig, publishing
+from imgcal.io import load_object, load_rig, publishing
 
 if TYPE_CHECKING:
     from imgcal.evaluation import Conditions, Method, Protocol
@@ -130,7 +130,7 @@ def _load(paths: tuple[Path, ...], setting: Setting) -> list[Model]:
 def _conditions(models: list[Model], setting: Setting) -> Conditions:
     """What is asked for, and for the rest what the first model was trained for."""
     from imgcal.evaluation import Conditions, Corruption
-    from imgcal.synthesis import PoseRange, RelativeDrift
+    from imgcal.synthesis.rigs import PoseRange, RelativeDrift
 
     if models:
         known = models[0].conditions

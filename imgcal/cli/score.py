@@ -13,10 +13,10 @@ import tyro
 
 from imgcal.cli.common import progress, read_detections
 from imgcal.detection import DetectionOptions
-from imgcal.formats import load_object, load_rig, open_input
-from imgcal.pipeline import Score as Scored
-from imgcal.pipeline import rms_length, score
-from imgcal.rig import CameraRig
+from imgcal.io import load_object, load_rig, open_input
+from imgcal.pipeline.calibration import Score as Scored
+from imgcal.pipeline.calibration import rms_length, score
+from imgcal.types.rig import CameraRig
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,8 @@ import torch
 
 from imgcal.cli.common import check_folder, progress
 from imgcal.errors import InputError
-from imgcal.formats import (
+from imgcal.geometry.rotations import vector_from_rotation
+from imgcal.io import (
     load_object,
     load_rig,
     publishing,
@@ -23,13 +24,12 @@ from imgcal.formats import (
     write_frame,
     write_text,
 )
-from imgcal.limits import FIDUCIAL_RADIUS
 from imgcal.messages import shortened
-from imgcal.objects import CalibrationObject
-from imgcal.rig import CameraRig
-from imgcal.rotations import vector_from_rotation
-from imgcal.simulation import FrameModel, Truth, simulate_frames, simulate_truth, true_detections
-from imgcal.synthesis import Drift, PhysicalDrift, PoseRange, RelativeDrift
+from imgcal.synthesis.captures import FrameModel, Truth, simulate_frames, simulate_truth, true_detections
+from imgcal.synthesis.rigs import Drift, PhysicalDrift, PoseRange, RelativeDrift
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.limits import FIDUCIAL_RADIUS
+from imgcal.types.rig import CameraRig
 from renderers import ClutterModel, SensorModel
 
 WRITTEN = ("capture.yaml", "rig.yaml", "object.csv", "truth", "frames")

@@ -10,12 +10,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from imgcal.detection.finding import outline, screen
-from imgcal.detection.measuring import Blobs, measure
+from imgcal.detection.candidates import outline, screen
+from imgcal.detection.centroids import Blobs, measure
 from imgcal.detection.options import DetectionOptions, Frame, checked_frame, checked_mask, full_scale
 from imgcal.detection.populations import usable, usual_size, without_dim
 from imgcal.errors import InputError
-from imgcal.observations import BlobFlag, Detections
+from imgcal.types.observations import BlobFlag, Detections
 
 LARGER = 32.0  # px, radius up to which blobs show when they are looked for with the usual limit
 LARGEST = 48.0  # px, radius that the windows hold

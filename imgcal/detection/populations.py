@@ -12,9 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from imgcal.detection.measuring import Blobs
+from imgcal.detection.centroids import Blobs
 from imgcal.detection.options import DetectionOptions
-from imgcal.observations import UNUSABLE
+from imgcal.types.observations import UNUSABLE
 
 GAP = 3.0  # ratio of neighbouring contrasts between two populations
 DIM = 0.08  # of full scale: the dim population is below, the bright one above

@@ -10,7 +10,7 @@ from imgcal.estimation.covariance import (
     relative_difference,
 )
 from imgcal.estimation.estimate import Estimate, EstimationOptions, estimate
-from imgcal.estimation.pose import initial_pose
+from imgcal.estimation.initial_pose import initial_pose
 
 __all__ = [
     "Estimate",

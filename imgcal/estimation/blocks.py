@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from imgcal.estimation.levenberg_marquardt import Solution
 from imgcal.estimation.linearize import Problem, jacobian_at, robust_weight
-from imgcal.estimation.robust import Loss
-from imgcal.estimation.solver import Solution
-from imgcal.rig import PARAMETERS
+from imgcal.estimation.robust_losses import Loss
+from imgcal.types.rig import PARAMETERS
 
 LEAST_BLOCKS = 6
 """Blocks whose scatter is trusted."""

@@ -20,11 +20,11 @@ from torch import Tensor
 from imgcal.errors import RefusedError
 from imgcal.estimation.curvature import curvature_covariance
 from imgcal.estimation.estimate import Estimate
+from imgcal.estimation.levenberg_marquardt import Solution, factorize
 from imgcal.estimation.linearize import POSE_PARAMETERS, points_at
-from imgcal.estimation.solver import Solution, factorize
-from imgcal.rig import PARAMETERS, CameraRig
-from imgcal.rotations import cross_matrix, left_jacobian
-from imgcal.transforms import RigidTransform
+from imgcal.geometry.rotations import cross_matrix, left_jacobian
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.types.rig import PARAMETERS, CameraRig
 from renderers.compiling import njit
 
 UNDETERMINED = "covariance: the observations do not determine the object's pose in every snapshot"
@@ -274,7 +274,7 @@ def object_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
     """Joint covariance of the estimated fiducials' coordinates: (*B, 3 N, 3 N) mm^2, in the object's frame.
 
     Zero where the object was given as exact. A common motion of all fiducials is known only as well as their tolerances
-    know it; see `imgcal.estimation.shape` for what does not depend on that.
+    know it; see `imgcal.estimation.object_shape` for what does not depend on that.
 
     Args:
         estimate: the estimate.

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from imgcal.estimation.estimate import Estimate
+from imgcal.estimation.levenberg_marquardt import Factorization, factorize, taken
 from imgcal.estimation.linearize import (
     POSE_PARAMETERS,
     Problem,
@@ -35,9 +36,7 @@ from imgcal.estimation.linearize import (
     rig_at,
     with_scale,
 )
-from imgcal.estimation.solver import Factorization, factorize, taken
-from imgcal.projection_compiled import project
-from imgcal.rig import PARAMETERS, CameraRig
+from imgcal.types.rig import PARAMETERS, CameraRig
 
 MOST_PAIRS, LEAST_PAIRS = 256, 64
 """Drawn for one snapshot; for many, where the posterior is narrow and hardly curved."""
@@ -130,6 +129,6 @@ def _residual(problem: Problem, state: State, step: Step, sign: int) -> Tensor:
     points = pose_at(many, there).apply((points_at(many, there) + problem.centroid).unsqueeze(1))  # (B K, S, N, 3)
     snapshots, fiducials = points.shape[1:3]
     radius = None if problem.radius_squared is None else problem.radius_squared.sqrt().repeat(snapshots)
-    uv = project(rig_at(many, there.offset), points.flatten(1, 2), radius).uv  # (B K, C, S N, 2)
+    uv = rig_at(many, there.offset).project_values(points.flatten(1, 2), radius).uv  # (B K, C, S N, 2)
     uv = uv.unflatten(2, (snapshots, fiducials)).permute(0, 2, 1, 4, 3).unflatten(0, (batch, pairs))
     return uv - problem.uv.unsqueeze(1)

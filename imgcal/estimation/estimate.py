@@ -10,15 +10,15 @@ import torch
 from torch import Tensor
 
 from imgcal.errors import InputError
-from imgcal.estimation import fused, implicit, solver
+from imgcal.estimation import implicit, levenberg_marquardt, lm_cpu
+from imgcal.estimation.initial_pose import initial_pose
 from imgcal.estimation.linearize import Problem, State, points_at, pose_at, rig_at
-from imgcal.estimation.pose import initial_pose
-from imgcal.estimation.robust import LOSSES, Loss
-from imgcal.limits import check_observations
-from imgcal.objects import CalibrationObject
-from imgcal.observations import Observations
-from imgcal.rig import PARAMETERS, CameraRig, RigPrior
-from imgcal.transforms import RigidTransform
+from imgcal.estimation.robust_losses import LOSSES, Loss
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.limits import check_observations
+from imgcal.types.observations import Observations
+from imgcal.types.rig import PARAMETERS, CameraRig, RigPrior
 
 PATIENCE = 15
 """Steps after which a rig begins again; from factory values within their prior, 6 are usual."""
@@ -50,7 +50,7 @@ class Estimate:
     iterations: int
     points_object: Tensor  # (*B, N, 3) mm, the fiducials as estimated; as given where the object is exact
     problem: Problem  # (B,) flattened, as solved
-    solution: solver.Solution  # (B,) flattened: state and normal equations at the minimum
+    solution: levenberg_marquardt.Solution  # (B,) flattened: state and normal equations at the minimum
     inflation: float = field(default=1.0, kw_only=True)
     """Factor on what noise adds to standard deviations, where blocks of snapshots scatter more: `block_scatter`."""
 
@@ -114,7 +114,7 @@ def make_loss(options: EstimationOptions) -> Loss:
     return loss if options.loss == "squared" else partial(loss, threshold=options.threshold)  # type: ignore[call-arg]
 
 
-def minimize(problem: Problem, start: State, options: EstimationOptions) -> solver.Solution:
+def minimize(problem: Problem, start: State, options: EstimationOptions) -> levenberg_marquardt.Solution:
     """Find the minimum from a start, on the CPU by the compiled solver; no gradient flows through it.
 
     Precise observations make narrow, winding valleys of the cost. A rig that is not through after `PATIENCE` steps
@@ -127,32 +127,36 @@ def minimize(problem: Problem, start: State, options: EstimationOptions) -> solv
         return first
     slow = problem.select(rows)
     coarse = replace(options, tolerance=COARSE_TOLERANCE, max_iterations=min(options.max_iterations, 2 * PATIENCE))
-    state, spent = solver.taken(start, rows), first.iterations
+    state, spent = levenberg_marquardt.taken(start, rows), first.iterations
     for factor in COARSER:
         stage = _solve(replace(slow, root_weight=slow.root_weight / factor), state, coarse)
         state, spent = stage.state, spent + stage.iterations
     second = _solve(slow, state, options)
     spent += second.iterations
     if not bool((second.converged & (second.equations.cost <= first.equations.cost[rows])).all()):
-        further = _solve(slow, solver.taken(first.state, rows), replace(options, max_iterations=left))
+        further = _solve(slow, levenberg_marquardt.taken(first.state, rows), replace(options, max_iterations=left))
         spent += further.iterations
-        second = solver.better(second, further)
-    return solver.replaced(first, rows, second, spent)
+        second = levenberg_marquardt.better(second, further)
+    return levenberg_marquardt.replaced(first, rows, second, spent)
 
 
-def _solve(problem: Problem, start: State, options: EstimationOptions) -> solver.Solution:
+def _solve(problem: Problem, start: State, options: EstimationOptions) -> levenberg_marquardt.Solution:
     with torch.no_grad():
         if problem.uv.device.type == "cpu":
             limits = (options.loss, options.threshold, options.max_iterations, options.tolerance)
-            return fused.minimize(problem, start, *limits)
-        return solver.minimize(problem, start, make_loss(options), options.max_iterations, options.tolerance)
+            return lm_cpu.minimize(problem, start, *limits)
+        return levenberg_marquardt.minimize(
+            problem, start, make_loss(options), options.max_iterations, options.tolerance
+        )
 
 
-def conclude(problem: Problem, solution: solver.Solution, state: State, batch: torch.Size = torch.Size()) -> Estimate:
+def conclude(
+    problem: Problem, solution: levenberg_marquardt.Solution, state: State, batch: torch.Size = torch.Size()
+) -> Estimate:
     """Say what a solution means; `state` is the solution's, possibly with a gradient."""
     seen = problem.root_weight > 0
     plain = state is solution.state and state.offset.device.type == "cpu"  # no gradient to carry
-    rigs, poses = (fused.rig_at if plain else rig_at)(problem, state.offset), pose_at(problem, state)
+    rigs, poses = (lm_cpu.rig_at if plain else rig_at)(problem, state.offset), pose_at(problem, state)
     residual = torch.where(seen.unsqueeze(-2), solution.equations.residual, 0.0).mT
     dof = 2 * seen.flatten(1).sum(1) - 6 * seen.shape[1]
     return Estimate(

@@ -13,9 +13,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from imgcal.estimation.levenberg_marquardt import Solution, factorize
 from imgcal.estimation.linearize import Problem, State, Step, moved, points_at, pose_at, rig_at
-from imgcal.estimation.robust import Loss
-from imgcal.estimation.solver import Solution, factorize
+from imgcal.estimation.robust_losses import Loss
 
 
 def attach_gradient(problem: Problem, solution: Solution, loss: Loss) -> State:

@@ -19,10 +19,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from imgcal.projection import NEAREST_DEPTH
-from imgcal.rig import PARAMETERS, CameraRig
-from imgcal.rotations import left_jacobian, rotation_from_vector
-from imgcal.transforms import RigidTransform
+from imgcal.geometry.projection import NEAREST_DEPTH
+from imgcal.geometry.rotations import left_jacobian, rotation_from_vector
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.types.rig import PARAMETERS, CameraRig
 
 POSE_PARAMETERS = 6
 

@@ -15,10 +15,10 @@ from torch import Tensor
 from imgcal.estimation import initial_pose
 from imgcal.estimation.estimate import make_problem, make_start
 from imgcal.estimation.linearize import Problem, State, moved, pose_at, rig_at
-from imgcal.networks.prediction import Prediction
-from imgcal.objects import CalibrationObject
-from imgcal.observations import Observations
-from imgcal.rig import PARAMETERS, CameraRig, pack21, unpack21
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.observations import Observations
+from imgcal.types.prediction import Prediction
+from imgcal.types.rig import PARAMETERS, CameraRig, pack21, unpack21
 
 Array = NDArray[np.float64]
 Intrinsics = tuple[Array, Array]  # camera matrix (3, 3), distortion (5,)

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from imgcal.estimation import Estimate, relative_covariance, relative_difference
 from imgcal.estimation.linearize import POSE_PARAMETERS, NormalEquations, linearize
-from imgcal.estimation.robust import squared
-from imgcal.networks.prediction import Prediction
-from imgcal.objects import CalibrationObject
-from imgcal.rig import PARAMETERS, CameraRig
+from imgcal.estimation.robust_losses import squared
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.prediction import Prediction
+from imgcal.types.rig import PARAMETERS, CameraRig
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from imgcal.errors import InputError
 from imgcal.evaluation.methods import Method, network_method
 from imgcal.evaluation.protocol import Conditions
 from imgcal.evaluation.report import Facts
-from imgcal.objects import CalibrationObject
-from imgcal.rig import CameraRig
 from imgcal.training.checkpoint import Checkpoint, load_checkpoint
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.rig import CameraRig
 
 METRICS = "metrics.jsonl"
 

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from imgcal.evaluation.protocol import REFERENCE, Scores
 from imgcal.evaluation.sweep import AXES, Sweep
-from imgcal.formats.atomic import write_bytes
+from imgcal.io.atomic import write_bytes
 
 if TYPE_CHECKING:
     from imgcal.evaluation.report import Report

@@ -10,18 +10,18 @@ from typing import TypedDict
 import torch
 from torch import Tensor
 
-from imgcal.corruption import Corrupted, Corruption
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import Estimate
 from imgcal.evaluation.methods import Given, Method
 from imgcal.evaluation.metrics import KINDS, Errors, concatenate, cramer_rao, errors
 from imgcal.messages import shortened
-from imgcal.networks.prediction import Prediction, Views
-from imgcal.objects import CalibrationObject
 from imgcal.refinement import as_prediction, refine_points
-from imgcal.refinement.robust import SQUARED
-from imgcal.rig import CameraRig
-from imgcal.synthesis import Drift, PoseRange, RelativeDrift, synthesize
+from imgcal.refinement.graduated_non_convexity import SQUARED
+from imgcal.synthesis.corruption import Corrupted, Corruption
+from imgcal.synthesis.rigs import Drift, PoseRange, RelativeDrift, synthesize
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.prediction import Prediction, Views
+from imgcal.types.rig import CameraRig
 
 REFERENCE = "MAP, true inliers"
 LEAST_FIDUCIALS = 3  # different ones that a pose needs

@@ -16,8 +16,8 @@ from rich.table import Table as RichTable
 from imgcal.evaluation.latency import Latency
 from imgcal.evaluation.protocol import REFERENCE, Conditions, Evaluation, Row, Scores
 from imgcal.evaluation.sweep import AXES, Sweep
-from imgcal.formats import write_text
-from imgcal.synthesis import RelativeDrift
+from imgcal.io import write_text
+from imgcal.synthesis.rigs import RelativeDrift
 
 FORMAT = "imgcal-evaluation/1"
 RESULT, TABLES = "evaluation.json", "evaluation.md"

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from imgcal.rig import CameraRig
-from imgcal.rotations import rotation_from_vector
-from imgcal.transforms import RigidTransform
-from imgcal.uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian
+from imgcal.estimation.rig_uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian
+from imgcal.geometry.rotations import rotation_from_vector
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.types.rig import CameraRig
 
 STEPS = 6
 """Of Gauss-Newton, each of which gains several digits here."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from imgcal.networks.config import PRESETS, Images, NetworkConfig, PaperImages, PaperPoints
-from imgcal.networks.decode import Decoder
-from imgcal.networks.prediction import Prediction, Views
-from imgcal.objects import CalibrationObject
-from imgcal.rig import CameraRig
+from imgcal.networks.parameterization import Decoder
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.prediction import Prediction, Views
+from imgcal.types.rig import CameraRig
 
 __all__ = ["PRESETS", "NetworkConfig", "Prediction", "Views", "build"]
 

@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field, model_validator
 
-from imgcal.formats.names import nearest
-from imgcal.formats.yaml_file import StrictModel
+from imgcal.io.names import nearest
+from imgcal.io.yaml_file import StrictModel
 from imgcal.messages import shortened
 from imgcal.networks.backbone_options import MOST_WEIGHTS, check_options
 

@@ -10,12 +10,12 @@ from torch.nn import functional
 
 from imgcal.networks.backbone import Backbone
 from imgcal.networks.config import Images, PaperImages
-from imgcal.networks.decode import Decoder
+from imgcal.networks.parameterization import Decoder
 from imgcal.networks.points import PaperHeads
-from imgcal.networks.positions import soft_positions
-from imgcal.networks.prediction import Prediction, Views
-from imgcal.networks.rendering import ImageOptions
-from imgcal.networks.trunk import Trunk
+from imgcal.networks.refiner import Trunk
+from imgcal.networks.soft_positions import soft_positions
+from imgcal.synthesis.colour_coding import ImageOptions
+from imgcal.types.prediction import Prediction, Views
 
 
 class PaperImageNetwork(nn.Module):

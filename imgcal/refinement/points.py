@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from imgcal.estimation import Estimate, EstimationOptions, estimate
-from imgcal.networks.prediction import Prediction, Views
-from imgcal.objects import CalibrationObject
-from imgcal.observations import Observations
-from imgcal.rig import CameraRig
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.observations import Observations
+from imgcal.types.prediction import Prediction, Views
+from imgcal.types.rig import CameraRig
 
 # From a start this near, gross outliers (swapped labels, false blobs) are best given up at once.
 ROBUST = EstimationOptions(loss="cauchy")

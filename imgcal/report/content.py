@@ -12,11 +12,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imgcal.accuracy import PredictedError
 from imgcal.estimation.covariance import relative_difference, relative_jacobian
-from imgcal.observations import Detections
-from imgcal.rig import PARAMETERS, CameraRig, RigPrior
-from imgcal.transforms import RigidTransform
+from imgcal.estimation.predicted_error import PredictedError
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.types.observations import Detections
+from imgcal.types.rig import PARAMETERS, CameraRig, RigPrior
 
 Array = NDArray[np.float64]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from imgcal.pipeline.tally import DOUBTFUL
 from imgcal.report.content import ReportContent
-from imgcal.tally import DOUBTFUL
 
 CROWDED = 1.0
 """Blobs that belong to nothing, in parts of those that are used, from which on it is said."""

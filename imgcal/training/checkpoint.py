@@ -14,17 +14,17 @@ from torch import Tensor, nn
 
 from imgcal import networks
 from imgcal.errors import InputError
-from imgcal.formats import load_object, load_rig, save_object, save_rig
-from imgcal.formats.json_text import read_json
-from imgcal.formats.names import title_of
-from imgcal.formats.safetensors_file import read_tensors, read_texts, write_tensors
-from imgcal.formats.yaml_file import validated
+from imgcal.io import load_object, load_rig, save_object, save_rig
+from imgcal.io.json_text import read_json
+from imgcal.io.names import title_of
+from imgcal.io.safetensors_file import read_tensors, read_texts, write_tensors
+from imgcal.io.yaml_file import validated
 from imgcal.messages import shortened
-from imgcal.networks.rendering import ImageOptions
-from imgcal.networks.trunk import Trunk
-from imgcal.objects import CalibrationObject
-from imgcal.rig import CameraRig
+from imgcal.networks.refiner import Trunk
+from imgcal.synthesis.colour_coding import ImageOptions
 from imgcal.training.experiment import Experiment
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.rig import CameraRig
 
 FORMAT = "imgcal-network/1"
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from imgcal.corruption import Corruption
-from imgcal.networks.prediction import Prediction, Views
-from imgcal.networks.rendering import ImageOptions, render_views
-from imgcal.objects import CalibrationObject
-from imgcal.rig import CameraRig
-from imgcal.synthesis import Drift, PoseRange, Snapshots, synthesize
+from imgcal.synthesis.colour_coding import ImageOptions, render_views
+from imgcal.synthesis.corruption import Corruption
+from imgcal.synthesis.rigs import Drift, PoseRange, Snapshots, synthesize
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.prediction import Prediction, Views
+from imgcal.types.rig import CameraRig
 
 
 @dataclass(frozen=True)

@@ -13,19 +13,17 @@ from accelerate import Accelerator
 from accelerate.utils import broadcast
 from torch import Tensor, nn
 
-from imgcal.corruption import Corruption
 from imgcal.errors import InputError, RefusedError
-from imgcal.formats.safetensors_file import write_tensors
-from imgcal.losses import Loss, compound, project_fiducials, reprojection_re
-from imgcal.networks.rendering import ImageOptions
-from imgcal.objects import CalibrationObject
-from imgcal.rig import CameraRig
-from imgcal.synthesis import Snapshots
+from imgcal.io.safetensors_file import write_tensors
+from imgcal.synthesis.colour_coding import ImageOptions
+from imgcal.synthesis.corruption import Corruption
+from imgcal.synthesis.rigs import Snapshots
 from imgcal.training.checkpoint import build_network, save_network, warm_start, without_pretrained
 from imgcal.training.data import Batch, Source, object_to
 from imgcal.training.end_to_end import refined_loss
 from imgcal.training.experiment import Experiment, save_experiment
 from imgcal.training.log import Log
+from imgcal.training.losses import Loss, compound, project_fiducials, reprojection_re
 from imgcal.training.optimization import (
     Schedule,
     make_average,
@@ -36,6 +34,8 @@ from imgcal.training.optimization import (
     update_average,
 )
 from imgcal.training.state import State, load_state, random_states, restore_random_states, save_state
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.rig import CameraRig
 
 RESULT, STATE, RESOLVED, BAD_BATCH = "model.safetensors", "state.safetensors", "resolved.yaml", "bad_batch.safetensors"
 

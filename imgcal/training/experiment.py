@@ -10,15 +10,15 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from imgcal.errors import InputError
-from imgcal.formats import load_object, load_rig, write_text
-from imgcal.formats.names import find_file
-from imgcal.formats.yaml_file import Flow, StrictModel, parse_yaml, read_yaml, validated, yaml_text
-from imgcal.losses import LossConfig
+from imgcal.io import load_object, load_rig, write_text
+from imgcal.io.names import find_file
+from imgcal.io.yaml_file import Flow, StrictModel, parse_yaml, read_yaml, validated, yaml_text
 from imgcal.messages import quoted
 from imgcal.networks import NetworkConfig
-from imgcal.objects import CalibrationObject
-from imgcal.rig import CameraRig
-from imgcal.synthesis import Drift, PhysicalDrift, PoseRange, RelativeDrift
+from imgcal.synthesis.rigs import Drift, PhysicalDrift, PoseRange, RelativeDrift
+from imgcal.training.losses import LossConfig
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.rig import CameraRig
 
 FORMAT = "imgcal-experiment/1"
 
@@ -97,7 +97,7 @@ class ImagesConfig(StrictModel):
 
 
 class CorruptionConfig(StrictModel):
-    """What goes wrong in the views during training: `imgcal.corruption.Corruption`."""
+    """What goes wrong in the views during training: `imgcal.synthesis.corruption.Corruption`."""
 
     noise: Spread = 0.0  # pixels, one standard deviation of each axis
     missing: Fraction = 0.0  # share of the fiducials that is not seen

@@ -19,7 +19,7 @@ from typing import Annotated, Any, Protocol
 import tyro
 
 from imgcal.errors import InputError
-from imgcal.formats import write_text
+from imgcal.io import write_text
 from scripts.benchmarks.effort import Effort
 from scripts.output import ROOT, command, make_folder, markdown, read_json, replaced, surroundings, write_json
 

@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from imgcal.formats import load_object, load_rig
-from imgcal.objects import CalibrationObject
-from imgcal.observations import Detections
-from imgcal.rig import CameraRig, RigPrior
-from imgcal.simulation import Truth, simulate_truth, simulate_volume, true_detections
-from imgcal.synthesis import PhysicalDrift
+from imgcal.io import load_object, load_rig
+from imgcal.synthesis.captures import Truth, simulate_truth, simulate_volume, true_detections
+from imgcal.synthesis.rigs import PhysicalDrift
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.observations import Detections
+from imgcal.types.rig import CameraRig, RigPrior
 
 NOISE = 0.1  # px
 

@@ -15,17 +15,18 @@ import torch
 from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
+from imgcal.association import bootstrap, track
+from imgcal.association.options import PipelineOptions
+from imgcal.association.series import Labelled, SnapshotIdentity
 from imgcal.detection import DetectionOptions, detect_snapshot
-from imgcal.formats import load_object, load_rig
-from imgcal.identity import bootstrap, track
-from imgcal.labelling import Labelled, PipelineOptions, SnapshotIdentity
-from imgcal.live import Recalibrator
-from imgcal.objects import CalibrationObject
-from imgcal.observations import Detections
-from imgcal.pipeline import calibrate, fit_labelled
-from imgcal.rig import CameraRig, RigPrior
-from imgcal.simulation import FrameModel, Truth, simulate_frames, simulate_truth, true_detections
-from imgcal.synthesis import PhysicalDrift
+from imgcal.io import load_object, load_rig
+from imgcal.online.recalibrator import Recalibrator
+from imgcal.pipeline.calibration import calibrate, fit_labelled
+from imgcal.synthesis.captures import FrameModel, Truth, simulate_frames, simulate_truth, true_detections
+from imgcal.synthesis.rigs import PhysicalDrift
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.observations import Detections
+from imgcal.types.rig import CameraRig, RigPrior
 from renderers import ClutterModel
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.peers import opencv_live

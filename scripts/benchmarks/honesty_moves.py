@@ -17,11 +17,11 @@ import torch
 import tyro
 
 from imgcal import PipelineOptions, RefusedError, calibrate
-from imgcal.formats import write_text
-from imgcal.labelling import label
-from imgcal.moved import MovedError
-from imgcal.observations import Detections
-from imgcal.steadiness import moves_of
+from imgcal.association.series import label
+from imgcal.io import write_text
+from imgcal.pipeline.steadiness import moves_of
+from imgcal.types.moved_camera import MovedError
+from imgcal.types.observations import Detections
 from scripts.benchmarks import camera_faults as faults
 from scripts.output import ROOT, command, markdown, read_json, replaced, surroundings, write_json
 

@@ -10,11 +10,11 @@ from typing import Any
 
 import torch
 
+from imgcal.io.resources import data_path
 from imgcal.networks import NetworkConfig, Views, build
-from imgcal.networks.rendering import render_views
 from imgcal.refinement import refine_images, refine_points
-from imgcal.resources import data_path
-from imgcal.synthesis import synthesize
+from imgcal.synthesis.colour_coding import render_views
+from imgcal.synthesis.rigs import synthesize
 from imgcal.training.checkpoint import Checkpoint, load_checkpoint
 from imgcal.training.engine import prepare, train_step
 from imgcal.training.experiment import load_experiment

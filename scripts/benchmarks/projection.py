@@ -14,14 +14,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from imgcal import projection_compiled
-from imgcal.estimation import fused
+from imgcal.estimation import lm_cpu
 from imgcal.estimation.linearize import Problem, State
-from imgcal.formats import load_object, load_rig
-from imgcal.projection import project_kornia
-from imgcal.rig import CameraRig
-from imgcal.synthesis import synthesize
-from imgcal.transforms import RigidTransform
+from imgcal.geometry.projection import project_kornia
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.io import load_object, load_rig
+from imgcal.synthesis.rigs import synthesize
+from imgcal.types.rig import CameraRig
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.peer import versions
 from scripts.benchmarks.peers import projections as peers
@@ -107,8 +106,8 @@ def value_cases(scene: Scene) -> dict[str, Run | None]:
     single, few = rig.to(torch.float32), points.float()
     lens = (rig.focal_length, rig.principal_point, rig.distortion, rig.image_size)
     return {
-        OURS: lambda: projection_compiled.project(rig, points).uv,
-        OURS_SINGLE: lambda: projection_compiled.project(single, few).uv,
+        OURS: lambda: rig.project_values(points).uv,
+        OURS_SINGLE: lambda: single.project_values(few).uv,
         TENSORS: lambda: rig.project(points).uv,
         OURS_KORNIA: lambda: project_kornia(rig.cam_from_rig.apply(points[:, None]), *lens).uv,
         KORNIA: peers.kornia_camera(views),
@@ -224,14 +223,14 @@ def _equations(scene: Scene, upstream: Tensor) -> Run:
     """One linearization by the estimate's compiled loop, at observations that leave `upstream` as residuals."""
     rig, points = scene.rig, scene.points_object
     centroid = points.mean(0)
-    observed = projection_compiled.project(rig, scene.points).uv - upstream
+    observed = rig.project_values(scene.points).uv - upstream
     uv = observed.mT[:, None].contiguous()
     ones = torch.ones_like(uv[..., 0, :])
     spread = torch.ones(*rig.focal_length.shape[:2], 15, dtype=uv.dtype)
     problem = Problem(uv, ones, (points - centroid).contiguous(), centroid, None, rig, spread)
     centre = scene.rig_from_object.apply(centroid[None])
     state = State(torch.zeros_like(spread), scene.rig_from_object.rotation[:, None].contiguous(), centre)
-    return lambda: fused.minimize(problem, state, "squared", 1.0, 0, 0.0).equations
+    return lambda: lm_cpu.minimize(problem, state, "squared", 1.0, 0, 0.0).equations
 
 
 def _measure_synthesis(effort: Effort) -> dict[str, Any]:
@@ -246,7 +245,7 @@ def _measure_synthesis(effort: Effort) -> dict[str, Any]:
         for batch in batches
     }
     cases[f"its projection alone, {count:,}: compiled"] = (
-        count, lambda: projection_compiled.project(made.rig, points)
+        count, lambda: made.rig.project_values(points)
     )  # fmt: skip
     cases["in tensors"] = (count, lambda: made.rig.project(points))
     rows = {name: {"name": name, "rigs": rigs, "times": {}} for name, (rigs, _) in cases.items()}

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
-from imgcal.estimation import camera_covariance, estimate, fused, initial_pose, solver
+from imgcal.estimation import camera_covariance, estimate, initial_pose, levenberg_marquardt, lm_cpu
 from imgcal.estimation.estimate import make_problem, make_start
-from imgcal.estimation.robust import squared
+from imgcal.estimation.robust_losses import squared
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.recalibration_cases import SQUARED, Cases, make_cases
 from scripts.timing import side_by_side
@@ -28,15 +28,15 @@ def measure(effort: Effort) -> dict[str, Any]:
 
     problem = make_problem(one.observations, one.factory, one.obj, one.spread)
     start = make_start(problem, one.start, None)
-    compiled = fused.minimize(problem, start, "squared", 3.0, *LIMITS)
-    tensors = solver.minimize(problem, start, squared, *LIMITS)
+    compiled = lm_cpu.minimize(problem, start, "squared", 3.0, *LIMITS)
+    tensors = levenberg_marquardt.minimize(problem, start, squared, *LIMITS)
     found = run(one)()
     rigs, snapshots = len(many), long.observations.uv.shape[1]
     cases = {
         "one snapshot, `estimate`": run(one),
         "one snapshot, start pose alone": lambda: initial_pose(one.observations, one.factory, one.obj),
-        "one snapshot, compiled solver alone": lambda: fused.minimize(problem, start, "squared", 3.0, *LIMITS),
-        "one snapshot, tensor solver alone": lambda: solver.minimize(problem, start, squared, *LIMITS),
+        "one snapshot, compiled solver alone": lambda: lm_cpu.minimize(problem, start, "squared", 3.0, *LIMITS),
+        "one snapshot, tensor solver alone": lambda: levenberg_marquardt.minimize(problem, start, squared, *LIMITS),
         "one snapshot, covariance": lambda: camera_covariance(found),  # type: ignore[arg-type]
         f"{rigs} rigs at once, one snapshot each": run(many),
         f"{rigs} rigs at once, without start poses": run(many, start=False),

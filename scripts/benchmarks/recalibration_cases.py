@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from imgcal.estimation import EstimationOptions, estimate, initial_pose, relative_covariance, relative_difference
-from imgcal.formats import load_object, load_rig
-from imgcal.objects import CalibrationObject
-from imgcal.observations import Observations
-from imgcal.rig import PARAMETERS, CameraRig
-from imgcal.synthesis import PhysicalDrift, PoseRange, sample_rig_from_object
-from imgcal.transforms import RigidTransform
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.io import load_object, load_rig
+from imgcal.synthesis.rigs import PhysicalDrift, PoseRange, sample_rig_from_object
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.observations import Observations
+from imgcal.types.rig import PARAMETERS, CameraRig
 from scripts.benchmarks.peers.rig_task import RigAnswer, RigTask
 
 SQUARED = EstimationOptions(loss="squared")

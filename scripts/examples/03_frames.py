@@ -3,8 +3,8 @@
 import torch
 
 import imgcal
-from imgcal.simulation import FrameModel, simulate_frames, simulate_truth
-from imgcal.synthesis import PhysicalDrift
+from imgcal.synthesis.captures import FrameModel, simulate_frames, simulate_truth
+from imgcal.synthesis.rigs import PhysicalDrift
 from renderers import ClutterModel
 
 generator = torch.Generator().manual_seed(2)

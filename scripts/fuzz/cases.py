@@ -14,8 +14,8 @@ import numpy as np
 import torch
 
 from imgcal.cli.main import main
-from imgcal.formats import load_detections, load_object, load_rig, read_frame, save_detections, save_object, save_rig
-from imgcal.formats.yaml_file import yaml_text
+from imgcal.io import load_detections, load_object, load_rig, read_frame, save_detections, save_object, save_rig
+from imgcal.io.yaml_file import yaml_text
 from imgcal.training.checkpoint import build_network, save_network
 from imgcal.training.experiment import load_experiment
 from scripts.fuzz.mutations import NAMES, VALUES, mutated

@@ -18,7 +18,7 @@ import torch
 from imgcal.cli.compiling import HINT
 from imgcal.cli.main import main
 from imgcal.errors import InputError
-from imgcal.formats import load_rig
+from imgcal.io import load_rig
 from scripts.fuzz.cases import Case
 
 NOISE = re.compile(r"Traceback|Warning|internal error|libpng|Corrupt JPEG|\[avi|^\s+File ", re.MULTILINE)

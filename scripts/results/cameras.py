@@ -19,10 +19,10 @@ from imgcal.errors import InputError
 from imgcal.evaluation import BASELINES, Conditions, Given, Method, reprojection_error
 from imgcal.evaluation.models import load_models
 from imgcal.evaluation.protocol import draw
-from imgcal.formats import load_object, load_rig, write_text
+from imgcal.io import load_object, load_rig, write_text
 from imgcal.networks import Prediction
-from imgcal.rig import CameraRig
-from imgcal.synthesis import RelativeDrift
+from imgcal.synthesis.rigs import RelativeDrift
+from imgcal.types.rig import CameraRig
 from scripts.output import ROOT, command, make_folder
 
 AXIS = 60.0  # mm, length of the line that shows where a camera looks

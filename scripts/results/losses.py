@@ -19,7 +19,9 @@ import tyro
 from torch import Tensor
 
 from imgcal.errors import InputError
-from imgcal.losses import (
+from imgcal.training.engine import Run, check_finite, prepare, train_step
+from imgcal.training.experiment import Experiment, changed, load_experiment
+from imgcal.training.losses import (
     distortion_size,
     focal_ratio,
     geodesic,
@@ -31,10 +33,8 @@ from imgcal.losses import (
     project_fiducials,
     reprojection_rmse,
 )
-from imgcal.networks.prediction import Prediction
-from imgcal.objects import CalibrationObject
-from imgcal.training.engine import Run, check_finite, prepare, train_step
-from imgcal.training.experiment import Experiment, changed, load_experiment
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.prediction import Prediction
 from scripts.output import BLUE, GREY, RESULTS, command, figure, surroundings, write_json
 
 PROPOSED = ("parameter RMSE", "geodesic", "reprojection RMSE")

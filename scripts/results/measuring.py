@@ -15,7 +15,7 @@ from imgcal.errors import InputError
 from imgcal.evaluation import BASELINES, Conditions, Corruption, Evaluation, Method, Protocol, Scores, evaluate, sweep
 from imgcal.evaluation.latency import latency
 from imgcal.evaluation.models import Model, load_models
-from imgcal.formats.safetensors_file import read_texts
+from imgcal.io.safetensors_file import read_texts
 from imgcal.training.checkpoint import FORMAT
 from imgcal.training.log import read_metrics
 from scripts.output import surroundings

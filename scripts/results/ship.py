@@ -16,8 +16,8 @@ import tyro
 from imgcal.errors import InputError
 from imgcal.evaluation import reprojection_error
 from imgcal.networks import Views
-from imgcal.networks.rendering import ImageOptions, render_views
-from imgcal.synthesis import synthesize
+from imgcal.synthesis.colour_coding import ImageOptions, render_views
+from imgcal.synthesis.rigs import synthesize
 from imgcal.training.checkpoint import Checkpoint, load_checkpoint, save_network
 from imgcal.training.experiment import Experiment, changed
 from scripts.output import command, make_folder

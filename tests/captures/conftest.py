@@ -14,11 +14,11 @@ import torch
 from scipy.optimize import least_squares
 
 from imgcal.cli.main import main
-from imgcal.formats import save_rig
-from imgcal.observations import Detections
-from imgcal.rig import CameraRig, RigPrior
-from imgcal.rotations import rotation_from_vector
-from imgcal.transforms import RigidTransform
+from imgcal.geometry.rotations import rotation_from_vector
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.io import save_rig
+from imgcal.types.observations import Detections
+from imgcal.types.rig import CameraRig, RigPrior
 
 # Rotation, translation, focal length, principal point, distortion: sizes of a unit step in the fit.
 SCALE = np.array([0.1] * 3 + [10.0] * 3 + [100.0] * 4 + [0.1, 0.1, 0.01, 0.01, 1.0])

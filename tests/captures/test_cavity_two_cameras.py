@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from imgcal.cli.main import main
-from imgcal.formats import load_detections, load_object, save_detections
-from imgcal.projection import project
-from imgcal.rig import RigPrior
+from imgcal.geometry.projection import project
+from imgcal.io import load_detections, load_object, save_detections
+from imgcal.types.rig import RigPrior
 from tests.captures.conftest import Points, as_detections, at_own_centres, disturbed, fit_rig
 
 CAMERAS = ("cam3", "cam4")

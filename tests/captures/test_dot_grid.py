@@ -8,9 +8,9 @@ import torch
 
 import imgcal
 from imgcal.estimation import camera_std
-from imgcal.formats import read_frame, write_text
-from imgcal.rig import CameraRig
-from imgcal.transforms import RigidTransform
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.io import read_frame, write_text
+from imgcal.types.rig import CameraRig
 
 HELD_OUT_LIMIT = 0.25  # px RMS, from the captures' README
 

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from imgcal.cli.main import main
-from imgcal.formats import load_detections, load_object, save_detections
-from imgcal.rig import RigPrior
+from imgcal.io import load_detections, load_object, save_detections
+from imgcal.types.rig import RigPrior
 from tests.captures.conftest import as_detections, at_own_centres, disturbed, fit_rig, read_points
 
 CAMERAS = ("cam1", "cam2", "cam3")

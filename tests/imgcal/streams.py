@@ -6,12 +6,12 @@ import numpy as np
 import torch
 
 from imgcal.estimation import EstimationOptions, estimate
-from imgcal.formats import load_object, load_rig
-from imgcal.observations import Detections, Observations
-from imgcal.rotations import rotation_from_vector
-from imgcal.simulation import simulate_truth
-from imgcal.synthesis import PhysicalDrift
-from imgcal.transforms import RigidTransform
+from imgcal.geometry.rotations import rotation_from_vector
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.io import load_object, load_rig
+from imgcal.synthesis.captures import simulate_truth
+from imgcal.synthesis.rigs import PhysicalDrift
+from imgcal.types.observations import Detections, Observations
 
 
 class Stream:

@@ -44,7 +44,7 @@ def test_every_public_name_is_there_and_is_no_module() -> None:
 
 
 def test_modules_are_attributes_and_what_is_not_there_is_an_attribute_error() -> None:
-    assert imgcal.formats is import_module("imgcal.formats")
+    assert imgcal.io is import_module("imgcal.io")
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = imgcal.nothing
     assert not hasattr(imgcal, "__path_of_nothing__")

@@ -5,11 +5,11 @@ import pytest
 import torch
 
 from imgcal.errors import RefusedError
-from imgcal.formats import load_object, load_rig
-from imgcal.live import Recalibrator
-from imgcal.rotations import rotation_from_vector
-from imgcal.simulation import FrameModel, simulate_frames, simulate_truth
-from imgcal.synthesis import PhysicalDrift
+from imgcal.geometry.rotations import rotation_from_vector
+from imgcal.io import load_object, load_rig
+from imgcal.online.recalibrator import Recalibrator
+from imgcal.synthesis.captures import FrameModel, simulate_frames, simulate_truth
+from imgcal.synthesis.rigs import PhysicalDrift
 from tests.imgcal.streams import Stream
 
 

@@ -26,7 +26,7 @@ class Count(event.Listener):
         pass
 
 event.register("numba:compile", Count())
-from renderers.adding_compiled import _widest
+from renderers.additive_splatting_cpu import _widest
 from renderers.compiling import cache_folder
 
 _widest(np.ones((1, 2), np.dtype(sys.argv[1])), np.ones((1, 2), bool))
@@ -50,7 +50,7 @@ def test_compiled_code_is_kept_by_version_in_the_users_cache_and_only_ours(tmp_p
     times, config, folder = run("float32", XDG_CACHE_HOME=str(tmp_path))
     assert times > 0 and config == "''"
     assert folder == tmp_path / "imgcal" / version("imgcal")
-    assert kept(folder) == {"adding_compiled"}
+    assert kept(folder) == {"additive_splatting_cpu"}
     assert run("float32", XDG_CACHE_HOME=str(tmp_path))[0] == 0
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imgcal.formats import load_object, load_rig
+from imgcal.io import load_object, load_rig
 from scripts.benchmarks import end_to_end
 from scripts.benchmarks import end_to_end_growth as growth
 from scripts.benchmarks.effort import Effort

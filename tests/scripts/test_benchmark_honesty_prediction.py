@@ -3,8 +3,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from imgcal.formats import load_object, load_rig
-from imgcal.labelling import PipelineOptions
+from imgcal.association.options import PipelineOptions
+from imgcal.io import load_object, load_rig
 from scripts.benchmarks.honesty_prediction import GATE, PAGE, RESULT, RIGS, SNAPSHOTS, Case, judge, measure, table
 from scripts.output import read_json
 

@@ -124,7 +124,7 @@ def test_runtime(tmp_path):
 
 
 def test_ring_is_the_reference_ring():
-    from imgcal.formats import load_rig
+    from imgcal.io import load_rig
 
     made, reference = script("runtime").ring(10), load_rig("O10")
     torch.testing.assert_close(made.positions, reference.positions, atol=1e-3, rtol=0)
@@ -144,8 +144,8 @@ def test_bundle_adjustment(trained, tmp_path):
 
 
 def test_plain_bundle_adjustment_starts_at_the_projection_of_the_rig():
-    from imgcal.formats import load_object, load_rig
-    from imgcal.synthesis import synthesize
+    from imgcal.io import load_object, load_rig
+    from imgcal.synthesis.rigs import synthesize
 
     module, obj = script("bundle_adjustment"), load_object("cube8")
     made = synthesize(load_rig("T4"), obj, 1, torch.Generator().manual_seed(2))

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from imgcal.cli.main import main
-from imgcal.formats import load_object, load_rig, save_object, save_rig
+from imgcal.io import load_object, load_rig, save_object, save_rig
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ import torch
 from imgcal.cli.main import main
 from imgcal.errors import InputError
 from imgcal.estimation import relative_difference
-from imgcal.formats import (
+from imgcal.geometry.rotations import vector_from_rotation
+from imgcal.io import (
     load_detections,
     load_object,
     load_rig,
@@ -19,10 +20,9 @@ from imgcal.formats import (
     save_detections,
     write_frame,
 )
-from imgcal.observations import Detections
-from imgcal.rotations import vector_from_rotation
-from imgcal.simulation import simulate_truth, true_detections
-from imgcal.synthesis import PhysicalDrift, RelativeDrift
+from imgcal.synthesis.captures import simulate_truth, true_detections
+from imgcal.synthesis.rigs import PhysicalDrift, RelativeDrift
+from imgcal.types.observations import Detections
 
 KEYS = {
     "status", "reason", "identity", "rms_px_before", "rms_px_after", "chi2_per_dof", "snapshots_used",

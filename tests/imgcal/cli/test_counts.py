@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from imgcal.cli.main import main
-from imgcal.formats import load_detections, save_detections, save_object, save_rig
-from imgcal.observations import BlobFlag
+from imgcal.io import load_detections, save_detections, save_object, save_rig
+from imgcal.types.observations import BlobFlag
 from scripts.benchmarks import camera_faults as damage
 
 CAMERA = 3

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from imgcal.cli.main import main
-from imgcal.formats import load_object, load_rig
+from imgcal.io import load_object, load_rig
 from imgcal.training.checkpoint import build_network, save_network
 from imgcal.training.experiment import load_experiment
 

@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 
 from imgcal.cli.main import main
-from imgcal.formats import load_detections, load_object
+from imgcal.io import load_detections, load_object
 
 
 def test_every_dot_has_its_colour_at_its_place(workplace, tmp_path):

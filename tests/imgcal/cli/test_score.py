@@ -3,7 +3,7 @@ import json
 import numpy as np
 
 from imgcal.cli.main import main
-from imgcal.formats import load_detections, save_detections
+from imgcal.io import load_detections, save_detections
 
 
 def score(workplace, source, rig, capsys):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from imgcal.cli.main import main
-from imgcal.formats import load_detections, load_rig, read_frame
+from imgcal.io import load_detections, load_rig, read_frame
 
 
 def simulate(out, *more):

@@ -4,7 +4,7 @@ import pytest
 
 from imgcal import networks
 from imgcal.cli.main import main
-from imgcal.formats import load_object, load_rig
+from imgcal.io import load_object, load_rig
 from imgcal.training import engine
 from imgcal.training.checkpoint import load_network
 from imgcal.training.log import read_metrics

@@ -8,7 +8,7 @@ from scipy.ndimage import distance_transform_edt, uniform_filter
 
 from imgcal.detection import fitting, window
 from imgcal.detection import moments as moments_of
-from imgcal.observations import BlobFlag
+from imgcal.types.observations import BlobFlag
 
 
 def components(frame, screening, invert=None):

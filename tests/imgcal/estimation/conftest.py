@@ -9,11 +9,11 @@ from torch import Tensor
 
 from imgcal.estimation.estimate import make_problem, make_start
 from imgcal.estimation.linearize import Problem, State
-from imgcal.objects import CalibrationObject
-from imgcal.observations import Observations
-from imgcal.rig import CameraRig
-from imgcal.synthesis import Drift, PhysicalDrift, PoseRange, sample_rig_from_object
-from imgcal.transforms import RigidTransform
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.synthesis.rigs import Drift, PhysicalDrift, PoseRange, sample_rig_from_object
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.observations import Observations
+from imgcal.types.rig import CameraRig
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ import torch
 from imgcal.estimation import camera_covariance, camera_std, estimate
 from imgcal.estimation.blocks import BlockScatter, block_scatter
 from imgcal.estimation.covariance import whitened_covariance
-from imgcal.estimation.robust import huber
-from imgcal.transforms import RigidTransform
+from imgcal.estimation.robust_losses import huber
+from imgcal.geometry.transforms import RigidTransform
 
 LOSS = partial(huber, threshold=3.0)
 

@@ -20,9 +20,9 @@ from imgcal.estimation import (
 )
 from imgcal.estimation.covariance import relative_jacobian, remaining_variance
 from imgcal.estimation.linearize import moved, rig_at
-from imgcal.rotations import rotation_from_vector
-from imgcal.synthesis import PhysicalDrift
-from imgcal.transforms import RigidTransform
+from imgcal.geometry.rotations import rotation_from_vector
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.synthesis.rigs import PhysicalDrift
 
 SQUARED = EstimationOptions(loss="squared", tolerance=1e-8)
 

@@ -7,10 +7,10 @@ import torch
 
 from imgcal.errors import InputError
 from imgcal.estimation import Estimate, EstimationOptions, estimate
-from imgcal.observations import Observations
-from imgcal.rig import RigPrior
-from imgcal.synthesis import RelativeDrift
-from imgcal.transforms import RigidTransform
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.synthesis.rigs import RelativeDrift
+from imgcal.types.observations import Observations
+from imgcal.types.rig import RigPrior
 
 SQUARED = EstimationOptions(loss="squared", tolerance=1e-10)
 

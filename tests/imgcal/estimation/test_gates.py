@@ -14,9 +14,9 @@ from imgcal.estimation import (
 )
 from imgcal.estimation.estimate import PATIENCE, make_start
 from imgcal.estimation.implicit import map_cost
-from imgcal.estimation.robust import LOSSES
-from imgcal.observations import Observations
-from imgcal.synthesis import Drift, PhysicalDrift, RelativeDrift
+from imgcal.estimation.robust_losses import LOSSES
+from imgcal.synthesis.rigs import Drift, PhysicalDrift, RelativeDrift
+from imgcal.types.observations import Observations
 
 SQUARED = EstimationOptions(loss="squared")
 

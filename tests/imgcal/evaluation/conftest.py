@@ -9,10 +9,10 @@ from torch import nn
 
 from imgcal.evaluation import Conditions, Corruption
 from imgcal.evaluation.protocol import Sample, draw
-from imgcal.formats import load_object, load_rig
-from imgcal.networks.prediction import Prediction
-from imgcal.synthesis import RelativeDrift
-from imgcal.transforms import RigidTransform
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.io import load_object, load_rig
+from imgcal.synthesis.rigs import RelativeDrift
+from imgcal.types.prediction import Prediction
 
 Make = Callable[..., Conditions]
 

@@ -8,8 +8,8 @@ import torch
 from imgcal.evaluation import classical
 from imgcal.evaluation.methods import BASELINES, factory_alone, map_from_pnp, network_method, pnp
 from imgcal.evaluation.metrics import errors
-from imgcal.networks.prediction import Prediction
-from imgcal.networks.rendering import ImageOptions
+from imgcal.synthesis.colour_coding import ImageOptions
+from imgcal.types.prediction import Prediction
 from tests.imgcal.evaluation.conftest import Fake, disturbed
 
 

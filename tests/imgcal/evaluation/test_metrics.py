@@ -5,9 +5,9 @@ import torch
 
 from imgcal.evaluation.metrics import KINDS, cramer_rao, errors, reprojection_error
 from imgcal.evaluation.protocol import Protocol, evaluate
-from imgcal.networks.prediction import Prediction
-from imgcal.rotations import rotation_from_vector
-from imgcal.transforms import RigidTransform
+from imgcal.geometry.rotations import rotation_from_vector
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.types.prediction import Prediction
 
 
 def test_a_prediction_that_is_the_truth_has_no_error(sample):

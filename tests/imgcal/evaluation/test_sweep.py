@@ -6,7 +6,7 @@ import torch
 from imgcal.errors import InputError
 from imgcal.evaluation import AXES, Method, Protocol, sweep
 from imgcal.evaluation.methods import factory_alone
-from imgcal.synthesis import RelativeDrift
+from imgcal.synthesis.rigs import RelativeDrift
 
 FACTORY = {"factory": Method(factory_alone)}
 FEW = Protocol(count=6, trials=1)

@@ -3,10 +3,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from imgcal.estimation.rig_uncertainty import rig_uncertainty
 from imgcal.evaluation.true_error import true_error
-from imgcal.rotations import rotation_from_vector
-from imgcal.transforms import RigidTransform
-from imgcal.uncertainty import rig_uncertainty
+from imgcal.geometry.rotations import rotation_from_vector
+from imgcal.geometry.transforms import RigidTransform
 
 F64 = torch.float64
 

@@ -4,11 +4,11 @@ import pytest
 import torch
 
 from imgcal.errors import InputError
-from imgcal.formats import load_object, load_rig
-from imgcal.losses import project_fiducials
+from imgcal.io import load_object, load_rig
 from imgcal.networks import PRESETS, NetworkConfig, Views, build
-from imgcal.networks.rendering import render_views
-from imgcal.synthesis import RelativeDrift, synthesize
+from imgcal.synthesis.colour_coding import render_views
+from imgcal.synthesis.rigs import RelativeDrift, synthesize
+from imgcal.training.losses import project_fiducials
 
 DRIFT = RelativeDrift(0.02, 0.02)
 SMALL = ["points", "points-one-pass", "points-cnn1d", "vit", "cnn", "vit-pooled", "cnn-pooled"]

@@ -4,14 +4,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from imgcal.formats import load_object, load_rig
-from imgcal.networks.prediction import Prediction
-from imgcal.networks.rendering import render_views
-from imgcal.objects import CalibrationObject
-from imgcal.rig import CameraRig
-from imgcal.rotations import rotation_from_vector
-from imgcal.synthesis import RelativeDrift, Snapshots, synthesize
-from imgcal.transforms import RigidTransform
+from imgcal.geometry.rotations import rotation_from_vector
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.io import load_object, load_rig
+from imgcal.synthesis.colour_coding import render_views
+from imgcal.synthesis.rigs import RelativeDrift, Snapshots, synthesize
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.prediction import Prediction
+from imgcal.types.rig import CameraRig
 from tests.imgcal.evaluation.conftest import conditions, sample  # noqa: F401  fixtures
 
 

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from imgcal.estimation import EstimationOptions
-from imgcal.networks.prediction import Prediction, Views
 from imgcal.refinement import refine_points
+from imgcal.types.prediction import Prediction, Views
 
 
 def found(estimate):

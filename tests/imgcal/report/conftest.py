@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.accuracy import predicted_error
 from imgcal.estimation import EstimationOptions, estimate, relative_covariance
-from imgcal.formats import load_object, load_rig
-from imgcal.observations import Detections, Observations
+from imgcal.estimation.predicted_error import predicted_error
+from imgcal.io import load_object, load_rig
+from imgcal.io.resources import data_path
 from imgcal.report import ReportContent, SnapshotSummary, relative_prior_std
-from imgcal.resources import data_path
-from imgcal.rig import PARAMETERS, CameraRig
-from imgcal.synthesis import PhysicalDrift, PoseRange, sample_rig_from_object, synthesize
+from imgcal.synthesis.rigs import PhysicalDrift, PoseRange, sample_rig_from_object, synthesize
+from imgcal.types.observations import Detections, Observations
+from imgcal.types.rig import PARAMETERS, CameraRig
 
 SIGMA = 0.05
 

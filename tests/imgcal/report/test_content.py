@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from imgcal.estimation import relative_difference
+from imgcal.geometry.rotations import rotation_from_vector
+from imgcal.geometry.transforms import RigidTransform
 from imgcal.report import ReportContent, relative_prior_std
-from imgcal.rig import PARAMETERS
-from imgcal.rotations import rotation_from_vector
-from imgcal.transforms import RigidTransform
+from imgcal.types.rig import PARAMETERS
 
 
 def test_residuals_agree_with_the_estimate(content: ReportContent) -> None:

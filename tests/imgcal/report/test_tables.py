@@ -10,7 +10,7 @@ import torch
 
 from imgcal.report import ReportContent
 from imgcal.report.tables import GROUPS, camera_rows, knowledge, signed
-from imgcal.rig import PARAMETERS
+from imgcal.types.rig import PARAMETERS
 
 
 @pytest.mark.parametrize(

@@ -9,11 +9,11 @@ from safetensors.torch import save
 
 from imgcal import networks
 from imgcal.errors import InputError
-from imgcal.formats import load_object, load_rig
-from imgcal.formats.safetensors_file import read_tensors, write_tensors
-from imgcal.networks.prediction import Views
+from imgcal.io import load_object, load_rig
+from imgcal.io.safetensors_file import read_tensors, write_tensors
 from imgcal.training.checkpoint import FORMAT, build_network, load_checkpoint, load_network, save_network, warm_start
 from imgcal.training.log import read_metrics
+from imgcal.types.prediction import Views
 from tests.imgcal.training.toy import Toy
 
 

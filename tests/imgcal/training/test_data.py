@@ -3,8 +3,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from imgcal.corruption import Corruption
-from imgcal.networks.rendering import ImageOptions
+from imgcal.synthesis.colour_coding import ImageOptions
+from imgcal.synthesis.corruption import Corruption
 from imgcal.training.data import Source, object_to
 
 

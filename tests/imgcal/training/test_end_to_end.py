@@ -3,14 +3,14 @@
 import pytest
 import torch
 
-from imgcal.corruption import Corruption
 from imgcal.errors import InputError
-from imgcal.formats import load_object, load_rig
-from imgcal.losses import RefinedLoss
-from imgcal.networks.prediction import Prediction
-from imgcal.synthesis import PoseRange, RelativeDrift
+from imgcal.io import load_object, load_rig
+from imgcal.synthesis.corruption import Corruption
+from imgcal.synthesis.rigs import PoseRange, RelativeDrift
 from imgcal.training.data import Source, object_to
 from imgcal.training.end_to_end import refined_loss
+from imgcal.training.losses import RefinedLoss
+from imgcal.types.prediction import Prediction
 
 CONFIG = RefinedLoss(weight=1.0)
 

@@ -6,7 +6,7 @@ import torch
 
 from imgcal import networks
 from imgcal.errors import InputError, RefusedError
-from imgcal.formats.safetensors_file import read_tensors
+from imgcal.io.safetensors_file import read_tensors
 from imgcal.training import engine
 from imgcal.training.checkpoint import load_checkpoint
 from imgcal.training.engine import BAD_BATCH, RESULT, STATE, finished, progress, train

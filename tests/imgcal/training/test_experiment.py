@@ -3,7 +3,7 @@ import math
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.synthesis import PhysicalDrift, PoseRange, RelativeDrift
+from imgcal.synthesis.rigs import PhysicalDrift, PoseRange, RelativeDrift
 from imgcal.training.experiment import changed, load_experiment, save_experiment
 from tests.imgcal.training.toy import EXPERIMENT
 

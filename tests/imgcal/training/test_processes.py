@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 
-from imgcal.formats.safetensors_file import read_tensors, read_texts
+from imgcal.io.safetensors_file import read_tensors, read_texts
 from imgcal.training.engine import RESULT, STATE, train
 from imgcal.training.log import read_metrics
 from tests.imgcal.training.toy import EXPERIMENT

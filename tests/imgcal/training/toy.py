@@ -5,13 +5,13 @@ from torch import nn
 
 from imgcal import networks
 from imgcal.cli.main import run as command
-from imgcal.networks.prediction import Prediction
-from imgcal.networks.rendering import ImageOptions
-from imgcal.rig import PARAMETERS
-from imgcal.rotations import rotation_from_6d
+from imgcal.geometry.rotations import rotation_from_6d
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.synthesis.colour_coding import ImageOptions
 from imgcal.training import engine
 from imgcal.training.engine import save
-from imgcal.transforms import RigidTransform
+from imgcal.types.prediction import Prediction
+from imgcal.types.rig import PARAMETERS
 
 EXPERIMENT = """
 format: imgcal-experiment/1

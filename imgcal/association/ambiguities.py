@@ -1,0 +1,128 @@
+"""Other labellings that might do as well: those of an object moved onto itself, wholly or in part."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from imgcal.association.hypotheses import Poses
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.types.calibration_object import CalibrationObject
+
+LEAST_OVERLAP = 0.6  # part of the fiducials that must fall onto others for a shift to be mistaken for none
+MOST_SHIFTS = 8  # the smallest ones; larger ones are made of them
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A rigid motion that takes most fiducials near others; fiducial i falls onto `permutation[i]`, -1 = onto none."""
+
+    rotation: NDArray[np.float64]  # (3, 3)
+    translation: NDArray[np.float64]  # (3,) mm
+    permutation: NDArray[np.int64]  # (N,)
+
+
+def lattice_shifts(obj: CalibrationObject) -> list[Motion]:
+    """Find the translations, smallest first, that take most fiducials onto others: the steps of a lattice."""
+    return list(_lattice_shifts(obj.points.double().cpu().numpy().tobytes(), 0.01 * obj.size))
+
+
+@lru_cache(maxsize=16)
+def _lattice_shifts(coordinates: bytes, tolerance: float) -> tuple[Motion, ...]:
+    """Find the shifts once for each object: snapshots are many, objects few."""
+    points = np.frombuffer(coordinates).reshape(-1, 3)
+    differences = (points[None] - points[:, None]).reshape(-1, 3)
+    cells, place, counts = np.unique(
+        np.round(differences / (2 * tolerance)).astype(np.int64), axis=0, return_inverse=True, return_counts=True
+    )
+    often = (counts >= LEAST_OVERLAP * len(points)) & cells.any(1)
+    sums = np.stack([np.bincount(place.ravel(), weights=differences[:, i]) for i in range(3)], axis=1)
+    shifts = sums[often] / counts[often, None]
+    shifts = shifts[np.argsort(np.linalg.norm(shifts, axis=1), kind="stable")[:MOST_SHIFTS]]
+    return tuple(Motion(np.eye(3), shift, _onto(points, points + shift, 2 * tolerance)) for shift in shifts)
+
+
+def near_turns(obj: CalibrationObject, tolerance: float) -> list[Motion]:
+    """Find the turns that take every fiducial to within `tolerance` (mm) of another, but are no symmetries.
+
+    Sizes of fiducials do not count here: that they break a symmetry must be seen in the blobs.
+    """
+    exact = {motion.permutation.tobytes() for motion in obj.symmetries}
+    turns = replace(obj, radius=None).near_symmetries(min(tolerance, 0.2 * obj.size))
+    return [
+        Motion(turn.rotation, turn.translation, turn.permutation)
+        for turn in turns
+        if turn.permutation.tobytes() not in exact
+    ]
+
+
+def moved(pose: RigidTransform, labels: NDArray[np.int64], motions: list[Motion]) -> tuple[Poses, NDArray[np.int64]]:
+    """Label the blobs as if the object had made each motion backwards.
+
+    Args:
+        pose: rig_from_object of a labelling.
+        labels: (C, N) blob of each fiducial.
+        motions: K motions.
+
+    Returns:
+        K poses and labellings (K, C, N) under which the blobs lie where they lay.
+    """
+    rotation, translation = pose.rotation.numpy(), pose.translation.numpy()
+    turns = np.stack([rotation @ motion.rotation.T for motion in motions])
+    shifts = np.stack([translation - turn @ motion.translation for turn, motion in zip(turns, motions, strict=True)])
+    changed = np.full((len(motions), *labels.shape), -1, dtype=np.int64)
+    for k, motion in enumerate(motions):
+        falls = motion.permutation >= 0
+        changed[k][:, motion.permutation[falls]] = labels[:, falls]
+    return Poses(turns, shifts), changed
+
+
+def displacement(uv: NDArray[np.float64], motion: Motion) -> NDArray[np.float64]:
+    """Median distance (C,) px that a motion moves fiducials in the images (C, N, 2)."""
+    falls = motion.permutation >= 0
+    return np.median(np.linalg.norm(uv[:, motion.permutation[falls]] - uv[:, falls], axis=-1), axis=1)
+
+
+def conflicts(obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[np.int64]) -> float:
+    """Share of commonly labelled blobs that two labellings (C, N) call differently, up to the object's symmetry.
+
+    Labellings without a common blob conflict entirely.
+    """
+    common = max(int(_common(first, second).sum()), 1)
+    return min(1 - int(agreed.sum()) / common for agreed in _agreed(obj, first, second))
+
+
+def differ(obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[np.int64]) -> bool:
+    """Tell whether two labellings (C, N) are different answers, up to the object's symmetry, not one with odd labels.
+
+    They are when a third of all common blobs, or of one camera's (three at least), are called differently.
+    """
+    common = _common(first, second)
+    if not common.any():
+        return True
+    return all(
+        3 * (common - agreed).sum() > common.sum() or bool(((common - agreed) >= np.maximum(3, common / 3)).any())
+        for agreed in _agreed(obj, first, second)
+    )
+
+
+def _agreed(obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Number of blobs that two labellings call the same, for each camera (C,) and symmetry."""
+    return [((first >= 0) & (first == second[:, motion.permutation])).sum(1) for motion in obj.symmetries]
+
+
+def _onto(points: NDArray[np.float64], images: NDArray[np.float64], tolerance: float) -> NDArray[np.int64]:
+    distance, index = cKDTree(points).query(images)
+    return np.where(distance <= tolerance, index, -1)
+
+
+def _common(first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Number of blobs that both labellings name, for each camera: (C,)."""
+    named = np.zeros((2, len(first), max(first.max(), second.max()) + 2), dtype=bool)
+    cameras = np.arange(len(first))[:, None]
+    named[0, cameras, first], named[1, cameras, second] = True, True  # label -1 lands in the last column
+    return named[..., :-1].all(0).sum(-1)

@@ -1,0 +1,124 @@
+"""One snapshot's blobs as dense arrays, and how far the prior lets predictions be off."""
+
+# Compiled functions take their types from their arguments.
+# ruff: noqa: ANN001, ANN202
+# mypy: allow-untyped-defs
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.errors import InputError
+from imgcal.types.observations import Detections
+from imgcal.types.rig import CameraRig
+from renderers.compiling import njit
+
+FAR = 1e6
+"""Pixel coordinate of padding: no gate reaches it."""
+
+
+@dataclass(frozen=True)
+class Blobs:
+    """Usable blobs of one snapshot, padded to the same number in every camera."""
+
+    uv: NDArray[np.float64]  # (C, M, 2) pixels, FAR where padded
+    ideal: NDArray[np.float32]  # (C, M, 2) pixels from the principal point, distortion removed, FAR where padded
+    sigma: NDArray[np.float64]  # (C, M) pixels
+    radius: NDArray[np.float64]  # (C, M) pixels, nan = unknown
+    row: NDArray[np.int64]  # (C, M) row of the detections, -1 where padded
+    count: NDArray[np.int64]  # (C,)
+    rows: int  # rows of the detections, usable or not
+
+    def only(self, camera: int) -> Blobs:
+        """Keep one camera; labels keep their numbers."""
+        one = [camera]
+        kept = (self.uv[one], self.ideal[one], self.sigma[one], self.radius[one], self.row[one], self.count[one])
+        return Blobs(*kept, self.rows)
+
+    def to_rows(self, labels: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Turn blob indices of fiducials (C, N) into fiducials of detection rows (rows,)."""
+        result = np.full(self.rows, -1, dtype=np.int64)
+        camera, fiducial = np.nonzero(labels >= 0)
+        result[self.row[camera, labels[camera, fiducial]]] = fiducial
+        return result
+
+
+def gather(detections: Detections, rig: CameraRig) -> Blobs:
+    """Collect the usable blobs of one snapshot; of several at exactly the same place the first one.
+
+    Args:
+        detections: blobs of one snapshot; its cameras are the rig's, in the rig's order.
+        rig: factory rig without batch axes.
+
+    Raises:
+        InputError: more than one snapshot, or cameras that are not the rig's.
+    """
+    if tuple(detections.camera_names) != tuple(rig.camera_names):
+        raise InputError(
+            f"detections of cameras {detections.camera_names}: expected {rig.camera_names} of rig {rig.name}"
+        )
+    if len(np.unique(detections.snapshot)) > 1:
+        raise InputError("identity: found blobs of several snapshots, expected those of one")
+    rows = np.flatnonzero(detections.usable)
+    places = np.column_stack((detections.camera[rows], detections.uv[rows]))
+    rows = rows[np.sort(np.unique(places, axis=0, return_index=True)[1])]
+    camera = detections.camera[rows]
+    order = np.argsort(camera, kind="stable")
+    rows, camera = rows[order], camera[order]
+    count = np.bincount(camera, minlength=rig.cameras)
+    slot = np.arange(len(rows)) - (np.cumsum(count) - count)[camera]
+    shape = (rig.cameras, max(int(count.max()), 1))
+    uv, row, sigma, radius = np.full((*shape, 2), FAR), np.full(shape, -1), np.ones(shape), np.full(shape, np.nan)
+    uv[camera, slot], row[camera, slot], sigma[camera, slot] = detections.uv[rows], rows, detections.sigma[rows]
+    radius[camera, slot] = detections.radius[rows]
+    lens = (rig.focal_length.numpy(), rig.principal_point.numpy(), rig.distortion.numpy())
+    ideal = np.full(uv.shape, FAR, dtype=np.float32)
+    _undistort(uv, count, *lens, ideal)
+    return Blobs(uv, ideal, sigma, radius, row, count, len(detections))
+
+
+@njit(cache=True)
+def _undistort(uv, count, focal, principal, distortion, ideal):
+    """Remove the distortion by fixed-point iteration: good to far less than a pixel, which is all that is needed."""
+    for c in range(len(uv)):
+        k1, k2, p1, p2, k3 = distortion[c]
+        for m in range(count[c]):
+            xd, yd = (uv[c, m, 0] - principal[c, 0]) / focal[c, 0], (uv[c, m, 1] - principal[c, 1]) / focal[c, 1]
+            x, y = xd, yd
+            for _ in range(10):
+                rr = x * x + y * y
+                radial = max(1 + rr * (k1 + rr * (k2 + rr * k3)), 0.2)
+                x, y = (
+                    (xd - 2 * p1 * x * y - p2 * (rr + 2 * x * x)) / radial,
+                    (yd - p1 * (rr + 2 * y * y) - 2 * p2 * x * y) / radial,
+                )
+            mean = (focal[c, 0] + focal[c, 1]) / 2
+            ideal[c, m, 0], ideal[c, m, 1] = mean * x, mean * y
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How far the factory values may be off, boiled down to what moves a pattern and what bends it."""
+
+    shift: NDArray[np.float64]  # (C,) pixels, one standard deviation of a pattern's place in the image
+    shape: float  # relative: one standard deviation of distances within a pattern
+
+
+def spread_of(std: Tensor, rig: CameraRig, distance: float) -> Spread:
+    """Boil the prior down.
+
+    Args:
+        std: (C, 15) prior standard deviation of each camera's parameters.
+        rig: factory rig.
+        distance: mm, from the cameras to the object, roughly.
+    """
+    s, focal = std.numpy(), rig.focal_length.mean(-1).numpy()
+    turn, travel = np.sqrt((s[:, :3] ** 2).mean(1)), np.sqrt((s[:, 3:6] ** 2).mean(1)) / distance
+    principal, scale = np.sqrt((s[:, 8:10] ** 2).mean(1)), np.sqrt((s[:, 6:8] ** 2).mean(1)) / focal
+    shift = np.sqrt(principal**2 + (focal * turn) ** 2 + (focal * travel) ** 2)
+    shape = np.sqrt(scale**2 + turn**2 + travel**2 + (principal / focal) ** 2)
+    return Spread(shift, float(shape.max()))

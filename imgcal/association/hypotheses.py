@@ -1,0 +1,267 @@
+"""Candidate poses: blob triples of one camera against all fiducial triples, tested on the camera's other blobs."""
+
+# Compiled functions take their types from their arguments.
+# ruff: noqa: ANN001, ANN202
+# mypy: allow-untyped-defs
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import permutations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, cKDTree
+
+from imgcal.association.blobs import Blobs
+from imgcal.association.p3p import FAST, three_point_pose
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.rig import CameraRig
+from renderers.compiling import njit
+
+MOST_FIDUCIAL_TRIPLES = 300_000
+DRAWS = 3  # blob triples of which the widest is taken
+PROBES = 8  # fiducials that every hypothesis is tested on; only promising ones are tested on all
+CELLS = 4  # raster cells to a tolerance
+MOST_CELLS = 512  # across the blobs; where that makes cells larger, the tolerance is larger too
+
+
+@dataclass(frozen=True)
+class FiducialTriples:
+    """Ordered triples of fiducials, one of each set that the object's symmetry cannot tell apart."""
+
+    triples: NDArray[np.int64]  # (T, 3)
+    sides: NDArray[np.float64]  # (T, 3) mm^2, squared distances 0-1, 0-2, 1-2
+    frames: NDArray[np.float64]  # (T, 3, 3) columns: along the first side, in the plane, normal
+    points: NDArray[np.float64]  # (N, 3) mm
+    order: NDArray[np.int64]  # (N,) random order in which a hypothesis is tested
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Candidate poses of the object."""
+
+    rotation: NDArray[np.float64]  # (K, 3, 3) rig_from_object
+    translation: NDArray[np.float64]  # (K, 3) mm
+
+    def __len__(self) -> int:
+        return len(self.rotation)
+
+    def select(self, rows: NDArray[np.int64]) -> Poses:
+        """Keep the given rows."""
+        return Poses(self.rotation[rows], self.translation[rows])
+
+    def __add__(self, other: Poses) -> Poses:
+        return Poses(
+            np.concatenate((self.rotation, other.rotation)), np.concatenate((self.translation, other.translation))
+        )
+
+
+def fiducial_triples(obj: CalibrationObject, generator: np.random.Generator) -> FiducialTriples:
+    """List the triples to try: all of them; of many fiducials those of the outer ones, or a random choice of these."""
+    points = obj.points.double().cpu().numpy()
+    count = len(points)
+    outer = ConvexHull(points).vertices if many(obj) and not obj.planar else np.arange(count)
+    if _orders(len(outer)) <= MOST_FIDUCIAL_TRIPLES:
+        triples = outer[list(permutations(range(len(outer)), 3))]
+    else:
+        triples = outer[generator.integers(0, len(outer), (MOST_FIDUCIAL_TRIPLES, 3))]
+        triples = triples[(triples != np.roll(triples, 1, axis=1)).all(1)]
+    if len(obj.symmetries) > 1:
+        permuted = np.stack([motion.permutation[triples] for motion in obj.symmetries])  # (G, T, 3)
+        triples = triples[(permuted @ [count * count, count, 1]).argmin(0) == 0]
+    a, b = points[triples[:, 1]] - points[triples[:, 0]], points[triples[:, 2]] - points[triples[:, 0]]
+    normal = np.cross(a, b)
+    area = np.linalg.norm(normal, axis=1)
+    wide = area > 1e-3 * area.max()
+    triples, a, b, normal = triples[wide], a[wide], b[wide], normal[wide] / area[wide, None]
+    along = a / np.linalg.norm(a, axis=1, keepdims=True)
+    frames = np.stack((along, np.cross(normal, along), normal), axis=-1)
+    sides = np.stack([(side * side).sum(1) for side in (a, b, a - b)], axis=1)
+    return FiducialTriples(triples, sides, frames, points, generator.permutation(count))
+
+
+def many(obj: CalibrationObject) -> bool:
+    """Tell whether the object has more triples than can be tried.
+
+    Then only outer blobs are compared with outer fiducials: what is outermost in an image is so in space.
+    """
+    return _orders(obj.fiducials) > MOST_FIDUCIAL_TRIPLES
+
+
+def _orders(count: int) -> int:
+    """Number of ordered triples."""
+    return count * (count - 1) * (count - 2)
+
+
+def likely_blobs(blobs: Blobs, camera: int, outer: bool) -> NDArray[np.int64]:
+    """List the blobs of a camera that are likely to be fiducials: those close to others.
+
+    Args:
+        blobs: the snapshot.
+        camera: index of the camera, which has four blobs at least.
+        outer: take the outermost blobs only, see `many`.
+    """
+    uv = blobs.ideal[camera, : blobs.count[camera]].astype(np.float64)
+    gaps = cKDTree(uv).query(uv, k=4)[0][:, -1]
+    dense = np.flatnonzero(gaps <= (4 if outer else 2) * np.sort(gaps)[len(uv) // 4])  # sparser at the rim
+    if len(dense) < 4:
+        dense = np.argsort(gaps)[:4]
+    return dense[ConvexHull(uv[dense], qhull_options="QJ").vertices] if outer else dense
+
+
+def blob_triples(
+    uv: NDArray[np.floating], likely: NDArray[np.int64], count: int, generator: np.random.Generator
+) -> NDArray[np.int64]:
+    """Draw triples of blobs (count, 3) that are not too narrow.
+
+    Args:
+        uv: (M, 2) pixels, the blobs of a camera.
+        likely: (L >= 3,) those to draw from.
+        count: number of triples.
+        generator: source of randomness.
+    """
+    # Three different ones: numbers among those that are left, moved past the ones that are taken.
+    drawn = generator.integers(0, len(likely) - np.arange(3), (DRAWS * count, 3))
+    drawn[:, 1] += drawn[:, 1] >= drawn[:, 0]
+    taken = np.sort(drawn[:, :2], axis=1)
+    drawn[:, 2] += drawn[:, 2] >= taken[:, 0]
+    drawn[:, 2] += drawn[:, 2] >= taken[:, 1]
+    drawn = likely[drawn]
+    at = uv.astype(np.float64)[drawn]
+    a, b = at[:, 1] - at[:, 0], at[:, 2] - at[:, 0]
+    area = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).reshape(DRAWS, count)
+    return drawn.reshape(DRAWS, count, 3)[area.argmax(0), np.arange(count)]
+
+
+def single_camera_poses(
+    blobs: Blobs,
+    rig: CameraRig,
+    cameras: NDArray[np.int64],
+    triples: NDArray[np.int64],
+    fiducials: FiducialTriples,
+    tolerance: float,
+    keep: int,
+) -> Poses:
+    """Find poses under which the blobs of one camera look like the object, for several triples of blobs at once.
+
+    Args:
+        blobs: the snapshot.
+        rig: factory rig.
+        cameras: (Q,) camera of each triple.
+        triples: (Q, 3) blobs.
+        fiducials: triples to match them with.
+        tolerance: pixels within which a predicted fiducial counts as seen, at least.
+        keep: poses to keep of each triple of blobs.
+    """
+    focal = rig.focal_length.mean(-1).numpy()
+    rays = blobs.ideal[cameras[:, None], triples].astype(np.float64) / focal[cameras, None, None]
+    seen = blobs.ideal[blobs.row >= 0]
+    cell = max(tolerance / CELLS, float(np.ptp(seen, axis=0).max()) / MOST_CELLS)
+    origin = np.zeros((len(blobs.count), 2))
+    raster = _rasterize(blobs.ideal, blobs.count, cell, origin)
+    score = np.zeros((len(triples), keep))
+    rotation, translation = np.zeros((len(triples), keep, 3, 3)), np.zeros((len(triples), keep, 3))
+    _search(
+        rays, cameras, fiducials.triples, fiducials.sides, fiducials.frames, fiducials.points, fiducials.order,
+        focal, raster, origin, 1 / cell, score, rotation, translation,
+    )  # fmt: skip
+    found = score > 0
+    camera = np.broadcast_to(cameras[:, None], found.shape)[found]
+    back = rig.cam_from_rig.rotation.mT.numpy()[camera]
+    offset = rig.cam_from_rig.translation.numpy()[camera]
+    return Poses(back @ rotation[found], (back @ (translation[found] - offset)[..., None])[..., 0])
+
+
+@njit(cache=True, fastmath=FAST)
+def _search(
+    rays, cameras, triples, sides, frames, points, order, focal, raster, origin, per_pixel, score, rotation, translation
+):  # fmt: skip
+    """Fill the best poses (in the camera's frame) of each triple of blobs."""
+    for q in range(len(rays)):
+        camera = cameras[q]
+        frame, depths, turn = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
+        for t in range(len(triples)):
+            for mirror in (1.0, -1.0):
+                if not three_point_pose(rays[q], sides[t], mirror, frame, depths):
+                    continue
+                for i in range(3):
+                    for j in range(3):
+                        turn[i, j] = (
+                            frame[i, 0] * frames[t, j, 0]
+                            + frame[i, 1] * frames[t, j, 1]
+                            + frame[i, 2] * frames[t, j, 2]
+                        )
+                p = points[triples[t, 0]]
+                x = rays[q, 0, 0] * depths[0] - turn[0, 0] * p[0] - turn[0, 1] * p[1] - turn[0, 2] * p[2]
+                y = rays[q, 0, 1] * depths[0] - turn[1, 0] * p[0] - turn[1, 1] * p[1] - turn[1, 2] * p[2]
+                z = depths[0] - turn[2, 0] * p[0] - turn[2, 1] * p[1] - turn[2, 2] * p[2]
+                value = _explained(
+                    turn, x, y, z, points, order, focal[camera], raster[camera], origin[camera], per_pixel, score[q, -1]
+                )
+                if value > score[q, -1]:
+                    place = len(score[q]) - 1
+                    while place > 0 and score[q, place - 1] < value:
+                        score[q, place] = score[q, place - 1]
+                        for i in range(3):
+                            translation[q, place, i] = translation[q, place - 1, i]
+                            for j in range(3):
+                                rotation[q, place, i, j] = rotation[q, place - 1, i, j]
+                        place -= 1
+                    score[q, place] = value
+                    translation[q, place, 0], translation[q, place, 1], translation[q, place, 2] = x, y, z
+                    for i in range(3):
+                        for j in range(3):
+                            rotation[q, place, i, j] = turn[i, j]
+
+
+@njit(cache=True, fastmath=FAST)
+def _explained(turn, x, y, z, points, order, focal, raster, origin, per_pixel, least):
+    """Sum over fiducials of their nearness to a blob; give up early where it cannot or will hardly reach `least`."""
+    height, width = raster.shape
+    total = 0.0
+    for i in range(len(order)):
+        p = points[order[i]]
+        depth = turn[2, 0] * p[0] + turn[2, 1] * p[1] + turn[2, 2] * p[2] + z
+        if depth > 1:
+            scale = focal / depth
+            u = (scale * (turn[0, 0] * p[0] + turn[0, 1] * p[1] + turn[0, 2] * p[2] + x) - origin[0]) * per_pixel
+            v = (scale * (turn[1, 0] * p[0] + turn[1, 1] * p[1] + turn[1, 2] * p[2] + y) - origin[1]) * per_pixel
+            if u >= 0 and v >= 0 and u < width and v < height:
+                total += raster[int(v), int(u)]
+        if total + (len(order) - 1 - i) <= least:
+            return 0.0
+        if i + 1 == PROBES and i + 1 < len(order) and total * len(order) < 0.5 * least * PROBES:
+            return 0.0
+    return total
+
+
+@njit(cache=True)
+def _rasterize(uv, count, cell, origin):
+    """Raster 1 - (distance to the nearest blob / tolerance)^2 for each camera, so that looking up replaces searching.
+
+    Returns:
+        raster (C, H, W); `origin` gets the pixel coordinates (C, 2) of its corner.
+    """
+    cameras, reach = len(uv), CELLS
+    height, width = 1, 1
+    for c in range(cameras):
+        if count[c] == 0:
+            continue
+        low_u, low_v, high_u, high_v = uv[c, 0, 0], uv[c, 0, 1], uv[c, 0, 0], uv[c, 0, 1]
+        for m in range(1, count[c]):
+            low_u, high_u = min(low_u, uv[c, m, 0]), max(high_u, uv[c, m, 0])
+            low_v, high_v = min(low_v, uv[c, m, 1]), max(high_v, uv[c, m, 1])
+        origin[c, 0], origin[c, 1] = low_u - (reach + 1) * cell, low_v - (reach + 1) * cell
+        width = max(width, int((high_u - low_u) / cell) + 2 * reach + 4)
+        height = max(height, int((high_v - low_v) / cell) + 2 * reach + 4)
+    raster = np.zeros((cameras, height, width), dtype=np.float32)
+    for c in range(cameras):
+        for m in range(count[c]):
+            u, v = (uv[c, m, 0] - origin[c, 0]) / cell, (uv[c, m, 1] - origin[c, 1]) / cell
+            for row in range(int(v) - reach, int(v) + reach + 1):
+                for column in range(int(u) - reach, int(u) + reach + 1):
+                    away = ((column + 0.5 - u) ** 2 + (row + 0.5 - v) ** 2) / (CELLS * CELLS)
+                    if 1 - away > raster[c, row, column]:
+                        raster[c, row, column] = 1 - away
+    return raster

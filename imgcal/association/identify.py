@@ -1,0 +1,359 @@
+"""Decide which blob is which fiducial: by prediction where a pose is known, else by votes of the whole rig."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.association.ambiguities import Motion, differ, displacement, lattice_shifts, moved, near_turns
+from imgcal.association.assignment import spacing
+from imgcal.association.blobs import Spread, gather, spread_of
+from imgcal.association.few import compare_all, few
+from imgcal.association.hypotheses import (
+    Poses,
+    fiducial_triples,
+    likely_blobs,
+    many,
+)
+from imgcal.association.result import Identity, IdentityOptions, Status
+from imgcal.association.search import VERIFIED, Search
+from imgcal.association.verify import (
+    STAGES,
+    Fits,
+    Scene,
+    certain,
+    evidence,
+    join,
+    predictions,
+    refine,
+    rig_and_pose,
+    settle,
+    start,
+)
+from imgcal.association.voting import match, predict_ideal, vote
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.observations import Detections
+from imgcal.types.rig import CameraRig
+
+FIRST_HYPOTHESES = 8_000  # in the first round: large objects get fewer triples of blobs; then twice as many each time
+MOST_HYPOTHESES = 400_000  # in a round
+MOST_FALSE = 40  # blobs a fiducial, above which three of them drawn in all rounds are hardly ever fiducials
+MOST_PAIRS = 30_000_000  # of fiducials and blobs: what memory allows
+PATIENCE = 3  # rounds that end with two good labellings
+MOST_STEPS = 6  # from one labelling to a better one of the moved object
+APPROXIMATE = 0.02  # rad, what poses from three points are off by, even for a perfect camera
+EXCLUDED = 60.0  # margin of a labelling in one camera, above which the rig need not be asked
+LEAST_ALONE = 6  # labels from which one camera can be fitted by itself
+# Explained part near a known pose, below which it is asked whether another pose explains more: an object shifted by its
+# own edge still explains half.
+CONVINCING = 0.6
+
+
+def identify(
+    detections: Detections,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    std: Tensor,
+    candidates: Sequence[RigidTransform] = (),
+    options: IdentityOptions = IdentityOptions(),
+    guesses: Sequence[RigidTransform] = (),
+) -> Identity:
+    """Label the blobs of one snapshot: try the candidate poses first, then the guesses, then look for others.
+
+    Args:
+        detections: blobs of one snapshot; only usable ones count.
+        rig: factory rig without batch axes, float64.
+        obj: the calibration object.
+        std: (C, 15) prior standard deviation of each camera's parameters: how far the factory values may be off.
+        candidates: rig_from_object that may hold, the likeliest first: last snapshot's, or one known from the set-up.
+        options: how sure to be.
+        guesses: rig_from_object that nobody knows anything of, but that are worth a look: what is found there must
+            stand against all turns of the object, as without them.
+
+    Returns:
+        The decision; `Identity.accepted` tells whether the labels may be used.
+
+    Raises:
+        InputError: blobs of several snapshots, or cameras that are not the rig's.
+    """
+    partial: Identity | None = None
+    for pose, known in [*((pose, True) for pose in candidates), *((pose, False) for pose in guesses)]:
+        found = track(detections, rig, obj, std, pose, options, pose_known=known)
+        if found.accepted and found.explained >= CONVINCING:
+            return found
+        partial = found if partial is None and found.accepted else partial
+    anew = bootstrap(detections, rig, obj, std, options)
+    return partial if partial is not None and anew.explained <= partial.explained else anew
+
+
+def track(
+    detections: Detections,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    std: Tensor,
+    rig_from_object: RigidTransform,
+    options: IdentityOptions = IdentityOptions(),
+    *,
+    pose_known: bool = True,
+) -> Identity:
+    """Label the blobs of one snapshot near a pose; arguments as in `identify`, `pose_known` = it is no mere guess."""
+    scene = Scene(gather(detections, rig), obj, rig, std)
+    if scene.blobs.uv[..., 0].size * obj.fiducials > MOST_PAIRS:
+        return _refused(scene, _too_many(scene))
+    poses = Poses(rig_from_object.rotation.numpy()[None], rig_from_object.translation.numpy()[None])
+    predicted = predict_ideal(rig, scene.obj.points.numpy(), poses)
+    distance = float(np.median(_distances(rig, poses, obj)))
+    tolerance, gate = _bounds(scene, distance, pose_known=True)
+    # Where the fiducials are dense, a wide tolerance pairs them with anything: also try a narrow one.
+    gap = spacing(predicted[0])
+    tolerances = [tolerance, max(3.0, 0.2 * gap)] if tolerance > 0.4 * gap else [tolerance]
+    attempts = [
+        match(scene.blobs, predicted, vote(scene.blobs, predicted, reach, gate).shift, 1.25 * reach)
+        for reach in tolerances
+    ]
+    fits = refine(scene, start(scene, poses.select(np.zeros(len(attempts), dtype=int)), np.concatenate(attempts)))
+    return _decide(scene, fits, options, pose_known)
+
+
+def bootstrap(
+    detections: Detections,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    std: Tensor,
+    options: IdentityOptions = IdentityOptions(),
+) -> Identity:
+    """Label the blobs of one snapshot with no pose known; arguments as in `identify`."""
+    scene = Scene(gather(detections, rig), obj, rig, std)
+    cameras = np.flatnonzero(scene.blobs.count >= 4)
+    if len(cameras) == 0:
+        return _refused(
+            scene, f"too few blobs: at most {scene.blobs.count.max()} in a camera, expected at least 4 in one"
+        )
+    compared = compare_all(scene, options) if few(scene) else None
+    if compared is not None and compared.accepted:
+        return compared
+    likely = {camera: likely_blobs(scene.blobs, camera, many(obj)) for camera in cameras.tolist()}
+    hopeful = {camera: rows for camera, rows in likely.items() if len(rows) <= MOST_FALSE * obj.fiducials}
+    if not hopeful or scene.blobs.uv[..., 0].size * obj.fiducials > MOST_PAIRS:
+        return _refused(scene, _too_many(scene))
+    bounds = _bounds(scene, rig.working_distance or _guess_distance(scene), pose_known=False)
+    generator = np.random.default_rng(options.seed)
+    search = Search(scene, hopeful, fiducial_triples(obj, generator), bounds)
+    fits: Fits | None = None
+    result = _refused(scene, "no pose of the object explains the blobs")
+    undecided = 0
+    for number in range(options.rounds):
+        fresh = search.round(min(FIRST_HYPOTHESES << number, MOST_HYPOTHESES), generator)
+        if fresh is not None:
+            fits = fresh if fits is None else _best(scene, join(fits, fresh), 2 * VERIFIED)
+            result = _decide(scene, fits, options, known_pose=False)
+            # Where two labellings explain enough, more hypotheses will not tell them apart.
+            undecided += result.undecided
+        if result.accepted or undecided == PATIENCE or search.hypotheses > options.most_hypotheses:
+            break
+    if compared is not None and not result.accepted:
+        result = compared
+    return replace(result, hypotheses=search.hypotheses)
+
+
+def _best(scene: Scene, fits: Fits, count: int) -> Fits:
+    """Keep the labellings with the most evidence."""
+    if len(fits.labels) == 1:
+        return fits
+    return fits.select(np.argsort(-evidence(scene, fits), kind="stable")[:count])
+
+
+def _decide(scene: Scene, fits: Fits, options: IdentityOptions, known_pose: bool) -> Identity:
+    """Accept the best labelling or say why not."""
+    odds = (options.label_odds, options.least_label_odds)
+    fits = _best(scene, fits, len(fits.labels))
+    best = settle(scene, fits.select(np.array([0])))
+    chosen = certain(scene, best, *odds)
+    share, refusal, margin = _share(scene, chosen), None, -np.inf
+    if share >= options.least_share:
+        settled, margin = _against_motions(scene, best, known_pose)
+        margin = min(margin, _margin(scene, settled, fits))
+        if settled is not best:
+            chosen = certain(scene, settled, *odds)
+            share = _share(scene, chosen)
+        if margin < options.least_margin:
+            refusal = (
+                f"another labelling explains the blobs nearly as well, or chance does: margin {margin:.1f}, expected "
+                f"{options.least_margin:.0f}; show more of the object, to more cameras"
+            )
+    if share < options.least_share:
+        refusal = _too_little(_share(scene, best), share, options.least_share)
+    rig, pose = rig_and_pose(scene, chosen, 0)
+    if refusal is not None:
+        undecided = share >= options.least_share
+        return replace(_refused(scene, refusal), rig_from_object=pose, rig=rig, margin=margin, undecided=undecided)
+    order = 1 if known_pose else len(scene.obj.symmetries)
+    status: Status = "by_tracking" if known_pose else "ambiguous" if order > 1 else "unique"
+    reason = f"explains {100 * share:.0f} % of what could be seen, margin {margin:.0f}"
+    return Identity(scene.blobs.to_rows(chosen.labels[0]), pose, rig, status, order, margin, reason, share)
+
+
+def _too_little(fitted: float, certain_share: float, least: float) -> str:
+    """Say why too few labels are certain: nothing fits, or what fits could be something else."""
+    if fitted >= least:
+        return (
+            f"the best pose explains {100 * fitted:.0f} % of what could be seen, but labels are certain of only "
+            f"{100 * certain_share:.0f} %, expected {100 * least:.0f} %: too few blobs, or too many that are no "
+            "fiducials; show more of the object, to more cameras"
+        )
+    return (
+        f"the best pose explains {100 * fitted:.0f} % of what could be seen, expected {100 * least:.0f} %; check that "
+        "object and rig are those in the images, and that the blobs are its fiducials (polarity, threshold, radius)"
+    )
+
+
+def _share(scene: Scene, fits: Fits) -> float:
+    """Labelled part of what could be seen: in each camera, the smaller of blobs and fiducials."""
+    return float((fits.labels >= 0).sum() / max(np.minimum(scene.blobs.count, scene.obj.fiducials).sum(), 1))
+
+
+def _margin(scene: Scene, best: Fits, others: Fits) -> float:
+    """Log odds of a labelling against the best different one, and against all blobs being clutter."""
+    weights = evidence(scene, others)
+    rivals = [
+        weight
+        for weight, labels in zip(weights, others.labels, strict=True)
+        if differ(scene.obj, best.labels[0], labels)
+    ]
+    return float(evidence(scene, best)[0] - max([0.0, *rivals]))
+
+
+def _against_motions(scene: Scene, best: Fits, known_pose: bool) -> tuple[Fits, float]:
+    """Compare a labelling with those of an object shifted or turned onto itself; change to a better one.
+
+    A lattice may be shifted in all cameras together, or in a single one as far as its prior allows.
+
+    Returns:
+        The best labelling found, and its margin over the best of its neighbours.
+    """
+    shifts = lattice_shifts(scene.obj)
+    spread = spread_of(scene.std, scene.rig, scene.rig.working_distance or _guess_distance(scene))
+    turns = [] if known_pose else near_turns(scene.obj, 2 * spread.shape * scene.obj.size)
+    if not shifts and not turns:
+        return best, np.inf
+    for _ in range(MOST_STEPS):
+        _, pose = rig_and_pose(scene, best, 0)
+        labels = best.labels[0]
+        alone = _shifted_alone(scene, best, shifts, 6 * spread.shift)
+        together = _preferred(labels, alone)
+        if together is not None:
+            fit = refine(scene, start(scene, _one(pose), together[None]), stages=STAGES[:1])
+            if _margin(scene, best, fit) < 0:
+                best = settle(scene, fit)
+                continue
+        rivals = [moved(pose, labels, [motion]) for motion in shifts + turns]
+        rivals += [(_one(pose), rival[None]) for margin, _, rival in alone if margin < EXCLUDED]
+        fits = [refine(scene, start(scene, *rival), stages=STAGES[:1]) for rival in rivals]
+        margins = [_margin(scene, best, rival) for rival in fits]
+        if not margins or min(margins) >= 0:
+            excluded = [margin for margin, _, _ in alone if margin >= EXCLUDED]
+            return best, min([np.inf, *margins, *excluded])
+        best = settle(scene, fits[int(np.argmin(margins))])
+    return best, 0.0
+
+
+def _shifted_alone(
+    scene: Scene, best: Fits, shifts: list[Motion], reach: NDArray[np.float64]
+) -> list[tuple[float, int, NDArray[np.int64]]]:
+    """Compare a labelling with those in which the object is shifted for one camera alone, as that camera sees it.
+
+    A camera by itself, its pose free, knows only which labelling explains more of its blobs. What it would rather not
+    have, the rig does not want either: there, the shift must be borne by the camera's prior in addition.
+
+    Args:
+        scene: the snapshot.
+        best: a labelling, fitted.
+        shifts: steps of a lattice.
+        reach: (C,) pixels, farther shifts are beyond the prior.
+
+    Returns:
+        Margin against the labelling in that camera, camera, labels (C, N) of all cameras; margin 0 = it cannot tell.
+    """
+    _, pose = rig_and_pose(scene, best, 0)
+    labels, uv, found = best.labels[0], predictions(best), []
+    for camera in range(scene.rig.cameras):
+        near = [motion for motion in shifts if displacement(uv, motion)[camera] < reach[camera]]
+        seen = (labels[camera] >= 0).sum() >= LEAST_ALONE
+        part = scene.only(camera)
+        mine = refine(part, start(part, _one(pose), labels[None, [camera]]), STAGES[:1]) if near and seen else None
+        for motion in near:
+            where, shifted = moved(pose, labels, [motion])
+            margin = 0.0
+            if mine is not None:
+                rival = refine(part, start(part, where, shifted[:, [camera]]), STAGES[:1])
+                margin = _margin(part, mine, rival)
+            alone = labels.copy()
+            alone[camera] = shifted[0, camera]
+            found.append((margin, camera, alone))
+    return found
+
+
+def _preferred(
+    labels: NDArray[np.int64], alone: list[tuple[float, int, NDArray[np.int64]]]
+) -> NDArray[np.int64] | None:
+    """Labels (C, N) in which every camera has the shift that it likes better; None = they all like theirs best."""
+    together, least = labels.copy(), np.zeros(len(labels))
+    for margin, camera, shifted in alone:
+        if margin < least[camera]:
+            together[camera], least[camera] = shifted[camera], margin
+    return together if (least < 0).any() else None
+
+
+def _one(pose: RigidTransform) -> Poses:
+    return Poses(pose.rotation.numpy()[None], pose.translation.numpy()[None])
+
+
+def _too_many(scene: Scene) -> str:
+    name = scene.rig.camera_names[int(scene.blobs.count.argmax())]
+    return (
+        f"too many blobs: found {scene.blobs.count.max()} in camera {name}, where an object of {scene.obj.fiducials} "
+        "fiducials is expected; raise the detection threshold, or mask what is no marker"
+    )
+
+
+def _refused(scene: Scene, reason: str) -> Identity:
+    labels = np.full(scene.blobs.rows, -1, dtype=np.int64)
+    return Identity(labels, None, None, "refused", 0, 0.0, reason)
+
+
+def _bounds(scene: Scene, distance: float, pose_known: bool) -> tuple[float, float]:
+    """How far (px) a fiducial may be from its place in the pattern, and how far the pattern from its own.
+
+    Both follow from the prior. A pose from one camera is off as much as that camera, and its depth as much as its focal
+    length, which shifts the images of cameras at other places.
+    """
+    spread: Spread = spread_of(scene.std, scene.rig, distance)
+    focal = float(scene.rig.focal_length.mean())
+    positions = scene.rig.positions.numpy()
+    baseline = float(np.linalg.norm(positions - positions.mean(0), axis=1).max())
+    parallax = 2 * spread.shape * focal * baseline / distance
+    shift = float(np.hypot(spread.shift.max() * (1.0 if pose_known else np.sqrt(2)), 0.0 if pose_known else parallax))
+    bend = 2.5 * spread.shape if pose_known else float(np.hypot(2.5 * spread.shape, APPROXIMATE))
+    return max(3.0, bend * focal * scene.obj.size / distance), max(10.0, 4 * shift)
+
+
+def _guess_distance(scene: Scene) -> float:
+    """Distance at which the object looks about as large as the cloud of blobs, mm."""
+    focal = scene.rig.focal_length.mean(-1).numpy()
+    guesses = []
+    for camera in np.flatnonzero(scene.blobs.count >= 4):
+        uv = scene.blobs.ideal[camera, : scene.blobs.count[camera]]
+        guesses.append(
+            focal[camera] * scene.obj.size / max(float(np.linalg.norm(uv - np.median(uv, axis=0), axis=1).mean()), 1.0)
+        )
+    return float(np.median(guesses))
+
+
+def _distances(rig: CameraRig, poses: Poses, obj: CalibrationObject) -> NDArray[np.float64]:
+    centre = poses.rotation[0] @ obj.points.mean(0).numpy() + poses.translation[0]
+    return np.linalg.norm(rig.positions.numpy() - centre, axis=1)

@@ -1,0 +1,285 @@
+"""Predict every fiducial with its uncertainty from a fit, and compare it with every blob."""
+
+# Compiled functions take their types from their arguments.
+# ruff: noqa: ANN001, ANN202
+# mypy: allow-untyped-defs, no-check-untyped-defs
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imgcal.association.blobs import Blobs
+from imgcal.estimation.levenberg_marquardt import Solution
+from imgcal.estimation.linearize import Problem
+from imgcal.estimation.lm_cpu import _exponential, _multiply, lens
+from imgcal.geometry.projection import NEAREST_DEPTH
+from renderers.compiling import njit
+
+FAST = {"contract", "reassoc", "nsz"}
+THRESHOLD = 3.0
+"""Of the Cauchy loss of the fits, in standard deviations."""
+
+
+@dataclass(frozen=True)
+class Innovations:
+    """How well each blob fits each fiducial, given all labels but the fiducial's own."""
+
+    squared: NDArray[np.float64]  # (K, C, N, M) squared distance from the prediction, normalized by its covariance
+    log_det: NDArray[np.float64]  # (K, C, N) of that covariance, which includes the blob's noise, px^4
+    own: NDArray[np.float64]  # (K, C, N) `squared` of the fiducial's own blob, inf = no label
+    residual: NDArray[np.float64]  # (K, C, N) squared distance px^2 from the fit that includes the label
+    freedom: NDArray[np.float64]  # (K, C, N) degrees of freedom that the label leaves to its residual: 0 to 2
+    uv: NDArray[np.float64]  # (K, C, N, 2) px, predictions
+    complexity: NDArray[np.float64]  # (K,) log of det of posterior precision over prior precision
+
+    def select(self, rows: NDArray[np.int64]) -> Innovations:
+        """Keep the given labellings."""
+        return Innovations(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+
+def innovations(
+    blobs: Blobs, labels: NDArray[np.int64], sigma: NDArray[np.float64], problem: Problem, solution: Solution
+) -> Innovations:
+    """Compare predictions with blobs.
+
+    Args:
+        blobs: the snapshot.
+        labels: (K, C, N) blob of each fiducial, -1 = none: those of the fit.
+        sigma: (K,) px, noise of blob centres beyond their own.
+        problem: the fit's.
+        solution: the fit.
+    """
+    count, cameras, fiducials = labels.shape
+    radius_squared = np.zeros(fiducials) if problem.radius_squared is None else problem.radius_squared.numpy()
+    valid = blobs.row >= 0
+    noise = blobs.sigma**2
+    typical = float(np.median(noise[valid])) if valid.any() else 0.0
+    shape = (count, cameras, fiducials)
+    squared, log_det, own = np.full((*shape, blobs.uv.shape[1]), np.inf), np.zeros(shape), np.full(shape, np.inf)
+    residual, freedom, uv = np.zeros(shape), np.zeros(shape), np.zeros((*shape, 2))
+    complexity = np.full(count, np.inf)
+    equations, state = solution.equations, solution.state
+    factory, step = problem.factory, state.offset * problem.spread
+    given = [
+        np.ascontiguousarray(tensor.numpy())
+        for tensor in (
+            factory.cam_from_rig.rotation,
+            step[..., :3],
+            factory.positions + step[..., 3:6],
+            factory.focal_length + step[..., 6:8],
+            factory.principal_point + step[..., 8:10],
+            factory.distortion + step[..., 10:],
+            problem.spread,
+            problem.points @ state.rotation[:, 0].mT,
+            state.centre[:, 0],
+        )
+    ]
+    for k in np.flatnonzero(np.isfinite(equations.cost.numpy())):
+        # Lower factors of the cameras' blocks, of the couplings' and of the pose's: see arrow.reduce.
+        eliminated = equations.camera[k].numpy().copy()
+        whitened = equations.coupling[k, 0].numpy().copy()
+        kept = equations.pose[k, 0].numpy().copy()
+        complexity[k] = _factorize(eliminated, whitened, kept)
+        if np.isfinite(complexity[k]):
+            _compare(  # type: ignore[call-arg]
+                *(array[k] for array in given), radius_squared,
+                eliminated, whitened, kept, blobs.uv, noise, typical, blobs.count, labels[k], sigma[k] ** 2,
+                squared[k], log_det[k], own[k], residual[k], freedom[k], uv[k],
+            )  # fmt: skip
+    return Innovations(squared, log_det, own, residual, freedom, uv, complexity)
+
+
+def contested(labels: NDArray[np.int64], found: Innovations, undecided: float) -> NDArray[np.bool_]:
+    """Mark labels (K, C, N) whose blob may as well belong to another fiducial, alone or in exchange for its blob.
+
+    Args:
+        labels: (K, C, N) blob of each fiducial, -1 = none: those of the fit.
+        found: from `innovations`.
+        undecided: how little the squared normalized innovations of two pairings may differ.
+    """
+    result = np.zeros(labels.shape, dtype=bool)
+    _contest(labels, found.squared, found.log_det, found.own, undecided, result)
+    return result
+
+
+@njit(cache=True)
+def _contest(labels, squared, log_det, own, undecided, result):
+    for k in range(len(labels)):
+        for c in range(labels.shape[1]):
+            mine = labels[k, c]
+            for i in range(len(mine)):
+                if mine[i] < 0:
+                    continue
+                for j in range(len(mine)):
+                    change = squared[k, c, j, mine[i]] + log_det[k, c, j] - own[k, c, i] - log_det[k, c, i]
+                    if mine[j] >= 0:  # in exchange
+                        change += squared[k, c, i, mine[j]] + log_det[k, c, i] - own[k, c, j] - log_det[k, c, j]
+                    if i != j and change < undecided:
+                        result[k, c, i] = True
+                        break
+
+
+@njit(cache=True, fastmath=FAST)
+def _factorize(blocks, coupling, kept):
+    """Factorize the arrow in place; return the logarithm of its determinant, inf where it is not positive definite."""
+    log_det = 0.0
+    for c in range(len(blocks)):
+        part = _cholesky(blocks[c])
+        if part == np.inf:
+            return np.inf
+        log_det += part
+        for i in range(15):
+            for j in range(6):
+                for k in range(i):
+                    coupling[c, i, j] -= blocks[c, i, k] * coupling[c, k, j]
+                coupling[c, i, j] /= blocks[c, i, i]
+        for i in range(6):
+            for j in range(6):
+                for k in range(15):
+                    kept[i, j] -= coupling[c, k, i] * coupling[c, k, j]
+    return log_det + _cholesky(kept)
+
+
+@njit(cache=True, fastmath=FAST)
+def _cholesky(matrix):
+    """Factorize the lower triangle in place; return the logarithm of the determinant, inf if not positive definite."""
+    log_det = 0.0
+    for j in range(len(matrix)):
+        for k in range(j):
+            matrix[j, j] -= matrix[j, k] * matrix[j, k]
+        if not matrix[j, j] > 0:
+            return np.inf
+        log_det += np.log(matrix[j, j])
+        matrix[j, j] = np.sqrt(matrix[j, j])
+        for i in range(j + 1, len(matrix)):
+            for k in range(j):
+                matrix[i, j] -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] /= matrix[j, j]
+    return log_det
+
+
+@njit(cache=True, fastmath=FAST)
+def _compare(
+    rotation0, turn, position, focal, principal, distortion, spread, rotated, centre, radius_squared,
+    eliminated, whitened, kept, blob_uv, blob_noise, typical_noise, blob_count, labels, extra,
+    squared, log_det, own, residual, freedom, uv,
+):  # fmt: skip
+    """Fill the outputs for one labelling."""
+    rows, parts = np.empty((2, 21)), np.empty((2, 21))
+    rotation, exponential, left = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    unit = max(1.0, np.sqrt(centre[0] ** 2 + centre[1] ** 2 + centre[2] ** 2))
+    for c in range(len(rotation0)):
+        _exponential(turn[c], exponential, left)
+        _multiply(exponential, rotation0[c], rotation)
+        for n in range(len(rotated)):
+            _rows(
+                rotated[n], rotation, left, centre, position[c],
+                focal[c], principal[c], distortion[c], spread[c], radius_squared[n], unit, rows, uv[c, n],
+            )  # fmt: skip
+            uu, uv_, vv = _whiten(rows, eliminated[c], whitened[c], kept, parts)
+            label = labels[c, n]
+            noise = (blob_noise[c, label] if label >= 0 else typical_noise) + extra
+            at_u, at_v = uv[c, n, 0], uv[c, n, 1]
+            residual[c, n], freedom[c, n], own[c, n] = 0.0, 0.0, np.inf
+            if label >= 0:
+                # Leaving the label out turns the prediction's covariance H into (W - H)^-1 W H and its error e into
+                # (W - H)^-1 W e, with W the noise over the weight that the robust loss gave the label.
+                eu, ev = at_u - blob_uv[c, label, 0], at_v - blob_uv[c, label, 1]
+                residual[c, n] = eu * eu + ev * ev
+                weighted = noise + residual[c, n] / THRESHOLD**2
+                freedom[c, n] = max(2 - (uu + vv) / weighted, 0.0)
+                a, b, d = weighted - uu, -uv_, weighted - vv
+                det = a * d - b * b
+                if not (a > 0 and d > 0 and det > 1e-9 * weighted * weighted):
+                    # Nothing but the label itself says where the fiducial is.
+                    a, b, d, det = 1e-4 * weighted, 0.0, 1e-4 * weighted, 1e-8 * weighted * weighted
+                scale = weighted / det
+                at_u = blob_uv[c, label, 0] + scale * (d * eu - b * ev)
+                at_v = blob_uv[c, label, 1] + scale * (a * ev - b * eu)
+                uu, uv_, vv = scale * d - 1, -scale * b, scale * a - 1
+                uu, uv_, vv = weighted * uu + noise, weighted * uv_, weighted * vv + noise
+            else:
+                uu, vv = uu + noise, vv + noise
+            det = max(uu * vv - uv_ * uv_, 1e-12 * uu * vv)
+            log_det[c, n] = np.log(det)
+            for m in range(squared.shape[2]):
+                if m >= blob_count[c]:
+                    squared[c, n, m] = np.inf
+                    continue
+                x, y = blob_uv[c, m, 0] - at_u, blob_uv[c, m, 1] - at_v
+                squared[c, n, m] = (vv * x * x - 2 * uv_ * x * y + uu * y * y) / det
+            if label >= 0:
+                own[c, n] = squared[c, n, label]
+
+
+@njit(cache=True, fastmath=FAST)
+def _rows(
+    rotated, rotation, left, centre, position, focal, principal, distortion, spread, radius_squared, unit, rows, uv
+):  # fmt: skip
+    """Fill the Jacobian (2, 21) of a pixel by 15 whitened camera and 6 pose parameters, and the pixel.
+
+    To the last digit that of the fit (`fused._linearize`): where a label alone decides a parameter, nothing is left of
+    it but the difference of two almost equal numbers.
+    """
+    ax, ay, az = rotated[0], rotated[1], rotated[2]
+    ox, oy, oz = ax + centre[0] - position[0], ay + centre[1] - position[1], az + centre[2] - position[2]
+    px = rotation[0, 0] * ox + rotation[0, 1] * oy + rotation[0, 2] * oz
+    py = rotation[1, 0] * ox + rotation[1, 1] * oy + rotation[1, 2] * oz
+    pz = rotation[2, 0] * ox + rotation[2, 1] * oy + rotation[2, 2] * oz
+    per_depth, log_slope, x, y, rr, xd, yd, jxx, jxy, jyy = lens(
+        px, py, max(pz, NEAREST_DEPTH), radius_squared,
+        distortion[0], distortion[1], distortion[2], distortion[3], distortion[4],
+    )  # fmt: skip
+    uv[0], uv[1] = focal[0] * xd + principal[0], focal[1] * yd + principal[1]
+    for r in range(2):
+        along_x, along_y = (jxx, jxy) if r == 0 else (jxy, jyy)
+        sx, sy = focal[r] * per_depth * along_x, focal[r] * per_depth * along_y
+        sz = focal[r] * log_slope * (along_x * x + along_y * y)
+        tx, ty, tz = py * sz - pz * sy, pz * sx - px * sz, px * sy - py * sx
+        bx = sx * rotation[0, 0] + sy * rotation[1, 0] + sz * rotation[2, 0]
+        by = sx * rotation[0, 1] + sy * rotation[1, 1] + sz * rotation[2, 1]
+        bz = sx * rotation[0, 2] + sy * rotation[1, 2] + sz * rotation[2, 2]
+        for i in range(3):
+            rows[r, i] = (tx * left[0, i] + ty * left[1, i] + tz * left[2, i]) * spread[i]
+        rows[r, 3], rows[r, 4], rows[r, 5] = -bx * spread[3], -by * spread[4], -bz * spread[5]
+        rows[r, 15], rows[r, 16], rows[r, 17] = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+        rows[r, 18], rows[r, 19], rows[r, 20] = bx * unit, by * unit, bz * unit
+    for r in range(2):
+        at, along, mixed = (x, xd, 12) if r == 0 else (y, yd, 13)
+        rows[r, 6 + r], rows[r, 7 - r] = along * spread[6 + r], 0.0
+        rows[r, 8 + r], rows[r, 9 - r] = spread[8 + r], 0.0
+        power = focal[r] * at * rr
+        rows[r, 10], rows[r, 11], rows[r, 14] = (
+            power * spread[10],
+            power * rr * spread[11],
+            power * rr * rr * spread[14],
+        )
+        rows[r, mixed] = focal[r] * 2 * x * y * spread[mixed]
+        rows[r, 25 - mixed] = focal[r] * (rr + 2 * at * at) * spread[25 - mixed]
+
+
+@njit(cache=True, fastmath=FAST)
+def _whiten(rows, eliminated, whitened, kept, parts):
+    """Apply the inverse of the arrow's triangular factor; return the covariance parts @ parts.T: uu, uv, vv."""
+    for r in range(2):
+        for i in range(15):
+            value = rows[r, i]
+            for j in range(i):
+                value -= eliminated[i, j] * parts[r, j]
+            parts[r, i] = value / eliminated[i, i]
+        for i in range(6):
+            value = rows[r, 15 + i]
+            for j in range(15):
+                value -= whitened[j, i] * parts[r, j]
+            for j in range(i):
+                value -= kept[i, j] * parts[r, 15 + j]
+            parts[r, 15 + i] = value / kept[i, i]
+    uu, uv, vv = 0.0, 0.0, 0.0
+    for i in range(21):
+        uu += parts[0, i] * parts[0, i]
+        uv += parts[0, i] * parts[1, i]
+        vv += parts[1, i] * parts[1, i]
+    return uu, uv, vv

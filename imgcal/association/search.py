@@ -1,0 +1,78 @@
+"""The search for a pose of which nothing is known: hypotheses of single cameras, on which the whole rig votes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import reduce
+from operator import add
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imgcal.association.ambiguities import conflicts
+from imgcal.association.hypotheses import FiducialTriples, blob_triples, single_camera_poses
+from imgcal.association.planar import planar_poses
+from imgcal.association.verify import Fits, Scene, refine, start
+from imgcal.association.voting import match, predict_ideal, vote
+from imgcal.types.calibration_object import CalibrationObject
+
+TRIPLES = 10  # of blobs in a round, over all cameras
+KEPT = 8  # poses of each
+PLANAR_EFFORT = 50_000  # hypotheses that take the time of a camera's poses of a planar object
+VOTES_A_HYPOTHESIS = 500  # likewise: comparisons of a fiducial with a blob
+MANY = 40  # fiducials of a planar object, above which triples are too many
+VERIFIED = 2  # different labellings that are fitted, the best of a round
+
+
+@dataclass
+class Search:
+    """Poses that hypotheses from single cameras suggest, for the whole rig to vote on."""
+
+    scene: Scene
+    likely: Mapping[int, NDArray[np.int64]]  # blobs to draw from, of each camera that is worth it
+    triples: FiducialTriples
+    bounds: tuple[float, float]  # see `_bounds`
+    hypotheses: int = 0  # so far; of planar objects, as many as would have taken their time
+
+    def round(self, hypotheses: int, generator: np.random.Generator) -> Fits | None:
+        """Make so many hypotheses, let the rig vote within the bounds, fit the best; None = there is none."""
+        scene, (tolerance, gate) = self.scene, self.bounds
+        cameras = np.array(list(self.likely))
+        if scene.obj.planar and scene.obj.fiducials > MANY:
+            chosen = generator.permutation(cameras)[:2]
+            poses = reduce(add, (planar_poses(scene.blobs, scene.rig, camera, scene.obj) for camera in chosen))
+            self.hypotheses += PLANAR_EFFORT * len(chosen)
+        else:
+            number = int(np.clip(hypotheses // len(self.triples.triples), 1, TRIPLES))
+            cameras = generator.permutation(cameras)[:number]
+            each = -(-number // len(cameras))
+            drawn = [blob_triples(scene.blobs.ideal[c], self.likely[c], each, generator) for c in cameras.tolist()]
+            camera = np.repeat(cameras, each)
+            poses = single_camera_poses(
+                scene.blobs, scene.rig, camera, np.concatenate(drawn), self.triples, tolerance, KEPT
+            )
+            self.hypotheses += len(camera) * len(self.triples.triples)
+        self.hypotheses += len(poses) * scene.blobs.uv[..., 0].size * scene.obj.fiducials // VOTES_A_HYPOTHESIS
+        if len(poses) == 0:
+            return None
+        predicted = predict_ideal(scene.rig, self.triples.points, poses)
+        votes = vote(scene.blobs, predicted, tolerance, gate)
+        best = np.argsort(-votes.count.sum(1), kind="stable")[: 4 * VERIFIED]
+        labels = match(scene.blobs, predicted[best], votes.shift[best], 1.25 * tolerance)
+        best, labels = _different(scene.obj, best, labels)
+        return refine(scene, start(scene, poses.select(best), labels))
+
+
+def _different(
+    obj: CalibrationObject, rows: NDArray[np.int64], labels: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Keep the fullest of labellings (K, C, N) that differ in most labels, `VERIFIED` at most."""
+    order = np.argsort(-(labels >= 0).sum((1, 2)), kind="stable")
+    kept: list[int] = []
+    for k in order:
+        if all(conflicts(obj, labels[other], labels[k]) > 0.5 for other in kept):
+            kept.append(int(k))
+        if len(kept) == VERIFIED:
+            break
+    return rows[kept], labels[kept]

@@ -1,0 +1,275 @@
+"""From a rough labelling to a certain one: fit rig and pose, predict with uncertainty, label again, finer each time.
+
+Only after such a fit can a label be judged: the factory rig alone is off by tens of pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, reduce
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.association.ambiguities import lattice_shifts
+from imgcal.association.assignment import assign
+from imgcal.association.blobs import Blobs
+from imgcal.association.hypotheses import Poses
+from imgcal.association.innovation import THRESHOLD, Innovations, contested, innovations
+from imgcal.estimation import lm_cpu
+from imgcal.estimation.linearize import Problem, State, pose_at
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.rig import CameraRig
+
+STAGES = (3.0, 0.7)
+"""Standard deviations (px) that the first fits allow, beyond the blobs' own; the last ones ask the residuals."""
+GATE = 25.0
+"""Squared normalized innovation of a label; two degrees of freedom exceed it once in 270,000."""
+LEAST_SIZE_SPREAD = 0.05
+"""Relative standard deviation of a blob's radius within its camera, at least: depth, tilt and exposure vary."""
+MOST_SIZE_MISFIT = 36.0
+"""Of one blob: a single odd radius decides no more than this."""
+UNDECIDED = 2 * np.log(1e3)
+"""Two pairings whose squared normalized innovations differ by less cannot be told apart."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is given: the blobs, the object, the factory rig and how far it may have drifted."""
+
+    blobs: Blobs
+    obj: CalibrationObject
+    rig: CameraRig
+    std: Tensor  # (C, 15)
+
+    @cached_property
+    def problem(self) -> Problem:
+        """Of one labelling, without any label."""
+        points, radius = self.obj.points.double(), self.obj.radius
+        centroid, cameras = points.mean(0), self.rig.cameras
+        return Problem(
+            uv=points.new_zeros(1, 1, cameras, 2, len(points)),
+            root_weight=points.new_zeros(1, 1, cameras, len(points)),
+            points=points - centroid,
+            centroid=centroid,
+            radius_squared=None if radius is None else radius.double().square(),
+            factory=self.rig.expand(1),
+            spread=self.std.expand(1, -1, -1),
+        )
+
+    def only(self, camera: int) -> Scene:
+        """Keep one camera."""
+        return Scene(self.blobs.only(camera), self.obj, self.rig.select([camera]), self.std[[camera]])
+
+
+@dataclass(frozen=True)
+class Fits:
+    """K labellings, each with the rig and pose that fit it best."""
+
+    labels: NDArray[np.int64]  # (K, C, N) blob of each fiducial, -1 = none
+    state: State
+    sigma: NDArray[np.float64]  # (K,) px, error of a blob centre beyond its own
+    cost: NDArray[np.float64]  # (K,) half of chi2, data and prior
+    innovations: Innovations | None = None  # of these labels at this state
+
+    def select(self, rows: NDArray[np.int64]) -> Fits:
+        """Keep the given labellings."""
+        state = State(self.state.offset[rows], self.state.rotation[rows], self.state.centre[rows])
+        found = None if self.innovations is None else self.innovations.select(rows)
+        return Fits(self.labels[rows], state, self.sigma[rows], self.cost[rows], found)
+
+
+def join(first: Fits, second: Fits) -> Fits:
+    """Put fitted labellings of one snapshot together."""
+    a, b = first.state, second.state
+    state = State(torch.cat((a.offset, b.offset)), torch.cat((a.rotation, b.rotation)), torch.cat((a.centre, b.centre)))
+    found = Innovations(
+        *(
+            np.concatenate((getattr(_found(first), f.name), getattr(_found(second), f.name)))
+            for f in fields(Innovations)
+        )
+    )
+    joined = (
+        np.concatenate(pair)
+        for pair in zip(
+            (first.labels, first.sigma, first.cost), (second.labels, second.sigma, second.cost), strict=True
+        )
+    )
+    labels, sigma, cost = joined
+    return Fits(labels, state, sigma, cost, found)
+
+
+def start(scene: Scene, poses: Poses, labels: NDArray[np.int64]) -> Fits:
+    """Put the factory rig at poses (K,) with rough labels (K, C, N)."""
+    u, _, vh = np.linalg.svd(poses.rotation)
+    rotation = torch.from_numpy(u @ vh)
+    centre = torch.from_numpy(np.ascontiguousarray(poses.translation)) + rotation @ scene.obj.points.mean(0).to(
+        rotation
+    )
+    offset = rotation.new_zeros(len(poses), *scene.std.shape)
+    return Fits(labels, State(offset, rotation[:, None], centre[:, None]), np.zeros(len(poses)), np.zeros(len(poses)))
+
+
+def refine(scene: Scene, fits: Fits, stages: tuple[float, ...] = STAGES) -> Fits:
+    """Fit and label again through all stages; the last labels are fitted too."""
+    for sigma in stages:
+        fits = fit(scene, replace(fits, sigma=np.full(len(fits.labels), sigma)))
+        fits = replace(fits, sigma=_residual_sigma(scene, fits), labels=_assign(fits))
+    return settle(scene, fit(scene, fits), rounds=1)
+
+
+def settle(scene: Scene, fits: Fits, rounds: int = 4) -> Fits:
+    """Label fitted labellings again, and fit, until the labels stay or for so many rounds."""
+    for _ in range(rounds):
+        labels = _assign(fits)
+        if np.array_equal(labels, fits.labels):
+            break
+        fits = fit(scene, replace(fits, sigma=_residual_sigma(scene, fits), labels=labels))
+    return fits
+
+
+def certain(scene: Scene, fits: Fits, odds: float, least_odds: float) -> Fits:
+    """Drop labels that are not certain: neither a false blob nor another fiducial may explain the blob nearly as well.
+
+    Args:
+        scene: what is given.
+        fits: refined labellings.
+        odds: odds of a label against a false blob, to be exceeded.
+        least_odds: the same where false blobs are so dense that hardly any label reaches `odds`.
+    """
+    # How dense false blobs are is asked once: a dropped label must not count as a false blob against the others.
+    surroundings = _detection_odds(scene, fits) - np.log(_clutter(scene, fits))
+    log_odds = _log_density(_found(fits)) + surroundings
+    usual = np.median(log_odds[np.isfinite(log_odds)]) if np.isfinite(log_odds).any() else 0.0
+    demanded = np.clip(usual - np.log(100), np.log(least_odds), np.log(odds))
+    # Two or three labels of one camera can support each other in the wrong place: most of what it sees must fit.
+    # In a lattice, half of them can, a step away.
+    most = 0.7 if lattice_shifts(scene.obj) else 0.5
+    enough = np.maximum(3, most * np.minimum(scene.blobs.count, scene.obj.fiducials))
+    for _ in range(4):
+        found = _found(fits)
+        log_odds = _log_density(found) + surroundings
+        good = (found.own < GATE) & (log_odds > demanded) & ~contested(fits.labels, found, UNDECIDED)
+        good &= (good.sum(-1) >= enough)[..., None]
+        if np.array_equal(good, fits.labels >= 0):
+            break
+        fits = fit(scene, replace(fits, labels=np.where(good, fits.labels, -1)))
+    return fits
+
+
+def evidence(scene: Scene, fits: Fits) -> NDArray[np.float64]:
+    """Log of the odds of each labelling against "all blobs are clutter" (Laplace's approximation): (K,)."""
+    labelled = fits.labels >= 0
+    noise = _blob_noise(scene, fits) + fits.sigma[:, None, None] ** 2
+    found = _found(fits)
+    gain = -np.log(2 * np.pi * noise) - np.log(_clutter(scene, fits)) + _detection_odds(scene, fits)
+    sizes = _size_misfit(scene, fits)
+    return np.where(labelled, gain, 0).sum((1, 2)) - fits.cost - 0.5 * (found.complexity + sizes)
+
+
+def predictions(fits: Fits) -> NDArray[np.float64]:
+    """Pixels of all fiducials under the first labelling: (C, N, 2)."""
+    return _found(fits).uv[0]
+
+
+def rig_and_pose(scene: Scene, fits: Fits, row: int) -> tuple[CameraRig, RigidTransform]:
+    """Give the rig and rig_from_object of one labelling, without batch axes."""
+    problem = problem_of(scene, fits)
+    return lm_cpu.rig_at(problem, fits.state.offset)[row], pose_at(problem, fits.state)[row, 0]
+
+
+def _found(fits: Fits) -> Innovations:
+    if fits.innovations is None:
+        raise RuntimeError("labellings were not fitted")
+    return fits.innovations
+
+
+def _assign(fits: Fits) -> NDArray[np.int64]:
+    return assign(_found(fits).squared, GATE)
+
+
+def _blob_noise(scene: Scene, fits: Fits) -> NDArray[np.float64]:
+    """Variance of each label's blob by its own account: (K, C, N) px^2."""
+    return scene.blobs.sigma[np.arange(fits.labels.shape[1])[:, None], np.maximum(fits.labels, 0)] ** 2
+
+
+def problem_of(scene: Scene, fits: Fits) -> Problem:
+    """Put labellings into the form that estimation knows."""
+    count, cameras, _ = fits.labels.shape
+    seen = fits.labels >= 0
+    uv = np.where(seen[..., None], scene.blobs.uv[np.arange(cameras)[:, None], np.maximum(fits.labels, 0)], 0.0)
+    sigma = np.sqrt(_blob_noise(scene, fits) + fits.sigma[:, None, None] ** 2)
+    problem = replace(
+        scene.problem,
+        uv=torch.from_numpy(np.ascontiguousarray(uv.swapaxes(-1, -2)))[:, None],
+        root_weight=torch.from_numpy(seen / sigma)[:, None],
+    )
+    if count == 1:
+        return problem
+    return replace(problem, factory=scene.rig.expand(count), spread=scene.std.expand(count, -1, -1))
+
+
+def fit(scene: Scene, fits: Fits) -> Fits:
+    """Fit labellings as they are."""
+    # One after the other: starting threads for a few small fits takes longer than the fits on a busy machine.
+    bare = replace(fits, innovations=None)
+    return reduce(join, [_fit_one(scene, bare.select(np.array([k]))) for k in range(len(fits.labels))])
+
+
+def _fit_one(scene: Scene, fits: Fits) -> Fits:
+    problem = problem_of(scene, fits)
+    solution = lm_cpu.minimize(problem, fits.state, "cauchy", THRESHOLD, 8, 1e-3)
+    found = innovations(scene.blobs, fits.labels, fits.sigma, problem, solution)
+    return replace(fits, state=solution.state, cost=solution.equations.cost.numpy(), innovations=found)
+
+
+def _residual_sigma(scene: Scene, fits: Fits) -> NDArray[np.float64]:
+    """Error of blob centres beyond their own, as far as the residuals show it: (K,) px."""
+    found = _found(fits)
+    inlier = (fits.labels >= 0) & (found.own < GATE)
+    freedom = np.where(inlier, found.freedom, 0).sum((1, 2))
+    variance = np.where(inlier, found.residual, 0).sum((1, 2)) / np.maximum(freedom, 1e-3)
+    own = np.where(inlier, _blob_noise(scene, fits), 0).sum((1, 2)) / np.maximum(inlier.sum((1, 2)), 1)
+    return np.minimum(np.sqrt(np.maximum(variance - own, 0)), fits.sigma)
+
+
+def _size_misfit(scene: Scene, fits: Fits) -> NDArray[np.float64]:
+    """Chi2 of the blobs' radii where fiducials differ in theirs: (K,). One unknown factor a camera takes the rest."""
+    radius = scene.obj.radius
+    if radius is None or not bool((radius > 1.05 * radius.min()).any()):
+        return np.zeros(len(fits.labels))
+    seen = scene.blobs.radius[np.arange(fits.labels.shape[1])[:, None], np.maximum(fits.labels, 0)]
+    with np.errstate(all="ignore"):
+        ratio = np.log(np.where(fits.labels >= 0, seen, np.nan) / radius.numpy())
+        ratio = np.where(np.isfinite(ratio).any(-1, keepdims=True), ratio, 0.0)
+        misfit = np.abs(ratio - np.nanmedian(ratio, axis=-1, keepdims=True))
+        spread = np.maximum(1.5 * np.nanmedian(misfit, axis=-1, keepdims=True), LEAST_SIZE_SPREAD)
+    return np.nansum(np.minimum((misfit / spread) ** 2, MOST_SIZE_MISFIT), axis=(1, 2))
+
+
+def _clutter(scene: Scene, fits: Fits) -> NDArray[np.float64]:
+    """False blobs per square pixel, near the object's image or overall, whichever is more: (K, 1, 1)."""
+    uv = _found(fits).uv
+    low, high = uv.min(2), uv.max(2)
+    middle, half = (low + high) / 2, 0.75 * (high - low) + 10
+    inside = (np.abs(scene.blobs.uv[None] - middle[:, :, None]) < half[:, :, None]).all(-1).sum((1, 2))
+    labelled = (fits.labels >= 0).sum((1, 2))
+    local = (np.maximum(inside - labelled, 0) + 1) / (4 * half.prod(-1)).sum(1)
+    overall = (scene.blobs.count.sum() - labelled + 1) / scene.rig.image_size.prod(1).sum().item()
+    return np.maximum(local, overall)[:, None, None]
+
+
+def _detection_odds(scene: Scene, fits: Fits) -> NDArray[np.float64]:
+    """Log odds that a fiducial in view gives a blob: (K, 1, 1)."""
+    uv = _found(fits).uv
+    in_view = ((uv > 0) & (uv < scene.rig.image_size.numpy()[:, None])).all(-1).sum((1, 2))
+    share = np.clip(((fits.labels >= 0).sum((1, 2)) + 1) / (in_view + 2), 0.05, 0.95)
+    return np.log(share / (1 - share))[:, None, None]
+
+
+def _log_density(found: Innovations) -> NDArray[np.float64]:
+    """Log density (per px^2) of each label's blob where it is (K, C, N); -inf = no label."""
+    return -np.log(2 * np.pi) - 0.5 * found.log_det - 0.5 * found.own

@@ -1,0 +1,390 @@
+"""Blobs in their windows, compiled: background, territory, weights, moments.
+
+Scratch arrays hold the part of the window that the blob may reach, its *area*, from row and column `MARGIN` on, and the
+pixels around it. Loops run from constant bounds, without which they are not vectorized. The tests hold the same in
+plain NumPy.
+"""
+
+# Compiled functions take their types from their arguments.
+# ruff: noqa: ANN001, ANN201, ANN202
+# mypy: allow-untyped-defs, no-check-untyped-defs
+
+from __future__ import annotations
+
+import numpy as np
+
+from imgcal.detection.candidates import BLOCK
+from imgcal.detection.fitting import BAND, FARTHEST, MOST, PARAMETERS, ROWS, fit_centre, start_of
+from imgcal.detection.moments import find_centroid, find_ramp, find_shape
+from imgcal.types.observations import BlobFlag
+from renderers.compiling import njit
+
+RING = 2  # px, width of the frame of a window from which the background is taken
+CLIP = (4.0, 9.0)  # standard deviations of a 3 x 3 mean below which a pixel is background: weak blob, bright blob
+CLIP_PEAK = 0.1  # of the peak: where the clip lies between the two
+SKIRT = 3.5  # px, how far the blurred edge reaches beyond the component that was found
+SPREAD = 5  # px, up to which distances are exact
+MARGIN = SPREAD + 1  # px around the area: distances are asked for in the pixels next to it
+SIGNIFICANT = 6.0  # standard deviations of a 3 x 3 mean that the brightest one of a blob must reach
+MISFIT = 0.05  # of the peak, beyond the noise: RMS residual from which a blob is no ellipse and keeps its centroid
+CROWDED = 0.6  # of the peak: a border this bright with a neighbour is no border
+CROWDED_CLIPPED = 0.9  # the same between clipped peaks that were parted: the light around them adds up there
+# Of the radius, times that part to the power 1.5: how far a neighbour's light moves the centre of a clipped blob. By
+# simulation of bright lamps with halos.
+SHARED = 0.1
+SMALLEST_SIGMA = 0.0005  # px, what sampling by pixels leaves without any noise
+# px * sqrt(px): position lost where clipping turns a soft edge into a step, over sqrt(radius); the worst case of the
+# exposures (2 to 15 times full scale) in the tests.
+CLIPPED_SIGMA = 0.045
+CLIPPED_FIT = 0.01  # the same where clipped pixels are left out of a fit
+_MERGED, _SATURATED = int(BlobFlag.MERGED), int(BlobFlag.SATURATED)
+_FAR = 200  # px^2; with two distances added to it still within 8 bit
+
+
+@njit(cache=True, nogil=True)
+def measure_all(
+    frame, tile, labels, boxes, label, parted, half_size, invert, saturation, limits,
+    uv, sigma, radius, contrast, flags, kept,
+):  # fmt: skip
+    """Fill the columns of all candidates of a frame."""
+    widest = 0
+    for k in range(len(half_size)):
+        widest = max(widest, half_size[k])
+    side = 2 * widest + 1 + 2 * MARGIN
+    scratch, ring = np.empty((4, side * side), np.float32), np.empty((4, 4 * RING * side), np.float32)
+    fit = np.empty((ROWS, MOST), np.float32)
+    distances, offsets = np.empty((3, side * side), np.uint8), np.empty((2, side * side), np.float32)
+    least, smallest, largest, longest = limits
+    for k in range(len(boxes)):
+        u, v = (boxes[k, 0] + boxes[k, 2]) // 2, (boxes[k, 1] + boxes[k, 3]) // 2
+        noise, slope, plane = _background(frame, u, v, half_size[k], invert, ring)
+        first, rows, columns = _area(frame, boxes[k], u, v, half_size[k])
+        shape, pixels = (rows, columns), rows * columns  # contiguous arrays: only these are vectorized
+        grey, smooth = scratch[0, :pixels].reshape(shape), scratch[1, :pixels].reshape(shape)
+        weight, ramp = scratch[2, :pixels].reshape(shape), scratch[3, :pixels].reshape(shape)
+        own, other = distances[0, :pixels].reshape(shape), distances[1, :pixels].reshape(shape)
+        brightest = _copy(frame, first, u, v, invert, plane, grey, offsets)
+        _blur(grey, smooth)
+        spare = distances[2, :pixels].reshape(shape)
+        crowded = _spread_labels(tile, labels, first, label[k], spare, own, other)
+        saddle = _claim(own, other, crowded, smooth, weight)
+        scale = _weigh(smooth, noise, weight)
+        peak, peak_mean, brightness = _find_peaks(grey, smooth, weight)
+        radius[k], contrast[k] = np.sqrt(brightness / peak / np.pi), peak
+        x, y = offsets[0, :pixels], offsets[1, :pixels]
+        # What was found of a flat patch is all of it.
+        patch = (boxes[k, 2] - boxes[k, 0] + 1) * (boxes[k, 3] - boxes[k, 1] + 1) > brightness / peak
+        elongation, two_peaked, middle, moments = find_shape(grey, weight, x, y, peak_mean / 2, patch)
+        kept[k] = (
+            smallest <= radius[k] <= largest and peak >= least
+            and peak_mean > SIGNIFICANT / 3 * noise and elongation <= longest
+        )  # fmt: skip
+        if not kept[k]:
+            continue
+        clipped = brightest >= saturation and _is_saturated(frame, first, invert, saturation, weight)
+        shared = min(saddle / peak_mean, 1.0)  # light, where others are as near
+        merged = two_peaked or shared > (CROWDED_CLIPPED if clipped and parted[k] else CROWDED)
+        flags[k] = clipped * _SATURATED + merged * _MERGED
+        known = x0 = y0 = residual = 0.0
+        if not flags[k] & _MERGED:
+            start = start_of(peak, radius[k], clipped, moments, middle)
+            count = _gather(grey, x, y, own, other, spare, plane, saturation if clipped else 1e9, start, fit)
+            if count > PARAMETERS:
+                x0, y0, known, residual = fit_centre(fit, count, start, clipped, noise)
+        fits = known * radius[k] ** 2 > max(noise**2, residual) and residual - noise**2 < (MISFIT * peak) ** 2
+        if fits and (x0 - middle[0]) ** 2 + (y0 - middle[1]) ** 2 < FARTHEST**2:
+            variance = max(noise**2, residual) / known + (slope * brightness / known) ** 2
+            variance += clipped * CLIPPED_FIT**2 / max(radius[k], 1.0)
+        else:
+            find_ramp(grey, weight, scale, ramp)
+            x0, y0, lever, tilt = find_centroid(grey, weight, ramp, x, y)
+            # Each pixel's noise moves the centroid by its lever arm over the brightness; mean of both axes.
+            variance = (noise**2 * lever / 2 + (slope * tilt / 2) ** 2) / brightness**2
+            variance += clipped * CLIPPED_SIGMA**2 / max(radius[k], 1.0)
+        variance += clipped * shared**3 * (SHARED * radius[k]) ** 2
+        uv[k, 0], uv[k, 1], sigma[k] = u + x0, v + y0, np.sqrt(variance + SMALLEST_SIGMA**2)
+
+
+@njit(cache=True, nogil=True)
+def _area(frame, box, u, v, half):
+    """First pixel (v, u), rows and columns of the scratch arrays.
+
+    The skirt of a component may reach the pixels of the frame that are around its box and not in the window's ring.
+    """
+    reach, inner = int(SKIRT), half - RING
+    left, right = max(box[0] - reach, u - inner, 0), min(box[2] + reach, u + inner, frame.shape[1] - 1)
+    top, bottom = max(box[1] - reach, v - inner, 0), min(box[3] + reach, v + inner, frame.shape[0] - 1)
+    return (top - MARGIN, left - MARGIN), bottom - top + 1 + 2 * MARGIN, right - left + 1 + 2 * MARGIN
+
+
+@njit(cache=True, nogil=True)
+def _grey(frame, v, u, invert):
+    """Grey value of a pixel, of dark frames subtracted from `invert` (-1 = bright).
+
+    Beyond the border the last row or column repeats.
+    """
+    value = np.float32(frame[min(max(v, 0), frame.shape[0] - 1), min(max(u, 0), frame.shape[1] - 1)])
+    return np.float32(invert) - value if invert >= 0 else value
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _background(frame, u, v, half, invert, ring):
+    """Fit a plane to the ring around a blob, without what else lies there.
+
+    Returns:
+        Noise, one standard deviation of a pixel, not less than that of rounding to grey levels; the standard deviation
+        of the plane's slopes; the plane at the middle of the window and its slopes.
+    """
+    count = 0
+    for y in range(-half, half + 1):
+        step = 1 if abs(y) > half - RING else 2 * half + 1 - RING
+        for start in range(1 if step == 1 else RING):
+            for x in range(start - half, half + 1, step):
+                ring[0, count], ring[1, count], ring[2, count] = _grey(frame, v + y, u + x, invert), x, y
+                ring[3, count] = ring[0, count]
+                count += 1
+    value, x, y = ring[0, :count], ring[1, :count], ring[2, :count]
+    middle = _select(ring[3], count, count // 2)
+    quarter = _select(ring[3], count // 2 + 1, count // 4)
+    # The lower half tells the spread: clutter in the ring is bright. One grey level is the estimate's quantization.
+    reach = 4 * (np.float32(1.4826) * (middle - quarter) + 1)
+    n = sx = sy = sxx = sxy = syy = g = gx = gy = 0.0
+    for r in range(count):
+        # Centred on the middle: grey values of 16 bit lose nothing in single precision.
+        value[r] -= middle
+        w = np.float32(1) if abs(value[r]) < reach else np.float32(0)
+        n += w
+        sx, sy = sx + w * x[r], sy + w * y[r]
+        sxx, sxy, syy = sxx + w * x[r] * x[r], sxy + w * x[r] * y[r], syy + w * y[r] * y[r]
+        g, gx, gy = g + w * value[r], gx + w * value[r] * x[r], gy + w * value[r] * y[r]
+    c0, cx, cy = _solve(n + 1e-3, sx, sy, sxx + 1e-3, sxy, syy + 1e-3, g, gx, gy)
+    squares = 0.0
+    for r in range(count):
+        residual = value[r] - c0 - cx * x[r] - cy * y[r]
+        squares += residual * residual if abs(value[r]) < reach else 0.0
+    noise = max(np.sqrt(squares / max(n - 3, 1.0)), 12**-0.5)
+    return noise, noise / np.sqrt(max((sxx + syy) / 2, 1.0)), (middle + c0, cx, cy)
+
+
+@njit(cache=True, nogil=True)
+def _select(values, count, rank):
+    """Value of a rank among the first `count` ones, which are left such that none before the rank is larger (Hoare)."""
+    low, high = 0, count - 1
+    while low < high:
+        pivot, i, j = values[(low + high) // 2], low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while values[j] > pivot:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if rank <= j:
+            high = j
+        elif rank >= i:
+            low = i
+        else:
+            break
+    return values[rank]
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _solve(a, b, c, d, e, f, x, y, z):
+    """Solve the symmetric system [[a, b, c], [b, d, e], [c, e, f]] by cofactors."""
+    aa, ab, ac = d * f - e * e, c * e - b * f, b * e - c * d
+    bb, bc, cc = a * f - c * c, b * c - a * e, a * d - b * b
+    det = a * aa + b * ab + c * ac
+    return (aa * x + ab * y + ac * z) / det, (ab * x + bb * y + bc * z) / det, (ac * x + bc * y + cc * z) / det
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _copy(frame, first, u, v, invert, plane, grey, offsets):
+    """Copy the area and its margin out of a frame without the background, and fill offsets from (u, v).
+
+    Returns:
+        The brightest pixel, background included.
+    """
+    rows, columns = grey.shape
+    inside = first[1] >= 0 and first[1] + columns <= frame.shape[1]
+    brightest = np.float32(-1)
+    for i in range(rows):
+        source = frame[min(max(first[0] + i, 0), frame.shape[0] - 1)]
+        level = np.float32(plane[0] + plane[2] * (first[0] + i - v) + plane[1] * (first[1] - u))
+        slope, row = np.float32(plane[1]), grey[i]
+        for j in range(columns):
+            value = np.float32(source[first[1] + j]) if inside else _grey(frame, first[0] + i, first[1] + j, -1)
+            if invert >= 0:
+                value = np.float32(invert) - value
+            brightest = max(brightest, value)
+            row[j] = value - level - slope * np.float32(j)
+            offsets[0, i * columns + j], offsets[1, i * columns + j] = first[1] + j - u, first[0] + i - v
+    return brightest
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _blur(values, means):
+    """Average the 3 x 3 pixels around each pixel of the area and of the pixels next to it."""
+    rows, columns = values.shape
+    for i in range(1, rows - 1):
+        above, middle, below, mean = values[i - 1], values[i], values[i + 1], means[i]
+        for j in range(1, columns - 1):
+            outer = above[j - 1] + above[j] + above[j + 1] + below[j - 1] + below[j] + below[j + 1]
+            mean[j] = (outer + middle[j - 1] + middle[j] + middle[j + 1]) * np.float32(1 / 9)
+
+
+@njit(cache=True, nogil=True)
+def _spread_labels(tile, labels, first, name, scratch, own, other):
+    """Fill squared distances (px^2) to the component `name` and to others; return whether there are others."""
+    rows, columns = own.shape
+    own[:] = _FAR
+    other[:] = _FAR
+    crowded = False
+    # Tiles begin with an empty one before the frame.
+    for r in range(max(first[0] // BLOCK, -1) + 1, min((first[0] + rows - 1) // BLOCK + 2, tile.shape[0] - 1)):
+        for c in range(max(first[1] // BLOCK, -1) + 1, min((first[1] + columns - 1) // BLOCK + 2, tile.shape[1] - 1)):
+            t = tile[r, c]
+            if t == 0:
+                continue
+            top, left = (r - 1) * BLOCK - first[0], (c - 1) * BLOCK - first[1]
+            for y in range(max(-top, 0), min(BLOCK, rows - top)):
+                for x in range(max(-left, 0), min(BLOCK, columns - left)):
+                    if labels[t, y, x] == name:
+                        own[top + y, left + x] = 0
+                    elif labels[t, y, x] > 0:
+                        other[top + y, left + x] = 0
+                        crowded = True
+    _spread(own, scratch)
+    if crowded:
+        _spread(other, scratch)
+    return crowded
+
+
+@njit(cache=True, nogil=True)
+def _spread(squared, scratch):
+    """Turn 0 and `_FAR` into squared distances from the zeros, up to `SPREAD` px along each axis.
+
+    Rows are taken as one: what leaves a row on one side and enters the next does not get past the margin.
+    """
+    flat, along = squared.reshape(-1), scratch.reshape(-1)
+    _lower(flat, along, np.int64(1))
+    _lower(along, flat, squared.shape[1])
+
+
+@njit(cache=True, nogil=True)
+def _lower(values, result, stride):
+    """Write the minimum over d of the values `d * stride` away plus d ** 2."""
+    for p in range(len(values)):
+        result[p] = values[p]
+    for d in range(1, SPREAD + 1):
+        gap = d * stride
+        left, right, middle = values[: -2 * gap], values[2 * gap :], result[gap:-gap]
+        for p in range(len(middle)):
+            middle[p] = min(middle[p], np.uint8(min(left[p], right[p]) + d * d))
+
+
+@njit(cache=True, nogil=True)
+def _claim(own, other, crowded, smooth, territory):
+    """Give a blob the pixels of the area that are no nearer to others than to it, up to its skirt: 1, all others 0.
+
+    Pixels as near to others as to the blob are border to both.
+
+    Returns:
+        The brightest border with a neighbour, 0 without one.
+    """
+    rows, columns = own.shape
+    territory[:] = 0
+    limit = np.uint8(SKIRT * SKIRT)
+    for i in range(MARGIN, rows - MARGIN):
+        to, near, far = territory[i], own[i], other[i]
+        for j in range(MARGIN, columns - MARGIN):
+            to[j] = np.float32(near[j] <= limit and near[j] <= far[j])
+    saddle = np.float32(0)
+    if not crowded:
+        return saddle
+    for i in range(MARGIN, rows - MARGIN):
+        for j in range(MARGIN, columns - MARGIN):
+            if territory[i, j] > 0 and smooth[i, j] > saddle:
+                for y in range(i - 1, i + 2):
+                    for x in range(j - 1, j + 2):
+                        if other[y, x] <= own[y, x]:
+                            saddle = max(saddle, smooth[i, j])
+    return saddle
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _gather(grey, x, y, own, other, marks, plane, saturation, start, fit):
+    """List the pixels around the edge of a blob that are its own and not saturated, for `fit_centre`.
+
+    Returns:
+        Their number, 0 if there are too many; the last rows of `fit` are their offsets x, y and grey values.
+    """
+    (rows, columns), count = grey.shape, 0
+    limit, inner = np.uint8(SKIRT * SKIRT), np.float32(max(start[1] - BAND, 0.0) ** 2 - 1)
+    xx, xy, yy, x0, y0 = start[2:].astype(np.float32)
+    value = grey.reshape(-1)
+    near, far = own.reshape(-1), other.reshape(-1)
+    most, level, tilt_x, tilt_y = (
+        np.float32(saturation - 0.1), np.float32(plane[0]), np.float32(plane[1]), np.float32(plane[2]),
+    )  # fmt: skip
+    listed_x, listed_y, listed_value = fit[ROWS - 3], fit[ROWS - 2], fit[ROWS - 1]
+    two, zero, one, flat = np.float32(2), np.uint8(0), np.uint8(1), marks.reshape(-1)
+    for p in range(len(value)):  # all pixels alike, which is vectorized
+        dx, dy = x[p] - x0, y[p] - y0
+        outer = xx * dx * dx + two * xy * dx * dy + yy * dy * dy >= inner
+        dim = level + tilt_x * x[p] + tilt_y * y[p] + value[p] < most
+        flat[p] = one if (near[p] <= limit) & (near[p] <= far[p]) & outer & dim else zero
+    for i in range(MARGIN, rows - MARGIN):
+        for p in range(i * columns + MARGIN, (i + 1) * columns - MARGIN):
+            listed_x[count], listed_y[count], listed_value[count] = x[p], y[p], value[p]
+            count += flat[p]
+        if count + columns > MOST:
+            return 0
+    return count
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _weigh(smooth, noise, weight):
+    """Turn the territory in `weight` into how much a pixel belongs to the blob: from 0 to 1 with its brightness.
+
+    Returns:
+        How much the weight grows with the 3 x 3 mean.
+    """
+    rows, columns = smooth.shape
+    top = np.float32(0)
+    for i in range(MARGIN, rows - MARGIN):
+        part, mean = weight[i], smooth[i]
+        for j in range(MARGIN, columns - MARGIN):
+            top = max(top, mean[j] * part[j])
+    scale = np.float32(1 / min(max(CLIP_PEAK * top, CLIP[0] / 3 * noise), CLIP[1] / 3 * noise))
+    zero, one = np.float32(0), np.float32(1)
+    for i in range(MARGIN, rows - MARGIN):
+        part, mean = weight[i], smooth[i]
+        for j in range(MARGIN, columns - MARGIN):
+            part[j] *= min(max(mean[j] * scale - one, zero), one)
+    return scale
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _find_peaks(grey, smooth, weight):
+    """Brightest pixel and brightest 3 x 3 mean of what is blob rather than background, and the sum of the blob."""
+    peak, top, total = np.float32(1e-6), np.float32(0), np.float32(0)
+    for i in range(MARGIN, grey.shape[0] - MARGIN):
+        part, value, mean = weight[i], grey[i], smooth[i]
+        for j in range(MARGIN, grey.shape[1] - MARGIN):
+            inside = part[j] > np.float32(0.5)
+            peak = max(peak, value[j] if inside else np.float32(0))
+            top = max(top, mean[j] if inside else np.float32(0))
+            total += part[j] * value[j]
+    return peak, top, max(float(total), 1e-6)
+
+
+@njit(cache=True, nogil=True)
+def _is_saturated(frame, first, invert, saturation, weight):
+    """Tell whether a pixel of the blob is at or above saturation."""
+    for i in range(MARGIN, weight.shape[0] - MARGIN):
+        for j in range(MARGIN, weight.shape[1] - MARGIN):
+            if weight[i, j] > 0.5 and _grey(frame, first[0] + i, first[1] + j, invert) >= saturation:
+                return True
+    return False

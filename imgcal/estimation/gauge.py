@@ -1,0 +1,56 @@
+"""Two estimates of one rig differ by a motion of the whole rig too, which no image shows. Here it is taken out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from imgcal.estimation import EstimationOptions, estimate
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.observations import Observations
+from imgcal.types.rig import CameraRig
+
+FINE = 0.1
+"""Pixels: differences between two estimates that are forgiven before a camera counts as moved."""
+
+
+def aligned(rig: CameraRig, reference: CameraRig, points_reference: Tensor, cameras: Sequence[int]) -> CameraRig:
+    """Move a whole rig so that some of its cameras see given points where those of a reference see them.
+
+    What is matched are images near the object, not positions and rotations: an estimate knows those well, and these
+    only together. A camera of the chosen ones that does not fit the others has little influence.
+
+    Args:
+        rig: without batch axes.
+        reference: the same cameras.
+        points_reference: (M, 3) mm in the reference's frame, where the object was.
+        cameras: numbers of those that have not moved.
+
+    Returns:
+        The rig in the reference's frame; `rig` itself where the cameras see too little.
+    """
+    chosen = list(cameras)
+    if not chosen:
+        return rig
+    there = reference.select(chosen).project(points_reference)
+    seen = there.visible
+    if int(seen.sum()) < 4:
+        return rig
+    observations = Observations(there.uv[None], torch.full_like(there.uv[None, ..., 0], FINE), seen[None])
+    cloud = CalibrationObject(points_reference, torch.ones_like(points_reference))
+    start = RigidTransform.identity(1, dtype=points_reference.dtype)
+    held = torch.zeros(len(chosen), 15, dtype=points_reference.dtype)
+    fit = estimate(
+        observations, rig.select(chosen), cloud, start, spread=held, options=EstimationOptions(loss="cauchy")
+    )
+    rig_from_reference = fit.rig_from_object[0]
+    cam_from_rig = rig.cam_from_rig
+    return replace(
+        rig,
+        cam_from_rig=cam_from_rig
+        @ RigidTransform(rig_from_reference.rotation[None], rig_from_reference.translation[None]),
+    )

@@ -1,0 +1,156 @@
+"""First guess of an object's pose from labelled fiducials, all cameras together, without iterating on images.
+
+The distance of a fiducial from the ray through its pixel is linear in the pose's nine rotation entries and the
+translation. With the translation eliminated, what is left is a quadratic form on rotations, nine by nine whatever the
+number of cameras and fiducials, minimized from the best of sixty starts at once.
+
+Source: object-space error of Lu, Hager and Mjolsness (PAMI 2000), generalized cameras as in Schweighofer and Pinz (BMVC
+2008), quadratic form in the rotation entries as in SQPnP (Terzakis and Lourakis, ECCV 2020).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from imgcal.geometry.projection import undistort
+from imgcal.geometry.rotations import rotation_from_vector
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.observations import Observations
+from imgcal.types.rig import CameraRig
+
+STARTS = 8
+
+
+@dataclass(frozen=True)
+class _QuadraticForm:
+    """cost(r) = r^T matrix r + 2 vector^T r + constant for r = the rotation's entries, row by row."""
+
+    matrix: Tensor  # (P, 9, 9)
+    vector: Tensor  # (P, 9)
+    translation_slope: Tensor  # (P, 3, 9) best translation = translation_constant - translation_slope @ r
+    translation_constant: Tensor  # (P, 3)
+
+
+def initial_pose(
+    observations: Observations, rig: CameraRig, obj: CalibrationObject, iterations: int = 10
+) -> RigidTransform:
+    """Estimate where the object is, with the rig taken as it stands.
+
+    Args:
+        observations: (*B, S, C, N); every snapshot needs three fiducials or more, seen by one camera or several.
+        rig: (*B) or without batch axes.
+        obj: N fiducials, planar or not.
+        iterations: Gauss-Newton steps on the rotation.
+
+    Returns:
+        (*B, S) rig_from_object with the smallest object-space error among those in front of the cameras. Meant as a
+        start: it does not weigh pixels by distance.
+    """
+    batch = observations.seen.shape[:-2]
+    points = obj.points.to(observations.uv)
+    centroid = points.mean(0)
+    centred = points - centroid
+    rays, origins = _rays(observations, rig)  # (P, C, N, 3), (P, C, 3)
+    seen = observations.seen.reshape(-1, *observations.seen.shape[-2:]).to(rays.dtype)
+    form = _quadratic_form(rays, origins, seen, centred)
+    starts = torch.as_tensor(Rotation.create_group("I").as_matrix(), dtype=rays.dtype, device=rays.device)
+    promising = _cost(form, starts.expand(len(rays), -1, -1, -1)).topk(STARTS, largest=False).indices
+    rotation = _minimize_on_rotations(form, starts[promising], iterations)  # (P, M, 3, 3)
+
+    entries, cost = rotation.flatten(-2), _cost(form, rotation)
+    translation = form.translation_constant[:, None] - entries @ form.translation_slope.mT
+    placed = centred @ rotation.mT + translation[..., None, :]  # (P, M, N, 3)
+    along = torch.einsum("pcnk,pmnk->pmcn", rays, placed) - torch.einsum("pcnk,pck->pcn", rays, origins)[:, None]
+    behind = ((along <= 0) * seen[:, None]).sum((-2, -1))
+    scale = cost.abs().amax(-1, keepdim=True) + 1
+    best = (cost + behind * scale).argmin(-1)
+    chosen = rotation[torch.arange(len(best)), best]
+    shift = translation[torch.arange(len(best)), best] - (chosen @ centroid)
+    return RigidTransform(chosen.reshape(*batch, 3, 3), shift.reshape(*batch, 3))
+
+
+def _rays(observations: Observations, rig: CameraRig) -> tuple[Tensor, Tensor]:
+    """Viewing rays in the rig frame, rigs and snapshots flattened: unit directions (P, C, N, 3), origins (P, C, 3)."""
+    dtype = observations.uv.dtype
+    rig = rig.to(dtype)
+    uv = torch.where(observations.seen[..., None], observations.uv, rig.principal_point.unsqueeze(-2).unsqueeze(-4))
+    flat = (rig.principal_point, rig.focal_length)
+    principal, focal = (value.unsqueeze(-2).unsqueeze(-4) for value in flat)
+    distortion = rig.distortion.unsqueeze(-3).expand(*uv.shape[:-2], 5)
+    xy, _ = undistort((uv - principal) / focal, distortion)
+    directions = torch.nn.functional.normalize(torch.cat((xy, torch.ones_like(xy[..., :1])), dim=-1), dim=-1)
+    rotation = rig.cam_from_rig.rotation.unsqueeze(-4)
+    rays = (directions @ rotation).reshape(-1, *directions.shape[-3:])
+    origins = rig.positions.unsqueeze(-3).expand(*uv.shape[:-2], 3)
+    return rays, origins.reshape(-1, *origins.shape[-2:])
+
+
+def _quadratic_form(rays: Tensor, origins: Tensor, seen: Tensor, points: Tensor) -> _QuadraticForm:
+    """Sum the squared distances of the fiducials from their rays into a quadratic form."""
+    eye = torch.eye(3, dtype=rays.dtype, device=rays.device)
+    per_ray = (eye - rays.unsqueeze(-1) * rays.unsqueeze(-2)) * seen[..., None, None]  # projects across the ray
+    across = per_ray.sum(1)  # (P, N, 3, 3)
+    pulled = torch.einsum("pcnij,pcj->pni", per_ray, origins)
+    total = across.sum(1)
+    slope = torch.einsum("pnij,na->pija", across, points).flatten(-2)  # (P, 3, 9)
+    matrix = torch.einsum("pnij,na,nb->piajb", across, points, points).flatten(-2).flatten(1, 2)
+    linear = torch.einsum("pni,na->pia", pulled, points).flatten(-2)
+    # A single ray leaves the translation along it free; a trace of regularization keeps the solve finite.
+    total = total + 1e-9 * total.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None] * eye
+    solved = torch.linalg.solve(total, torch.cat((slope, pulled.sum(1)[..., None]), dim=-1))
+    translation_slope, constant = solved[..., :9], solved[..., 9]
+    return _QuadraticForm(
+        matrix=matrix - slope.mT @ translation_slope,
+        vector=(slope.mT @ constant[..., None]).squeeze(-1) - linear,
+        translation_slope=translation_slope,
+        translation_constant=constant,
+    )
+
+
+def _cost(form: _QuadraticForm, rotation: Tensor) -> Tensor:
+    """Object-space error, up to a constant, of rotations (P, M, 3, 3): (P, M) mm^2."""
+    entries = rotation.flatten(-2)
+    return (entries * (entries @ form.matrix + 2 * form.vector[:, None])).sum(-1)
+
+
+def _minimize_on_rotations(form: _QuadraticForm, rotation: Tensor, iterations: int) -> Tensor:
+    """Damped Gauss-Newton from many starts at once: (P, M, 3, 3) -> (P, M, 3, 3)."""
+    vector = form.vector[:, None, :, None]
+    generators = _generators(rotation)
+    trace = form.matrix.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None, None]
+    damping = 1e-6 * trace * torch.eye(3, dtype=rotation.dtype, device=rotation.device)
+    for _ in range(iterations):
+        tangent = torch.einsum("gij,pmjk->pmikg", generators, rotation).flatten(-3, -2)  # (P, M, 9, 3)
+        # One product for the tangents and the rotation of all starts: (9, 9) @ (9, 4 M).
+        both = torch.cat((tangent, rotation.flatten(-2)[..., None]), dim=-1)
+        weighted = torch.einsum("pij,pmjk->pmik", form.matrix, both)
+        right = tangent.mT @ (weighted[..., 3:] + vector)
+        step = _solve_symmetric(tangent.mT @ weighted[..., :3] + damping, right.squeeze(-1))
+        length = step.norm(dim=-1, keepdim=True)
+        step = step * (0.7 / length.clamp_min(0.7))
+        rotation = rotation_from_vector(-step) @ rotation
+    return rotation
+
+
+def _solve_symmetric(matrix: Tensor, right: Tensor) -> Tensor:
+    """Solve three-by-three systems by cofactors: (*B, 3, 3), (*B, 3) -> (*B, 3); a library call a matrix is slower."""
+    first, second, third = matrix.unbind(-2)
+    cofactors = torch.stack(
+        (torch.linalg.cross(second, third), torch.linalg.cross(third, first), torch.linalg.cross(first, second)), dim=-2
+    )
+    determinant = (first * cofactors[..., 0, :]).sum(-1, keepdim=True)
+    return (cofactors @ right[..., None]).squeeze(-1) / determinant
+
+
+def _generators(like: Tensor) -> Tensor:
+    """The three infinitesimal rotations: (3, 3, 3)."""
+    generators = like.new_zeros(3, 3, 3)
+    for axis in range(3):
+        j, k = (axis + 1) % 3, (axis + 2) % 3
+        generators[axis, k, j], generators[axis, j, k] = 1.0, -1.0
+    return generators

@@ -1,0 +1,259 @@
+"""Cameras that moved while snapshots were taken: when, by how much, and whose the motion is.
+
+A motion has no owner without a gauge: relative to a camera that was bumped, all the others moved. So a camera is given
+a second place from some snapshot on, and everything is estimated again; the fewest such steps that leave nothing to
+explain are the answer. Most cameras stand still, and they are what the others are measured against.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.estimation import EstimationOptions
+from imgcal.estimation.change_points import (
+    CLIP,
+    LEAST_SNAPSHOTS,
+    Blocks,
+    Step,
+    blocks_of,
+    dispersion,
+    is_significant,
+    likeliest_step,
+)
+from imgcal.estimation.estimate import minimize
+from imgcal.estimation.linearize import Problem, State, points_at, pose_at, rig_at
+from imgcal.estimation.robust_losses import huber
+from imgcal.types.moved_camera import Kind, MovedCamera
+from imgcal.types.rig import PARAMETERS
+
+ERROR = 1e-5
+"""Probability of naming a camera in a capture in which none has moved, as far as noise is what it is said to be."""
+LEAST_MOVE = 0.15
+"""Pixels, in the image of the camera: smaller ones do no harm, and slow drifts of every rig reach them."""
+LEAST_GAIN = 50.0
+"""Chi-squared of the kind of values that explains a step best."""
+LEAST_MOTION = 0.9
+"""Of the chi-squared of a step of all values, the part that a motion alone explains, noise in the others apart."""
+MOST_UNEXPLAINED = 0.5
+"""Of what does not fit in a camera that stands still, the part that may be left where it has several places."""
+LEAST_LEAD = 0.8
+"""Of the clearest camera's statistic: another one that explains as much may be the one that moved."""
+
+KINDS: dict[Kind, tuple[slice, float]] = {
+    "rotation": (slice(0, 3), 180 / np.pi),
+    "position": (slice(3, 6), 1.0),
+    "focal_length": (slice(6, 8), 0.5**0.5),
+}
+"""Which values of a camera, and the factor from their length to what is told: degrees, mm, px along one axis."""
+
+MOTION = slice(0, 6)  # rotation and position
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Places:
+    """A rig in which a camera may have several places, one after the other: V of them, each seen as a camera."""
+
+    problem: Problem  # one rig of V cameras
+    state: State
+    camera: tuple[int, ...]  # (V,) of the rig
+    first: tuple[int, ...]  # (V,) row of the first snapshot
+
+    @cached_property
+    def seen(self) -> NDArray[np.bool_]:
+        """Snapshots in which there are labels: (S, V)."""
+        return (self.problem.root_weight[0] > 0).any(-1).numpy()
+
+    @cached_property
+    def blocks(self) -> Blocks:
+        """Normal equations, snapshot by snapshot."""
+        return blocks_of(self.problem, self.state)
+
+    def divided(self, step: Step, options: EstimationOptions) -> Places:
+        """Give a camera another place from a step on, and estimate again."""
+        problem, state, last = self.problem, self.state, len(self.camera)
+        copies = [*range(last), step.camera]
+        root_weight = problem.root_weight[:, :, copies].clone()
+        root_weight[:, step.row :, step.camera] = 0
+        root_weight[:, : step.row, last] = 0
+        parted = replace(
+            problem,
+            uv=problem.uv[:, :, copies].contiguous(),
+            root_weight=root_weight,
+            factory=problem.factory.select(copies),
+            spread=problem.spread[:, copies],
+        )
+        start = replace(state, offset=state.offset[:, copies])
+        solution = minimize(parted, start, options)
+        camera, first = (*self.camera, self.camera[step.camera]), (*self.first, step.row)
+        return Places(parted, solution.state, camera, first)
+
+    def places_of(self, camera: int) -> list[int]:
+        """Numbers of a camera's places, in the order of time."""
+        return sorted((v for v, c in enumerate(self.camera) if c == camera), key=lambda v: self.first[v])
+
+    def shift(self, before: int, after: int) -> float:
+        """Median distance (px) between the images of the fiducials from two places."""
+        rig, poses = rig_at(self.problem, self.state.offset)[0], pose_at(self.problem, self.state)[0]
+        points = poses.apply(points_at(self.problem, self.state)[0] + self.problem.centroid)
+        seen = rig.select([before, after]).expand(len(points)).project(points)
+        both = seen.visible.all(1)
+        distance = (seen.uv[:, 0] - seen.uv[:, 1]).norm(dim=-1)[both]
+        return float(distance.median()) if len(distance) else 0.0
+
+    def costs(self, place: int) -> Array:
+        """What each snapshot's labels would cost if their camera stood at one of its places: (S,) half chi-squared."""
+        loss, _ = huber(self._squared(place, self.places_of(self.camera[place])), CLIP)
+        return 0.5 * loss.sum(-1).numpy()
+
+    def misfit(self, camera: int) -> float:
+        """Chi-squared of a camera's labels, each clipped, beyond what noise makes it."""
+        own = [self._squared(place, [place]) for place in self.places_of(camera)]
+        labels = [(self.problem.root_weight[0][:, place] > 0).sum() for place in self.places_of(camera)]
+        return float(sum(part.clamp_max(CLIP**2).sum() for part in own) - 2 * sum(labels))
+
+    def _squared(self, place: int, labels: list[int]) -> Tensor:
+        """Squared whitened residuals (S, N) of the labels of some places of a camera, if it stood at one of them."""
+        rig, poses = rig_at(self.problem, self.state.offset)[0], pose_at(self.problem, self.state)[0]
+        points = poses.apply(points_at(self.problem, self.state)[0] + self.problem.centroid)
+        uv = rig.select([place]).expand(len(points)).project(points, self._radius).uv[:, 0]
+        weight = self.problem.root_weight[0][:, labels].sum(1)  # of whichever place holds the label
+        return ((uv - self.problem.uv[0, :, place].mT) * weight[..., None]).square().sum(-1)
+
+    @property
+    def _radius(self) -> Tensor | None:
+        squared = self.problem.radius_squared
+        return None if squared is None else squared.sqrt()
+
+    def change(self, before: int, after: int, noise: float) -> Change:
+        """Difference between two places of a camera, with what is known of it."""
+        offset, spread = self.state.offset[0].numpy(), self.problem.spread[0, before].numpy()
+        covariance = self.blocks.covariance.reshape(len(self.camera), PARAMETERS, len(self.camera), PARAMETERS)
+        joint = covariance[before, :, before] + covariance[after, :, after]
+        joint = joint - covariance[before, :, after] - covariance[after, :, before]
+        information: Array = np.linalg.inv(noise * joint + 1e-12 * np.eye(PARAMETERS)).astype(np.float64)
+        return Change(information, information @ (offset[after] - offset[before]), spread)
+
+
+@dataclass(frozen=True)
+class Change:
+    """A difference of a camera's values, whitened by the prior."""
+
+    information: Array  # (15, 15)
+    pull: Array  # (15,) information times the difference
+    spread: Array  # (15,) standard deviations of the prior
+
+    def gain(self, part: slice) -> float:
+        """Chi-squared of the difference where only a part of the values may differ."""
+        return float(self.pull[part] @ np.linalg.solve(self.information[part, part], self.pull[part]))
+
+    @property
+    def is_physical(self) -> bool:
+        """Tell whether a motion, or another focal length, explains it: errors of the lens would take all values."""
+        kinds = max(self.gain(part) for part, _ in KINDS.values())
+        motion = max(self.gain(MOTION), self.gain(KINDS["focal_length"][0]))
+        others = PARAMETERS - MOTION.stop  # each of them takes one from noise alone
+        return kinds >= LEAST_GAIN and motion >= LEAST_MOTION * (self.gain(slice(None)) - others)
+
+    def size(self) -> tuple[Kind, float, float]:
+        """Kind, size and standard deviation, by the one kind of values that explains the difference best."""
+        kind = max(KINDS, key=lambda name: self.gain(KINDS[name][0]))
+        part, unit = KINDS[kind]
+        alone, scale = np.linalg.inv(self.information[part, part]), unit * self.spread[part]
+        change = alone @ self.pull[part] * scale
+        length = float(np.linalg.norm(change))
+        direction = change / max(length, 1e-30)
+        return kind, length, float(direction @ (alone * scale * scale[:, None]) @ direction) ** 0.5
+
+
+def find_moves(
+    problem: Problem, state: State, camera_names: tuple[str, ...], snapshot_names: tuple[str, ...],
+    options: EstimationOptions,
+) -> tuple[MovedCamera, ...]:  # fmt: skip
+    """Look for cameras that have moved between two snapshots.
+
+    Args:
+        problem: one rig of C cameras, with all labels, those that do not fit included.
+        state: the estimate.
+        camera_names: C.
+        snapshot_names: S, in the order of time.
+        options: how estimates are made.
+
+    Returns:
+        In the order of time. Where two cameras explain a motion alike, both are named: "cam01 or cam02".
+    """
+    cameras = len(camera_names)
+    places = still = Places(problem, state, tuple(range(cameras)), (0,) * cameras)
+    noise, doubts = 1.0, {}
+    left_out: set[int] = set()
+    for _ in range(3 * cameras):
+        seen = places.seen & ~np.isin(places.camera, list(left_out))
+        step = likeliest_step(places.blocks, seen)
+        candidates = int(places.seen.sum())
+        if step is None or not is_significant(step.statistic, candidates, ERROR):
+            break
+        divided = _located(places, step, options)
+        if divided is not None:
+            # What is left when the step has been explained says how much of it correlated errors may feign.
+            left = dispersion(divided.blocks, divided.seen)
+            new = len(divided.camera) - 1
+            if (
+                is_significant(step.statistic / left, candidates, ERROR)
+                and divided.shift(step.camera, new) >= LEAST_MOVE
+                and divided.change(step.camera, new, left).is_physical
+            ):
+                doubts[new] = _doubts(places, step)
+                places, noise = divided, left
+                continue
+        left_out.add(places.camera[step.camera])
+    moving = {places.camera[v] for v in doubts}
+    # Labels that are wrong in many snapshots pull hither and thither, and no few places explain them.
+    steady = {c for c in moving if places.misfit(c) > MOST_UNEXPLAINED * still.misfit(c)}
+    return _told(places, doubts, moving - steady, noise, camera_names, snapshot_names)
+
+
+def _located(places: Places, step: Step, options: EstimationOptions) -> Places | None:
+    """Divide a camera's time where its two places explain most; None = too near to an end to be told from a slip."""
+    divided = places.divided(step, options)
+    new = len(divided.camera) - 1
+    for _ in range(4):
+        shown = np.flatnonzero(places.seen[:, step.camera])
+        # From a snapshot on, the new place instead of the old one: the sum of what that saves.
+        saved = (divided.costs(step.camera) - divided.costs(new))[shown]
+        row = int(shown[np.cumsum(saved[::-1])[::-1].argmax()])
+        if min((shown < row).sum(), (shown >= row).sum()) < LEAST_SNAPSHOTS:
+            return None
+        if row == step.row:
+            break
+        step = replace(step, row=row)
+        divided = places.divided(step, options)
+    return divided
+
+
+def _doubts(places: Places, step: Step) -> set[int]:
+    """Other cameras of the rig that explain a step nearly as well."""
+    near = np.flatnonzero(step.rivals > LEAST_LEAD * step.statistic)
+    return {places.camera[v] for v in near} - {places.camera[step.camera]}
+
+
+def _told(
+    places: Places, doubts: dict[int, set[int]], moving: set[int], noise: float,
+    camera_names: tuple[str, ...], snapshot_names: tuple[str, ...],
+) -> tuple[MovedCamera, ...]:  # fmt: skip
+    moves = []
+    for camera in sorted(moving):
+        numbers = places.places_of(camera)
+        for before, after in pairwise(numbers):
+            kind, size, sigma = places.change(before, after, noise).size()
+            others = sorted(doubts.get(after, set()) - moving)
+            name = " or ".join(camera_names[i] for i in (camera, *others))
+            row = places.first[after]
+            moves.append((row, MovedCamera(name, snapshot_names[row], kind, size, sigma)))
+    return tuple(move for _, move in sorted(moves, key=lambda pair: (pair[0], pair[1].camera)))

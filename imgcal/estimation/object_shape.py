@@ -1,0 +1,288 @@
+"""Is the object what its file says? Tests by what the residuals of a fit say about each fiducial, and the cure.
+
+A fiducial that is off its place pulls all its residuals the same way in the object's frame, whatever the snapshot. The
+pull is the gradient of the cost by the fiducials' coordinates, and its variance the information that is left when rig
+and poses have adapted: a score test (Rao, Proc. Camb. Phil. Soc. 1948), which needs no second fit. The object's scale
+is a direction of its own: nothing but the prior of the cameras' positions knows it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.stats import f as fisher
+from scipy.stats import norm
+
+from imgcal.estimation.covariance import object_covariance
+from imgcal.estimation.estimate import Estimate
+from imgcal.estimation.levenberg_marquardt import Solution, factorize
+from imgcal.estimation.linearize import Problem, State, jacobian_at, linearize, points_at, robust_weight
+from imgcal.estimation.robust_losses import Loss
+from imgcal.types.rig import PARAMETERS
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.floating]
+
+UNSURE = 1e-9
+"""Of the largest information, below which a direction of the shape counts as undetermined (a rigid motion, for one)."""
+WIDE = 0.05
+"""Of the object's size: how far off a fiducial is thought to be before the data have spoken."""
+NARROW = 1e-4
+"""Of the object's size: a fiducial that is off by less is in its place."""
+MOST_FIDUCIALS = 64
+"""Of an object whose shape is asked about: boards and clouds with more are taken as they are measured."""
+COMPLEXITY = 3.0
+"""Log evidence that each further tolerance must gain."""
+LEAST_SNAPSHOTS = 8
+"""From which the pulls of single snapshots are compared with each other."""
+ROUNDS = 60
+"""Of `learnt_tolerances` and of `offsets`, at most."""
+
+
+@dataclass(frozen=True)
+class ShapeEvidence:
+    """What a fit says about the object, linearized: N fiducials."""
+
+    information: Array  # (3 N, 3 N) mm^-2, of the fiducials' coordinates, rig and poses marginalized
+    pull: Array  # (3 N,) mm^-1, information times the displacement from `places` that the data ask for
+    places: Array  # (N, 3) mm, where the object's file puts the fiducials, about their centroid
+    points: Array  # (N, 3) mm, where the fit has them, about the same point
+    tolerance: Array  # (N,) mm, granted to them in this fit
+    chi2: float  # of the fit, data and priors
+    freedom: float  # its degrees of freedom
+
+    @cached_property
+    def directions(self) -> tuple[Floats, Floats, Floats]:
+        """What the data determine: directions (3 N, D), the variance (D,) that noise gives them, displacements (D,)."""
+        values, vectors = np.linalg.eigh(self.information)
+        sure = values > UNSURE * values[-1]
+        vectors, variance = vectors[:, sure], 1 / values[sure]
+        return vectors, variance, variance * (vectors.T @ self.pull)
+
+    def _covariance(self, tolerance: Array) -> Array:
+        """Covariance (D, D) of those displacements, were the fiducials off by tolerances (N,) mm."""
+        vectors, variance, _ = self.directions
+        return (vectors.T * np.repeat(tolerance**2, 3)) @ vectors + np.diag(variance)
+
+    @cached_property
+    def _determined(self) -> tuple[Floats, Floats, Floats]:
+        """Directions (3 N, D), displacements along them (D,), and the inverse of their covariance (D, D)."""
+        vectors, variance, displacement = self.directions
+        if not self.tolerance.any():
+            return vectors, displacement, np.diag(1 / variance)
+        return vectors, displacement, np.linalg.inv(self._covariance(self.tolerance))
+
+    def log_evidence(self, tolerance: Array) -> float:
+        """Log likelihood of what the data ask for, were the fiducials off by tolerances (N,) mm."""
+        covariance, displacement = self._covariance(tolerance), self.directions[2]
+        _, log_det = np.linalg.slogdet(covariance)
+        return -0.5 * float(displacement @ np.linalg.solve(covariance, displacement) + log_det)
+
+    @property
+    def scale_error(self) -> tuple[float, float]:
+        """Relative scale of the object that explains the data best, less one, and its standard deviation."""
+        scale = self.points.ravel()
+        weight, found = float(scale @ self.information @ scale), float(scale @ self.pull)
+        # One camera, wherever it is, cannot know how large the object is.
+        if weight <= UNSURE * float(np.abs(self.information).max()) * float(scale @ scale):
+            return 0.0, np.inf
+        if self.tolerance.any():
+            vectors, displacement, precision = self._determined
+            pull = vectors.T @ scale @ precision
+            weight, found = float(pull @ (vectors.T @ scale)), float(pull @ displacement)
+        return found / weight, weight**-0.5
+
+    def bent_sigma(self, scatter: float = 1.0) -> float:
+        """How sure it is that the object is bent, its scale left aside, in standard deviations of a normal variable.
+
+        An F test: what displacements of the fiducials beyond their tolerances would explain, against what they leave.
+
+        Args:
+            scatter: how much more the snapshots disagree than noise allows; see `pull_scatter`.
+
+        Returns:
+            Zero for an object of more than `MOST_FIDUCIALS`: what is left of a lens that the model does not know looks
+            like a deformed grid, too.
+        """
+        if len(self.places) > MOST_FIDUCIALS:
+            return 0.0
+        _, displacement, precision = self._determined
+        error, deviation = self.scale_error
+        explained = float(displacement @ precision @ displacement) - (error / deviation) ** 2
+        mine, rest = len(displacement) - int(np.isfinite(deviation)), self.freedom - len(displacement)
+        if mine <= 0 or rest <= 0:
+            return 0.0
+        left = max(self.chi2 - explained, 1e-12 * self.chi2) / rest
+        ratio = explained / (mine * left * scatter)
+        return float(norm.isf(max(fisher.sf(ratio, mine, rest), 1e-300)))
+
+
+def shape_evidence(problem: Problem, solution: Solution, loss: Loss) -> ShapeEvidence | None:
+    """Ask a fit of one rig (B = 1) about the object that it took; None where rig and poses are undetermined."""
+    state = solution.state
+    points = points_at(problem, state)[0]
+    size = 3 * len(points) + 1
+    unit = torch.ones(1, size, dtype=points.dtype, device=points.device)
+    free = replace(problem, points=points, object_spread=unit)
+    equations = linearize(free, replace(state, object_offset=torch.zeros_like(unit)), loss)
+    factorization = factorize(replace(equations, object=None))
+    reduced, own = factorization.reduced, equations.object
+    if own is None or bool(reduced.failed.any()):
+        return None
+    first, second = (own.camera, own.pose) if factorization.cameras_first else (own.pose, own.camera)
+    eliminated = torch.linalg.solve_triangular(reduced.eliminated, first, upper=False)
+    kept = second.flatten(1, 2) - (reduced.whitened.mT @ eliminated).sum(1)
+    kept = torch.linalg.solve_triangular(reduced.kept, kept, upper=False)
+    eliminated = eliminated.flatten(1, 2)
+    square = (own.own - eliminated.mT @ eliminated - kept.mT @ kept)[0, :-1, :-1]
+    square.diagonal().sub_(1)  # the prior of `unit`
+    information, gradient = square.cpu().double().numpy(), own.gradient[0, :-1].cpu().double().numpy()
+    places = problem.points.cpu().double().numpy()
+    displaced = (points.cpu().double().numpy() - places).ravel()
+    tolerance, cost = np.zeros(len(places)), float(equations.cost)
+    if problem.object_spread is not None and state.object_offset is not None:
+        tolerance = problem.object_spread[0, :-1:3].cpu().double().numpy()
+        cost += 0.5 * float(state.object_offset.square().sum())
+    return ShapeEvidence(
+        information=information,
+        pull=information @ displaced - gradient,
+        places=places,
+        points=points.cpu().double().numpy(),
+        tolerance=tolerance,
+        chi2=2 * cost,
+        freedom=2 * int((problem.root_weight > 0).sum()) - 6 * problem.uv.shape[1],
+    )
+
+
+def pull_scatter(problem: Problem, state: State, loss: Loss) -> float:
+    """Variance of the snapshots' pulls about their mean, over that of noise; 1 at least, and for a few snapshots.
+
+    Errors of lenses and centroids that belong to places rather than to fiducials pull differently in each snapshot.
+
+    Args:
+        problem: of one rig, with an object that is not exact.
+        state: the minimum.
+        loss: of the fit.
+    """
+    snapshots = problem.uv.shape[1]
+    if snapshots < LEAST_SNAPSHOTS:
+        return 1.0
+    at = jacobian_at(problem, state)
+    assert at.by_fiducial is not None
+    weight = robust_weight(problem, at, loss)[0, :, :, None, None, :]
+    by_pose, by_fiducial = at.by_rig[0, ..., PARAMETERS:-1, :, :], at.by_fiducial[0]  # (S, C, 6 or 3, 2, N)
+    pull = (by_fiducial * weight * at.residual[0].unsqueeze(-3)).sum((1, 3)).mT.flatten(1)  # (S, 3 N)
+    # The poses have adapted to each snapshot: what they took is no longer in its pull.
+    own = (by_fiducial.square() * weight).sum((1, 3)).mT.flatten(1)
+    across = torch.einsum("scirn,scjrn->sinj", by_pose, by_fiducial * weight).flatten(2)  # (S, 6, 3 N)
+    among = torch.einsum("scirn,scjrn->sij", by_pose, by_pose * weight)
+    taken = (across * torch.linalg.solve(among, across)).sum(1)
+    variance = (own - taken).clamp_min(0).sum(0)
+    found = (pull - pull.mean(0)).square().sum(0) * (snapshots / (snapshots - 1))
+    seen = variance > 1e-6 * variance.max()
+    return max(1.0, float((found[seen] / variance[seen]).mean()))
+
+
+def learnt_tolerances(shape: ShapeEvidence) -> Array:
+    """Learn from the data how far each fiducial may be off: automatic relevance determination.
+
+    Where one or two are off, the others stay in their places, and so hold the object's frame and scale. Where many are,
+    nothing says which, and all get the same tolerance. The evidence of the data decides.
+
+    Returns:
+        (N,) mm, standard deviations; those that were granted where they are enough.
+
+    Source: MacKay, "Bayesian interpolation" (Neural Computation 1992), one precision a fiducial.
+    """
+    size = float(np.sqrt(np.square(shape.places).sum(1).mean()))
+    floor = np.maximum(shape.tolerance, NARROW * size)
+    common = np.maximum(_learn_one(shape, size), shape.tolerance)
+    alone = _learn_each(shape, size, floor)
+    alone = np.where(alone > 1.5 * floor, alone, shape.tolerance)
+    off = int((alone > shape.tolerance).sum())
+    if shape.log_evidence(alone) - COMPLEXITY * off >= shape.log_evidence(common) - COMPLEXITY:
+        return alone
+    return common
+
+
+def _learn_each(shape: ShapeEvidence, size: float, floor: Array) -> Array:
+    """Iterate tolerances (N,) mm that are as large as the displacements they allow, not below `floor`."""
+    spread = np.maximum(WIDE * size, floor)
+    for _ in range(ROUNDS):
+        precision = np.repeat(spread**-2.0, 3)
+        covariance = np.linalg.inv(shape.information + np.diag(precision))
+        square = np.square(covariance @ shape.pull).reshape(-1, 3).sum(1)
+        determined = 3 - (covariance.diagonal() * precision).reshape(-1, 3).sum(1)
+        previous = spread
+        spread = np.clip(np.sqrt(square / np.maximum(determined, 1e-3)), floor, 10 * WIDE * size)
+        if np.abs(spread / previous - 1).max() < 0.01:
+            break
+    return spread
+
+
+def _learn_one(shape: ShapeEvidence, size: float) -> float:
+    """Iterate one tolerance (mm) for all fiducials."""
+    _, variance, displacement = shape.directions
+    spread = WIDE * size
+    for _ in range(ROUNDS):
+        kept = spread**2 / (variance + spread**2)  # of each displacement
+        previous = spread
+        spread = float(np.sqrt(np.square(kept * displacement).sum() / max(kept.sum(), 1e-3)))
+        spread = min(max(spread, NARROW * size), 10 * WIDE * size)
+        if abs(spread / previous - 1) < 0.01:
+            break
+    return spread
+
+
+@dataclass(frozen=True)
+class FiducialOffset:
+    """How far a fiducial is from the place that the object's file gives it."""
+
+    fiducial: int  # row of the object file
+    offset: Array  # (3,) mm in the object's frame
+    sigma: float  # mm, one standard deviation of the offset along itself
+
+    @property
+    def distance(self) -> float:
+        """Length of the offset, mm."""
+        return float(np.linalg.norm(self.offset))
+
+
+def offsets(estimate: Estimate, points: Array) -> tuple[FiducialOffset, ...]:
+    """Compare the estimated fiducials with their places `points` (N, 3) mm, fiducial by fiducial.
+
+    A rigid motion of the object is no displacement: the object is first laid onto its places so that as many fiducials
+    as possible are where they belong.
+
+    Source: S-transformation (Baarda 1973) with weights that follow the displacements, as in deformation analysis.
+    """
+    found, covariance = (
+        estimate.points_object.detach().double().numpy(),
+        object_covariance(estimate, curved=False).double().numpy(),
+    )
+    moved, centred = (found - points).ravel(), points - points.mean(0)
+    motions = np.zeros((len(points), 3, 6))  # displacement by a rotation about the centroid and a translation
+    motions[:, :, 3:] = np.eye(3)
+    for axis in range(3):
+        motions[:, :, axis] = np.cross(np.eye(3)[axis], centred)
+    rigid = motions.reshape(-1, 6)
+    own = np.sqrt(covariance.diagonal().reshape(-1, 3).sum(1))
+    least = NARROW * np.sqrt(np.square(centred).sum(1).mean()) + own
+    left = moved.reshape(-1, 3)
+    for _ in range(ROUNDS):
+        weight = np.repeat(1 / (np.square(left).sum(1) + least**2), 3)
+        fit = np.linalg.pinv(rigid.T * weight @ rigid) @ (rigid.T * weight)
+        left = (moved - rigid @ (fit @ moved)).reshape(-1, 3)
+    project = np.eye(len(moved)) - rigid @ fit
+    remaining = project @ covariance @ project.T
+    result = []
+    for n, offset in enumerate(left):
+        block = remaining[3 * n : 3 * n + 3, 3 * n : 3 * n + 3]
+        length = float(np.linalg.norm(offset))
+        along = offset / length if length > 0 else np.full(3, 3**-0.5)
+        result.append(FiducialOffset(n, offset, float(np.sqrt(max(along @ block @ along, 0.0)))))
+    return tuple(result)

@@ -1,0 +1,252 @@
+"""How good a recalibrated rig is where it is used: predicted errors over the working volume, in pixels and in mm."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from imgcal.errors import InputError
+from imgcal.estimation import Estimate, camera_covariance
+from imgcal.estimation.rig_uncertainty import RigUncertainty, rig_uncertainty, without_gradient
+from imgcal.geometry.projection import undistort
+from imgcal.geometry.transforms import rotate
+from imgcal.types.rig import CameraRig
+
+GRID = 11
+"""Points along each side of the working volume; odd, so that there is a middle."""
+ANCHORS = 7
+"""The same, of the points by which true and estimated rig are laid upon one another."""
+MAP_SIZE = (16, 24)
+"""Rows and columns of each camera's map, which covers the whole image."""
+MAP_DEPTHS = (0.05, 0.5, 0.95)
+"""Depths of the maps: these quantiles of the depths at which a camera sees the working volume."""
+
+EXCEPTIONAL = 2.0
+"""Times the median camera's error beyond which a camera is an exception."""
+
+
+@dataclass(frozen=True)
+class WorkingVolume:
+    """A box along the axes of the rig frame."""
+
+    low: Tensor  # (3,) mm
+    high: Tensor  # (3,) mm
+
+    def grid(self, count: int = GRID) -> Tensor:
+        """Evenly spaced points, the faces included: (count, count, count, 3) mm, indexed by x, y, z."""
+        steps = torch.linspace(0, 1, count, dtype=self.low.dtype, device=self.low.device)
+        share = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"), -1)
+        return self.low + share * (self.high - self.low)
+
+    def contains(self, points: Tensor) -> Tensor:
+        """Tell which points (..., 3) lie inside: (...) bool."""
+        return ((points >= self.low) & (points <= self.high)).all(-1)
+
+
+@dataclass(frozen=True)
+class PredictedError:
+    """Errors to expect of a rig, after the rigid motion of the whole rig that makes them smallest.
+
+    All are expected (RMS) lengths, of the calibration's errors alone where nothing else is said. Pixels: image of a
+    point by the true rig against that by this one. Millimetres: a point seen by all cameras that have it in view,
+    without noise, triangulated with this rig, against the true point.
+    """
+
+    volume: WorkingVolume
+    camera_names: tuple[str, ...]  # C
+    uncertainty: RigUncertainty  # the same at any point
+    px: Tensor  # (C, X, Y, Z) pixels over `volume.grid()`; nan where the camera does not see the point
+    mm: Tensor  # (X, Y, Z) mm; nan where fewer than two cameras see the point
+    mm_with_noise: Tensor  # (X, Y, Z) mm, when each pixel is measured with `noise`, too
+    noise: float  # px, median standard deviation of the observations, each axis
+    maps: Tensor  # (C, D, H, W) pixels over the image; nan where a pixel belongs to no ray
+    map_depths: Tensor  # (C, D) mm; nan for a camera that sees nothing of the volume
+    map_inside: Tensor  # (C, D, H, W) bool, in the working volume
+
+    @property
+    def median_px(self) -> float:
+        """Median over cameras and places, as far as they are seen."""
+        return _quantile(self.px, 0.5)
+
+    @property
+    def p95_px(self) -> float:
+        """Exceeded in 5 % of the places that cameras see."""
+        return _quantile(self.px, 0.95)
+
+    @property
+    def median_mm(self) -> float:
+        """Median over the part of the volume that two cameras see."""
+        return _quantile(self.mm, 0.5)
+
+    @property
+    def p95_mm(self) -> float:
+        """Exceeded in 5 % of the part of the volume that two cameras see."""
+        return _quantile(self.mm, 0.95)
+
+    @property
+    def median_mm_with_noise(self) -> float:
+        """Median of what one measurement of a point is off, noise of its pixels included."""
+        return _quantile(self.mm_with_noise, 0.5)
+
+    @property
+    def camera_px(self) -> tuple[float, ...]:
+        """Median of each camera over what it sees of the volume, C; nan for one that sees nothing."""
+        return tuple(_quantile(camera, 0.5) for camera in self.px)
+
+    @property
+    def worst_camera(self) -> int:
+        """Index of the camera with the largest median error."""
+        return int(torch.tensor(self.camera_px).nan_to_num(-1.0).argmax())
+
+    @property
+    def exceptions(self) -> tuple[int, ...]:
+        """Indices of the cameras that are known much worse than the others, the worst first."""
+        known = torch.tensor(self.camera_px)
+        usual = _quantile(known, 0.5)
+        return tuple(int(i) for i in known.nan_to_num(-1.0).argsort(descending=True) if known[i] > EXCEPTIONAL * usual)
+
+    @cached_property
+    def mm_without_exceptions(self) -> Tensor:
+        """`mm` when the exceptions take no part in triangulation: (X, Y, Z)."""
+        others = self.uncertainty.without(self.exceptions)
+        points = self.volume.grid().flatten(0, -2)
+        return others.point_error(points, others.rig.project(points).visible).view(self.mm.shape)
+
+    @property
+    def seen_share(self) -> float:
+        """Share of the volume that two cameras see."""
+        return float(self.mm.isfinite().double().mean())
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for `result.json`; what is not known is None."""
+        worst = self.worst_camera
+        return {
+            "median_px": _known(self.median_px),
+            "p95_px": _known(self.p95_px),
+            "median_mm": _known(self.median_mm),
+            "p95_mm": _known(self.p95_mm),
+            "noise_px": self.noise,
+            "median_mm_with_noise": _known(self.median_mm_with_noise),
+            "worst_camera": self.camera_names[worst],
+            "worst_camera_px": _known(self.camera_px[worst]),
+            "exceptions": [self.camera_names[i] for i in self.exceptions],
+            "median_mm_without_exceptions": _known(_quantile(self.mm_without_exceptions, 0.5)),
+            "per_camera_px": {n: _known(px) for n, px in zip(self.camera_names, self.camera_px, strict=True)},
+            "volume_mm": {"low": self.volume.low.tolist(), "high": self.volume.high.tolist()},
+            "seen_by_two_cameras": self.seen_share,
+        }
+
+
+def predicted_error(
+    calibration: Estimate, *, volume: WorkingVolume | None = None, covariance: Tensor | None = None
+) -> PredictedError:
+    """Predict the errors that a recalibrated rig makes where it is used.
+
+    Args:
+        calibration: what `calibrate` or `estimate` gave, without batch axes.
+        volume: where the rig is used; None = `working_volume(calibration)`.
+        covariance: (15 C, 15 C) of all cameras' parameters; None = `joint_covariance(calibration)`.
+
+    Raises:
+        InputError: an estimate with batch axes.
+        RefusedError: the information is singular.
+    """
+    if calibration.rig.batch_shape:
+        raise InputError(
+            f"predicted error: found a batch of {tuple(calibration.rig.batch_shape)} rigs, expected one rig without "
+            "batch axes"
+        )
+    rig = without_gradient(calibration.rig)
+    volume = working_volume(calibration) if volume is None else volume
+    covariance = joint_covariance(calibration) if covariance is None else covariance
+    grid = volume.grid()
+    shape, points = grid.shape[:-1], grid.flatten(0, -2)
+    anchors = volume.grid(ANCHORS).flatten(0, -2)
+    uncertainty = rig_uncertainty(rig, covariance.detach().to(points), anchors)
+    projection = rig.project(points)
+    seen, noise = projection.visible, _noise(calibration)
+    maps, depths, inside = _maps(uncertainty, volume, torch.where(seen, projection.depth, torch.nan))
+    return PredictedError(
+        volume=volume,
+        camera_names=rig.camera_names,
+        uncertainty=uncertainty,
+        px=torch.where(seen, uncertainty.pixel_error(points), torch.nan).unflatten(1, shape),
+        mm=uncertainty.point_error(points, seen).view(shape),
+        mm_with_noise=uncertainty.point_error(points, seen, noise).view(shape),
+        noise=noise,
+        maps=maps,
+        map_depths=depths,
+        map_inside=inside,
+    )
+
+
+def joint_covariance(calibration: Estimate) -> Tensor:
+    """Covariance of all cameras' parameters that the prediction starts from: (15 C, 15 C).
+
+    The flat one: what `camera_covariance` adds by second order is mostly that a motion of the whole rig, of which
+    nothing but the prior is known, bends the parameters. That is no error, and a linear projection cannot take it out
+    again; for the rest, first order is enough (docs/benchmarks.md, "Honesty").
+    """
+    return camera_covariance(calibration, curved=False)
+
+
+def working_volume(calibration: Estimate) -> WorkingVolume:
+    """Where the rig is used, as far as a calibration knows.
+
+    Returns:
+        The box that holds the object, turned in any way, about every place where it was seen, and at the rig's working
+        distance, where the rig has one: a single snapshot then says where it belongs, too.
+    """
+    problem, rig = calibration.problem, without_gradient(calibration.rig)
+    pose = calibration.rig_from_object.to(torch.float64)
+    centres = rotate(pose.rotation.detach(), problem.centroid.detach().to(pose.rotation)) + pose.translation.detach()
+    if rig.working_distance is not None:
+        centres = torch.cat((centres, centres.new_tensor([[0.0, 0.0, rig.working_distance]])))
+    reach = float(problem.points.norm(dim=-1).max())
+    return WorkingVolume(centres.amin(0) - reach, centres.amax(0) + reach)
+
+
+def _maps(uncertainty: RigUncertainty, volume: WorkingVolume, depths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Errors over whole images at some depths, the depths, and what lies in the volume.
+
+    Args:
+        uncertainty: of the rig.
+        volume: where the rig is used.
+        depths: (C, P) mm at which cameras see the volume, nan where they do not.
+    """
+    rig = uncertainty.rig
+    shown = torch.nanquantile(depths, depths.new_tensor(MAP_DEPTHS), dim=1).mT  # (C, D)
+    on_plane, valid = _rays(rig, MAP_SIZE)
+    rays = torch.cat((on_plane, torch.ones_like(on_plane[..., :1])), -1)  # (C, H W, 3)
+    in_camera = (rays[:, None] * shown[..., None, None]).flatten(1, 2)  # (C, D H W, 3)
+    points = rig.cam_from_rig.inverse().apply(in_camera)
+    shape = (len(MAP_DEPTHS), *MAP_SIZE)
+    error = uncertainty.pixel_error(points).unflatten(1, shape)
+    inside = volume.contains(points).unflatten(1, shape)
+    return torch.where(valid.unflatten(1, MAP_SIZE)[:, None], error, torch.nan), shown, inside
+
+
+def _rays(rig: CameraRig, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Undistorted middles of the cells of each image: (C, H W, 2) on the z = 1 plane, (C, H W) bool whether any."""
+    rows, columns = ((torch.arange(n, dtype=torch.float64, device=rig.focal_length.device) + 0.5) / n for n in size)
+    share = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1).flatten(0, 1)
+    uv = share * rig.image_size[:, None] - 0.5
+    return undistort((uv - rig.principal_point[:, None]) / rig.focal_length[:, None], rig.distortion)
+
+
+def _noise(calibration: Estimate) -> float:
+    weight = calibration.problem.root_weight
+    return float((1 / weight[weight > 0].double()).median())
+
+
+def _quantile(values: Tensor, share: float) -> float:
+    known = values[values.isfinite()]
+    return float(known.quantile(share)) if len(known) else float("nan")
+
+
+def _known(value: float) -> float | None:
+    return value if value == value else None

@@ -1,0 +1,218 @@
+"""What the covariance of a rig means at a point: error of its pixel (px), and of its triangulation (mm), gauge-free.
+
+A motion of the whole rig changes nothing that anyone can see, and does not count: errors are those that are left after
+the rigid motion that makes them smallest over a set of points, the working volume. To first order that is a projection
+of the parameters' covariance, see `aligned_covariance`; docs/method.md has the equations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from imgcal.errors import RefusedError
+from imgcal.geometry.projection import distort_with_jacobian
+from imgcal.geometry.rotations import cross_matrix
+from imgcal.types.rig import PARAMETERS, CameraRig
+
+ROUNDS = 3
+"""Of weighing the points of the alignment by the error that the alignment before leaves at them."""
+
+
+@dataclass(frozen=True)
+class RigUncertainty:
+    """A rig, and what is not known of it once it is laid upon the true one as well as a rigid motion can.
+
+    Both alignments are over the same points, one in pixels (what cameras show), one in mm (what is triangulated).
+    Weights let what is known worse than the median count less, so that one bad camera or a far corner does not push
+    the rest aside: the median's variance over its own.
+    """
+
+    rig: CameraRig  # C cameras, no batch axes
+    covariance: Tensor  # (15 C, 15 C) before any alignment
+    points: Tensor  # (P, 3) mm, over which is aligned
+    px_weight: Tensor  # (C, P) of each pixel in the alignment, 0 where the camera does not see the point
+    mm_weight: Tensor  # (P,) of each triangulated point, 0 where fewer than two cameras see it
+    px_covariance: Tensor  # (15 C, 15 C) after the alignment in pixels; nan where too little is seen for one
+    mm_covariance: Tensor  # (15 C, 15 C) after the alignment in mm; nan where cameras share too little for one
+
+    def without(self, cameras: Collection[int]) -> RigUncertainty:
+        """Leave cameras out, and align the others anew."""
+        kept = [i for i in range(self.rig.cameras) if i not in cameras]
+        rows = torch.tensor([PARAMETERS * i + j for i in kept for j in range(PARAMETERS)], device=self.points.device)
+        return rig_uncertainty(self.rig.select(kept), self.covariance[rows[:, None], rows], self.points)
+
+    def pixel_error(self, points: Tensor) -> Tensor:
+        """Predicted error of each camera's pixel of points: (C, P) px, expected (RMS) length of the difference.
+
+        Args:
+            points: (P, 3) mm in the rig frame, or (C, P, 3), own points for each camera. What a camera does not see has
+                an error, too, which means nothing.
+        """
+        rows = pixel_jacobian(self.rig, points).flatten(1, 2)  # (C, 2 P, 15)
+        cameras = self.rig.cameras
+        blocks = self.px_covariance.unflatten(0, (cameras, PARAMETERS)).unflatten(-1, (cameras, PARAMETERS))
+        own = blocks.diagonal(dim1=0, dim2=2).permute(2, 0, 1)  # (C, 15, 15)
+        variance = ((rows @ own) * rows).sum(-1).unflatten(1, (-1, 2)).sum(-1)
+        return variance.clamp_min(0).sqrt()
+
+    def point_error(self, points: Tensor, seen: Tensor, noise: float = 0.0) -> Tensor:
+        """Predicted error of triangulated points: (P,) mm, expected (RMS) distance.
+
+        Args:
+            points: (P, 3) mm in the rig frame.
+            seen: (C, P) bool, the cameras that take part; each counts alike.
+            noise: px, standard deviation of each axis of one measured pixel; 0 = error of the calibration alone.
+
+        Returns:
+            nan where fewer than two cameras take part.
+        """
+        triangulation, information = _triangulation(self.rig, points, seen)
+        rows = triangulation.flatten(0, 1)
+        variance = ((rows @ self.mm_covariance) * rows).sum(-1).unflatten(0, (-1, 3)).sum(-1)
+        if noise:
+            variance = variance + noise**2 * inverse_or_zero(information).diagonal(dim1=-2, dim2=-1).sum(-1)
+        return torch.where(seen.sum(0) >= 2, variance.clamp_min(0).sqrt(), torch.nan)
+
+
+def rig_uncertainty(rig: CameraRig, covariance: Tensor, points: Tensor) -> RigUncertainty:
+    """Remove the gauge from the covariance of a rig's parameters.
+
+    Args:
+        rig: C cameras, no batch axes.
+        covariance: (15 C, 15 C) of all cameras' parameters, as `estimation.camera_covariance`.
+        points: (P, 3) mm over which estimated and true rig are laid upon one another.
+    """
+    seen = rig.project(points).visible
+    motion = rigid_motion(rig, points.mean(0))
+    pixels = pixel_jacobian(rig, points)
+    triangulation, _ = _triangulation(rig, points, seen)
+    px_weight, mm_weight = seen.to(points), (seen.sum(0) >= 2).to(points)
+    px_covariance = mm_covariance = covariance
+    for _ in range(ROUNDS):
+        metric = torch.block_diag(*torch.einsum("cp,cpai,cpaj->cij", px_weight, pixels, pixels))
+        px_covariance = _aligned_if_possible(covariance, motion, metric)
+        rows = (mm_weight.sqrt()[:, None, None] * triangulation).flatten(0, 1)
+        mm_covariance = _aligned_if_possible(covariance, motion, rows.mT @ rows)
+        found = RigUncertainty(rig, covariance, points, px_weight, mm_weight, px_covariance, mm_covariance)
+        px_weight = _weight(found.pixel_error(points), seen)
+        mm_weight = _weight(found.point_error(points, seen), seen.sum(0) >= 2)
+    return found
+
+
+def _weight(error: Tensor, valid: Tensor) -> Tensor:
+    """Median variance over own variance, one at most; zero where not valid."""
+    valid = valid & error.isfinite()
+    if not bool(valid.any()):
+        return torch.zeros_like(error)
+    median = error[valid].median()
+    weight = torch.where(error > median, median / error, 1.0).square()
+    return torch.where(valid, weight, 0.0)
+
+
+def aligned_covariance(covariance: Tensor, motion: Tensor, metric: Tensor) -> Tensor:
+    """Project a covariance onto the complement of the rigid motions in a metric.
+
+    Args:
+        covariance: (K, K) of all parameters.
+        motion: (K, 6) change of the parameters with a rigid motion of all cameras.
+        metric: (K, K) matrix of the squared error that the motion shall make smallest.
+
+    Returns:
+        (K, K), P covariance P^T with P = I - G (G^T H G)^-1 G^T H.
+
+    Raises:
+        RefusedError: the metric does not determine the motion.
+    """
+    weighted = metric @ motion
+    normal = motion.mT @ weighted
+    scale = normal.diagonal().clamp_min(torch.finfo(normal.dtype).tiny).rsqrt()
+    factor, failed = torch.linalg.cholesky_ex(scale[:, None] * normal * scale)
+    if bool(failed):
+        raise RefusedError("predicted error: too little of the working volume is seen by the cameras to compare rigs")
+    best = scale[:, None] * torch.cholesky_solve(scale[:, None] * weighted.mT, factor)
+    projector = torch.eye(len(covariance), dtype=covariance.dtype, device=covariance.device) - motion @ best
+    return projector @ covariance @ projector.mT
+
+
+def _aligned_if_possible(covariance: Tensor, motion: Tensor, metric: Tensor) -> Tensor:
+    try:
+        return aligned_covariance(covariance, motion, metric)
+    except RefusedError:
+        return torch.full_like(covariance, torch.nan)
+
+
+def rigid_motion(rig: CameraRig, centre: Tensor) -> Tensor:
+    """Change of all parameters with a motion of the whole rig: (15 C, 6), turn about `centre` (rad), then shift (mm).
+
+    A camera's position moves by w x (position - centre) + t, its left rotation is -R w. A point that moves along
+    keeps its pixels.
+    """
+    turn = rig.cam_from_rig.rotation
+    motion = turn.new_zeros(rig.cameras, PARAMETERS, 6)
+    motion[:, 0:3, 0:3] = -turn
+    motion[:, 3:6, 0:3] = -cross_matrix(rig.positions - centre)
+    motion[:, 3:6, 3:6] = torch.eye(3, dtype=turn.dtype, device=turn.device)
+    return motion.flatten(0, 1)
+
+
+def pixel_jacobian(rig: CameraRig, points: Tensor) -> Tensor:
+    """Derivative of the pixels of points by the parameters of their camera: (C, P, 2, 15).
+
+    Args:
+        rig: C cameras, no batch axes.
+        points: (P, 3) or (C, P, 3) mm in the rig frame.
+    """
+    rotation = rig.cam_from_rig.rotation
+    in_camera = points @ rotation.mT + rig.cam_from_rig.translation[:, None]  # (C, P, 3)
+    depth = in_camera[..., 2:]
+    xy = in_camera[..., :2] / depth
+    x, y = xy.unbind(-1)
+    xd, yd, jxx, jxy, jyy, rr = distort_with_jacobian(x, y, *rig.distortion[:, None].unbind(-1))
+    focal = rig.focal_length[:, None]
+    by_xy = torch.stack((jxx, jxy, jxy, jyy), -1).unflatten(-1, (2, 2)) * focal[..., None]
+    by_point = torch.cat((by_xy, -(by_xy @ xy[..., None])), -1) / depth[..., None]  # (C, P, 2, 3) of the camera frame
+    along = in_camera[..., None, :].expand_as(by_point)
+    jacobian = by_point.new_zeros(*by_point.shape[:-1], PARAMETERS)
+    jacobian[..., 0:3] = torch.linalg.cross(along, by_point)
+    jacobian[..., 3:6] = -(by_point @ rotation[:, None])
+    jacobian[..., 6:8] = torch.diag_embed(torch.stack((xd, yd), -1))
+    jacobian[..., 8:10] = torch.eye(2, dtype=xy.dtype, device=xy.device)
+    by_p1 = torch.stack((2 * x * y, rr + 2 * y * y), -1)
+    by_p2 = torch.stack((rr + 2 * x * x, 2 * x * y), -1)
+    radial = [xy * rr[..., None] ** power for power in (1, 2, 3)]
+    by_distortion = torch.stack((radial[0], radial[1], by_p1, by_p2, radial[2]), -1)
+    jacobian[..., 10:15] = by_distortion * focal[..., None]
+    return jacobian
+
+
+def _triangulation(rig: CameraRig, points: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
+    """How triangulated points follow the rig, and how well pixels determine them.
+
+    With exact pixels, the point that fits them best moves by -(sum K^T K)^-1 sum K^T J dp, where J is the derivative of
+    the pixels by the parameters, and K by the point.
+
+    Returns:
+        (P, 3, 15 C) mm by parameter, without the sign; (P, 3, 3) sum of K^T K, 1 / mm^2 for pixels of unit variance.
+    """
+    by_camera = pixel_jacobian(rig, points)
+    by_point = -by_camera[..., 3:6] * seen[..., None, None]
+    information = torch.einsum("cpai,cpaj->pij", by_point, by_point)
+    response = torch.einsum("cpai,cpaj->picj", by_point, by_camera).flatten(-2)
+    return inverse_or_zero(information) @ response, information
+
+
+def inverse_or_zero(information: Tensor) -> Tensor:
+    """Inverse of (P, 3, 3); zero where there is none."""
+    factor, failed = torch.linalg.cholesky_ex(information)
+    eye = torch.eye(3, dtype=information.dtype, device=information.device)
+    good = (failed == 0)[:, None, None]
+    return torch.where(good, torch.cholesky_inverse(torch.where(good, factor, eye)), 0.0)
+
+
+def without_gradient(rig: CameraRig) -> CameraRig:
+    """The same values, double precision, without a graph."""
+    return replace(rig.map_tensors(lambda tensor, _: tensor.detach()), image_size=rig.image_size).to(torch.float64)

@@ -1,0 +1,283 @@
+"""The fit of labelled snapshots together with what it depends on: noise, outliers, and how wide the prior must be."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from imgcal.errors import RefusedError
+from imgcal.estimation.covariance import remaining_variance
+from imgcal.estimation.estimate import EstimationOptions, make_loss, minimize
+from imgcal.estimation.levenberg_marquardt import Solution
+from imgcal.estimation.linearize import Problem, State, points_at
+from imgcal.estimation.object_shape import ShapeEvidence, learnt_tolerances, pull_scatter, shape_evidence
+from imgcal.estimation.pose_support import require_poses
+from imgcal.estimation.robust_losses import Loss
+
+KINDS = {
+    "rotation": slice(0, 3),
+    "position": slice(3, 6),
+    "focal_length": slice(6, 8),
+    "principal_point": slice(8, 10),
+    "distortion": slice(10, 15),
+}
+ROUNDS = 40
+"""Of fits at most: noise, outliers, object and prior follow each other, and most captures need three to six."""
+BENT = 5.0
+"""Standard deviations from which the object is not what its file says."""
+WRONG_SCALE = 4.0
+"""Standard deviations of the cameras' positions, all moved together, from which the object's scale is wrong."""
+
+GROSS_SCALE = 0.05
+"""Relative error of the scale that is named at once: it spoils noise and labels of any fit."""
+MOST_SCALE = 0.5
+"""Relative error of the scale above which something else is wrong: exchanged cameras, for one."""
+
+
+class FitOptions(Protocol):
+    """What of the pipeline's options decides when a fit has come to rest."""
+
+    @property
+    def estimation(self) -> EstimationOptions:
+        """The solver's options."""
+
+    @property
+    def outlier(self) -> float:
+        """Standard deviations beyond which a label is left out."""
+
+    @property
+    def widest_prior(self) -> float:
+        """Factor by which a kind of factory values may have drifted more than the prior says."""
+
+
+@dataclass(frozen=True)
+class SettledFit:
+    """A fit whose noise, outliers, object and prior agree with its residuals."""
+
+    problem: Problem
+    solution: Solution
+    sigma: NDArray[np.floating]  # (S, C, N) px, with the model error
+    seen: NDArray[np.bool_]  # (S, C, N) labels that fit
+    model_error: float  # px
+    widened: Mapping[str, float]
+    shape: ShapeEvidence | None = None  # what the residuals say about the object; None = not asked
+
+
+def settle(
+    problem: Problem,
+    starts: Sequence[tuple[State, float]],
+    variance: NDArray[np.floating],
+    labels: NDArray[np.bool_],
+    options: FitOptions,
+    examine: bool = True,
+    alike: bool = False,
+) -> SettledFit:
+    """Fit, ask the residuals for noise, outliers, the object and the prior's width, and fit again until they stay.
+
+    Args:
+        problem: with the prior to begin with.
+        starts: where to begin, and with which model error (px). One by which some label does not fit gives way to the
+            next; the last one stays.
+        variance: (S, C, N) px^2, the blobs' own.
+        labels: (S, C, N) bool, what was labelled.
+        options: how sure the result must be.
+        examine: ask about the object, too, and free the fiducials that are not where its file says.
+        alike: each snapshot may have the labels of another turn of a symmetric object: it cannot be said which fiducial
+            is not in its place.
+
+    Raises:
+        RefusedError: no minimum was found, or noise, outliers, object and prior do not come to rest.
+        UndeterminedPosesError: without outliers some snapshots do not say where the object is.
+    """
+    (state, model_error), *later = starts
+    loss = make_loss(options.estimation)
+    widened: dict[str, float] = {}
+    kept, unexamined, shape = labels, examine, None
+    for _ in range(ROUNDS):
+        seen, noise = kept, variance + model_error**2
+        problem, solution, squared = _fit(problem, state, noise, seen, options)
+        if unexamined and not later and bool(solution.converged):
+            # Before outliers are left out: all labels of a fiducial that is off its place may be among them.
+            unexamined = False
+            shape, free = _examine(problem, solution, loss, options, GROSS_SCALE, alike)
+            if free is not None:
+                (problem, state), kept = free, labels
+                continue
+        # Judged by the sigma of this fit: what a coarse fit leaves says little about fine outliers. Where a fiducial
+        # was left out there is no residual: it stays out.
+        kept = seen & (squared <= options.outlier**2 * noise)
+        require_poses(kept, problem.points)
+        if later and not (bool(solution.converged) and (kept == labels).all()):
+            (state, model_error), *later = later
+            kept = labels
+            continue
+        later = []
+        if not bool(solution.converged):
+            rms = float(np.sqrt(squared[seen].mean()))
+            raise RefusedError(f"estimation: no minimum after {solution.iterations} iterations (RMS {rms:.3g} px)")
+        state, remaining = solution.state, remaining_variance(solution)[0]
+        taken = 6 * len(seen) + float((1 - remaining).sum())
+        previous, model_error = model_error, _model_error(squared[seen], variance[seen], taken)
+        if abs(model_error - previous) > 0.02 * previous or (kept != seen).any():
+            continue
+        if examine:
+            shape, free = _examine(problem, solution, loss, options, 0.0, alike)
+            if free is not None:
+                (problem, state), kept = free, labels
+                continue
+        too_narrow = _too_narrow(state.offset[0].numpy(), remaining)
+        if not too_narrow or max(widened.values(), default=1.0) > options.widest_prior:
+            return SettledFit(problem, solution, np.sqrt(noise), seen, model_error, widened, shape)
+        widened |= {kind: widened.get(kind, 1.0) * factor for kind, factor in too_narrow.items()}
+        problem, state = _widen(problem, state, too_narrow)
+    raise RefusedError(
+        f"estimation: noise, outliers and prior have not come to rest after {ROUNDS} fits: the rig has changed far "
+        "more than its prior allows, or many labels are wrong",
+        python="give the rig a wider prior where it may have changed so much: replace(rig, prior=RigPrior(...))",
+        command="write larger values under `prior` in the rig file where the rig may have changed so much",
+    )
+
+
+def _examine(
+    problem: Problem, solution: Solution, loss: Loss, options: FitOptions, least_scale: float, alike: bool
+) -> tuple[ShapeEvidence | None, tuple[Problem, State] | None]:
+    """Ask a fit about the object; errors of its scale count from `least_scale`, relative.
+
+    Returns:
+        What it says, and a problem in which fiducials that are not in their places have tolerances, with a state to go
+        on from; None = they are where they should be, as far as the fit can tell.
+
+    Raises:
+        RefusedError: the object has another scale; or it is bent, and symmetric.
+    """
+    shape = shape_evidence(problem, solution, loss)
+    if shape is None:
+        return None, None
+    if alike and shape.bent_sigma() >= BENT:
+        raise RefusedError(
+            "object: its fiducials are not where its file says, and because it can be turned into itself, nobody can "
+            "say which: each snapshot may have the labels of another turn",
+            python="measure it anew, give labels (Detections.fiducial), or use an object without symmetry",
+            command="measure it anew, give labels (a column `fiducial`), or use an object without symmetry",
+        )
+    free = _free_object(shape, problem, solution, loss, options) if shape.bent_sigma() >= BENT else None
+    if free is None:
+        _require_scale(shape, problem, solution, least_scale)
+    return shape, free
+
+
+def _free_object(
+    shape: ShapeEvidence, problem: Problem, solution: Solution, loss: Loss, options: FitOptions
+) -> tuple[Problem, State] | None:
+    spread = learnt_tolerances(shape)
+    if not (spread > 1.01 * shape.tolerance).any():
+        return None
+    before = problem.object_spread
+    scale = problem.points.new_zeros(1) if before is None else before[0, -1:]
+    free = torch.cat((torch.from_numpy(spread).to(problem.uv).repeat_interleave(3), scale))
+    # The displacements stay, in new units; where a tolerance is still zero there was none.
+    displaced = (points_at(problem, solution.state)[0] - problem.points).flatten()
+    whitened = torch.where(free > 0, torch.cat((displaced, torch.zeros_like(scale))) / free.clamp_min(1e-30), 0.0)
+    problem = replace(problem, object_spread=free[None])
+    state = replace(solution.state, object_offset=whitened[None])
+    found = minimize(problem, state, options.estimation)
+    # Where snapshots disagree about the fiducials, something else than the object is behind it.
+    if not bool(found.converged) or shape.bent_sigma(pull_scatter(problem, found.state, loss)) < BENT:
+        return None
+    return problem, found.state
+
+
+def _require_scale(shape: ShapeEvidence, problem: Problem, solution: Solution, least: float) -> None:
+    """Refuse where the cameras have moved together as a wrong scale of the object would make them.
+
+    How far they have moved otherwise says how far the prior can be trusted to know them.
+    """
+    position = KINDS["position"]
+    offset, spread = (tensor[0, :, position].numpy() for tensor in (solution.state.offset, problem.spread))
+    places = problem.factory.positions[0].numpy() + offset * spread
+    direction = np.where(spread > 0, (places - places.mean(0)) / np.maximum(spread, 1e-30), 0.0).ravel()
+    along = float(direction @ offset.ravel()) ** 2 / max(float(direction @ direction), 1e-30)
+    freedom = float((1 - remaining_variance(solution)[0, :, position]).sum())
+    usual = (float(np.square(offset).sum()) - along) / max(freedom, 1.0)
+    usual = usual if usual > 1 + 2 * (2 / max(freedom, 1.0)) ** 0.5 else 1.0
+    error, deviation = shape.scale_error
+    granted = 0.0 if problem.object_spread is None else float(problem.object_spread[0, -1])
+    if MOST_SCALE > abs(error) > max(least, WRONG_SCALE * np.hypot(deviation * usual**0.5, granted)):
+        size = "larger" if error > 0 else "smaller"
+        raise RefusedError(
+            f"object: all cameras have moved together, as if it were {100 * abs(error):.2g} +- {100 * deviation:.1g} % "
+            f"{size} than its file says",
+            python=f"measure it anew, look at its unit, or grant its scale a tolerance (now {granted:g}): "
+            "replace(obj, scale_tolerance=...)",
+            command=f"measure it anew, look at its unit, or grant its scale a tolerance (now {granted:g}): "
+            "--object-scale-tolerance",
+        )
+
+
+def _fit(
+    problem: Problem, state: State, noise: NDArray[np.floating], seen: NDArray[np.bool_], options: FitOptions
+) -> tuple[Problem, Solution, NDArray[np.floating]]:
+    """Fit with a noise (px^2), and give the problem, its solution and the squared residuals, (S, C, N) px^2 both."""
+    root_weight = torch.from_numpy(np.where(seen, noise**-0.5, 0.0)).to(problem.uv)
+    problem = replace(problem, root_weight=root_weight[None])
+    solution = minimize(problem, state, options.estimation)
+    return problem, solution, np.square(solution.equations.residual[0].numpy()).sum(-2)
+
+
+def _model_error(squared: NDArray[np.floating], variance: NDArray[np.floating], taken: float) -> float:
+    """Standard deviation (px, each axis) that residuals hold beyond the blobs' own sigma; 0 = insignificant.
+
+    The median of squared distances over two axes is 1.386 for unit noise, whatever a minority of outliers does.
+    Residuals are smaller than the noise by what the parameters took: each takes the share of one observation that its
+    prior left.
+
+    Args:
+        squared: (M,) px^2, squared lengths of the residuals.
+        variance: (M,) px^2 of each axis, the blobs' own.
+        taken: degrees of freedom that the parameters took.
+    """
+    count = 2 * len(squared)
+    free = max(count - taken, 1.0)
+    squared = squared * (count / free)
+    middle = (len(squared) - 1) // 2
+
+    def excess(error: float) -> float:
+        return float(np.partition(squared / (variance + error**2), middle)[middle]) / 1.386
+
+    # Six standard deviations of a chi-squared mean: below, the residuals fit the sigmas that the blobs have.
+    if excess(0.0) <= 1 + 6 * (2 / free) ** 0.5:
+        return 0.0
+    low, high = 0.0, float(np.sqrt(squared.max()))
+    for _ in range(30):
+        error = 0.5 * (low + high)
+        low, high = (error, high) if excess(error) > 1 else (low, error)
+    return high
+
+
+def _too_narrow(offset: NDArray[np.floating], remaining: NDArray[np.float64]) -> dict[str, float]:
+    """Kinds of values that have drifted more than their prior allows: factor by which the prior is too narrow.
+
+    The whitened offsets (C, 15) of a kind should have a mean square of one, over as many values as the data determine:
+    those of which they leave little (C, 15) of the prior's variance.
+    """
+    factors = {}
+    for kind, part in KINDS.items():
+        freedom = float((1 - remaining[:, part]).sum())
+        if freedom > 1:
+            excess = float(np.square(offset[:, part]).sum()) / freedom
+            if excess > 1 + 4 * (2 / freedom) ** 0.5:
+                factors[kind] = excess**0.5
+    return factors
+
+
+def _widen(problem: Problem, state: State, factors: Mapping[str, float]) -> tuple[Problem, State]:
+    """Widen the prior; the state, counted in prior standard deviations, stays where it is."""
+    scale = torch.ones_like(problem.spread[0, 0])
+    for kind, factor in factors.items():
+        scale[KINDS[kind]] = factor
+    return replace(problem, spread=problem.spread * scale), replace(state, offset=state.offset / scale)

@@ -1,0 +1,235 @@
+"""Captured frames: `frames/<camera name>/<snapshot>.<png|tif|...>` or `frames/<camera name>.<png|tif|mp4|...>`.
+
+One file a camera holds one snapshot a page (TIFF) or frame (video), named "0", "1", ...; an image is snapshot "0".
+Optional beside `frames/`: `capture.yaml` (format, bit_depth, note) and `masks/<camera name>.png` (not black = ignored).
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imgcal.errors import InputError
+from imgcal.io.atomic import write_text
+from imgcal.io.detections_csv import load_detections
+from imgcal.io.frames import IMAGE_SUFFIXES, TIFF_SUFFIXES, VIDEO_SUFFIXES, Frame, Video, count_frames, read_frame
+from imgcal.io.names import is_file_name, natural_key, nearest
+from imgcal.io.publishing import is_unfinished
+from imgcal.io.yaml_file import StrictModel, read_yaml, validated, yaml_text
+from imgcal.messages import listed
+from imgcal.types.observations import Detections
+from imgcal.types.rig import CameraRig
+
+FORMAT = "imgcal-capture/1"
+
+
+class _Settings(StrictModel):
+    format: Literal["imgcal-capture/1"]
+    bit_depth: Literal[8, 12, 16]
+    note: str | None = None
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Frames of a rig on disk; nothing is decoded before it is asked for."""
+
+    folder: Path
+    camera_names: tuple[str, ...]  # C, in the order of the rig
+    snapshot_names: tuple[str, ...]  # S, of all cameras together; "2" comes before "10"
+    files: Mapping[str, Mapping[str, tuple[Path, int]]]  # camera -> snapshot -> file, page or frame in it
+    image_size: Mapping[str, tuple[int, int]]  # camera -> width, height in pixels; empty when opened without a rig
+    bit_depth: int | None = None  # 8, 12 or 16 as stated in capture.yaml; None = not stated
+
+    def snapshots(self, first: int = 0, last: int | None = None) -> Iterator[tuple[str, dict[str, Frame | None]]]:
+        """Read frames one snapshot at a time, so that memory does not grow with the length of the capture.
+
+        Args:
+            first: number of the first snapshot.
+            last: number of the snapshot to stop before; None = to the end.
+
+        Yields:
+            Name of the snapshot and, for every camera, its frame (H, W), or None where there is none.
+
+        Raises:
+            InputError: a frame is unreadable, or of another size or bit depth than expected.
+        """
+        before: dict[str, tuple[int, int, int]] = {}
+        with contextlib.ExitStack() as stack:
+            videos: dict[Path, Video] = {}
+            for snapshot in self.snapshot_names[first:last]:
+                frames: dict[str, Frame | None] = {}
+                for camera in self.camera_names:
+                    path, index = self.files[camera].get(snapshot, (None, 0))
+                    if path is None:
+                        frames[camera] = None
+                        continue
+                    if path.suffix.lower() not in VIDEO_SUFFIXES:
+                        alone = path.parent != self.folder / "frames"
+                        frame = _read_image(path, index, alone, self.image_size.get(camera))
+                    else:
+                        if path not in videos:
+                            videos[path] = stack.enter_context(Video(path))
+                        frame = videos[path].read(index)
+                    self._check(frame, camera, path, before)
+                    frames[camera] = frame
+                yield snapshot, frames
+
+    def mask(self, camera: str) -> NDArray[np.bool_] | None:
+        """Read the mask of a camera.
+
+        Returns:
+            (H, W) bool, True where the image is to be ignored; None when the camera has no mask.
+        """
+        path = self.folder / "masks" / f"{camera}.png"
+        if not path.exists():
+            return None
+        mask = read_frame(path, size=self.image_size.get(camera))
+        _check_size(mask, path, camera, self.image_size.get(camera))
+        return np.asarray(mask > 0)
+
+    def _check(self, frame: Frame, camera: str, path: Path, before: dict[str, tuple[int, int, int]]) -> None:
+        """Compare with the rig, with capture.yaml and with the first frame of the camera."""
+        bits = 8 * frame.itemsize
+        width, height, first_bits = before.setdefault(camera, (frame.shape[1], frame.shape[0], bits))
+        _check_size(frame, path, camera, self.image_size.get(camera, (width, height)))
+        if self.bit_depth is not None and (self.bit_depth > 8) != (bits > 8):
+            story = f"a {self.bit_depth}-bit frame saved as 8-bit" if bits == 8 else f"{bits}-bit pixels"
+            raise InputError(f"{path}: found {story}, expected {self.bit_depth} bit as stated in capture.yaml")
+        if first_bits != bits:
+            story = "a 16-bit frame saved as 8-bit" if bits == 8 else f"{bits}-bit pixels"
+            raise InputError(f"{path}: found {story}, expected {first_bits} bit as in the first frame of {camera}")
+        if self.bit_depth == 12 and frame.max(initial=0) > 4095:
+            raise InputError(f"{path}: found the value {frame.max()}, expected at most 4095 (12 bit in the low bits)")
+
+
+def open_capture(folder: str | Path, rig: CameraRig | None = None) -> Capture:
+    """Find the frames of a capture.
+
+    Args:
+        folder: the folder that holds `frames/`.
+        rig: gives the cameras, their order and image sizes; a camera without files is allowed. None = what is there.
+
+    Raises:
+        InputError: one line with the file or folder, what was found and what was expected.
+    """
+    folder = Path(folder)
+    frames = folder / "frames"
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder, expected a capture that holds frames/<camera name>/")
+    if not frames.is_dir() and is_unfinished(folder):
+        raise InputError(f"{folder}: found a capture that was not finished, expected one whose making came to its end")
+    if not frames.is_dir():
+        found = listed(path.name for path in _listing(folder)) or "an empty folder"
+        raise InputError(f"{folder}: found {found}, expected a capture that holds frames/<camera name>/")
+    files: dict[str, dict[str, tuple[Path, int]]] = {}
+    for path in _listing(frames):
+        camera = path.name if path.is_dir() else path.stem
+        if camera in files:
+            raise InputError(f"{frames}: found camera {camera} more than once, expected one folder or file for it")
+        files[camera] = _folder_snapshots(path) if path.is_dir() else _file_snapshots(path)
+    if rig is not None:
+        _check_cameras(frames, files, rig)
+    if not any(files.values()):
+        raise InputError(f"{frames}: found no frames, expected images or videos of the cameras")
+    names = tuple(files) if rig is None else rig.camera_names
+    masks = folder / "masks"
+    for path in _listing(masks) if masks.exists() else ():
+        if path.stem not in names or path.suffix.lower() != ".png":
+            raise InputError(f"{path}: expected masks named <camera name>.png, cameras: {listed(names)}")
+    settings = folder / "capture.yaml"
+    return Capture(
+        folder=folder,
+        camera_names=names,
+        snapshot_names=tuple(sorted({snapshot for found in files.values() for snapshot in found}, key=natural_key)),
+        files={name: files.get(name, {}) for name in names},
+        image_size={} if rig is None else _sizes(rig),
+        bit_depth=read_yaml(settings, _Settings, FORMAT).bit_depth if settings.exists() else None,
+    )
+
+
+def open_input(path: str | Path, rig: CameraRig | None = None, fiducials: int | None = None) -> Capture | Detections:
+    """Open what a user gives to a command: a capture folder or a detections file; arguments as for their functions."""
+    path = Path(path)
+    if path.is_dir():
+        return open_capture(path, rig)
+    if not path.is_file():
+        found = "found a device or pipe" if path.exists() else "no such file or folder"
+        raise InputError(f"{path}: {found}, expected a capture folder or a detections file (.csv, .csv.gz)")
+    suffix = path.suffix.lower()
+    if suffix in IMAGE_SUFFIXES | VIDEO_SUFFIXES:
+        raise InputError(f"{path}: found one image or video, expected the capture folder that holds frames/")
+    return load_detections(path, rig, fiducials)
+
+
+def save_capture_settings(folder: str | Path, bit_depth: int, note: str | None = None) -> None:
+    """Write `capture.yaml`: the bit depth (8, 12 or 16) of all frames and a remark for people."""
+    content: dict[str, Any] = {"format": FORMAT, "bit_depth": bit_depth}
+    if note is not None:
+        content["note"] = note
+    path = Path(folder) / "capture.yaml"
+    validated(content, _Settings, f"{path}: not written")
+    write_text(path, yaml_text(content))
+
+
+def _listing(folder: Path) -> list[Path]:
+    """Entries in natural order, without hidden files."""
+    if not folder.is_dir():
+        raise InputError(f"{folder}: found a file, expected a folder")
+    entries = [path for path in folder.iterdir() if not path.name.startswith(".")]
+    for path in entries:
+        if not is_file_name(path.name):
+            raise InputError(f"{path}: found a name that is no text, or too long, expected one that can be shown")
+    return sorted(entries, key=lambda path: natural_key(path.name))
+
+
+def _folder_snapshots(folder: Path) -> dict[str, tuple[Path, int]]:
+    """One image a snapshot."""
+    found: dict[str, tuple[Path, int]] = {}
+    for path in _listing(folder):
+        if path.suffix.lower() not in IMAGE_SUFFIXES:
+            raise InputError(f"{path}: expected an image of one snapshot ({', '.join(sorted(IMAGE_SUFFIXES))})")
+        if path.stem in found:
+            raise InputError(f"{path}: found snapshot {path.stem} more than once, also in {found[path.stem][0].name}")
+        found[path.stem] = (path, 0)
+    return found
+
+
+def _file_snapshots(path: Path) -> dict[str, tuple[Path, int]]:
+    """All snapshots of a camera in one file."""
+    if path.suffix.lower() not in IMAGE_SUFFIXES | VIDEO_SUFFIXES:
+        expected = ", ".join(sorted(IMAGE_SUFFIXES | VIDEO_SUFFIXES))
+        raise InputError(f"{path}: expected a folder, an image or a video of one camera ({expected})")
+    return {str(index): (path, index) for index in range(count_frames(path))}
+
+
+def _read_image(path: Path, page: int, alone: bool, size: tuple[int, int] | None) -> Frame:
+    if alone and path.suffix.lower() in TIFF_SUFFIXES and (pages := count_frames(path)) != 1:
+        raise InputError(f"{path}: found {pages} pages, expected 1 in a file of one snapshot")
+    return read_frame(path, page, size)
+
+
+def _check_cameras(frames: Path, found: Iterable[str], rig: CameraRig) -> None:
+    unknown = [camera for camera in found if camera not in rig.camera_names]
+    if unknown:
+        hint = f"; put the snapshots into {frames / rig.camera_names[0]}" if rig.cameras == 1 else ""
+        raise InputError(
+            f"{frames}: found {listed(unknown)}, expected the cameras of rig {rig.name}: "
+            f"{listed(rig.camera_names)}{nearest(unknown[0], rig.camera_names)}{hint}"
+        )
+
+
+def _check_size(frame: Frame, path: Path, camera: str, size: tuple[int, int] | None) -> None:
+    if size is not None and frame.shape != size[::-1]:
+        height, width = frame.shape
+        raise InputError(f"{path}: found {width}x{height} pixels, expected {size[0]}x{size[1]} for camera {camera}")
+
+
+def _sizes(rig: CameraRig) -> dict[str, tuple[int, int]]:
+    sizes = rig.image_size.tolist()
+    return {name: (int(width), int(height)) for name, (width, height) in zip(rig.camera_names, sizes, strict=True)}

@@ -1,0 +1,199 @@
+"""Detections: CSV or CSV.gz with the header `snapshot,camera,u,v`.
+
+Optional columns: `sigma` (pixels; without it `DEFAULT_SIGMA` holds for every blob), `fiducial` (row of the object file,
+empty = unlabelled), `radius` (pixels, empty = unknown) and `flags` (sum of `BlobFlag` bits).
+
+Convention: a snapshot or camera without any blob has no row, so a file does not know of it; cameras come back when the
+file is read with its rig.
+"""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imgcal.errors import InputError
+from imgcal.io.atomic import replacing
+from imgcal.io.csv_file import Chunk, fail_row, read_chunks
+from imgcal.io.names import is_file_name, nearest
+from imgcal.messages import listed, shortened
+from imgcal.types import limits
+from imgcal.types.observations import BlobFlag, Detections
+from imgcal.types.rig import CameraRig
+
+REQUIRED = ("snapshot", "camera", "u", "v")
+OPTIONAL = ("sigma", "fiducial", "radius", "flags")
+
+DEFAULT_SIGMA = 0.1
+"""Pixels, one standard deviation of each axis, for files without the column `sigma`."""
+
+MARGIN = 5.0  # pixels outside the image that are still taken: centres of cut discs, rounding
+
+
+def load_detections(path: str | Path, rig: CameraRig | None = None, fiducials: int | None = None) -> Detections:
+    """Read detections; a million rows take a few seconds.
+
+    Args:
+        path: CSV file, with or without gzip compression.
+        rig: gives the cameras and their order, and the image sizes that are checked; None = cameras in file order.
+        fiducials: number of points of the object, the limit of the column `fiducial`; None = not checked.
+
+    Returns:
+        Detections; snapshots in file order, which is the order in which their names first appear.
+
+    Raises:
+        InputError: one line with the file, the line, what was found and what was expected.
+    """
+    path = Path(path)
+    cameras = {} if rig is None else {name: index for index, name in enumerate(rig.camera_names)}
+    known_cameras = None if rig is None else rig.camera_names
+    snapshots: dict[str, int] = {}
+    parts: list[dict[str, NDArray[Any]]] = []
+    for chunk in read_chunks(path, REQUIRED, OPTIONAL):
+        part = {
+            "camera": _indices(chunk, "camera", cameras, known_cameras),
+            "snapshot": _indices(chunk, "snapshot", snapshots, None),
+            **_numbers(chunk, fiducials),
+        }
+        if rig is not None:
+            _check_inside(chunk, part, rig)
+        parts.append(part)
+    if not parts:
+        raise InputError(f"{path}: found a header and no rows, expected at least one blob")
+    column = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    _check_unique(path, column, tuple(cameras), tuple(snapshots))
+    return Detections(
+        uv=np.stack((column["u"], column["v"]), axis=1),
+        sigma=column["sigma"],
+        camera=column["camera"],
+        snapshot=column["snapshot"],
+        fiducial=column["fiducial"].astype(np.int64),
+        radius=column["radius"],
+        flags=column["flags"].astype(np.uint8),
+        camera_names=tuple(cameras),
+        snapshot_names=tuple(snapshots),
+    )
+
+
+def save_detections(detections: Detections, path: str | Path) -> None:
+    """Write detections in one step, compressed when the name ends in .gz; equal detections give equal bytes.
+
+    Args:
+        detections: blobs; numbers are written in their shortest exact form.
+        path: the file to write.
+
+    Raises:
+        InputError: the file cannot be written, or a name could not be read again.
+    """
+    path = Path(path)
+    for name in (*detections.camera_names, *detections.snapshot_names):
+        if not is_file_name(name):
+            raise InputError(f"{path}: not written: found {shortened(name)!r}, expected a name that can be a file name")
+    labelled, known = detections.fiducial >= 0, np.isfinite(detections.radius)
+    columns = {
+        "snapshot": map(detections.snapshot_names.__getitem__, detections.snapshot.tolist()),
+        "camera": map(detections.camera_names.__getitem__, detections.camera.tolist()),
+        "u": map(repr, detections.uv[:, 0].tolist()),
+        "v": map(repr, detections.uv[:, 1].tolist()),
+        "sigma": map(repr, detections.sigma.tolist()),
+        "radius": (repr(v) if k else "" for v, k in zip(detections.radius.tolist(), known.tolist(), strict=True)),
+        "flags": map(str, detections.flags.tolist()),
+    }
+    if labelled.any():
+        columns["fiducial"] = (str(v) if v >= 0 else "" for v in detections.fiducial.tolist())
+    with replacing(path) as file:
+        # No time stamp and no file name inside: equal content gives equal bytes.
+        binary = gzip.GzipFile("", "wb", 6, file, mtime=0) if path.suffix == ".gz" else file
+        text = io.TextIOWrapper(binary, encoding="utf-8", newline="")
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(zip(*columns.values(), strict=True))
+        text.flush()
+        text.detach()
+        if binary is not file:
+            binary.close()
+
+
+def _indices(chunk: Chunk, column: str, known: dict[str, int], allowed: tuple[str, ...] | None) -> NDArray[np.int64]:
+    """Replace the names of a column by numbers; new ones are added to `known` unless the names are given."""
+    names = chunk.columns[column]
+    if allowed is None:
+        for name in dict.fromkeys(names):
+            if name not in known and not is_file_name(name):
+                found = repr(shortened(name)) if name else "an empty cell"
+                chunk.fail(names.index(name), f"{column}: found {found}, expected a name that can be a file name")
+            known.setdefault(name, len(known))
+    else:
+        unknown = next((name for name in dict.fromkeys(names) if name not in known), None)
+        if unknown is not None:
+            chunk.fail(
+                names.index(unknown),
+                f"camera: found {shortened(unknown)!r} (this file: {shortened(', '.join(dict.fromkeys(names)))}), "
+                f"expected a camera of the rig: {listed(allowed)}{nearest(unknown, allowed)}",
+            )
+    return np.fromiter(map(known.__getitem__, names), dtype=np.int64, count=len(names))
+
+
+def _numbers(chunk: Chunk, fiducials: int | None) -> dict[str, NDArray[np.float64]]:
+    """Convert the numeric columns; absent ones get their defaults."""
+    count = len(chunk)
+    result = {axis: chunk.numbers(axis, limits.PIXEL, f"a finite pixel coordinate, {limits.PIXEL}") for axis in "uv"}
+    result["sigma"] = np.full(count, DEFAULT_SIGMA)
+    if "sigma" in chunk.columns:
+        result["sigma"] = chunk.numbers("sigma", limits.SIGMA, f"a standard deviation > 0, {limits.SIGMA}")
+    result["fiducial"] = np.full(count, -1.0)
+    if "fiducial" in chunk.columns:
+        last = limits.MOST_FIDUCIALS if fiducials is None else fiducials - 1
+        filled = _filled(chunk, "fiducial", "-1")
+        result["fiducial"] = filled.numbers(
+            "fiducial", limits.Range(-1, last, ""), f"a row of the object, 0 to {last}", whole=True
+        )
+    result["radius"] = np.full(count, np.nan)
+    if "radius" in chunk.columns:
+        radius = _filled(chunk, "radius", "0").numbers("radius", limits.BLOB_RADIUS, f"a radius, {limits.BLOB_RADIUS}")
+        result["radius"] = np.where(radius > 0, radius, np.nan)
+    result["flags"] = np.zeros(count)
+    if "flags" in chunk.columns:
+        bits = limits.Range(0, 2 * max(BlobFlag) - 1, "")
+        result["flags"] = chunk.numbers("flags", bits, f"a sum of flag bits, {bits}", whole=True)
+    return result
+
+
+def _filled(chunk: Chunk, column: str, default: str) -> Chunk:
+    """Replace the empty cells of a column."""
+    cells = tuple(cell or default for cell in chunk.columns[column])
+    return Chunk(chunk.path, chunk.first_row, {**chunk.columns, column: cells})
+
+
+def _check_inside(chunk: Chunk, part: dict[str, NDArray[Any]], rig: CameraRig) -> None:
+    size = rig.image_size.cpu().numpy()[part["camera"]]
+    uv = np.stack((part["u"], part["v"]), axis=1)
+    outside = ((uv < -0.5 - MARGIN) | (uv > size - 0.5 + MARGIN)).any(axis=1)
+    if outside.any():
+        row = int(outside.argmax())
+        u, v = (shortened(chunk.columns[axis][row]) for axis in "uv")
+        camera, (width, height) = chunk.columns["camera"][row], size[row]
+        chunk.fail(
+            row,
+            f"found ({u}, {v}), expected a pixel of the {width}x{height} image of camera {camera}",
+        )
+
+
+def _check_unique(
+    path: Path, column: dict[str, NDArray[Any]], cameras: tuple[str, ...], snapshots: tuple[str, ...]
+) -> None:
+    """Find fiducials that one camera saw twice in one snapshot."""
+    rows = np.flatnonzero(column["fiducial"] >= 0)
+    keys = np.stack([column[name][rows].astype(np.int64) for name in ("snapshot", "camera", "fiducial")])
+    order = np.lexsort(keys)  # stable: the first of equal rows stays first
+    repeated = order[1:][(np.diff(keys[:, order]) == 0).all(axis=0)]
+    if len(repeated):
+        snapshot, camera, fiducial = keys[:, repeated.min()]
+        place = f"camera {cameras[camera]} in snapshot {snapshots[snapshot]}"
+        fail_row(path, int(rows[repeated.min()]), f"found fiducial {fiducial} again for {place}, expected it once")

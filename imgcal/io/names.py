@@ -1,0 +1,69 @@
+"""Names that a user typed: near misses, sorting, and the bare names of shipped files."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+from imgcal.errors import InputError
+from imgcal.io.resources import data_path, shipped_names
+
+MOST_NAMES = 8  # that a message lists
+LONGEST_NAME = 200  # bytes: file systems end at 255, and something is put behind
+
+
+def natural_key(name: str) -> tuple[list[str | int], str]:
+    """Sort key that counts: "2" before "10"; equal numbers ("1", "01") stay apart."""
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)], name
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Say which known name was probably meant: `, nearest: cam01`, or nothing when none is near."""
+    names = {candidate.lower(): candidate for candidate in known}
+    matches = difflib.get_close_matches(name.lower(), names, n=1)
+    return f", nearest: {names[matches[0]]}" if matches else ""
+
+
+def is_file_name(name: str) -> bool:
+    """Tell whether the name of a camera or a snapshot can be a file name, which stays in its folder, and a CSV cell."""
+    sound = name.isprintable() and name == name.strip() and not name.startswith(".") and not set(name) & set("/\\")
+    return sound and 0 < len(name.encode()) <= LONGEST_NAME
+
+
+def title_of(path: Path) -> str:
+    """Make a name of a file name, which need not be text."""
+    name = "".join(c if c.isprintable() else "?" for c in path.stem)
+    return name[:LONGEST_NAME]
+
+
+def check_regular(path: Path) -> None:
+    """Raise `InputError` at a folder, a device or a pipe: reading one may wait for ever."""
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: found a folder, device or pipe, expected a file")
+
+
+def find_file(path: str | Path, kind: str, suffix: str) -> Path:
+    """Find a file by its path or, when there is none, by the bare name of a shipped one.
+
+    Args:
+        path: a path, or a name such as "O10".
+        kind: the folder of the shipped data, "rigs" or "objects".
+        suffix: of the shipped files.
+
+    Raises:
+        InputError: neither exists.
+    """
+    path = Path(path)
+    if path.is_file():
+        return path
+    shipped = shipped_names(kind, suffix)
+    if str(path) in shipped:
+        return data_path(kind, str(path) + suffix)
+    check_regular(path)
+    some = difflib.get_close_matches(path.stem, shipped, n=MOST_NAMES, cutoff=0.3) or shipped[:MOST_NAMES]
+    names = shipped if len(shipped) <= MOST_NAMES else [*some, f"... {len(shipped)} in all"]
+    raise InputError(
+        f"{path}: no such file, nor one of the shipped {kind} ({', '.join(names)}){nearest(path.stem, shipped)}"
+    )

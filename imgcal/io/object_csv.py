@@ -1,0 +1,110 @@
+"""Calibration objects: CSV with the header `x,y,z` (mm), optional columns `name`, `radius` and `tolerance` (mm)."""
+
+from __future__ import annotations
+
+import csv
+import io
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from imgcal.errors import InputError
+from imgcal.io.atomic import write_text
+from imgcal.io.csv_file import Chunk, read_chunks
+from imgcal.io.names import LONGEST_NAME, find_file, title_of
+from imgcal.messages import shortened
+from imgcal.types import limits
+from imgcal.types.calibration_object import CalibrationObject
+from renderers.palette import palette
+
+# Nearer than this to one line, in units of the object's size, no pose can be found.
+COLLINEAR = 1e-6
+SMALLEST = 1e-3  # mm, extent of an object
+NAME = "a different name for every point"
+
+
+def load_object(path: str | Path) -> CalibrationObject:
+    """Read a calibration object.
+
+    Args:
+        path: a CSV file, or the bare name of a shipped object such as "cube8" when there is no such file.
+
+    Returns:
+        The object in float64; colours from `renderers.palette`.
+
+    Raises:
+        InputError: one line with the file, the line, what was found and what was expected.
+    """
+    path = find_file(path, "objects", ".csv")
+    chunks = list(islice(read_chunks(path, ("x", "y", "z"), ("name", "radius", "tolerance")), 2))
+    count = sum(map(len, chunks))
+    if not 4 <= count <= limits.MOST_FIDUCIALS:
+        found = count if count < 4 else f"more than {limits.MOST_FIDUCIALS}"
+        raise InputError(f"{path}: found {found} points, expected 4 to {limits.MOST_FIDUCIALS}")
+    chunk = chunks[0]
+    axes = [chunk.numbers(axis, limits.COORDINATE, f"a finite coordinate, {limits.COORDINATE}") for axis in "xyz"]
+    points = np.stack(axes, axis=1)
+    _check_points(chunk, points)
+    radius = None
+    if "radius" in chunk.columns:
+        radius = torch.from_numpy(
+            chunk.numbers("radius", limits.FIDUCIAL_RADIUS, f"a radius > 0, {limits.FIDUCIAL_RADIUS}")
+        )
+    tolerance = None
+    if "tolerance" in chunk.columns:
+        tolerance = torch.from_numpy(chunk.numbers("tolerance", limits.TOLERANCE, f"a tolerance, {limits.TOLERANCE}"))
+    names = tuple(name.strip() for name in chunk.columns.get("name", ()))
+    for row, name in enumerate(names):
+        if not _is_name(name) or name in names[:row]:
+            chunk.fail(row, f"name: found {shortened(name)!r}, expected {NAME}")
+    return CalibrationObject(
+        torch.from_numpy(points), palette(count).double(), radius, title_of(path), names, tolerance
+    )
+
+
+def save_object(obj: CalibrationObject, path: str | Path) -> None:
+    """Write a calibration object in one step; every number in its shortest exact form.
+
+    Raises:
+        InputError: the file cannot be written, or a name could not be read again.
+    """
+    names = obj.fiducial_names
+    for row, name in enumerate(names):
+        if not _is_name(name) or name in names[:row]:
+            raise InputError(f"{path}: not written: found the name {shortened(name)!r}, expected {NAME}")
+    columns: list[list[str]] = [[f"{value!r}" for value in axis] for axis in obj.points.double().T.tolist()]
+    header = ["x", "y", "z"]
+    if names:
+        header.append("name")
+        columns.append(list(names))
+    if obj.radius is not None:
+        header.append("radius")
+        columns.append([f"{value!r}" for value in obj.radius.double().tolist()])
+    if obj.tolerance is not None:
+        header.append("tolerance")
+        columns.append([f"{value!r}" for value in obj.tolerance.double().tolist()])
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(zip(*columns, strict=True))
+    write_text(path, text.getvalue())
+
+
+def _is_name(name: str) -> bool:
+    return 0 < len(name) <= LONGEST_NAME and name.isprintable() and name == name.strip()
+
+
+def _check_points(chunk: Chunk, points: np.ndarray) -> None:
+    _, first, groups = np.unique(points, axis=0, return_index=True, return_inverse=True)
+    repeated = np.flatnonzero(first[groups.ravel()] != np.arange(len(points)))
+    if len(repeated):
+        row = int(repeated[0])
+        original = int(first[groups.ravel()][row])
+        chunk.fail(row, f"found the same point as in row {original + 1}, expected different points")
+    singular = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    if singular[0] < SMALLEST:
+        raise InputError(f"{chunk.path}: found all {len(points)} points at one place, expected coordinates in mm")
+    if singular[1] < COLLINEAR * singular[0]:
+        raise InputError(f"{chunk.path}: found all {len(points)} points on one line, expected a plane or a solid")

@@ -1,0 +1,299 @@
+"""Rig files: YAML, `format: imgcal-rig/1`."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor
+
+from imgcal.errors import InputError
+from imgcal.geometry.rotations import rotation_from_vector, vector_from_rotation
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.io.atomic import write_text
+from imgcal.io.names import LONGEST_NAME, find_file, is_file_name, title_of
+from imgcal.io.yaml_file import Flow, FlowMap, StrictModel, read_yaml, validated, yaml_text
+from imgcal.messages import listed, quoted
+from imgcal.types import limits
+from imgcal.types.rig import PARAMETER_NAMES, PARAMETERS, CameraRig, RigPrior
+
+FORMAT = "imgcal-rig/1"
+ENTRY_NAMES = {"cameras": "camera"}
+
+# How far the distortion may move a point at half the image diagonal, in units of its distance from the centre.
+LARGEST_DISTORTION = 10.0
+
+
+def _within(plausible: limits.Range) -> Any:
+    return Field(allow_inf_nan=False, ge=plausible.low, le=plausible.high)
+
+
+def _exactly(count: int) -> Any:
+    return Field(min_length=count, max_length=count)
+
+
+Focal = Annotated[float, _within(limits.FOCAL_LENGTH)]
+Pixel = Annotated[float, _within(limits.PIXEL)]
+Coefficient = Annotated[float, _within(limits.DISTORTION)]
+Shift = Annotated[float, _within(limits.TRANSLATION)]
+Angle = Annotated[float, Field(allow_inf_nan=False, ge=-1e6, le=1e6)]
+Spread = Annotated[float, Field(allow_inf_nan=False, ge=0, le=1e12)]
+Covariance = Annotated[float, Field(allow_inf_nan=False, ge=-1e24, le=1e24)]
+Side = Annotated[int, Field(gt=0, le=limits.LONGEST_SIDE)]
+Name = Annotated[str, Field(max_length=LONGEST_NAME)]
+
+
+@dataclass(frozen=True)
+class RigCovariance:
+    """Uncertainty of a rig, in the order of `imgcal.types.rig.PARAMETER_NAMES` for each camera."""
+
+    std: Tensor  # (C, 15) one standard deviation: rad, mm, pixels, pixels, 1
+    matrix: Tensor | None = None  # (15 C, 15 C); None = not kept
+    reference_camera: str | None = None  # rotations and positions are relative to this camera; None = to the rig frame
+
+    @classmethod
+    def from_matrix(cls, matrix: Tensor, reference_camera: str | None = None) -> RigCovariance:
+        """Take the standard deviations from the diagonal of a (15 C, 15 C) covariance."""
+        std = matrix.diagonal().clamp_min(0).sqrt().unflatten(0, (-1, PARAMETERS))
+        return cls(std, matrix, reference_camera)
+
+
+class _Transform(StrictModel):
+    rotation_vector: Annotated[list[Angle], _exactly(3)]
+    translation: Annotated[list[Shift], _exactly(3)]
+
+    @model_validator(mode="after")
+    def _in_radians(self) -> _Transform:
+        angle = math.hypot(*self.rotation_vector)
+        if angle > 2 * math.pi + 1e-9:
+            raise ValueError(f"found a rotation vector of length {angle:g}, expected rad, at most 2 pi")
+        return self
+
+
+class _Std(StrictModel):
+    rotation: Annotated[list[Spread], _exactly(3)]
+    position: Annotated[list[Spread], _exactly(3)]
+    focal_length: Annotated[list[Spread], _exactly(2)]
+    principal_point: Annotated[list[Spread], _exactly(2)]
+    distortion: Annotated[list[Spread], _exactly(5)]
+
+
+class _Camera(StrictModel):
+    name: str
+    image_size: Annotated[list[Side], _exactly(2)]
+    focal_length: Annotated[list[Focal], _exactly(2)]
+    principal_point: Annotated[list[Pixel], _exactly(2)]
+    distortion: Annotated[list[Coefficient], _exactly(5)]
+    cam_from_rig: _Transform
+    std: _Std | None = None
+
+    @model_validator(mode="after")
+    def _sound(self) -> _Camera:
+        # The name is also a file name in a capture and a cell of a CSV file.
+        if not is_file_name(self.name):
+            raise ValueError(f"found the camera name {quoted(self.name)!r}, expected a name that can be a file name")
+        if math.prod(self.image_size) > limits.MOST_PIXELS:
+            raise ValueError(f"image_size: found {self.image_size}, expected at most {limits.MOST_PIXELS:,} pixels")
+        radius = math.hypot(*self.image_size) / 2 / min(self.focal_length)
+        k1, k2, p1, p2, k3 = (abs(k) for k in self.distortion)
+        shift = k1 * radius**2 + k2 * radius**4 + k3 * radius**6 + 3 * (p1 + p2) * radius
+        if shift > LARGEST_DISTORTION:
+            raise ValueError(
+                f"distortion: found {self.distortion}, which moves the image corners by {shift:.0f} times their "
+                "distance from the centre; expected k1, k2, p1, p2, k3 on the z = 1 plane"
+            )
+        return self
+
+
+class _Prior(StrictModel):
+    focal_length: Annotated[float, _within(limits.PRIOR_FOCAL_LENGTH)] = RigPrior.focal_length
+    principal_point: Annotated[float, _within(limits.PRIOR_PRINCIPAL_POINT)] = RigPrior.principal_point
+    distortion: Annotated[float, _within(limits.PRIOR_DISTORTION)] = RigPrior.distortion
+    rotation: Annotated[float, _within(limits.PRIOR_ROTATION)] = RigPrior.rotation
+    position: Annotated[float, _within(limits.PRIOR_POSITION)] = RigPrior.position
+
+
+class _Covariance(StrictModel):
+    reference_camera: Name | None = None
+    parameters: Annotated[list[Name], Field(max_length=PARAMETERS)]
+    # One wrong value of millions is enough to know.
+    matrix: (
+        Annotated[list[Annotated[list[Covariance], Field(fail_fast=True)]], Field(min_length=1, fail_fast=True)] | None
+    ) = None
+
+
+class _RigFile(StrictModel):
+    format: Literal["imgcal-rig/1"]
+    name: Name | None = None
+    working_distance: Annotated[float, _within(limits.DISTANCE)] | None = None
+    cameras: Annotated[list[_Camera], Field(min_length=1, max_length=limits.MOST_CAMERAS)]
+    prior: _Prior | None = None
+    covariance: _Covariance | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> _RigFile:
+        if self.name is not None and not self.name.isprintable():
+            raise ValueError(f"name: found {self.name!r}, expected text that can be shown")
+        names = [camera.name for camera in self.cameras]
+        twice, times = Counter(names).most_common(1)[0]
+        if times > 1:
+            raise ValueError(f"found the camera name {twice} more than once, expected different names")
+        given = [camera.name for camera in self.cameras if camera.std is not None]
+        if given and len(given) < len(names):
+            raise ValueError(f"found `std` for {listed(given)} only, expected it for all cameras or none")
+        if bool(given) != (self.covariance is not None):
+            raise ValueError(
+                "expected `std` of the cameras and the block `covariance` together, found only one of them"
+            )
+        if self.covariance is not None:
+            _check_covariance(self.covariance, names, _std_tensor(self))
+        return self
+
+
+def load_rig(path: str | Path) -> CameraRig:
+    """Read a rig.
+
+    Args:
+        path: a YAML file, or the bare name of a shipped rig such as "O10" when there is no such file.
+
+    Returns:
+        The rig in float64, without batch axes.
+
+    Raises:
+        InputError: one line with the file, the camera, what was found and what was expected.
+    """
+    content, path = _read(path)
+    cameras = content.cameras
+
+    def column(values: list[list[float]]) -> Tensor:
+        return torch.tensor(values, dtype=torch.float64)
+
+    return CameraRig(
+        focal_length=column([camera.focal_length for camera in cameras]),
+        principal_point=column([camera.principal_point for camera in cameras]),
+        distortion=column([camera.distortion for camera in cameras]),
+        cam_from_rig=RigidTransform(
+            rotation_from_vector(column([camera.cam_from_rig.rotation_vector for camera in cameras])),
+            column([camera.cam_from_rig.translation for camera in cameras]),
+        ),
+        image_size=torch.tensor([camera.image_size for camera in cameras]),
+        camera_names=tuple(camera.name for camera in cameras),
+        name=content.name if content.name is not None else title_of(path),
+        working_distance=content.working_distance,
+        prior=None if content.prior is None else RigPrior(**content.prior.model_dump()),
+    )
+
+
+def load_rig_covariance(path: str | Path) -> RigCovariance | None:
+    """Read the uncertainty that stands in a rig file; None when it has none. Arguments and errors as for `load_rig`."""
+    content, _ = _read(path)
+    if content.covariance is None:
+        return None
+    reference_camera = content.covariance.reference_camera
+    if content.covariance.matrix is None:
+        return RigCovariance(_std_tensor(content), None, reference_camera)
+    matrix = torch.tensor(content.covariance.matrix, dtype=torch.float64)
+    return RigCovariance.from_matrix(matrix, reference_camera)
+
+
+def save_rig(rig: CameraRig, path: str | Path, covariance: RigCovariance | None = None, full: bool = False) -> None:
+    """Write a rig in one step; every number in its shortest exact form.
+
+    Args:
+        rig: without batch axes; any floating-point type.
+        path: the file to write.
+        covariance: one standard deviation of every parameter goes to its camera, to 6 digits; None = not written.
+        full: write the whole covariance matrix, too (half a megabyte for 10 cameras).
+
+    Raises:
+        InputError: the file cannot be written, or the rig could not be read again (NaN, for example).
+    """
+    if rig.batch_shape:
+        raise InputError(f"{path}: found a batch of rigs of shape {tuple(rig.batch_shape)}, expected one rig")
+    content: dict[str, Any] = {"format": FORMAT, "name": rig.name}
+    if rig.working_distance is not None:
+        content["working_distance"] = rig.working_distance
+    content["cameras"] = [_camera_entry(rig, camera, covariance) for camera in range(rig.cameras)]
+    if rig.prior is not None:
+        content["prior"] = {key: float(value) for key, value in vars(rig.prior).items()}
+    if covariance is not None:
+        content["covariance"] = _covariance_entry(covariance, full, path)
+    validated(content, _RigFile, f"{path}: not written", ENTRY_NAMES)
+    write_text(path, yaml_text(content))
+
+
+def _read(path: str | Path) -> tuple[_RigFile, Path]:
+    path = find_file(path, "rigs", ".yaml")
+    return read_yaml(path, _RigFile, FORMAT, ENTRY_NAMES), path
+
+
+def _camera_entry(rig: CameraRig, camera: int, covariance: RigCovariance | None) -> dict[str, Any]:
+    rotation = rig.cam_from_rig.rotation[camera].double()
+    entry: dict[str, Any] = {
+        "name": rig.camera_names[camera],
+        "image_size": Flow(rig.image_size[camera].tolist()),
+        "focal_length": _flow(rig.focal_length[camera]),
+        "principal_point": _flow(rig.principal_point[camera]),
+        "distortion": _flow(rig.distortion[camera]),
+        "cam_from_rig": FlowMap(
+            rotation_vector=_flow(vector_from_rotation(rotation)),
+            translation=_flow(rig.cam_from_rig.translation[camera]),
+        ),
+    }
+    if covariance is not None:
+        # Six digits are plenty for a spread; the exact values are those of the matrix.
+        rounded = [float(f"{value:.6g}") for value in covariance.std[camera].tolist()]
+        parts = torch.tensor(rounded, dtype=torch.float64).split((3, 3, 2, 2, 5))
+        entry["std"] = FlowMap(zip(_Std.model_fields, map(_flow, parts), strict=True))
+    return entry
+
+
+def _covariance_entry(covariance: RigCovariance, full: bool, path: str | Path) -> dict[str, Any]:
+    entry: dict[str, Any] = {}
+    if covariance.reference_camera is not None:
+        entry["reference_camera"] = covariance.reference_camera
+    entry["parameters"] = Flow(PARAMETER_NAMES)
+    if full:
+        if covariance.matrix is None:
+            raise InputError(f"{path}: not written: found no covariance matrix, expected one with full=True")
+        entry["matrix"] = [Flow(row) for row in covariance.matrix.double().tolist()]
+    return entry
+
+
+def _std_tensor(content: _RigFile) -> Tensor:
+    """Collect the standard deviations of all cameras: (C, 15)."""
+    rows = [[v for part in camera.std.model_dump().values() for v in part] for camera in content.cameras if camera.std]
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+def _check_covariance(covariance: _Covariance, names: list[str], std: Tensor) -> None:
+    if covariance.reference_camera is not None and covariance.reference_camera not in names:
+        found = covariance.reference_camera
+        raise ValueError(f"covariance: found reference_camera {found}, expected one of {listed(names)}")
+    if tuple(covariance.parameters) != PARAMETER_NAMES:
+        raise ValueError(f"covariance: found other parameters than {', '.join(PARAMETER_NAMES)}, or another order")
+    if covariance.matrix is None:
+        return
+    size = len(names) * PARAMETERS
+    lengths = {len(row) for row in covariance.matrix}
+    if len(covariance.matrix) != size or lengths != {size}:
+        raise ValueError(
+            f"covariance: found a matrix of {len(covariance.matrix)} rows of {min(lengths, default=0)} to "
+            f"{max(lengths, default=0)} values, expected {size} rows of {size}"
+        )
+    matrix = torch.tensor(covariance.matrix, dtype=torch.float64)
+    variance = std.flatten().square()
+    scale = (variance[:, None] * variance).sqrt()
+    if not torch.allclose(matrix.diagonal(), variance, rtol=1e-4, atol=0.0):
+        raise ValueError("covariance: found a diagonal that differs from the squares of `std`, expected the same")
+    if ((matrix - matrix.mT).abs() > 1e-6 * scale).any() or (matrix.abs() > (1 + 1e-4) * scale).any():
+        raise ValueError("covariance: found a matrix that is not symmetric or has correlations above 1")
+
+
+def _flow(values: Tensor) -> Flow:
+    return Flow(values.detach().double().tolist())

@@ -1,0 +1,135 @@
+"""From the numbers of a network's heads to rigs: the one place that owns their scales."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor, nn
+
+from imgcal.errors import InputError
+from imgcal.geometry.projection import Projection
+from imgcal.geometry.rotations import rotation_from_6d, rotation_from_vector
+from imgcal.geometry.transforms import RigidTransform, rotate
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.prediction import Prediction
+from imgcal.types.rig import CameraRig, unpack18
+
+POSE_SHIFT = 10.0  # mm that one unit of a head moves the object
+POSE_TURN = 0.05  # rad that one unit of a head turns it, after the first pass
+
+
+@dataclass(frozen=True)
+class RigState:
+    """A rig near the factory's and the object's pose, as networks move them."""
+
+    offsets: Tensor  # (B, C, 15) parameters minus factory values, in units of their spread
+    rotation: Tensor  # (B, 3, 3) rig_from_object
+    centre: Tensor  # (B, 3) mm, the object's centroid in the rig
+
+    def detach(self) -> RigState:
+        """Cut the graph."""
+        return RigState(self.offsets.detach(), self.rotation.detach(), self.centre.detach())
+
+
+class Decoder(nn.Module):
+    """Turn head outputs into predictions; holds the factory rig, the object and the spread as buffers, no weights."""
+
+    focal_length: Tensor  # (C, 2)
+    principal_point: Tensor  # (C, 2)
+    distortion: Tensor  # (C, 5)
+    rotation: Tensor  # (C, 3, 3)
+    translation: Tensor  # (C, 3)
+    image_size: Tensor  # (C, 2)
+    spread: Tensor  # (C, 15)
+    centroid: Tensor  # (3,) mm
+    centred: Tensor  # (N, 3) mm
+    level: Tensor  # (3, 3)
+
+    def __init__(self, factory: CameraRig, obj: CalibrationObject, spread: Tensor) -> None:
+        super().__init__()
+        if factory.working_distance is None:
+            raise InputError(f"rig {factory.name}: found no working_distance, expected one (mm) to start from")
+        self._like = factory
+        self.working_distance = factory.working_distance
+        points = obj.points.to(factory.focal_length)
+        buffers = {
+            "focal_length": factory.focal_length,
+            "principal_point": factory.principal_point,
+            "distortion": factory.distortion,
+            "rotation": factory.cam_from_rig.rotation,
+            "translation": factory.cam_from_rig.translation,
+            "image_size": factory.image_size,
+            "spread": spread.to(factory.focal_length),
+            "centroid": points.mean(0),
+            "centred": points - points.mean(0),
+            # Seen from the rig, an object below it that lies level has its z axis towards the cameras.
+            "level": torch.diag(torch.tensor((1.0, -1.0, -1.0))),
+        }
+        for name, tensor in buffers.items():
+            self.register_buffer(name, tensor.clone(), persistent=False)
+        # Takes a fiducial's distance from the principal point, over f, to about one.
+        self.unit = factory.working_distance / float(self.centred.norm(dim=-1).mean())
+
+    @property
+    def factory(self) -> CameraRig:
+        """The factory rig, float32, on the network's device."""
+        return replace(
+            self._like,
+            focal_length=self.focal_length,
+            principal_point=self.principal_point,
+            distortion=self.distortion,
+            cam_from_rig=RigidTransform(self.rotation, self.translation),
+            image_size=self.image_size,
+        )
+
+    def normalized(self, uv: Tensor) -> Tensor:
+        """Pixels (B, C, N, 2) to numbers of about one, by the factory's intrinsics."""
+        return (uv - self.principal_point[:, None]) / self.focal_length[:, None] * self.unit
+
+    def start(self, offsets: Tensor, pose: Tensor) -> RigState:
+        """Place rigs from nothing.
+
+        Args:
+            offsets: (B, C, 15) in units of the spread.
+            pose: (B, 9) 6D rotation less that of a level object, then a shift from the working distance.
+        """
+        identity = pose.new_tensor((1.0, 0.0, 0.0, 0.0, 1.0, 0.0))
+        rotation = self.level @ rotation_from_6d(pose[:, :6] + identity)
+        centre = pose.new_tensor((0.0, 0.0, self.working_distance)) + POSE_SHIFT * pose[:, 6:]
+        return RigState(offsets, rotation, centre)
+
+    def move(self, state: RigState, offsets: Tensor, pose: Tensor) -> RigState:
+        """Correct rigs: offsets (B, C, 15) in units of the spread, pose (B, 6) turn and shift."""
+        rotation = rotation_from_vector(POSE_TURN * pose[:, :3]) @ state.rotation
+        return RigState(state.offsets + offsets, rotation, state.centre + POSE_SHIFT * pose[:, 3:])
+
+    def prediction(self, state: RigState) -> Prediction:
+        """The rig and the pose of a state: (B,)."""
+        shift = state.centre - rotate(state.rotation, self.centroid.expand_as(state.centre))
+        return Prediction(self.factory.moved(state.offsets * self.spread), RigidTransform(state.rotation, shift))
+
+    def project(self, prediction: Prediction) -> Projection:
+        """Project the object's fiducials, as points: (B, C, N), without gradient."""
+        return prediction.rig.project_values(prediction.rig_from_object.apply(self.centred + self.centroid))
+
+    def absolute(self, numbers: Tensor) -> Prediction:
+        """Decode the paper's 18 numbers a camera: (B, C, 18), each camera on its own in the object's frame.
+
+        Scales are those of a rig, not of one camera: working distance for translations, mean focal length, mean
+        principal point; the 6D rotation and the distortion as they are.
+
+        Source: paper, supplementary section 1.
+        """
+        identity = numbers.new_tensor((1.0, 0.0, 0.0, 0.0, 1.0, 0.0))
+        packed = torch.cat(
+            (
+                numbers[..., :6] + identity,
+                numbers[..., 6:9] * self.working_distance,
+                numbers[..., 9:11] * self.focal_length.mean(),
+                numbers[..., 11:13] * self.principal_point.mean(0),
+                numbers[..., 13:],
+            ),
+            dim=-1,
+        )
+        return Prediction.from_cameras(unpack18(packed, self.factory), self.factory)

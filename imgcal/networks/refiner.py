@@ -1,0 +1,145 @@
+"""From fiducial positions to a rig: our own network, common to the point and the image variants.
+
+One token a camera and one for the rig; attention over all of them. A first pass places the rig from positions alone.
+Every later pass projects the object with the rig as it stands and sees what is left over, so that positions reach the
+heads as differences: a fraction of a pixel is then a number that a network can act on. All heads predict offsets from
+the factory rig and start at zero: an untrained network returns the factory calibration.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor, nn
+
+from imgcal.networks.layers import conv1d, mlp, transformer, zeroed
+from imgcal.networks.parameterization import Decoder, RigState
+from imgcal.types.prediction import Prediction
+from imgcal.types.rig import PARAMETERS
+
+RESIDUAL_SCALES = (20.0, 4.0)  # pixels, where a residual saturates; a linear part (in 100 px) stands beside
+LIMIT = 5.0  # largest input of the linear parts
+LEAST_TRUST = 7.0  # largest log of a factor on sigma: a thousand sigmas, no weight at all
+
+
+class Stage(nn.Module):
+    """One pass: numbers of each camera in, parameters of each camera and of the pose out."""
+
+    def __init__(
+        self, inputs: int, features: int, cameras: int, pose: int, encoder: str, width: int, depth: int, heads: int
+    ) -> None:
+        super().__init__()
+        self.embed = mlp((inputs, 2 * width, width))
+        self.embed_features = nn.Linear(features, width, bias=False) if features else None
+        if self.embed_features is not None:  # a trunk that was trained on points is as good with features, at first
+            nn.init.zeros_(self.embed_features.weight)
+        self.camera_identity = nn.Parameter(0.5 * torch.randn(cameras, width))
+        self.rig_token = nn.Parameter(0.5 * torch.randn(width))
+        self.encoder = transformer(width, depth, heads) if encoder == "transformer" else conv1d(width, depth)
+        self.camera_head = zeroed(mlp((width + inputs, 2 * width, PARAMETERS)))
+        self.pose_head = zeroed(mlp((width, 2 * width, pose)))
+
+    def forward(self, inputs: Tensor, features: Tensor | None) -> tuple[Tensor, Tensor]:
+        """(B, C, inputs), (B, C, features) -> (B, C, 15), (B, pose)."""
+        tokens = self.embed(inputs) + self.camera_identity
+        if self.embed_features is not None and features is not None:
+            tokens = tokens + self.embed_features(features)
+        tokens = torch.cat((tokens, self.rig_token.expand(len(tokens), 1, -1)), dim=1)
+        encoded = self.encoder(tokens)
+        with torch.autocast(inputs.device.type, enabled=False):
+            encoded = encoded.to(inputs.dtype)
+            # The heads see the positions themselves, too: pooling and normalization would round them.
+            return self.camera_head(torch.cat((encoded[:, :-1], inputs), dim=-1)), self.pose_head(encoded[:, -1])
+
+
+class Trunk(nn.Module):
+    """Positions, and how far to trust each, to predictions coarse to fine."""
+
+    def __init__(
+        self,
+        decoder: Decoder,
+        *,
+        encoder: str,
+        width: int,
+        heads: int,
+        depth: int,
+        later_depth: int,
+        passes: int,
+        trust: bool = False,
+        features: int = 0,
+    ) -> None:
+        super().__init__()
+        self.decoder, self.passes = decoder, passes
+        cameras, fiducials = len(decoder.focal_length), len(decoder.centred)
+        shape = (encoder, width, depth, heads)
+        self.first = Stage(3 * fiducials, features, cameras, 9, *shape)
+        parts = 2 * (len(RESIDUAL_SCALES) + 2) + 1
+        later = (encoder, width, later_depth, heads)
+        inputs = parts * fiducials + PARAMETERS
+        self.later = Stage(inputs, features, cameras, 6, *later) if passes > 1 else None
+        self.trust_head = zeroed(mlp((inputs, width, fiducials))) if trust else None
+
+    def forward(self, uv: Tensor, weight: Tensor, features: Tensor | None = None) -> tuple[Prediction, ...]:
+        """Predict.
+
+        Args:
+            uv: (B, C, N, 2) pixels of the sensor; any finite value where the weight is zero.
+            weight: (B, C, N) in [0, 1], zero where not seen.
+            features: (B, C, F) of an image encoder, or None.
+
+        Returns:
+            One prediction a pass.
+        """
+        device = uv.device.type
+        with torch.autocast(device, enabled=False):
+            uv, weight = uv.float(), weight.float()
+            positions = self.decoder.normalized(uv).clamp(-LIMIT, LIMIT) * weight[..., None]
+            inputs = torch.cat((positions.flatten(-2), weight), dim=-1)
+        offsets, pose = self.first(inputs, features)
+        with torch.autocast(device, enabled=False):
+            state = self.decoder.start(offsets, pose)
+            predictions = [self.decoder.prediction(state)]
+        for _ in range(self.passes - 1):
+            state = state.detach()  # each pass answers for its own error only, as in RAFT (Teed and Deng, ECCV 2020)
+            with torch.autocast(device, enabled=False):
+                inputs = self._differences(state, predictions[-1], uv, weight)
+            assert self.later is not None
+            offsets, pose = self.later(inputs, features)
+            with torch.autocast(device, enabled=False):
+                state = self.decoder.move(state, offsets, pose)
+                predictions.append(self.decoder.prediction(state))
+        if self.trust_head is not None:
+            with torch.autocast(device, enabled=False):
+                log_sigma = self.trust_head(self._differences(state.detach(), predictions[-1], uv, weight))
+            predictions[-1] = replace(predictions[-1], log_sigma=log_sigma.clamp(-LEAST_TRUST, LEAST_TRUST))
+        return tuple(predictions)
+
+    @torch.no_grad()
+    def rescale(self, spread: Tensor) -> None:
+        """Make weights that were trained with offsets in other units say the same in those of this network.
+
+        Args:
+            spread: (C', 15) of the other training; cameras may differ, their mean counts.
+        """
+        old, new = spread.to(self.decoder.spread).mean(0), self.decoder.spread.mean(0)
+        ratio = torch.where((old > 0) & (new > 0), old / new.clamp_min(1e-30), 1.0)
+        for stage in (self.first, self.later):
+            if stage is not None:
+                for parameter in stage.camera_head[-1].parameters():  # (15, width) and (15,)
+                    parameter.mT.mul_(ratio) if parameter.ndim == 2 else parameter.mul_(ratio)
+        # Some layers are also told the offsets: their last inputs.
+        told = [] if self.later is None else [self.later.embed[0], self.later.camera_head[0]]
+        for layer in [*told, *([] if self.trust_head is None else [self.trust_head[0]])]:
+            next(layer.parameters())[:, -PARAMETERS:] /= ratio
+
+    @torch.no_grad()
+    def _differences(self, state: RigState, prediction: Prediction, uv: Tensor, weight: Tensor) -> Tensor:
+        """What a later pass sees: (B, C, inputs), without gradient."""
+        projected = self.decoder.project(prediction).uv
+        residual = (projected - uv) * weight[..., None]
+        scaled = [torch.tanh(residual / scale) for scale in RESIDUAL_SCALES]
+        around = self.decoder.normalized(projected)
+        parts = [(residual / 100).clamp(-LIMIT, LIMIT), *scaled, around.clamp(-LIMIT, LIMIT)]
+        offsets = state.offsets.clamp(-LIMIT, LIMIT)
+        return torch.cat((*(part.flatten(-2) for part in parts), weight, offsets), dim=-1)

@@ -1,0 +1,417 @@
+"""Recalibration while a rig runs: frames of one snapshot after another, a calibration for each."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, fields, replace
+from types import TracebackType
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.association.ambiguities import lattice_shifts
+from imgcal.association.options import PipelineOptions
+from imgcal.association.series import Follower, SnapshotIdentity
+from imgcal.detection import Blobs, DetectionOptions, detect_snapshot
+from imgcal.detection.options import Frame
+from imgcal.errors import InputError, RefusedError
+from imgcal.estimation import flat_std
+from imgcal.estimation.gauge import aligned
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.online.breaks import MEDIAN, information, series_of
+from imgcal.online.following import (
+    LEAST_EXPLAINED,
+    astray,
+    found_again,
+    near_prediction,
+    spare_blobs,
+    widened,
+    without_strays,
+)
+from imgcal.online.motion import measured_move
+from imgcal.online.resection import resected
+from imgcal.online.window import RELEARNT, SIGNIFICANT, Kept, Usual, Window, WindowFit
+from imgcal.pipeline.calibration import Calibration
+from imgcal.pipeline.sources import checked_detections, checked_frames
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.moved_camera import MovedCamera
+from imgcal.types.observations import Detections
+from imgcal.types.rig import CameraRig, RigPrior
+
+MOST_FOLLOWED = 64
+"""Fiducials of a lattice up to which a snapshot may be labelled by the last prediction alone; a larger one could have
+slipped by a pitch unnoticed."""
+LEAST_FOLLOWED = 0.9
+"""Share of the last snapshot's labels that must be found again, and fit."""
+REMEMBERED = 8
+"""Latest snapshots that are compared with a new one which does not fit, however small the window."""
+
+NEAR = "near the last prediction"
+
+CameraState = Literal["seen", "recent", "kept", "factory", "astray"]
+
+
+@dataclass(frozen=True)
+class LiveCalibration(Calibration):
+    """A calibration from the latest snapshots, and what each camera's values are made from.
+
+    States of a camera: `seen` in this snapshot; `recent`, in an earlier one of the window; `kept`, in none of them: it
+    has the values that it had last, with their standard deviation; `factory`, it has seen nothing yet: the factory's
+    values and prior; `astray`, it sees what may be the object, but not where its values put it: they are its last ones,
+    and hold no more.
+    """
+
+    cameras: Mapping[str, CameraState] = field(default_factory=dict)
+    moved: tuple[MovedCamera, ...] = ()  # noticed with this snapshot; again when a camera that was lost is found
+    restarted: bool = False  # older snapshots did not go with this one, nothing said why, and they were given up
+
+
+@dataclass(frozen=True)
+class _Last:
+    """What was known of a camera when it was last seen."""
+
+    rig: CameraRig
+    std: Tensor  # (15,)
+    seen: frozenset[int]  # cameras in the window of that time
+
+
+class Recalibrator:
+    """Keeps what the next snapshot needs: the last pose, what the rig has shown itself to be, a pool of threads.
+
+    Memory does not grow with the number of snapshots. A context manager: leaving it ends the threads.
+    """
+
+    def __init__(
+        self,
+        rig: CameraRig,
+        obj: CalibrationObject,
+        options: PipelineOptions = PipelineOptions(),
+        *,
+        detection: DetectionOptions = DetectionOptions(),
+        window: int = 1,
+    ) -> None:
+        """Start from a factory calibration.
+
+        Args:
+            rig: the factory calibration, without batch axes.
+            obj: the calibration object.
+            options: how sure each result must be. Cameras that see nothing are always accepted.
+            detection: how blobs are found.
+            window: number of latest snapshots that a calibration is made from; more know the rig better and follow it
+                more slowly. Of a camera that moves, those before the move are left out.
+        """
+        if window < 1:
+            raise InputError(f"window: found {window}, expected at least 1 snapshot")
+        rig = rig.to(torch.float64)
+        self.rig, self.obj, self.detection, self.window = rig, obj, detection, window
+        self.options = replace(options, blind_cameras=True)
+        self._follower = Follower(rig, obj, self.options, remembered=0)
+        self._fit = WindowFit(rig, obj, self.options, window)
+        self._recent: deque[Kept] = deque(maxlen=max(window, REMEMBERED))
+        self._spread = (rig.prior or RigPrior()).std(rig)
+        self._latest: LiveCalibration | None = None
+        self._fitted: Calibration | None = None  # the same without what is kept of cameras that are not in the window
+        self._last: dict[int, _Last] = {}
+        self._lost: dict[int, tuple[int, int]] = {}  # camera -> when it went astray, how often since
+        self._follows = False  # the last snapshot says where the object is now
+        self._spare: deque[NDArray[np.int64]] = deque(maxlen=15)
+        self._tests: deque[float] = deque(maxlen=200)
+        self._model_errors: deque[float] = deque(maxlen=10)
+        self._count = self._refused = 0
+        self._slips = obj.fiducials > MOST_FOLLOWED and bool(lattice_shifts(obj))
+        self._pool = ThreadPoolExecutor(min(rig.cameras, os.cpu_count() or 1))
+
+    def __enter__(self) -> Recalibrator:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the threads."""
+        self._pool.shutdown()
+
+    def update(self, source: Mapping[str, Frame | None] | Detections) -> LiveCalibration:
+        """Recalibrate from a new snapshot.
+
+        Args:
+            source: frames by camera, (H, W), None = no frame; or blobs that were found elsewhere, labelled or not.
+
+        Returns:
+            The calibration from the latest snapshots. Cameras that see nothing stay in it: see `LiveCalibration`.
+
+        Raises:
+            RefusedError: this snapshot cannot decide; the next one is tried afresh.
+            InputError: a frame is no grey image, of another size than the rig says, or of a camera that the rig does
+                not have; blobs of more than one snapshot.
+        """
+        name = f"{self._count:05d}"
+        self._count += 1
+        detections = self._blobs(source, name)
+        usable = detections.select(detections.usable)
+        coded = usable.fiducial.copy() if (usable.fiducial >= 0).any() else None
+        followed = self._follow(usable, name) if coded is None else None
+        if followed is not None:
+            return followed
+        self._follows = False
+        return self._concluded(*self._decided(usable, name, coded))
+
+    def _blobs(self, source: Mapping[str, Frame | None] | Detections, name: str) -> Detections:
+        if isinstance(source, Detections):
+            if len(source.snapshot_names) != 1:
+                raise InputError(f"detections: found {len(source.snapshot_names)} snapshots, expected one")
+            if len(np.unique(source.snapshot)) <= 1:  # its number in a longer table does not matter
+                source = replace(source, snapshot=np.zeros_like(source.snapshot))
+            return replace(checked_detections(source, self.rig, self.obj), snapshot_names=(name,))
+        given = checked_frames(source, self.rig)
+        frames: dict[str, Frame | None] = {}
+        for camera in self.rig.camera_names:
+            frame = given.get(camera)
+            if isinstance(frame, Sequence):
+                raise InputError(f"camera {camera}: found {len(frame)} frames, expected one of this moment, or None")
+            frames[camera] = frame
+        return _table(detect_snapshot(frames, self.detection, pool=self._pool), name, self.rig)
+
+    def _follow(self, blobs: Detections, name: str) -> LiveCalibration | None:
+        """Label blobs by the last result's prediction, where the object has moved little; None = not to be trusted.
+
+        What is accepted here has been fitted: as many labels as before, hardly any of them an outlier.
+        """
+        latest = self._latest
+        if latest is None or not self._follows or self._slips:
+            return None
+        points = latest.rig_from_object[-1].apply(latest.points_object)
+        predicted = latest.rig.project(points, self.obj.radius).uv.numpy()  # (C, N, 2)
+        named = replace(blobs, fiducial=near_prediction(blobs, predicted))
+        blobs, pose = without_strays(named, latest.rig, latest.object, latest.rig_from_object[-1], self.options)
+        before = int(latest.observations.seen[-1].sum())
+        if (blobs.fiducial >= 0).sum() < LEAST_FOLLOWED * before or self._astray(blobs, pose).any():
+            return None
+        snapshot = SnapshotIdentity(name, "by_tracking", NEAR, 1, pose)
+        try:
+            return self._concluded(blobs, snapshot, least=LEAST_FOLLOWED * before)
+        except RefusedError:
+            return None
+
+    def _decided(
+        self, usable: Detections, name: str, coded: NDArray[np.int64] | None
+    ) -> tuple[Detections, SnapshotIdentity]:
+        """Label a snapshot by itself, with what is known of the rig."""
+        prior, follower = (self.rig.prior or RigPrior()).std(self.rig), self._follower
+        follower.rig, follower.spread = self.rig, prior
+        if self._latest is not None:
+            follower.rig, follower.spread = self._latest.rig, torch.minimum(2 * flat_std(self._latest), prior)
+        snapshot, labels = follower.decide(usable, name, coded)
+        again = self._latest is not None and self._refused & (self._refused - 1) == 0
+        if snapshot.status == "refused" and coded is None and again:
+            # What was known may hold no more. Another try is dear: after 1, 2, 4, 8, ... refusals in a row.
+            follower.rig, follower.spread = self.rig, prior
+            snapshot, labels = follower.decide(usable, name, coded)
+        if snapshot.status == "refused":
+            self._refused += 1
+            raise RefusedError(f"identity: {snapshot.reason}")
+        self._refused = 0
+        return replace(usable, fiducial=labels), snapshot
+
+    def _usual(self) -> Usual:
+        """What earlier fits looked like."""
+        enough = len(self._tests) >= self.rig.cameras
+        excess = float(np.median(self._tests)) / MEDIAN if enough else None
+        return Usual(excess, max(self._model_errors)) if self._model_errors else Usual(excess)
+
+    def _astray(self, blobs: Detections, pose: RigidTransform) -> NDArray[np.bool_]:
+        """Find cameras, of which something is known, that see what may be the object where it should not be: (C,)."""
+        if self._latest is None:
+            return np.zeros(self.rig.cameras, dtype=bool)
+        usual = np.median(self._spare, axis=0) if self._spare else np.zeros(self.rig.cameras)
+        return astray(blobs, usual, self._latest.rig, self.obj, pose)
+
+    def _concluded(self, blobs: Detections, snapshot: SnapshotIdentity, least: float = 0.0) -> LiveCalibration:
+        """Fit the window, find out what moved, and keep what the next snapshot needs.
+
+        Args:
+            blobs: labelled.
+            snapshot: how they were.
+            least: number of labels that must fit.
+        """
+        window, found, missed = self._searched(Window((*self._recent, Kept(blobs, snapshot)), self._spread))
+        # A larger window is compared with its newest snapshot whenever it is fitted.
+        doubtful = self.window == 1 and (bool(found) or self._contradicted(window.kept[-1]))
+        fitted = self._fit(window, self._fitted, self._usual(), doubtful)
+        result, window = fitted.result, fitted.window
+        if int(result.observations.seen[-1].sum()) < least:
+            raise RefusedError("estimation: too few labels fit")
+        missed += sorted(_all_out(window.kept[-1].blobs, result) - set(missed))
+        found_now = _seen(result, -1) - set(missed)
+        self._lost = {camera: lost for camera, lost in self._lost.items() if camera not in found_now}
+        for camera in missed:
+            first, times = self._lost.get(camera, (self._count - 1, 0))
+            self._lost[camera] = first, times + 1
+        live = self._completed(result, window)
+        if fitted.tests or not window.moved:
+            self._tests.extend(fitted.tests)
+            self._model_errors.append(result.model_error)
+        self._recent.clear()
+        self._recent.extend(window.kept)
+        self._spread = window.spread
+        self._spare.append(spare_blobs(window.kept[-1].blobs, self.rig.cameras))
+        self._latest, self._fitted, self._follows = live, result, True
+        self._follower.follow(result.rig_from_object[-1])
+        return live
+
+    def _contradicted(self, newest: Kept) -> bool:
+        """Tell whether most labels of some camera are not where the last snapshot's rig puts them."""
+        pose, latest = newest.snapshot.rig_from_object, self._latest
+        if latest is None or pose is None or newest.snapshot.reason == NEAR:
+            return False
+        fitting, _ = without_strays(newest.blobs, latest.rig, self.obj, pose, self.options)
+        given, left = (
+            np.bincount(blobs.camera[blobs.fiducial >= 0], minlength=self.rig.cameras)
+            for blobs in (newest.blobs, fitting)
+        )
+        return bool(((given >= 3) & (left < 0.5 * given)).any())
+
+    def _searched(self, window: Window) -> tuple[Window, list[int], list[int]]:
+        """Look for the object in cameras that do not see it where it should be: also says in which, or in vain."""
+        newest, latest, found, missed = window.kept[-1], self._latest, [], []
+        pose = newest.snapshot.rig_from_object
+        cameras = [] if latest is None or pose is None else np.flatnonzero(self._astray(newest.blobs, pose)).tolist()
+        if latest is None or pose is None or not cameras:
+            return window, [], []
+        std = torch.minimum(2 * flat_std(latest), self._spread)
+        for camera in cameras:
+            wide = widened(self._spread, latest.rig, [camera], pose, self.obj, RELEARNT)
+            labelled = found_again(newest.blobs, camera, latest.rig, self.obj, pose, std, self.options)
+            labelled = self._resected(window, camera, latest) if labelled is None else labelled
+            if labelled is None:
+                missed.append(camera)
+                if self._lost.get(camera, (0, 0))[1] == 1:  # twice is no chance
+                    window = window.after_move(camera, len(window.kept), wide)
+                continue
+            found.append(camera)
+            newest = replace(newest, blobs=labelled)
+            window = replace(window, kept=(*window.kept[:-1], newest))
+            if not any(kept.sees(camera) for kept in window.kept[:-1]):
+                # Nothing that is remembered contradicts, but the prior may: it is of the place before.
+                window = window.after_move(camera, len(window.kept) - 1, wide)
+        return window, found, missed
+
+    def _resected(self, window: Window, camera: int, latest: Calibration) -> Detections | None:
+        """Look for a camera anywhere, by all snapshots since it was lost: after 1, 2, 4, 8, ... of them."""
+        first, times = self._lost.get(camera, (0, 0))
+        if not times or times & (times - 1):
+            return None
+        since = [kept for kept in window.kept if int(kept.snapshot.name) >= first]
+        places = self._fit.rough(window)[0].rig_from_object[-len(since) :].apply(latest.points_object)
+        rows = [np.flatnonzero(kept.blobs.camera == camera) for kept in since]
+        seen = [kept.blobs.uv[r] for kept, r in zip(since, rows, strict=True)]
+        labels = resected(seen, places, latest.rig.select([camera]), np.random.default_rng(times))
+        if labels is None:
+            return None
+        fiducial = since[-1].blobs.fiducial.copy()
+        fiducial[rows[-1]] = labels
+        return replace(since[-1].blobs, fiducial=fiducial)
+
+    def _completed(self, result: Calibration, window: Window) -> LiveCalibration:
+        """Give cameras that are not in the window what was last known of them, and say what holds for each."""
+        inside, now = _seen(result), _seen(result, -1)
+        if self._fitted is not None and self._latest is not None and (left := _seen(self._fitted) - inside):
+            std = flat_std(self._latest)
+            self._last |= {c: _Last(self._latest.rig, std[c], _seen(self._fitted)) for c in left}
+        states: dict[str, CameraState] = {}
+        rig, factory = result.rig, result.problem.factory
+        spread = result.problem.spread.clone()
+        for camera, name in enumerate(self.rig.camera_names):
+            if camera in self._lost:
+                states[name] = "astray"
+            elif camera in inside:
+                states[name] = "seen" if camera in now else "recent"
+            else:
+                states[name] = "kept" if camera in self._last else "factory"
+            if camera in inside or camera not in self._last:
+                continue
+            last = self._last[camera]
+            there = aligned(last.rig, rig, _places(result), sorted(last.seen & inside))
+            rig, factory = _with_camera(rig, there, camera), _with_camera(factory, there.expand(1), camera)
+            spread[0, camera] = torch.maximum(last.std, window.spread[camera]) if camera in self._lost else last.std
+        values = {entry.name: getattr(result, entry.name) for entry in fields(Calibration)}
+        values |= {"rig": rig, "problem": replace(result.problem, factory=factory, spread=spread)}
+        values["moved"] = self._moves(result, window)
+        return LiveCalibration(**values, cameras=states, restarted=window.restarted)
+
+    def _moves(self, result: Calibration, window: Window) -> tuple[MovedCamera, ...]:
+        """Say which cameras moved, and how far where it can be told."""
+        before, moves = self._latest, []
+        for camera, first in window.moved.items():
+            name = self.rig.camera_names[camera]
+            if not first or before is None or self._fitted is None:
+                moves.append(MovedCamera(name, first or window.kept[-1].snapshot.name, "unknown"))
+                continue
+            if camera in _seen(self._fitted):
+                known = information(series_of(self._fitted, self._fitted.observations, self.obj.radius))[camera]
+            else:
+                std = self._last[camera].std if camera in self._last else self._spread[camera]
+                known = np.diag(std[:6].numpy() ** -2.0)
+            move, surely = measured_move(before.rig, known, result, camera, first, window.spread[camera, :6])
+            if surely > SIGNIFICANT:
+                moves.append(move)
+        return tuple(moves)
+
+
+def _seen(result: Calibration, snapshot: int | None = None) -> frozenset[int]:
+    """Cameras whose labels take part in a fit, or in one snapshot of it."""
+    seen = result.observations.seen if snapshot is None else result.observations.seen[[snapshot]]
+    return frozenset(seen.any(-1).any(0).nonzero().flatten().tolist())
+
+
+def _all_out(blobs: Detections, result: Calibration) -> set[int]:
+    """Cameras in which the newest labels do not fit, or hardly any."""
+    given = np.bincount(blobs.camera[blobs.fiducial >= 0], minlength=result.rig.cameras)
+    fit = result.observations.seen[-1].sum(-1).numpy()
+    return set(np.flatnonzero((given >= 3) & (fit < LEAST_EXPLAINED * given)).tolist())
+
+
+def _places(result: Calibration) -> Tensor:
+    """Where fiducials were while the window was filled: (M, 3) mm, some dozens."""
+    points = result.rig_from_object.apply(result.points_object).reshape(-1, 3)
+    return points[:: max(1, len(points) // 60)]
+
+
+def _with_camera(rig: CameraRig, other: CameraRig, camera: int) -> CameraRig:
+    """Replace the values of a camera by those that it has in another rig (of the same batch axes)."""
+    chosen = torch.arange(rig.cameras) == camera
+
+    def put(tensor: Tensor, source: Tensor, axes: int) -> Tensor:
+        return torch.where(chosen.reshape(-1, *(1,) * (axes - 1)), source, tensor)
+
+    return replace(
+        rig,
+        focal_length=put(rig.focal_length, other.focal_length, 2),
+        principal_point=put(rig.principal_point, other.principal_point, 2),
+        distortion=put(rig.distortion, other.distortion, 2),
+        cam_from_rig=RigidTransform(
+            put(rig.cam_from_rig.rotation, other.cam_from_rig.rotation, 3),
+            put(rig.cam_from_rig.translation, other.cam_from_rig.translation, 2),
+        ),
+    )
+
+
+def _table(blobs: Blobs, name: str, rig: CameraRig) -> Detections:
+    count = len(blobs.uv)
+    return Detections(
+        uv=blobs.uv,
+        sigma=blobs.sigma,
+        camera=blobs.camera,
+        snapshot=np.zeros(count, dtype=np.int64),
+        fiducial=np.full(count, -1, dtype=np.int64),
+        radius=blobs.radius,
+        flags=blobs.flags,
+        camera_names=rig.camera_names,
+        snapshot_names=(name,),
+    )

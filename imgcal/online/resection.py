@@ -1,0 +1,159 @@
+"""Find a camera again that may be anywhere: its neighbours know where the object was, snapshot after snapshot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations, permutations
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.estimation import EstimationOptions, estimate
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.observations import Observations
+from imgcal.types.rig import CameraRig
+
+TRIES = 600
+"""Triples of blobs that are taken for triples of fiducials."""
+ROUGH, FINE = 6.0, 2.0
+"""Pixels between a blob and its fiducial: by a pose from three of them, and after a fit of all."""
+LEAST_MATCHES = 8
+"""Over all snapshots: four of one snapshot may agree by chance."""
+LEAST_SHARE = 0.7
+"""Of what could be seen: the smaller of blobs and fiducials, snapshot by snapshot."""
+LEAST_LEAD = 1.3
+"""Times as many matches as any pose that gives other labels."""
+
+
+def resected(
+    blobs: Sequence[NDArray[np.float64]], points_rig: Tensor, camera: CameraRig, generator: np.random.Generator
+) -> NDArray[np.int64] | None:
+    """Label the blobs of the last snapshot by the one place of the camera that explains all snapshots.
+
+    Args:
+        blobs: (M_s, 2) pixels for each of S snapshots.
+        points_rig: (S, N, 3) mm, where the fiducials were.
+        camera: a rig of one camera; only its lens is taken from it.
+        generator: chooses among triples where there are many.
+
+    Returns:
+        (M,) fiducial of each blob of the last snapshot, -1 = none; None where no place explains enough, or several do.
+    """
+    seen = [_ideal(uv, camera) for uv in blobs]
+    points = points_rig.numpy()
+    poses = _hypotheses(seen, points, generator)
+    if not len(poses):
+        return None
+    focal = float(camera.focal_length.mean())
+    labels = [_matches(poses, p, xy, ROUGH / focal) for p, xy in zip(points, seen, strict=True)]  # S x (K, M)
+    count = sum((found >= 0).sum(1) for found in labels)
+    best = int(np.argmax(count))
+    first = [found[best] for found in labels]
+    fitted = _fitted(camera, points_rig, blobs, first)
+    if fitted is None:
+        return None
+    inside = fitted.expand(len(points)).project(points_rig).visible[:, 0].sum(-1).numpy()
+    final = [
+        _matches(_pose(fitted), p, _ideal(uv, fitted), FINE / focal)[0] for p, uv in zip(points, blobs, strict=True)
+    ]
+    matches = sum(int((found >= 0).sum()) for found in final)
+    possible = sum(min(int(n), len(xy)) for n, xy in zip(inside, seen, strict=True))
+    agree = sum((found == mine).sum(1) for found, mine in zip(labels, final, strict=True))
+    others = count[agree < 0.5 * sum(len(xy) for xy in seen)]
+    if matches < max(LEAST_MATCHES, LEAST_SHARE * possible, LEAST_LEAD * others.max(initial=0)):
+        return None
+    return final[-1]
+
+
+def _ideal(uv: NDArray[np.float64], camera: CameraRig) -> NDArray[np.float64]:
+    """Take the lens out: (M, 2) on the z = 1 plane."""
+    if not len(uv):
+        return np.zeros((0, 2))
+    (fx, fy), (cx, cy) = camera.focal_length[0].tolist(), camera.principal_point[0].tolist()
+    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    return np.asarray(cv2.undistortPoints(uv[:, None], matrix, camera.distortion[0].numpy())[:, 0], dtype=np.float64)
+
+
+def _hypotheses(
+    seen: list[NDArray[np.float64]], points: NDArray[np.float64], generator: np.random.Generator
+) -> NDArray[np.float64]:
+    """Poses (K, 3, 4), cam_from_rig, from three blobs of one snapshot each."""
+    found = []
+    triples = np.array([t for t in combinations(range(points.shape[1]), 3) if _spans(points[0, list(t)], points[0])])
+    usable = [s for s, xy in enumerate(seen) if len(xy) >= 3]
+    for s in usable if len(triples) else []:
+        wanted = TRIES // len(usable) + 1
+        choice = _ordered_triples(len(seen[s]), wanted, generator)
+        pairs = generator.permutation(len(triples) * len(choice))[:wanted]
+        for pair in pairs:
+            fiducials, rows = triples[pair // len(choice)], choice[pair % len(choice)]
+            _, turns, shifts = cv2.solveP3P(
+                points[s, fiducials], seen[s][rows], np.eye(3), None, flags=cv2.SOLVEPNP_AP3P
+            )
+            found += [np.hstack((cv2.Rodrigues(r)[0], t)) for r, t in zip(turns, shifts, strict=True)]
+    poses: NDArray[np.float64] = np.array(found, dtype=np.float64).reshape(-1, 3, 4)
+    return np.asarray(poses[np.isfinite(poses).all((1, 2))])
+
+
+def _ordered_triples(count: int, wanted: int, generator: np.random.Generator) -> NDArray[np.int64]:
+    """Three different blobs in every order, or so many at random where there are many."""
+    if count <= 8:
+        return np.array(list(permutations(range(count), 3)))
+    return np.array([generator.permutation(count)[:3] for _ in range(wanted)])
+
+
+def _spans(triangle: NDArray[np.float64], whole: NDArray[np.float64]) -> bool:
+    """Tell whether three points are far enough from one line to give a pose."""
+    area = np.linalg.norm(np.cross(triangle[1] - triangle[0], triangle[2] - triangle[0]))
+    return bool(area > 0.05 * np.square(whole - whole.mean(0)).sum(1).mean())
+
+
+def _matches(
+    poses: NDArray[np.float64], points: NDArray[np.float64], xy: NDArray[np.float64], tolerance: float
+) -> NDArray[np.int64]:
+    """Fiducial (K, M) that is nearest to each blob and has it as nearest blob, within a tolerance; -1 = none."""
+    at = points @ poses[:, :, :3].swapaxes(-1, -2) + poses[:, None, :, 3]  # (K, N, 3)
+    front = at[..., 2] > 1.0
+    where = np.where(front[..., None], at[..., :2] / np.maximum(at[..., 2:], 1.0), 1e6)
+    if not len(xy):
+        return np.zeros((len(poses), 0), dtype=np.int64)
+    distance = np.linalg.norm(where[:, :, None] - xy[None, None], axis=-1)  # (K, N, M)
+    nearest = distance.argmin(1)  # (K, M)
+    back = np.take_along_axis(distance.argmin(2), nearest, axis=1)
+    close = np.take_along_axis(distance, nearest[:, None], axis=1)[:, 0] < tolerance
+    return np.where(close & (back == np.arange(len(xy))), nearest, -1)
+
+
+def _fitted(
+    camera: CameraRig, points_rig: Tensor, blobs: Sequence[NDArray[np.float64]], labels: list[NDArray[np.int64]]
+) -> CameraRig | None:
+    """Move the camera to where its labels fit best; None with too few."""
+    snapshot = np.repeat(np.arange(len(labels)), [len(found) for found in labels])
+    fiducial, uv = np.concatenate(labels), np.concatenate(list(blobs))
+    rows = np.flatnonzero(fiducial >= 0)
+    if len(rows) < 4:
+        return None
+    cloud = points_rig[snapshot[rows], fiducial[rows]]
+    given = torch.from_numpy(uv[rows])[None, None]
+    observations = Observations(
+        given, torch.full_like(given[..., 0], 1.0), torch.ones_like(given[..., 0], dtype=torch.bool)
+    )
+    held = torch.zeros(1, 15, dtype=points_rig.dtype)
+    fit = estimate(
+        observations,
+        camera,
+        CalibrationObject(cloud, torch.ones_like(cloud)),
+        spread=held,
+        options=EstimationOptions(loss="cauchy"),
+    )
+    return replace(camera, cam_from_rig=camera.cam_from_rig @ fit.rig_from_object[0].reshape(1))
+
+
+def _pose(camera: CameraRig) -> NDArray[np.float64]:
+    transform: RigidTransform = camera.cam_from_rig
+    return torch.cat((transform.rotation, transform.translation[..., None]), dim=-1).numpy()

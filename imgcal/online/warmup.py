@@ -1,0 +1,87 @@
+"""Compiling ahead of time: every function that the first calibration would have to wait for."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+
+from imgcal.detection import detect
+from imgcal.errors import RefusedError
+from imgcal.io import load_object, load_rig
+from imgcal.online.recalibrator import Recalibrator
+from imgcal.pipeline.calibration import calibrate, score
+from imgcal.synthesis.captures import FrameModel, Truth, simulate_frames, simulate_truth, true_detections
+from imgcal.synthesis.colour_coding import ImageOptions, render_views
+from imgcal.synthesis.rigs import PoseRange, RelativeDrift
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.rig import CameraRig
+from renderers import SensorModel, palette
+
+RIG, OBJECT, SIZE = "T4", "asymmetric8", (512, 272)
+SNAPSHOTS = 3
+
+
+def warm_up() -> None:
+    """Recalibrate a small simulated rig in every way there is, so that all that is compiled for it is in the cache.
+
+    Takes seconds where everything is there already. What is compiled holds for rigs, objects and frames of any size.
+    """
+    rig = load_rig(RIG).resized(torch.tensor(SIZE))
+    obj = load_object(OBJECT)
+    generator = torch.Generator().manual_seed(0)
+    poses = PoseRange((0.0, 2 * math.pi), (0.0, 0.5), (0.0, 0.0))
+    truth = simulate_truth(rig, obj, SNAPSHOTS, generator, RelativeDrift(0.01, 0.01), poses)
+    for depth in (8, 16):
+        _from_frames(truth, rig, obj, SensorModel(bit_depth=depth), generator)
+    exact = true_detections(truth)
+    with _whatever_comes():
+        calibrate(exact, rig, obj)
+        score(exact, rig, obj)
+    _of_a_plane(rig, generator)
+    _of_bloomed_lamps()
+    seen = torch.ones(truth.uv.shape[:-1], dtype=torch.bool)
+    for uv in (truth.uv, truth.uv.float()):  # of `imgcal render`, and of the networks
+        render_views(uv, seen, rig.image_size, obj, ImageOptions(32, 1.5))
+        rig.to(uv.dtype).expand(1).project_values(obj.points.to(uv.dtype)[None])
+
+
+def _from_frames(
+    truth: Truth, rig: CameraRig, obj: CalibrationObject, sensor: SensorModel, generator: torch.Generator
+) -> None:
+    """Blobs are found, told apart and followed."""
+    shots = list(simulate_frames(truth, obj, FrameModel(sensor), generator))
+    stacks = {name: [shot[name] for shot in shots] for name in rig.camera_names}
+    with _whatever_comes():
+        calibrate(stacks, rig, obj)
+    with Recalibrator(rig, obj, window=2) as recalibrator:
+        for shot in (shots[0], *shots):
+            with _whatever_comes():
+                recalibrator.update(shot)
+
+
+def _of_a_plane(rig: CameraRig, generator: torch.Generator) -> None:
+    """An object that is flat is told apart in another way."""
+    points = torch.tensor([(x, y, 0.0) for x in (0, 40, 90) for y in (0, 30, 75)], dtype=torch.float64)
+    plane = CalibrationObject(points, palette(len(points)).double())
+    truth = simulate_truth(rig, plane, 2, generator, None)
+    unlabelled = true_detections(truth)
+    with _whatever_comes():
+        calibrate(unlabelled, rig, plane)
+
+
+def _of_bloomed_lamps() -> None:
+    """Blobs that are clipped and joined by their light are parted."""
+    v, u = np.mgrid[:64, :96]
+    light = sum(400 * np.exp(-((u - at) ** 2 + (v - 32) ** 2) / 72) for at in (38, 58))
+    detect({"lamps": (5 + np.minimum(light, 250)).astype(np.uint8)})
+
+
+@contextlib.contextmanager
+def _whatever_comes() -> Iterator[None]:
+    """What such a small rig knows of itself does not matter."""
+    with contextlib.suppress(RefusedError):
+        yield

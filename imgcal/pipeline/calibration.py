@@ -1,0 +1,374 @@
+"""From blobs to a recalibrated rig: labels, then one estimate over all snapshots, then the checks that it must pass.
+
+`calibrate` and `score` are what the commands of the same names do, on values in memory. Neither reads nor writes files.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from imgcal.association.options import PipelineOptions
+from imgcal.association.series import Labelled, Progress, label, observations_of, without_snapshots
+from imgcal.detection import DetectionOptions
+from imgcal.errors import RefusedError
+from imgcal.estimation import Estimate, estimate, initial_pose
+from imgcal.estimation.blocks import BlockScatter, block_scatter
+from imgcal.estimation.covariance import whitened_covariance
+from imgcal.estimation.estimate import conclude, make_loss, make_problem, make_start
+from imgcal.estimation.object_shape import FiducialOffset
+from imgcal.estimation.pose_support import UndeterminedPosesError, require_poses
+from imgcal.estimation.predicted_error import PredictedError, predicted_error
+from imgcal.estimation.variance_components import settle
+from imgcal.pipeline.checks import (
+    require_cameras,
+    require_fit,
+    require_most_labels,
+    require_near_prior,
+    require_same_residuals,
+    require_views,
+)
+from imgcal.pipeline.initialization import FirstGuess, Guesser, residual_of
+from imgcal.pipeline.object_checks import displaced, lost_fiducials, object_offsets
+from imgcal.pipeline.sources import Frames, blobs_of
+from imgcal.pipeline.steadiness import steady_part
+from imgcal.pipeline.tally import Tally, tally
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.moved_camera import MovedCamera
+from imgcal.types.observations import BlobFlag, Detections, Observations
+from imgcal.types.prediction import Prediction
+from imgcal.types.rig import CameraRig, RigPrior
+
+LEAST_KEPT = 0.8
+"""Share of the snapshots that must keep a pose when outliers have been left out."""
+
+
+@dataclass(frozen=True)
+class Calibration(Estimate):
+    """An `Estimate`, with what it was made from. Snapshots are those used, in order."""
+
+    labelled: Labelled
+    observations: Observations  # (S, C, N) as used: outliers not seen, sigma with the model error
+    model_error: float  # px, what the residuals hold beyond the blobs' own sigma
+    outliers: int  # labelled blobs left out
+    widened: Mapping[str, float]  # by kind of value: factor by which the prior was too narrow, where it was
+    factory: CameraRig
+    obj: CalibrationObject  # as it was given
+    shape: tuple[FiducialOffset, ...] = ()  # where each fiducial is instead; empty = the object was taken as exact
+    scale_sigma: float | None = None  # relative: an error of the object's scale four times as large would be noticed
+    bent_sigma: float | None = None  # how sure it is that the object is not as estimated; None = not asked
+    block_length: int = 0  # snapshots in the blocks whose scatter the covariance follows; 0 = that of the noise
+    first_guess: FirstGuess | None = None  # what a network said, where one was asked
+    guess_used: bool = False  # its guess was nearer to the images than the factory calibration
+    seconds: Mapping[str, float] = field(default_factory=dict)  # by stage
+    moved: tuple[MovedCamera, ...] = ()  # during the capture; snapshots used are those since then
+
+    @cached_property
+    def before(self) -> Estimate:
+        """The factory rig as it stands on the same observations: only the poses are fitted."""
+        return estimate(
+            self.observations,
+            self.factory,
+            self.obj.taken_as_exact(),
+            self.rig_from_object,
+            spread=torch.zeros_like(self.problem.spread[0]),
+        )
+
+    @property
+    def object(self) -> CalibrationObject:
+        """The object as it was estimated: its fiducials in their estimated places, taken as exact."""
+        return replace(self.obj.taken_as_exact(), points=self.points_object.detach())
+
+    @property
+    def displaced(self) -> tuple[FiducialOffset, ...]:
+        """Fiducials that are surely not in their places; what is known of lost ones rests on a few odd labels."""
+        return tuple(d for d in displaced(self.shape, self.obj) if d.fiducial not in self.lost)
+
+    @cached_property
+    def lost(self) -> tuple[int, ...]:
+        """Fiducials that were hardly found where the others were."""
+        points = self.rig_from_object.apply(self.points_object)
+        visible = self.rig.expand(len(points)).project(points, self.obj.radius).visible
+        return lost_fiducials(self.observations.seen.numpy(), visible.numpy())
+
+    @cached_property
+    def tally(self) -> Tally:
+        """What each camera saw in each snapshot, and how much of it is explained."""
+        return tally(self.labelled, self.observations.seen.numpy(), self.rig_from_object, self.factory, self.obj)
+
+    @property
+    def labelled_detections(self) -> Detections:
+        """All blobs with the labels that they got; those left out as outliers have the flag `BlobFlag.OUTLIER`."""
+        detections, used = self.labelled.detections, self.labelled.used
+        row = np.full(len(self.labelled.snapshots), -1)
+        row[used] = np.arange(len(used))
+        s, c, n = row[detections.snapshot], detections.camera, detections.fiducial
+        outlier = (s >= 0) & (n >= 0)
+        outlier[outlier] = ~self.observations.seen.numpy()[s[outlier], c[outlier], n[outlier]]
+        marked = detections.flags | np.where(outlier, int(BlobFlag.OUTLIER), 0).astype(np.uint8)
+        return replace(detections, flags=marked)
+
+    @cached_property
+    def predicted_error(self) -> PredictedError:
+        """How good the rig is over the working volume."""
+        return predicted_error(self)
+
+    @property
+    def identity(self) -> str:
+        """coded | unique | by_prior | by_tracking | ambiguous."""
+        return self.labelled.identity
+
+
+def calibrate(
+    source: Detections | Frames,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    options: PipelineOptions = PipelineOptions(),
+    *,
+    detection: DetectionOptions = DetectionOptions(),
+    guesser: Guesser | None = None,
+    progress: Progress | None = None,
+) -> Calibration:
+    """Recalibrate a rig from what its cameras saw.
+
+    Args:
+        source: blobs, labelled or not, or frames in memory (see `imgcal.detect`).
+        rig: the factory calibration, without batch axes.
+        obj: the calibration object.
+        options: how sure the result must be.
+        detection: how blobs are found in frames.
+        guesser: network whose first guess the estimate starts from (`imgcal.pipeline.initialization.load_guesser`).
+        progress: wraps the loop over snapshots, for a progress bar.
+
+    Raises:
+        RefusedError: the data cannot decide; the message says why.
+        InputError: the data do not belong to this rig or object: other cameras, frames of another size.
+    """
+    started, rig = time.perf_counter(), rig.to(torch.float64)
+    detections = blobs_of(source, rig, obj, detection)
+    found = time.perf_counter()
+    labelled = label(detections, rig, obj, options, progress)
+    identified = time.perf_counter()
+    labelled = _with_poses(labelled, rig, obj)
+    _require_any_view(labelled, rig, obj)
+    labelled, moved = steady_part(labelled, detections, rig, obj, options)
+    fit = fit_labelled(labelled, rig, obj, options, guesser)
+    require_views(fit.tally, rig)
+    seconds = {
+        "detection": found - started,
+        "identity": identified - found,
+        "estimation": time.perf_counter() - identified,
+    }
+    return replace(fit, seconds=seconds, moved=moved)
+
+
+def fit_labelled(
+    labelled: Labelled,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    options: PipelineOptions = PipelineOptions(),
+    guesser: Guesser | None = None,
+    *,
+    latest: Calibration | None = None,
+    spread: Tensor | None = None,
+) -> Calibration:
+    """Estimate the rig from all labelled snapshots, leaving out what does not fit, and check that the rest does.
+
+    Args:
+        labelled: from `label`.
+        rig: the factory calibration.
+        obj: the calibration object.
+        options: how sure the result must be.
+        guesser: network whose first guess is the start, where it is nearer to the images than the factory calibration.
+        latest: what the snapshot before gave, from the same factory calibration: a start that saves time.
+        spread: (C, 15) how far the factory values may be off; None = as the rig says.
+
+    Raises:
+        RefusedError: a camera saw nothing, the estimate has no minimum, or the residuals do not fit.
+    """
+    rig = rig.to(torch.float64)
+    labelled = given = _with_poses(labelled, rig, obj)
+    while True:
+        try:
+            return _fit_labelled(labelled, rig, obj, options, guesser, latest, spread)
+        except UndeterminedPosesError as error:
+            labelled = without_snapshots(labelled, error.rows)
+            if len(labelled.used) < LEAST_KEPT * len(given.used):
+                raise RefusedError(
+                    f"{error} (found {len(given.used) - len(labelled.used)} of {len(given.used)} such snapshots): some "
+                    "fiducial is not where the object file says"
+                ) from error
+
+
+def _fit_labelled(
+    labelled: Labelled,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    options: PipelineOptions,
+    guesser: Guesser | None,
+    latest: Calibration | None,
+    spread: Tensor | None,
+) -> Calibration:
+    """Do the work of `fit_labelled` for snapshots that all have a pose."""
+    observations, poses = observations_of(labelled, rig, obj)
+    variance, labels = observations.sigma.numpy() ** 2, observations.seen.numpy()
+    require_cameras(labels, rig, options)
+    alike = labelled.identity == "ambiguous" and len(labelled.used) > 1
+    if alike and obj.tolerance is not None and bool(obj.tolerance.any()):
+        raise RefusedError(
+            "object: it can be turned into itself, and each snapshot may have the labels of another turn: where its "
+            "fiducials are within their tolerances cannot be estimated",
+            python="give labels (Detections.fiducial), use an object without symmetry, or one without tolerances",
+            command="give labels (a column `fiducial`), use an object without symmetry, or one without tolerances",
+        )
+    prior = (rig.prior or RigPrior()).std(rig) if spread is None else spread
+    problem = make_problem(observations, rig, _with_learnt(obj, latest), prior)
+    assert poses is not None  # see `_with_poses`
+    guess = None if guesser is None else guesser.guess(observations, rig, obj)
+    guess_used = guess is not None and _nearer(guess, Prediction(rig, poses), observations, obj)
+    state = make_start(problem, poses, None)
+    if guess is not None and guess_used:
+        state = make_start(problem, guess.rig_from_object, guess.rig)
+    starts = [(state, options.identity_error)]
+    if latest is not None and not latest.widened:
+        change = latest.problem.spread * latest.solution.state.offset
+        offset = torch.where(prior > 0, change / prior.clamp_min(1e-30), 0.0)
+        starts.insert(0, (replace(state, offset=offset), latest.model_error))
+    found = settle(problem, starts, variance, labels, options, examine=latest is None, alike=alike)
+    fit = conclude(found.problem, found.solution, found.solution.state)
+    require_same_residuals(fit, observations, found.seen, obj)
+    shape = object_offsets(fit, found.shape, obj)
+    scatter = BlockScatter()
+    if latest is None:
+        covariance = whitened_covariance(found.solution)[0]
+        scatter = block_scatter(found.problem, found.solution, covariance, make_loss(options.estimation))
+        fit = replace(fit, inflation=scatter.factor)
+    outliers = int(labels.sum() - found.seen.sum())
+    require_cameras(found.seen, rig, options)
+    require_near_prior(fit, prior, rig, found.widened, options)
+    require_most_labels(labels, found.seen, rig)
+    require_fit(found.model_error, outliers / max(int(labels.sum()), 1), 2**0.5 * float(fit.rms), options)
+    values = {name: getattr(fit, name) for name in Estimate.__dataclass_fields__}
+    return Calibration(
+        **values,
+        labelled=labelled,
+        observations=Observations(
+            observations.uv, torch.from_numpy(found.sigma).to(observations.sigma), torch.from_numpy(found.seen)
+        ),
+        model_error=found.model_error,
+        outliers=outliers,
+        widened=found.widened,
+        factory=rig,
+        obj=obj,
+        shape=shape,
+        scale_sigma=None if found.shape is None else finite(found.shape.scale_error[1]),
+        bent_sigma=None if found.shape is None else found.shape.bent_sigma(),
+        block_length=scatter.length,
+        first_guess=guess,
+        guess_used=guess_used,
+    )
+
+
+def _with_learnt(obj: CalibrationObject, latest: Calibration | None) -> CalibrationObject:
+    """The object with the tolerances that the latest result has found necessary."""
+    if latest is None or latest.problem.object_spread is None:
+        return obj
+    return replace(obj, tolerance=latest.problem.object_spread[0, :-1:3])
+
+
+def _require_any_view(labelled: Labelled, rig: CameraRig, obj: CalibrationObject) -> None:
+    """Refuse where a camera sees the object, and identity could not label any of it: worse than seeing nothing."""
+    observations, poses = observations_of(labelled, rig, obj)
+    assert poses is not None
+    require_views(tally(labelled, observations.seen.numpy(), poses, rig, obj), rig, least_share=0.0)
+
+
+def _nearer(guess: FirstGuess, factory: Prediction, observations: Observations, obj: CalibrationObject) -> bool:
+    """Tell whether the start that a guess gives, its mean rig, is nearer to the images than the factory calibration."""
+    start = Prediction(guess.rig, guess.rig_from_object)
+    return bool(residual_of(start, observations, obj).norm() < residual_of(factory, observations, obj).norm())
+
+
+def _with_poses(labelled: Labelled, rig: CameraRig, obj: CalibrationObject) -> Labelled:
+    """Refuse the snapshots whose labels lie on one line; find the poses of those that came with labels."""
+    observations, poses = observations_of(labelled, rig, obj)
+    try:
+        require_poses(observations.seen.numpy(), obj.points)
+    except UndeterminedPosesError as error:
+        return _with_poses(without_snapshots(labelled, error.rows), rig, obj)
+    if poses is not None:
+        return labelled
+    poses, snapshots = initial_pose(observations, rig, obj), list(labelled.snapshots)
+    for row, snapshot in enumerate(labelled.used):
+        snapshots[snapshot] = replace(snapshots[snapshot], rig_from_object=poses[row])
+    return replace(labelled, snapshots=tuple(snapshots))
+
+
+def finite(value: float) -> float | None:
+    """None for what is not known."""
+    return value if np.isfinite(value) else None
+
+
+def rms_length(residual: Tensor, seen: Tensor) -> float | None:
+    """RMS length (px) of the seen residuals, as OpenCV's calibrateCamera defines it; None where nothing was seen.
+
+    Args:
+        residual: (..., 2) pixels.
+        seen: (...) bool.
+    """
+    return float(residual[seen].square().sum(-1).mean().sqrt()) if bool(seen.any()) else None
+
+
+@dataclass(frozen=True)
+class Score:
+    """Reprojection errors of a rig that is held fixed; only the object's poses are fitted."""
+
+    labelled: Labelled
+    residual: Tensor  # (S, C, N, 2) pixels
+    seen: Tensor  # (S, C, N) bool
+
+    @property
+    def distances(self) -> Tensor:
+        """Length of each residual: (M,) pixels."""
+        return self.residual.norm(dim=-1)[self.seen]
+
+
+def score(
+    source: Detections | Frames,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    options: PipelineOptions = PipelineOptions(),
+    progress: Progress | None = None,
+    *,
+    detection: DetectionOptions = DetectionOptions(),
+) -> Score:
+    """Measure how well a rig explains what its cameras saw.
+
+    Args:
+        source: blobs, labelled or not, or frames in memory (see `imgcal.detect`).
+        rig: the rig to be scored; its prior is used for identity only.
+        obj: the calibration object.
+        options: how sure identity must be.
+        progress: wraps the loop over snapshots.
+        detection: how blobs are found in frames.
+
+    Raises:
+        RefusedError: no snapshot could be decided.
+        InputError: the data do not belong to this rig or object: other cameras, frames of another size.
+    """
+    rig = rig.to(torch.float64)
+    labelled = label(blobs_of(source, rig, obj, detection), rig, obj, options, progress)
+    observations, poses = observations_of(labelled, rig, obj)
+    fixed = torch.zeros(*rig.distortion.shape[:-1], 15, dtype=rig.distortion.dtype)
+    # What is reported is an RMS in pixels: centres count alike, however well each was measured.
+    even = replace(observations, sigma=torch.full_like(observations.sigma, options.identity_error))
+    fit = estimate(even, rig, obj.taken_as_exact(), poses, spread=fixed, options=options.estimation)
+    if not bool(fit.converged):
+        raise RefusedError(f"score: no pose of the object fits (RMS {2**0.5 * float(fit.rms):.3g} px)")
+    return Score(labelled, fit.residual, observations.seen)

@@ -1,0 +1,163 @@
+"""What a calibration must pass before it is given to anybody: each check refuses with its reason, or does nothing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.association.options import PipelineOptions
+from imgcal.errors import RefusedError
+from imgcal.estimation import Estimate
+from imgcal.pipeline.tally import Tally
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.observations import Observations
+from imgcal.types.rig import PARAMETER_NAMES, CameraRig
+
+LEAST_EXPLAINED = 0.5
+"""Of what a camera sees of the object, the share that must be where the rest of the rig expects it."""
+SAME_PIXEL = 1e-3
+"""Pixels up to which two ways of projecting may differ."""
+LEAST_SIGHT = 0.3
+"""Blobs that may be fiducials, in parts of the fiducials in view, from which a camera is said to see the object."""
+
+
+def require_cameras(seen: NDArray[np.bool_], rig: CameraRig, options: PipelineOptions) -> None:
+    """Refuse where a camera has nothing that is `seen` (S, C, N)."""
+    blind = [rig.camera_names[i] for i in np.flatnonzero(~seen.any(axis=(0, 2)))]
+    if blind and (not options.blind_cameras or len(blind) == rig.cameras):
+        raise RefusedError(
+            f"camera {', '.join(blind)}: found no fiducial in any snapshot, expected some; nothing can be said of it",
+            python="rig.select leaves a camera out, PipelineOptions(blind_cameras=True) keeps its factory values",
+            command="--without leaves a camera out, --blind-cameras keeps its factory values",
+        )
+
+
+def require_views(counts: Tally, rig: CameraRig, least_share: float = LEAST_EXPLAINED) -> None:
+    """Refuse where a camera sees what may be the object, and hardly any of it where the rest of the rig expects it.
+
+    Labels that were never given count as much against a camera as those that were given and did not fit.
+
+    Args:
+        counts: what each camera saw.
+        rig: names the cameras.
+        least_share: of what a camera sees of the object, to be where it should be; zero = anything at all.
+    """
+    kept, unexplained, expected = (count.sum(0) for count in (counts.kept, counts.unexplained, counts.expected))
+    bad = (kept <= least_share * (kept + unexplained)) & (unexplained >= LEAST_SIGHT * np.maximum(expected, 1))
+    if bad.any():
+        camera = int(np.argmax(np.where(bad, unexplained, -1)))
+        which = ", ".join(rig.camera_names[i] for i in np.flatnonzero(bad))
+        raise RefusedError(
+            f"camera {which}: the other cameras put {expected[camera]} fiducials into the image of "
+            f"{rig.camera_names[camera]}, found {kept[camera]} there, and {unexplained[camera]} blobs that belong to "
+            "nothing: the image may be mirrored or turned, the frames of another camera or moment, place or lens not "
+            "those of the rig file",
+            python="put that right, or leave the camera out of the rig (rig.select) and of the detections",
+            command=f"put that right, or leave out what is wrong: --without {which.replace(',', '')}",
+        )
+
+
+def require_fit(model_error: float, outlier_share: float, rms: float, options: PipelineOptions) -> None:
+    """Refuse where residuals (px) or the share of left-out labels are larger than noise makes them."""
+    if model_error > options.largest_model_error:
+        raise RefusedError(
+            f"estimation: the best rig misses the blobs by {rms:.2f} px (RMS), of which {model_error:.2f} px do not "
+            f"fit their noise, expected at most {options.largest_model_error:g}: the object is not as its file says, "
+            "labels are wrong, or the lenses are of another kind",
+            python="measure the object anew; where all is right, raise PipelineOptions.largest_model_error",
+            command="measure the object anew, and look at labels given in the input",
+        )
+    if outlier_share > options.most_outliers:
+        raise RefusedError(
+            f"estimation: {100 * outlier_share:.0f} % of the labelled blobs do not fit any rig, expected at most "
+            f"{100 * options.most_outliers:.0f} %: labels are wrong, or something moved during the capture",
+            python="calibrate from fewer snapshots (Detections.of_snapshots) to find which ones fit",
+            command="calibrate from fewer snapshots (--snapshots A:B) to find which ones fit",
+        )
+
+
+def require_same_residuals(
+    fit: Estimate, observations: Observations, seen: NDArray[np.bool_], obj: CalibrationObject
+) -> None:
+    """Project the object with the rig that is about to be returned: the residuals must be those about to be reported.
+
+    Shares nothing with the solver. Should they differ, the solver's state and its report do not belong together.
+    """
+    points = fit.rig_from_object.apply(fit.points_object.unsqueeze(-3)).to(fit.rig.focal_length)
+    uv = fit.rig.expand(len(points)).project_values(points, obj.radius).uv  # (S, C, N, 2)
+    difference = (uv - observations.uv - fit.residual)[torch.from_numpy(seen)]
+    if not bool((difference.abs() < SAME_PIXEL).all()):
+        raise RefusedError(
+            "estimation: the rig that was found and its residuals do not belong together (up to "
+            f"{float(difference.abs().max()):.2g} px apart): please report this with the data"
+        )
+
+
+def require_near_prior(
+    fit: Estimate, prior: Tensor, rig: CameraRig, widened: Mapping[str, float], options: PipelineOptions
+) -> None:
+    """Refuse where a value, or a kind of values, is farther from the factory's than the `prior` (C, 15) can bear."""
+    offset, spread, std = (tensor.numpy() for tensor in (fit.solution.state.offset[0], fit.problem.spread[0], prior))
+    change = offset * spread
+    drift = np.where(std > 0, np.abs(change) / np.maximum(std, 1e-30), 0.0)
+    camera, parameter = divmod(int(drift.argmax()), drift.shape[1])
+    kind = max(widened, key=lambda name: widened[name], default="")
+    if drift[camera, parameter] > options.largest_drift:
+        name = PARAMETER_NAMES[parameter]
+        found = (
+            f"camera {rig.camera_names[camera]}: {name.replace('_', ' ')} would differ from its factory value by "
+            f"{_with_unit(change[camera, parameter], name)}, with a tolerance (prior) of "
+            f"{_with_unit(std[camera, parameter], name)} and {options.largest_drift:g} times as much accepted"
+        )
+    elif kind and widened[kind] > options.widest_prior:
+        found = (
+            f"the {kind.replace('_', ' ')} of all cameras together would differ from the factory values "
+            f"{widened[kind]:.1f} times as much as its tolerance (prior) says, with {options.widest_prior:g} times as "
+            "much accepted"
+        )
+    else:
+        return
+    raise RefusedError(
+        f"estimation: {found}: cameras may be exchanged, labels wrong, or the rig file that of another rig",
+        python="where the rig has really changed so much, give it a wider prior: replace(rig, prior=RigPrior(...))",
+        command="where the rig has really changed so much, write larger values under `prior` in the rig file",
+    )
+
+
+def require_most_labels(labels: NDArray[np.bool_], kept: NDArray[np.bool_], rig: CameraRig) -> None:
+    """Refuse where most labels of one camera or one fiducial do not fit: they are not what they are said to be."""
+    before, after = labels.sum((0, 2)), kept.sum((0, 2))
+    bad = np.flatnonzero((before >= 6) & (after < 0.5 * before)).tolist()
+    if bad:
+        which = [rig.camera_names[i] for i in bad]
+        raise RefusedError(
+            f"estimation: camera {', '.join(which)}: {before[bad[0]] - after[bad[0]]} of {before[bad[0]]} labels in "
+            f"{which[0]} do not fit what the other cameras see: its frames may be of another moment, or its labels of "
+            "other fiducials",
+            python="put that right, or leave the camera out of the rig (rig.select) and of the detections",
+            command=f"put that right, or leave it out: --without {' '.join(which)}",
+        )
+    before, after = labels.sum((0, 1)), kept.sum((0, 1))
+    bad = np.flatnonzero((before >= 6) & (after < 0.5 * before)).tolist()
+    if bad:
+        raise RefusedError(
+            f"estimation: fiducial {', '.join(map(str, bad))} (row of the object file): "
+            f"{before[bad[0]] - after[bad[0]]} of {before[bad[0]]} labels of fiducial {bad[0]} do not fit: it "
+            "has moved on the object, or labels are swapped",
+            python="measure it anew, or leave it out of the object",
+            command="measure it anew, or take its row out of the object file",
+        )
+
+
+def _with_unit(value: float, name: str) -> str:
+    """Write a value of a parameter as people read it."""
+    if name.startswith("rotation"):
+        return f"{math.degrees(value):.3g} deg"
+    if name.startswith("position"):
+        return f"{value:.3g} mm"
+    return f"{value:.3g} px" if name in ("fx", "fy", "cx", "cy") else f"{value:.3g}"

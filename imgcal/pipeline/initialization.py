@@ -1,0 +1,151 @@
+"""A network's first guess for captured snapshots: labelled fiducials in, a rig and poses to start the estimate from.
+
+Image networks never see a grey frame: the labelled fiducials are drawn anew, each in its own colour.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from imgcal.errors import InputError
+from imgcal.geometry.projection import resized_pixels
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.io.names import nearest
+from imgcal.io.resources import data_path, shipped_names
+from imgcal.synthesis.colour_coding import ImageOptions, render_views
+from imgcal.training.checkpoint import check_object, check_rig, load_checkpoint, read_subject
+from imgcal.types.calibration_object import CalibrationObject, SelfMotion
+from imgcal.types.observations import Observations
+from imgcal.types.prediction import Prediction, Views
+from imgcal.types.rig import CameraRig
+
+KINDS = ("points", "vit", "cnn")
+CHUNK = 32  # snapshots at once: their images take memory
+
+
+@dataclass(frozen=True)
+class FirstGuess:
+    """What a network says about some snapshots of one rig."""
+
+    name: str  # of the network
+    rig: CameraRig  # without batch axes: the mean over snapshots
+    rig_from_object: RigidTransform  # (S,)
+    residual: Tensor  # (S, C, N, 2) pixels, predicted by each snapshot's own rig minus observed; zero where not seen
+
+
+@dataclass(frozen=True)
+class Guesser:
+    """A trained network, ready for a rig of some of its cameras and images of another size than in training."""
+
+    name: str
+    network: nn.Module
+    trained: CameraRig  # factory rig of the training
+    cameras: tuple[int, ...] | None = None  # those that there are, in the order of the rig; None = all
+
+    @torch.no_grad()
+    def guess(self, observations: Observations, rig: CameraRig, obj: CalibrationObject) -> FirstGuess:
+        """Look at every snapshot on its own.
+
+        A symmetric object may have been labelled in a turn that the network has never seen: all turns are tried, and
+        each snapshot keeps the one that fits best.
+
+        Args:
+            observations: (S, C, N) labelled fiducials, in the pixels of `rig`.
+            rig: the factory rig.
+            obj: the object.
+        """
+        shown = self._shown(observations, rig)
+        turns = [self._turned(shown, rig, obj, motion) for motion in obj.symmetries]
+        residuals = torch.stack([residual_of(turn, observations, obj) for turn in turns])  # (turns, S, C, N, 2)
+        best = residuals.square().sum((2, 3, 4)).nan_to_num(torch.inf).argmin(0), torch.arange(len(observations.uv))
+        guess = Prediction.joined(turns, lambda tensors: torch.stack(tensors)[best])
+        mean = rig.moved(guess.rig.difference(rig).mean(0))
+        return FirstGuess(self.name, mean, guess.rig_from_object, residuals[best])
+
+    def _shown(self, observations: Observations, rig: CameraRig) -> Views:
+        """What all cameras of the training see: those that are not there see nothing."""
+        cameras = self._present
+        scale = self.trained.image_size[cameras].to(observations.uv) / rig.image_size
+        snapshots, _, fiducials = observations.seen.shape
+        uv = torch.zeros(snapshots, self.trained.cameras, fiducials, 2)
+        uv[:, cameras] = resized_pixels(observations.uv, scale[:, None]).float()
+        seen = torch.zeros(uv.shape[:-1], dtype=torch.bool)
+        seen[:, cameras] = observations.seen
+        return Views(uv=uv, seen=seen)
+
+    @property
+    def _present(self) -> list[int]:
+        return list(range(self.trained.cameras) if self.cameras is None else self.cameras)
+
+    def _turned(self, shown: Views, rig: CameraRig, obj: CalibrationObject, motion: SelfMotion) -> Prediction:
+        """What the network says of an object turned by a symmetry, turned back: (S,), in the pixels of `rig`."""
+        assert shown.uv is not None and shown.seen is not None
+        source = torch.from_numpy(np.argsort(motion.permutation))  # fiducial whose image each label gets
+        views = zip(shown.uv[:, :, source].split(CHUNK), shown.seen[:, :, source].split(CHUNK), strict=True)
+        said = Prediction.joined([self._predict(*chunk, obj) for chunk in views], torch.cat).to(rig.focal_length.dtype)
+        turn = RigidTransform(torch.from_numpy(motion.rotation), torch.from_numpy(motion.translation))
+        there = said.rig.select(self._present).resized(rig.image_size)
+        return Prediction(there, said.rig_from_object @ turn.to(rig.focal_length.dtype))
+
+    def _predict(self, uv: Tensor, seen: Tensor, obj: CalibrationObject) -> Prediction:
+        options = cast(ImageOptions | None, self.network.image_options)
+        views = Views(uv=uv, seen=seen)
+        if options is not None:
+            views = Views(images=render_views(uv, seen, self.trained.image_size, obj, options, quantise=True))
+        prediction: Prediction = self.network(views)[-1]
+        return prediction
+
+
+def residual_of(prediction: Prediction, observations: Observations, obj: CalibrationObject) -> Tensor:
+    """Predicted minus observed: (S, C, N, 2) pixels, zero where not seen; one rig (S,) a snapshot or one for all."""
+    poses = prediction.rig_from_object
+    rigs = prediction.rig.expand(len(observations.uv))
+    uv = rigs.project(poses.apply(obj.points.to(poses.rotation)), obj.radius).uv
+    return torch.where(observations.seen[..., None], uv - observations.uv, 0.0)
+
+
+def load_guesser(name: str, rig: CameraRig, obj: CalibrationObject) -> Guesser:
+    """Find the network for a rig and an object.
+
+    Args:
+        name: one of `KINDS`, for the shipped networks, or a file that `imgcal train` wrote.
+        rig: the factory rig: all cameras of the training or some of them; its images may be smaller or larger.
+        obj: the object; the radius of its fiducials does not matter to a first guess.
+
+    Raises:
+        InputError: no such file, or no network for this rig and object.
+    """
+    if name not in KINDS:
+        if not Path(name).is_file():
+            raise InputError(
+                f"first guess: found `{name}`, expected none, {', '.join(KINDS)}, or a file of `imgcal train`"
+                f"{nearest(name, KINDS)}"
+            )
+        return _load(Path(name), rig, obj)
+    shipped = [stem for stem in shipped_names("models", ".safetensors") if stem.startswith(f"{name}-")]
+    reasons = []
+    for stem in shipped:
+        try:
+            return _load(data_path("models", f"{stem}.safetensors"), rig, obj)
+        except InputError as error:
+            reasons.append(error)
+    why = "".join(f" ({reason})" for reason in reasons[:1])
+    raise InputError(
+        f"first guess `{name}`: found no shipped network for rig {rig.name} and object {obj.name}, expected one of "
+        f"{', '.join(shipped) or 'none'}: train one with `imgcal train` and give its file{why}"
+    )
+
+
+def _load(path: Path, rig: CameraRig, obj: CalibrationObject) -> Guesser:
+    trained, trained_obj = read_subject(path)
+    cameras = tuple(trained.camera_names.index(name) for name in rig.camera_names if name in trained.camera_names)
+    there = trained.select(cameras) if len(cameras) == rig.cameras else trained
+    check_rig(path, there, rig.resized(there.image_size) if rig.cameras == there.cameras else rig)
+    check_object(path, replace(trained_obj, radius=None), replace(obj, radius=None))
+    return Guesser(path.stem, load_checkpoint(path).network, trained, cameras)

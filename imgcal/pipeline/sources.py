@@ -1,0 +1,115 @@
+"""What a program hands over, frames or blobs, compared with the rig and the object before anything is made of it.
+
+Files are checked where they are read, line by line; this is the same for values in memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+
+import numpy as np
+
+from imgcal.association.series import matched_to_rig
+from imgcal.detection import DetectionOptions, detect
+from imgcal.detection.options import Frame
+from imgcal.errors import InputError
+from imgcal.io.detections_csv import MARGIN
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.limits import BLOB_RADIUS, SIGMA
+from imgcal.types.observations import Detections
+from imgcal.types.rig import CameraRig
+
+Frames = Mapping[str, Frame | Sequence[Frame | None] | None]
+ROWS = tuple(field.name for field in fields(Detections) if not field.name.endswith("_names"))
+
+
+def blobs_of(
+    source: Detections | Frames, rig: CameraRig, obj: CalibrationObject, options: DetectionOptions
+) -> Detections:
+    """Take blobs as they are, or find them in frames; cameras are numbered as in the rig.
+
+    Raises:
+        InputError: neither blobs nor frames, or they are not of this rig and object.
+    """
+    if isinstance(source, Detections):
+        return checked_detections(source, rig, obj)
+    frames = checked_frames(source, rig)
+    if not frames:
+        raise InputError(f"frames: found no camera, expected frames of the cameras of rig {rig.name}")
+    return matched_to_rig(detect(frames, options), rig)
+
+
+def checked_frames(frames: object, rig: CameraRig) -> Frames:
+    """Return frames by camera if all of them are of the rig's cameras and sizes, and explain otherwise."""
+    if not isinstance(frames, Mapping):
+        raise InputError(f"found a {type(frames).__name__}, expected Detections or frames: {{camera name: frame}}")
+    sizes = dict(zip(rig.camera_names, rig.image_size.tolist(), strict=True))
+    for camera, entry in frames.items():
+        if camera not in sizes:
+            raise InputError(
+                f"frames: found camera {camera!s:.80}, expected cameras of rig {rig.name}: {', '.join(sizes)}"
+            )
+        width, height = (int(size) for size in sizes[camera])
+        for frame in entry if isinstance(entry, Sequence) and not isinstance(entry, str) else (entry,):
+            if isinstance(frame, np.ndarray) and frame.ndim == 2 and frame.shape != (height, width):
+                raise InputError(
+                    f"camera {camera}: found a frame of {frame.shape[1]}x{frame.shape[0]} pixels, "
+                    f"expected {width}x{height} as in rig {rig.name}"
+                )
+    return frames
+
+
+def checked_detections(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> Detections:
+    """Return detections with their cameras numbered as in the rig, if they can be of this rig and object.
+
+    Raises:
+        InputError: columns that do not belong together, a camera, fiducial or pixel that does not exist, or a standard
+            deviation that is none.
+    """
+    count = np.shape(detections.uv)[:1]
+    for name in ROWS:
+        column, expected = getattr(detections, name), (*count, 2) if name == "uv" else count
+        if not isinstance(column, np.ndarray) or column.shape != expected:
+            found = f"an array of shape {column.shape}" if isinstance(column, np.ndarray) else type(column).__name__
+            raise InputError(f"detections: {name}: found {found}, expected a NumPy array of shape {expected}")
+    for name, end in (("camera", len(detections.camera_names)), ("snapshot", len(detections.snapshot_names))):
+        _require(
+            detections, name, (getattr(detections, name) >= 0) & (getattr(detections, name) < end), f"0 to {end - 1}"
+        )
+    _require(
+        detections,
+        "fiducial",
+        detections.fiducial < obj.fiducials,
+        f"a row of the object, 0 to {obj.fiducials - 1}, or -1",
+    )
+    _require(
+        detections,
+        "sigma",
+        (detections.sigma >= SIGMA.low) & (detections.sigma <= SIGMA.high),
+        f"a standard deviation > 0, {SIGMA}",
+    )
+    _require(
+        detections,
+        "radius",
+        np.isnan(detections.radius) | ((detections.radius >= 0) & (detections.radius <= BLOB_RADIUS.high)),
+        f"a radius, {BLOB_RADIUS}, or nan",
+    )
+    detections = matched_to_rig(detections, rig)
+    size = rig.image_size.numpy()[detections.camera]
+    inside = ((detections.uv >= -0.5 - MARGIN) & (detections.uv <= size - 0.5 + MARGIN)).all(axis=1)
+    if not inside.all():
+        row = int(inside.argmin())
+        (u, v), (width, height) = detections.uv[row], size[row]
+        raise InputError(
+            f"detections: found ({u:g}, {v:g}) in row {row}, expected a pixel of the {width}x{height} image of camera "
+            f"{rig.camera_names[detections.camera[row]]}"
+        )
+    return detections
+
+
+def _require(detections: Detections, column: str, good: np.ndarray, expected: str) -> None:
+    if not good.all():
+        row = int(good.argmin())
+        found = getattr(detections, column)[row]
+        raise InputError(f"detections: {column}: found {found} in row {row}, expected {expected}")

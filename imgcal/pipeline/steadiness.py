@@ -1,0 +1,190 @@
+"""Whether all cameras stood still during a capture, before one rig is estimated from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.stats import hypergeom
+
+from imgcal.association.options import PipelineOptions
+from imgcal.association.series import Labelled, label, observations_of
+from imgcal.errors import RefusedError
+from imgcal.estimation import Estimate, estimate, initial_pose
+from imgcal.estimation.change_points import CLIP, LEAST_SNAPSHOTS
+from imgcal.estimation.moves import find_moves
+from imgcal.pipeline.tally import Tally, tally
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.moved_camera import MovedCamera, MovedError
+from imgcal.types.observations import Detections
+from imgcal.types.rig import CameraRig
+
+MEDIAN = 1.386
+"""Of a squared length with unit variance on both axes."""
+LEAST_AGREEMENT = 0.9
+"""Of the labels of the other cameras, where a snapshot has been labelled twice."""
+MOST_MIXED = 0.2
+"""Share of snapshots of the other kind on either side of the time at which a camera was lost."""
+LEAST_CHANCE = 0.05
+"""That what a camera does not agree with falls so cleanly on one side of a moment; of those that disagree at all."""
+MOST_MOVES = 8  # parts of a capture that are looked at, one after the other
+
+Bools = NDArray[np.bool_]
+
+
+def steady_part(
+    labelled: Labelled, detections: Detections, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
+) -> tuple[Labelled, tuple[MovedCamera, ...]]:
+    """Leave out the snapshots before the last move of a camera.
+
+    Args:
+        labelled: all snapshots.
+        detections: the same as they were given, with the labels of the input alone.
+        rig: the factory calibration.
+        obj: the calibration object.
+        options: whether to go on when a camera has moved.
+
+    Returns:
+        The labelled snapshots, those before the last move refused, and the moves, in the order of time.
+
+    Raises:
+        MovedError: a camera has moved, and the options do not say what then.
+        RefusedError: after the last move no snapshot could be decided.
+    """
+    part, first, moved = labelled, 0, list(moves_of(labelled, rig, obj, options))
+    if not moved:
+        return labelled, ()
+    total, found = len(labelled.snapshots), moved
+    names = [snapshot.name for snapshot in labelled.snapshots]
+    for _ in range(MOST_MOVES):
+        first = max(names.index(move.snapshot) for move in found)
+        if not options.after_last_move:
+            raise MovedError(moved, total - first, total)
+        part = label(detections.of_snapshots(first, total), rig, obj, options)
+        found = list(moves_of(part, rig, obj, options))
+        if not found:
+            return _with_earlier(part, labelled, first), tuple(moved)
+        moved += found
+    raise MovedError(moved, total - first, total)
+
+
+def _with_earlier(part: Labelled, labelled: Labelled, first: int) -> Labelled:
+    """Put the snapshots before a part of a capture back, refused."""
+    reason = "taken before a camera moved"
+    earlier = tuple(
+        s if s.status == "refused" else replace(s, status="refused", reason=reason, rig_from_object=None)
+        for s in labelled.snapshots[:first]
+    )
+    fiducial = np.full(len(labelled.detections), -1, dtype=np.int64)
+    fiducial[labelled.detections.snapshot >= first] = part.detections.fiducial
+    return Labelled(replace(labelled.detections, fiducial=fiducial), (*earlier, *part.snapshots))
+
+
+def moves_of(
+    labelled: Labelled, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
+) -> tuple[MovedCamera, ...]:
+    """Say which cameras moved between two snapshots.
+
+    A camera that has moved far is not labelled any more by what identity has learnt from the snapshots before. Such
+    snapshots are labelled afresh, so that how far it moved can be measured.
+    """
+    if len(labelled.used) < 2 * LEAST_SNAPSHOTS:
+        return ()
+    fit = _fit(labelled, rig, obj, options)
+    lost = _lost(fit.tally)
+    if (lost.sum(0) >= LEAST_SNAPSHOTS).any():
+        again = _labelled_afresh(labelled, lost, rig, obj, options)
+        fit = _fit(again, rig, obj, options)
+    names = tuple(labelled.snapshots[s].name for s in labelled.used)
+    found = find_moves(fit.estimate.problem, fit.estimate.solution.state, rig.camera_names, names, options.estimation)
+    gone = _gone(fit.tally, labelled, rig, {move.camera for move in found})
+    return tuple(sorted((*found, *gone), key=lambda move: names.index(move.snapshot)))
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """One rig for all labels, however badly some of them fit."""
+
+    estimate: Estimate
+    tally: Tally
+
+
+def _fit(labelled: Labelled, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions) -> _Fit:
+    """Estimate one rig, no label left out, with the noise that the residuals show.
+
+    Where one rig cannot fit, this is slow to settle, and need not: what it leaves is asked for steps.
+    """
+    observations, poses = observations_of(labelled, rig, obj)
+    own, seen = observations.sigma, observations.seen
+    error: torch.Tensor | float = options.identity_error
+    found: Estimate | None = None
+    for _ in range(2):
+        noisy = replace(observations, sigma=(own.square() + error**2).sqrt())
+        start = (poses or initial_pose(observations, rig, obj)) if found is None else found.rig_from_object
+        guess = None if found is None else found.rig
+        found = estimate(noisy, rig, obj, start, first_guess=guess, options=options.estimation)
+        free = max(1 - (15 * rig.cameras + 6 * len(seen)) / (2 * int(seen.sum())), 0.2)
+        variance = found.residual.square().sum(-1)[seen].median() / (MEDIAN * free)
+        error = (variance - own[seen].square().median()).clamp_min(0).sqrt()
+    assert found is not None
+    fitting = (found.residual.norm(dim=-1) <= CLIP * noisy.sigma) & seen
+    return _Fit(found, tally(labelled, fitting.numpy(), found.rig_from_object, rig, obj))
+
+
+def _lost(counts: Tally) -> Bools:
+    """Snapshots in which most of what a camera may see of the object has no label: (S, C)."""
+    in_view = np.minimum(counts.expected, counts.usable)
+    return (in_view > 0) & (2 * counts.labelled < in_view)
+
+
+def _labelled_afresh(
+    labelled: Labelled, lost: Bools, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
+) -> Labelled:
+    """Label the snapshots in which cameras are `lost` (S, C) without what the others have taught; take those labels."""
+    detections = labelled.detections
+    rows = np.flatnonzero(np.isin(detections.snapshot, np.flatnonzero(lost.any(1))))
+    try:
+        again = label(replace(detections.select(rows), fiducial=np.full(len(rows), -1)), rig, obj, options).detections
+    except RefusedError:
+        return labelled
+    old, new = detections.fiducial[rows], again.fiducial
+    snapshot, here = detections.snapshot[rows], lost[detections.snapshot[rows], detections.camera[rows]]
+    # A symmetric object may have been labelled in another turn, which the labels of the other cameras show.
+    both = (old >= 0) & (new >= 0) & ~here
+    count = len(labelled.snapshots)
+    same = np.bincount(snapshot[both & (old == new)], minlength=count)
+    agreed = same >= np.maximum(LEAST_AGREEMENT * np.bincount(snapshot[both], minlength=count), 3)
+    fiducial = detections.fiducial.copy()
+    fiducial[rows] = np.where(here & agreed[snapshot], new, old)
+    return Labelled(replace(detections, fiducial=fiducial), labelled.snapshots)
+
+
+def _gone(counts: Tally, labelled: Labelled, rig: CameraRig, known: set[str]) -> list[MovedCamera]:
+    """Cameras that saw the object where it is at first, and then elsewhere, or the other way round.
+
+    That snapshots in which a camera agrees and in which it does not are parted so cleanly by a moment has a probability
+    when nothing but chance decides which are which.
+    """
+    moves = []
+    agrees, differs = counts.kept > counts.unexplained, counts.unexplained > counts.kept
+    differs &= 2 * counts.unexplained >= counts.expected
+    doubtful = int((differs.sum(0) >= LEAST_SNAPSHOTS).sum())
+    for camera, name in enumerate(rig.camera_names):
+        rows = np.flatnonzero(agrees[:, camera] | differs[:, camera])
+        wrong = differs[rows, camera]
+        total, count = len(rows), int(wrong.sum())
+        if name in known or not LEAST_SNAPSHOTS <= count <= total - LEAST_SNAPSHOTS:
+            continue
+        place = np.arange(LEAST_SNAPSHOTS, total - LEAST_SNAPSHOTS + 1)
+        before = np.cumsum(wrong)[place - 1]
+        chance = np.minimum(
+            hypergeom.sf(before - 1, total, count, place), hypergeom.sf(count - before - 1, total, count, total - place)
+        )
+        best = int(chance.argmin())
+        shares = before[best] / place[best], (count - before[best]) / (total - place[best])
+        parted = min(shares) <= MOST_MIXED and max(shares) >= 1 - MOST_MIXED
+        if parted and 2 * len(place) * doubtful * chance[best] < LEAST_CHANCE:
+            moves.append(MovedCamera(name, labelled.snapshots[rows[place[best]]].name, "unknown"))
+    return moves

@@ -1,0 +1,81 @@
+"""How much of what each camera saw, and of what it should have seen, the rest of the rig can explain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imgcal.association.series import Labelled
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.rig import CameraRig
+
+MARGIN = 0.05
+"""Of the image's width and height, from its border: as far a camera that has drifted may miss what it should see."""
+
+DOUBTFUL = 0.25
+"""Share of what a camera sees of the object that is not where it should be, from which on it is said: partly hidden
+markers and false blobs beside them leave a tenth in good captures."""
+
+Counts = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Tally:
+    """Blobs and fiducials counted by snapshot (all of them, S) and camera (C)."""
+
+    blobs: Counts  # (S, C) found
+    usable: Counts  # (S, C) of these, not merged, at the border or masked
+    labelled: Counts  # (S, C) blobs with a fiducial
+    kept: Counts  # (S, C) labels that fit
+    expected: Counts  # (S, C) fiducials in view of the factory camera, given where the rest of the rig sees the object
+
+    @property
+    def outliers(self) -> Counts:
+        """Labels that do not fit: (S, C)."""
+        return self.labelled - self.kept
+
+    @property
+    def unexplained(self) -> Counts:
+        """Blobs that may be fiducials in view, and are not where these should be: (S, C).
+
+        False blobs beside fiducials that were all found are no witness against a camera, nor are fiducials in view that
+        are hidden: each counts as far as there is something of the other.
+        """
+        return np.maximum(np.minimum(self.expected, self.usable) - self.kept, 0)
+
+
+def tally(
+    labelled: Labelled, kept: NDArray[np.bool_], poses: RigidTransform, factory: CameraRig, obj: CalibrationObject
+) -> Tally:
+    """Count.
+
+    Args:
+        labelled: all snapshots, S.
+        kept: (U, C, N) labels that fit, of the used snapshots.
+        poses: (U,) rig_from_object of the used snapshots.
+        factory: the rig that says what is in view: it has not been spoilt by wrong labels.
+        obj: N fiducials.
+    """
+    detections, used = labelled.detections, labelled.used
+    shape = (len(labelled.snapshots), factory.cameras)
+
+    def count(rows: NDArray[np.bool_]) -> Counts:
+        cell = detections.snapshot[rows] * shape[1] + detections.camera[rows]
+        return np.bincount(cell, minlength=shape[0] * shape[1]).reshape(shape)
+
+    projection = factory.expand(len(used)).project(poses.apply(obj.points.to(factory.focal_length)), obj.radius)
+    size = factory.image_size.numpy()[:, None]
+    uv = projection.uv.numpy()
+    inside = ((uv > MARGIN * size) & (uv < (1 - MARGIN) * size)).all(-1) & projection.visible.numpy()
+    fitting, expected = np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=np.int64)
+    fitting[used], expected[used] = kept.sum(-1), inside.sum(-1)
+    return Tally(
+        blobs=count(np.ones(len(detections), dtype=bool)),
+        usable=count(detections.usable),
+        labelled=count(detections.fiducial >= 0),
+        kept=fitting,
+        expected=expected,
+    )

@@ -1,0 +1,218 @@
+"""Points after the network: MAP refinement that outliers cannot pull away, and that mends exchanged labels.
+
+First all points, by plain least squares: where the residuals fit the noise and the prior, that is the answer. The other
+rigs go through graduated non-convexity: a bounded loss (Geman and McClure) whose threshold shrinks from the error of
+the first guess to the noise, so that outliers lose their pull before they can mislead. Then points are chosen anew
+among all, those of exchanged labels under the label that fits, and least squares on the chosen ones ends it.
+
+Source: graduated non-convexity as in Yang et al., RA-L 2020.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from imgcal.estimation import Estimate, EstimationOptions, initial_pose
+from imgcal.refinement.points import as_prediction, observed, refine_points
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.prediction import Prediction, Views
+from imgcal.types.rig import CameraRig
+
+SQUARED = EstimationOptions(loss="squared")
+AT_FIRST = EstimationOptions(loss="squared", max_iterations=15)  # outliers can keep it busy without end
+FAR = 100.0  # pixels: points farther off are all equally wrong
+
+
+@dataclass(frozen=True)
+class RobustOptions:
+    """What counts as an outlier. All but `thresholds` in standard deviations or multiples of others."""
+
+    thresholds: tuple[float, ...] = (64.0, 32.0, 16.0, 8.0, 4.0, 2.0, 1.0, 0.5)  # pixels, of rounds from far to near
+    last_threshold: float = 3.0  # sigma, of the last round
+    begin: float = 0.25  # of the first guess's median residual: the narrowest threshold to begin with
+    mending: float = 16.0  # of a round's threshold: points farther off may belong to another fiducial
+    gate: float = 8.0  # sigma: points farther off are left out in the end
+    fits: float = 5.0  # standard deviations of chi2, and of a residual, beyond which outliers are suspected
+    rounds: int = 2  # of choosing points, in the end
+
+
+@dataclass(frozen=True)
+class Target:
+    """What predictions are refined towards."""
+
+    uv: Tensor  # (B, C, N, 2) pixels
+    seen: Tensor  # (B, C, N) bool
+    factory: CameraRig  # without batch axes
+    obj: CalibrationObject
+    spread: Tensor  # (C, 15) standard deviations of the factory values
+    sigma: float  # pixels, noise of the points
+    factor: Tensor | None = None  # (B, C, N) on the sigma of each fiducial, as a network may say
+
+    def __getitem__(self, rows: Tensor) -> Target:
+        factor = None if self.factor is None else self.factor[rows]
+        return Target(self.uv[rows], self.seen[rows], self.factory, self.obj, self.spread, self.sigma, factor)
+
+    def fit(
+        self,
+        start: Prediction,
+        options: EstimationOptions = SQUARED,
+        uv: Tensor | None = None,
+        seen: Tensor | None = None,
+    ) -> Estimate:
+        """MAP estimate from a start, of all points or of the given ones."""
+        views = Views(uv=self.uv if uv is None else uv, seen=self.seen if seen is None else seen)
+        sigma = self.sigma if self.factor is None else self.sigma * self.factor
+        return refine_points(start, views, self.factory, self.obj, self.spread, sigma, options)
+
+
+def refine_robustly(
+    prediction: Prediction,
+    views: Views,
+    factory: CameraRig,
+    obj: CalibrationObject,
+    spread: Tensor,
+    *,
+    sigma: float,
+    options: RobustOptions = RobustOptions(),
+) -> Prediction:
+    """Refine predictions by the points that were seen.
+
+    Args:
+        prediction: (B,) first guesses, a network's or others; its `log_sigma` weighs the points.
+        views: (B,) uv and seen.
+        factory: the factory rig, without batch axes.
+        obj: N fiducials.
+        spread: (C, 15) standard deviation of each factory value (`Drift.std`).
+        sigma: noise of the points, pixels.
+        options: what counts as an outlier.
+
+    Returns:
+        (B,) refined, in float64. Each rig on its own: the others of its batch do not matter.
+    """
+    if views.uv is None or views.seen is None:
+        raise ValueError("views hold no points")
+    guess = prediction.detach().to(torch.float64)
+    trust = None if guess.log_sigma is None else guess.log_sigma.exp()
+    target = Target(views.uv.double(), views.seen, factory.to(torch.float64), obj, spread.double(), sigma, trust)
+    fit = target.fit(guess, AT_FIRST)
+    suspect = (~fits(fit, sigma, options.fits)).nonzero().squeeze(-1)
+    result = as_prediction(fit)
+    if len(suspect):
+        result = _replaced(result, suspect, _robust(guess[suspect], target[suspect], options))
+    return result
+
+
+def fits(fit: Estimate, sigma: float, limit: float) -> Tensor:
+    """Tell which estimates explain all their points: (B,) bool."""
+    dof = fit.dof.clamp_min(1).to(fit.chi2)
+    whole = fit.chi2 <= dof + limit * (2 * dof).sqrt()
+    each = fit.residual.norm(dim=-1).flatten(1).amax(-1) <= limit * sigma
+    return whole & each & fit.converged
+
+
+def _robust(guess: Prediction, target: Target, options: RobustOptions) -> Prediction:
+    """Refine rigs that have outliers."""
+    near = options.last_threshold
+    limits = (*(limit for pixels in options.thresholds if (limit := pixels / target.sigma) > near), near)
+    begin = _first_round(guess, target, limits, options.begin)
+    result = guess
+    for number, limit in enumerate(limits):
+        rows = (begin <= number).nonzero().squeeze(-1)
+        if len(rows):
+            part, some = result[rows], target[rows]
+            bounded = EstimationOptions(loss="geman_mcclure", threshold=limit)
+            points = mended(part, some, options.mending * limit)
+            result = _replaced(result, rows, as_prediction(some.fit(part, bounded, points.uv, points.seen)))
+    for _ in range(options.rounds):
+        points = mended(result, target, options.gate)
+        result = as_prediction(target.fit(result, uv=points.uv, seen=points.fits))
+    worse = ~(_misfit(result, target) < _misfit(guess, target))
+    rows = worse.nonzero().squeeze(-1)
+    return _replaced(result, rows, guess[rows])
+
+
+def _misfit(prediction: Prediction, target: Target) -> Tensor:
+    """Mean distance of the points from where they are expected, each at most `FAR`: (B,) pixels. A fit that ran away
+    from a bad start fits nothing, the start at least some.
+    """
+    distance = (_predicted_uv(prediction, target) - target.uv).norm(dim=-1).nan_to_num(nan=FAR).clamp_max(FAR)
+    return (distance * target.seen).sum((1, 2)) / target.seen.sum((1, 2)).clamp_min(1)
+
+
+def _first_round(guess: Prediction, target: Target, limits: tuple[float, ...], share: float) -> Tensor:
+    """Number of the round to begin with, (B,): the narrowest threshold of pixels that is wide enough for the guess."""
+    distance = (_predicted_uv(guess, target) - target.uv).norm(dim=-1) / target.sigma
+    typical = torch.where(target.seen, distance, torch.nan).flatten(1).nanmedian(-1).values.nan_to_num()
+    wide_enough = torch.tensor(limits).to(typical) >= share * typical[:, None]
+    return (wide_enough.sum(-1) - 1).clamp(0, max(len(limits) - 2, 0))
+
+
+@dataclass(frozen=True)
+class Mended:
+    """Points, some under another label than they came with."""
+
+    uv: Tensor  # (B, C, N, 2) pixels
+    seen: Tensor  # (B, C, N) bool
+    fits: Tensor  # (B, C, N) bool: of those, near where they are expected
+
+
+def mended(prediction: Prediction, target: Target, gate: float) -> Mended:
+    """Give points that do not fit to other fiducials of the same camera: those that have no fitting point themselves.
+
+    Args:
+        prediction: (B,) where points are expected.
+        target: the points as they came.
+        gate: sigma within which a point fits. Point and fiducial must be each other's nearest.
+    """
+    expected, limit = _predicted_uv(prediction, target), gate * target.sigma
+    fit = target.seen & ((expected - target.uv).norm(dim=-1) <= limit)
+    lost = target.seen & ~fit
+    distance = (target.uv.unsqueeze(-2) - expected.unsqueeze(-3)).norm(dim=-1)  # (B, C, N points, N fiducials)
+    distance = torch.where(lost.unsqueeze(-1) & ~fit.unsqueeze(-2), distance, torch.inf)
+    nearest, fiducial, mutual = mutual_nearest(distance)
+    source = (mutual & (nearest <= limit)).nonzero(as_tuple=True)
+    place = (*source[:2], fiducial[source])
+    uv, seen = target.uv.clone(), target.seen.clone()
+    seen[source] = False
+    uv[place], seen[place], fit[place] = target.uv[source], True, True
+    return Mended(uv, seen, fit)
+
+
+def mutual_nearest(distance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Find the nearest column of each row of (*B, N, N), and whether that column's nearest row is the same one.
+
+    Returns:
+        Distance, column, and bool, each (*B, N).
+    """
+    nearest, column = distance.min(-1)
+    rows = torch.arange(distance.shape[-2], device=distance.device)
+    return nearest, column, distance.argmin(-2).gather(-1, column) == rows
+
+
+def robust_pose(views: Views, factory: CameraRig, obj: CalibrationObject, sigma: float) -> Prediction:
+    """Place the object with the factory rig as it stands, in spite of outliers: a start without a network."""
+    if views.uv is None or views.seen is None:
+        raise ValueError("views hold no points")
+    uv, rig = views.uv.double(), factory.to(torch.float64)
+    fixed = torch.zeros_like(rig.distortion[..., :1]).expand(rig.cameras, 15)
+    target = Target(uv, views.seen, rig, obj, fixed, sigma)
+    pose = initial_pose(observed(uv, views.seen, sigma), rig, obj)[:, 0]
+    result = Prediction(rig.expand(len(views)), pose)
+    for pixels in (100.0, 30.0):
+        bounded = EstimationOptions(loss="geman_mcclure", threshold=pixels / sigma)
+        result = as_prediction(target.fit(result, bounded))
+    return result
+
+
+def _predicted_uv(prediction: Prediction, target: Target) -> Tensor:
+    points = target.obj.points.to(target.uv).expand(len(target.uv), -1, -1)
+    radius = None if target.obj.radius is None else target.obj.radius.to(target.uv)
+    return prediction.cameras_from_object.project(points, radius).uv
+
+
+def _replaced(whole: Prediction, rows: Tensor, part: Prediction) -> Prediction:
+    """Put `part` in the place of some rigs of a batch."""
+    return Prediction.joined((whole, part), lambda pair: pair[0].index_copy(0, rows, pair[1]))

@@ -1,0 +1,318 @@
+"""Render-and-compare: the rig whose colour-coded images are the given ones, without detected points."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from imgcal.errors import InputError
+from imgcal.estimation import Estimate, EstimationOptions, estimate
+from imgcal.estimation.estimate import make_problem
+from imgcal.refinement.graduated_non_convexity import refine_robustly
+from imgcal.refinement.label_swaps import colours_at, exchanged
+from imgcal.refinement.photometric import DotWindows, NearFit, ShiftPrior, blurred_step
+from imgcal.refinement.points import as_prediction
+from imgcal.synthesis.colour_coding import LEVELS, ImageOptions
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.observations import Observations
+from imgcal.types.prediction import Prediction, Views
+from imgcal.types.rig import CameraRig
+
+PRESENT = 0.5  # amplitude above which a dot counts as there
+FARTHEST = 1e3  # image widths beyond which a predicted pixel is as good as any other
+# Floats of a chunk's largest temporary: what a processor's cache holds, and what a GPU has room for.
+CHUNK = {"cpu": 1_000_000, "cuda": 200_000_000}
+FLOATS_A_PAIR = 52  # of that temporary, for each channel of each pair of dots: 4 products a row of 13
+
+
+Attempt = Literal["relabel", "near", "far"]
+"""What to try for rigs that images do not confirm: dots in each other's colours; from near, as the rig mostly knows
+where dots are that its cameras have taken for each other; or from afar again.
+"""
+
+
+@dataclass(frozen=True)
+class ImageRefinementOptions:
+    """How images are compared. Lengths in pixels of the image, brightness in grey levels of 8 bit."""
+
+    image: ImageOptions = ImageOptions()
+    blurs: tuple[float, ...] = (16.0, 8.0, 8.0, 4.0, 2.0, 1.0)  # standard deviations, one step each, far to near
+    shift: ShiftPrior = ShiftPrior(together=8.0, alone=2.0)  # of the dots, in each blurred step
+    trust: float = 0.1  # see `photometric.blurred_step`
+    pooling: int = 4  # pixels, each way, that are averaged before blurred steps
+    steps: int = 3  # near steps
+    attempts: tuple[Attempt, ...] = ("relabel", "near", "far", "near", "relabel")  # while a rig is not confirmed
+    noise: float = 12**-0.5  # grey levels, one standard deviation; that of rounding to 8 bit
+    position_noise: float = 0.0  # sensor pixels: how far drawn dots are from where the fiducials were
+    near: float = 3.0  # pixels, median: how far the first guess may be off where colours are asked for
+    gate: float = 8.0  # sigma, beyond which a dot is not the fiducial that it was taken for
+    most_residual: float = 2.0  # grey levels, RMS in a dot's window, beyond which the dot is not believed
+    most_chi2: float = 5.0  # per degree of freedom, beyond which a rig has not converged
+    estimation: EstimationOptions = EstimationOptions()
+
+
+@torch.no_grad()
+def refine_images(
+    prediction: Prediction,
+    images: Tensor,
+    factory: CameraRig,
+    obj: CalibrationObject,
+    spread: Tensor,
+    options: ImageRefinementOptions = ImageRefinementOptions(),
+) -> tuple[Estimate, Observations]:
+    """Refine a network's prediction on the images that it has seen: photometric Gauss-Newton, then MAP.
+
+    Each image is compared with rendered dots, blurred at first and sharp at last, every camera on its own, which gives
+    the dots' places and how well they are known; the most probable rig follows from those. Rigs that the images do not
+    confirm are tried again from there, and with dots taken for those whose places they have (`exchanged`).
+
+    Args:
+        prediction: (B,) first guess.
+        images: (B, C, 3, size, size) in [0, 1] as `render_views` draws them.
+        factory: the factory rig, the centre of the prior.
+        obj: N fiducials in their colours.
+        spread: (C, 15) or (B, C, 15) standard deviation of each factory value.
+        options: how to compare.
+
+    Returns:
+        The estimate, one snapshot a rig, in float64 and in sensor pixels, and the dots that it was found from.
+        `converged` is false where the images are not explained: residuals too large, light where no dot is, or a rig
+        too improbable for its dots (`chi2_per_dof`).
+
+    Raises:
+        InputError: images of another shape than the options and the rig say.
+    """
+    _check(images, factory, options)
+    problem = _ImageProblem(factory.to(torch.float64), obj, spread.double(), options)
+    guess = prediction.detach().to(torch.float64)
+    guess = Prediction(guess.rig.resized(problem.size), guess.rig_from_object)
+    dots = problem.look(images, guess)
+    result = problem.solve(dots, guess)
+    for attempt in options.attempts:
+        again = (~result.converged).nonzero().squeeze(-1)
+        if len(again) == 0:
+            break
+        found = as_prediction(result)
+        if attempt == "relabel":
+            again = again[problem.near(guess[again], dots.select(again))]
+            if len(again) == 0:
+                continue
+            new = problem.relabel(images[again], guess[again], dots.select(again))
+            relabelled = problem.solve(new, found[again])
+            better = problem.explained(relabelled, new) > problem.explained(result, dots)[again]
+            again, new = again[better], new.select(better)
+        else:
+            new = problem.look(images[again], found[again], dots.select(again) if attempt == "near" else None)
+        dots = dots.updated(again, new)
+        result = problem.solve(dots, found)
+    return problem.on_sensor(result, dots)
+
+
+@dataclass(frozen=True)
+class _Dots:
+    """What images show, in pixels of the image."""
+
+    uv: Tensor  # (B, C, N, 2)
+    sigma: Tensor  # (B, C, N)
+    believed: Tensor  # (B, C, N) bool
+    light: Tensor  # (B, C) of all channels, in dots of a channel of 1
+    colour: Tensor  # (B, C, N) the fiducial whose colour the dot has: another one's where labels are exchanged
+
+    def select(self, rows: Tensor) -> _Dots:
+        """Keep some rigs."""
+        return _Dots(**{name: value[rows] for name, value in vars(self).items()})
+
+    def updated(self, rows: Tensor, new: _Dots) -> _Dots:
+        """Replace some rigs."""
+        return _Dots(**{name: value.index_copy(0, rows, getattr(new, name)) for name, value in vars(self).items()})
+
+
+class _ImageProblem:
+    """The factory rig as it would be if the images were what its sensors deliver.
+
+    There, one standard deviation holds for both axes of a dot; on a sensor that is not square it does not. Whitened
+    parameters are the same in both, and so is everything in the normal equations.
+    """
+
+    def __init__(
+        self, factory: CameraRig, obj: CalibrationObject, spread: Tensor, options: ImageRefinementOptions
+    ) -> None:
+        """Take float64; predictions given to the other methods are for images, too."""
+        self.factory, self.obj, self.spread, self.options = factory, obj, spread, options
+        self.size = torch.full((2,), options.image.size, device=spread.device)
+        self.rig = factory.resized(self.size)
+        self.scale = options.image.size / factory.image_size.to(spread)  # (C, 2) image pixels a sensor pixel
+        self.unit = self.scale.prod(-1).sqrt()[:, None]  # (C, 1) the same, mean of both axes
+        units = torch.ones_like(spread)
+        units[..., 6:10] = torch.cat((self.scale, self.scale), -1)
+        self.image_spread = spread * units
+        self.points = obj.points.to(spread)
+        self.colours = obj.colours.to(spread.device, torch.float32)
+
+    def look(self, images: Tensor, guess: Prediction, known: _Dots | None = None) -> _Dots:
+        """Find the dots of images (B, C, 3, H, W) near where a prediction puts them, or near where they are known."""
+        options, flat, batch = self.options, images.flatten(0, 1), images.shape[:2]
+        uv = self._places(guess)
+        if known is None:
+            blurs, steps = options.blurs, options.steps
+        else:
+            blurs, steps = options.blurs[-1:], 2 * options.steps
+            uv = torch.where(known.believed[..., None], known.uv, uv)
+        far, amplitude, light = (part.unflatten(0, batch) for part in self._far(flat, uv.flatten(0, 1), blurs))
+        uv = far if known is None else uv  # of what is known, only whether it is there is asked again
+        own = torch.arange(self.obj.fiducials, device=uv.device).expand(uv.shape[:-1])
+        return self._measure(images, uv, amplitude > PRESENT, own, light, steps)
+
+    def near(self, guess: Prediction, dots: _Dots) -> Tensor:
+        """Tell which guesses most dots are near to: (B,) bool."""
+        offset = torch.where(dots.believed, (self._places(guess) - dots.uv).norm(dim=-1), torch.nan)
+        return offset.flatten(1).nanmedian(-1).values < self.options.near
+
+    def explained(self, result: Estimate, dots: _Dots) -> Tensor:
+        """Count the dots that rigs explain, (B,): none where they contradict each other."""
+        return dots.believed.sum((1, 2)) * (result.chi2_per_dof < self.options.most_chi2)
+
+    def relabel(self, images: Tensor, guess: Prediction, dots: _Dots) -> _Dots:
+        """Find dots again that were drawn in each other's colours, by the rig that most dots agree on.
+
+        Args:
+            images: (B, C, 3, H, W).
+            guess: (B,) where to start.
+            dots: what was found; some may be at the place of another fiducial.
+        """
+        rig = self._agreed(guess, dots)
+        uv = self._places(rig)
+        offset = (uv - dots.uv).norm(dim=-1)
+        colour = colours_at(images.flatten(0, 1), uv.flatten(0, 1), self.options.image.dot)
+        fits = dots.believed & (offset < self.options.gate * dots.sigma)
+        taken = exchanged(colour.unflatten(0, uv.shape[:2]), self.colours, fits)
+        return self._measure(images, uv, taken >= 0, taken.clamp_min(0), dots.light, 2 * self.options.steps)
+
+    def _agreed(self, guess: Prediction, dots: _Dots) -> Prediction:
+        """Estimate rigs in spite of dots that are not what they seem."""
+        typical = float(dots.sigma[dots.believed].median()) if bool(dots.believed.any()) else 1.0
+        factor = torch.where(dots.believed, dots.sigma / typical, 1.0)
+        weighed = Prediction(guess.rig, guess.rig_from_object, factor.log())
+        views = Views(uv=dots.uv, seen=dots.believed)
+        return refine_robustly(weighed, views, self.rig, self.obj, self.image_spread, sigma=typical)
+
+    def _places(self, guess: Prediction) -> Tensor:
+        """Where a prediction puts the dots: (B, C, N, 2), finite."""
+        size = self.options.image.size
+        radius = None if self.obj.radius is None else self.obj.radius.to(self.points)
+        uv = guess.rig.project(guess.rig_from_object.apply(self.points), radius).uv
+        return uv.nan_to_num(size / 2).clamp(-FARTHEST * size, FARTHEST * size)
+
+    def _measure(self, images: Tensor, uv: Tensor, present: Tensor, colour: Tensor, light: Tensor, steps: int) -> _Dots:
+        """Fit dots of given colours near given places, and say which to believe.
+
+        Args:
+            images: (B, C, 3, H, W).
+            uv: (B, C, N, 2) where they are expected.
+            present: (B, C, N) bool: which are there.
+            colour: (B, C, N) the fiducial whose colour they have; those of the present ones differ.
+            light: (B, C), see `_Dots`.
+            steps: near steps.
+        """
+        options, size = self.options, self.options.image.size
+        batch = uv.shape[:2]
+        painted, there = uv.clone(), torch.zeros_like(present)  # in the order of the colours
+        place = present.nonzero(as_tuple=True)
+        paint = (*place[:2], colour[place])
+        painted[paint], there[paint] = uv[place], True
+        fit = self._near(images.flatten(0, 1), painted.flatten(0, 1), there.flatten(0, 1), steps)
+        uv, variance, mean_square = (
+            part.unflatten(0, batch).gather(
+                2, colour.view(*colour.shape, *[1] * (part.ndim - 2)).expand(*colour.shape, *part.shape[2:])
+            )
+            for part in (fit.uv, fit.variance, fit.mean_square)
+        )
+        noise = mean_square.clamp_min((options.noise / LEVELS) ** 2)
+        sigma = (variance * noise + (options.position_noise * self.unit) ** 2).sqrt()
+        inside = ((uv > -0.5) & (uv < size - 0.5)).all(-1)
+        explained = mean_square < (options.most_residual / LEVELS) ** 2
+        return _Dots(uv, sigma, present & inside & explained & sigma.isfinite(), light, colour)
+
+    def _far(self, flat: Tensor, uv: Tensor, blurs: tuple[float, ...]) -> tuple[Tensor, Tensor, Tensor]:
+        """Take blurred steps: places (M, N, 2), amplitudes (M, N) and the light of each image (M,)."""
+        options, pool = self.options, self.options.pooling
+        pieces = flat.split(_chunk(flat, flat.shape[1:].numel()))
+        pooled, dot = torch.cat([_pooled(some, pool) for some in pieces]), options.image.dot / pool
+        shift, amplitude = options.shift.scaled(1 / pool), uv.new_ones(uv.shape[:-1])
+        near = ((uv + 0.5) / pool - 0.5).to(self.colours)
+        for blur in blurs:
+            step, amplitude = blurred_step(pooled, near, self.colours, dot, blur / pool, shift, options.trust)
+            near = near + step
+        dark = (1 + options.noise) / LEVELS  # noise that cannot be negative adds up over a black image
+        light = torch.where(pooled > dark, pooled, 0.0).sum((1, 2, 3))
+        return (near.to(uv) + 0.5) * pool - 0.5, amplitude, light / (2 * math.pi * dot**2)
+
+    def _near(self, flat: Tensor, uv: Tensor, present: Tensor, steps: int) -> NearFit:
+        """Take near steps, as many images at a time as their temporaries leave room for."""
+        count = _chunk(flat, self.colours.numel() * len(self.colours) * FLOATS_A_PAIR)
+        parts = zip(flat.split(count), uv.split(count), present.split(count), strict=True)
+        dot = self.options.image.dot
+        fits = [DotWindows(some, at, self.colours, dot).fit(at, there, steps) for some, at, there in parts]
+        return fits[0] if len(fits) == 1 else NearFit(*(torch.cat(column) for column in zip(*fits, strict=True)))
+
+    def solve(self, dots: _Dots, guess: Prediction) -> Estimate:
+        """Find the rig (for images) that explains the dots; `converged` where images and prior confirm it."""
+        result = estimate(
+            Observations(dots.uv.unsqueeze(1), dots.sigma.unsqueeze(1), dots.believed.unsqueeze(1)),
+            self.rig,
+            self.obj,
+            guess.rig_from_object.reshape(-1, 1),
+            spread=self.image_spread,
+            first_guess=guess.rig,
+            options=self.options.estimation,
+        )
+        brightness = self.colours.sum(-1)
+        stray = dots.light - (dots.believed * brightness[dots.colour]).sum(
+            -1
+        )  # saturation and borders only make it smaller
+        explained = (stray < PRESENT * brightness.min()).all(-1) & (result.chi2_per_dof < self.options.most_chi2)
+        return replace(result, converged=result.converged & explained)
+
+    def on_sensor(self, result: Estimate, dots: _Dots) -> tuple[Estimate, Observations]:
+        """Take an estimate for images, and what it is from, to the sensors' pixels."""
+        observations = Observations(
+            self.options.image.to_sensor(dots.uv, self.factory.image_size).unsqueeze(1),
+            (dots.sigma / self.unit).unsqueeze(1),
+            dots.believed.unsqueeze(1),
+        )
+        sensor = replace(
+            result,
+            rig=result.rig.resized(self.factory.image_size),
+            residual=result.residual / self.scale[:, None],
+            problem=make_problem(observations, self.factory, self.obj, self.spread),
+        )
+        return sensor, observations
+
+
+def _chunk(images: Tensor, floats: int) -> int:
+    """How many images to work on at a time, where one needs so many floats."""
+    return max(1, CHUNK.get(images.device.type, CHUNK["cuda"]) // floats)
+
+
+def _pooled(images: Tensor, pool: int) -> Tensor:
+    """Mean over squares of pixels: (M, K, H, W) -> (M, K, H / pool, W / pool), float32."""
+    rows = images[:, :, ::pool].float()
+    for row in range(1, pool):  # slices: several times faster than a sum over a short axis
+        rows = rows + images[:, :, row::pool].float()
+    width = images.shape[-1]
+    average = torch.eye(width // pool, device=images.device).repeat_interleave(pool, 0) / pool**2
+    return rows @ average
+
+
+def _check(images: Tensor, factory: CameraRig, options: ImageRefinementOptions) -> None:
+    size = options.image.size
+    if size % options.pooling:
+        raise InputError(f"image size: found {size}, expected a multiple of the {options.pooling} pixels of pooling")
+    if images.ndim != 5 or images.shape[1:] != (factory.cameras, 3, size, size):
+        raise InputError(
+            f"images: found shape {tuple(images.shape)}, expected (rigs, {factory.cameras}, 3, {size}, {size})"
+        )

@@ -1,0 +1,157 @@
+"""Synthetic captures with known truth: one drifted rig, an object that moves, realistic infrared frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.synthesis.rigs import Drift, PoseRange, Snapshots, synthesize
+from imgcal.synthesis.spheres import sphere_images
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.observations import BlobFlag, Detections
+from imgcal.types.rig import CameraRig
+from renderers import Blobs, ClutterModel, SensorModel, infrared_frames, sample_clutter
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What a capture was made from."""
+
+    rig: CameraRig  # the drifted rig
+    rig_from_object: RigidTransform  # (S,)
+    uv: Tensor  # (S, C, N, 2) pixels, exact image points
+    visible: Tensor | None = None  # (S, C, N) bool, where a camera does not see everything; None = all is seen
+
+
+@dataclass(frozen=True)
+class FrameModel:
+    """How markers become frames."""
+
+    sensor: SensorModel = SensorModel()
+    clutter: ClutterModel | None = None
+    marker_radius: float = 6.0  # mm, where the object's fiducials have no radius of their own
+
+
+def simulate_truth(
+    rig: CameraRig,
+    obj: CalibrationObject,
+    snapshots: int,
+    generator: torch.Generator,
+    drift: Drift | None,
+    pose_range: PoseRange = PoseRange(),
+) -> Truth:
+    """Disturb the rig once, then move the object: every fiducial is in view of every camera in every snapshot.
+
+    Raises:
+        RefusedError: the drifted rig cannot see the object.
+    """
+    # The first snapshot decides about the drift too, so that the rig is one that sees the object at all.
+    first = synthesize(rig, obj, 1, generator, drift=drift, pose_range=pose_range)
+    true_rig = first.rig[0]
+    parts: list[Snapshots] = [first]
+    if snapshots > 1:
+        parts.append(synthesize(true_rig, obj, snapshots - 1, generator, drift=None, pose_range=pose_range))
+    poses = RigidTransform(
+        torch.cat([part.rig_from_object.rotation for part in parts]),
+        torch.cat([part.rig_from_object.translation for part in parts]),
+    )
+    return Truth(true_rig, poses, torch.cat([part.projection.uv for part in parts]))
+
+
+def simulate_volume(
+    rig: CameraRig,
+    obj: CalibrationObject,
+    snapshots: int,
+    generator: torch.Generator,
+    drift: Drift | None,
+    low: tuple[float, float, float] = (-1600.0, -1600.0, 300.0),
+    high: tuple[float, float, float] = (1600.0, 1600.0, 2000.0),
+) -> Truth:
+    """Disturb the rig once, then carry the object through a box: a wand in a room, seen by some cameras at a time.
+
+    Args:
+        rig: the factory rig, without batch axes.
+        obj: the calibration object.
+        snapshots: number of poses, S: positions even in the box, orientations even over all rotations.
+        generator: source of randomness.
+        drift: how the parameters differ from the factory's; None = not at all.
+        low: lower corner of the box for the object's centroid, mm in the rig's frame.
+        high: upper corner of the box.
+    """
+    true_rig = rig if drift is None else drift.apply(rig, generator)
+    points = obj.points.to(rig.focal_length)
+    corners = points.new_tensor((low, high))
+    centres = torch.lerp(corners[0], corners[1], torch.rand(snapshots, 3, generator=generator, dtype=points.dtype))
+    quaternion = torch.randn(snapshots, 4, generator=generator, dtype=points.dtype)
+    rotation = torch.from_numpy(Rotation.from_quat(quaternion.numpy()).as_matrix()).to(points)
+    poses = RigidTransform(rotation, centres - rotation @ points.mean(0))
+    seen = true_rig.expand(snapshots).project(poses.apply(points), obj.radius)
+    return Truth(true_rig, poses, seen.uv, seen.visible)
+
+
+def simulate_frames(
+    truth: Truth, obj: CalibrationObject, model: FrameModel, generator: torch.Generator
+) -> Iterator[dict[str, NDArray[np.uint8] | NDArray[np.uint16]]]:
+    """Render the frames of one snapshot after another: camera name -> (H, W)."""
+    rig = truth.rig
+    radius = torch.full_like(obj.points[:, 0], model.marker_radius) if obj.radius is None else obj.radius
+    for pose in range(len(truth.uv)):
+        points = truth.rig_from_object[pose].apply(obj.points)
+        projection = rig.project(points, obj.radius)
+        markers = Blobs(
+            uv=projection.uv,
+            shape=sphere_images(rig, points, radius),
+            intensity=torch.ones_like(projection.depth),
+            visible=projection.visible,
+            depth=projection.depth,
+        )
+        yield _frames(markers, rig, model, generator)
+
+
+def true_detections(truth: Truth) -> Detections:
+    """The exact image points of what is seen as labelled detections, without noise."""
+    snapshots, cameras, fiducials = truth.uv.shape[:3]
+    snapshot, camera, fiducial = (a.reshape(-1) for a in np.indices((snapshots, cameras, fiducials)))
+    count = len(snapshot)
+    exact = Detections(
+        uv=truth.uv.reshape(-1, 2).double().numpy(),
+        sigma=np.full(count, 0.1),
+        camera=camera,
+        snapshot=snapshot,
+        fiducial=fiducial,
+        radius=np.full(count, np.nan),
+        flags=np.full(count, int(BlobFlag.NONE), dtype=np.uint8),
+        camera_names=truth.rig.camera_names,
+        snapshot_names=tuple(f"{s:05d}" for s in range(snapshots)),
+    )
+    return exact if truth.visible is None else exact.select(truth.visible.reshape(-1).numpy())
+
+
+def _frames(
+    markers: Blobs, rig: CameraRig, model: FrameModel, generator: torch.Generator
+) -> dict[str, NDArray[np.uint8] | NDArray[np.uint16]]:
+    """Render one snapshot: cameras with images of the same size together."""
+    frames: dict[str, NDArray[np.uint8] | NDArray[np.uint16]] = {}
+    sizes = [tuple(size) for size in rig.image_size.tolist()]
+    for width, height in sorted(set(sizes)):
+        cameras = [camera for camera, size in enumerate(sizes) if size == (width, height)]
+        some = Blobs(
+            markers.uv[cameras].float(),
+            markers.shape[cameras].float(),
+            markers.intensity[cameras].float(),
+            markers.visible[cameras],
+            markers.depth[cameras].float(),
+        )
+        clutter = None
+        if model.clutter is not None:
+            clutter = sample_clutter(model.clutter, some, (height, width), generator=generator)
+        rendered = infrared_frames(some, (height, width), model.sensor, clutter=clutter, generator=generator)
+        frames |= {rig.camera_names[c]: frame for c, frame in zip(cameras, rendered.frames.numpy(), strict=True)}
+    return {name: frames[name] for name in rig.camera_names}

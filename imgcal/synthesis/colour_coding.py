@@ -1,0 +1,87 @@
+"""What image networks look at: one square image a camera, every fiducial a soft dot in its own colour."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from imgcal.errors import InputError
+from imgcal.geometry.projection import resized_pixels
+from imgcal.types.calibration_object import CalibrationObject
+from renderers import splat
+
+LEVELS = 255  # largest grey level of images as they are saved
+LEAST_SIZE, MOST_SIZE = 8, 4096
+
+
+@dataclass(frozen=True)
+class ImageOptions:
+    """Size of the images, and of the dots in them."""
+
+    size: int = 224  # pixels, width and height
+    dot: float = 1.5  # pixels of the image, standard deviation of a dot
+
+    def __post_init__(self) -> None:
+        if not LEAST_SIZE <= self.size <= MOST_SIZE:
+            raise InputError(f"image size: found {self.size}, expected {LEAST_SIZE} to {MOST_SIZE} pixels")
+        if not (math.isfinite(self.dot) and 0 < self.dot < self.size):
+            raise InputError(f"dot: found {self.dot}, expected more than 0 and less than the {self.size} pixels")
+
+    def from_sensor(self, uv: Tensor, image_size: Tensor) -> Tensor:
+        """Take sensor pixels (*B, C, N, 2) to pixels of the image by the pixel-centre rule u' + 1/2 = s (u + 1/2)."""
+        return resized_pixels(uv, (self.size / image_size.to(uv))[:, None])
+
+    def to_sensor(self, uv: Tensor, image_size: Tensor) -> Tensor:
+        """Invert `from_sensor`."""
+        return resized_pixels(uv, (image_size.to(uv) / self.size)[:, None])
+
+
+def render_views(
+    uv: Tensor,
+    seen: Tensor,
+    image_size: Tensor,
+    obj: CalibrationObject,
+    options: ImageOptions = ImageOptions(),
+    *,
+    quantise: bool = False,
+    out: Tensor | None = None,
+) -> Tensor:
+    """Draw what an image network takes: `Views.images`.
+
+    Differentiable in uv. Without gradients, a reused `out` saves most of the time on a CPU (see `renderers.splat`).
+
+    Args:
+        uv: (*B, C, N, 2) pixels of the sensor, projected or detected; anything where not seen.
+        seen: (*B, C, N) bool; the others are not drawn.
+        image_size: (C, 2) width and height of the sensors (`CameraRig.image_size`).
+        obj: N fiducials, whose colours are drawn.
+        options: size of the images and of the dots.
+        quantise: round to 8 bit as images that were saved are; the gradient passes as if it did not.
+        out: (*B, C, 3, size, size) contiguous buffer that is overwritten and returned; not differentiable.
+
+    Returns:
+        (*B, C, 3, size, size) in [0, 1] on black; where dots overlap their light adds up, at most to 1.
+
+    Raises:
+        ValueError: shapes that do not belong together, or `out` while gradients are recorded.
+    """
+    points = options.from_sensor(uv, image_size)
+    colours = obj.colours.to(points)
+    shape = (options.size, options.size)
+    if torch.is_grad_enabled() and points.requires_grad:
+        images = splat(points, colours, options.dot, shape, visible=seen, out=out).clamp(0, 1)
+        return images + (_rounded(images.detach().clone()) - images.detach()) if quantise else images
+    # Rounded to 8 bit before anything coarser: a bfloat16 buffer would round first.
+    direct = out is None or not quantise or out.dtype == points.dtype
+    images = splat(points, colours, options.dot, shape, visible=seen, out=out if direct else None).clamp_(0, 1)
+    if quantise:
+        images = _rounded(images)
+    return images if direct or out is None else out.copy_(images)
+
+
+def _rounded(images: Tensor) -> Tensor:
+    """Round to grey levels, in place."""
+    return images.mul_(LEVELS).round_().div_(LEVELS)

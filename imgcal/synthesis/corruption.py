@@ -1,0 +1,100 @@
+"""What goes wrong in real views: noise, missing fiducials, exchanged labels, false blobs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from imgcal.errors import InputError
+from imgcal.types.prediction import Views
+
+SWAPPED, FALSE = 1, 2
+
+
+@dataclass(frozen=True)
+class Corruption:
+    """How much goes wrong. Shares are of fiducials in one camera's view; each is drawn on its own."""
+
+    noise: float = 0.0  # pixels, one standard deviation of each axis, Gaussian
+    missing: float = 0.0  # share that is not seen
+    swapped: float = 0.0  # share of the seen whose label is exchanged with that of another one in the same camera
+    false: float = 0.0  # share of the seen that is found somewhere else in the image, anywhere
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.noise) and self.noise >= 0):
+            raise InputError(f"noise: found {self.noise}, expected a standard deviation >= 0 in pixels")
+        for name in ("missing", "swapped", "false"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise InputError(f"{name}: found {getattr(self, name)}, expected a share between 0 and 1")
+
+    @property
+    def nothing(self) -> bool:
+        """Tell whether views stay as they are."""
+        return not any(getattr(self, field.name) for field in fields(self))
+
+    @torch.no_grad()
+    def apply(self, views: Views, image_size: Tensor, generator: torch.Generator) -> Corrupted:
+        """Corrupt views of labelled points.
+
+        As many random numbers are drawn whatever the values are, so that of two corruptions from equal generators the
+        larger one hits the same fiducials and more.
+
+        Args:
+            views: uv (B, C, N, 2) and seen (B, C, N); images, if any, are dropped: they are drawn from the result.
+            image_size: (C, 2) pixels, width and height.
+            generator: on the device of the views.
+        """
+        if views.uv is None or views.seen is None:
+            raise ValueError("views hold no points")
+        uv, seen = views.uv, views.seen
+        draws = torch.rand((6, *seen.shape), generator=generator, dtype=uv.dtype, device=uv.device)
+        noise = torch.randn(uv.shape, generator=generator, dtype=uv.dtype, device=uv.device)
+        if self.nothing:
+            return Corrupted(Views(uv=_hidden(uv, seen), seen=seen), seen, torch.zeros_like(seen, dtype=torch.uint8))
+        uv = uv + self.noise * noise
+        seen = seen & (draws[0] >= self.missing)
+        source = _exchanged(seen, self.swapped, draws[1], draws[2])
+        own = torch.arange(seen.shape[-1], device=uv.device)
+        uv = uv.gather(-2, source[..., None].expand(uv.shape))
+        false = seen & (draws[3] < self.false)
+        anywhere = draws[4:].movedim(0, -1)
+        uv = torch.where(false[..., None], anywhere * image_size.to(uv)[:, None] - 0.5, uv)
+        fault = (source != own).to(torch.uint8) * SWAPPED
+        fault = torch.where(false, FALSE, fault)
+        return Corrupted(Views(uv=_hidden(uv, seen), seen=seen), seen & (fault == 0), fault)
+
+
+@dataclass(frozen=True)
+class Corrupted:
+    """Corrupted views, and which of their points are what they are said to be."""
+
+    views: Views  # (B,)
+    inlier: Tensor  # (B, C, N) bool: seen, and neither swapped nor false
+    fault: Tensor  # (B, C, N) uint8: 0, SWAPPED or FALSE; means nothing where not seen
+
+
+def _hidden(uv: Tensor, seen: Tensor) -> Tensor:
+    """Take away where unseen fiducials are: nobody may learn from it."""
+    return torch.where(seen[..., None], uv, 0.0)
+
+
+def _exchanged(seen: Tensor, share: float, order: Tensor, chance: Tensor) -> Tensor:
+    """For each fiducial (*B, N) the one whose place it takes: itself, or its partner in a random pair of seen ones.
+
+    A pair is exchanged with the probability that makes `share` of the seen ones exchanged on average; of an odd number
+    one has no partner.
+    """
+    count = seen.sum(-1, keepdim=True)
+    paired = 2 * (count // 2)
+    probability = (share * count / paired.clamp_min(2)).clamp_max(1)
+    drawn = torch.where(seen, order, 2.0).argsort(-1)  # the seen first, in random order
+    pairs = seen.shape[-1] // 2
+    first, second = drawn[..., 0 : 2 * pairs : 2], drawn[..., 1 : 2 * pairs : 2]
+    complete = 2 * torch.arange(pairs, device=seen.device) < paired
+    exchange = complete & (chance[..., :pairs] < probability)
+    source = torch.arange(seen.shape[-1], device=seen.device).expand(seen.shape).clone()
+    source.scatter_(-1, first, torch.where(exchange, second, first))
+    return source.scatter_(-1, second, torch.where(exchange, first, second))

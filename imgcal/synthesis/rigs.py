@@ -1,0 +1,261 @@
+"""Dynamic camera pose synthesis: random rig poses on a hemisphere, drifted parameters, visibility check.
+
+Source: paper section 4.1. Random numbers come from an explicit `torch.Generator`, whose device is where all runs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from imgcal.errors import InputError, RefusedError
+from imgcal.geometry.projection import Projection
+from imgcal.geometry.rotations import euler_from_rotation, rotation_from_euler
+from imgcal.geometry.transforms import RigidTransform, rotate
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.rig import PARAMETERS, CameraRig, RigPrior
+
+LARGEST_SPREAD = 1e6  # of a drift, in any unit
+
+
+@dataclass(frozen=True)
+class PoseRange:
+    """Where the rig may be: on the hemisphere around the object, looking at it, rolled about its axis. All in rad."""
+
+    theta: tuple[float, float] = (0.0, 2 * math.pi)  # azimuth
+    phi: tuple[float, float] = (0.0, math.pi / 2)  # angle from the zenith
+    alpha: tuple[float, float] = (0.0, 2 * math.pi)  # roll
+
+    @classmethod
+    def overhead(cls) -> PoseRange:
+        """Stay at the zenith with any roll: the paper's "fixed overhead" rows."""
+        return cls(theta=(0.0, 0.0), phi=(0.0, 0.0))
+
+
+@dataclass(frozen=True)
+class RelativeDrift:
+    """The paper's perturbation: every value times 1 + delta, delta uniform in [-kappa, kappa]."""
+
+    kappa_intrinsics: float = 0.025
+    kappa_extrinsics: float = 0.025
+
+    def __post_init__(self) -> None:
+        for name in ("kappa_intrinsics", "kappa_extrinsics"):
+            value = getattr(self, name)
+            if not 0 <= value < 1:
+                raise InputError(f"{name}: found {value}, expected 0 <= kappa < 1 (0.025 is 2.5 %)")
+
+    def apply(self, rig: CameraRig, generator: torch.Generator, *batch: int) -> CameraRig:
+        """Disturb focal lengths, principal points, distortion; Euler angles and positions of the cameras in the rig.
+
+        Returns:
+            (*batch, *B) rigs, each disturbed on its own.
+        """
+        draws = _parameters_first(torch.rand, rig, generator, batch)
+        extrinsics = draws[..., :6] * (2 * self.kappa_extrinsics) + (1 - self.kappa_extrinsics)
+        intrinsics = draws[..., 6:] * (2 * self.kappa_intrinsics) + (1 - self.kappa_intrinsics)
+        angles = extrinsics[..., 0:3] * euler_from_rotation(rig.cam_from_rig.rotation)
+        positions = extrinsics[..., 3:6] * rig.positions
+        rotation = rotation_from_euler(angles)
+        return replace(
+            rig,
+            focal_length=intrinsics[..., 0:2] * rig.focal_length,
+            principal_point=intrinsics[..., 2:4] * rig.principal_point,
+            distortion=intrinsics[..., 4:9] * rig.distortion,
+            cam_from_rig=RigidTransform(rotation, -rotate(rotation, positions)),
+        )
+
+    def std(self, rig: CameraRig) -> Tensor:
+        """Standard deviation of each parameter under this drift: (*B, C, 15), to first order in kappa."""
+        uniform = 1 / math.sqrt(3)
+        k_int, k_ext = self.kappa_intrinsics * uniform, self.kappa_extrinsics * uniform
+        a, b, c = euler_from_rotation(rig.cam_from_rig.rotation).unbind(-1)
+        # d(rotation)/d(angles) as rotation vectors on the left of Rz(c) Ry(b) Rx(a).
+        zero, one = torch.zeros_like(a), torch.ones_like(a)
+        about_x = torch.stack((c.cos() * b.cos(), c.sin() * b.cos(), -b.sin()), -1) * a[..., None]
+        about_y = torch.stack((-c.sin(), c.cos(), zero), -1) * b[..., None]
+        about_z = torch.stack((zero, zero, one), -1) * c[..., None]
+        rotation = (about_x.square() + about_y.square() + about_z.square()).sqrt()
+        return torch.cat(
+            (
+                rotation * k_ext,
+                rig.positions.abs() * k_ext,
+                rig.focal_length * k_int,
+                rig.principal_point * k_int,
+                rig.distortion.abs() * k_int,
+            ),
+            dim=-1,
+        )
+
+
+@dataclass(frozen=True)
+class PhysicalDrift:
+    """Gaussian drift in physical units, for real rigs; each number is one standard deviation."""
+
+    rotation_deg: float = 0.5  # each axis
+    position: float = 2.0  # mm, each axis
+    focal_length: float = 0.01  # relative
+    principal_point: float = 5.0  # pixels
+    distortion: float = 0.005  # absolute
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0 <= value <= LARGEST_SPREAD:
+                raise InputError(
+                    f"{name}: found {value}, expected a standard deviation >= 0, at most {LARGEST_SPREAD:g}"
+                )
+
+    def apply(self, rig: CameraRig, generator: torch.Generator, *batch: int) -> CameraRig:
+        """Disturb every parameter of every camera independently: (*batch, *B) rigs."""
+        return rig.moved(_parameters_first(torch.randn, rig, generator, batch) * self.std(rig))
+
+    def std(self, rig: CameraRig) -> Tensor:
+        """Standard deviation of each parameter: (*B, C, 15)."""
+        as_prior = RigPrior(
+            self.focal_length, self.principal_point, self.distortion, math.radians(self.rotation_deg), self.position
+        )
+        return as_prior.std(rig)
+
+
+Drift = RelativeDrift | PhysicalDrift
+
+
+@dataclass(frozen=True)
+class Snapshots:
+    """Synthetic rigs, each with one view of the object."""
+
+    rig: CameraRig  # (B,) drifted rigs
+    rig_from_object: RigidTransform  # (B,)
+    projection: Projection  # (B, C, N)
+
+
+@torch.no_grad()
+def synthesize(
+    rig: CameraRig,
+    obj: CalibrationObject,
+    count: int,
+    generator: torch.Generator,
+    *,
+    drift: Drift | None = RelativeDrift(),
+    pose_range: PoseRange = PoseRange(),
+    max_rounds: int = 100,
+) -> Snapshots:
+    """Make exactly `count` random rigs that see every fiducial in every camera.
+
+    Args:
+        rig: the factory rig, without batch axes; device and dtype come from it.
+        obj: the calibration object; its centroid is put on the rig's axis at the working distance.
+        count: number of rigs, B.
+        generator: source of randomness, on the rig's device.
+        drift: how the parameters differ from the factory's; None = not at all.
+        pose_range: where the rig may be.
+        max_rounds: rounds of rejection before giving up.
+
+    Raises:
+        RefusedError: too few random rigs see everything; the message names the camera that fails most.
+
+    Source: paper section 4.1: hemisphere point, R_focus, R_random, perturbation, visibility check.
+    """
+    points, radius = obj.points.to(rig.focal_length), None if obj.radius is None else obj.radius.to(rig.focal_length)
+    kept: list[Snapshots] = []
+    missing, tried, failures = count, 0, torch.zeros(rig.cameras, device=points.device)
+    for _ in range(max_rounds):
+        accepted = max(tried - int(failures.amax()), 1) / max(tried, 1)
+        batch = count if not kept and not tried else min(math.ceil(1.2 * missing / accepted) + 8, 4 * count + 64)
+        trial = _sample(rig, points, radius, batch, generator, drift, pose_range)
+        seen = trial.projection.visible.all(-1)  # (B, C)
+        good = seen.all(-1)
+        found = int(good.sum())
+        if found == batch and not kept and batch == count:
+            return trial
+        tried, failures = tried + batch, failures + (~seen).sum(0)
+        kept.append(_take(trial, good.nonzero().squeeze(-1)[:missing]))
+        missing -= min(found, missing)
+        if missing == 0:
+            return _concatenate(kept)
+    worst = int(failures.argmax())
+    raise RefusedError(
+        f"synthesis: {count - missing} of {count} rigs after {tried} trials; camera {rig.camera_names[worst]} misses "
+        f"part of object {obj.name} in {100 * float(failures[worst]) / tried:.0f} % of them: reduce the drift, the "
+        "pose range or the object, or change the working distance"
+    )
+
+
+def sample_rig_from_object(
+    count: int, working_distance: float, centroid: Tensor, pose_range: PoseRange, generator: torch.Generator
+) -> RigidTransform:
+    """Sample poses of an object seen from a rig on a hemisphere around it.
+
+    Args:
+        count: number of poses, B.
+        working_distance: mm from the rig's origin to the object's centroid.
+        centroid: (3,) mm in the object's frame; gives dtype and device.
+        pose_range: where the rig may be.
+        generator: source of randomness.
+
+    Returns:
+        (B,) rig_from_object: the object's centroid at (0, 0, working_distance), R_focus, then the roll R_random.
+    """
+    draws = torch.rand((3, count), generator=generator, dtype=centroid.dtype, device=centroid.device)
+    low, high = centroid.new_tensor((pose_range.theta, pose_range.phi, pose_range.alpha)).unsqueeze(-2).unbind(-1)
+    angles = torch.lerp(low, high, draws)
+    (st, sp, sa), (ct, cp, ca) = angles.sin(), angles.cos()
+    # R_random times R_focus, whose rows are the unit vectors of azimuth and zenith angle and the viewing direction.
+    inward_x, inward_y = -sp * ct, -sp * st
+    along_x, along_y = cp * ct, cp * st
+    entries = (
+        -ca * st - sa * along_x, ca * ct - sa * along_y, sa * sp,
+        ca * along_x - sa * st, sa * ct + ca * along_y, -ca * sp,
+        inward_x, inward_y, -cp,
+    )  # fmt: skip
+    rotation = torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
+    target = centroid.new_tensor((0.0, 0.0, working_distance))
+    return RigidTransform(rotation, target - rotation @ centroid)
+
+
+def _sample(
+    rig: CameraRig,
+    points: Tensor,
+    radius: Tensor | None,
+    count: int,
+    generator: torch.Generator,
+    drift: Drift | None,
+    pose_range: PoseRange,
+) -> Snapshots:
+    if rig.working_distance is None:
+        raise InputError(f"rig {rig.name}: found no working_distance, expected one (mm) to place the rig by")
+    poses = sample_rig_from_object(count, rig.working_distance, points.mean(0), pose_range, generator)
+    drifted = rig.expand(count) if drift is None else drift.apply(rig, generator, count)
+    return Snapshots(drifted, poses, drifted.project_values(poses.apply(points), radius))
+
+
+def _take(snapshots: Snapshots, rows: Tensor) -> Snapshots:
+    p = snapshots.projection
+    projection = Projection(p.uv[rows], p.depth[rows], p.visible[rows])
+    return Snapshots(snapshots.rig[rows], snapshots.rig_from_object[rows], projection)
+
+
+def _concatenate(parts: list[Snapshots]) -> Snapshots:
+    rig = CameraRig.joined([part.rig for part in parts], torch.cat)
+    projection = Projection(
+        torch.cat([part.projection.uv for part in parts]),
+        torch.cat([part.projection.depth for part in parts]),
+        torch.cat([part.projection.visible for part in parts]),
+    )
+    return Snapshots(rig, RigidTransform.joined([part.rig_from_object for part in parts], torch.cat), projection)
+
+
+def _parameters_first(
+    draw: Callable[..., Tensor], rig: CameraRig, generator: torch.Generator, batch: tuple[int, ...]
+) -> Tensor:
+    """Draw a number for every parameter: (*batch, *B, C, 15), parameters first in memory, for long contiguous rows.
+
+    Elementwise operations keep the memory order of their first operand.
+    """
+    like = rig.focal_length
+    shape = (PARAMETERS, *batch, *like.shape[:-1])
+    return draw(shape, generator=generator, dtype=like.dtype, device=like.device).movedim(0, -1)

@@ -1,0 +1,89 @@
+"""What a network is given (`Views`) and what it returns (`Prediction`)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from imgcal.geometry.rotations import rotation_from_6d, sixd_from_rotation
+from imgcal.geometry.transforms import Join, RigidTransform
+from imgcal.types.rig import CameraRig
+
+
+@dataclass(frozen=True)
+class Views:
+    """One snapshot of each rig, as the networks take it: labelled points, colour-coded images, or both."""
+
+    uv: Tensor | None = None  # (B, C, N, 2) pixels of the sensor; any finite value where not seen
+    seen: Tensor | None = None  # (B, C, N) bool
+    images: Tensor | None = None  # (B, C, 3, H, W) in [0, 1], colour-coded splats on black
+
+    def __len__(self) -> int:
+        given = self.images if self.uv is None else self.uv
+        if given is None:
+            raise ValueError("views hold neither points nor images")
+        return len(given)
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A rig and the object's pose in it. Only their product, the cameras seen from the object, is what images show."""
+
+    rig: CameraRig  # (B,)
+    rig_from_object: RigidTransform  # (B,)
+    log_sigma: Tensor | None = None  # (B, C, N) log of the factor on each fiducial's sigma in a refinement; None = 1
+
+    def __getitem__(self, rows: Tensor | slice) -> Prediction:
+        """Keep some rigs of the batch."""
+        log_sigma = None if self.log_sigma is None else self.log_sigma[rows]
+        return Prediction(self.rig[rows], self.rig_from_object[rows], log_sigma)
+
+    @property
+    def cameras_from_object(self) -> CameraRig:
+        """The cameras in the object's frame: what the paper's 21 numbers a camera describe."""
+        return self.rig.from_object(self.rig_from_object)
+
+    @classmethod
+    def from_cameras(cls, cameras: CameraRig, factory: CameraRig) -> Prediction:
+        """Split cameras in the object's frame into a rig near the factory's, and the object's pose.
+
+        Args:
+            cameras: (B,) rigs whose cam_from_rig is cam_from_object, each camera on its own (the paper's networks).
+            factory: the factory rig, without batch axes.
+
+        Returns:
+            The same cameras; the pose is the mean over cameras of what each says with its factory place in the rig.
+        """
+        each = factory.to(cameras.focal_length.dtype).cam_from_rig.inverse() @ cameras.cam_from_rig  # (B, C)
+        rotation = rotation_from_6d(sixd_from_rotation(each.rotation.mean(-3)))
+        pose = RigidTransform(rotation, each.translation.mean(-2))
+        inverse = pose.inverse()
+        cam_from_rig = cameras.cam_from_rig @ RigidTransform(inverse.rotation[:, None], inverse.translation[:, None])
+        rig = replace(
+            factory,
+            focal_length=cameras.focal_length,
+            principal_point=cameras.principal_point,
+            distortion=cameras.distortion,
+            cam_from_rig=cam_from_rig,
+        )
+        return cls(rig, pose)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Prediction], join: Join) -> Prediction:
+        """Make one of several as `CameraRig.joined` does; `log_sigma` is left out."""
+        poses = RigidTransform.joined([part.rig_from_object for part in parts], join)
+        return cls(CameraRig.joined([part.rig for part in parts], join), poses)
+
+    def detach(self) -> Prediction:
+        """Cut the graph."""
+        pose = RigidTransform(self.rig_from_object.rotation.detach(), self.rig_from_object.translation.detach())
+        log_sigma = None if self.log_sigma is None else self.log_sigma.detach()
+        return Prediction(self.rig.map_tensors(lambda tensor, _: tensor.detach()), pose, log_sigma)
+
+    def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Prediction:
+        """Change the floating-point type, move to a device, or both."""
+        log_sigma = None if self.log_sigma is None else self.log_sigma.to(dtype=dtype, device=device)
+        return Prediction(self.rig.to(dtype, device), self.rig_from_object.to(dtype, device), log_sigma)

@@ -1,0 +1,277 @@
+"""`CameraRig`: intrinsics and extrinsics of any number of cameras, with any leading batch axes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from imgcal.geometry.projection import Projection, project_components, resized_pixels
+from imgcal.geometry.projection_cpu import project_cpu
+from imgcal.geometry.rotations import rotation_from_6d, rotation_from_vector, sixd_from_rotation, vector_from_rotation
+from imgcal.geometry.transforms import Join, RigidTransform, rotate
+
+PARAMETERS = 15
+"""Free parameters of a camera, in this order: rotation (3, rad), position (3, mm), focal length (2, pixels), principal
+point (2, pixels), distortion (5). Rotation: cam_from_rig = exp(w) cam_from_rig0. Position: of the camera in the rig."""
+
+PARAMETER_NAMES = (
+    "rotation_x", "rotation_y", "rotation_z", "position_x", "position_y", "position_z",
+    "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class RigPrior:
+    """One standard deviation of each factory value: how far a camera may have drifted."""
+
+    focal_length: float = 0.02  # relative
+    principal_point: float = 10.0  # pixels
+    distortion: float = 0.05  # absolute
+    rotation: float = 0.01  # rad, each axis
+    position: float = 10.0  # mm, each axis
+
+    def std(self, rig: CameraRig) -> Tensor:
+        """Spread over the parameters of each camera: (*B, C, 15), in the order of `PARAMETER_NAMES`."""
+        ones = torch.ones_like(rig.distortion)
+        return torch.cat(
+            (
+                ones[..., :3] * self.rotation,
+                ones[..., :3] * self.position,
+                rig.focal_length * self.focal_length,
+                ones[..., :2] * self.principal_point,
+                ones * self.distortion,
+            ),
+            dim=-1,
+        )
+
+
+@dataclass(frozen=True)
+class CameraRig:
+    """Cameras fixed to a common frame: whatever the factory says it is; only relations between cameras matter."""
+
+    focal_length: Tensor  # (*B, C, 2) pixels: fx, fy
+    principal_point: Tensor  # (*B, C, 2) pixels: cx, cy
+    distortion: Tensor  # (*B, C, 5): k1, k2, p1, p2, k3
+    cam_from_rig: RigidTransform  # (*B, C)
+    image_size: Tensor  # (C, 2) pixels: width, height
+    camera_names: tuple[str, ...]  # C
+    name: str = "rig"
+    working_distance: float | None = None  # mm, from the rig's origin to the object
+    prior: RigPrior | None = None
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """Leading batch axes."""
+        return self.focal_length.shape[:-2]
+
+    @property
+    def cameras(self) -> int:
+        """Number of cameras, C."""
+        return len(self.camera_names)
+
+    @property
+    def positions(self) -> Tensor:
+        """Camera centres in the rig frame: (*B, C, 3) mm."""
+        return -self.cam_from_rig.origin_image()
+
+    def project(self, points_rig: Tensor, radius: Tensor | None = None) -> Projection:
+        """Project points into every camera.
+
+        Args:
+            points_rig: (*B, N, 3) mm, points in the rig frame; batch axes broadcast against the rig's.
+            radius: (N,) mm of spherical fiducials, whose apparent centres are projected; None = points.
+
+        Returns:
+            uv (*B, C, N, 2), depth and visible (*B, C, N); differentiable.
+        """
+        # Components apart, and fiducials first in memory: each step then runs over one long row of all cameras.
+        components = points_rig.movedim((-1, -2), (0, 1)).contiguous().unsqueeze(-1)  # (3, N, *B, 1)
+        x, y, z = components.expand(*components.shape[:-1], self.cameras).contiguous().movedim(1, -1)  # (*B, C, N)
+        rows = self.cam_from_rig.rotation.unsqueeze(-3).unbind(-2)
+        shifts = self.cam_from_rig.translation.unsqueeze(-2).unbind(-1)
+        points_cam = []
+        for row, shift in zip(rows, shifts, strict=True):
+            by_x, by_y, by_z = row.unbind(-1)  # (*B, C, 1)
+            points_cam.append(torch.addcmul(torch.addcmul(torch.addcmul(shift, x, by_x), y, by_y), z, by_z))
+        return project_components(
+            tuple(points_cam), self.focal_length, self.principal_point, self.distortion, self.image_size, radius
+        )
+
+    def project_values(self, points_rig: Tensor, radius: Tensor | None = None) -> Projection:
+        """Do the work of `project` without gradients: several times faster on the CPU.
+
+        Args:
+            points_rig: (B, N, 3) mm, for the (B,) rigs of this one; same floating-point type.
+            radius: (N,) mm of spherical fiducials; None = points.
+        """
+        if points_rig.device.type != "cpu":
+            with torch.no_grad():
+                return self.project(points_rig, radius)
+        lens = (self.focal_length, self.principal_point, self.distortion)
+        return project_cpu(points_rig, self.cam_from_rig, *lens, self.image_size, radius)
+
+    def from_object(self, rig_from_object: RigidTransform) -> CameraRig:
+        """Express the rig in the frame of an object: `cam_from_rig` of the result is `cam_from_object`.
+
+        Args:
+            rig_from_object: (*B) transforms.
+
+        Returns:
+            The same cameras; batch axes broadcast.
+        """
+        expanded = RigidTransform(rig_from_object.rotation[..., None, :, :], rig_from_object.translation[..., None, :])
+        cam_from_object = self.cam_from_rig @ expanded
+        batch = cam_from_object.rotation.shape[:-3]
+        return replace(
+            self,
+            focal_length=self.focal_length.expand(*batch, -1, -1),
+            principal_point=self.principal_point.expand(*batch, -1, -1),
+            distortion=self.distortion.expand(*batch, -1, -1),
+            cam_from_rig=cam_from_object,
+        )
+
+    def moved(self, step: Tensor) -> CameraRig:
+        """Add a step to the parameters: (*B, C, 15), in the order of `PARAMETER_NAMES`."""
+        rotation = rotation_from_vector(step[..., 0:3]) @ self.cam_from_rig.rotation
+        positions = self.positions + step[..., 3:6]
+        return replace(
+            self,
+            focal_length=self.focal_length + step[..., 6:8],
+            principal_point=self.principal_point + step[..., 8:10],
+            distortion=self.distortion + step[..., 10:15],
+            cam_from_rig=RigidTransform(rotation, -rotate(rotation, positions)),
+        )
+
+    def difference(self, reference: CameraRig) -> Tensor:
+        """Invert `moved`: the step (*B, C, 15) that takes `reference` to this rig."""
+        rotation = self.cam_from_rig.rotation @ reference.cam_from_rig.rotation.mT
+        parts = (
+            vector_from_rotation(rotation),
+            self.positions - reference.positions,
+            self.focal_length - reference.focal_length,
+            self.principal_point - reference.principal_point,
+            self.distortion - reference.distortion,
+        )
+        batch = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
+        return torch.cat([part.expand(*batch, -1) for part in parts], dim=-1)
+
+    def resized(self, image_size: Tensor) -> CameraRig:
+        """Scale the intrinsics to images of another size by the pixel-centre rule u' + 1/2 = s (u + 1/2).
+
+        Args:
+            image_size: (C, 2) or (2,) pixels: new width, height.
+        """
+        image_size = image_size.expand(self.cameras, 2)
+        scale = image_size.to(self.focal_length) / self.image_size.to(self.focal_length)
+        return replace(
+            self,
+            focal_length=self.focal_length * scale,
+            principal_point=resized_pixels(self.principal_point, scale),
+            image_size=image_size,
+        )
+
+    def select(self, cameras: Sequence[int]) -> CameraRig:
+        """Keep the cameras of the given indices, in the given order."""
+        index = list(cameras)
+        return replace(
+            self,
+            focal_length=self.focal_length[..., index, :],
+            principal_point=self.principal_point[..., index, :],
+            distortion=self.distortion[..., index, :],
+            cam_from_rig=RigidTransform(
+                self.cam_from_rig.rotation[..., index, :, :], self.cam_from_rig.translation[..., index, :]
+            ),
+            image_size=self.image_size[index],
+            camera_names=tuple(self.camera_names[i] for i in index),
+        )
+
+    @classmethod
+    def joined(cls, rigs: Sequence[CameraRig], join: Join) -> CameraRig:
+        """Make one of several; `join` takes the list of their focal lengths, and so on. The rest is the first one's."""
+        return replace(
+            rigs[0],
+            focal_length=join([rig.focal_length for rig in rigs]),
+            principal_point=join([rig.principal_point for rig in rigs]),
+            distortion=join([rig.distortion for rig in rigs]),
+            cam_from_rig=RigidTransform.joined([rig.cam_from_rig for rig in rigs], join),
+        )
+
+    def __getitem__(self, index: object) -> CameraRig:
+        """Index the batch axes."""
+        return self.map_tensors(lambda tensor, _: tensor[index])  # type: ignore[index]
+
+    def expand(self, *batch: int) -> CameraRig:
+        """Repeat the rig over leading batch axes without copying."""
+        return self.map_tensors(lambda tensor, axes: tensor.expand(*batch, *tensor.shape[-axes:]))
+
+    def reshape(self, *batch: int) -> CameraRig:
+        """Change the batch axes to another shape with as many rigs."""
+        return self.map_tensors(lambda tensor, axes: tensor.reshape(*batch, *tensor.shape[-axes:]))
+
+    def map_tensors(self, function: Callable[[Tensor, int], Tensor]) -> CameraRig:
+        """Apply `function(tensor, number of its axes that are not batch)` to every tensor that has batch axes."""
+        return replace(
+            self,
+            focal_length=function(self.focal_length, 2),
+            principal_point=function(self.principal_point, 2),
+            distortion=function(self.distortion, 2),
+            cam_from_rig=RigidTransform(
+                function(self.cam_from_rig.rotation, 3), function(self.cam_from_rig.translation, 2)
+            ),
+        )
+
+    def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> CameraRig:
+        """Change the floating-point type, move to a device, or both."""
+        return replace(
+            self,
+            focal_length=self.focal_length.to(dtype=dtype, device=device),
+            principal_point=self.principal_point.to(dtype=dtype, device=device),
+            distortion=self.distortion.to(dtype=dtype, device=device),
+            cam_from_rig=self.cam_from_rig.to(dtype=dtype, device=device),
+            image_size=self.image_size.to(device=device),
+        )
+
+
+def pack21(rig: CameraRig) -> Tensor:
+    """Pack the paper's 21 numbers a camera: rotation (9, row-major), translation, f, principal point, distortion (5).
+
+    Args:
+        rig: a rig in the object's frame (`CameraRig.from_object`).
+
+    Returns:
+        (*B, C, 21). Convention: distortion in our order k1, k2, p1, p2, k3; the paper lists k1, k2, k3, p1, p2.
+    """
+    return torch.cat((rig.cam_from_rig.rotation.flatten(-2), _pack_rest(rig)), dim=-1)
+
+
+def pack18(rig: CameraRig) -> Tensor:
+    """Pack the paper's 18 network outputs a camera: `pack21` with the 6D rotation for the matrix; (*B, C, 18)."""
+    return torch.cat((sixd_from_rotation(rig.cam_from_rig.rotation), _pack_rest(rig)), dim=-1)
+
+
+def unpack21(packed: Tensor, like: CameraRig) -> CameraRig:
+    """Invert `pack21`; names and image sizes come from `like`."""
+    return _unpack(packed[..., :9].unflatten(-1, (3, 3)), packed[..., 9:], like)
+
+
+def unpack18(packed: Tensor, like: CameraRig) -> CameraRig:
+    """Invert `pack18`; the 6D rotation is orthogonalized; names and image sizes come from `like`."""
+    return _unpack(rotation_from_6d(packed[..., :6]), packed[..., 6:], like)
+
+
+def _pack_rest(rig: CameraRig) -> Tensor:
+    return torch.cat((rig.cam_from_rig.translation, rig.focal_length, rig.principal_point, rig.distortion), dim=-1)
+
+
+def _unpack(rotation: Tensor, rest: Tensor, like: CameraRig) -> CameraRig:
+    translation, focal_length, principal_point, distortion = rest.split((3, 2, 2, 5), dim=-1)
+    return replace(
+        like,
+        focal_length=focal_length,
+        principal_point=principal_point,
+        distortion=distortion,
+        cam_from_rig=RigidTransform(rotation, translation),
+    )

@@ -1,0 +1,223 @@
+"""Add Gaussian splats to images on CPUs: compiled, so that only pixels that a splat reaches are touched.
+
+Tensors cannot add windows without an index for every pixel of every window, or a matrix product over whole images; both
+cost several times what is done here. `additive_splatting.py` says the same in tensors, and this is tested against it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from renderers import additive_splatting
+from renderers.additive_splatting import Splats
+from renderers.compiling import njit
+
+Array = NDArray[np.floating[Any]]
+Flags = NDArray[np.bool_]
+Places = NDArray[np.int32]
+
+# Standard deviations beyond which a profile is less than the rounding of its peak: it is cut off there.
+REACH = {torch.float32: 6.0, torch.float64: 8.6}
+# Fewer images than this are not worth the start of another thread.
+IMAGES_PER_THREAD = 64
+NOWHERE = -(2**31)  # where the windows of splats start that are not drawn
+FAST = {"contract", "reassoc", "nsz"}
+
+
+def added(splats: Splats, image_size: tuple[int, int], out: Tensor | None = None) -> Tensor:
+    """Do the work of `additive_splatting.added`, which has the arguments, for tensors on the CPU."""
+    if out is None:
+        images: Tensor = _Added.apply(image_size, *splats)
+        return images
+    _draw(out, splats)
+    return out
+
+
+class _Added(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image_size: tuple[int, int], *tensors: Tensor) -> Tensor:
+        splats = Splats(*tensors)
+        kind = np.float64 if splats.uv.dtype == torch.float64 else np.float32
+        # NumPy asks Linux for huge pages: most of the time of a large fresh tensor goes into faults of small ones.
+        images = torch.from_numpy(np.empty((len(splats.uv), splats.colours.shape[2], *image_size), dtype=kind))
+        ctx.save_for_backward(*splats, *_draw(images, splats))
+        return images
+
+    @staticmethod
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+        *values, visible, steps, starts = ctx.saved_tensors
+        if torch.is_grad_enabled():  # the gradient itself is to be differentiated
+            images = additive_splatting.added(Splats._make((*values, visible)), (upstream.shape[2], upstream.shape[3]))
+            wanted = [x for x in values if x.requires_grad]
+            found = iter(torch.autograd.grad(images, wanted, upstream, create_graph=True))
+            return (None, *(next(found) if x.requires_grad else None for x in values), None)
+        gradients = [torch.empty_like(x, memory_format=torch.contiguous_format) for x in values]
+        _in_threads(_gradients, _arrays(upstream, *values, steps, starts, *gradients))
+        return (None, *gradients, None)
+
+
+def _draw(images: Tensor, splats: Splats) -> tuple[Tensor, Tensor]:
+    """Overwrite images.
+
+    Returns:
+        (B, N, 2, w + 1) error function at the edges of the pixels of each window, and where it starts (B, N, 2).
+
+    """
+    uv, sizes, weight, colours, visible = _arrays(*splats)
+    longest = max(images.shape[2:])
+    half = min(math.ceil(REACH[splats.uv.dtype] * _widest(sizes, visible)), longest)
+    edges = torch.empty((*splats.uv.shape, 2 * half + 2), dtype=splats.uv.dtype)
+    starts = torch.empty(splats.uv.shape, dtype=torch.int32)
+    _place(uv, sizes, visible, longest, *_arrays(edges, starts))
+    steps = edges.erf_()  # of all edges at once, where it is vectorized
+    _in_threads(_add, [images.numpy(), sizes, weight, colours, *_arrays(steps, starts)])
+    return steps, starts
+
+
+def _arrays(*tensors: Tensor) -> list[NDArray[Any]]:
+    """Share the memory of contiguous tensors; copy the others."""
+    return [tensor.detach().contiguous().numpy() for tensor in tensors]
+
+
+def _in_threads(work: Callable[..., None], arrays: list[NDArray[Any]]) -> None:
+    """Call compiled work on all images, or on shares of them in as many threads as torch would use."""
+    count = len(arrays[0])
+    threads = min(torch.get_num_threads(), count // IMAGES_PER_THREAD)
+    if threads < 2:
+        work(*arrays)
+        return
+    bounds = [count * share // threads for share in range(threads + 1)]
+    with ThreadPoolExecutor(threads) as pool:
+        shares = [[x[a:b] for x in arrays] for a, b in pairwise(bounds)]
+        list(pool.map(lambda share: work(*share), shares))
+
+
+@njit(cache=True)
+def _widest(sizes: Array, visible: Flags) -> float:
+    widest = 0.0
+    for b in range(sizes.shape[0]):
+        for n in range(sizes.shape[1]):
+            if visible[b, n] and sizes[b, n] > widest:
+                widest = sizes[b, n]
+    return widest
+
+
+@njit(cache=True, error_model="numpy")
+def _place(uv: Array, sizes: Array, visible: Flags, longest: int, edges: Array, starts: Places) -> None:
+    """Find where windows start, and the edges of their pixels from the centre, in units of sqrt(2) size."""
+    half = edges.shape[3] // 2 - 1
+    for b in range(uv.shape[0]):
+        for n in range(uv.shape[1]):
+            u, v = uv[b, n]
+            if not (visible[b, n] and np.isfinite(u) and np.isfinite(v)):
+                starts[b, n], edges[b, n] = NOWHERE, 0
+                continue
+            scale = 1 / (math.sqrt(2) * sizes[b, n])
+            for axis in range(2):
+                # Far outside the image is as good as just out of reach, and fits into an integer.
+                start = round(min(max(uv[b, n, axis], -half - 1.0), longest + half + 1.0)) - half
+                starts[b, n, axis] = start
+                first = start - 0.5 - uv[b, n, axis]
+                for j in range(edges.shape[3]):
+                    edges[b, n, axis, j] = (first + j) * scale
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _add(images: Array, sizes: Array, weight: Array, colours: Array, steps: Array, starts: Places) -> None:
+    height, width = images.shape[2:]
+    length = steps.shape[3] - 1
+    profiles = np.empty((2, length), dtype=images.dtype)
+    for b in range(images.shape[0]):
+        images[b] = 0
+        for n in range(sizes.shape[1]):
+            left, top = starts[b, n]
+            first, last = max(left, 0), min(left + length, width)
+            if left == NOWHERE or last <= first:
+                continue
+            _profiles(steps[b, n], sizes[b, n], profiles)
+            across, down = profiles[0, first - left : last - left], profiles[1]
+            for k in range(images.shape[1]):
+                light = colours[b, n, k] * weight[b, n]
+                if light == 0:
+                    continue
+                for i in range(max(top, 0), min(top + length, height)):
+                    row, factor = images[b, k, i, first:last], light * down[i - top]
+                    for j in range(len(across)):
+                        row[j] += factor * across[j]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _gradients(
+    upstream: Array, uv: Array, sizes: Array, weight: Array, colours: Array, steps: Array, starts: Places,
+    by_uv: Array, by_sizes: Array, by_weight: Array, by_colours: Array,
+) -> None:  # fmt: skip
+    height, width = upstream.shape[2:]
+    length = steps.shape[3] - 1
+    zero = upstream.dtype.type(0)
+    profiles = np.empty((2, length), dtype=upstream.dtype)
+    by_profiles = np.empty_like(profiles)
+    by_uv[:], by_sizes[:], by_weight[:], by_colours[:] = 0, 0, 0, 0
+    for b in range(upstream.shape[0]):
+        for n in range(sizes.shape[1]):
+            left, top = starts[b, n]
+            first, last = max(left, 0), min(left + length, width)
+            if left == NOWHERE or last <= first:
+                continue
+            _profiles(steps[b, n], sizes[b, n], profiles)
+            by_profiles[:] = 0
+            across, down = profiles[0, first - left : last - left], profiles[1]
+            by_across, by_down = by_profiles[0, first - left : last - left], by_profiles[1]
+            for k in range(upstream.shape[1]):
+                light, by_light = colours[b, n, k] * weight[b, n], zero
+                # Two loops over the window, the second finds it in the cache: a sum alone is vectorized, without
+                # checks whether what is written overlaps what is read.
+                for i in range(max(top, 0), min(top + length, height)):
+                    row, total = upstream[b, k, i, first:last], zero
+                    for j in range(len(across)):
+                        total += row[j] * across[j]
+                    by_down[i - top] += light * total
+                    by_light += down[i - top] * total
+                by_colours[b, n, k] = weight[b, n] * by_light
+                by_weight[b, n] += colours[b, n, k] * by_light
+                for i in range(max(top, 0), min(top + length, height)):
+                    row, factor = upstream[b, k, i, first:last], light * down[i - top]
+                    for j in range(len(across)):
+                        by_across[j] += factor * row[j]
+            for axis in range(2):
+                start = starts[b, n, axis] - uv[b, n, axis]
+                by_uv[b, n, axis], by_size = _through_profile(by_profiles[axis], profiles[axis], start, sizes[b, n])
+                by_sizes[b, n] += by_size
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _profiles(steps: Array, size: float, profiles: Array) -> None:
+    scale = profiles.dtype.type(math.sqrt(math.pi / 2)) * size
+    for axis in range(2):
+        for j in range(profiles.shape[1]):
+            profiles[axis, j] = scale * (steps[axis, j + 1] - steps[axis, j])
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _through_profile(by_profile: Array, values: Array, start: float, size: float) -> Any:
+    """Take a gradient by a profile's pixels to one by its centre and one by its size."""
+    by_centre = by_size = before = by_profile.dtype.type(0)
+    for j in range(len(values)):
+        edge = (start + j - 0.5) / size
+        gaussian = math.exp(-0.5 * edge * edge)
+        # This edge is the right one of the pixel before, and the left one of this pixel.
+        change = by_profile[j] - before
+        by_centre += change * gaussian
+        by_size += change * edge * gaussian + by_profile[j] * values[j] / size
+        before = by_profile[j]
+    edge = (start + len(values) - 0.5) / size
+    gaussian = math.exp(-0.5 * edge * edge)
+    return by_centre - before * gaussian, by_size - before * edge * gaussian

@@ -1,0 +1,57 @@
+import numpy as np
+import torch
+
+from imgcal.association.ambiguities import conflicts, differ, lattice_shifts, moved, near_turns
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.io import load_object
+from imgcal.io.resources import data_path
+from imgcal.types.calibration_object import CalibrationObject
+
+
+def lattice(columns: int, rows: int) -> CalibrationObject:
+    grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows), [0.0]), axis=-1).reshape(-1, 3) * 10.0
+    return CalibrationObject(torch.from_numpy(grid), torch.ones(len(grid), 3))
+
+
+def test_steps_of_a_lattice_are_found() -> None:
+    obj = lattice(6, 5)
+    shifts = lattice_shifts(obj)
+    assert {tuple(motion.translation.round(6)) for motion in shifts[:4]} == {
+        (10, 0, 0),
+        (-10, 0, 0),
+        (0, 10, 0),
+        (0, -10, 0),
+    }
+    points = obj.points.numpy()
+    for motion in shifts:
+        falls = motion.permutation >= 0
+        np.testing.assert_allclose(points[falls] + motion.translation, points[motion.permutation[falls]], atol=1e-9)
+
+
+def test_an_asymmetric_object_has_no_motion() -> None:
+    obj = load_object(data_path("objects", "asymmetric8.csv"))
+    assert lattice_shifts(obj) == []
+    assert near_turns(obj, 1.0) == []
+
+
+def test_moved_labels_and_pose_explain_the_same_blobs() -> None:
+    obj = lattice(6, 5)
+    pose = RigidTransform(torch.eye(3, dtype=torch.float64), torch.tensor([1.0, 2, 500], dtype=torch.float64))
+    labels = np.arange(30)[None]
+    motion = lattice_shifts(obj)[0]
+    poses, changed = moved(pose, labels, [motion])
+    before = pose.apply(obj.points).numpy()
+    after = obj.points.numpy() @ poses.rotation[0].T + poses.translation[0]
+    named = changed[0, 0] >= 0
+    np.testing.assert_allclose(after[named], before[changed[0, 0][named]], atol=1e-9)
+
+
+def test_labellings_differ_up_to_symmetry_only() -> None:
+    cube = load_object(data_path("objects", "cube8.csv"))
+    labels = np.tile(np.arange(8), (3, 1))
+    turned = np.empty_like(labels)
+    turned[:, cube.symmetries[5].permutation] = labels
+    assert conflicts(cube, labels, turned) == 0
+    assert not differ(cube, labels, turned)
+    mixed = np.concatenate((labels[:2], turned[2:]))  # one camera follows another symmetry element
+    assert differ(cube, labels, mixed)

@@ -1,0 +1,56 @@
+"""A camera with two places: where they part, how far they are apart, and whether a motion explains it."""
+
+import numpy as np
+import pytest
+
+from imgcal.association.series import label, observations_of
+from imgcal.estimation import EstimationOptions, estimate
+from imgcal.estimation.change_points import Step
+from imgcal.estimation.moves import Change, Places, find_moves
+from scripts.benchmarks import camera_faults as faults
+
+CAMERA, FIRST, COUNT = 3, 15, 30
+OPTIONS = EstimationOptions()
+NAMES = tuple(str(s) for s in range(COUNT))
+
+
+@pytest.fixture(scope="module")
+def bumped():
+    """A rig estimated from a capture in which a camera was turned by 0.1 degrees."""
+    rig, wand, truth = faults.wand_in_a_room(COUNT, 1)
+    truth = faults.changed_from(truth, wand, CAMERA, FIRST, lambda r: faults.turned(r, CAMERA, 0.1))
+    observations, _ = observations_of(label(faults.blobs(truth, 1, labelled=True), rig, wand), rig, wand)
+    fit = estimate(observations, rig, wand)
+    return Places(fit.problem, fit.solution.state, tuple(range(10)), (0,) * 10), rig
+
+
+def test_a_second_place_takes_the_labels_from_its_snapshot_on(bumped):
+    places, _ = bumped
+    divided = places.divided(Step(CAMERA, FIRST, 0.0, np.zeros(10)), OPTIONS)
+    assert divided.camera[-1] == CAMERA and divided.first[-1] == FIRST
+    assert divided.places_of(CAMERA) == [CAMERA, 10]
+    assert not divided.seen[FIRST:, CAMERA].any() and not divided.seen[:FIRST, 10].any()
+    assert np.array_equal(divided.seen[:, CAMERA] | divided.seen[:, 10], places.seen[:, CAMERA])
+    assert divided.shift(CAMERA, 10) == pytest.approx(1000 * np.radians(0.1), rel=0.2)  # px, focal length some 1000
+    assert abs(divided.misfit(CAMERA)) < 0.2 * places.misfit(CAMERA)
+    assert (divided.costs(CAMERA) < divided.costs(10))[:FIRST].all()
+    assert (divided.costs(CAMERA) > divided.costs(10))[FIRST:].all()
+
+
+def test_the_moment_is_found_from_a_wrong_start(bumped):
+    places, rig = bumped
+    (move,) = find_moves(places.problem, places.state, rig.camera_names, NAMES, OPTIONS)
+    assert (move.camera, move.snapshot, move.kind) == ("cam04", str(FIRST), "rotation")
+    assert abs(move.size - 0.1) < 4 * move.sigma
+
+
+def test_a_change_is_told_by_the_kind_that_explains_it():
+    information, step, spread = np.diag(np.full(15, 100.0)), np.zeros(15), np.ones(15)
+    step[3:5] = 3.0, 4.0
+    change = Change(information, information @ step, spread)
+    kind, size, sigma = change.size()
+    assert (kind, size, sigma) == ("position", pytest.approx(5.0), pytest.approx(0.1))
+    assert change.is_physical
+    step[10:15] = 3.0  # the lens would have to change with it
+    assert not Change(information, information @ step, spread).is_physical
+    assert not Change(information, information @ (step * 0 + 0.1), spread).is_physical

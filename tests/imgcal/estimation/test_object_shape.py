@@ -1,0 +1,96 @@
+"""Tests of the object by its residuals: they keep still for a right object, and find what is wrong with another one."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+
+from imgcal.estimation import EstimationOptions, estimate
+from imgcal.estimation.object_shape import learnt_tolerances, offsets, pull_scatter, shape_evidence
+from imgcal.estimation.robust_losses import huber
+
+LOSS = partial(huber, threshold=3.0)
+
+
+def evidence(case, row):
+    """What one of a batch of rigs says about the object."""
+    one = replace(case.observations, **{k: v[row] for k, v in vars(case.observations).items()})
+    found = estimate(one, case.factory, case.obj, spread=case.spread)
+    return found, shape_evidence(found.problem, found.solution, LOSS)
+
+
+def displaced(case, fiducial, by):
+    """The same observations, with an object file in which a fiducial stands `by` mm from where it was seen."""
+    points = case.obj.points.clone()
+    points[fiducial] -= torch.tensor(by, dtype=points.dtype)
+    return replace(case, obj=replace(case.obj, points=points))
+
+
+@pytest.mark.parametrize("snapshots", [1, 3, 10])
+def test_a_right_object_is_not_suspected(simulate, snapshots: int) -> None:
+    case = simulate(20, snapshots=snapshots, cameras=5, missing=0.1)
+    found = [evidence(case, row)[1] for row in range(20)]
+    sigmas = np.array([shape.bent_sigma() for shape in found])
+    scales = np.array([error / deviation for error, deviation in (shape.scale_error for shape in found)])
+    assert sigmas.max() < 3.5 and abs(sigmas.mean()) < 1.2
+    assert 0.6 < np.sqrt(np.square(scales).mean()) < 1.4
+
+
+@pytest.mark.parametrize("fiducial", [0, 5])
+def test_one_displaced_fiducial_is_found_and_no_other(simulate, fiducial: int) -> None:
+    case = displaced(simulate(4, snapshots=6, cameras=5), fiducial, (0.3, 0.0, -0.4))
+    for row in range(4):
+        found, shape = evidence(case, row)
+        assert shape.bent_sigma() > 10
+        spread = learnt_tolerances(shape)
+        assert np.delete(spread, fiducial).max() < 0.2 * spread[fiducial]
+        obj = replace(case.obj, tolerance=torch.from_numpy(spread))
+        one = replace(case.observations, **{k: v[row] for k, v in vars(case.observations).items()})
+        fit = estimate(one, case.factory, obj, found.rig_from_object, spread=case.spread)
+        each = offsets(fit, case.obj.points.numpy())
+        assert [o.fiducial for o in each if o.distance > 4 * o.sigma + 0.01] == [fiducial]
+        assert each[fiducial].distance == pytest.approx(0.5, abs=4 * each[fiducial].sigma)
+        assert shape_evidence(fit.problem, fit.solution, LOSS).bent_sigma() < 4
+        assert pull_scatter(fit.problem, fit.solution.state, LOSS) == 1  # too few snapshots to compare
+
+
+def test_where_many_fiducials_are_off_all_get_the_same_tolerance(simulate) -> None:
+    case = simulate(snapshots=6, cameras=5, bent=0.3)
+    found = estimate(case.observations, case.factory, case.obj, spread=case.spread)
+    spread = learnt_tolerances(shape_evidence(found.problem, found.solution, LOSS))
+    assert np.ptp(spread) < 1e-9 and 0.15 < spread[0] < 0.6
+
+
+def test_the_scale_is_told_from_the_shape(simulate) -> None:
+    case = simulate(snapshots=6, cameras=10)
+    larger = replace(case.obj, points=case.obj.points / 1.05)  # the true one is 5 % larger than the file says
+    found = estimate(case.observations, case.factory, larger, spread=case.spread)
+    shape = shape_evidence(found.problem, found.solution, LOSS)
+    error, deviation = shape.scale_error
+    assert error == pytest.approx(0.05, abs=5 * deviation) and error > 8 * deviation
+    assert shape.bent_sigma() < 4
+
+
+def test_granted_tolerances_are_not_suspected_and_more_is(simulate) -> None:
+    for factor, low, high in ((1.0, -4.0, 4.0), (12.0, 8.0, np.inf)):
+        case = simulate(snapshots=8, cameras=5, bent=0.2 * factor, tolerance=0.2)
+        options = EstimationOptions(loss="squared")
+        found = estimate(case.observations, case.factory, case.obj, spread=case.spread, options=options)
+        assert low < shape_evidence(found.problem, found.solution, LOSS).bent_sigma() < high
+
+
+def test_errors_that_belong_to_places_scatter_from_snapshot_to_snapshot(simulate) -> None:
+    case = simulate(snapshots=40, cameras=5, tolerance=0.1)
+    for field, low, high in ((0.0, 1.0, 1.3), (0.15, 2.0, np.inf)):
+        uv = case.observations.uv + field * torch.sin(case.observations.uv.flip(-1) / 40)
+        found = estimate(replace(case.observations, uv=uv), case.factory, case.obj, spread=case.spread)
+        assert low <= pull_scatter(found.problem, found.solution.state, LOSS) < high
+
+
+def test_one_camera_does_not_know_the_scale(simulate) -> None:
+    case = simulate(snapshots=4, cameras=1)
+    found = estimate(case.observations, case.factory, case.obj, spread=case.spread)
+    error, deviation = shape_evidence(found.problem, found.solution, LOSS).scale_error
+    assert abs(error) < 4 * deviation and deviation > 0.01

@@ -1,0 +1,102 @@
+"""Where a fit starts must not decide where it ends."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from imgcal.association.series import label
+from imgcal.errors import RefusedError
+from imgcal.estimation import variance_components
+from imgcal.io import load_object, load_rig
+from imgcal.pipeline import calibration
+from imgcal.pipeline.calibration import calibrate, fit_labelled
+from imgcal.synthesis.captures import simulate_truth, true_detections
+from imgcal.synthesis.rigs import PhysicalDrift
+
+
+def two_captures(rig, obj, noise=0.05):
+    """Labelled detections of two snapshots of one drifted rig."""
+    truth = simulate_truth(rig, obj, 2, torch.Generator().manual_seed(3), PhysicalDrift())
+    table = true_detections(truth)
+    table.uv[:] += noise * np.random.default_rng(3).standard_normal(table.uv.shape)
+    table.sigma[:] = 0.05
+    return table.of_snapshots(0, 1), table.of_snapshots(1, 2)
+
+
+@pytest.mark.parametrize("noise", [0.05, 0.3])  # as the blobs say, and six times as much
+def test_the_latest_result_is_a_start_and_no_more(noise, o10, asymmetric8):
+    before, now = two_captures(o10, asymmetric8, noise)
+    latest = calibrate(before, o10, asymmetric8)
+    labelled = label(now, o10, asymmetric8)
+    fresh = fit_labelled(labelled, o10, asymmetric8)
+    followed = fit_labelled(labelled, o10, asymmetric8, latest=latest)
+    assert torch.equal(followed.observations.seen, fresh.observations.seen)
+    assert followed.model_error == pytest.approx(fresh.model_error, rel=0.05)
+    shift = followed.rig.difference(fresh.rig).abs() / fresh.problem.spread[0]
+    assert shift.max() < 0.02  # standard deviations of the prior: the solver stops where the cost falls by 1e-4
+
+
+def test_the_latest_result_gives_way_where_a_label_does_not_fit(o10, asymmetric8):
+    before, now = two_captures(o10, asymmetric8)
+    latest = calibrate(before, o10, asymmetric8)
+    now.uv[[5, 30, 61]] += (9.0, -7.0)
+    labelled = label(now, o10, asymmetric8)
+    fresh = fit_labelled(labelled, o10, asymmetric8)
+    followed = fit_labelled(labelled, o10, asymmetric8, latest=latest)
+    assert fresh.outliers >= 3
+    assert torch.equal(followed.observations.seen, fresh.observations.seen)
+    torch.testing.assert_close(followed.rig.focal_length, fresh.rig.focal_length)
+
+
+def hard(seed):
+    """A rig of six that has drifted several times as far as its prior allows; heavy tails and many wrong labels."""
+    random = np.random.default_rng(seed)
+    rig, obj, far = load_rig("O6"), load_object("asymmetric8"), random.uniform(1, 6)
+    drift = PhysicalDrift(0.57 * far, 10 * far, 0.02 * far, 10 * far, 0.02 * far)
+    snapshots = int(random.choice([1, 2, 4, 8]))
+    table = true_detections(simulate_truth(rig, obj, snapshots, torch.Generator().manual_seed(seed), drift))
+    count = len(table)
+    table.uv[:] += 0.05 * random.standard_t(2.5, size=(count, 2))
+    table.sigma[:] = 0.05
+    wrong = int(random.uniform(0.05, 0.2) * count)
+    rows = random.choice(count, wrong, replace=False)
+    table.uv[rows] += random.normal(size=(wrong, 2)) * random.choice([3, 10, 50])
+    table.uv[:] = np.clip(table.uv, 0, [2047, 1087])
+    return rig, obj, table
+
+
+@pytest.mark.parametrize("seed", [44, 213])  # came to no rest within eight fits
+def test_a_calibration_reports_the_residuals_of_the_rig_that_it_returns(seed) -> None:
+    rig, obj, table = hard(seed)
+    try:
+        found = calibrate(table, rig, obj)
+    except RefusedError:
+        return
+    points = found.rig_from_object.apply(found.points_object)
+    uv = found.rig.expand(len(points)).project(points).uv
+    difference = (uv - found.observations.uv - found.residual)[found.observations.seen]
+    assert difference.abs().max() < 1e-6
+
+
+def test_what_does_not_come_to_rest_is_refused(o10, asymmetric8, monkeypatch) -> None:
+    table, _ = two_captures(o10, asymmetric8, 0.3)
+    assert calibrate(table, o10, asymmetric8).model_error > 0
+    monkeypatch.setattr(variance_components, "ROUNDS", 1)
+    with pytest.raises(RefusedError, match="have not come to rest after 1 fits"):
+        calibrate(table, o10, asymmetric8)
+
+
+def test_a_solution_of_another_problem_is_not_returned(o10, asymmetric8, monkeypatch) -> None:
+    """The last check projects with the rig that is about to be returned."""
+    table, _ = two_captures(o10, asymmetric8)
+    settle = calibration.settle
+
+    def widened(*args, **kwargs):
+        found = settle(*args, **kwargs)
+        return replace(found, problem=replace(found.problem, spread=2 * found.problem.spread))
+
+    monkeypatch.setattr(calibration, "settle", widened)
+    with pytest.raises(RefusedError, match="do not belong together"):
+        calibrate(table, o10, asymmetric8)

@@ -1,0 +1,109 @@
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pytest
+import torch
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from imgcal.errors import InputError
+from imgcal.io.object_csv import load_object, save_object
+from imgcal.types.calibration_object import CalibrationObject
+from renderers.palette import palette
+
+GOOD = "x,y,z\n0,0,0\n1.5,0,0\n0,1,0\n0,0,1\n"
+
+
+@pytest.mark.parametrize(("name", "count"), [("cube8", 8), ("cube27", 27), ("sphere64", 64), ("asymmetric8", 8)])
+def test_shipped_objects_load_by_name(name: str, count: int) -> None:
+    obj = load_object(name)
+    assert (obj.name, obj.fiducials) == (name, count)
+    assert obj.points.dtype == torch.float64
+    torch.testing.assert_close(obj.colours, palette(count).double())
+
+
+def test_optional_columns_in_any_order(tmp_path: Path) -> None:
+    path = tmp_path / "o.csv"
+    path.write_text("radius,name,z,y,x\n1,p,3,2,1\n2,q,6,5,4\n1,r,0,0,0\n\n1,s,9,0,1e1\n")
+    obj = load_object(path)
+    assert obj.points.tolist() == [[1, 2, 3], [4, 5, 6], [0, 0, 0], [10, 0, 9]]
+    assert obj.radius is not None
+    assert obj.radius.tolist() == [1, 2, 1, 1]
+    assert obj.fiducial_names == ("p", "q", "r", "s")
+
+
+def test_tolerances_are_read_and_written(tmp_path: Path) -> None:
+    path = tmp_path / "o.csv"
+    path.write_text("x,y,z,tolerance\n0,0,0,0.2\n1,0,0,0\n0,1,0,0.1\n0,0,1,0.1\n")
+    obj = load_object(path)
+    assert obj.tolerance.tolist() == [0.2, 0, 0.1, 0.1] and not obj.exact
+    save_object(obj, tmp_path / "again.csv")
+    assert load_object(tmp_path / "again.csv").tolerance.tolist() == obj.tolerance.tolist()
+    path.write_text("x,y,z,tolerance\n0,0,0,-0.2\n1,0,0,0\n0,1,0,0.1\n0,0,1,0.1\n")
+    with pytest.raises(InputError, match=r"line 2: tolerance: found -0\.2, expected a tolerance, 0 to 1000 mm"):
+        load_object(path)
+
+
+def test_planar_object_is_fine(tmp_path: Path) -> None:
+    (tmp_path / "o.csv").write_text("\ufeffx,y,z\r\n0,0,0\r\n1,0,0\r\n0,1,0\r\n1,1,0\r\n", encoding="utf-8")
+    assert load_object(tmp_path / "o.csv").planar
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "found an empty file, expected the columns x,y,z"),
+        ("x,y,z\n", "found 0 points, expected 4"),
+        ("x,y,z\n0,0,0\n1,0,0\n0,1,0\n", "found 3 points, expected 4"),
+        ("x,y\n0,0\n", "found no column z"),
+        ("x,y,z,raduis\n0,0,0,1\n", "unknown column 'raduis', nearest: radius"),
+        ("x;y;z\n0;0;0\n", "unknown column 'x;y;z'"),
+        ("x,y,z,z\n0,0,0,0\n", "column z more than once"),
+        (GOOD + "a,0,0\n", "line 6: x: found 'a', expected a finite coordinate"),
+        (GOOD + "\n\n0,nan,7\n", "line 8: y: found nan"),
+        (GOOD + "0,0,inf\n", "line 6: z: found inf"),
+        (GOOD + ",0,0\n", "line 6: x: found ''"),
+        (GOOD + "5,5\n", "line 6: found 2 cells, expected 3: x,y,z"),
+        (GOOD + "1.50,0,0\n", "line 6: found the same point as in row 2"),
+        ("x,y,z\n0,0,0\n1,2,3\n2,4,6\n-1,-2,-3\n", "found all 4 points on one line"),
+        ("x,y,z,radius\n0,0,0,1\n1,0,0,1\n0,1,0,-2\n0,0,1,1\n", "line 4: radius: found -2, expected a radius > 0"),
+        ("x,y,z,name\n0,0,0,a\n1,0,0,b\n0,1,0,a\n0,0,1,c\n", "line 4: name: found 'a'"),
+        ('x,y,z\n"0,0,0\n', "not valid CSV"),
+        ("x,y,z\n\x00\x01", r"not valid CSV|line 2|found 0 points"),
+    ],
+)
+def test_bad_files_give_one_clear_line(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "bad.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message) as caught:
+        load_object(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_unknown_name_offers_the_nearest() -> None:
+    with pytest.raises(InputError, match=r"cube9: no such file.*nearest: cube8"):
+        load_object("cube9")
+
+
+def named(*names: str) -> CalibrationObject:
+    points = torch.cat((torch.zeros(1, 3), torch.eye(3)))[: len(names)].double()
+    return CalibrationObject(points, palette(len(names)).double(), None, "o", names)
+
+
+@settings(deadline=None)
+@given(st.lists(st.text(st.characters(exclude_categories=["C", "Z"]), min_size=1), min_size=4, max_size=4, unique=True))
+@example(["a,b", 'c"d', '"e"', "f'g"])
+@example(["a b", '"', "'", ","])
+def test_names_come_back_whatever_they_are(names: list[str]) -> None:
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "o.csv"
+        save_object(named(*names), path)
+        assert load_object(path).fiducial_names == tuple(names)
+
+
+@pytest.mark.parametrize("name", ["a\nb", "a\rb", "", " a", "x" * 1000, "p"])
+def test_names_that_could_not_be_read_again_are_not_written(name: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"o\.csv: not written: found the name"):
+        save_object(named("p", "q", "r", name), tmp_path / "o.csv")
+    assert not list(tmp_path.iterdir())

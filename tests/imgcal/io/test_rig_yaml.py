@@ -1,0 +1,260 @@
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from imgcal.errors import InputError
+from imgcal.geometry.rotations import rotation_from_vector
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.io.rig_yaml import RigCovariance, load_rig, load_rig_covariance, save_rig
+from imgcal.types.rig import CameraRig, RigPrior
+
+TEXT = """\
+format: imgcal-rig/1
+name: pair
+working_distance: 850.14                 # mm, optional
+cameras:
+  - name: left
+    image_size: [2048, 1088]
+    focal_length: [1627.0, 1627]
+    principal_point: [1024.0, 544.0]
+    distortion: [0.1, -0.1, 0.0, 9e-05, 0.0]
+    cam_from_rig: {rotation_vector: [0.0, 0.1, 0.0], translation: [0.0, 0.0, 1.0]}
+  - name: right
+    image_size: [640, 480]
+    focal_length: [800.0, 801.0]
+    principal_point: [320.0, 240.0]
+    distortion: [0.0, 0.0, 0.0, 0.0, 0.0]
+    cam_from_rig: {rotation_vector: [0.0, 0.0, 0.0], translation: [100.0, 0.0, 0.0]}
+prior:
+  focal_length: 0.03
+  principal_point: 11.0
+"""
+
+
+def make_rig(numbers: torch.Tensor, names: tuple[str, ...] = ("a", "b", "c")) -> CameraRig:
+    """Make a rig of the given numbers: (C, 15) rotation, translation, f - 1000, principal point, distortion."""
+    rotation, translation, focal, centre, distortion = numbers.split((3, 3, 2, 2, 5), dim=-1)
+    return CameraRig(
+        focal_length=1000 + focal,
+        principal_point=centre,
+        distortion=distortion,
+        cam_from_rig=RigidTransform(rotation_from_vector(rotation), translation),
+        image_size=torch.tensor([[2048, 1088]] * len(numbers)),
+        camera_names=names,
+        name="made",
+        working_distance=850.5,
+        prior=RigPrior(rotation=0.123),
+    )
+
+
+def covariance_of(cameras: int) -> RigCovariance:
+    generator = torch.Generator().manual_seed(0)
+    root = torch.randn(15 * cameras, 15 * cameras, generator=generator, dtype=torch.float64)
+    root[:6] = 0  # the reference camera's place is exact
+    return RigCovariance.from_matrix(root @ root.mT / 100, "a")
+
+
+def test_reads_the_documented_example(tmp_path: Path) -> None:
+    path = tmp_path / "pair.yaml"
+    path.write_text(TEXT)
+    rig = load_rig(path)
+    assert rig.camera_names == ("left", "right")
+    assert rig.name == "pair"
+    assert rig.working_distance == 850.14
+    assert rig.prior == RigPrior(focal_length=0.03, principal_point=11.0)
+    assert rig.image_size.tolist() == [[2048, 1088], [640, 480]]
+    assert rig.focal_length.dtype == torch.float64
+    assert rig.distortion[0].tolist() == [0.1, -0.1, 0.0, 9e-05, 0.0]
+    assert rig.cam_from_rig.translation[1].tolist() == [100.0, 0.0, 0.0]
+    torch.testing.assert_close(
+        rig.cam_from_rig.rotation[0], rotation_from_vector(torch.tensor([0, 0.1, 0], dtype=torch.float64))
+    )
+    assert load_rig_covariance(path) is None
+
+
+@pytest.mark.parametrize(("name", "cameras"), [("O10", 10), ("O6", 6), ("U7", 7), ("T4", 4)])
+def test_shipped_rigs_load_by_name(name: str, cameras: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    rig = load_rig(name)
+    assert (rig.name, rig.cameras) == (name, cameras)
+    (tmp_path / name).mkdir()  # a folder of that name, a capture perhaps, is in nobody's way
+    assert load_rig(name).cameras == cameras
+
+
+finite = st.floats(-1e3, 1e3, allow_nan=False)
+small = st.floats(-0.5, 0.5, allow_nan=False)
+camera_numbers = st.tuples(*[small] * 3, *[finite] * 3, *[st.floats(-900, 900)] * 2, *[finite] * 2, *[small] * 5)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(camera_numbers, min_size=3, max_size=3))
+def test_round_trip_is_exact(tmp_path_factory: pytest.TempPathFactory, numbers: list[tuple[float, ...]]) -> None:
+    rig = make_rig(torch.tensor(numbers, dtype=torch.float64))
+    path = tmp_path_factory.getbasetemp() / "round.yaml"
+    # Near the smallest focal lengths half a unit of distortion is absurd.
+    rig = replace(rig, distortion=rig.distortion * (rig.focal_length.amin() / 2000).clamp(max=1) ** 6)
+    save_rig(rig, path)
+    loaded = load_rig(path)
+    for name in ("focal_length", "principal_point", "distortion", "image_size"):
+        assert torch.equal(getattr(loaded, name), getattr(rig, name))
+    assert torch.equal(loaded.cam_from_rig.translation, rig.cam_from_rig.translation)
+    torch.testing.assert_close(loaded.cam_from_rig.rotation, rig.cam_from_rig.rotation, rtol=0, atol=4e-15)
+    assert (loaded.camera_names, loaded.name, loaded.working_distance, loaded.prior) == (
+        rig.camera_names, rig.name, rig.working_distance, rig.prior,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["no", "1", "1e5", "a: b", "kamera ü", "#1", "null", "2024-01-01"])
+def test_names_that_look_like_something_else_survive(name: str, tmp_path: Path) -> None:
+    rig = make_rig(torch.zeros(1, 15, dtype=torch.float64), (name,))
+    save_rig(rig, tmp_path / "r.yaml")
+    assert load_rig(tmp_path / "r.yaml").camera_names == (name,)
+
+
+def test_covariance_round_trip(tmp_path: Path) -> None:
+    rig, path = make_rig(torch.zeros(3, 15, dtype=torch.float64)), tmp_path / "r.yaml"
+    covariance = covariance_of(3)
+    save_rig(rig, path, covariance, full=True)
+    loaded = load_rig_covariance(path)
+    assert loaded is not None and loaded.matrix is not None and covariance.matrix is not None
+    assert torch.equal(loaded.matrix, covariance.matrix)
+    assert torch.equal(loaded.std, covariance.std)
+    assert loaded.reference_camera == "a"
+    save_rig(rig, path, covariance)
+    loaded = load_rig_covariance(path)
+    assert loaded is not None and loaded.matrix is None
+    torch.testing.assert_close(loaded.std, covariance.std, rtol=1e-5, atol=0)
+    assert load_rig(path).cameras == 3
+    assert max(map(len, path.read_text().splitlines())) < 300
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("format: imgcal-rig/1\n", "", r"found no key `format`, expected `format: imgcal-rig/1`"),
+        ("imgcal-rig/1", "imgcal-rig/2", r"found `format: 'imgcal-rig/2'`"),
+        (TEXT, "", r"found an empty file"),
+        (TEXT, "- 1\n- 2\n", r"found list \[1, 2\]"),
+        (TEXT, "\x00\x01\x02", r"not a YAML text file"),
+        ("name: pair", "[a, b]: pair", r"not valid YAML in line 2: found a list, a mapping or an alias as a key"),
+        ("[1627.0, 1627]", "[1627.0, 1627", r"not valid YAML in line \d+"),
+        ("name: pair", "name: pair\nname: other", r"line 3: key `name` given twice"),
+        ("focal_length: [800.0, 801.0]", "focal_lenght: [800.0, 801.0]",
+         r"camera right: unknown key `focal_lenght`, nearest: focal_length \(and 1 more\)"),
+        ("prior:\n", "prior:\n  rotatoin: 0.1\n", r"prior: unknown key `rotatoin`, nearest: rotation"),
+        ("rotation_vector: [0.0, 0.1", "rotation: [0.0, 0.1", r"camera left: cam_from_rig: unknown key `rotation`"),
+        ("[800.0, 801.0]", "[800.0]", r"camera right: focal_length: found 1 values, expected 2"),
+        ("[320.0, 240.0]", "[320.0, 240.0, 1.0]", r"camera right: principal_point: found more than 2 values"),
+        ("[800.0, 801.0]", "[800.0, -801.0]", r"focal_length\[1\]: found -801\.0, expected greater than"),
+        ("[800.0, 801.0]", "[800.0, .nan]", r"focal_length\[1\]: found nan, expected a finite number"),
+        ("[0.0, 0.0, 1.0]", "[0.0, .inf, 1.0]", r"camera left: cam_from_rig: translation\[1\]: found inf"),
+        ("[0.0, 0.1, 0.0]", "[0.0, .nan, 0.0]", r"rotation_vector\[1\]: found nan"),
+        ("[0.0, 0.1, 0.0]", "[0.0, 90.0, 0.0]", r"length 90, expected rad"),
+        ("[640, 480]", "[640, 0]", r"image_size\[1\]: found 0, expected greater than 0"),
+        ("[640, 480]", "[640.5, 480]", r"image_size\[0\]: found 640\.5, expected a valid integer"),
+        ("[320.0, 240.0]", "[320.0, '240.0']", r"principal_point\[1\]: found '240\.0', expected a valid number"),
+        ("[320.0, 240.0]", "[320.0, true]", r"principal_point\[1\]: found True, expected a valid number"),
+        ("[0.1, -0.1, 0.0", "[1000.0, -0.1, 0.0", r"camera left: distortion: found \[1000\.0"),
+        ("name: right", "name: left", r"camera name left more than once"),
+        ("name: right", "name: 7", r"camera number 2: name: found 7, expected a valid string"),
+        ("name: right", "name: a/b", r"found the camera name 'a/b'"),
+        ("    distortion: [0.0, 0.0, 0.0, 0.0, 0.0]\n", "", r"camera right: key `distortion` is missing"),
+        ("850.14", "-1", r"working_distance: found -1, expected greater than"),
+        (TEXT[TEXT.index("cameras") :], "cameras: []", r"cameras: found 0 values, expected 1 or more"),
+        ("[800.0, 801.0]", "[800.0, 1e-150]", r"focal_length\[1\]: found 1e-150"),
+        ("[800.0, 801.0]", "[800.0, 1e308]", r"focal_length\[1\]: found 1e\+308"),
+        ("[0.0, 0.0, 1.0]", "[0.0, 1e200, 1.0]", r"translation\[1\]: found 1e\+200"),
+        ("[640, 480]", "[60000, 60000]", r"image_size: found \[60000, 60000\], expected at most"),
+        ("[320.0, 240.0]", "[320.0, -1e30]", r"principal_point\[1\]"),
+        ("850.14", "1e-30", r"working_distance: found 1e-30"),
+        ("prior:\n", "prior:\n  rotation: 1e-200\n", r"prior: rotation: found 1e-200"),
+        ("name: right", "name: ../right", r"found the camera name '../right'"),
+        ("name: right", "name: " + 300 * "x", r"camera x{37}\.\.\.: found the camera name 'x+\.\.\.', "),
+        ("name: pair", 'name: "a\\x1b[31m"', r"name: found 'a\\x1b\[31m', expected text"),
+        ("name: right", "1: right", r"camera number 2: unknown key `1`"),
+        ("name: right", "name: !!int ''", r"line \d+: found '', expected a value of type int"),
+        ("name: right", "name: right\n    " + "x" * 900 + ": 1", r"unknown key `x{37}\.\.\.`"),
+        (TEXT[TEXT.index("cameras") :], "prior: &c {}\ncameras: [" + "*c, " * 200_000 + "]",
+         r"cameras: found more than 256"),
+        (TEXT[TEXT.index("cameras") :], "\n".join(f"k{i}: 0" for i in range(5000)), r"found 5,001 values"),
+        ("prior:\n", "prior:\n  rotation: 0\n", r"prior: rotation: found 0"),
+        ("prior:\n", "covariance: {parameters: [fx]}\nprior:\n", r"found only one of `std`|`std`.*`covariance`"),
+    ],
+)  # fmt: skip
+def test_bad_files_give_one_clear_line(old: str, new: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "bad.yaml"
+    assert old in TEXT
+    path.write_text(TEXT.replace(old, new))
+    with pytest.raises(InputError, match=message) as caught:
+        load_rig(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_deep_nesting_is_no_traceback(tmp_path: Path) -> None:
+    (tmp_path / "deep.yaml").write_text("[" * 5000)
+    with pytest.raises(InputError, match=r"deep\.yaml: not valid YAML"):
+        load_rig(tmp_path / "deep.yaml")
+
+
+def _edit(content: dict[str, Any], case: str) -> None:
+    block = content["covariance"]
+    if case == "reference":
+        block["reference_camera"] = "z"
+    elif case == "order":
+        block["parameters"].reverse()
+    elif case == "shape":
+        block["matrix"].pop()
+    elif case == "diagonal":
+        block["matrix"][20][20] *= 2
+    elif case == "symmetry":
+        block["matrix"][20][21] += 0.1
+    elif case == "std":
+        del content["cameras"][1]["std"]
+    elif case == "length":
+        content["cameras"][1]["std"]["position"].pop()
+
+
+@pytest.mark.parametrize(
+    ("case", "message"),
+    [
+        ("reference", "found reference_camera z, expected one of a, b, c"),
+        ("order", "other parameters"),
+        ("shape", "matrix of 44 rows"),
+        ("diagonal", "diagonal that differs"),
+        ("symmetry", "not symmetric"),
+        ("std", "found `std` for a, c only"),
+        ("length", "camera b: std: position: found 2 values, expected 3"),
+    ],
+)
+def test_bad_covariance(case: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "r.yaml"
+    save_rig(make_rig(torch.zeros(3, 15, dtype=torch.float64)), path, covariance_of(3), full=True)
+    content = yaml.safe_load(path.read_text())
+    _edit(content, case)
+    path.write_text(yaml.safe_dump(content))
+    with pytest.raises(InputError, match=message):
+        load_rig(path)
+
+
+def test_unknown_name_offers_the_nearest(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"O11: no such file.*O10, O6, T4, U7.*nearest: O10"):
+        load_rig("O11")
+    with pytest.raises(InputError, match="found a folder"):
+        load_rig(tmp_path)
+
+
+def test_what_could_not_be_read_again_is_not_written(tmp_path: Path) -> None:
+    rig, path = make_rig(torch.zeros(3, 15, dtype=torch.float64)), tmp_path / "r.yaml"
+    broken = replace(rig, focal_length=rig.focal_length * float("nan"))
+    with pytest.raises(InputError, match=r"not written: camera a: focal_length\[0\]: found nan"):
+        save_rig(broken, path)
+    with pytest.raises(InputError, match="expected one rig"):
+        save_rig(rig.expand(2), path)
+    assert not path.exists()

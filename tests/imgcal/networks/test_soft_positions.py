@@ -1,0 +1,70 @@
+"""Soft positions of colour-coded dots, against where they were drawn."""
+
+import pytest
+import torch
+
+from imgcal.networks.soft_positions import soft_positions
+from renderers import palette, splat
+
+COLOURS = palette(8)
+
+
+def draw(uv, size=96, dot=1.5, visible=None):
+    images = splat(uv, COLOURS, dot, (size, size), visible=visible).clamp(0, 1)
+    return (images * 255).round() / 255
+
+
+@pytest.fixture
+def apart():
+    """Positions (5, 8, 2) that lie at least 12 pixels from each other."""
+    generator = torch.Generator().manual_seed(0)
+    grid = torch.stack(torch.meshgrid(torch.arange(3.0), torch.arange(3.0), indexing="ij"), -1).reshape(-1, 2)[:8]
+    return 20 + 28 * grid + 8 * torch.rand((5, 8, 2), generator=generator)
+
+
+def test_dots_that_lie_apart_are_found_to_a_hundredth_of_a_pixel(apart):
+    uv, confidence = soft_positions(draw(apart), COLOURS, 1.5)
+    assert (uv - apart).norm(dim=-1).max() < 0.02
+    assert confidence.min() > 0.8
+
+
+def test_a_missing_dot_has_no_confidence(apart):
+    visible = torch.ones(5, 8, dtype=torch.bool)
+    visible[2, 3] = False
+    uv, confidence = soft_positions(draw(apart, visible=visible), COLOURS, 1.5)
+    assert confidence[2, 3] == 0
+    assert uv.isfinite().all()
+    assert (confidence > 0.8).sum() == 39
+
+
+def test_a_black_image_has_nothing():
+    uv, confidence = soft_positions(torch.zeros(2, 3, 32, 32), COLOURS, 1.5)
+    assert (uv == 0).all()
+    assert (confidence == 0).all()
+
+
+def test_positions_move_with_the_image(apart):
+    one, _ = soft_positions(draw(apart), COLOURS, 1.5)
+    other, _ = soft_positions(draw(apart + torch.tensor([1.0, 2.0])), COLOURS, 1.5)
+    assert torch.allclose(other - one, torch.tensor([1.0, 2.0]).expand_as(one), atol=1e-3)
+
+
+def test_belief_chooses_between_two_dots_of_one_colour():
+    uv = torch.tensor([[[20.0, 20.0], [70.0, 70.0]]])
+    images = splat(uv, COLOURS[:1].expand(2, 3), 1.5, (96, 96))
+    belief = torch.zeros(1, 1, 2, 2)
+    belief[..., 1, 1] = 8.0
+    belief[..., 0, 0] = -8.0
+    found, confidence = soft_positions(images, COLOURS[:1], 1.5, belief)
+    assert torch.allclose(found[0, 0], uv[0, 1], atol=0.05)
+    assert confidence[0, 0] > 0.8
+
+
+def test_gradients_reach_the_belief():
+    uv = torch.tensor([[[20.0, 20.0], [24.0, 20.0]]])
+    images = splat(uv, COLOURS[:1].expand(2, 3), 1.5, (96, 96))
+    belief = torch.zeros(1, 1, 24, 24, requires_grad=True)
+    found, _ = soft_positions(images, COLOURS[:1], 1.5, belief)
+    found.sum().backward()
+    assert belief.grad.isfinite().all()
+    assert belief.grad.abs().max() > 0

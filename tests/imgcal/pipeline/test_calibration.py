@@ -1,0 +1,76 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from imgcal.association.options import PipelineOptions
+from imgcal.errors import RefusedError
+from imgcal.pipeline.calibration import calibrate, score
+from imgcal.synthesis.captures import simulate_truth, true_detections
+from imgcal.synthesis.rigs import PhysicalDrift
+
+
+def capture(rig, obj, snapshots=6, noise=0.05, seed=0):
+    """True rig, and labelled detections with noise and the sigma that it has."""
+    truth = simulate_truth(rig, obj, snapshots, torch.Generator().manual_seed(seed), PhysicalDrift())
+    table = true_detections(truth)
+    table.uv[:] += noise * np.random.default_rng(seed).standard_normal(table.uv.shape)
+    table.sigma[:] = max(noise, 1e-3)
+    return truth.rig, table
+
+
+def test_an_honest_calibration(o10, asymmetric8):
+    truth, table = capture(o10, asymmetric8)
+    result = calibrate(table, o10, asymmetric8)
+    assert result.model_error == 0 and result.outliers <= 2 and not result.widened
+    assert 0.8 < result.chi2_per_dof < 1.2
+    assert result.rig.difference(truth)[:, 6:8].abs().max() < 0.2 * o10.difference(truth)[:, 6:8].abs().max()
+    assert result.before.rms > 50 * result.rms
+
+
+@pytest.mark.parametrize("hidden", [0.15, 0.4])
+def test_noise_that_the_blobs_do_not_know_is_measured(hidden, o10, asymmetric8):
+    _, table = capture(o10, asymmetric8, noise=0.0)
+    table.uv[:] += hidden * np.random.default_rng(1).standard_normal(table.uv.shape)
+    table.sigma[:] = 0.02
+    result = calibrate(table, o10, asymmetric8)
+    assert result.model_error == pytest.approx(hidden, rel=0.15)
+    assert 0.75 < result.chi2_per_dof < 1.3
+
+
+def test_gross_outliers_are_left_out(o10, asymmetric8):
+    truth, table = capture(o10, asymmetric8)
+    bad = np.random.default_rng(2).choice(len(table), 20, replace=False)
+    table.uv[bad] += (7.0, -5.0)
+    result = calibrate(table, o10, asymmetric8)
+    assert 20 <= result.outliers <= 26
+    assert result.rms < 0.06
+    assert (result.rig.difference(truth)[:, 6:8]).abs().max() < 3
+
+
+def test_two_cameras_swapped_is_refused(o10, asymmetric8):
+    _, table = capture(o10, asymmetric8)
+    swapped = np.where(table.camera == 2, 3, np.where(table.camera == 3, 2, table.camera))
+    with pytest.raises(RefusedError, match="factory value"):
+        calibrate(replace(table, camera=swapped), o10, asymmetric8)
+
+
+def test_a_camera_of_another_moment_is_refused(o10, asymmetric8):
+    _, table = capture(o10, asymmetric8)
+    late = np.where(table.camera == 4, (table.snapshot + 1) % 6, table.snapshot)
+    with pytest.raises(RefusedError):
+        calibrate(replace(table, snapshot=late), o10, asymmetric8)
+
+
+def test_a_refusal_names_what_python_offers(o10, asymmetric8):
+    _, table = capture(o10, asymmetric8)
+    with pytest.raises(RefusedError, match=r"PipelineOptions\(blind_cameras=True\)") as refusal:
+        calibrate(table.select(table.camera != 3), o10, asymmetric8)
+    assert "--" not in str(refusal.value) and "--blind-cameras" in refusal.value.for_command
+
+
+def test_a_score_needs_no_prior(o10, asymmetric8):
+    truth, table = capture(o10, asymmetric8, noise=0.0)
+    assert score(table, truth, asymmetric8).distances.max() < 1e-6
+    assert score(table, o10, asymmetric8, PipelineOptions()).distances.mean() > 1

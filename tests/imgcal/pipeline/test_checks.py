@@ -1,0 +1,67 @@
+"""Refusals say in plain words what was found, and what to do."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from imgcal.association.options import PipelineOptions
+from imgcal.errors import RefusedError
+from imgcal.pipeline.checks import require_fit, require_most_labels, require_near_prior
+from imgcal.types.rig import RigPrior
+
+OPTIONS = PipelineOptions()
+
+
+def drifted(rig, camera, parameter, deviations):
+    prior = RigPrior().std(rig)
+    offset = torch.zeros_like(prior)
+    offset[camera, parameter] = deviations
+    state = SimpleNamespace(offset=offset[None])
+    return SimpleNamespace(solution=SimpleNamespace(state=state), problem=SimpleNamespace(spread=prior[None])), prior
+
+
+@pytest.mark.parametrize(
+    ("parameter", "expected"),
+    [
+        (1, r"cam03: rotation y would differ from its factory value by 6\.3 deg, with a tolerance \(prior\) of 0\.573"),
+        (5, r"cam03: position z would differ from its factory value by 110 mm, with a tolerance \(prior\) of 10 mm"),
+        (8, "cam03: cx would differ from its factory value by 110 px"),
+        (11, "cam03: k2 would differ from its factory value by 0.55,"),
+    ],
+)  # fmt: skip
+def test_a_value_too_far_from_the_factory_is_told_in_its_unit(parameter, expected, o10):
+    fit, prior = drifted(o10, 2, parameter, 11.0)
+    with pytest.raises(RefusedError, match=expected) as found:
+        require_near_prior(fit, prior, o10, {}, OPTIONS)
+    assert "under `prior` in the rig file" in found.value.for_command and "RigPrior(" in str(found.value)
+
+
+def test_a_kind_of_values_too_far_from_the_factory_is_named(o10):
+    fit, prior = drifted(o10, 2, 1, 5.5)
+    require_near_prior(fit, prior, o10, {"rotation": 3.9}, OPTIONS)
+    with pytest.raises(RefusedError, match=r"the focal length of all cameras .* 4\.2 times"):
+        require_near_prior(fit, prior, o10, {"rotation": 2.0, "focal_length": 4.2}, OPTIONS)
+
+
+def test_residuals_and_outliers_are_told_with_what_to_do():
+    require_fit(0.9, 0.2, 0.3, OPTIONS)
+    with pytest.raises(RefusedError, match=r"misses the blobs by 1\.60 px .* 1\.50 px do not fit"):
+        require_fit(1.5, 0.0, 1.6, OPTIONS)
+    with pytest.raises(RefusedError, match="30 % of the labelled blobs") as found:
+        require_fit(0.0, 0.3, 0.1, OPTIONS)
+    assert "--snapshots" in found.value.for_command and "--snapshots" not in str(found.value)
+
+
+def test_a_camera_or_a_fiducial_most_of_whose_labels_do_not_fit_is_named(o10):
+    labels = np.ones((4, 10, 8), dtype=bool)
+    kept = labels.copy()
+    kept[:3, 6] = False
+    with pytest.raises(RefusedError, match="estimation: camera cam07: 24 of 32 labels") as found:
+        require_most_labels(labels, kept, o10)
+    assert found.value.for_command.endswith("--without cam07")
+    kept = labels.copy()
+    kept[:3, :, 5] = False
+    with pytest.raises(RefusedError, match=r"fiducial 5 .* 30 of 40 labels"):
+        require_most_labels(labels, kept, o10)

@@ -1,0 +1,99 @@
+"""What a program hands over is compared with the rig and the object, as files are."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from imgcal.errors import InputError
+from imgcal.io import load_object, load_rig
+from imgcal.online.recalibrator import Recalibrator
+from imgcal.pipeline.calibration import calibrate, score
+from imgcal.synthesis.captures import FrameModel, simulate_frames, simulate_truth, true_detections
+from imgcal.synthesis.rigs import PhysicalDrift
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """A small rig, an object, frames and exact blobs of one snapshot."""
+    rig, obj = load_rig("T4").resized(torch.tensor([1024, 544])), load_object("asymmetric8")
+    generator = torch.Generator().manual_seed(4)
+    truth = simulate_truth(rig, obj, 1, generator, PhysicalDrift())
+    return rig, obj, next(simulate_frames(truth, obj, FrameModel(), generator)), true_detections(truth)
+
+
+def update(source, rig, obj):
+    with Recalibrator(rig, obj) as live:
+        return live.update(source)
+
+
+EVERYWHERE = pytest.mark.parametrize("job", [calibrate, score, update])
+
+
+@EVERYWHERE
+@pytest.mark.parametrize(
+    ("turn", "found"), [(np.rot90, "544x1024"), (lambda frame: np.ascontiguousarray(frame[::2, ::2]), "512x272")]
+)
+def test_frames_of_another_size_are_no_frames_of_this_rig(seen, job, turn, found):
+    rig, obj, frames, _ = seen
+    other = {**frames, "cam03": turn(frames["cam03"])}
+    with pytest.raises(InputError, match=f"camera cam03: found a frame of {found} pixels, expected 1024x544"):
+        job(other, rig, obj)
+
+
+def test_one_wrong_frame_of_many_is_found(seen):
+    rig, obj, frames, _ = seen
+    many = {name: [frame, None, frame] for name, frame in frames.items()}
+    many["cam02"][2] = np.rot90(many["cam02"][2])
+    with pytest.raises(InputError, match="camera cam02"):
+        calibrate(many, rig, obj)
+
+
+@EVERYWHERE
+@pytest.mark.parametrize("source", [None, 7, "frames", [1, 2], {"cam01": "x"}, {"cam99": None}, {1: None}])
+def test_what_is_neither_frames_nor_blobs_is_said_in_one_line(seen, job, source):
+    rig, obj, _, _ = seen
+    with pytest.raises(InputError, match="found") as error:
+        job(source, rig, obj)
+    assert "\n" not in str(error.value)
+
+
+@EVERYWHERE
+@pytest.mark.parametrize(
+    ("column", "value", "reason"),
+    [
+        (
+            "uv",
+            (1400.0, 100.0),
+            r"found \(1400, 100\) in row 5, expected a pixel of the 1024x544 image of camera cam01",
+        ),
+        ("uv", (np.nan, 1.0), "expected a pixel"),
+        ("sigma", 0.0, "sigma: found 0.0 in row 5"),
+        ("sigma", -1.0, "sigma: found -1.0 in row 5"),
+        ("sigma", np.inf, "sigma: found inf"),
+        ("fiducial", 8, "fiducial: found 8 in row 5, expected a row of the object, 0 to 7"),
+        ("camera", 4, "camera: found 4 in row 5, expected 0 to 3"),
+        ("snapshot", -1, "snapshot: found -1"),
+    ],
+)
+def test_blobs_that_cannot_be_of_this_rig_or_object(seen, job, column, value, reason):
+    rig, obj, _, blobs = seen
+    wrong = getattr(blobs, column).copy()
+    wrong[5] = value
+    with pytest.raises(InputError, match=reason):
+        job(replace(blobs, **{column: wrong}), rig, obj)
+
+
+def test_columns_of_different_lengths(seen):
+    rig, obj, _, blobs = seen
+    with pytest.raises(InputError, match=r"sigma: found an array of shape \(3,\), expected .* \(32,\)"):
+        calibrate(replace(blobs, sigma=blobs.sigma[:3]), rig, obj)
+    with pytest.raises(InputError, match="uv: found list"):
+        calibrate(replace(blobs, uv=blobs.uv.tolist()), rig, obj)
+
+
+def test_a_score_takes_frames(seen):
+    rig, obj, frames, _ = seen
+    truth = calibrate(frames, rig, obj).rig
+    assert score(frames, truth, obj).distances.max() < 0.2

@@ -1,0 +1,83 @@
+"""A camera whose blobs nobody can label is refused by name; one that sees much else besides is not."""
+
+import numpy as np
+import pytest
+
+from imgcal.association.options import PipelineOptions
+from imgcal.errors import RefusedError
+from imgcal.pipeline.calibration import calibrate
+from scripts.benchmarks import camera_faults as damage
+
+CAMERA = 3
+BLIND = PipelineOptions(
+    blind_cameras=True
+)  # a camera without any label would be refused otherwise, as one that sees nothing
+MAKE = {"room": damage.wand_in_a_room, "ring": damage.object_before_a_ring}
+
+
+def wrong(kind, how):
+    rig, obj, truth = MAKE[kind](8)
+    if how == "lens":
+        truth = damage.with_camera(truth, obj, CAMERA, lambda r: damage.longer_lens(r, CAMERA))
+    elif how == "place":  # a camera of another rig
+        truth = damage.with_camera(truth, obj, CAMERA, lambda r: r.select([*range(CAMERA), 7, *range(CAMERA + 1, 10)]))
+    table = damage.blobs(truth)
+    if how == "late":
+        table = damage.late(table, CAMERA)
+    elif how == "swapped":
+        table = damage.swapped(table, CAMERA, 5)
+    elif how in ("u", "v", "both", "turned"):
+        table = damage.mirrored(table, rig, CAMERA, how)
+    return table, rig, obj
+
+
+@pytest.mark.parametrize("options", [PipelineOptions(), BLIND])
+@pytest.mark.parametrize("how", ["u", "v", "both", "turned", "lens", "place", "late", "swapped"])
+@pytest.mark.parametrize("kind", MAKE)
+def test_a_camera_whose_image_is_not_what_it_is_said_to_be_is_refused_by_name(kind, how, options):
+    table, rig, obj = wrong(kind, how)
+    with pytest.raises(RefusedError, match=r"^camera .*cam04.*: the other cameras put \d+ fiducials .*rig\.select"):
+        calibrate(table, rig, obj, options)
+
+
+@pytest.mark.parametrize("crowd", [0, 5, 40])
+@pytest.mark.parametrize("kind", MAKE)
+def test_false_blobs_do_not_count_against_a_camera(kind, crowd):
+    rig, obj, truth = MAKE[kind](8)
+    found = calibrate(damage.blobs(truth, crowded=(CAMERA, crowd)), rig, obj).tally
+    assert found.kept[:, CAMERA].sum() > 0.9 * found.expected[:, CAMERA].sum()
+    assert found.unexplained.sum() < 0.05 * found.kept.sum()
+
+
+@pytest.mark.parametrize("kind", MAKE)
+def test_a_camera_that_is_hidden_a_third_of_the_time_among_reflections_is_accepted(kind):
+    rig, obj, truth = MAKE[kind](9)
+    table = damage.blobs(truth, labelled=True, crowded=(CAMERA, 6))
+    hidden = (table.camera == CAMERA) & (table.snapshot % 3 == 0) & (table.fiducial >= 0)
+    table = table.select(~hidden)
+    table.fiducial[:] = -1
+    assert calibrate(table, rig, obj).tally.kept[1::3, CAMERA].sum() > 0
+
+
+def test_counts_add_up():
+    rig, obj, truth = damage.wand_in_a_room(6)
+    table = damage.blobs(truth)
+    result = calibrate(table, rig, obj)
+    found = result.tally
+    assert found.blobs.shape == (6, 10) and found.blobs.sum() == len(table)
+    assert found.labelled.sum() == (result.labelled.detections.fiducial >= 0).sum()
+    assert found.outliers.sum() == result.outliers
+    assert found.kept.sum() == int(result.observations.seen.sum())
+    assert np.array_equal(found.usable, found.blobs)  # nothing is flagged here
+
+
+def test_a_covered_camera_with_one_reflection_counts_as_blind():
+    rig, obj, truth = damage.wand_in_a_room(6)
+    table = damage.blobs(truth)
+    own = np.flatnonzero(table.camera == CAMERA)
+    first = own[np.unique(table.snapshot[own], return_index=True)[1]]
+    table.uv[first] = (100.0, 200.0)
+    table = table.select(np.setdiff1d(np.arange(len(table)), np.setdiff1d(own, first)))
+    with pytest.raises(RefusedError, match="found no fiducial in any snapshot"):
+        calibrate(table, rig, obj)
+    assert calibrate(table, rig, obj, BLIND).tally.kept[:, CAMERA].sum() == 0

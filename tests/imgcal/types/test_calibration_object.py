@@ -1,0 +1,113 @@
+"""`CalibrationObject`: symmetry groups of known bodies, near symmetries, bad input."""
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from imgcal.errors import InputError
+from imgcal.io import load_object
+from imgcal.types.calibration_object import CalibrationObject, SelfMotion
+
+
+def body(points: Tensor, radius: Tensor | None = None) -> CalibrationObject:
+    return CalibrationObject(points.double(), torch.ones(len(points), 3), radius)
+
+
+def grid(rows: int, columns: int) -> Tensor:
+    return torch.tensor([(10.0 * i, 10.0 * j, 0.0) for i, j in product(range(rows), range(columns))])
+
+
+TETRAHEDRON = torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) * 50
+PRISM = torch.tensor([(np.cos(a), np.sin(a), z) for a in np.arange(6) * np.pi / 3 for z in (-1.3, 1.3)]) * 40
+
+
+@pytest.mark.parametrize(("name", "order"), [("cube8", 24), ("cube27", 24), ("asymmetric8", 1), ("sphere64", 2)])
+def test_symmetries_of_the_shipped_objects(name: str, order: int) -> None:
+    assert len(load_object(name).symmetries) == order
+
+
+@pytest.mark.parametrize(
+    ("points", "order"),
+    [(grid(10, 10), 8), (grid(3, 5), 4), (TETRAHEDRON, 12), (PRISM, 12), (TETRAHEDRON + 300, 12)],
+)
+def test_symmetries_of_known_bodies(points: Tensor, order: int) -> None:
+    assert len(body(points).symmetries) == order
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_symmetries_do_not_depend_on_where_the_body_is(seed: int) -> None:
+    turn = torch.from_numpy(Rotation.random(rng=seed).as_matrix())
+    points = load_object("cube8").points @ turn.T + torch.tensor([500.0, -20.0, 3.0], dtype=torch.float64)
+    shuffled = points[torch.randperm(8, generator=torch.Generator().manual_seed(seed))]
+    assert len(body(shuffled).symmetries) == 24
+
+
+def check(obj: CalibrationObject, motion: SelfMotion, tolerance: float) -> None:
+    points = obj.points.numpy()
+    np.testing.assert_allclose(motion.rotation @ motion.rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(motion.rotation) == pytest.approx(1)
+    assert sorted(motion.permutation) == list(range(len(points)))
+    gaps = np.linalg.norm(points @ motion.rotation.T + motion.translation - points[motion.permutation], axis=1)
+    assert gaps.max() <= tolerance
+    assert motion.residual == pytest.approx(np.sqrt(np.mean(gaps**2)), abs=1e-9)
+
+
+def test_self_motions_map_the_object_onto_itself() -> None:
+    obj = load_object("cube8")
+    first, *_ = obj.symmetries
+    assert first.permutation.tolist() == list(range(8))
+    for motion in obj.symmetries:
+        check(obj, motion, 1e-9)
+    permutations = {tuple(motion.permutation) for motion in obj.symmetries}
+    assert len(permutations) == 24
+    composed = {tuple(np.array(p)[list(q)]) for p in permutations for q in permutations}
+    assert composed == permutations  # a group
+
+
+def test_radius_breaks_symmetry() -> None:
+    points = load_object("cube8").points
+    radius = torch.full((8,), 5.0, dtype=torch.float64)
+    assert len(body(points, radius).symmetries) == 24
+    radius[3] = 7.0
+    assert len(body(points, radius).symmetries) == 3  # the rotations about the diagonal through the larger fiducial
+
+
+def test_near_symmetries_appear_with_the_tolerance() -> None:
+    generator = torch.Generator().manual_seed(0)
+    points = load_object("cube8").points
+    obj = body(points + torch.randn(8, 3, generator=generator, dtype=torch.float64))
+    assert len(obj.symmetries) == 1
+    near = obj.near_symmetries(tolerance=8.0)
+    assert len(near) == 24
+    residuals = [motion.residual for motion in near]
+    assert residuals[0] == 0
+    assert residuals == sorted(residuals)
+    for motion in near:
+        check(obj, motion, 8.0)
+
+
+def test_moved_fiducial_breaks_the_grid() -> None:
+    points = grid(4, 4)
+    points[0] += torch.tensor([2.0, 0, 0])
+    assert len(body(points).symmetries) == 1
+    assert len(body(points).near_symmetries(tolerance=3.0)) == 8
+
+
+def test_planarity_and_size() -> None:
+    assert body(grid(3, 3)).planar
+    assert not body(TETRAHEDRON).planar
+    assert body(TETRAHEDRON).size == pytest.approx(50 * np.sqrt(3))
+
+
+def test_unusable_objects_say_why() -> None:
+    with pytest.raises(InputError, match="expected \\(N >= 4, 3\\)"):
+        body(TETRAHEDRON[:3])
+    line = body(torch.tensor([[float(i), 2.0 * i, 0] for i in range(5)]))
+    with pytest.raises(InputError, match="one line"):
+        _ = line.symmetries
+    assert replace(line, points=TETRAHEDRON.double()).fiducials == 4

@@ -1,0 +1,161 @@
+"""`CameraRig`: packings, moves, resizing, selections."""
+
+import pytest
+import torch
+
+from imgcal.geometry.rotations import rotation_from_euler
+from imgcal.geometry.transforms import RigidTransform
+from imgcal.synthesis.rigs import PhysicalDrift, PoseRange, sample_rig_from_object, synthesize
+from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types.rig import (
+    PARAMETER_NAMES,
+    PARAMETERS,
+    CameraRig,
+    RigPrior,
+    pack18,
+    pack21,
+    unpack18,
+    unpack21,
+)
+
+SHAPES = [(), (1,), (2, 3), (10,)]  # the last one has as many rigs as cameras
+
+
+def drifted(rig: CameraRig, *batch: int, seed: int = 0) -> CameraRig:
+    return PhysicalDrift(rotation_deg=3).apply(rig, torch.Generator().manual_seed(seed), *batch)
+
+
+def assert_same(first: CameraRig, second: CameraRig) -> None:
+    torch.testing.assert_close(first.focal_length, second.focal_length)
+    torch.testing.assert_close(first.principal_point, second.principal_point)
+    torch.testing.assert_close(first.distortion, second.distortion)
+    torch.testing.assert_close(first.cam_from_rig.rotation, second.cam_from_rig.rotation)
+    torch.testing.assert_close(first.cam_from_rig.translation, second.cam_from_rig.translation)
+
+
+def poses(*batch: int) -> RigidTransform:
+    count = torch.Size(batch).numel()
+    centroid = torch.zeros(3, dtype=torch.float64)
+    return sample_rig_from_object(count, 850.0, centroid, PoseRange(), torch.Generator().manual_seed(5)).reshape(*batch)
+
+
+@pytest.mark.parametrize("batch", SHAPES)
+def test_packings_round_trip(o10: CameraRig, batch: tuple[int, ...]) -> None:
+    rig = drifted(o10, *batch).from_object(poses(*batch))
+    packed21, packed18 = pack21(rig), pack18(rig)
+    assert packed21.shape == (*batch, 10, 21)
+    assert packed18.shape == (*batch, 10, 18)
+    assert_same(unpack21(packed21, o10), rig)
+    assert_same(unpack18(packed18, o10), rig)
+
+
+def test_packing_follows_the_paper(o10: CameraRig) -> None:
+    packed = pack21(o10)[3]
+    torch.testing.assert_close(packed[:9], o10.cam_from_rig.rotation[3].reshape(9))
+    torch.testing.assert_close(packed[9:12], o10.cam_from_rig.translation[3])
+    torch.testing.assert_close(packed[12:14], o10.focal_length[3])
+    torch.testing.assert_close(packed[14:16], o10.principal_point[3])
+    torch.testing.assert_close(packed[16:], o10.distortion[3])
+
+
+@pytest.mark.parametrize("batch", SHAPES)
+def test_difference_inverts_moved(o10: CameraRig, batch: tuple[int, ...]) -> None:
+    step = torch.rand(*batch, 10, PARAMETERS, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    moved = o10.moved(step)
+    assert moved.batch_shape == batch
+    torch.testing.assert_close(moved.difference(o10), step)
+    torch.testing.assert_close(moved.cam_from_rig.inverse().translation, moved.positions)
+
+
+@pytest.mark.parametrize(("name", "index"), [("rotation_y", 1), ("position_x", 3), ("fy", 7), ("cx", 8), ("p1", 12)])
+def test_parameter_order(o10: CameraRig, name: str, index: int) -> None:
+    assert PARAMETER_NAMES[index] == name
+    step = torch.zeros(10, PARAMETERS, dtype=torch.float64)
+    step[:, index] = 0.01
+    moved = o10.moved(step)
+    if name == "rotation_y":
+        turn = rotation_from_euler(torch.tensor([0, 0.01, 0], dtype=torch.float64))
+        torch.testing.assert_close(moved.cam_from_rig.rotation, turn @ o10.cam_from_rig.rotation)
+        torch.testing.assert_close(moved.positions, o10.positions)
+        return
+    changed = {
+        "position_x": (moved.positions - o10.positions)[:, 0],
+        "fy": (moved.focal_length - o10.focal_length)[:, 1],
+        "cx": (moved.principal_point - o10.principal_point)[:, 0],
+        "p1": (moved.distortion - o10.distortion)[:, 2],
+    }
+    torch.testing.assert_close(changed[name], torch.full((10,), 0.01, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("batch", SHAPES)
+def test_project_equals_camera_by_camera(
+    o10: CameraRig, asymmetric8: CalibrationObject, batch: tuple[int, ...]
+) -> None:
+    rig, rig_from_object = drifted(o10, *batch), poses(*batch)
+    found = rig.project(rig_from_object.apply(asymmetric8.points))
+    assert found.uv.shape == (*batch, 10, 8, 2)
+    assert found.visible.shape == found.depth.shape == (*batch, 10, 8)
+    moved = rig.from_object(rig_from_object)
+    for camera in range(10):
+        one = moved.select([camera]).project(asymmetric8.points.expand(*batch, 8, 3))
+        torch.testing.assert_close(one.uv[..., 0, :, :], found.uv[..., camera, :, :], rtol=0, atol=1e-9)
+
+
+def test_project_broadcasts(o10: CameraRig, asymmetric8: CalibrationObject) -> None:
+    many_points = poses(2, 3).apply(asymmetric8.points)
+    torch.testing.assert_close(o10.project(many_points).uv[1, 2], o10.project(many_points[1, 2]).uv)
+    many_rigs = drifted(o10, 4)
+    torch.testing.assert_close(many_rigs.project(many_points[0, 0]).uv[3], many_rigs[3].project(many_points[0, 0]).uv)
+
+
+def test_project_gradcheck(o10: CameraRig, asymmetric8: CalibrationObject) -> None:
+    step = torch.zeros(2, 3, PARAMETERS, dtype=torch.float64, requires_grad=True)
+    points = poses(2).apply(asymmetric8.points).detach().requires_grad_()
+    rig = o10.select([0, 4, 7])
+    assert torch.autograd.gradcheck(lambda s, p: rig.moved(s).project(p).uv / 1000, (step, points), atol=1e-6)
+
+
+def test_resizing_keeps_pixel_centres(o10: CameraRig, asymmetric8: CalibrationObject) -> None:
+    points = poses(3).apply(asymmetric8.points)
+    small = o10.resized(torch.tensor([512, 544]))
+    full, reduced = o10.project(points), small.project(points)
+    scale = torch.tensor([0.25, 0.5], dtype=torch.float64)
+    torch.testing.assert_close(reduced.uv + 0.5, scale * (full.uv + 0.5))
+    assert torch.equal(reduced.visible, full.visible)
+    assert_same(small.resized(o10.image_size), o10)
+    assert small.image_size.tolist() == [[512, 544]] * 10
+
+
+def test_from_object_chains(o10: CameraRig, asymmetric8: CalibrationObject) -> None:
+    rig_from_object = poses(2, 3)
+    torch.testing.assert_close(
+        o10.from_object(rig_from_object).project(asymmetric8.points).uv,
+        o10.project(rig_from_object.apply(asymmetric8.points)).uv,
+    )
+
+
+def test_select_index_expand_reshape(o10: CameraRig) -> None:
+    rig = drifted(o10, 2, 3)
+    chosen = rig.select([7, 2])
+    assert chosen.camera_names == (o10.camera_names[7], o10.camera_names[2])
+    torch.testing.assert_close(chosen.focal_length[1, 0, 0], rig.focal_length[1, 0, 7])
+    assert_same(rig.reshape(6)[5], rig[1, 2])
+    assert_same(o10.expand(4)[2], o10)
+    assert rig.batch_shape == (2, 3)
+    as_float = rig.to(torch.float32)
+    assert as_float.focal_length.dtype == as_float.cam_from_rig.rotation.dtype == torch.float32
+    assert as_float.image_size.dtype == o10.image_size.dtype
+
+
+def test_prior_standard_deviations(o10: CameraRig) -> None:
+    std = RigPrior(focal_length=0.02, principal_point=7, distortion=0.05, rotation=0.01, position=3).std(o10)
+    assert std.shape == (10, PARAMETERS)
+    expected = torch.tensor(
+        [0.01] * 3 + [3] * 3 + [0.02 * 1620, 0.02 * 1621] + [7] * 2 + [0.05] * 5, dtype=torch.float64
+    )
+    torch.testing.assert_close(std[0], expected)
+
+
+def test_drifted_rigs_differ(o10: CameraRig, asymmetric8: CalibrationObject) -> None:
+    snapshots = synthesize(o10, asymmetric8, 2, torch.Generator().manual_seed(0))
+    assert (snapshots.rig[0].difference(snapshots.rig[1]).abs().amax(0) > 0).sum() >= 12
