@@ -1,7 +1,7 @@
-"""The solver's fast path on CPUs: `solver.minimize` compiled to one loop a rig, without temporaries.
+"""The solver's fast path on CPUs: `levenberg_marquardt.minimize` compiled to one loop a rig, without temporaries.
 
-`linearize.py`, `schur.py` and `levenberg_marquardt.py` say the same in tensors, run on any device, and are what this is tested
-against. Names, units and layouts are theirs. Rigs of a batch run in parallel.
+`linearize.py`, `schur.py` and `levenberg_marquardt.py` say the same in tensors, run on any device, and this is tested
+against them. Names, units and layouts are theirs. Rigs of a batch run in parallel.
 """
 
 from __future__ import annotations

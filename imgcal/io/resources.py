@@ -11,7 +11,7 @@ def data_path(*parts: str) -> Path:
     Convention: an installed wheel carries the data as `imgcal/data`; a checkout has `data/` beside the package. The
     returned path need not exist.
     """
-    package = Path(__file__).resolve().parent
+    package = Path(__file__).resolve().parents[1]
     inside = package / "data"
     return (inside if inside.is_dir() else package.parent / "data").joinpath(*parts)
 
