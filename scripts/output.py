@@ -22,8 +22,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from imgcal.errors import InputError, RefusedError
-from imgcal.io import write_text
-from imgcal.io.atomic import write_bytes
+from imgcal.io import write_bytes, write_text
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "docs" / "results"

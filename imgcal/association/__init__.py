@@ -1,7 +1,5 @@
 """Which blob is which fiducial, for the unlabelled blobs of all cameras together."""
 
-from imgcal.association.identify import bootstrap, identify, track
-from imgcal.association.orientation import oriented
-from imgcal.association.result import Identity, IdentityOptions, Status
+import lazy_loader as lazy
 
-__all__ = ["Identity", "IdentityOptions", "Status", "bootstrap", "identify", "oriented", "track"]
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from imgcal.association.hypotheses import Poses
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.types.calibration_object import CalibrationObject
+from imgcal.geometry import RigidTransform
+from imgcal.types import CalibrationObject
 
 LEAST_OVERLAP = 0.6  # part of the fiducials that must fall onto others for a shift to be mistaken for none
 MOST_SHIFTS = 8  # the smallest ones; larger ones are made of them

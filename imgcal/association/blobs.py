@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.errors import InputError
-from imgcal.types.observations import Detections
-from imgcal.types.rig import CameraRig
+from imgcal.types import CameraRig, Detections
 from renderers.compiling import njit
 
 FAR = 1e6

@@ -14,9 +14,8 @@ from scipy.stats import chi2
 from imgcal.association.hypotheses import Poses
 from imgcal.association.result import Identity, IdentityOptions, Status
 from imgcal.association.verify import Fits, Scene, evidence, fit, problem_of, rig_and_pose, start
-from imgcal.estimation import initial_pose, lm_cpu
-from imgcal.estimation.linearize import State
-from imgcal.types.observations import Observations
+from imgcal.estimation import State, initial_pose, lm_cpu
+from imgcal.types import Observations
 
 MOST_LABELLINGS = 400
 FITS = 0.999  # quantile of chi-squared that the right labelling stays below

@@ -15,8 +15,7 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from imgcal.association.blobs import Blobs
 from imgcal.association.p3p import FAST, three_point_pose
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.rig import CameraRig
+from imgcal.types import CalibrationObject, CameraRig
 from renderers.compiling import njit
 
 MOST_FIDUCIAL_TRIPLES = 300_000

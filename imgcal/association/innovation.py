@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.association.blobs import Blobs
-from imgcal.estimation.levenberg_marquardt import Solution
-from imgcal.estimation.linearize import Problem
-from imgcal.estimation.lm_cpu import _exponential, _multiply, lens
-from imgcal.geometry.projection import NEAREST_DEPTH
+from imgcal.estimation import Problem, Solution, lens
+from imgcal.estimation.lm_cpu import _exponential, _multiply
+from imgcal.geometry import NEAREST_DEPTH
 from renderers.compiling import njit
 
 FAST = {"contract", "reassoc", "nsz"}

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from imgcal.association.result import IdentityOptions
 from imgcal.estimation import EstimationOptions
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.geometry import RigidTransform
 
 
 @dataclass(frozen=True)

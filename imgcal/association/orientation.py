@@ -8,9 +8,8 @@ import numpy as np
 import torch
 
 from imgcal.association.result import Identity
-from imgcal.geometry.rotations import geodesic_angle
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.types.calibration_object import CalibrationObject
+from imgcal.geometry import RigidTransform, geodesic_angle
+from imgcal.types import CalibrationObject
 
 CLEAR = 0.5
 """Part of the second nearest turn's angle that the nearest one must not exceed for a given pose to decide."""

@@ -12,8 +12,7 @@ from scipy.spatial import cKDTree
 
 from imgcal.association.blobs import Blobs
 from imgcal.association.hypotheses import Poses
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.rig import CameraRig
+from imgcal.types import CalibrationObject, CameraRig
 
 Floats = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.types.rig import CameraRig
+from imgcal.geometry import RigidTransform
+from imgcal.types import CameraRig
 
 Status = Literal["unique", "by_prior", "by_tracking", "ambiguous", "refused"]
 """How a labelling was decided: by the blobs alone (`unique`, or `ambiguous` where the object's symmetry allows others),

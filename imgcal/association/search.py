@@ -15,7 +15,7 @@ from imgcal.association.hypotheses import FiducialTriples, blob_triples, single_
 from imgcal.association.planar import planar_poses
 from imgcal.association.verify import Fits, Scene, refine, start
 from imgcal.association.voting import match, predict_ideal, vote
-from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types import CalibrationObject
 
 TRIPLES = 10  # of blobs in a round, over all cameras
 KEPT = 8  # poses of each

@@ -13,14 +13,10 @@ from numpy.typing import NDArray
 from imgcal.association import Identity, Status, identify, oriented
 from imgcal.association.options import PipelineOptions
 from imgcal.errors import InputError, RefusedError
-from imgcal.estimation import estimate, flat_std
-from imgcal.estimation.pose_support import ON_A_LINE
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.estimation import ON_A_LINE, estimate, flat_std
+from imgcal.geometry import RigidTransform
 from imgcal.messages import listed
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.limits import check_object, check_rig
-from imgcal.types.observations import Detections, Observations
-from imgcal.types.rig import CameraRig, RigPrior
+from imgcal.types import CalibrationObject, CameraRig, Detections, Observations, RigPrior, check_object, check_rig
 
 MOST_REMEMBERED = 64
 """Snapshots that take part in refits of the rig while identity goes on: later ones add little to it."""

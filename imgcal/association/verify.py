@@ -18,11 +18,9 @@ from imgcal.association.assignment import assign
 from imgcal.association.blobs import Blobs
 from imgcal.association.hypotheses import Poses
 from imgcal.association.innovation import THRESHOLD, Innovations, contested, innovations
-from imgcal.estimation import lm_cpu
-from imgcal.estimation.linearize import Problem, State, pose_at
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.rig import CameraRig
+from imgcal.estimation import Problem, State, lm_cpu, pose_at
+from imgcal.geometry import RigidTransform
+from imgcal.types import CalibrationObject, CameraRig
 
 STAGES = (3.0, 0.7)
 """Standard deviations (px) that the first fits allow, beyond the blobs' own; the last ones ask the residuals."""

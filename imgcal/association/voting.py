@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from imgcal.association.assignment import mutual_nearest
 from imgcal.association.blobs import Blobs
 from imgcal.association.hypotheses import Poses
-from imgcal.types.rig import CameraRig
+from imgcal.types import CameraRig
 from renderers.compiling import njit
 
 MOST_BINS = 200  # across a camera's range of shifts; the tolerance grows where it asks for more

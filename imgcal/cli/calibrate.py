@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import torch
 import tyro
 
-from imgcal.association.options import PipelineOptions
+from imgcal.association import PipelineOptions
 from imgcal.cli.common import (
     StartPose,
     check_folder,
@@ -40,14 +40,9 @@ from imgcal.io import (
     save_rig,
     write_text,
 )
-from imgcal.pipeline.calibration import Calibration, calibrate, rms_length
-from imgcal.pipeline.initialization import load_guesser
+from imgcal.pipeline import Calibration, calibrate, load_guesser, rms_length
 from imgcal.report import write_report
-from imgcal.types import limits
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.moved_camera import MovedError
-from imgcal.types.observations import Detections
-from imgcal.types.rig import PARAMETER_NAMES, CameraRig
+from imgcal.types import PARAMETER_NAMES, CalibrationObject, CameraRig, Detections, MovedError, limits
 
 WRITTEN = ("report.html", "rig.yaml", "object.csv", "result.json")
 

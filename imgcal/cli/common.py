@@ -19,12 +19,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from imgcal.detection import Blobs, DetectionOptions, detect_snapshot, without_dim
 from imgcal.errors import InputError
-from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import Capture, Frame
 from imgcal.messages import listed, shortened
-from imgcal.types.observations import Detections
-from imgcal.types.rig import CameraRig
+from imgcal.types import CameraRig, Detections
 
 Item = TypeVar("Item")
 

@@ -6,10 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from imgcal.pipeline.calibration import Calibration
-from imgcal.pipeline.tally import DOUBTFUL, Tally
-from imgcal.types.observations import Detections
-from imgcal.types.rig import CameraRig
+from imgcal.pipeline import DOUBTFUL, Calibration, Tally
+from imgcal.types import CameraRig, Detections
 
 
 def counts_by_camera(counts: Tally, camera: int) -> dict[str, int]:

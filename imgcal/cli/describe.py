@@ -12,14 +12,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import imgcal
-from imgcal.association.series import matched_to_rig
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.association import matched_to_rig
+from imgcal.geometry import RigidTransform
 from imgcal.io import Frame
-from imgcal.pipeline.calibration import Calibration, rms_length
+from imgcal.pipeline import Calibration, rms_length
 from imgcal.report import ReportContent, SnapshotSummary, relative_prior_std
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.observations import Detections
-from imgcal.types.rig import CameraRig
+from imgcal.types import CalibrationObject, CameraRig, Detections
 
 Pictures = Mapping[str, Frame | None]
 

@@ -19,10 +19,8 @@ from imgcal.errors import InputError
 from imgcal.io import load_object, load_rig, publishing
 
 if TYPE_CHECKING:
-    from imgcal.evaluation import Conditions, Method, Protocol
-    from imgcal.evaluation.models import Model
-    from imgcal.evaluation.protocol import Progress as Advance
-    from imgcal.evaluation.report import Report
+    from imgcal.evaluation import Conditions, Method, Model, Protocol, Report
+    from imgcal.evaluation import Progress as Advance
 
 Axis = Literal["kappa", "phi", "noise", "missing", "swapped", "false"]
 
@@ -95,8 +93,7 @@ class Compare:
 
 def _run(paths: tuple[Path, ...], setting: Setting, baselines: bool, out: Path | None) -> None:
     # Imported late: what brings networks and plots along takes seconds, which the other commands should not wait.
-    from imgcal.evaluation import BASELINES, Protocol
-    from imgcal.evaluation.report import PLOTS, RESULT, TABLES, write
+    from imgcal.evaluation import BASELINES, PLOTS, RESULT, TABLES, Protocol, write
 
     if out is not None:
         check_folder(out)
@@ -119,7 +116,7 @@ def _load(paths: tuple[Path, ...], setting: Setting) -> list[Model]:
         return []
     import torch
 
-    from imgcal.evaluation.models import load_models
+    from imgcal.evaluation import load_models
 
     rig = None if setting.rig is None else load_rig(setting.rig)
     obj = None if setting.object is None else load_object(setting.object)
@@ -129,8 +126,8 @@ def _load(paths: tuple[Path, ...], setting: Setting) -> list[Model]:
 
 def _conditions(models: list[Model], setting: Setting) -> Conditions:
     """What is asked for, and for the rest what the first model was trained for."""
-    from imgcal.evaluation import Conditions, Corruption
-    from imgcal.synthesis.rigs import PoseRange, RelativeDrift
+    from imgcal.evaluation import Conditions
+    from imgcal.synthesis import Corruption, PoseRange, RelativeDrift
 
     if models:
         known = models[0].conditions
@@ -153,9 +150,7 @@ def _conditions(models: list[Model], setting: Setting) -> Conditions:
 
 
 def _measure(methods: Mapping[str, Method], conditions: Conditions, protocol: Protocol, setting: Setting) -> Report:
-    from imgcal.evaluation import AXES, evaluate, sweep
-    from imgcal.evaluation.latency import latency
-    from imgcal.evaluation.report import Report
+    from imgcal.evaluation import AXES, Report, evaluate, latency, sweep
 
     fast = {name: method for name, method in methods.items() if method.most is None}
     along = replace(protocol, count=setting.sweep_count, trials=1)
@@ -185,7 +180,7 @@ def _bar(total: int) -> Iterator[Advance]:
 
 def _print(report: Report) -> None:
     """Tables on standard output: for people on a terminal, as Markdown elsewhere."""
-    from imgcal.evaluation.report import describe, markdown, tables
+    from imgcal.evaluation import describe, markdown, tables
 
     if not sys.stdout.isatty():
         print(markdown(report), end="")

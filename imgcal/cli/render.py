@@ -12,12 +12,12 @@ import numpy as np
 import torch
 import tyro
 
-from imgcal.association.series import label, matched_to_rig, to_observations
+from imgcal.association import label, matched_to_rig, to_observations
 from imgcal.cli.common import check_folder, progress, read_detections
 from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError
 from imgcal.io import load_object, load_rig, open_input, publishing, write_image
-from imgcal.synthesis.colour_coding import LEVELS, ImageOptions, render_views
+from imgcal.synthesis import LEVELS, ImageOptions, render_views
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,9 @@ import tyro
 from imgcal.cli.common import progress, read_detections
 from imgcal.detection import DetectionOptions
 from imgcal.io import load_object, load_rig, open_input
-from imgcal.pipeline.calibration import Score as Scored
-from imgcal.pipeline.calibration import rms_length, score
-from imgcal.types.rig import CameraRig
+from imgcal.pipeline import Score as Scored
+from imgcal.pipeline import rms_length, score
+from imgcal.types import CameraRig
 
 
 @dataclass(frozen=True)

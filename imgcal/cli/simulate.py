@@ -12,7 +12,7 @@ import torch
 
 from imgcal.cli.common import check_folder, progress
 from imgcal.errors import InputError
-from imgcal.geometry.rotations import vector_from_rotation
+from imgcal.geometry import vector_from_rotation
 from imgcal.io import (
     load_object,
     load_rig,
@@ -25,11 +25,18 @@ from imgcal.io import (
     write_text,
 )
 from imgcal.messages import shortened
-from imgcal.synthesis.captures import FrameModel, Truth, simulate_frames, simulate_truth, true_detections
-from imgcal.synthesis.rigs import Drift, PhysicalDrift, PoseRange, RelativeDrift
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.limits import FIDUCIAL_RADIUS
-from imgcal.types.rig import CameraRig
+from imgcal.synthesis import (
+    Drift,
+    FrameModel,
+    PhysicalDrift,
+    PoseRange,
+    RelativeDrift,
+    Truth,
+    simulate_frames,
+    simulate_truth,
+    true_detections,
+)
+from imgcal.types import FIDUCIAL_RADIUS, CalibrationObject, CameraRig
 from renderers import ClutterModel, SensorModel
 
 WRITTEN = ("capture.yaml", "rig.yaml", "object.csv", "truth", "frames")

@@ -42,8 +42,7 @@ class Train:
         # Imported late: accelerate and TensorBoard take seconds, which the other commands should not wait.
         import torch
 
-        from imgcal.training.engine import RESULT, STATE, finished, train
-        from imgcal.training.experiment import load_experiment
+        from imgcal.training import RESULT, STATE, finished, load_experiment, train
 
         changes = [change for changes in self.set for change in changes]
         changes += [] if self.minutes is None else [f"training.minutes={float(self.minutes)!r}"]

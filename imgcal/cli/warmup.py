@@ -7,7 +7,7 @@ import time
 from dataclasses import dataclass
 
 from imgcal.cli.compiling import tells_of_compiling
-from imgcal.online.warmup import warm_up
+from imgcal.online import warm_up
 from renderers.compiling import cache_folder
 
 

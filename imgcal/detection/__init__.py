@@ -1,8 +1,5 @@
 """Blobs in captured frames: OpenCV finds them, a fitted ellipse measures them."""
 
-from imgcal.detection.centroids import Blobs
-from imgcal.detection.detector import detect, detect_frame, detect_snapshot
-from imgcal.detection.options import DetectionOptions
-from imgcal.detection.populations import without_dim
+import lazy_loader as lazy
 
-__all__ = ["Blobs", "DetectionOptions", "detect", "detect_frame", "detect_snapshot", "without_dim"]
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

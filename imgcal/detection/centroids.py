@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from imgcal.detection.candidates import Candidates
 from imgcal.detection.kernels import measure_all
 from imgcal.detection.options import DetectionOptions, Frame
-from imgcal.types.observations import BlobFlag
+from imgcal.types import BlobFlag
 
 HALF_SIZES = (7, 10, 14, 20, 29, 42, 60)  # px; windows of 2 h + 1
 REACH = 4  # px from a component to the end of its window: the skirt and a ring that is clear of it

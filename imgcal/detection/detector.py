@@ -15,7 +15,7 @@ from imgcal.detection.centroids import Blobs, measure
 from imgcal.detection.options import DetectionOptions, Frame, checked_frame, checked_mask, full_scale
 from imgcal.detection.populations import usable, usual_size, without_dim
 from imgcal.errors import InputError
-from imgcal.types.observations import BlobFlag, Detections
+from imgcal.types import BlobFlag, Detections
 
 LARGER = 32.0  # px, radius up to which blobs show when they are looked for with the usual limit
 LARGEST = 48.0  # px, radius that the windows hold

@@ -16,7 +16,7 @@ import numpy as np
 from imgcal.detection.candidates import BLOCK
 from imgcal.detection.fitting import BAND, FARTHEST, MOST, PARAMETERS, ROWS, fit_centre, start_of
 from imgcal.detection.moments import find_centroid, find_ramp, find_shape
-from imgcal.types.observations import BlobFlag
+from imgcal.types import BlobFlag
 from renderers.compiling import njit
 
 RING = 2  # px, width of the frame of a window from which the background is taken

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from imgcal.detection.centroids import Blobs
 from imgcal.detection.options import DetectionOptions
-from imgcal.types.observations import UNUSABLE
+from imgcal.types import UNUSABLE
 
 GAP = 3.0  # ratio of neighbouring contrasts between two populations
 DIM = 0.08  # of full scale: the dim population is below, the bright one above

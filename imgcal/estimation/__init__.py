@@ -1,27 +1,5 @@
 """Batched maximum a posteriori estimation of rigs, with covariance and gradients."""
 
-from imgcal.estimation.covariance import (
-    camera_covariance,
-    camera_std,
-    flat_std,
-    object_covariance,
-    pose_covariance,
-    relative_covariance,
-    relative_difference,
-)
-from imgcal.estimation.estimate import Estimate, EstimationOptions, estimate
-from imgcal.estimation.initial_pose import initial_pose
+import lazy_loader as lazy
 
-__all__ = [
-    "Estimate",
-    "EstimationOptions",
-    "camera_covariance",
-    "camera_std",
-    "estimate",
-    "flat_std",
-    "initial_pose",
-    "object_covariance",
-    "pose_covariance",
-    "relative_covariance",
-    "relative_difference",
-]
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from imgcal.estimation.levenberg_marquardt import Solution
-from imgcal.estimation.linearize import Problem, jacobian_at, robust_weight
+from imgcal.estimation.linearization import Problem, jacobian_at, robust_weight
 from imgcal.estimation.robust_losses import Loss
-from imgcal.types.rig import PARAMETERS
+from imgcal.types import PARAMETERS
 
 LEAST_BLOCKS = 6
 """Blocks whose scatter is trusted."""

@@ -16,9 +16,9 @@ import torch
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from imgcal.estimation.linearize import Problem, State, linearize
+from imgcal.estimation.linearization import Problem, State, linearize
 from imgcal.estimation.robust_losses import huber, squared
-from imgcal.types.rig import PARAMETERS
+from imgcal.types import PARAMETERS
 
 STEP = 8
 """Values of a camera that may step: rotation, position, focal lengths."""

@@ -19,12 +19,11 @@ from torch import Tensor
 
 from imgcal.errors import RefusedError
 from imgcal.estimation.curvature import curvature_covariance
-from imgcal.estimation.estimate import Estimate
 from imgcal.estimation.levenberg_marquardt import Solution, factorize
-from imgcal.estimation.linearize import POSE_PARAMETERS, points_at
-from imgcal.geometry.rotations import cross_matrix, left_jacobian
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.types.rig import PARAMETERS, CameraRig
+from imgcal.estimation.linearization import POSE_PARAMETERS, points_at
+from imgcal.estimation.map_estimate import Estimate
+from imgcal.geometry import RigidTransform, cross_matrix, left_jacobian
+from imgcal.types import PARAMETERS, CameraRig
 from renderers.compiling import njit
 
 UNDETERMINED = "covariance: the observations do not determine the object's pose in every snapshot"

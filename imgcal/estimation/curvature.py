@@ -21,9 +21,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from imgcal.estimation.estimate import Estimate
 from imgcal.estimation.levenberg_marquardt import Factorization, factorize, taken
-from imgcal.estimation.linearize import (
+from imgcal.estimation.linearization import (
     POSE_PARAMETERS,
     Problem,
     State,
@@ -36,7 +35,8 @@ from imgcal.estimation.linearize import (
     rig_at,
     with_scale,
 )
-from imgcal.types.rig import PARAMETERS, CameraRig
+from imgcal.estimation.map_estimate import Estimate
+from imgcal.types import PARAMETERS, CameraRig
 
 MOST_PAIRS, LEAST_PAIRS = 256, 64
 """Drawn for one snapshot; for many, where the posterior is narrow and hardly curved."""

@@ -9,10 +9,8 @@ import torch
 from torch import Tensor
 
 from imgcal.estimation import EstimationOptions, estimate
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.observations import Observations
-from imgcal.types.rig import CameraRig
+from imgcal.geometry import RigidTransform
+from imgcal.types import CalibrationObject, CameraRig, Observations
 
 FINE = 0.1
 """Pixels: differences between two estimates that are forgiven before a camera counts as moved."""

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from imgcal.estimation.levenberg_marquardt import Solution, factorize
-from imgcal.estimation.linearize import Problem, State, Step, moved, points_at, pose_at, rig_at
+from imgcal.estimation.linearization import Problem, State, Step, moved, points_at, pose_at, rig_at
 from imgcal.estimation.robust_losses import Loss
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from imgcal.estimation import schur
-from imgcal.estimation.linearize import (
+from imgcal.estimation.linearization import (
     POSE_PARAMETERS,
     NormalEquations,
     ObjectEquations,
@@ -20,7 +20,7 @@ from imgcal.estimation.linearize import (
     moved,
 )
 from imgcal.estimation.robust_losses import Loss
-from imgcal.types.rig import PARAMETERS
+from imgcal.types import PARAMETERS
 
 LEAST_DAMPING = 1e-9
 MOST_DAMPING = 1e12

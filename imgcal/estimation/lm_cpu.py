@@ -1,7 +1,7 @@
 """The solver's fast path on CPUs: `levenberg_marquardt.minimize` compiled to one loop a rig, without temporaries.
 
-`linearize.py`, `schur.py` and `levenberg_marquardt.py` say the same in tensors, run on any device, and this is tested
-against them. Names, units and layouts are theirs. Rigs of a batch run in parallel.
+`linearization.py`, `schur.py` and `levenberg_marquardt.py` say the same in tensors, run on any device, and this is
+tested against them. Names, units and layouts are theirs. Rigs of a batch run in parallel.
 """
 
 from __future__ import annotations
@@ -23,10 +23,9 @@ from imgcal.estimation.levenberg_marquardt import (
     Solution,
     pixel_rounding,
 )
-from imgcal.estimation.linearize import NormalEquations, ObjectEquations, Problem, State
-from imgcal.geometry.projection import NEAREST_DEPTH
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.types.rig import CameraRig
+from imgcal.estimation.linearization import NormalEquations, ObjectEquations, Problem, State
+from imgcal.geometry import NEAREST_DEPTH, RigidTransform
+from imgcal.types import CameraRig
 from renderers.compiling import njit
 
 LOSS_CODES = {"squared": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3}

@@ -26,11 +26,10 @@ from imgcal.estimation.change_points import (
     is_significant,
     likeliest_step,
 )
-from imgcal.estimation.estimate import minimize
-from imgcal.estimation.linearize import Problem, State, points_at, pose_at, rig_at
+from imgcal.estimation.linearization import Problem, State, points_at, pose_at, rig_at
+from imgcal.estimation.map_estimate import minimize
 from imgcal.estimation.robust_losses import huber
-from imgcal.types.moved_camera import Kind, MovedCamera
-from imgcal.types.rig import PARAMETERS
+from imgcal.types import PARAMETERS, Kind, MovedCamera
 
 ERROR = 1e-5
 """Probability of naming a camera in a capture in which none has moved, as far as noise is what it is said to be."""

@@ -18,11 +18,11 @@ from scipy.stats import f as fisher
 from scipy.stats import norm
 
 from imgcal.estimation.covariance import object_covariance
-from imgcal.estimation.estimate import Estimate
 from imgcal.estimation.levenberg_marquardt import Solution, factorize
-from imgcal.estimation.linearize import Problem, State, jacobian_at, linearize, points_at, robust_weight
+from imgcal.estimation.linearization import Problem, State, jacobian_at, linearize, points_at, robust_weight
+from imgcal.estimation.map_estimate import Estimate
 from imgcal.estimation.robust_losses import Loss
-from imgcal.types.rig import PARAMETERS
+from imgcal.types import PARAMETERS
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -37,7 +37,7 @@ MOST_FIDUCIALS = 64
 """Of an object whose shape is asked about: boards and clouds with more are taken as they are measured."""
 COMPLEXITY = 3.0
 """Log evidence that each further tolerance must gain."""
-LEAST_SNAPSHOTS = 8
+SNAPSHOTS_TO_BEND = 8
 """From which the pulls of single snapshots are compared with each other."""
 ROUNDS = 60
 """Of `learnt_tolerances` and of `offsets`, at most."""
@@ -169,7 +169,7 @@ def pull_scatter(problem: Problem, state: State, loss: Loss) -> float:
         loss: of the fit.
     """
     snapshots = problem.uv.shape[1]
-    if snapshots < LEAST_SNAPSHOTS:
+    if snapshots < SNAPSHOTS_TO_BEND:
         return 1.0
     at = jacobian_at(problem, state)
     assert at.by_fiducial is not None

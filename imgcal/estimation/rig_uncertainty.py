@@ -14,9 +14,8 @@ import torch
 from torch import Tensor
 
 from imgcal.errors import RefusedError
-from imgcal.geometry.projection import distort_with_jacobian
-from imgcal.geometry.rotations import cross_matrix
-from imgcal.types.rig import PARAMETERS, CameraRig
+from imgcal.geometry import cross_matrix, distort_with_jacobian
+from imgcal.types import PARAMETERS, CameraRig
 
 ROUNDS = 3
 """Of weighing the points of the alignment by the error that the alignment before leaves at them."""

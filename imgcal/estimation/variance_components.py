@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from imgcal.errors import RefusedError
 from imgcal.estimation.covariance import remaining_variance
-from imgcal.estimation.estimate import EstimationOptions, make_loss, minimize
 from imgcal.estimation.levenberg_marquardt import Solution
-from imgcal.estimation.linearize import Problem, State, points_at
+from imgcal.estimation.linearization import Problem, State, points_at
+from imgcal.estimation.map_estimate import EstimationOptions, make_loss, minimize
 from imgcal.estimation.object_shape import ShapeEvidence, learnt_tolerances, pull_scatter, shape_evidence
 from imgcal.estimation.pose_support import require_poses
 from imgcal.estimation.robust_losses import Loss

@@ -12,13 +12,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from imgcal.estimation import initial_pose
-from imgcal.estimation.estimate import make_problem, make_start
-from imgcal.estimation.linearize import Problem, State, moved, pose_at, rig_at
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.observations import Observations
-from imgcal.types.prediction import Prediction
-from imgcal.types.rig import PARAMETERS, CameraRig, pack21, unpack21
+from imgcal.estimation import Problem, State, initial_pose, make_problem, make_start, moved, pose_at, rig_at
+from imgcal.types import PARAMETERS, CalibrationObject, CameraRig, Observations, Prediction, pack21, unpack21
 
 Array = NDArray[np.float64]
 Intrinsics = tuple[Array, Array]  # camera matrix (3, 3), distortion (5,)

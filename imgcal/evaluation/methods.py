@@ -13,13 +13,16 @@ from torch import Tensor, nn
 
 from imgcal.estimation import estimate
 from imgcal.evaluation import classical
-from imgcal.refinement import ImageRefinementOptions, as_prediction, refine_images, refine_robustly
-from imgcal.refinement.graduated_non_convexity import robust_pose
-from imgcal.refinement.points import observed
-from imgcal.synthesis.colour_coding import ImageOptions, render_views
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.prediction import Prediction, Views
-from imgcal.types.rig import CameraRig
+from imgcal.refinement import (
+    ImageRefinementOptions,
+    as_prediction,
+    observed,
+    refine_images,
+    refine_robustly,
+    robust_pose,
+)
+from imgcal.synthesis import ImageOptions, render_views
+from imgcal.types import CalibrationObject, CameraRig, Prediction, Views
 
 DRIFTED_SIGMA = 10.0  # pixels: what the points of a factory rig are off by
 

@@ -9,12 +9,16 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
-from imgcal.estimation import Estimate, relative_covariance, relative_difference
-from imgcal.estimation.linearize import POSE_PARAMETERS, NormalEquations, linearize
-from imgcal.estimation.robust_losses import squared
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.prediction import Prediction
-from imgcal.types.rig import PARAMETERS, CameraRig
+from imgcal.estimation import (
+    POSE_PARAMETERS,
+    Estimate,
+    NormalEquations,
+    linearize,
+    relative_covariance,
+    relative_difference,
+    squared,
+)
+from imgcal.types import PARAMETERS, CalibrationObject, CameraRig, Prediction
 
 
 @dataclass(frozen=True)

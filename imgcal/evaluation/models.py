@@ -13,9 +13,8 @@ from imgcal.errors import InputError
 from imgcal.evaluation.methods import Method, network_method
 from imgcal.evaluation.protocol import Conditions
 from imgcal.evaluation.report import Facts
-from imgcal.training.checkpoint import Checkpoint, load_checkpoint
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.rig import CameraRig
+from imgcal.training import Checkpoint, load_checkpoint
+from imgcal.types import CalibrationObject, CameraRig
 
 METRICS = "metrics.jsonl"
 
@@ -96,6 +95,6 @@ def _names(paths: Sequence[Path]) -> list[str]:
 def _history(path: Path) -> tuple[dict[str, Any], ...]:
     if not path.is_file():
         return ()
-    from imgcal.training.log import read_metrics  # brings TensorBoard along, which is slow to import
+    from imgcal.training import read_metrics
 
     return tuple(read_metrics(path))

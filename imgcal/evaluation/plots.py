@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from imgcal.evaluation.protocol import REFERENCE, Scores
-from imgcal.evaluation.sweep import AXES, Sweep
-from imgcal.io.atomic import write_bytes
+from imgcal.evaluation.sweeps import AXES, Sweep
+from imgcal.io import write_bytes
 
 if TYPE_CHECKING:
     from imgcal.evaluation.report import Report

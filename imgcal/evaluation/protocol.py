@@ -15,13 +15,9 @@ from imgcal.estimation import Estimate
 from imgcal.evaluation.methods import Given, Method
 from imgcal.evaluation.metrics import KINDS, Errors, concatenate, cramer_rao, errors
 from imgcal.messages import shortened
-from imgcal.refinement import as_prediction, refine_points
-from imgcal.refinement.graduated_non_convexity import SQUARED
-from imgcal.synthesis.corruption import Corrupted, Corruption
-from imgcal.synthesis.rigs import Drift, PoseRange, RelativeDrift, synthesize
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.prediction import Prediction, Views
-from imgcal.types.rig import CameraRig
+from imgcal.refinement import SQUARED, as_prediction, refine_points
+from imgcal.synthesis import Corrupted, Corruption, Drift, PoseRange, RelativeDrift, synthesize
+from imgcal.types import CalibrationObject, CameraRig, Prediction, Views
 
 REFERENCE = "MAP, true inliers"
 LEAST_FIDUCIALS = 3  # different ones that a pose needs

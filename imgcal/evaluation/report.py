@@ -13,11 +13,11 @@ from typing import Any
 import torch
 from rich.table import Table as RichTable
 
-from imgcal.evaluation.latency import Latency
 from imgcal.evaluation.protocol import REFERENCE, Conditions, Evaluation, Row, Scores
-from imgcal.evaluation.sweep import AXES, Sweep
+from imgcal.evaluation.sweeps import AXES, Sweep
+from imgcal.evaluation.timing import Latency
 from imgcal.io import write_text
-from imgcal.synthesis.rigs import RelativeDrift
+from imgcal.synthesis import RelativeDrift
 
 FORMAT = "imgcal-evaluation/1"
 RESULT, TABLES = "evaluation.json", "evaluation.md"

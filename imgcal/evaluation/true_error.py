@@ -5,10 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from imgcal.estimation.rig_uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian
-from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.types.rig import CameraRig
+from imgcal.estimation import RigUncertainty, inverse_or_zero, pixel_jacobian
+from imgcal.geometry import RigidTransform, rotation_from_vector
+from imgcal.types import CameraRig
 
 STEPS = 6
 """Of Gauss-Newton, each of which gains several digits here."""

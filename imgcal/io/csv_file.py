@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from imgcal.errors import InputError
 from imgcal.io.names import check_regular, nearest
 from imgcal.messages import shortened
-from imgcal.types.limits import Range
+from imgcal.types import Range
 
 Numbers = NDArray[np.float64]
 

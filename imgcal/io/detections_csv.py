@@ -23,9 +23,7 @@ from imgcal.io.atomic import replacing
 from imgcal.io.csv_file import Chunk, fail_row, read_chunks
 from imgcal.io.names import is_file_name, nearest
 from imgcal.messages import listed, shortened
-from imgcal.types import limits
-from imgcal.types.observations import BlobFlag, Detections
-from imgcal.types.rig import CameraRig
+from imgcal.types import BlobFlag, CameraRig, Detections, limits
 
 REQUIRED = ("snapshot", "camera", "u", "v")
 OPTIONAL = ("sigma", "fiducial", "radius", "flags")

@@ -13,7 +13,7 @@ from typing import BinaryIO
 
 from imgcal.errors import InputError
 from imgcal.io.names import check_regular
-from imgcal.types.limits import MOST_PIXELS
+from imgcal.types import MOST_PIXELS
 
 Size = tuple[int, int]  # width, height in pixels
 

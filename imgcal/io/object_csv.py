@@ -15,8 +15,7 @@ from imgcal.io.atomic import write_text
 from imgcal.io.csv_file import Chunk, read_chunks
 from imgcal.io.names import LONGEST_NAME, find_file, title_of
 from imgcal.messages import shortened
-from imgcal.types import limits
-from imgcal.types.calibration_object import CalibrationObject
+from imgcal.types import CalibrationObject, limits
 from renderers.palette import palette
 
 # Nearer than this to one line, in units of the object's size, no pose can be found.

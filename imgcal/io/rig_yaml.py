@@ -13,14 +13,12 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from imgcal.errors import InputError
-from imgcal.geometry.rotations import rotation_from_vector, vector_from_rotation
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.geometry import RigidTransform, rotation_from_vector, vector_from_rotation
 from imgcal.io.atomic import write_text
 from imgcal.io.names import LONGEST_NAME, find_file, is_file_name, title_of
 from imgcal.io.yaml_file import Flow, FlowMap, StrictModel, read_yaml, validated, yaml_text
 from imgcal.messages import listed, quoted
-from imgcal.types import limits
-from imgcal.types.rig import PARAMETER_NAMES, PARAMETERS, CameraRig, RigPrior
+from imgcal.types import PARAMETER_NAMES, PARAMETERS, CameraRig, RigPrior, limits
 
 FORMAT = "imgcal-rig/1"
 ENTRY_NAMES = {"cameras": "camera"}

@@ -1,50 +1,5 @@
 """Networks: point and image variants, the paper's and ours, by preset."""
 
-from __future__ import annotations
+import lazy_loader as lazy
 
-from torch import Tensor, nn
-
-from imgcal.networks.config import PRESETS, Images, NetworkConfig, PaperImages, PaperPoints
-from imgcal.networks.parameterization import Decoder
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.prediction import Prediction, Views
-from imgcal.types.rig import CameraRig
-
-__all__ = ["PRESETS", "NetworkConfig", "Prediction", "Views", "build"]
-
-
-def build(config: NetworkConfig, factory: CameraRig, obj: CalibrationObject, drift_std: Tensor) -> nn.Module:
-    """Make an untrained network; its weights come from torch's default generator.
-
-    Args:
-        config: which network.
-        factory: the factory rig, float32, without batch axes.
-        obj: the calibration object.
-        drift_std: (C, 15) spread of the rig's parameters, the unit of predicted offsets (`Drift.std`).
-
-    Returns:
-        A module that takes `Views` and returns one `Prediction` a pass, coarse to fine. Attributes: `image_options`
-        (None for point variants), `factory`, `obj`, `config`.
-
-    Raises:
-        InputError: an unknown backbone, or a rig without working distance.
-    """
-    # timm takes seconds to import: only for those who need it.
-    from imgcal.networks.points import PaperPointNetwork, PointNetwork
-
-    decoder, variant = Decoder(factory, obj, drift_std), config.variant()
-    network: nn.Module
-    if isinstance(variant, PaperPoints):
-        network = PaperPointNetwork(variant, decoder)
-    elif isinstance(variant, PaperImages):
-        from imgcal.networks.images import PaperImageNetwork
-
-        network = PaperImageNetwork(variant, decoder)
-    elif isinstance(variant, Images):
-        from imgcal.networks.images import ImageNetwork
-
-        network = ImageNetwork(variant, decoder, obj.colours)
-    else:
-        network = PointNetwork(variant, decoder)
-    network.factory, network.obj, network.config = factory, obj, config  # type: ignore[assignment]
-    return network
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

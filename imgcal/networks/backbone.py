@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from imgcal.errors import InputError
-from imgcal.io.names import nearest
+from imgcal.io import nearest
 from imgcal.messages import quoted, shortened
 from imgcal.networks.backbone_options import MOST_WEIGHTS, check_options
 

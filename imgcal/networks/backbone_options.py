@@ -9,7 +9,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from imgcal.io.names import nearest
+from imgcal.io import nearest
 from imgcal.messages import listed, shortened
 
 MOST_WEIGHTS = 500_000_000  # of a whole network: 2 GB

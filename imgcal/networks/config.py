@@ -7,8 +7,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field, model_validator
 
-from imgcal.io.names import nearest
-from imgcal.io.yaml_file import StrictModel
+from imgcal.io import StrictModel, nearest
 from imgcal.messages import shortened
 from imgcal.networks.backbone_options import MOST_WEIGHTS, check_options
 

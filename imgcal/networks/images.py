@@ -14,8 +14,8 @@ from imgcal.networks.parameterization import Decoder
 from imgcal.networks.points import PaperHeads
 from imgcal.networks.refiner import Trunk
 from imgcal.networks.soft_positions import soft_positions
-from imgcal.synthesis.colour_coding import ImageOptions
-from imgcal.types.prediction import Prediction, Views
+from imgcal.synthesis import ImageOptions
+from imgcal.types import Prediction, Views
 
 
 class PaperImageNetwork(nn.Module):

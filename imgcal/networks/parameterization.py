@@ -8,12 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from imgcal.errors import InputError
-from imgcal.geometry.projection import Projection
-from imgcal.geometry.rotations import rotation_from_6d, rotation_from_vector
-from imgcal.geometry.transforms import RigidTransform, rotate
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.prediction import Prediction
-from imgcal.types.rig import CameraRig, unpack18
+from imgcal.geometry import Projection, RigidTransform, rotate, rotation_from_6d, rotation_from_vector
+from imgcal.types import CalibrationObject, CameraRig, Prediction, unpack18
 
 POSE_SHIFT = 10.0  # mm that one unit of a head moves the object
 POSE_TURN = 0.05  # rad that one unit of a head turns it, after the first pass

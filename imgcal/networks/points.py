@@ -11,8 +11,8 @@ from imgcal.networks.config import PaperPoints, Points
 from imgcal.networks.layers import conv1d, mlp, transformer
 from imgcal.networks.parameterization import Decoder
 from imgcal.networks.refiner import Trunk
-from imgcal.synthesis.colour_coding import ImageOptions
-from imgcal.types.prediction import Prediction, Views
+from imgcal.synthesis import ImageOptions
+from imgcal.types import Prediction, Views
 
 CIE_NOISE = 0.01  # standard deviation of the noise on the one-hot camera identities
 

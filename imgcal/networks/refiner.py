@@ -15,8 +15,7 @@ from torch import Tensor, nn
 
 from imgcal.networks.layers import conv1d, mlp, transformer, zeroed
 from imgcal.networks.parameterization import Decoder, RigState
-from imgcal.types.prediction import Prediction
-from imgcal.types.rig import PARAMETERS
+from imgcal.types import PARAMETERS, Prediction
 
 RESIDUAL_SCALES = (20.0, 4.0)  # pixels, where a residual saturates; a linear part (in 100 px) stands beside
 LIMIT = 5.0  # largest input of the linear parts

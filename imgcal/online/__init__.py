@@ -1,1 +1,5 @@
+"""Recalibration while a rig runs: a window of snapshots, cameras that move, cameras that are found again."""
 
+import lazy_loader as lazy
+
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.estimation import Estimate
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.types.observations import Observations
-from imgcal.types.rig import CameraRig
+from imgcal.geometry import RigidTransform
+from imgcal.types import CameraRig, Observations
 
 FARTHEST = 6.0
 """Standard deviations at which a residual is clipped: a few wrong labels look like no move of the camera."""

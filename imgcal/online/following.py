@@ -9,15 +9,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imgcal.association.assignment import distances_to_nearest, mutual_nearest
-from imgcal.association.identify import track
-from imgcal.association.options import PipelineOptions
-from imgcal.association.series import to_observations
+from imgcal.association import PipelineOptions, distances_to_nearest, mutual_nearest, to_observations, track
 from imgcal.estimation import estimate
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.observations import Detections
-from imgcal.types.rig import CameraRig
+from imgcal.geometry import RigidTransform
+from imgcal.types import CalibrationObject, CameraRig, Detections
 
 TOO_NEAR = 0.6
 """Distance (px) between two predictions below which nearness does not tell which is which."""

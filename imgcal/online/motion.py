@@ -12,10 +12,8 @@ from torch import Tensor
 
 from imgcal.estimation import EstimationOptions, estimate
 from imgcal.online.breaks import information, series_of
-from imgcal.pipeline.calibration import Calibration
-from imgcal.types.moved_camera import Kind, MovedCamera
-from imgcal.types.observations import Observations
-from imgcal.types.rig import CameraRig
+from imgcal.pipeline import Calibration
+from imgcal.types import CameraRig, Kind, MovedCamera, Observations
 
 
 def measured_move(

@@ -15,15 +15,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imgcal.association.ambiguities import lattice_shifts
-from imgcal.association.options import PipelineOptions
-from imgcal.association.series import Follower, SnapshotIdentity
-from imgcal.detection import Blobs, DetectionOptions, detect_snapshot
-from imgcal.detection.options import Frame
+from imgcal.association import Follower, PipelineOptions, SnapshotIdentity, lattice_shifts
+from imgcal.detection import Blobs, DetectionOptions, Frame, detect_snapshot
 from imgcal.errors import InputError, RefusedError
-from imgcal.estimation import flat_std
-from imgcal.estimation.gauge import aligned
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.estimation import aligned, flat_std
+from imgcal.geometry import RigidTransform
 from imgcal.online.breaks import MEDIAN, information, series_of
 from imgcal.online.following import (
     LEAST_EXPLAINED,
@@ -37,12 +33,8 @@ from imgcal.online.following import (
 from imgcal.online.motion import measured_move
 from imgcal.online.resection import resected
 from imgcal.online.window import RELEARNT, SIGNIFICANT, Kept, Usual, Window, WindowFit
-from imgcal.pipeline.calibration import Calibration
-from imgcal.pipeline.sources import checked_detections, checked_frames
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.moved_camera import MovedCamera
-from imgcal.types.observations import Detections
-from imgcal.types.rig import CameraRig, RigPrior
+from imgcal.pipeline import Calibration, checked_detections, checked_frames
+from imgcal.types import CalibrationObject, CameraRig, Detections, MovedCamera, RigPrior
 
 MOST_FOLLOWED = 64
 """Fiducials of a lattice up to which a snapshot may be labelled by the last prediction alone; a larger one could have

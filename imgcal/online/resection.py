@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.estimation import EstimationOptions, estimate
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.observations import Observations
-from imgcal.types.rig import CameraRig
+from imgcal.geometry import RigidTransform
+from imgcal.types import CalibrationObject, CameraRig, Observations
 
 TRIES = 600
 """Triples of blobs that are taken for triples of fiducials."""

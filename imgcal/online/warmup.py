@@ -13,12 +13,19 @@ from imgcal.detection import detect
 from imgcal.errors import RefusedError
 from imgcal.io import load_object, load_rig
 from imgcal.online.recalibrator import Recalibrator
-from imgcal.pipeline.calibration import calibrate, score
-from imgcal.synthesis.captures import FrameModel, Truth, simulate_frames, simulate_truth, true_detections
-from imgcal.synthesis.colour_coding import ImageOptions, render_views
-from imgcal.synthesis.rigs import PoseRange, RelativeDrift
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.rig import CameraRig
+from imgcal.pipeline import calibrate, score
+from imgcal.synthesis import (
+    FrameModel,
+    ImageOptions,
+    PoseRange,
+    RelativeDrift,
+    Truth,
+    render_views,
+    simulate_frames,
+    simulate_truth,
+    true_detections,
+)
+from imgcal.types import CalibrationObject, CameraRig
 from renderers import SensorModel, palette
 
 RIG, OBJECT, SIZE = "T4", "asymmetric8", (512, 272)

@@ -10,17 +10,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imgcal.association.options import PipelineOptions
-from imgcal.association.series import Labelled, SnapshotIdentity, to_observations
+from imgcal.association import Labelled, PipelineOptions, SnapshotIdentity, to_observations
 from imgcal.errors import RefusedError
 from imgcal.estimation import Estimate, estimate, initial_pose
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.geometry import RigidTransform
 from imgcal.online.breaks import Series, find_breaks, series_of
 from imgcal.online.following import near_prediction, widened
-from imgcal.pipeline.calibration import Calibration, fit_labelled
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.observations import Detections, Observations
-from imgcal.types.rig import CameraRig
+from imgcal.pipeline import Calibration, fit_labelled
+from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
 
 SIGNIFICANT = 50.0
 """Chi-squared, six degrees of freedom: a camera that stands still exceeds it once in 200 million tests."""

@@ -14,18 +14,27 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from imgcal.association.options import PipelineOptions
-from imgcal.association.series import Labelled, Progress, label, observations_of, without_snapshots
+from imgcal.association import Labelled, PipelineOptions, Progress, label, observations_of, without_snapshots
 from imgcal.detection import DetectionOptions
 from imgcal.errors import RefusedError
-from imgcal.estimation import Estimate, estimate, initial_pose
-from imgcal.estimation.blocks import BlockScatter, block_scatter
-from imgcal.estimation.covariance import whitened_covariance
-from imgcal.estimation.estimate import conclude, make_loss, make_problem, make_start
-from imgcal.estimation.object_shape import FiducialOffset
-from imgcal.estimation.pose_support import UndeterminedPosesError, require_poses
-from imgcal.estimation.predicted_error import PredictedError, predicted_error
-from imgcal.estimation.variance_components import settle
+from imgcal.estimation import (
+    BlockScatter,
+    Estimate,
+    FiducialOffset,
+    PredictedError,
+    UndeterminedPosesError,
+    block_scatter,
+    conclude,
+    estimate,
+    initial_pose,
+    make_loss,
+    make_problem,
+    make_start,
+    predicted_error,
+    require_poses,
+    settle,
+    whitened_covariance,
+)
 from imgcal.pipeline.checks import (
     require_cameras,
     require_fit,
@@ -39,11 +48,16 @@ from imgcal.pipeline.object_checks import displaced, lost_fiducials, object_offs
 from imgcal.pipeline.sources import Frames, blobs_of
 from imgcal.pipeline.steadiness import steady_part
 from imgcal.pipeline.tally import Tally, tally
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.moved_camera import MovedCamera
-from imgcal.types.observations import BlobFlag, Detections, Observations
-from imgcal.types.prediction import Prediction
-from imgcal.types.rig import CameraRig, RigPrior
+from imgcal.types import (
+    BlobFlag,
+    CalibrationObject,
+    CameraRig,
+    Detections,
+    MovedCamera,
+    Observations,
+    Prediction,
+    RigPrior,
+)
 
 LEAST_KEPT = 0.8
 """Share of the snapshots that must keep a pose when outliers have been left out."""

@@ -10,13 +10,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imgcal.association.options import PipelineOptions
+from imgcal.association import PipelineOptions
 from imgcal.errors import RefusedError
 from imgcal.estimation import Estimate
 from imgcal.pipeline.tally import Tally
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.observations import Observations
-from imgcal.types.rig import PARAMETER_NAMES, CameraRig
+from imgcal.types import PARAMETER_NAMES, CalibrationObject, CameraRig, Observations
 
 LEAST_EXPLAINED = 0.5
 """Of what a camera sees of the object, the share that must be where the rest of the rig expects it."""

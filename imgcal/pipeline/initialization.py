@@ -14,16 +14,11 @@ import torch
 from torch import Tensor, nn
 
 from imgcal.errors import InputError
-from imgcal.geometry.projection import resized_pixels
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.io.names import nearest
-from imgcal.io.resources import data_path, shipped_names
-from imgcal.synthesis.colour_coding import ImageOptions, render_views
-from imgcal.training.checkpoint import check_object, check_rig, load_checkpoint, read_subject
-from imgcal.types.calibration_object import CalibrationObject, SelfMotion
-from imgcal.types.observations import Observations
-from imgcal.types.prediction import Prediction, Views
-from imgcal.types.rig import CameraRig
+from imgcal.geometry import RigidTransform, resized_pixels
+from imgcal.io import data_path, nearest, shipped_names
+from imgcal.synthesis import ImageOptions, render_views
+from imgcal.training import check_object, check_rig, load_checkpoint, read_subject
+from imgcal.types import CalibrationObject, CameraRig, Observations, Prediction, SelfMotion, Views
 
 KINDS = ("points", "vit", "cnn")
 CHUNK = 32  # snapshots at once: their images take memory

@@ -6,10 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.errors import RefusedError
-from imgcal.estimation import Estimate
-from imgcal.estimation.object_shape import LEAST_SNAPSHOTS, FiducialOffset, ShapeEvidence, offsets
-from imgcal.estimation.variance_components import BENT
-from imgcal.types.calibration_object import CalibrationObject
+from imgcal.estimation import BENT, SNAPSHOTS_TO_BEND, Estimate, FiducialOffset, ShapeEvidence, offsets
+from imgcal.types import CalibrationObject
 
 CERTAIN = 4.0
 """Standard deviations from which a fiducial is named as displaced."""
@@ -48,7 +46,7 @@ def object_offsets(fit: Estimate, shape: ShapeEvidence | None, obj: CalibrationO
         "--object-tolerance MM, or a column `tolerance`",
     }
     # Of a few snapshots nobody can tell whether it is the lenses instead: then they would disagree.
-    few = fit.problem.uv.shape[1] < LEAST_SNAPSHOTS
+    few = fit.problem.uv.shape[1] < SNAPSHOTS_TO_BEND
     if few and shape is not None and shape.bent_sigma() >= 2 * BENT:
         raise RefusedError(
             "estimation: the object is not as its file says, and other places of its fiducials do not explain the "

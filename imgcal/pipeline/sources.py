@@ -10,15 +10,11 @@ from dataclasses import fields
 
 import numpy as np
 
-from imgcal.association.series import matched_to_rig
-from imgcal.detection import DetectionOptions, detect
-from imgcal.detection.options import Frame
+from imgcal.association import matched_to_rig
+from imgcal.detection import DetectionOptions, Frame, detect
 from imgcal.errors import InputError
-from imgcal.io.detections_csv import MARGIN
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.limits import BLOB_RADIUS, SIGMA
-from imgcal.types.observations import Detections
-from imgcal.types.rig import CameraRig
+from imgcal.io import MARGIN
+from imgcal.types import BLOB_RADIUS, SIGMA, CalibrationObject, CameraRig, Detections
 
 Frames = Mapping[str, Frame | Sequence[Frame | None] | None]
 ROWS = tuple(field.name for field in fields(Detections) if not field.name.endswith("_names"))

@@ -9,17 +9,11 @@ import torch
 from numpy.typing import NDArray
 from scipy.stats import hypergeom
 
-from imgcal.association.options import PipelineOptions
-from imgcal.association.series import Labelled, label, observations_of
+from imgcal.association import Labelled, PipelineOptions, label, observations_of
 from imgcal.errors import RefusedError
-from imgcal.estimation import Estimate, estimate, initial_pose
-from imgcal.estimation.change_points import CLIP, LEAST_SNAPSHOTS
-from imgcal.estimation.moves import find_moves
+from imgcal.estimation import CLIP, LEAST_SNAPSHOTS, Estimate, estimate, find_moves, initial_pose
 from imgcal.pipeline.tally import Tally, tally
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.moved_camera import MovedCamera, MovedError
-from imgcal.types.observations import Detections
-from imgcal.types.rig import CameraRig
+from imgcal.types import CalibrationObject, CameraRig, Detections, MovedCamera, MovedError
 
 MEDIAN = 1.386
 """Of a squared length with unit variance on both axes."""

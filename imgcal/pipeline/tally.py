@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from imgcal.association.series import Labelled
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.rig import CameraRig
+from imgcal.association import Labelled
+from imgcal.geometry import RigidTransform
+from imgcal.types import CalibrationObject, CameraRig
 
 MARGIN = 0.05
 """Of the image's width and height, from its border: as far a camera that has drifted may miss what it should see."""

@@ -17,9 +17,7 @@ from torch import Tensor
 
 from imgcal.estimation import Estimate, EstimationOptions, initial_pose
 from imgcal.refinement.points import as_prediction, observed, refine_points
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.prediction import Prediction, Views
-from imgcal.types.rig import CameraRig
+from imgcal.types import CalibrationObject, CameraRig, Prediction, Views
 
 SQUARED = EstimationOptions(loss="squared")
 AT_FIRST = EstimationOptions(loss="squared", max_iterations=15)  # outliers can keep it busy without end

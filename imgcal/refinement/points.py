@@ -6,10 +6,7 @@ import torch
 from torch import Tensor
 
 from imgcal.estimation import Estimate, EstimationOptions, estimate
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.observations import Observations
-from imgcal.types.prediction import Prediction, Views
-from imgcal.types.rig import CameraRig
+from imgcal.types import CalibrationObject, CameraRig, Observations, Prediction, Views
 
 # From a start this near, gross outliers (swapped labels, false blobs) are best given up at once.
 ROBUST = EstimationOptions(loss="cauchy")

@@ -10,17 +10,13 @@ import torch
 from torch import Tensor
 
 from imgcal.errors import InputError
-from imgcal.estimation import Estimate, EstimationOptions, estimate
-from imgcal.estimation.estimate import make_problem
+from imgcal.estimation import Estimate, EstimationOptions, estimate, make_problem
 from imgcal.refinement.graduated_non_convexity import refine_robustly
 from imgcal.refinement.label_swaps import colours_at, exchanged
 from imgcal.refinement.photometric import DotWindows, NearFit, ShiftPrior, blurred_step
 from imgcal.refinement.points import as_prediction
-from imgcal.synthesis.colour_coding import LEVELS, ImageOptions
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.observations import Observations
-from imgcal.types.prediction import Prediction, Views
-from imgcal.types.rig import CameraRig
+from imgcal.synthesis import LEVELS, ImageOptions
+from imgcal.types import CalibrationObject, CameraRig, Observations, Prediction, Views
 
 PRESENT = 0.5  # amplitude above which a dot counts as there
 FARTHEST = 1e3  # image widths beyond which a predicted pixel is as good as any other

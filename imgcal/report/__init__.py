@@ -1,6 +1,5 @@
 """The report: one self-contained HTML page that shows a recalibration."""
 
-from imgcal.report.content import ReportContent, SnapshotSummary, relative_prior_std
-from imgcal.report.page import render, write_report
+import lazy_loader as lazy
 
-__all__ = ["ReportContent", "SnapshotSummary", "relative_prior_std", "render", "write_report"]
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from markupsafe import Markup
 
-from imgcal.estimation.predicted_error import MAP_DEPTHS, MAP_SIZE, PredictedError
+from imgcal.estimation import MAP_DEPTHS, MAP_SIZE, PredictedError
 from imgcal.report import svg
 from imgcal.report.charts import RESIDUAL_CLASSES
 from imgcal.report.content import ReportContent

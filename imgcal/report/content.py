@@ -12,11 +12,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imgcal.estimation.covariance import relative_difference, relative_jacobian
-from imgcal.estimation.predicted_error import PredictedError
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.types.observations import Detections
-from imgcal.types.rig import PARAMETERS, CameraRig, RigPrior
+from imgcal.estimation import PredictedError, relative_difference, relative_jacobian
+from imgcal.geometry import RigidTransform
+from imgcal.types import PARAMETERS, CameraRig, Detections, RigPrior
 
 Array = NDArray[np.float64]
 

@@ -17,11 +17,11 @@ import numpy as np
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
-from imgcal.io.atomic import write_text
+from imgcal.io import write_text
 from imgcal.report import accuracy, charts, overlay, scene, svg, tables
 from imgcal.report.content import MOVED, UNDETERMINED, ReportContent
 from imgcal.report.verdict import judge
-from imgcal.types.rig import PARAMETER_NAMES
+from imgcal.types import PARAMETER_NAMES
 
 LARGEST_SNAPSHOT_TABLE = 400
 

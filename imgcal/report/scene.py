@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from imgcal.report.content import Array, ReportContent
-from imgcal.types.rig import CameraRig
+from imgcal.types import CameraRig
 
 Figure = dict[str, Any]  # {"data": [...], "layout": {...}} of plotly; colours may be "var(--name)" of the style sheet
 

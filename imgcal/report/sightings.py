@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from imgcal.pipeline.tally import DOUBTFUL
+from imgcal.pipeline import DOUBTFUL
 from imgcal.report.content import ReportContent
 
 CROWDED = 1.0

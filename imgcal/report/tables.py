@@ -9,7 +9,7 @@ import numpy as np
 
 from imgcal.report import svg
 from imgcal.report.content import ReportContent
-from imgcal.types.rig import PARAMETER_NAMES
+from imgcal.types import PARAMETER_NAMES
 
 MINUS = "\N{MINUS SIGN}"
 

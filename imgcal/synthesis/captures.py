@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.geometry import RigidTransform
 from imgcal.synthesis.rigs import Drift, PoseRange, Snapshots, synthesize
 from imgcal.synthesis.spheres import sphere_images
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.observations import BlobFlag, Detections
-from imgcal.types.rig import CameraRig
+from imgcal.types import BlobFlag, CalibrationObject, CameraRig, Detections
 from renderers import Blobs, ClutterModel, SensorModel, infrared_frames, sample_clutter
 
 

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from imgcal.errors import InputError
-from imgcal.geometry.projection import resized_pixels
-from imgcal.types.calibration_object import CalibrationObject
+from imgcal.geometry import resized_pixels
+from imgcal.types import CalibrationObject
 from renderers import splat
 
 LEVELS = 255  # largest grey level of images as they are saved

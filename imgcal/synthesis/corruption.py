@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from imgcal.errors import InputError
-from imgcal.types.prediction import Views
+from imgcal.types import Views
 
 SWAPPED, FALSE = 1, 2
 

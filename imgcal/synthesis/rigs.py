@@ -13,11 +13,8 @@ import torch
 from torch import Tensor
 
 from imgcal.errors import InputError, RefusedError
-from imgcal.geometry.projection import Projection
-from imgcal.geometry.rotations import euler_from_rotation, rotation_from_euler
-from imgcal.geometry.transforms import RigidTransform, rotate
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.rig import PARAMETERS, CameraRig, RigPrior
+from imgcal.geometry import Projection, RigidTransform, euler_from_rotation, rotate, rotation_from_euler
+from imgcal.types import PARAMETERS, CalibrationObject, CameraRig, RigPrior
 
 LARGEST_SPREAD = 1e6  # of a drift, in any unit
 

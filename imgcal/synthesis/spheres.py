@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from imgcal.geometry.projection import NEAREST_DEPTH, distort_with_jacobian
-from imgcal.types.rig import CameraRig
+from imgcal.geometry import NEAREST_DEPTH, distort_with_jacobian
+from imgcal.types import CameraRig
 
 
 def sphere_images(rig: CameraRig, points_rig: Tensor, radius: Tensor) -> Tensor:

@@ -1,15 +1,5 @@
 """Training of the networks: experiment files, checkpoints, and the engine (`imgcal.training.engine.train`)."""
 
-from imgcal.training.checkpoint import Checkpoint, build_network, load_checkpoint, load_network, save_network
-from imgcal.training.experiment import Experiment, load_experiment, save_experiment
+import lazy_loader as lazy
 
-__all__ = [
-    "Checkpoint",
-    "Experiment",
-    "build_network",
-    "load_checkpoint",
-    "load_experiment",
-    "load_network",
-    "save_experiment",
-    "save_network",
-]
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

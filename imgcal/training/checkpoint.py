@@ -14,17 +14,23 @@ from torch import Tensor, nn
 
 from imgcal import networks
 from imgcal.errors import InputError
-from imgcal.io import load_object, load_rig, save_object, save_rig
-from imgcal.io.json_text import read_json
-from imgcal.io.names import title_of
-from imgcal.io.safetensors_file import read_tensors, read_texts, write_tensors
-from imgcal.io.yaml_file import validated
+from imgcal.io import (
+    load_object,
+    load_rig,
+    read_json,
+    read_tensors,
+    read_texts,
+    save_object,
+    save_rig,
+    title_of,
+    validated,
+    write_tensors,
+)
 from imgcal.messages import shortened
-from imgcal.networks.refiner import Trunk
-from imgcal.synthesis.colour_coding import ImageOptions
+from imgcal.networks import Trunk
+from imgcal.synthesis import ImageOptions
 from imgcal.training.experiment import Experiment
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.rig import CameraRig
+from imgcal.types import CalibrationObject, CameraRig
 
 FORMAT = "imgcal-network/1"
 

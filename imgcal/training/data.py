@@ -7,12 +7,8 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from imgcal.synthesis.colour_coding import ImageOptions, render_views
-from imgcal.synthesis.corruption import Corruption
-from imgcal.synthesis.rigs import Drift, PoseRange, Snapshots, synthesize
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.prediction import Prediction, Views
-from imgcal.types.rig import CameraRig
+from imgcal.synthesis import Corruption, Drift, ImageOptions, PoseRange, Snapshots, render_views, synthesize
+from imgcal.types import CalibrationObject, CameraRig, Prediction, Views
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from imgcal.errors import InputError
 from imgcal.refinement import as_prediction, refine_points
 from imgcal.training.data import Batch, Source
 from imgcal.training.losses import RefinedLoss, project_fiducials, reprojection_re
-from imgcal.types.prediction import Prediction
+from imgcal.types import Prediction
 
 WORST = 200.0  # pixels: where the error of a refined rig stops to count
 

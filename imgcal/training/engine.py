@@ -14,10 +14,8 @@ from accelerate.utils import broadcast
 from torch import Tensor, nn
 
 from imgcal.errors import InputError, RefusedError
-from imgcal.io.safetensors_file import write_tensors
-from imgcal.synthesis.colour_coding import ImageOptions
-from imgcal.synthesis.corruption import Corruption
-from imgcal.synthesis.rigs import Snapshots
+from imgcal.io import write_tensors
+from imgcal.synthesis import Corruption, ImageOptions, Snapshots
 from imgcal.training.checkpoint import build_network, save_network, warm_start, without_pretrained
 from imgcal.training.data import Batch, Source, object_to
 from imgcal.training.end_to_end import refined_loss
@@ -34,8 +32,7 @@ from imgcal.training.optimization import (
     update_average,
 )
 from imgcal.training.state import State, load_state, random_states, restore_random_states, save_state
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.rig import CameraRig
+from imgcal.types import CalibrationObject, CameraRig
 
 RESULT, STATE, RESOLVED, BAD_BATCH = "model.safetensors", "state.safetensors", "resolved.yaml", "bad_batch.safetensors"
 

@@ -10,15 +10,23 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from imgcal.errors import InputError
-from imgcal.io import load_object, load_rig, write_text
-from imgcal.io.names import find_file
-from imgcal.io.yaml_file import Flow, StrictModel, parse_yaml, read_yaml, validated, yaml_text
+from imgcal.io import (
+    Flow,
+    StrictModel,
+    find_file,
+    load_object,
+    load_rig,
+    parse_yaml,
+    read_yaml,
+    validated,
+    write_text,
+    yaml_text,
+)
 from imgcal.messages import quoted
 from imgcal.networks import NetworkConfig
-from imgcal.synthesis.rigs import Drift, PhysicalDrift, PoseRange, RelativeDrift
+from imgcal.synthesis import Drift, PhysicalDrift, PoseRange, RelativeDrift
 from imgcal.training.losses import LossConfig
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.rig import CameraRig
+from imgcal.types import CalibrationObject, CameraRig
 
 FORMAT = "imgcal-experiment/1"
 

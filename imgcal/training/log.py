@@ -13,8 +13,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from torch.utils.tensorboard import SummaryWriter
 
 from imgcal.errors import InputError
-from imgcal.io import write_text
-from imgcal.io.json_text import read_json
+from imgcal.io import read_json, write_text
 
 EXTRA = "extra"  # key of a row that a longer run does not have
 

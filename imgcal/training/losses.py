@@ -16,12 +16,9 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from imgcal.geometry.projection import project_kornia
-from imgcal.geometry.rotations import geodesic_angle
-from imgcal.io.yaml_file import StrictModel
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.prediction import Prediction
-from imgcal.types.rig import CameraRig, pack21
+from imgcal.geometry import geodesic_angle, project_kornia
+from imgcal.io import StrictModel
+from imgcal.types import CalibrationObject, CameraRig, Prediction, pack21
 
 # Nearer points (mm) are projected at this depth, differences are cut at this size (pixels): what an untrained network
 # predicts behind a camera would overflow float32, whose gradient is then nan even where the loss itself is clamped.

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.optim.lr_scheduler import ReduceLROnPlateau
 
 from imgcal.errors import InputError
-from imgcal.io.names import nearest
+from imgcal.io import nearest
 from imgcal.training.experiment import OptimizerConfig, ScheduleConfig
 
 

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from imgcal.errors import InputError
-from imgcal.io.json_text import read_json
-from imgcal.io.safetensors_file import read_tensors, write_tensors
+from imgcal.io import read_json, read_tensors, write_tensors
 from imgcal.training.experiment import Experiment
 
 FORMAT = "imgcal-training/1"

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from imgcal.geometry.rotations import rotation_from_6d, sixd_from_rotation
-from imgcal.geometry.transforms import Join, RigidTransform
+from imgcal.geometry import Join, RigidTransform, rotation_from_6d, sixd_from_rotation
 from imgcal.types.rig import CameraRig
 
 

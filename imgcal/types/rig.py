@@ -8,10 +8,19 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from imgcal.geometry.projection import Projection, project_components, resized_pixels
-from imgcal.geometry.projection_cpu import project_cpu
-from imgcal.geometry.rotations import rotation_from_6d, rotation_from_vector, sixd_from_rotation, vector_from_rotation
-from imgcal.geometry.transforms import Join, RigidTransform, rotate
+from imgcal.geometry import (
+    Join,
+    Projection,
+    RigidTransform,
+    project_components,
+    project_cpu,
+    resized_pixels,
+    rotate,
+    rotation_from_6d,
+    rotation_from_vector,
+    sixd_from_rotation,
+    vector_from_rotation,
+)
 
 PARAMETERS = 15
 """Free parameters of a camera, in this order: rotation (3, rad), position (3, mm), focal length (2, pixels), principal

@@ -11,11 +11,9 @@ import torch
 from torch import Tensor
 
 from imgcal.io import load_object, load_rig
-from imgcal.synthesis.captures import Truth, simulate_truth, simulate_volume, true_detections
-from imgcal.synthesis.rigs import PhysicalDrift
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.observations import Detections
-from imgcal.types.rig import CameraRig, RigPrior
+from imgcal.synthesis import PhysicalDrift, Truth, simulate_truth, true_detections
+from imgcal.synthesis.captures import simulate_volume
+from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
 
 NOISE = 0.1  # px
 

@@ -19,15 +19,11 @@ from torch import Tensor
 
 from imgcal.errors import RefusedError
 from imgcal.estimation import estimate
-from imgcal.geometry.rotations import rotation_from_vector, vector_from_rotation
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.geometry import RigidTransform, rotation_from_vector, vector_from_rotation
 from imgcal.io import load_object, load_rig
-from imgcal.online.recalibrator import Recalibrator
-from imgcal.synthesis.captures import FrameModel, Truth, simulate_frames, simulate_truth
-from imgcal.synthesis.rigs import PhysicalDrift
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.observations import Observations
-from imgcal.types.rig import CameraRig
+from imgcal.online import Recalibrator
+from imgcal.synthesis import FrameModel, PhysicalDrift, Truth, simulate_frames, simulate_truth
+from imgcal.types import CalibrationObject, CameraRig, Observations
 from renderers import ClutterModel
 from scripts.benchmarks import end_to_end_growth as growth
 from scripts.benchmarks.effort import Effort

@@ -15,18 +15,13 @@ import torch
 from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
-from imgcal.association import bootstrap, track
-from imgcal.association.options import PipelineOptions
-from imgcal.association.series import Labelled, SnapshotIdentity
+from imgcal.association import Labelled, PipelineOptions, SnapshotIdentity, bootstrap, track
 from imgcal.detection import DetectionOptions, detect_snapshot
 from imgcal.io import load_object, load_rig
-from imgcal.online.recalibrator import Recalibrator
-from imgcal.pipeline.calibration import calibrate, fit_labelled
-from imgcal.synthesis.captures import FrameModel, Truth, simulate_frames, simulate_truth, true_detections
-from imgcal.synthesis.rigs import PhysicalDrift
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.observations import Detections
-from imgcal.types.rig import CameraRig, RigPrior
+from imgcal.online import Recalibrator
+from imgcal.pipeline import calibrate, fit_labelled
+from imgcal.synthesis import FrameModel, PhysicalDrift, Truth, simulate_frames, simulate_truth, true_detections
+from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
 from renderers import ClutterModel
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.peers import opencv_live

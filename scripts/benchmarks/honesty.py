@@ -21,14 +21,12 @@ import tyro
 from torch import Tensor
 
 from imgcal import Calibration, PipelineOptions, RefusedError, calibrate, load_object, load_rig
-from imgcal.association.series import to_observations
+from imgcal.association import to_observations
 from imgcal.estimation import estimate, relative_covariance, relative_difference
 from imgcal.estimation.variance_components import KINDS
 from imgcal.evaluation.true_error import true_error
 from imgcal.io import write_text
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.observations import Detections
-from imgcal.types.rig import CameraRig, RigPrior
+from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
 from scripts.benchmarks.honesty_prediction import Case
 from scripts.output import ROOT, command, markdown, read_json, replaced, surroundings, write_json
 

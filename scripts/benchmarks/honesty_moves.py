@@ -17,11 +17,10 @@ import torch
 import tyro
 
 from imgcal import PipelineOptions, RefusedError, calibrate
-from imgcal.association.series import label
+from imgcal.association import label
 from imgcal.io import write_text
 from imgcal.pipeline.steadiness import moves_of
-from imgcal.types.moved_camera import MovedError
-from imgcal.types.observations import Detections
+from imgcal.types import Detections, MovedError
 from scripts.benchmarks import camera_faults as faults
 from scripts.output import ROOT, command, markdown, read_json, replaced, surroundings, write_json
 

@@ -14,12 +14,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.association import bootstrap, track
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.geometry import RigidTransform
 from imgcal.io import load_object, load_rig
-from imgcal.synthesis.rigs import RelativeDrift, synthesize
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.observations import Detections
-from imgcal.types.rig import CameraRig
+from imgcal.synthesis import RelativeDrift, synthesize
+from imgcal.types import CalibrationObject, CameraRig, Detections
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.peer import peer, versions
 from scripts.benchmarks.peers import p3p_hungarian as p3p

@@ -10,14 +10,13 @@ from typing import Any
 
 import torch
 
-from imgcal.io.resources import data_path
-from imgcal.networks import NetworkConfig, Views, build
+from imgcal.io import data_path
+from imgcal.networks import NetworkConfig, build
 from imgcal.refinement import refine_images, refine_points
-from imgcal.synthesis.colour_coding import render_views
-from imgcal.synthesis.rigs import synthesize
-from imgcal.training.checkpoint import Checkpoint, load_checkpoint
+from imgcal.synthesis import render_views, synthesize
+from imgcal.training import Checkpoint, load_checkpoint, load_experiment
 from imgcal.training.engine import prepare, train_step
-from imgcal.training.experiment import load_experiment
+from imgcal.types import Views
 from scripts.benchmarks.effort import Effort
 from scripts.output import BLUE, GREY, figure, markdown
 from scripts.timing import Timing, side_by_side

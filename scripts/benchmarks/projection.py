@@ -14,13 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from imgcal.estimation import lm_cpu
-from imgcal.estimation.linearize import Problem, State
-from imgcal.geometry.projection import project_kornia
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.estimation import Problem, State, lm_cpu
+from imgcal.geometry import RigidTransform, project_kornia
 from imgcal.io import load_object, load_rig
-from imgcal.synthesis.rigs import synthesize
-from imgcal.types.rig import CameraRig
+from imgcal.synthesis import synthesize
+from imgcal.types import CameraRig
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.peer import versions
 from scripts.benchmarks.peers import projections as peers

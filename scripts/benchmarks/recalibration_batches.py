@@ -6,9 +6,16 @@ from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
-from imgcal.estimation import camera_covariance, estimate, initial_pose, levenberg_marquardt, lm_cpu
-from imgcal.estimation.estimate import make_problem, make_start
-from imgcal.estimation.robust_losses import squared
+from imgcal.estimation import (
+    camera_covariance,
+    estimate,
+    initial_pose,
+    levenberg_marquardt,
+    lm_cpu,
+    make_problem,
+    make_start,
+    squared,
+)
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.recalibration_cases import SQUARED, Cases, make_cases
 from scripts.timing import side_by_side

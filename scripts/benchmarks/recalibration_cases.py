@@ -11,12 +11,11 @@ import torch
 from torch import Tensor
 
 from imgcal.estimation import EstimationOptions, estimate, initial_pose, relative_covariance, relative_difference
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.geometry import RigidTransform
 from imgcal.io import load_object, load_rig
-from imgcal.synthesis.rigs import PhysicalDrift, PoseRange, sample_rig_from_object
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.observations import Observations
-from imgcal.types.rig import PARAMETERS, CameraRig
+from imgcal.synthesis import PhysicalDrift, PoseRange
+from imgcal.synthesis.rigs import sample_rig_from_object
+from imgcal.types import PARAMETERS, CalibrationObject, CameraRig, Observations
 from scripts.benchmarks.peers.rig_task import RigAnswer, RigTask
 
 SQUARED = EstimationOptions(loss="squared")
@@ -36,7 +35,7 @@ class Cases:
     spread: Tensor  # (C, 15)
     poses: RigidTransform  # (B, S)
     observations: Observations  # (B, S, C, N)
-    start: RigidTransform  # (B, S) by imgcal.estimation.initial_pose, with the factory rig
+    start: RigidTransform  # (B, S) by imgcal.estimation.pose_initialization, with the factory rig
 
     def __len__(self) -> int:
         return len(self.observations.uv)

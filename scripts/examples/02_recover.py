@@ -4,9 +4,8 @@ import torch
 
 import imgcal
 from imgcal.estimation import camera_std
-from imgcal.synthesis.captures import simulate_truth
-from imgcal.synthesis.rigs import PhysicalDrift
-from imgcal.types.observations import Observations
+from imgcal.synthesis import PhysicalDrift, simulate_truth
+from imgcal.types import Observations
 
 generator = torch.Generator().manual_seed(1)
 factory, obj = imgcal.load_rig("O10"), imgcal.load_object("asymmetric8")

@@ -3,8 +3,7 @@
 import torch
 
 import imgcal
-from imgcal.synthesis.captures import FrameModel, simulate_frames, simulate_truth
-from imgcal.synthesis.rigs import PhysicalDrift
+from imgcal.synthesis import FrameModel, PhysicalDrift, simulate_frames, simulate_truth
 from renderers import ClutterModel
 
 generator = torch.Generator().manual_seed(2)

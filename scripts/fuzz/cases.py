@@ -14,10 +14,17 @@ import numpy as np
 import torch
 
 from imgcal.cli.main import main
-from imgcal.io import load_detections, load_object, load_rig, read_frame, save_detections, save_object, save_rig
-from imgcal.io.yaml_file import yaml_text
-from imgcal.training.checkpoint import build_network, save_network
-from imgcal.training.experiment import load_experiment
+from imgcal.io import (
+    load_detections,
+    load_object,
+    load_rig,
+    read_frame,
+    save_detections,
+    save_object,
+    save_rig,
+    yaml_text,
+)
+from imgcal.training import build_network, load_experiment, save_network
 from scripts.fuzz.mutations import NAMES, VALUES, mutated
 
 SIZE = (256, 136)  # pixels: small frames are quick

@@ -27,14 +27,12 @@ from torch import Tensor
 from imgcal.estimation import EstimationOptions, estimate, initial_pose
 from imgcal.evaluation import BASELINES, Conditions, Given, network_method, reprojection_error
 from imgcal.evaluation.protocol import Sample, draw
-from imgcal.geometry.rotations import vector_from_rotation
+from imgcal.geometry import vector_from_rotation
 from imgcal.io import load_object, load_rig
-from imgcal.networks import Prediction
-from imgcal.refinement import as_prediction
-from imgcal.refinement.points import observed
-from imgcal.synthesis.rigs import PoseRange, RelativeDrift
+from imgcal.refinement import as_prediction, observed
+from imgcal.synthesis import PoseRange, RelativeDrift
 from imgcal.training import load_network
-from imgcal.types.rig import CameraRig, pack21
+from imgcal.types import CameraRig, Prediction, pack21
 from scripts.output import BLUE, GREEN, GREY, RED, RESULTS, command, figure, surroundings, write_json
 
 Array = NDArray[np.float64]

@@ -16,13 +16,11 @@ import tyro
 from torch import Tensor
 
 from imgcal.errors import InputError
-from imgcal.evaluation import BASELINES, Conditions, Given, Method, reprojection_error
-from imgcal.evaluation.models import load_models
+from imgcal.evaluation import BASELINES, Conditions, Given, Method, load_models, reprojection_error
 from imgcal.evaluation.protocol import draw
 from imgcal.io import load_object, load_rig, write_text
-from imgcal.networks import Prediction
-from imgcal.synthesis.rigs import RelativeDrift
-from imgcal.types.rig import CameraRig
+from imgcal.synthesis import RelativeDrift
+from imgcal.types import CameraRig, Prediction
 from scripts.output import ROOT, command, make_folder
 
 AXIS = 60.0  # mm, length of the line that shows where a camera looks

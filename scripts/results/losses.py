@@ -19,8 +19,9 @@ import tyro
 from torch import Tensor
 
 from imgcal.errors import InputError
+from imgcal.training import Experiment, load_experiment
 from imgcal.training.engine import Run, check_finite, prepare, train_step
-from imgcal.training.experiment import Experiment, changed, load_experiment
+from imgcal.training.experiment import changed
 from imgcal.training.losses import (
     distortion_size,
     focal_ratio,
@@ -33,8 +34,7 @@ from imgcal.training.losses import (
     project_fiducials,
     reprojection_rmse,
 )
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.prediction import Prediction
+from imgcal.types import CalibrationObject, Prediction
 from scripts.output import BLUE, GREY, RESULTS, command, figure, surroundings, write_json
 
 PROPOSED = ("parameter RMSE", "geodesic", "reprojection RMSE")

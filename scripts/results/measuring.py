@@ -12,12 +12,23 @@ from time import monotonic
 from typing import Any
 
 from imgcal.errors import InputError
-from imgcal.evaluation import BASELINES, Conditions, Corruption, Evaluation, Method, Protocol, Scores, evaluate, sweep
-from imgcal.evaluation.latency import latency
-from imgcal.evaluation.models import Model, load_models
-from imgcal.io.safetensors_file import read_texts
+from imgcal.evaluation import (
+    BASELINES,
+    Conditions,
+    Evaluation,
+    Method,
+    Model,
+    Protocol,
+    Scores,
+    evaluate,
+    latency,
+    load_models,
+    sweep,
+)
+from imgcal.io import read_texts
+from imgcal.synthesis import Corruption
+from imgcal.training import read_metrics
 from imgcal.training.checkpoint import FORMAT
-from imgcal.training.log import read_metrics
 from scripts.output import surroundings
 
 NOISE = Corruption(noise=0.1)

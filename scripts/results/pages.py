@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from imgcal.networks.config import Images, PaperImages
-from imgcal.training.experiment import Experiment
+from imgcal.networks import Images, PaperImages
+from imgcal.training import Experiment
 from scripts.output import markdown
 from scripts.results.measuring import FACTORY, NETWORK, ROBUST, WITHOUT
 

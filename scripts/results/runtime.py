@@ -23,14 +23,12 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from imgcal import networks
-from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import load_object, load_rig
-from imgcal.networks import NetworkConfig, Prediction, Views
+from imgcal.networks import NetworkConfig
 from imgcal.refinement import refine_points
-from imgcal.synthesis.rigs import PhysicalDrift, Snapshots, synthesize
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.rig import CameraRig
+from imgcal.synthesis import PhysicalDrift, Snapshots, synthesize
+from imgcal.types import CalibrationObject, CameraRig, Prediction, Views
 from scripts.output import BLUE, GREEN, GREY, RED, RESULTS, command, figure, surroundings, write_json
 
 DRIFT = PhysicalDrift()

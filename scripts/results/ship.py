@@ -15,11 +15,10 @@ import tyro
 
 from imgcal.errors import InputError
 from imgcal.evaluation import reprojection_error
-from imgcal.networks import Views
-from imgcal.synthesis.colour_coding import ImageOptions, render_views
-from imgcal.synthesis.rigs import synthesize
-from imgcal.training.checkpoint import Checkpoint, load_checkpoint, save_network
-from imgcal.training.experiment import Experiment, changed
+from imgcal.synthesis import ImageOptions, render_views, synthesize
+from imgcal.training import Checkpoint, Experiment, load_checkpoint, save_network
+from imgcal.training.experiment import changed
+from imgcal.types import Views
 from scripts.output import command, make_folder
 
 MODELS = Path("data/models")

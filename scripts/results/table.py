@@ -15,9 +15,8 @@ from typing import Annotated, Any
 import tyro
 
 from imgcal.errors import InputError
-from imgcal.io import write_text
-from imgcal.io.resources import shipped_names
-from imgcal.training.experiment import Experiment, load_experiment
+from imgcal.io import shipped_names, write_text
+from imgcal.training import Experiment, load_experiment
 from scripts.output import RESULTS, ROOT, command, read_json, replaced, write_json
 from scripts.results.charts import over_time, sweeps
 from scripts.results.measuring import Effort, Source, find, measure, swept

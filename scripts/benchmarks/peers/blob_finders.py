@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.detection import DetectionOptions, detect_frame
-from imgcal.types.observations import UNUSABLE
+from imgcal.types import UNUSABLE
 from scripts.benchmarks.peer import peer
 
 Frame = NDArray[np.uint8]

@@ -4,7 +4,7 @@ import torch
 from imgcal.association.blobs import gather
 from imgcal.association.innovation import innovations
 from imgcal.estimation.levenberg_marquardt import Solution
-from imgcal.estimation.linearize import Problem, State, linearize
+from imgcal.estimation.linearization import Problem, State, linearize
 from imgcal.io import load_object, load_rig
 from imgcal.io.resources import data_path
 from imgcal.synthesis.rigs import synthesize
@@ -55,7 +55,7 @@ def test_covariance_of_an_unlabelled_fiducial_matches_the_dense_one() -> None:
     covariance = torch.linalg.inv(information)
 
     def pixel(parameters: torch.Tensor) -> torch.Tensor:
-        from imgcal.estimation.linearize import moved, pose_at, rig_at
+        from imgcal.estimation.linearization import moved, pose_at, rig_at
 
         new = moved(problem, state, parameters[:30].view(1, 2, 15), parameters[30:].view(1, 1, 6))
         return rig_at(problem, new.offset)[0].project(pose_at(problem, new)[0, 0].apply(obj.points)).uv[0, 3]

@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from imgcal.estimation.estimate import make_problem, make_start
-from imgcal.estimation.linearize import Problem, State
+from imgcal.estimation.linearization import Problem, State
+from imgcal.estimation.map_estimate import make_problem, make_start
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.synthesis.rigs import Drift, PhysicalDrift, PoseRange, sample_rig_from_object
 from imgcal.types.calibration_object import CalibrationObject

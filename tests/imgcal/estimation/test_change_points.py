@@ -8,7 +8,7 @@ from scipy.stats import chi2
 from imgcal.association.series import label, observations_of
 from imgcal.estimation import estimate
 from imgcal.estimation.change_points import LEAST_SNAPSHOTS, STEP, blocks_of, dispersion, is_significant, likeliest_step
-from imgcal.estimation.linearize import jacobian_at
+from imgcal.estimation.linearization import jacobian_at
 from imgcal.types.rig import PARAMETERS
 from scripts.benchmarks import camera_faults as damage
 

@@ -19,7 +19,7 @@ from imgcal.estimation import (
     relative_difference,
 )
 from imgcal.estimation.covariance import relative_jacobian, remaining_variance
-from imgcal.estimation.linearize import moved, rig_at
+from imgcal.estimation.linearization import moved, rig_at
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.synthesis.rigs import PhysicalDrift

@@ -12,8 +12,8 @@ from imgcal.estimation import (
     relative_covariance,
     relative_difference,
 )
-from imgcal.estimation.estimate import PATIENCE, make_start
 from imgcal.estimation.implicit import map_cost
+from imgcal.estimation.map_estimate import PATIENCE, make_start
 from imgcal.estimation.robust_losses import LOSSES
 from imgcal.synthesis.rigs import Drift, PhysicalDrift, RelativeDrift
 from imgcal.types.observations import Observations

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from imgcal.estimation.levenberg_marquardt import damped_step, minimize
-from imgcal.estimation.linearize import linearize
+from imgcal.estimation.linearization import linearize
 from imgcal.estimation.robust_losses import LOSSES, squared
 
 

@@ -7,10 +7,11 @@ import pytest
 import torch
 from torch import nn
 
-from imgcal.evaluation import Conditions, Corruption
+from imgcal.evaluation import Conditions
 from imgcal.evaluation.protocol import Sample, draw
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.io import load_object, load_rig
+from imgcal.synthesis import Corruption
 from imgcal.synthesis.rigs import RelativeDrift
 from imgcal.types.prediction import Prediction
 

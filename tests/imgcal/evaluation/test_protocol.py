@@ -5,10 +5,10 @@ import torch
 
 from imgcal.errors import InputError, RefusedError
 from imgcal.evaluation import BASELINES, Conditions, Method, Protocol, evaluate, network_method
-from imgcal.evaluation.latency import latency
 from imgcal.evaluation.methods import factory_alone
 from imgcal.evaluation.metrics import KINDS, Errors
 from imgcal.evaluation.protocol import LEAST_SIGMA, Scores
+from imgcal.evaluation.timing import latency
 from tests.imgcal.evaluation.conftest import Fake, straight_down
 
 FACTORY = {"factory": Method(factory_alone)}

@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from imgcal.evaluation import Evaluation, Method, Protocol, Row, Scores, evaluate, network_method, sweep
-from imgcal.evaluation.latency import Latency
 from imgcal.evaluation.methods import factory_alone
 from imgcal.evaluation.plots import draw_latency, draw_sweep, draw_training
 from imgcal.evaluation.report import Facts, Report, Table, as_values, describe, markdown, tables, write
+from imgcal.evaluation.timing import Latency
 from tests.imgcal.evaluation.conftest import Fake, straight_down
 
 HISTORY = ({"step": 10, "re_px": 9.0}, {"step": 20, "re_px": 5.0, "validation_re_px": 6.0})

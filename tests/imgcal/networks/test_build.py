@@ -5,10 +5,11 @@ import torch
 
 from imgcal.errors import InputError
 from imgcal.io import load_object, load_rig
-from imgcal.networks import PRESETS, NetworkConfig, Views, build
+from imgcal.networks import PRESETS, NetworkConfig, build
 from imgcal.synthesis.colour_coding import render_views
 from imgcal.synthesis.rigs import RelativeDrift, synthesize
 from imgcal.training.losses import project_fiducials
+from imgcal.types import Views
 
 DRIFT = RelativeDrift(0.02, 0.02)
 SMALL = ["points", "points-one-pass", "points-cnn1d", "vit", "cnn", "vit-pooled", "cnn-pooled"]

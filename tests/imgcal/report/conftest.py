@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from imgcal.estimation import EstimationOptions, estimate, relative_covariance
-from imgcal.estimation.predicted_error import predicted_error
+from imgcal.estimation.accuracy import predicted_error
 from imgcal.io import load_object, load_rig
 from imgcal.io.resources import data_path
 from imgcal.report import ReportContent, SnapshotSummary, relative_prior_std

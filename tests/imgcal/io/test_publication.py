@@ -10,7 +10,7 @@ import pytest
 
 from imgcal.errors import InputError
 from imgcal.io.atomic import write_text
-from imgcal.io.publishing import DEAD_AFTER, PREFIX, is_unfinished, publishing
+from imgcal.io.publication import DEAD_AFTER, PREFIX, is_unfinished, publishing
 
 NAMES = ("report", "rig", "result")
 OLD = {"report": "old", "rig": "old", "result": "old", "mine": "untouched"}

@@ -11,14 +11,11 @@ from torch import Tensor
 
 from imgcal.errors import InputError
 from imgcal.estimation import implicit, levenberg_marquardt, lm_cpu
-from imgcal.estimation.initial_pose import initial_pose
-from imgcal.estimation.linearize import Problem, State, points_at, pose_at, rig_at
+from imgcal.estimation.linearization import Problem, State, points_at, pose_at, rig_at
+from imgcal.estimation.pose_initialization import initial_pose
 from imgcal.estimation.robust_losses import LOSSES, Loss
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.limits import check_observations
-from imgcal.types.observations import Observations
-from imgcal.types.rig import PARAMETERS, CameraRig, RigPrior
+from imgcal.geometry import RigidTransform
+from imgcal.types import PARAMETERS, CalibrationObject, CameraRig, Observations, RigPrior, check_observations
 
 PATIENCE = 15
 """Steps after which a rig begins again; from factory values within their prior, 6 are usual."""

@@ -16,12 +16,8 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from imgcal.geometry.projection import undistort
-from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.observations import Observations
-from imgcal.types.rig import CameraRig
+from imgcal.geometry import RigidTransform, rotation_from_vector, undistort
+from imgcal.types import CalibrationObject, CameraRig, Observations
 
 STARTS = 8
 

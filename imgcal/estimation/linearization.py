@@ -19,10 +19,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from imgcal.geometry.projection import NEAREST_DEPTH
-from imgcal.geometry.rotations import left_jacobian, rotation_from_vector
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.types.rig import PARAMETERS, CameraRig
+from imgcal.geometry import NEAREST_DEPTH, RigidTransform, left_jacobian, rotation_from_vector
+from imgcal.types import PARAMETERS, CameraRig
 
 POSE_PARAMETERS = 6
 

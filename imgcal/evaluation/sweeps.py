@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from imgcal.errors import InputError
 from imgcal.evaluation.methods import Method
 from imgcal.evaluation.protocol import Conditions, Evaluation, Progress, Protocol, evaluate
-from imgcal.io.names import nearest
-from imgcal.synthesis.rigs import RelativeDrift
+from imgcal.io import nearest
+from imgcal.synthesis import RelativeDrift
 
 
 def _at_kappa(conditions: Conditions, value: float) -> Conditions:

@@ -7,7 +7,7 @@ import torch
 
 from imgcal import InputError, PipelineOptions, calibrate, estimate, predicted_error
 from imgcal.cli.common import only_cameras
-from imgcal.estimation.predicted_error import (
+from imgcal.estimation.accuracy import (
     GRID,
     MAP_DEPTHS,
     MAP_SIZE,

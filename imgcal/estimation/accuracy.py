@@ -12,9 +12,8 @@ from torch import Tensor
 from imgcal.errors import InputError
 from imgcal.estimation import Estimate, camera_covariance
 from imgcal.estimation.rig_uncertainty import RigUncertainty, rig_uncertainty, without_gradient
-from imgcal.geometry.projection import undistort
-from imgcal.geometry.transforms import rotate
-from imgcal.types.rig import CameraRig
+from imgcal.geometry import rotate, undistort
+from imgcal.types import CameraRig
 
 GRID = 11
 """Points along each side of the working volume; odd, so that there is a middle."""

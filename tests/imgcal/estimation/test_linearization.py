@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from imgcal.estimation.implicit import map_cost
-from imgcal.estimation.linearize import Problem, State, linearize, moved, points_at, pose_at, rig_at
+from imgcal.estimation.linearization import Problem, State, linearize, moved, points_at, pose_at, rig_at
 from imgcal.estimation.robust_losses import cauchy, squared
 
 CASES = [((), 1, 3, 5), ((1,), 2, 4, 6), ((2, 3), 2, 3, 5), ((4,), 1, 4, 4)]

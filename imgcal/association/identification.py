@@ -35,10 +35,8 @@ from imgcal.association.verify import (
     start,
 )
 from imgcal.association.voting import match, predict_ideal, vote
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.observations import Detections
-from imgcal.types.rig import CameraRig
+from imgcal.geometry import RigidTransform
+from imgcal.types import CalibrationObject, CameraRig, Detections
 
 FIRST_HYPOTHESES = 8_000  # in the first round: large objects get fewer triples of blobs; then twice as many each time
 MOST_HYPOTHESES = 400_000  # in a round

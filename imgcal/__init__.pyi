@@ -1,0 +1,41 @@
+from .association import PipelineOptions
+from .detection import DetectionOptions, detect
+from .errors import InputError, RefusedError
+from .estimation import Estimate, EstimationOptions, PredictedError, WorkingVolume, estimate, predicted_error
+from .geometry import Projection, RigidTransform
+from .io import load_detections, load_object, load_rig, save_detections, save_rig
+from .online import Recalibrator
+from .pipeline import Calibration, calibrate, score
+from .types import CalibrationObject, CameraRig, Detections, Observations, RigPrior
+
+__version__: str
+
+__all__ = [
+    "Calibration",
+    "CalibrationObject",
+    "CameraRig",
+    "DetectionOptions",
+    "Detections",
+    "Estimate",
+    "EstimationOptions",
+    "InputError",
+    "Observations",
+    "PipelineOptions",
+    "PredictedError",
+    "Projection",
+    "Recalibrator",
+    "RefusedError",
+    "RigPrior",
+    "RigidTransform",
+    "WorkingVolume",
+    "calibrate",
+    "detect",
+    "estimate",
+    "load_detections",
+    "load_object",
+    "load_rig",
+    "predicted_error",
+    "save_detections",
+    "save_rig",
+    "score",
+]

@@ -1,0 +1,14 @@
+from .centroids import Blobs
+from .detector import detect, detect_frame, detect_snapshot
+from .options import DetectionOptions, Frame
+from .populations import without_dim
+
+__all__ = [
+    "Blobs",
+    "DetectionOptions",
+    "Frame",
+    "detect",
+    "detect_frame",
+    "detect_snapshot",
+    "without_dim",
+]

@@ -1,0 +1,82 @@
+from . import lm_cpu
+from .accuracy import MAP_DEPTHS, MAP_SIZE, PredictedError, WorkingVolume, predicted_error
+from .blocks import BlockScatter, block_scatter
+from .change_points import CLIP, LEAST_SNAPSHOTS
+from .covariance import (
+    camera_covariance,
+    camera_std,
+    flat_std,
+    object_covariance,
+    pose_covariance,
+    relative_covariance,
+    relative_difference,
+    relative_jacobian,
+    whitened_covariance,
+)
+from .gauge import aligned
+from .levenberg_marquardt import Solution
+from .linearization import POSE_PARAMETERS, NormalEquations, Problem, State, linearize, moved, pose_at, rig_at
+from .lm_cpu import lens
+from .map_estimate import Estimate, EstimationOptions, conclude, estimate, make_loss, make_problem, make_start
+from .moves import find_moves
+from .object_shape import SNAPSHOTS_TO_BEND, FiducialOffset, ShapeEvidence, offsets
+from .pose_initialization import initial_pose
+from .pose_support import ON_A_LINE, UndeterminedPosesError, require_poses
+from .rig_uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian
+from .robust_losses import squared
+from .variance_components import BENT, settle
+
+__all__ = [
+    "BENT",
+    "CLIP",
+    "LEAST_SNAPSHOTS",
+    "MAP_DEPTHS",
+    "MAP_SIZE",
+    "ON_A_LINE",
+    "POSE_PARAMETERS",
+    "SNAPSHOTS_TO_BEND",
+    "BlockScatter",
+    "Estimate",
+    "EstimationOptions",
+    "FiducialOffset",
+    "NormalEquations",
+    "PredictedError",
+    "Problem",
+    "RigUncertainty",
+    "ShapeEvidence",
+    "Solution",
+    "State",
+    "UndeterminedPosesError",
+    "WorkingVolume",
+    "aligned",
+    "block_scatter",
+    "camera_covariance",
+    "camera_std",
+    "conclude",
+    "estimate",
+    "find_moves",
+    "flat_std",
+    "initial_pose",
+    "inverse_or_zero",
+    "lens",
+    "linearize",
+    "lm_cpu",
+    "make_loss",
+    "make_problem",
+    "make_start",
+    "moved",
+    "object_covariance",
+    "offsets",
+    "pixel_jacobian",
+    "pose_at",
+    "pose_covariance",
+    "predicted_error",
+    "relative_covariance",
+    "relative_difference",
+    "relative_jacobian",
+    "require_poses",
+    "rig_at",
+    "settle",
+    "squared",
+    "whitened_covariance",
+]

@@ -1,0 +1,51 @@
+from .atomic import replacing, write_bytes, write_text
+from .capture import Capture, open_capture, open_input, save_capture_settings
+from .detections_csv import MARGIN, load_detections, save_detections
+from .frames import Frame, read_frame, write_frame, write_image
+from .json_text import read_json
+from .names import find_file, nearest, title_of
+from .object_csv import load_object, save_object
+from .publication import publishing
+from .resources import data_path, shipped_names
+from .rig_yaml import RigCovariance, load_rig, load_rig_covariance, save_rig
+from .safetensors_file import read_tensors, read_texts, write_tensors
+from .yaml_file import Flow, StrictModel, parse_yaml, read_yaml, validated, yaml_text
+
+__all__ = [
+    "MARGIN",
+    "Capture",
+    "Flow",
+    "Frame",
+    "RigCovariance",
+    "StrictModel",
+    "data_path",
+    "find_file",
+    "load_detections",
+    "load_object",
+    "load_rig",
+    "load_rig_covariance",
+    "nearest",
+    "open_capture",
+    "open_input",
+    "parse_yaml",
+    "publishing",
+    "read_frame",
+    "read_json",
+    "read_tensors",
+    "read_texts",
+    "read_yaml",
+    "replacing",
+    "save_capture_settings",
+    "save_detections",
+    "save_object",
+    "save_rig",
+    "shipped_names",
+    "title_of",
+    "validated",
+    "write_bytes",
+    "write_frame",
+    "write_image",
+    "write_tensors",
+    "write_text",
+    "yaml_text",
+]

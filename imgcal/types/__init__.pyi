@@ -1,0 +1,37 @@
+from . import limits
+from .calibration_object import CalibrationObject, SelfMotion
+from .limits import BLOB_RADIUS, FIDUCIAL_RADIUS, MOST_PIXELS, SIGMA, Range, check_object, check_observations, check_rig
+from .moved_camera import Kind, MovedCamera, MovedError
+from .observations import UNUSABLE, BlobFlag, Detections, Observations
+from .prediction import Prediction, Views
+from .rig import PARAMETER_NAMES, PARAMETERS, CameraRig, RigPrior, pack21, unpack18, unpack21
+
+__all__ = [
+    "BLOB_RADIUS",
+    "FIDUCIAL_RADIUS",
+    "MOST_PIXELS",
+    "PARAMETERS",
+    "PARAMETER_NAMES",
+    "SIGMA",
+    "UNUSABLE",
+    "BlobFlag",
+    "CalibrationObject",
+    "CameraRig",
+    "Detections",
+    "Kind",
+    "MovedCamera",
+    "MovedError",
+    "Observations",
+    "Prediction",
+    "Range",
+    "RigPrior",
+    "SelfMotion",
+    "Views",
+    "check_object",
+    "check_observations",
+    "check_rig",
+    "limits",
+    "pack21",
+    "unpack18",
+    "unpack21",
+]

@@ -1,0 +1,44 @@
+"""The structure that CONTRIBUTING draws: imports point down, and rooms know each other by what they export."""
+
+import ast
+from pathlib import Path
+
+from importlinter.cli import EXIT_STATUS_SUCCESS, lint_imports
+
+ROOT = Path(__file__).parents[1]
+SOURCES = sorted((ROOT / "imgcal").rglob("*.py"))
+
+
+def imports(path: Path) -> list[tuple[str, str]]:
+    """Every `from MODULE import NAME` of a file, as (module, name)."""
+    nodes = (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom))
+    return [(node.module or "", alias.name) for node in nodes for alias in node.names]
+
+
+def room_of(path: Path) -> str:
+    return path.relative_to(ROOT / "imgcal").parts[0].removesuffix(".py")
+
+
+def test_imports_point_down() -> None:
+    config = str(ROOT / "pyproject.toml")
+    assert lint_imports(config_filename=config, cache_dir=None) == EXIT_STATUS_SUCCESS
+
+
+def test_rooms_know_each_other_by_what_they_export() -> None:
+    inside = [
+        f"{path.relative_to(ROOT)}: {module}.{name}"
+        for path in SOURCES
+        for module, name in imports(path)
+        if module.startswith("imgcal.") and module.count(".") > 1 and module.split(".")[1] != room_of(path)
+    ]
+    assert not inside, inside
+
+
+def test_private_names_stay_where_they_are() -> None:
+    taken = [
+        f"{path.relative_to(ROOT)}: {module}.{name}"
+        for path in SOURCES
+        for module, name in imports(path)
+        if module.startswith(("imgcal", "renderers")) and name.startswith("_") and name != "__version__"
+    ]
+    assert not taken, taken
