@@ -17,7 +17,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from renderers import additive_splatting
 from renderers.additive_splatting import Splats
 from renderers.compiling import njit
 
@@ -33,54 +32,42 @@ NOWHERE = -(2**31)  # where the windows of splats start that are not drawn
 FAST = {"contract", "reassoc", "nsz"}
 
 
-def added(splats: Splats, image_size: tuple[int, int], out: Tensor | None = None) -> Tensor:
-    """Do the work of `additive_splatting.added`, which has the arguments, for tensors on the CPU."""
-    if out is None:
-        images: Tensor = _Added.apply(image_size, *splats)
-        return images
-    _draw(out, splats)
-    return out
+def drawn(splats: Splats, image_size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
+    """Draw splats as `draw` does into fresh images (B, K, H, W), which come first."""
+    kind = np.float64 if splats.uv.dtype == torch.float64 else np.float32
+    # NumPy asks Linux for huge pages: most of the time of a large fresh tensor goes into faults of small ones.
+    images = torch.from_numpy(np.empty((len(splats.uv), splats.colours.shape[2], *image_size), dtype=kind))
+    return images, *draw(images, splats)
 
 
-class _Added(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, image_size: tuple[int, int], *tensors: Tensor) -> Tensor:
-        splats = Splats(*tensors)
-        kind = np.float64 if splats.uv.dtype == torch.float64 else np.float32
-        # NumPy asks Linux for huge pages: most of the time of a large fresh tensor goes into faults of small ones.
-        images = torch.from_numpy(np.empty((len(splats.uv), splats.colours.shape[2], *image_size), dtype=kind))
-        ctx.save_for_backward(*splats, *_draw(images, splats))
-        return images
-
-    @staticmethod
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        *values, visible, steps, starts = ctx.saved_tensors
-        if torch.is_grad_enabled():  # the gradient itself is to be differentiated
-            images = additive_splatting.added(Splats._make((*values, visible)), (upstream.shape[2], upstream.shape[3]))
-            wanted = [x for x in values if x.requires_grad]
-            found = iter(torch.autograd.grad(images, wanted, upstream, create_graph=True))
-            return (None, *(next(found) if x.requires_grad else None for x in values), None)
-        gradients = [torch.empty_like(x, memory_format=torch.contiguous_format) for x in values]
-        _in_threads(_gradients, _arrays(upstream, *values, steps, starts, *gradients))
-        return (None, *gradients, None)
+def draw(images: Tensor, splats: Splats) -> tuple[Tensor, Tensor]:
+    """Overwrite images (B, K, H, W); return what `windows` does."""
+    steps, starts = windows(splats, max(images.shape[2:]))
+    _in_threads(_add, [images.numpy(), *_arrays(splats.sizes, splats.weight, splats.colours, steps, starts)])
+    return steps, starts
 
 
-def _draw(images: Tensor, splats: Splats) -> tuple[Tensor, Tensor]:
-    """Overwrite images.
+def windows(splats: Splats, longest: int) -> tuple[Tensor, Tensor]:
+    """Find the pixels that each splat reaches, in images whose longer side is given.
 
     Returns:
         (B, N, 2, w + 1) error function at the edges of the pixels of each window, and where it starts (B, N, 2).
 
     """
-    uv, sizes, weight, colours, visible = _arrays(*splats)
-    longest = max(images.shape[2:])
+    uv, sizes, visible = _arrays(splats.uv, splats.sizes, splats.visible)
     half = min(math.ceil(REACH[splats.uv.dtype] * _widest(sizes, visible)), longest)
     edges = torch.empty((*splats.uv.shape, 2 * half + 2), dtype=splats.uv.dtype)
     starts = torch.empty(splats.uv.shape, dtype=torch.int32)
     _place(uv, sizes, visible, longest, *_arrays(edges, starts))
-    steps = edges.erf_()  # of all edges at once, where it is vectorized
-    _in_threads(_add, [images.numpy(), sizes, weight, colours, *_arrays(steps, starts)])
-    return steps, starts
+    return edges.erf_(), starts  # of all edges at once, where it is vectorized
+
+
+def gradients(upstream: Tensor, splats: Splats, steps: Tensor, starts: Tensor) -> tuple[Tensor, ...]:
+    """Take the gradient by images (B, K, H, W) to those by all but `visible`; windows as `windows` returns them."""
+    values = splats[:4]
+    found = [torch.empty_like(x, memory_format=torch.contiguous_format) for x in values]
+    _in_threads(_gradients, _arrays(upstream, *values, steps, starts, *found))
+    return tuple(found)
 
 
 def _arrays(*tensors: Tensor) -> list[NDArray[Any]]:

@@ -6,7 +6,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from renderers import additive_splatting, additive_splatting_cpu
+from renderers import additive_splatting, additive_splatting_operator
 from renderers.additive_splatting import Splats, profile
 from renderers.compositing import Canvas, composite_windows, window_starts
 
@@ -70,7 +70,7 @@ def splat(
     batch, count = uv.shape[:-2], uv.shape[-2]
     images = math.prod(batch)
     _check(uv, colours, compositing, depth)
-    dtype = torch.promote_types(uv.dtype, torch.float32)
+    dtype = uv.dtype if uv.dtype == torch.float64 else torch.float32
     # Autocast would round the profiles to bfloat16, and the gradient of a coordinate with them.
     with torch.autocast(uv.device.type, enabled=False):
         sizes = torch.as_tensor(size, dtype=dtype, device=uv.device).expand(*batch, count)
@@ -87,13 +87,13 @@ def splat(
             _check_out(out, shape, uv.device, splats)
         if compositing == "add":
             return _add(splats, shape, out)
-        composed = _over(splats.drawn(), image_size, depth).reshape(shape)
+        composed = _over(splats.drawn(), _reach(size), image_size, depth).reshape(shape)
         return composed if out is None else out.copy_(composed)
 
 
 def _add(splats: Splats, shape: tuple[int, ...], out: Tensor | None) -> Tensor:
     """Sum the splats in any order."""
-    added = additive_splatting_cpu.added if splats.uv.device.type == "cpu" else additive_splatting.added
+    added = additive_splatting_operator.added if splats.uv.device.type == "cpu" else additive_splatting.added
     image_size = (shape[-2], shape[-1])
     if out is None:
         return added(splats, image_size).view(shape)
@@ -108,16 +108,24 @@ def _add(splats: Splats, shape: tuple[int, ...], out: Tensor | None) -> Tensor:
     return out
 
 
-def _over(splats: Splats, image_size: tuple[int, int], depth: Tensor | None) -> Tensor:
-    """Composite the splats front to back on local windows: (B, K, H, W)."""
+def _reach(size: Tensor | float) -> float:
+    """Largest size, in pixels; infinite where a graph is made, which must not depend on values of tensors."""
+    if isinstance(size, int | float):
+        return float(size)
+    if torch.compiler.is_compiling():
+        return math.inf
+    return float(size.detach().max()) if size.numel() else 0.0
+
+
+def _over(splats: Splats, reach: float, image_size: tuple[int, int], depth: Tensor | None) -> Tensor:
+    """Composite the splats front to back on local windows, or on whole images: (B, K, H, W)."""
     uv, sizes, weight, colours, _ = splats
     if depth is not None:
         order = depth.reshape(sizes.shape).argsort(dim=-1, stable=True)
         uv, colours = (x.gather(1, order[..., None].expand_as(x)) for x in (uv, colours))
         sizes, weight = sizes.gather(1, order), weight.gather(1, order)
-    reach = float(sizes.detach().max()) if sizes.numel() else 0.0
-    window = 2 * math.ceil(WINDOW_SIGMAS * reach) + 1
     height, width = image_size
+    window = 2 * math.ceil(WINDOW_SIGMAS * reach) + 1 if reach < math.inf else max(image_size)
     window_height, window_width = min(window, height), min(window, width)
     rows = window_starts(uv[..., 1], window_height, height)
     columns = window_starts(uv[..., 0], window_width, width)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from renderers import additive_splatting, additive_splatting_cpu, splat
+from renderers import additive_splatting, additive_splatting_cpu, additive_splatting_operator, splat
 from renderers.additive_splatting import Splats
 
 SIZE = (19, 33)
@@ -37,7 +37,7 @@ def test_equals_whole_matrix_products(dtype: torch.dtype, tolerance: float, wide
     splats.sizes[2, 3] *= widest  # windows larger than the image
     upstream = torch.randn(4, channels, *SIZE, generator=torch.Generator().manual_seed(0), dtype=dtype)
     found = []
-    for path in (additive_splatting, additive_splatting_cpu):
+    for path in (additive_splatting, additive_splatting_operator):
         images = path.added(splats, SIZE) if found else path.added(Splats(*leaves(splats), splats.visible), SIZE)
         found.append((images, *torch.autograd.grad(images, splats[:4], upstream)))
     torch.testing.assert_close(found[1][0], found[0][0], rtol=0, atol=tolerance)
@@ -45,7 +45,7 @@ def test_equals_whole_matrix_products(dtype: torch.dtype, tolerance: float, wide
         torch.testing.assert_close(fast, slow, rtol=100 * tolerance, atol=100 * tolerance)
 
 
-@pytest.mark.parametrize("path", [additive_splatting, additive_splatting_cpu])
+@pytest.mark.parametrize("path", [additive_splatting, additive_splatting_operator])
 def test_a_buffer_holds_the_same_images(path) -> None:
     splats = scene(3, 5)
     out = torch.full((3, 3, *SIZE), torch.nan, dtype=torch.float64)
@@ -58,7 +58,7 @@ def test_second_gradients() -> None:
     uv, sizes, weight, colours = splats[:4]
     given = [x.requires_grad_() for x in (uv.nan_to_num(5.0).clamp(-5, 40), sizes + 0.5, weight, colours)]
     assert torch.autograd.gradgradcheck(
-        lambda *x: additive_splatting_cpu.added(Splats(*x, splats.visible), SIZE), given, fast_mode=True
+        lambda *x: additive_splatting_operator.added(Splats(*x, splats.visible), SIZE), given, fast_mode=True
     )
 
 
@@ -67,7 +67,7 @@ def test_gradient_of_one_argument_from_an_expanded_upstream() -> None:
     splats.uv.requires_grad_()
     found, expected = (
         torch.autograd.grad(path.added(splats, SIZE).sum(), splats.uv)[0]
-        for path in (additive_splatting_cpu, additive_splatting)
+        for path in (additive_splatting_operator, additive_splatting)
     )
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
 
@@ -86,7 +86,7 @@ def test_threads_change_nothing() -> None:
     found = []
     for threads in (3, 1):
         torch.set_num_threads(threads)
-        images = additive_splatting_cpu.added(Splats(*leaves(splats), splats.visible), SIZE)
+        images = additive_splatting_operator.added(Splats(*leaves(splats), splats.visible), SIZE)
         found.append((images, *torch.autograd.grad(images.square().sum(), splats[:4])))
     for many, one in zip(*found, strict=True):
         assert torch.equal(many, one)
