@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt, uniform_filter
 
-from imgcal.detection import fitting, window
+from imgcal.detection import fitting, kernels
 from imgcal.detection import moments as moments_of
 from imgcal.types.observations import BlobFlag
 
@@ -46,7 +46,7 @@ def measure(frame, labels, label, box, half, saturation, invert=None, parted=Fal
         raw = invert - raw
     found = np.where(inside, labels[rows, columns], 0)
     y, x = np.mgrid[-half : half + 1, -half : half + 1].astype(np.float64)
-    inner = np.maximum(abs(x), abs(y)) <= half - window.RING
+    inner = np.maximum(abs(x), abs(y)) <= half - kernels.RING
     plane, noise, slope = background(raw[~inner], x[~inner], y[~inner])
     grey = raw - plane[0] - plane[1] * x - plane[2] * y
     smooth = uniform_filter(grey, 3)
@@ -55,10 +55,10 @@ def measure(frame, labels, label, box, half, saturation, invert=None, parted=Fal
     free = (found == 0) | (found == label)
     other = np.where(free.all(), np.inf, distance_transform_edt(free))
     foreign = cv2.dilate(((other <= own) & inner).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    territory = (own <= window.SKIRT) & (own <= other) & inner & inside
+    territory = (own <= kernels.SKIRT) & (own <= other) & inner & inside
     saddle = smooth[territory & foreign].max(initial=0)
 
-    clip = np.clip(window.CLIP_PEAK * smooth[territory].max(initial=0), *(c / 3 * noise for c in window.CLIP))
+    clip = np.clip(kernels.CLIP_PEAK * smooth[territory].max(initial=0), *(c / 3 * noise for c in kernels.CLIP))
     weight = np.where(territory, np.clip(smooth / clip - 1, 0, 1), 0)
     core = weight > 0.5
     if not core.any():
@@ -70,22 +70,24 @@ def measure(frame, labels, label, box, half, saturation, invert=None, parted=Fal
     clipped = bool((raw[core] >= saturation).any())
     flags = BlobFlag.SATURATED if clipped else BlobFlag.NONE
     x0 = y0 = known = residual = 0.0
-    if two_peaked or saddle > (window.CROWDED_CLIPPED if clipped and parted else window.CROWDED) * top:
+    if two_peaked or saddle > (kernels.CROWDED_CLIPPED if clipped and parted else kernels.CROWDED) * top:
         flags |= BlobFlag.MERGED
     else:
         start = fitting.start_of(grey[core].max(), radius, clipped, moments, middle)
         rows = territory & (quadratic(start, x, y) >= max(start[1] - fitting.BAND, 0) ** 2 - 1)
         rows &= (raw < saturation) | (not clipped)
         x0, y0, known, residual = fit(x[rows], y[rows], grey[rows], start, clipped, noise)
-    fits = known * radius**2 > max(noise**2, residual) and residual - noise**2 < (window.MISFIT * grey[core].max()) ** 2
-    if fits and np.hypot(x0 - middle[0], y0 - middle[1]) < window.FARTHEST:
+    fits = (
+        known * radius**2 > max(noise**2, residual) and residual - noise**2 < (kernels.MISFIT * grey[core].max()) ** 2
+    )
+    if fits and np.hypot(x0 - middle[0], y0 - middle[1]) < kernels.FARTHEST:
         variance = max(noise**2, residual) / known + (slope * brightness / known) ** 2
-        variance += clipped * window.CLIPPED_FIT**2 / max(radius, 1)
+        variance += clipped * kernels.CLIPPED_FIT**2 / max(radius, 1)
     else:
         x0, y0, variance = centroid(grey, weight, clip, noise, slope, x, y)
-        variance += clipped * window.CLIPPED_SIGMA**2 / max(radius, 1)
-    variance += clipped * min(saddle / top, 1) ** 3 * (window.SHARED * radius) ** 2
-    sigma = np.sqrt(variance + window.SMALLEST_SIGMA**2)
+        variance += clipped * kernels.CLIPPED_SIGMA**2 / max(radius, 1)
+    variance += clipped * min(saddle / top, 1) ** 3 * (kernels.SHARED * radius) ** 2
+    sigma = np.sqrt(variance + kernels.SMALLEST_SIGMA**2)
     return centre[0] + x0, centre[1] + y0, sigma, radius, elongation, flags
 
 
