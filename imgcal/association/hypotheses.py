@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, cKDTree
 
 from imgcal.association.blobs import Blobs
-from imgcal.association.p3p import FAST, three_point_pose
+from imgcal.association.p3p import FAST, three_point_pose, towards
 from imgcal.types import CalibrationObject, CameraRig
 from renderers.compiling import njit
 
@@ -162,8 +162,8 @@ def single_camera_poses(
     score = np.zeros((len(triples), keep))
     rotation, translation = np.zeros((len(triples), keep, 3, 3)), np.zeros((len(triples), keep, 3))
     _search(
-        rays, cameras, fiducials.triples, fiducials.sides, fiducials.frames, fiducials.points, fiducials.order,
-        focal, raster, origin, 1 / cell, score, rotation, translation,
+        *towards(rays), cameras, fiducials.triples, fiducials.sides, fiducials.frames, fiducials.points,
+        fiducials.order, focal, raster, origin, 1 / cell, score, rotation, translation,
     )  # fmt: skip
     found = score > 0
     camera = np.broadcast_to(cameras[:, None], found.shape)[found]
@@ -174,7 +174,8 @@ def single_camera_poses(
 
 @njit(cache=True, fastmath=FAST)
 def _search(
-    rays, cameras, triples, sides, frames, points, order, focal, raster, origin, per_pixel, score, rotation, translation
+    rays, directions, cameras, triples, sides, frames, points, order, focal, raster, origin, per_pixel,
+    score, rotation, translation,
 ):  # fmt: skip
     """Fill the best poses (in the camera's frame) of each triple of blobs."""
     for q in range(len(rays)):
@@ -182,7 +183,7 @@ def _search(
         frame, depths, turn = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
         for t in range(len(triples)):
             for mirror in (1.0, -1.0):
-                if not three_point_pose(rays[q], sides[t], mirror, frame, depths):
+                if not three_point_pose(rays[q], directions[q], sides[t], mirror, frame, depths):
                     continue
                 for i in range(3):
                     for j in range(3):
@@ -192,9 +193,9 @@ def _search(
                             + frame[i, 2] * frames[t, j, 2]
                         )
                 p = points[triples[t, 0]]
-                x = rays[q, 0, 0] * depths[0] - turn[0, 0] * p[0] - turn[0, 1] * p[1] - turn[0, 2] * p[2]
-                y = rays[q, 0, 1] * depths[0] - turn[1, 0] * p[0] - turn[1, 1] * p[1] - turn[1, 2] * p[2]
-                z = depths[0] - turn[2, 0] * p[0] - turn[2, 1] * p[1] - turn[2, 2] * p[2]
+                x = directions[q, 0, 0] * depths[0] - turn[0, 0] * p[0] - turn[0, 1] * p[1] - turn[0, 2] * p[2]
+                y = directions[q, 0, 1] * depths[0] - turn[1, 0] * p[0] - turn[1, 1] * p[1] - turn[1, 2] * p[2]
+                z = directions[q, 0, 2] * depths[0] - turn[2, 0] * p[0] - turn[2, 1] * p[1] - turn[2, 2] * p[2]
                 value = _explained(
                     turn, x, y, z, points, order, focal[camera], raster[camera], origin[camera], per_pixel, score[q, -1]
                 )

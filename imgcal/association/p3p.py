@@ -7,28 +7,50 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from renderers.compiling import njit
 
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
+def towards(rays: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Turn cameras towards what they see, as scaled orthography wants them.
+
+    Args:
+        rays: (*B, 3, 2) coordinates on the z = 1 plane.
+
+    Returns:
+        The same rays on the plane z = 1 of a camera that looks at their mean (*B, 3, 2), and the points there in the
+        axes of the camera as it is (*B, 3, 3).
+    """
+    points = np.concatenate((rays, np.ones((*rays.shape[:-1], 1))), axis=-1)
+    view = points.mean(-2)
+    view /= np.linalg.norm(view, axis=-1, keepdims=True)
+    points /= (points * view[..., None, :]).sum(-1, keepdims=True)
+    right = np.stack((view[..., 2], np.zeros(view.shape[:-1]), -view[..., 0]), axis=-1)
+    right /= np.linalg.norm(right, axis=-1, keepdims=True)
+    axes = np.stack((right, np.cross(view, right)), axis=-1)  # (*B, 3, 2)
+    return points @ axes, points
+
+
 @njit(cache=True, fastmath=FAST)
-def three_point_pose(rays, sides, mirror, rotation_frame, depths):
+def three_point_pose(rays, directions, sides, mirror, rotation_frame, depths):
     """Find the pose of a triangle of known sides seen along three rays.
 
     Scaled orthography has exactly two solutions, mirror images of each other, in closed form; the image is then
     corrected for the depths found, once. Where perspective P3P has no real solution because the camera is not quite
-    what it is thought to be, this still gives the nearest sensible one. The correction leaves about a degree where the
-    object's depth is a fifth of its distance.
+    what it is thought to be, this still gives the nearest sensible one. The correction leaves a quarter of a degree
+    where the object's depth is a fifth of its distance, if the camera looks at it: see `towards`.
 
     Args:
-        rays: (3, 2) coordinates on the z = 1 plane.
+        rays: (3, 2) coordinates on the z = 1 plane of a camera that looks at the triangle.
+        directions: (3, 3) points of that plane, in the axes in which the pose is wanted.
         sides: (3,) mm^2, squared distances of the points 0-1, 0-2 and 1-2.
         mirror: +1 or -1: which of the two solutions.
-        rotation_frame: (3, 3) filled with the triangle's frame in the camera: columns along the first side, in the
-            plane, normal to it.
-        depths: (3,) mm, filled with the depths of the points.
+        rotation_frame: (3, 3) filled with the triangle's frame: columns along the first side, in the plane, normal to
+            it.
+        depths: (3,) mm, filled with the depths of the points: they lie at `directions * depths`.
 
     Returns:
         False where the points of the triangle lie in line, or all rays are one.
@@ -56,15 +78,16 @@ def three_point_pose(rays, sides, mirror, rotation_frame, depths):
         z1, z2 = 1 + mirror * h1, 1 + mirror * (h2 if same_side else -h2)
     depths[0] = 1 / np.sqrt(scale2)
     depths[1], depths[2] = z1 * depths[0], z2 * depths[0]
-    return depths[1] > 0 and depths[2] > 0 and _frame(rays, depths, rotation_frame)
+    return depths[1] > 0 and depths[2] > 0 and _frame(directions, depths, rotation_frame)
 
 
 @njit(cache=True, fastmath=FAST)
-def _frame(rays, depths, frame):
-    """Fill the frame of the triangle rays * depths."""
-    ax, ay = rays[1, 0] * depths[1] - rays[0, 0] * depths[0], rays[1, 1] * depths[1] - rays[0, 1] * depths[0]
-    bx, by = rays[2, 0] * depths[2] - rays[0, 0] * depths[0], rays[2, 1] * depths[2] - rays[0, 1] * depths[0]
-    az, bz = depths[1] - depths[0], depths[2] - depths[0]
+def _frame(directions, depths, frame):
+    """Fill the frame of the triangle directions * depths."""
+    d = directions
+    x0, y0, z0 = d[0, 0] * depths[0], d[0, 1] * depths[0], d[0, 2] * depths[0]
+    ax, ay, az = d[1, 0] * depths[1] - x0, d[1, 1] * depths[1] - y0, d[1, 2] * depths[1] - z0
+    bx, by, bz = d[2, 0] * depths[2] - x0, d[2, 1] * depths[2] - y0, d[2, 2] * depths[2] - z0
     nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
     along, normal = np.sqrt(ax * ax + ay * ay + az * az), np.sqrt(nx * nx + ny * ny + nz * nz)
     if not (along > 0 and normal > 0):
