@@ -8,6 +8,7 @@ be read but not written, such as that of an image that was warmed up when it was
 from __future__ import annotations
 
 import atexit
+import gc
 import os
 import shutil
 import tempfile
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core import event
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -28,6 +30,7 @@ def njit(**options: Any) -> Callable[[Function], Function]:
     options = {"cache": True, "no_cfunc_wrapper": True} | options
 
     def decorate(function: Function) -> Function:
+        _RESTING.ours.add(function)
         # Numba chooses the folder when it decorates. Only then: what others compile is theirs to keep.
         before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, cache_folder()  # type: ignore[attr-defined]
         try:
@@ -38,6 +41,31 @@ def njit(**options: Any) -> Callable[[Function], Function]:
             numba.config.CACHE_DIR = before  # type: ignore[attr-defined]
 
     return decorate
+
+
+class _Rest(event.Listener):
+    """Lets Python's garbage collector rest while a function of ours is compiled: it takes an eighth of that time."""
+
+    def __init__(self) -> None:
+        self.ours: set[Callable[..., Any]] = set()
+        self.depth, self.enabled = 0, False
+
+    def on_start(self, happening: event.Event) -> None:
+        if self.depth or happening.data["dispatcher"].py_func in self.ours:
+            if not self.depth:
+                self.enabled = gc.isenabled()
+                gc.disable()
+            self.depth += 1
+
+    def on_end(self, happening: event.Event) -> None:
+        if self.depth:
+            self.depth -= 1
+            if not self.depth and self.enabled:
+                gc.enable()
+
+
+_RESTING = _Rest()
+event.register("numba:compile", _RESTING)
 
 
 @cache

@@ -1,3 +1,4 @@
+import gc
 import os
 import subprocess
 import sys
@@ -6,6 +7,7 @@ from pathlib import Path
 
 import numba
 import pytest
+from numba.core import event
 
 from renderers import compiling
 
@@ -93,3 +95,36 @@ def test_a_users_cache_that_cannot_be_made_leaves_the_choice_to_numba(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     monkeypatch.setattr(numba.config, "CACHE_DIR", "")
     assert compiling.cache_folder.__wrapped__() == ""
+
+
+def test_the_garbage_collector_rests_while_ours_is_compiled_and_works_again_after() -> None:
+    seen: list[bool] = []
+
+    class Watch(event.Listener):
+        def on_start(self, happening: event.Event) -> None:
+            seen.append(gc.isenabled())
+
+        def on_end(self, happening: event.Event) -> None:
+            pass
+
+    @compiling.njit(cache=False)
+    def inner(x: float) -> float:
+        return x + 1
+
+    @compiling.njit(cache=False)
+    def outer(x: float) -> float:
+        return inner(x) + 2
+
+    watch = Watch()
+    event.register("numba:compile", watch)
+    try:
+        outer(1.0)
+        assert seen[:2] == [False, False] and gc.isenabled()
+        seen.clear()
+        numba.njit(lambda x: x + 2)(1.0)  # not ours
+        assert seen == [True]
+        with pytest.raises(numba.core.errors.TypingError):
+            inner("a")
+        assert gc.isenabled()
+    finally:
+        event.unregister("numba:compile", watch)
