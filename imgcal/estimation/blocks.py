@@ -17,8 +17,9 @@ import torch
 from torch import Tensor
 
 from imgcal.estimation.levenberg_marquardt import Solution
-from imgcal.estimation.linearization import Problem, jacobian_at, robust_weight
-from imgcal.estimation.robust_losses import Loss
+from imgcal.estimation.linearization import Problem
+from imgcal.estimation.map_estimate import equations_by_snapshot
+from imgcal.estimation.robust_losses import NamedLoss
 from imgcal.types import PARAMETERS
 
 LEAST_BLOCKS = 6
@@ -42,7 +43,7 @@ class BlockScatter:
     length: int = 0  # snapshots in a block, where they scatter most; 0 = no more than the noise makes them
 
 
-def block_scatter(problem: Problem, solution: Solution, covariance: Tensor, loss: Loss) -> BlockScatter:
+def block_scatter(problem: Problem, solution: Solution, covariance: Tensor, loss: NamedLoss) -> BlockScatter:
     """Measure the scatter for one rig, B = 1.
 
     Args:
@@ -54,9 +55,8 @@ def block_scatter(problem: Problem, solution: Solution, covariance: Tensor, loss
     snapshots, cameras = problem.uv.shape[1:3]
     if snapshots < LEAST_BLOCKS:
         return BlockScatter()
-    at = jacobian_at(problem, solution.state)
-    weight = robust_weight(problem, at, loss)[..., None, None, :]
-    pull = -(at.by_rig[..., :PARAMETERS, :, :] * at.residual.unsqueeze(-3) * weight).sum((-2, -1))[0].flatten(1)
+    equations = equations_by_snapshot(problem, solution.state, loss)
+    pull = (solution.state.offset - equations.camera_gradient).flatten(1)  # the prior's own pull taken out
     influence = (pull - pull.mean(0)) @ covariance  # (S, 15 C)
     by_noise = covariance - covariance @ covariance  # the rest is the prior's
     found, size = BlockScatter(), 1

@@ -8,7 +8,8 @@ clipped, as Huber's loss clips them: a few wrong labels cannot make up a step.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -16,8 +17,9 @@ import torch
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from imgcal.estimation.linearization import Problem, State, linearize
-from imgcal.estimation.robust_losses import huber, squared
+from imgcal.estimation.linearization import Problem, State
+from imgcal.estimation.map_estimate import equations_by_snapshot
+from imgcal.estimation.robust_losses import NamedLoss
 from imgcal.types import PARAMETERS
 
 STEP = 8
@@ -30,7 +32,10 @@ LEAST_SNAPSHOTS = 2
 """On either side of a step: one snapshot alone may be a slip of another kind."""
 MOST_TIMES = 128
 """Places of a step that are tried in one pass; longer captures are searched in two."""
-CHUNK = 256  # snapshots that are linearized at once
+GROWTH = 1.5
+"""Of the number of snapshots on the shorter side, from one place to the next where a step is first looked for."""
+NEARBY = 0.4
+"""Of its statistic that a step keeps at the nearest of these places, at least; four fifths are expected."""
 
 Array = NDArray[np.float64]
 
@@ -51,16 +56,15 @@ class Blocks:
 
     camera: Array  # (S, V, 15, 15) information of the labels
     gradient: Array  # (S, V, 15) with clipped residuals
-    coupling: Array  # (S, V, 15, 6) with the pose, which is whitened
+    coupling: Array  # (S, 6, 15 V) with the pose, which is whitened
     pull: Array  # (S, 6) gradient of the whitened pose
     prior: Array  # (V, 15) offsets: the prior's gradient
 
     @cached_property
     def information(self) -> Array:
         """Of all cameras together, poses eliminated: (15 V, 15 V)."""
-        size = self.prior.size
-        wide = self.coupling.transpose(1, 2, 0, 3).reshape(size, -1)
-        total = np.eye(size) - wide @ wide.T
+        tall = self.coupling.reshape(-1, self.prior.size)
+        total = np.eye(self.prior.size) - tall.T @ tall
         blocks = total.reshape(*self.prior.shape, *self.prior.shape)
         for camera, block in enumerate(self.camera.sum(0)):
             blocks[camera, :, camera, :] += block
@@ -74,80 +78,120 @@ class Blocks:
     @cached_property
     def downhill(self) -> Array:
         """Newton's step of all cameras' values: (15 V,)."""
-        gradient = self.gradient.sum(0) + self.prior - np.einsum("svij,sj->vi", self.coupling, self.pull)
-        return self.covariance @ gradient.reshape(-1)
+        gradient = self.gradient.sum(0) + self.prior
+        tall = self.coupling.reshape(-1, self.prior.size)
+        return self.covariance @ (gradient.ravel() - self.pull.ravel() @ tall)
 
-    def statistics(self, camera: int, rows: NDArray[np.int64]) -> Array:
-        """Score statistic of a step of one camera before each of some snapshots, in increasing order: (R,)."""
-        own, coupling = self.camera[:, camera, :STEP], self.coupling[:, camera, :STEP]  # (S, 8, 15), (S, 8, 6)
-        cross = -np.einsum("saj,svij->savi", coupling, self.coupling)  # (S, 8, V, 15)
-        cross[:, :, camera] += own
-        score = self.gradient[:, camera, :STEP] - np.einsum("saj,sj->sa", coupling, self.pull)
-        cross, score = (_from(part, rows) for part in (cross.reshape(len(own), STEP, -1), score))  # from each row on
-        inner = _from(own[..., :STEP] - coupling @ coupling.transpose(0, 2, 1), rows)
-        information = inner - cross @ self.covariance @ cross.transpose(0, 2, 1)
-        gradient = score - cross @ self.downhill
+    def statistics(self, cameras: Sequence[int], rows: NDArray[np.int64]) -> Array:
+        """Score statistics of steps of some cameras before each of some snapshots, in increasing order: (R, K)."""
+        chosen, size = np.asarray(cameras), self.prior.size
+        stepping = (PARAMETERS * chosen[:, None] + np.arange(STEP)).ravel()
+        mine = self.coupling[:, :, stepping]  # (S, 6, 8 K)
+        ends = [*rows[1:], len(mine)]
+        cross = np.empty((len(rows), len(stepping), size))
+        for part, first, end in zip(cross, rows, ends, strict=True):
+            part[:] = -mine[first:end].reshape(-1, len(stepping)).T @ self.coupling[first:end].reshape(-1, size)
+        blocks = cross.reshape(len(rows), len(chosen), STEP, -1, PARAMETERS)
+        number = np.arange(len(chosen))
+        blocks[:, number, :, chosen] += np.add.reduceat(self.camera[:, chosen, :STEP], rows).swapaxes(0, 1)
+        score = self.gradient[:, chosen, :STEP].reshape(len(mine), -1) - (self.pull[:, None] @ mine)[:, 0]
+        cross, score = (_from(part) for part in (cross, np.add.reduceat(score, rows)))
+        blocks = cross.reshape(blocks.shape)
+        inner = blocks[:, number, :, chosen, :STEP].swapaxes(0, 1)  # (R, K, 8, 8)
+        gradient = (score - cross @ self.downhill).reshape(*inner.shape[:3], 1)
+        known = (cross.reshape(-1, size) @ self.covariance).reshape(*inner.shape[:3], size)
+        information = inner - known @ blocks.reshape(known.shape).swapaxes(-1, -2)
         information += np.eye(STEP) / WIDEST_STEP**2
-        return np.einsum("ra,ra->r", gradient, np.linalg.solve(information, gradient[..., None])[..., 0])
+        return (gradient * np.linalg.solve(information, gradient)).sum((-2, -1))
 
 
-def _from(parts: Array, rows: NDArray[np.int64]) -> Array:
-    """Sum of parts (S, ...) from each of some rows on: (R, ...)."""
-    return np.cumsum(np.add.reduceat(parts, rows)[::-1], axis=0)[::-1]
+def _from(parts: Array) -> Array:
+    """Replace parts (R, ...) by their sum from each of them on."""
+    np.cumsum(parts[::-1], axis=0, out=parts[::-1])
+    return parts
 
 
 def blocks_of(problem: Problem, state: State) -> Blocks:
     """Linearize snapshot by snapshot, at a state of one rig."""
-    count = problem.uv.shape[1]
-    parts = [_linearized(problem, state, slice(first, first + CHUNK)) for first in range(0, count, CHUNK)]
-    camera, gradient, coupling, pull = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return Blocks(camera, gradient, coupling, pull, state.offset[0].numpy())
-
-
-def _linearized(problem: Problem, state: State, rows: slice) -> tuple[Array, Array, Array, Array]:
-    """Blocks of some snapshots, taken as rigs of one snapshot each."""
-    uv, root_weight = problem.uv[0, rows, None], problem.root_weight[0, rows, None]
-    same = torch.zeros(len(uv), dtype=torch.long)
-    alone = replace(problem.select(same), uv=uv, root_weight=root_weight)
-    shape = None if state.object_offset is None else state.object_offset[same]
-    there = State(state.offset[same], state.rotation[0, rows, None], state.centre[0, rows, None], shape)
-    full, clipped = (linearize(alone, there, loss) for loss in (squared, lambda r: huber(r, CLIP)))
-    eye = torch.eye(PARAMETERS, dtype=uv.dtype)
+    full = clipped = equations_by_snapshot(problem, state, NamedLoss("squared"))
+    whitened = full.residual[:, 0] * problem.root_weight[0].unsqueeze(-2)
+    if bool((whitened.square().sum(-2) > CLIP**2).any()):
+        clipped = equations_by_snapshot(problem, state, NamedLoss("huber", CLIP))
     lower = torch.linalg.cholesky(full.pose[:, 0])
-    coupling = torch.linalg.solve_triangular(lower[:, None], full.coupling[:, 0].mT, upper=False).mT
+    coupling = torch.linalg.solve_triangular(lower, full.coupling[:, 0].flatten(1, 2).mT, upper=False)
     pull = torch.linalg.solve_triangular(lower, clipped.pose_gradient[:, 0, :, None], upper=False)[..., 0]
     # The prior's pull is the same in each of them, and counts once.
-    gradient = clipped.camera_gradient - there.offset
-    return (full.camera - eye).numpy(), gradient.numpy(), coupling.numpy(), pull.numpy()
+    gradient = clipped.camera_gradient - state.offset
+    camera = full.camera - torch.eye(PARAMETERS, dtype=lower.dtype)
+    return Blocks(
+        camera.numpy(), gradient.numpy(), coupling.contiguous().numpy(), pull.numpy(), state.offset[0].numpy()
+    )
 
 
-def likeliest_step(blocks: Blocks, seen: NDArray[np.bool_]) -> Step | None:
-    """Find the camera and the snapshot at which a step explains most; None = nothing could be seen to step.
+def likeliest_step(blocks: Blocks, seen: NDArray[np.bool_], least: float = 0.0) -> Step | None:
+    """Find the camera and the snapshot at which a step explains most.
 
     Args:
         blocks: of S snapshots and V cameras.
         seen: (S, V) bool, snapshots in which a camera has labels.
+        least: statistic of a step that matters; others are looked for only where some camera has one.
+
+    Returns:
+        None where nothing could be seen to step, or no step is so likely.
     """
-    best: Step | None = None
+    places = {camera: rows for camera in range(seen.shape[1]) if len(rows := _places(seen[:, camera]))}
+    first = [c for c, most in _screened(blocks, places).items() if most >= NEARBY * least] if least else list(places)
+    found = {camera: _search(blocks, camera, places[camera]) for camera in first}
+    if not found or max(statistic for statistic, _ in found.values()) < least:
+        return None
+    found |= {camera: _search(blocks, camera, places[camera]) for camera in places.keys() - found.keys()}
     rivals = np.zeros(seen.shape[1])
-    for camera in range(seen.shape[1]):
-        shown = np.flatnonzero(seen[:, camera])
-        rows = shown[LEAST_SNAPSHOTS : len(shown) - LEAST_SNAPSHOTS + 1]
-        if not len(rows):
-            continue
-        coarse = (
-            rows[np.unique(np.linspace(0, len(rows) - 1, MOST_TIMES).astype(int))] if len(rows) > MOST_TIMES else rows
-        )
-        statistics = blocks.statistics(camera, coarse)
-        if len(coarse) < len(rows):
-            place = int(statistics.argmax())
-            near = (rows >= coarse[max(place - 1, 0)]) & (rows <= coarse[min(place + 1, len(coarse) - 1)])
-            coarse = rows[near]
-            statistics = blocks.statistics(camera, coarse)
-        rivals[camera] = statistics.max()
-        if best is None or rivals[camera] > best.statistic:
-            best = Step(camera, int(coarse[statistics.argmax()]), float(rivals[camera]), rivals)
-    return best
+    for camera, (statistic, _) in found.items():
+        rivals[camera] = statistic
+    best = int(rivals.argmax())
+    return Step(best, found[best][1], float(rivals[best]), rivals)
+
+
+def _places(seen: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Snapshots at which a camera that is `seen` (S,) in some may be told to step."""
+    shown = np.flatnonzero(seen)
+    return shown[LEAST_SNAPSHOTS : len(shown) - LEAST_SNAPSHOTS + 1]
+
+
+def _screened(blocks: Blocks, places: Mapping[int, NDArray[np.int64]]) -> dict[int, float]:
+    """Largest statistic of each camera over a few of its places, in one go: a step nearby shows there, too."""
+    few = {camera: rows[_spread(len(rows))] for camera, rows in places.items()}
+    if not few:
+        return {}
+    rows = np.unique(np.concatenate(list(few.values())))
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST_TIMES)).astype(int))]
+    statistics = blocks.statistics(list(few), rows)
+    largest = {}
+    for number, (camera, own) in enumerate(places.items()):
+        inside = (rows >= own[0]) & (rows <= own[-1])
+        largest[camera] = float(statistics[inside, number].max(initial=0.0))
+    return largest
+
+
+def _spread(count: int) -> NDArray[np.int64]:
+    """Numbers of a few of so many places, denser towards either end, where a place matters more."""
+    steps = LEAST_SNAPSHOTS * GROWTH ** np.arange(np.log(max(count, 2)) / np.log(GROWTH))
+    near = np.unique(np.ceil(steps).astype(np.int64) - LEAST_SNAPSHOTS)
+    near = near[near <= (count - 1) // 2]
+    return np.unique(np.concatenate((near, count - 1 - near)))
+
+
+def _search(blocks: Blocks, camera: int, rows: NDArray[np.int64]) -> tuple[float, int]:
+    """Largest statistic of a camera over some places, and the place."""
+    tried = rows
+    if len(rows) > MOST_TIMES:
+        coarse = rows[np.unique(np.linspace(0, len(rows) - 1, MOST_TIMES).astype(int))]
+        place = int(blocks.statistics([camera], coarse).argmax())
+        near = (rows >= coarse[max(place - 1, 0)]) & (rows <= coarse[min(place + 1, len(coarse) - 1)])
+        tried = rows[near]
+    statistics = blocks.statistics([camera], tried)[:, 0]
+    best = int(statistics.argmax())
+    return float(statistics[best]), int(tried[best])
 
 
 def dispersion(blocks: Blocks, seen: NDArray[np.bool_]) -> float:
@@ -158,12 +202,16 @@ def dispersion(blocks: Blocks, seen: NDArray[np.bool_]) -> float:
     """
     found = []
     for camera in range(seen.shape[1]):
-        shown = np.flatnonzero(seen[:, camera])
-        rows = shown[LEAST_SNAPSHOTS : len(shown) - LEAST_SNAPSHOTS + 1]
+        rows = _places(seen[:, camera])
         if len(rows):
             few = rows[np.unique(np.linspace(0, len(rows) - 1, 16).astype(int))]
-            found.append(blocks.statistics(camera, few))
+            found.append(blocks.statistics([camera], few))
     return max(1.0, float(np.median(np.concatenate(found))) / float(chi2.median(STEP))) if found else 1.0
+
+
+def least_significant(candidates: int, error: float) -> float:
+    """Statistic from which `is_significant` holds."""
+    return float(chi2.isf(error / max(candidates, 1), STEP))
 
 
 def is_significant(statistic: float, candidates: int, error: float) -> bool:

@@ -20,15 +20,16 @@ from torch import Tensor
 from imgcal.errors import RefusedError
 from imgcal.estimation.curvature import curvature_covariance
 from imgcal.estimation.levenberg_marquardt import Solution, factorize
-from imgcal.estimation.linearization import POSE_PARAMETERS, points_at
+from imgcal.estimation.linearization import POSE_PARAMETERS, NormalEquations, points_at
+from imgcal.estimation.lm_cpu import cholesky, subtract_gram
 from imgcal.estimation.map_estimate import Estimate
 from imgcal.geometry import RigidTransform, cross_matrix, left_jacobian
 from imgcal.types import PARAMETERS, CameraRig
 from renderers.compiling import njit
 
 UNDETERMINED = "covariance: the observations do not determine the object's pose in every snapshot"
-MOST_DENSE = 60
-"""Pose parameters up to which `remaining_variance` needs no library."""
+FEW_SNAPSHOTS = 10
+"""Up to which `remaining_variance` eliminates the cameras of an exact object, not the poses."""
 
 
 def camera_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
@@ -68,7 +69,7 @@ def camera_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
 def whitened_covariance(solution: Solution) -> Tensor:
     """Joint covariance of all cameras' whitened offsets: (B, 15 C, 15 C)."""
     equations = solution.equations
-    factorization = factorize(equations)
+    factorization = solution.factorization
     reduced, cameras = factorization.reduced, equations.camera.shape[1]
     if bool(reduced.failed.any()):
         raise RefusedError(UNDETERMINED)
@@ -107,21 +108,88 @@ def remaining_variance(solution: Solution) -> NDArray[np.float64]:
     """
     equations = solution.equations
     snapshots, cameras = equations.coupling.shape[1:3]
-    exact = equations.object is None
-    if equations.cost.device.type == "cpu" and POSE_PARAMETERS * snapshots <= MOST_DENSE and exact:
-        variance = np.empty((len(equations.cost), cameras, PARAMETERS))
-        camera, coupling, pose = (
-            block.detach().double().numpy() for block in (equations.camera, equations.coupling, equations.pose)
-        )
-        for b in range(len(variance)):
-            wide = coupling[b].transpose(1, 2, 0, 3).reshape(cameras, PARAMETERS, -1)
-            _diagonal(camera[b].copy(), wide.copy(), pose[b], variance[b])
-    else:
+    if equations.cost.device.type != "cpu":
         diagonal = whitened_covariance(solution).diagonal(dim1=-2, dim2=-1)
         variance = diagonal.unflatten(-1, (cameras, PARAMETERS)).cpu().numpy()
+    elif snapshots <= FEW_SNAPSHOTS and equations.object is None:
+        variance = _by_poses(equations)
+    else:
+        variance = _by_cameras(equations)
     if not np.isfinite(variance).all():
         raise RefusedError(UNDETERMINED)
     return variance
+
+
+def _by_poses(equations: NormalEquations) -> NDArray[np.float64]:
+    """Diagonals (B, C, 15) by way of the poses' dense information."""
+    camera, coupling, pose = _doubles(equations.camera, equations.coupling, equations.pose)
+    variance = np.empty(camera.shape[:3])
+    for b in range(len(variance)):
+        wide = coupling[b].transpose(1, 2, 0, 3).reshape(*camera.shape[1:3], -1)
+        _diagonal(camera[b].copy(), wide.copy(), pose[b], variance[b])
+    return variance
+
+
+def _by_cameras(equations: NormalEquations) -> NDArray[np.float64]:
+    """Diagonals (B, C, 15) by way of the dense information of the cameras and, behind them, of the object."""
+    camera, coupling, pose = _doubles(equations.camera, equations.coupling, equations.pose)
+    batch, cameras = camera.shape[:2]
+    coupling = coupling.transpose(0, 1, 4, 2, 3).reshape(*pose.shape[:3], -1)  # (B, S, 6, 15 C)
+    wide = coupling.shape[-1]
+    kept = np.zeros((batch, wide, wide))
+    blocks = kept.reshape(batch, cameras, PARAMETERS, cameras, PARAMETERS)
+    blocks[:, range(cameras), :, range(cameras)] = camera.swapaxes(0, 1)
+    if equations.object is not None:
+        own = equations.object
+        across, with_pose, square = _doubles(own.camera.flatten(1, 2), own.pose, own.own)
+        kept = np.concatenate(
+            (np.concatenate((kept, across), 2), np.concatenate((across.swapaxes(1, 2), square), 2)), 1
+        )
+        coupling = np.concatenate((coupling, with_pose), 3)
+    variance = np.empty((batch, cameras, PARAMETERS))
+    for b in range(batch):
+        _diagonal_without_poses(kept[b], np.ascontiguousarray(coupling[b]), pose[b], variance[b].reshape(-1))
+    return variance
+
+
+def _doubles(*tensors: Tensor) -> tuple[NDArray[np.float64], ...]:
+    return tuple(tensor.detach().double().numpy() for tensor in tensors)
+
+
+@njit(cache=True, fastmath={"contract", "reassoc", "nsz"})
+def _diagonal_without_poses(kept, coupling, poses, result):
+    """First diagonal entries (D,) of the inverse of `kept` (K, K), less what poses (S, 6, 6) take that couple by
+    (S, 6, K); overwrites `kept`, and gives nan where a factorization fails.
+    """
+    count, size, wide = coupling.shape
+    lower, half, row = np.empty((size, size)), np.empty((size, wide)), np.empty(wide)
+    determined = True
+    for s in range(count):
+        for i in range(size):
+            for j in range(size):
+                lower[i, j] = poses[s, i, j]
+        determined = cholesky(lower) and determined
+        for i in range(size):
+            inverse = 1 / lower[i, i]
+            for j in range(wide):
+                half[i, j] = coupling[s, i, j]
+            for k in range(i):
+                for j in range(wide):
+                    half[i, j] -= lower[i, k] * half[k, j]
+            for j in range(wide):
+                half[i, j] *= inverse
+        subtract_gram(kept, half)
+    determined = cholesky(kept) and determined
+    for j in range(len(result)):
+        row[j] = 1 / kept[j, j]
+        total = row[j] ** 2
+        for i in range(j + 1, wide):
+            value = 0.0
+            for k in range(j, i):
+                value -= kept[i, k] * row[k]
+            row[i] = value / kept[i, i]
+            total += row[i] ** 2
+        result[j] = total if determined else np.nan
 
 
 @njit(cache=True)
@@ -287,7 +355,7 @@ def object_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
     batch = estimate.chi2.shape
     if equations.object is None or problem.object_spread is None:
         return problem.points.new_zeros(*batch, 3 * fiducials, 3 * fiducials)
-    reduced = factorize(equations).reduced
+    reduced = estimate.solution.factorization.reduced
     if bool(reduced.failed.any()):
         raise RefusedError(UNDETERMINED)
     size = 3 * fiducials + 1

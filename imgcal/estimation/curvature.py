@@ -21,7 +21,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from imgcal.estimation.levenberg_marquardt import Factorization, factorize, taken
+from imgcal.estimation.levenberg_marquardt import Factorization, taken
 from imgcal.estimation.linearization import (
     POSE_PARAMETERS,
     Problem,
@@ -56,7 +56,7 @@ def curvature_covariance(estimate: Estimate, quantity: Callable[[CameraRig, Tens
         (*B, Q, Q), symmetric and not negative: to be added to the covariance of the flat posterior.
     """
     problem, solution = estimate.problem, estimate.solution
-    factorization = factorize(solution.equations)
+    factorization = solution.factorization
     pairs = max(LEAST_PAIRS, MOST_PAIRS // problem.uv.shape[1])
     generator = torch.Generator(problem.uv.device).manual_seed(0)  # the same estimate has the same covariance
     x = _draw(factorization, solution.state, pairs, generator)

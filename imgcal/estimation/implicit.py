@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from imgcal.estimation.levenberg_marquardt import Solution, factorize
+from imgcal.estimation.levenberg_marquardt import Solution
 from imgcal.estimation.linearization import Problem, State, Step, moved, points_at, pose_at, rig_at
 from imgcal.estimation.robust_losses import Loss
 
@@ -68,7 +68,7 @@ def _inverse_hessian(problem: Problem, solution: Solution, loss: Loss) -> Callab
     Conjugate gradients on exact Hessian products, preconditioned by the Gauss-Newton factorization: a handful of
     iterations, because the two differ only by curvature times residual.
     """
-    precondition = factorize(solution.equations).solve
+    precondition = solution.factorization.solve
 
     def product(v: Step) -> Step:
         with torch.enable_grad():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import TypeVar
 
 import torch
@@ -41,6 +42,11 @@ class Solution:
     equations: NormalEquations
     converged: Tensor  # (B,) bool: the last accepted step was below the tolerance
     iterations: int
+
+    @cached_property
+    def factorization(self) -> Factorization:
+        """Of the equations, undamped: what covariances are made from."""
+        return factorize(self.equations)
 
 
 def minimize(problem: Problem, start: State, loss: Loss, max_iterations: int, tolerance: float) -> Solution:

@@ -6,7 +6,7 @@ tested against them. Names, units and layouts are theirs. Rigs of a batch run in
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
@@ -45,37 +45,16 @@ def minimize(
         max_iterations: linearizations at most, for each rig.
         tolerance: see `solver.minimize`.
     """
-    batch, snapshots, cameras, _, fiducials = problem.uv.shape
-    new = problem.uv.new_empty
-    own_spread = new(batch, 0) if problem.object_spread is None else problem.object_spread
-    own_offset = torch.zeros_like(own_spread) if start.object_offset is None else start.object_offset.clone()
-    state = State(start.offset.clone(), start.rotation.clone(), start.centre.clone(), own_offset)
-    own = own_spread.shape[1]  # M, 0 = the object is exact
-    cameras_first = 6 * snapshots <= 15 * cameras
-    shape = (cameras, 15, 6 * snapshots + own) if cameras_first else (snapshots, 6, 15 * cameras + own)
-    camera, coupling, pose = new(batch, cameras, 15, 15), new(batch, *shape), new(batch, snapshots, 6, 6)
-    camera_gradient, pose_gradient, own_gradient = new(batch, cameras, 15), new(batch, snapshots, 6), new(batch, own)
-    border = new(batch, own, shape[-1])
-    cost, residual = new(batch), new(batch, snapshots, cameras, 2, fiducials)
-    converged = np.zeros(batch, dtype=np.bool_)
-    iterations = np.zeros(batch, dtype=np.int64)
-    radius_squared = problem.points.new_zeros(fiducials) if problem.radius_squared is None else problem.radius_squared
-    factory = problem.factory
-    state_tensors = (state.offset, state.rotation, state.centre, own_offset)
-    block_tensors = (camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual)
-    rig = (
-        factory.cam_from_rig.rotation,
-        factory.positions,
-        factory.focal_length,
-        factory.principal_point,
-        factory.distortion,
-    )
-    given = (problem.uv, problem.root_weight, *rig, problem.spread, own_spread)
-    arrays = _arrays((*given, *state_tensors, *block_tensors, cost))
-    limits = (cameras_first, LOSS_CODES[loss], threshold, max_iterations)
+    own_spread, state = _object_of(problem, start)
+    blocks = _Blocks.of(problem)
+    cost, count = blocks.cost, len(blocks.cost)
+    converged = np.zeros(count, dtype=np.bool_)
+    iterations = np.zeros(count, dtype=np.int64)
+    arrays = _arrays((*_given(problem), own_spread, *_parts(state), *blocks.parts, cost))
+    limits = (blocks.cameras_first, LOSS_CODES[loss], threshold, max_iterations)
     tolerances = (tolerance + pixel_rounding(problem)).numpy()
-    shared = _arrays((problem.points, radius_squared))
-    if batch == 1:
+    shared = _shared(problem)
+    if count == 1:
         _minimize_rig(  # type: ignore[call-arg]
             *shared, *(array[0] for array in arrays[:-1]), arrays[-1], converged, iterations, *limits, tolerances[0]
         )
@@ -85,22 +64,97 @@ def minimize(
         numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
         _minimize_all(*shared, *arrays, converged, iterations, *limits, tolerances)  # type: ignore[call-arg]
         torch.set_num_threads(threads)
-    wide = shape[-1] - own
-    across = border[..., :wide]
-    if cameras_first:
-        blocks = coupling[..., :wide].unflatten(-1, (snapshots, 6)).permute(0, 3, 1, 2, 4)
-        parts = (coupling[..., wide:], across.unflatten(-1, (snapshots, 6)).permute(0, 2, 3, 1))
-    else:
-        blocks = coupling[..., :wide].unflatten(-1, (cameras, 15)).permute(0, 1, 3, 4, 2)
-        parts = (across.unflatten(-1, (cameras, 15)).permute(0, 2, 3, 1), coupling[..., wide:])
-    equations = NormalEquations(cost, camera, blocks, pose, camera_gradient, pose_gradient, residual)
-    if own:
-        lower = border[..., wide:]
-        square = lower.tril() + lower.tril(-1).mT
-        equations = replace(equations, object=ObjectEquations(*parts, square, own_gradient))
-    else:
+    if not own_spread.shape[1]:
         state = replace(state, object_offset=None)
-    return Solution(state, equations, torch.from_numpy(converged), int(iterations.max()))
+    return Solution(state, blocks.equations(), torch.from_numpy(converged), int(iterations.max()))
+
+
+def linearize(problem: Problem, state: State, loss: str, threshold: float) -> NormalEquations:
+    """Do the work of `linearization.linearize` for tensors on the CPU, without gradients; the loss as in `minimize`."""
+    own_spread, state = _object_of(problem, state)
+    blocks = _Blocks.of(problem)
+    arrays = _arrays((*_given(problem), own_spread, *_parts(state), *blocks.parts, blocks.cost))
+    _linearize_all(*_shared(problem), *arrays, blocks.cameras_first, LOSS_CODES[loss], threshold)  # type: ignore[call-arg]
+    return blocks.equations()
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    """The normal equations as the compiled loops lay them out, B rigs; M columns of the object stand behind."""
+
+    cameras_first: bool
+    camera: Tensor  # (B, C, 15, 15)
+    coupling: Tensor  # (B, C, 15, 6 S + M) where cameras are eliminated first, else (B, S, 6, 15 C + M)
+    pose: Tensor  # (B, S, 6, 6)
+    border: Tensor  # (B, M, as wide), lower triangle
+    camera_gradient: Tensor  # (B, C, 15)
+    pose_gradient: Tensor  # (B, S, 6)
+    own_gradient: Tensor  # (B, M)
+    residual: Tensor  # (B, S, C, 2, N)
+    cost: Tensor  # (B,)
+
+    @classmethod
+    def of(cls, problem: Problem) -> _Blocks:
+        """Make room for those of a problem."""
+        batch, snapshots, cameras, _, fiducials = problem.uv.shape
+        own = 0 if problem.object_spread is None else problem.object_spread.shape[1]
+        cameras_first = 6 * snapshots <= 15 * cameras
+        shape = (cameras, 15, 6 * snapshots + own) if cameras_first else (snapshots, 6, 15 * cameras + own)
+        sizes = (
+            (cameras, 15, 15), shape, (snapshots, 6, 6), (own, shape[-1]),
+            (cameras, 15), (snapshots, 6), (own,), (snapshots, cameras, 2, fiducials), (),
+        )  # fmt: skip
+        return cls(cameras_first, *(problem.uv.new_empty(batch, *size) for size in sizes))
+
+    @property
+    def parts(self) -> tuple[Tensor, ...]:
+        """All but the cost, in the order of the compiled loops."""
+        gradients = (self.camera_gradient, self.pose_gradient, self.own_gradient)
+        return (self.camera, self.coupling, self.pose, self.border, *gradients, self.residual)
+
+    def equations(self) -> NormalEquations:
+        """The same as `linearization.linearize` has them."""
+        wide = self.coupling.shape[-1] - self.border.shape[1]
+        coupling, across = self.coupling[..., :wide], self.border[..., :wide]
+        if self.cameras_first:
+            blocks = coupling.unflatten(-1, (-1, 6)).permute(0, 3, 1, 2, 4)
+        else:
+            blocks = coupling.unflatten(-1, (-1, 15)).permute(0, 1, 3, 4, 2)
+        gradients = (self.camera_gradient, self.pose_gradient)
+        equations = NormalEquations(self.cost, self.camera, blocks, self.pose, *gradients, self.residual)
+        if not self.border.shape[1]:
+            return equations
+        if self.cameras_first:
+            pair = (self.coupling[..., wide:], across.unflatten(-1, (-1, 6)).permute(0, 2, 3, 1))
+        else:
+            pair = (across.unflatten(-1, (-1, 15)).permute(0, 2, 3, 1), self.coupling[..., wide:])
+        lower = self.border[..., wide:]
+        square = lower.tril() + lower.tril(-1).mT
+        return replace(equations, object=ObjectEquations(*pair, square, self.own_gradient))
+
+
+def _object_of(problem: Problem, state: State) -> tuple[Tensor, State]:
+    """Spread of the object's parameters (B, M), M = 0 where it is exact, and a copy of the state with as many."""
+    spread = problem.uv.new_empty(len(problem.uv), 0) if problem.object_spread is None else problem.object_spread
+    offset = torch.zeros_like(spread) if state.object_offset is None else state.object_offset.clone()
+    return spread, State(state.offset.clone(), state.rotation.clone(), state.centre.clone(), offset)
+
+
+def _given(problem: Problem) -> tuple[Tensor, ...]:
+    factory = problem.factory
+    pinhole = (factory.focal_length, factory.principal_point, factory.distortion)
+    rig = (factory.cam_from_rig.rotation, factory.positions, *pinhole)
+    return (problem.uv, problem.root_weight, *rig, problem.spread)
+
+
+def _parts(state: State) -> tuple[Tensor, ...]:
+    assert state.object_offset is not None  # see `_object_of`
+    return (state.offset, state.rotation, state.centre, state.object_offset)
+
+
+def _shared(problem: Problem) -> list[np.ndarray]:
+    points, squared = problem.points, problem.radius_squared
+    return _arrays((points, points.new_zeros(len(points)) if squared is None else squared))
 
 
 def rig_at(problem: Problem, offset: Tensor) -> CameraRig:
@@ -208,6 +262,26 @@ def _minimize_rig(
         _copy(pose_gradient, best_blocks[5])
         _copy(own_gradient, best_blocks[6])
         _copy(residual, best_blocks[7])
+
+
+@njit(cache=True, fastmath=_FAST)
+def _linearize_all(
+    points, radius_squared, uv, root_weight, rotation0, position0, focal0, principal0, distortion0, spread, own_spread,
+    offset, rotation, centre, own_offset,
+    camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual,
+    cost, cameras_first, loss, threshold,
+):  # fmt: skip
+    for b in range(len(cost)):
+        given = (
+            points, radius_squared, uv[b], root_weight[b],
+            rotation0[b], position0[b], focal0[b], principal0[b], distortion0[b], spread[b], own_spread[b],
+        )  # fmt: skip
+        state = (offset[b], rotation[b], centre[b], own_offset[b])
+        blocks = (
+            camera[b], coupling[b], pose[b], border[b], camera_gradient[b], pose_gradient[b], own_gradient[b],
+            residual[b],
+        )  # fmt: skip
+        cost[b] = _linearize(given, state, blocks, cameras_first, loss, threshold)
 
 
 @njit(cache=True, fastmath=_FAST)
@@ -456,7 +530,7 @@ def _solve(
     for p in range(count):
         for i in range(size):
             factor[p, i, i] *= 1 + damping
-        if not _cholesky(factor[p]):
+        if not cholesky(factor[p]):
             return np.nan
         for i in range(size):
             # Forward substitution of the coupling and of the right-hand side.
@@ -470,7 +544,7 @@ def _solve(
             for j in range(wide):
                 whitened[p, i, j] *= inverse
     tall = whitened.reshape(count * size, wide)
-    _subtract_gram(schur, tall)
+    subtract_gram(schur, tall)
     flat, right = np.empty(wide, dtype=schur.dtype), right_kept.reshape(-1)
     for j in range(wide):
         flat[j] = -right[j] if j < first_border else -right_border[j - first_border]
@@ -478,7 +552,7 @@ def _solve(
         forward = step_blocks[r // size, r % size]
         for j in range(wide):
             flat[j] -= tall[r, j] * forward
-    if not _cholesky(schur):
+    if not cholesky(schur):
         return np.nan
     _back_substitute_both(schur, flat)
     gain = 0.0
@@ -505,17 +579,18 @@ def _solve(
 
 
 @njit(cache=True, fastmath=_FAST)
-def _subtract_gram(matrix, tall):
-    """Subtract tall.T @ tall from the lower triangle."""
-    for r in range(tall.shape[0]):
+def subtract_gram(matrix, tall):
+    """Subtract tall.T @ tall from the lower triangle; the number of rows is divisible by three, as 6 and 15 are."""
+    # Three rows at once: the matrix is read and written a third as often.
+    for r in range(0, tall.shape[0], 3):
         for i in range(tall.shape[1]):
-            value = tall[r, i]
+            first, second, third = tall[r, i], tall[r + 1, i], tall[r + 2, i]
             for j in range(i + 1):
-                matrix[i, j] -= value * tall[r, j]
+                matrix[i, j] -= first * tall[r, j] + second * tall[r + 1, j] + third * tall[r + 2, j]
 
 
 @njit(cache=True, fastmath=_FAST)
-def _cholesky(matrix):
+def cholesky(matrix):
     """Factorize in place (lower triangle); false if not positive definite."""
     for j in range(matrix.shape[0]):
         diagonal = matrix[j, j]

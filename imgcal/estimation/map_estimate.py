@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Literal
 
 import torch
@@ -11,9 +10,17 @@ from torch import Tensor
 
 from imgcal.errors import InputError
 from imgcal.estimation import implicit, levenberg_marquardt, lm_cpu
-from imgcal.estimation.linearization import Problem, State, points_at, pose_at, rig_at
+from imgcal.estimation.linearization import (
+    NormalEquations,
+    Problem,
+    State,
+    linearize,
+    points_at,
+    pose_at,
+    rig_at,
+)
 from imgcal.estimation.pose_initialization import initial_pose
-from imgcal.estimation.robust_losses import LOSSES, Loss
+from imgcal.estimation.robust_losses import NamedLoss
 from imgcal.geometry import RigidTransform
 from imgcal.types import PARAMETERS, CalibrationObject, CameraRig, Observations, RigPrior, check_observations
 
@@ -105,10 +112,9 @@ def estimate(
     return conclude(problem, solution, implicit.attach_gradient(problem, solution, make_loss(options)), batch)
 
 
-def make_loss(options: EstimationOptions) -> Loss:
+def make_loss(options: EstimationOptions) -> NamedLoss:
     """Return the robust loss that the options name."""
-    loss = LOSSES[options.loss]
-    return loss if options.loss == "squared" else partial(loss, threshold=options.threshold)  # type: ignore[call-arg]
+    return NamedLoss(options.loss, options.threshold)
 
 
 def minimize(problem: Problem, start: State, options: EstimationOptions) -> levenberg_marquardt.Solution:
@@ -145,6 +151,37 @@ def _solve(problem: Problem, start: State, options: EstimationOptions) -> levenb
         return levenberg_marquardt.minimize(
             problem, start, make_loss(options), options.max_iterations, options.tolerance
         )
+
+
+def equations_at(problem: Problem, state: State, loss: NamedLoss) -> NormalEquations:
+    """Normal equations at a state, by the compiled loops where they can; no gradient flows through them."""
+    with torch.no_grad():
+        if problem.uv.device.type == "cpu":
+            return lm_cpu.linearize(problem, state, loss.name, loss.threshold)
+        return linearize(problem, state, loss)
+
+
+def equations_by_snapshot(problem: Problem, state: State, loss: NamedLoss) -> NormalEquations:
+    """Normal equations of each snapshot of one rig (B = 1), as of S rigs of one snapshot each, the object held.
+
+    Each of them has the whole prior; less that, and summed, they are those of the rig.
+    """
+    count = problem.uv.shape[1]
+
+    def repeated(tensor: Tensor) -> Tensor:
+        return tensor.expand(count, *tensor.shape[1:])
+
+    alone = replace(
+        problem,
+        uv=problem.uv[0].unsqueeze(1),
+        root_weight=problem.root_weight[0].unsqueeze(1),
+        points=points_at(problem, state)[0],
+        factory=problem.factory.map_tensors(lambda tensor, _: repeated(tensor)),
+        spread=repeated(problem.spread),
+        object_spread=None,
+    )
+    there = State(repeated(state.offset), state.rotation[0].unsqueeze(1), state.centre[0].unsqueeze(1))
+    return equations_at(alone, there, loss)
 
 
 def conclude(

@@ -24,6 +24,7 @@ from imgcal.estimation.change_points import (
     blocks_of,
     dispersion,
     is_significant,
+    least_significant,
     likeliest_step,
 )
 from imgcal.estimation.linearization import Problem, State, points_at, pose_at, rig_at
@@ -194,9 +195,9 @@ def find_moves(
     left_out: set[int] = set()
     for _ in range(3 * cameras):
         seen = places.seen & ~np.isin(places.camera, list(left_out))
-        step = likeliest_step(places.blocks, seen)
         candidates = int(places.seen.sum())
-        if step is None or not is_significant(step.statistic, candidates, ERROR):
+        step = likeliest_step(places.blocks, seen, least_significant(candidates, ERROR))
+        if step is None:
             break
         divided = _located(places, step, options)
         if divided is not None:

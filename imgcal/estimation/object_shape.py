@@ -19,9 +19,9 @@ from scipy.stats import norm
 
 from imgcal.estimation.covariance import object_covariance
 from imgcal.estimation.levenberg_marquardt import Solution, factorize
-from imgcal.estimation.linearization import Problem, State, jacobian_at, linearize, points_at, robust_weight
-from imgcal.estimation.map_estimate import Estimate
-from imgcal.estimation.robust_losses import Loss
+from imgcal.estimation.linearization import Problem, State, jacobian_at, points_at, robust_weight
+from imgcal.estimation.map_estimate import Estimate, equations_at
+from imgcal.estimation.robust_losses import Loss, NamedLoss
 from imgcal.types import PARAMETERS
 
 Array = NDArray[np.float64]
@@ -121,26 +121,21 @@ class ShapeEvidence:
         return float(norm.isf(max(fisher.sf(ratio, mine, rest), 1e-300)))
 
 
-def shape_evidence(problem: Problem, solution: Solution, loss: Loss) -> ShapeEvidence | None:
+def shape_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> ShapeEvidence | None:
     """Ask a fit of one rig (B = 1) about the object that it took; None where rig and poses are undetermined."""
     state = solution.state
     points = points_at(problem, state)[0]
     size = 3 * len(points) + 1
     unit = torch.ones(1, size, dtype=points.dtype, device=points.device)
     free = replace(problem, points=points, object_spread=unit)
-    equations = linearize(free, replace(state, object_offset=torch.zeros_like(unit)), loss)
-    factorization = factorize(replace(equations, object=None))
-    reduced, own = factorization.reduced, equations.object
+    equations = equations_at(free, replace(state, object_offset=torch.zeros_like(unit)), loss)
+    reduced, own = factorize(equations).reduced, equations.object
     if own is None or bool(reduced.failed.any()):
         return None
-    first, second = (own.camera, own.pose) if factorization.cameras_first else (own.pose, own.camera)
-    eliminated = torch.linalg.solve_triangular(reduced.eliminated, first, upper=False)
-    kept = second.flatten(1, 2) - (reduced.whitened.mT @ eliminated).sum(1)
-    kept = torch.linalg.solve_triangular(reduced.kept, kept, upper=False)
-    eliminated = eliminated.flatten(1, 2)
-    square = (own.own - eliminated.mT @ eliminated - kept.mT @ kept)[0, :-1, :-1]
-    square.diagonal().sub_(1)  # the prior of `unit`
-    information, gradient = square.cpu().double().numpy(), own.gradient[0, :-1].cpu().double().numpy()
+    # The object stands behind cameras or poses: the last part of the factor is that of what both leave of it.
+    lower = reduced.kept[0, -size:, -size:][:-1, :-1].cpu().double().numpy()
+    information = lower @ lower.T - np.eye(size - 1)  # the prior of `unit`
+    gradient = own.gradient[0, :-1].cpu().double().numpy()
     places = problem.points.cpu().double().numpy()
     displaced = (points.cpu().double().numpy() - places).ravel()
     tolerance, cost = np.zeros(len(places)), float(equations.cost)

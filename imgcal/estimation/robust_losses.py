@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -35,3 +37,16 @@ def geman_mcclure(d2: Tensor, threshold: float = 3.0) -> tuple[Tensor, Tensor]:
 
 
 LOSSES: dict[str, Loss] = {"squared": squared, "huber": huber, "cauchy": cauchy, "geman_mcclure": geman_mcclure}
+
+
+@dataclass(frozen=True)
+class NamedLoss:
+    """A robust loss as options name it, for tensors and for compiled loops."""
+
+    name: Literal["squared", "huber", "cauchy", "geman_mcclure"]
+    threshold: float = 3.0  # standard deviations, where it stops being quadratic
+
+    def __call__(self, d2: Tensor) -> tuple[Tensor, Tensor]:
+        """Loss and derivative."""
+        loss = LOSSES[self.name]
+        return loss(d2) if self.name == "squared" else loss(d2, self.threshold)  # type: ignore[call-arg]

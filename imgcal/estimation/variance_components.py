@@ -17,7 +17,7 @@ from imgcal.estimation.linearization import Problem, State, points_at
 from imgcal.estimation.map_estimate import EstimationOptions, make_loss, minimize
 from imgcal.estimation.object_shape import ShapeEvidence, learnt_tolerances, pull_scatter, shape_evidence
 from imgcal.estimation.pose_support import require_poses
-from imgcal.estimation.robust_losses import Loss
+from imgcal.estimation.robust_losses import NamedLoss
 
 KINDS = {
     "rotation": slice(0, 3),
@@ -144,7 +144,7 @@ def settle(
 
 
 def _examine(
-    problem: Problem, solution: Solution, loss: Loss, options: FitOptions, least_scale: float, alike: bool
+    problem: Problem, solution: Solution, loss: NamedLoss, options: FitOptions, least_scale: float, alike: bool
 ) -> tuple[ShapeEvidence | None, tuple[Problem, State] | None]:
     """Ask a fit about the object; errors of its scale count from `least_scale`, relative.
 
@@ -172,7 +172,7 @@ def _examine(
 
 
 def _free_object(
-    shape: ShapeEvidence, problem: Problem, solution: Solution, loss: Loss, options: FitOptions
+    shape: ShapeEvidence, problem: Problem, solution: Solution, loss: NamedLoss, options: FitOptions
 ) -> tuple[Problem, State] | None:
     spread = learnt_tolerances(shape)
     if not (spread > 1.01 * shape.tolerance).any():

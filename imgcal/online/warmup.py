@@ -30,6 +30,7 @@ from renderers import SensorModel, palette
 
 RIG, OBJECT, SIZE = "T4", "asymmetric8", (512, 272)
 SNAPSHOTS = 3
+MANY = 12  # enough to ask for moves, for blocks, and for what is known in the way of long captures
 
 
 def warm_up() -> None:
@@ -48,6 +49,10 @@ def warm_up() -> None:
     with _whatever_comes():
         calibrate(exact, rig, obj)
         score(exact, rig, obj)
+    with _whatever_comes():
+        calibrate(
+            true_detections(simulate_truth(rig, obj, MANY, generator, RelativeDrift(0.01, 0.01), poses)), rig, obj
+        )
     _of_a_plane(rig, generator)
     _of_bloomed_lamps()
     seen = torch.ones(truth.uv.shape[:-1], dtype=torch.bool)

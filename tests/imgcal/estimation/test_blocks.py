@@ -1,7 +1,6 @@
 """Covariance by the scatter between blocks of snapshots: silent for white noise, right for errors of places."""
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -10,10 +9,10 @@ import torch
 from imgcal.estimation import camera_covariance, camera_std, estimate
 from imgcal.estimation.blocks import BlockScatter, block_scatter
 from imgcal.estimation.covariance import whitened_covariance
-from imgcal.estimation.robust_losses import huber
+from imgcal.estimation.robust_losses import NamedLoss
 from imgcal.geometry.transforms import RigidTransform
 
-LOSS = partial(huber, threshold=3.0)
+LOSS = NamedLoss("huber", 3.0)
 
 
 def scatter(found) -> BlockScatter:

@@ -7,7 +7,15 @@ from scipy.stats import chi2
 
 from imgcal.association.series import label, observations_of
 from imgcal.estimation import estimate
-from imgcal.estimation.change_points import LEAST_SNAPSHOTS, STEP, blocks_of, dispersion, is_significant, likeliest_step
+from imgcal.estimation.change_points import (
+    LEAST_SNAPSHOTS,
+    STEP,
+    blocks_of,
+    dispersion,
+    is_significant,
+    least_significant,
+    likeliest_step,
+)
 from imgcal.estimation.linearization import jacobian_at
 from imgcal.types.rig import PARAMETERS
 from scripts.benchmarks import camera_faults as damage
@@ -54,7 +62,7 @@ def test_statistics_are_those_of_the_dense_system():
     rows = np.array([2, 3, 4])
     for camera in (0, 3):
         expected = [dense_statistic(fit, camera, row) for row in rows]
-        assert blocks.statistics(camera, rows) == pytest.approx(expected, rel=1e-6)
+        assert blocks.statistics([camera], rows)[:, 0] == pytest.approx(expected, rel=1e-6)
 
 
 def test_a_step_is_found_in_its_camera_at_its_time():
@@ -63,6 +71,20 @@ def test_a_step_is_found_in_its_camera_at_its_time():
     assert (step.camera, step.row) == (3, 15)
     assert is_significant(step.statistic, 240, 1e-5)
     assert np.delete(step.rivals, 3).max() < 0.5 * step.statistic
+
+
+@pytest.mark.parametrize(("first", "size"), [(2, 0.3), (9, 0.03), (30, 0.02), (57, 0.3)])
+def test_a_step_that_matters_is_found_among_few_places(first, size):
+    fit, seen = fitted(damage.wand_in_a_room, 60, first, lambda r: damage.turned(r, 3, size), first)
+    blocks = blocks_of(fit.problem, fit.solution.state)
+    whole = likeliest_step(blocks, seen)
+    assert whole.statistic > 60
+    least = least_significant(600, 1e-5)
+    assert is_significant(least + 1e-6, 600, 1e-5) and not is_significant(least - 1e-6, 600, 1e-5)
+    found = likeliest_step(blocks, seen, least)
+    assert (found.camera, found.row) == (whole.camera, whole.row)
+    np.testing.assert_allclose(found.rivals, whole.rivals)
+    assert likeliest_step(blocks, seen, 1.01 * whole.statistic) is None
 
 
 def test_long_captures_are_searched_in_two_passes(monkeypatch):
@@ -79,7 +101,7 @@ def test_statistics_where_nothing_steps_are_chi_squared():
     for seed in range(12):
         fit, seen = fitted(damage.wand_in_a_room, 10, seed)
         blocks = blocks_of(fit.problem, fit.solution.state)
-        found += [blocks.statistics(camera, np.array([5]))[0] for camera in range(10)]
+        found += blocks.statistics(range(10), np.array([5])).ravel().tolist()
         assert dispersion(blocks, seen) < 2
     assert np.mean(found) == pytest.approx(STEP, rel=0.15)
     assert np.mean(np.array(found) > chi2.isf(0.05, STEP)) < 0.12

@@ -6,9 +6,9 @@ from functools import partial
 import pytest
 import torch
 
-from imgcal.estimation import levenberg_marquardt, linearize, lm_cpu
+from imgcal.estimation import levenberg_marquardt, linearize, lm_cpu, rig_at
 from imgcal.estimation.levenberg_marquardt import NormalEquations, Solution
-from imgcal.estimation.robust_losses import LOSSES
+from imgcal.estimation.robust_losses import LOSSES, NamedLoss
 
 CASES = [
     ((), 1, 10, 8, None),
@@ -88,6 +88,29 @@ def test_same_minimum_with_an_object_that_is_not_exact(
         )
 
 
+@pytest.mark.parametrize("tolerance", [0.0, 0.4])
+@pytest.mark.parametrize(("batch", "snapshots", "cameras", "fiducials", "radius"), CASES)
+def test_linearization_is_that_of_tensors(
+    simulate, batch: tuple[int, ...], snapshots: int, cameras: int, fiducials: int, radius: float | None, tolerance
+) -> None:
+    size = {"snapshots": snapshots, "cameras": cameras, "fiducials": fiducials, "radius": radius}
+    case = simulate(*batch, **size, missing=0.05, tolerance=tolerance, bent=tolerance)
+    problem = case.problem()
+    state, seen = case.start(problem), problem.root_weight > 0
+    state = replace(state, offset=state.offset + 0.3)
+    if state.object_offset is not None:
+        state = replace(state, object_offset=state.object_offset - 0.2)
+    compiled = seen_only(lm_cpu.linearize(problem, state, "huber", 3.0), seen)
+    tensors = seen_only(linearize(problem, state, NamedLoss("huber", 3.0)), seen)
+    for name in ("cost", "camera", "coupling", "pose", "camera_gradient", "pose_gradient", "residual"):
+        a, b = getattr(compiled, name), getattr(tensors, name)
+        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-12 * float(b.abs().max()), msg=name)
+    assert (compiled.object is None) == (tolerance == 0)
+    for name in ("camera", "pose", "own", "gradient") if tolerance else ():
+        a, b = getattr(compiled.object, name), getattr(tensors.object, name)
+        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-12 * float(b.abs().max()), msg=name)
+
+
 def test_single_precision_stays_close(simulate) -> None:
     case = simulate(16, snapshots=2, cameras=10, fiducials=8)
     problem = case.problem()
@@ -145,7 +168,7 @@ def test_rig_at_equals_the_one_in_tensors(simulate, batch: tuple[int, ...]) -> N
     problem = case.problem()
     offset = torch.randn(problem.spread.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     offset[0, 1, :3] = 0
-    compiled, tensors = lm_cpu.rig_at(problem, offset), linearize.rig_at(problem, offset)
+    compiled, tensors = lm_cpu.rig_at(problem, offset), rig_at(problem, offset)
     torch.testing.assert_close(compiled.cam_from_rig.rotation, tensors.cam_from_rig.rotation, rtol=0, atol=1e-14)
     torch.testing.assert_close(compiled.cam_from_rig.translation, tensors.cam_from_rig.translation, rtol=0, atol=1e-11)
     assert torch.equal(compiled.focal_length, tensors.focal_length)

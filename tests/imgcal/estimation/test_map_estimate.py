@@ -7,6 +7,8 @@ import torch
 
 from imgcal.errors import InputError
 from imgcal.estimation import Estimate, EstimationOptions, estimate
+from imgcal.estimation.map_estimate import equations_at, equations_by_snapshot
+from imgcal.estimation.robust_losses import NamedLoss
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.synthesis.rigs import RelativeDrift
 from imgcal.types.observations import Observations
@@ -169,3 +171,17 @@ def test_relative_drift_prior(simulate) -> None:
     assert (case.spread == 0).any()
     moved = run(case).rig.difference(case.factory)
     assert not moved[:, case.spread == 0][..., 3:].abs().gt(1e-9).any()
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 0.4])
+def test_equations_of_the_snapshots_add_up_to_those_of_the_rig(simulate, tolerance: float) -> None:
+    case = simulate(snapshots=5, cameras=3, missing=0.1, tolerance=tolerance, bent=tolerance)
+    found = run(case)
+    problem, state, loss = found.problem, found.solution.state, NamedLoss("huber", 2.0)
+    single, whole = equations_by_snapshot(problem, state, loss), equations_at(problem, state, loss)
+    prior = torch.eye(15, dtype=torch.float64)
+    torch.testing.assert_close((single.camera - prior).sum(0), whole.camera[0] - prior)
+    gradient = (single.camera_gradient - state.offset).sum(0) + state.offset[0]
+    torch.testing.assert_close(gradient, whole.camera_gradient[0], rtol=1e-9, atol=1e-6)
+    for name in ("coupling", "pose", "pose_gradient", "residual"):
+        torch.testing.assert_close(getattr(single, name)[:, 0], getattr(whole, name)[0], rtol=1e-9, atol=1e-6)

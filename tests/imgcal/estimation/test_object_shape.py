@@ -1,7 +1,6 @@
 """Tests of the object by its residuals: they keep still for a right object, and find what is wrong with another one."""
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -9,9 +8,9 @@ import torch
 
 from imgcal.estimation import EstimationOptions, estimate
 from imgcal.estimation.object_shape import learnt_tolerances, offsets, pull_scatter, shape_evidence
-from imgcal.estimation.robust_losses import huber
+from imgcal.estimation.robust_losses import NamedLoss
 
-LOSS = partial(huber, threshold=3.0)
+LOSS = NamedLoss("huber", 3.0)
 
 
 def evidence(case, row):

@@ -1,0 +1,70 @@
+"""Runs the cases of `calibration_speed` on whatever imgcal is found first: that of another checkout, for one.
+
+Needs nothing but the names in `imgcal.__all__`. Reads lines `CASE SECONDS` from standard input, runs the case for about
+as long, and writes a line with the CPU time (ms) of each call, as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from imgcal import Detections, PipelineOptions, Recalibrator, calibrate, load_object, load_rig
+
+
+class Case:
+    """One calibration again and again, or one live stream there and back."""
+
+    def __init__(self, folder: Path, name: str) -> None:
+        """Read `NAME.json`, rig, object and window (0 = a calibration of all snapshots), and `NAME.npz`, the blobs."""
+        given = json.loads((folder / f"{name}.json").read_text())
+        rig, obj = load_rig(given["rig"]), load_object(given["object"])
+        with np.load(folder / f"{name}.npz") as columns:
+            count = int(columns["snapshot"].max()) + 1
+            names = tuple(f"{s:05d}" for s in range(count))
+            blobs = Detections(**columns, camera_names=rig.camera_names, snapshot_names=names)
+        self._call: Callable[[], object]
+        if given["window"]:
+            stream = _there_and_back([blobs.of_snapshots(s, s + 1) for s in range(count)])
+            live = Recalibrator(rig, obj, PipelineOptions(blind_cameras=True), window=given["window"])
+            self._call = lambda: live.update(next(stream))
+        else:
+            self._call = lambda: calibrate(blobs, rig, obj)
+        for _ in range(3 + 2 * given["window"]):  # compilation; the window is full
+            self._call()
+
+    def run(self, seconds: float) -> list[float]:
+        """Call for about so long, once at least: CPU time of each call, ms."""
+        taken: list[float] = []
+        while not taken or sum(taken) < 1e3 * seconds:
+            began = time.process_time()
+            self._call()
+            taken.append(1e3 * (time.process_time() - began))
+        return taken
+
+
+def _there_and_back(parts: list[Detections]) -> Iterator[Detections]:
+    while True:
+        yield from parts
+        yield from parts[-2:0:-1]
+
+
+def main() -> None:
+    """Answer until standard input ends."""
+    torch.set_num_threads(1)
+    folder, cases = Path(sys.argv[1]), dict[str, Case]()
+    for line in sys.stdin:
+        name, seconds = line.split()
+        if name not in cases:
+            cases[name] = Case(folder, name)
+        print(json.dumps(cases[name].run(float(seconds))), flush=True)
+
+
+if __name__ == "__main__":
+    main()
