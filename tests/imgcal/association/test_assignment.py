@@ -2,6 +2,7 @@ from itertools import permutations
 
 import numpy as np
 import pytest
+from scipy.optimize import linear_sum_assignment
 
 from imgcal.association.assignment import assign, mutual_nearest, spacing
 
@@ -22,6 +23,29 @@ def test_assign_costs_least(fiducials: int, blobs: int) -> None:
         assert len(set(found[made])) == made.sum()
         total = c[np.flatnonzero(made), found[made]].sum() + gate * (~made).sum()
         assert total == pytest.approx(cheapest(c, gate))
+
+
+@pytest.mark.parametrize(("fiducials", "blobs", "gate"), [(30, 40, 25.0), (40, 12, 25.0), (8, 8, 400.0), (20, 60, 1.0)])
+def test_assign_costs_as_much_as_with_a_spare_blob_for_each_fiducial(fiducials: int, blobs: int, gate: float) -> None:
+    random = np.random.default_rng(1)
+    cost = random.chisquare(2, (3, 2, fiducials, blobs)) * random.choice([1.0, 30.0], (3, 2, fiducials, blobs))
+    cost[..., -1] = np.inf  # padding
+    labels = assign(cost, gate)
+    assert labels.shape == (3, 2, fiducials)
+    for place in np.ndindex(3, 2):
+        spare = np.concatenate((np.minimum(cost[place], 1e9), np.full((fiducials, fiducials), gate)), axis=1)
+        expected = spare[linear_sum_assignment(spare)].sum()
+        made = labels[place] >= 0
+        assert (cost[place][made, labels[place][made]] < gate).all()
+        assert cost[place][made, labels[place][made]].sum() + gate * (~made).sum() == pytest.approx(expected)
+
+
+def test_assign_does_not_care_about_the_order() -> None:
+    random = np.random.default_rng(2)
+    cost = random.chisquare(2, (12, 15))
+    rows, columns = random.permutation(12), random.permutation(15)
+    shuffled = assign(cost[rows][:, columns], 3.0)
+    np.testing.assert_array_equal(np.where(shuffled >= 0, columns[shuffled], -1), assign(cost, 3.0)[rows])
 
 
 def test_mutual_nearest_makes_no_contested_pair() -> None:

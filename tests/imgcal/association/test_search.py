@@ -1,0 +1,81 @@
+"""Rounds of a search: what they find, what they count, and when they find nothing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from imgcal.association.ambiguities import conflicts
+from imgcal.association.hypotheses import fiducial_triples
+from imgcal.association.search import PLANAR_EFFORT, VERIFIED, Search, _different
+from imgcal.association.verify import evidence
+from imgcal.io import load_object
+from tests.imgcal.association.scenes import make_object, scene_of, take
+
+
+def search_of(scene, cameras, bounds=(8.0, 150.0)) -> Search:
+    likely = {camera: np.arange(scene.blobs.count[camera]) for camera in cameras}
+    return Search(scene, likely, fiducial_triples(scene.obj, np.random.default_rng(0)), bounds)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_round_finds_the_labels(seed, o10, asymmetric8) -> None:
+    rig = o10.select([0, 3, 6])
+    snapshot = take(rig, asymmetric8, seed, false=1, missing=1)
+    scene = scene_of(snapshot, rig, asymmetric8)
+    search = search_of(scene, [0, 1, 2])
+    fits = search.round(5000, np.random.default_rng(seed))
+    assert fits is not None and len(fits.labels) <= VERIFIED
+    best = fits.labels[evidence(scene, fits).argmax()]
+    assert conflicts(asymmetric8, snapshot.labels(scene.blobs, 8), best) < 0.1
+    assert search.hypotheses >= 12 * 8 * 7 * 6  # ten blob triples, as many in each camera
+
+
+def test_the_same_seed_finds_the_same_and_effort_is_counted(o10, asymmetric8) -> None:
+    rig = o10.select([0, 3])
+    scene = scene_of(take(rig, asymmetric8, 4), rig, asymmetric8)
+    found = []
+    for _ in range(2):
+        search = search_of(scene, [0, 1])
+        fits = search.round(3000, np.random.default_rng(9))
+        found.append((search.hypotheses, fits.labels))
+    assert found[0][0] == found[1][0]
+    np.testing.assert_array_equal(found[0][1], found[1][1])
+    before = search.hypotheses
+    search.round(3000, np.random.default_rng(10))
+    assert search.hypotheses > 1.5 * before
+
+
+def test_planar_objects_with_many_fiducials_are_searched_as_planes(o10) -> None:
+    random = np.random.default_rng(0)
+    obj = make_object(np.c_[random.uniform(-90, 90, (60, 2)), np.zeros(60)])
+    rig = o10.select([0, 4])
+    snapshot = take(rig, obj, 1)
+    scene = scene_of(snapshot, rig, obj)
+    search = search_of(scene, [0, 1])
+    fits = search.round(1, random)
+    assert search.hypotheses >= 2 * PLANAR_EFFORT
+    assert min(conflicts(obj, snapshot.labels(scene.blobs, 60), labels) for labels in fits.labels) < 0.05
+
+
+def test_a_round_without_poses_finds_nothing(o10) -> None:
+    random = np.random.default_rng(1)
+    obj = make_object(np.c_[random.uniform(-90, 90, (60, 2)), np.zeros(60)])
+    rig = o10.select([0])
+    scene = scene_of(take(rig, obj, 1), rig, obj)
+    elsewhere = random.uniform(-600, 600, scene.blobs.ideal.shape).astype(np.float32)
+    elsewhere[0, :30] *= 0.01
+    assert search_of(replace(scene, blobs=replace(scene.blobs, ideal=elsewhere)), [0]).round(1, random) is None
+
+
+def test_different_labellings_are_kept_the_fullest_first() -> None:
+    cube = load_object("cube8")
+    full = np.tile(np.arange(8), (2, 1))
+    fewer = np.where(np.arange(8) < 6, full, -1)
+    turned = full[:, cube.symmetries[7].permutation]
+    random = np.random.default_rng(0)
+    other, third = (full[:, random.permutation(8)] for _ in range(2))
+    assert min(conflicts(cube, *pair) for pair in ((full, other), (full, third), (other, third))) > 0.5
+    rows, labels = _different(cube, np.array([40, 41, 42, 43, 44]), np.stack((fewer, full, turned, other, third)))
+    assert rows.tolist() == [41, 43] and len(rows) == VERIFIED
+    np.testing.assert_array_equal(labels, np.stack((full, other)))
