@@ -29,6 +29,7 @@ from imgcal.cli.describe import describe, describe_refusal
 from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import relative_covariance
+from imgcal.extras import advice, missing
 from imgcal.io import (
     RigCovariance,
     load_object,
@@ -41,7 +42,6 @@ from imgcal.io import (
     write_text,
 )
 from imgcal.pipeline import Calibration, calibrate, load_guesser, rms_length
-from imgcal.report import write_report
 from imgcal.types import PARAMETER_NAMES, CalibrationObject, CameraRig, Detections, MovedError, limits
 
 WRITTEN = ("report.html", "rig.yaml", "object.csv", "result.json")
@@ -90,6 +90,8 @@ class Calibrate:
         """Calibrate and write."""
         started = time.perf_counter()
         self._check_out()
+        lacking = missing("plotly", "jinja2") if self.report else None
+        draws = self.report and lacking is None
         complete, obj = load_rig(self.rig), self._object()
         rig = without_cameras(complete, self.without)
         reference = self._reference(rig)
@@ -115,6 +117,8 @@ class Calibrate:
             seconds |= {name: value for name, value in outcome.seconds.items() if name != "detection"}
         except RefusedError as error:
             outcome = error
+        if lacking:
+            print(f"note: no report.html, which {advice(lacking)}", file=sys.stderr)
         with publishing(self.out, WRITTEN, mark="result.json") as out:
             if isinstance(outcome, RefusedError):
                 result = refused_summary(outcome, detections, rig, seconds)
@@ -125,7 +129,9 @@ class Calibrate:
                     save_object(outcome.object, out / "object.csv")
                 result = summary(outcome, seconds)
                 content = describe(outcome, covariance.std, rig, frames, reference, seconds)
-            if self.report:
+            if draws:
+                from imgcal.report import write_report  # brings plotly along, which is not in the core
+
                 write_report(content, out / "report.html")
             write_text(out / "result.json", json.dumps(result, indent=2) + "\n")
         if isinstance(outcome, RefusedError):
@@ -134,7 +140,7 @@ class Calibrate:
             save_detections(outcome.labelled_detections, self.labelled)
         for move in outcome.moved:
             print(f"{move}: only the snapshots since then are used")
-        _print(result, self.out, self.report)
+        _print(result, self.out, draws)
         for note in doubtful_cameras(outcome):
             print(f"note: {note}; see the report", file=sys.stderr)
 

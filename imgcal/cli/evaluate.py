@@ -16,6 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from imgcal.cli.common import check_folder
 from imgcal.errors import InputError
+from imgcal.extras import advice, missing
 from imgcal.io import load_object, load_rig, publishing
 
 if TYPE_CHECKING:
@@ -97,6 +98,8 @@ def _run(paths: tuple[Path, ...], setting: Setting, baselines: bool, out: Path |
 
     if out is not None:
         check_folder(out)
+        if lacking := missing("matplotlib"):  # found out now, not when all is measured
+            raise InputError(f"--out {advice(lacking)}")
     protocol = Protocol(setting.count, setting.trials, setting.seed)
     models = _load(paths, setting)
     conditions = _conditions(models, setting)

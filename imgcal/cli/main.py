@@ -18,6 +18,7 @@ import tyro
 from imgcal.cli.compiling import tells_of_compiling
 from imgcal.cli.interruption import ends_at_once
 from imgcal.errors import InputError, RefusedError
+from imgcal.extras import advice
 from imgcal.messages import one_line, quoted
 
 DONE, UNUSABLE, REFUSED, INTERRUPTED = 0, 2, 3, 130
@@ -87,7 +88,7 @@ def main(arguments: list[str] | None = None) -> int:
     except BaseException as error:
         if debug:
             traceback.print_exc()
-        code, message = _verdict(error)
+        code, message = _verdict(error, given)
         print(f"imgcal: {one_line(message)}", file=sys.stderr)
         return code
     return DONE
@@ -142,7 +143,7 @@ def _undrawn(box: str) -> str:
     return f"{problem.strip()}; see {command[0] if command else 'imgcal --help'}"
 
 
-def _verdict(error: BaseException) -> tuple[int, str]:
+def _verdict(error: BaseException, given: list[str]) -> tuple[int, str]:
     """Say what a failure means to the user: exit code and message."""
     match error:
         case InputError():
@@ -154,6 +155,8 @@ def _verdict(error: BaseException) -> tuple[int, str]:
             return REFUSED, error.for_command
         case KeyboardInterrupt():
             return INTERRUPTED, str(error) or "interrupted"
+        case ModuleNotFoundError() if lacking := advice(error.name):
+            return UNUSABLE, f"{next((word for word in given if word in COMMANDS), 'this')} {lacking}"
         case MemoryError():
             return UNUSABLE, f"not enough memory for this input ({str(error) or 'MemoryError'}); {DEBUG} shows where"
     ours = [frame for frame in traceback.extract_tb(error.__traceback__) if "imgcal" in Path(frame.filename).parts]

@@ -328,7 +328,7 @@ def test_a_report_that_cannot_be_written_leaves_the_earlier_result(workplace, bl
     def full(_, path):
         raise InputError(f"{path}: cannot be written: No space left on device")
 
-    monkeypatch.setattr("imgcal.cli.calibrate.write_report", full)
+    monkeypatch.setattr("imgcal.report.write_report", full)
     for source in (workplace.capture / "truth" / "detections.csv", blind):
         capsys.readouterr()
         assert calibrate(workplace, source, out) == 2

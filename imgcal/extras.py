@@ -1,0 +1,34 @@
+"""What does not come with the core: which extra brings which library."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+EXTRAS = {
+    "train": ("accelerate", "tensorboard", "timm"),
+    "report": ("jinja2", "matplotlib", "plotly"),
+}
+"""Libraries of each extra, by the names that they are imported by; `pyproject.toml` has the versions."""
+
+
+def missing(*libraries: str) -> str | None:
+    """Name the first of some libraries that is not installed; None where all are. Imports none of them.
+
+    Examples:
+        >>> missing("json", "a_library_that_nobody_has")
+        'a_library_that_nobody_has'
+    """
+    return next((library for library in libraries if find_spec(library) is None), None)
+
+
+def advice(library: str | None) -> str | None:
+    """Say what to install for a library of an extra; None for any other.
+
+    Examples:
+        >>> advice("timm")
+        'needs timm: pip install "imgcal[train]"'
+    """
+    for extra, libraries in EXTRAS.items():
+        if library in libraries:
+            return f'needs {library}: pip install "imgcal[{extra}]"'
+    return None

@@ -1,0 +1,82 @@
+"""A slim core: who did not install an extra calibrates, and is told in one line what else would need."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from imgcal.extras import EXTRAS, advice, missing
+
+ROOT = Path(__file__).parents[2]
+SAMPLE = ROOT / "data" / "samples" / "O10"
+BROUGHT_ALONG = ("huggingface_hub", "markupsafe", "PIL", "torchvision")  # by libraries of the extras
+CALIBRATE = ["calibrate", str(SAMPLE), "--rig", f"{SAMPLE}/rig.yaml", "--object", f"{SAMPLE}/object.csv", "--out"]
+
+
+def run_without(libraries: tuple[str, ...], *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run a command line where some libraries cannot be imported."""
+    absent = "import sys; sys.modules |= dict.fromkeys(sys.argv.pop(1).split()); "
+    code = absent + "from imgcal.cli.main import run; run()"
+    command = [sys.executable, "-c", code, " ".join(libraries), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=os.environ, check=False)
+
+
+def without_extras(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return run_without((*EXTRAS["train"], *EXTRAS["report"], *BROUGHT_ALONG), *arguments)
+
+
+def said(done: subprocess.CompletedProcess[str]) -> list[str]:
+    """Lines on standard error, but that a first run compiles."""
+    return [line for line in done.stderr.splitlines() if "compiling for this machine" not in line]
+
+
+def test_extras_are_those_of_the_package() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    for extra, libraries in EXTRAS.items():
+        assert tuple(re.match(r"[a-z0-9]+", line)[0] for line in extras[extra]) == libraries
+        assert not missing(*libraries)
+    assert advice("numpy") is None and advice(None) is None
+
+
+def test_the_core_calibrates_all_but_the_report(tmp_path: Path) -> None:
+    done = without_extras(*CALIBRATE, str(tmp_path / "out"))
+    assert done.returncode == 0, done.stderr
+    assert said(done) == ['note: no report.html, which needs plotly: pip install "imgcal[report]"']
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"rig.yaml", "result.json"}
+    assert json.loads((tmp_path / "out" / "result.json").read_text())["status"] == "ok"
+    assert "report.html" not in done.stdout
+    assert not said(without_extras(*CALIBRATE, str(tmp_path / "asked"), "--no-report"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "needs"),
+    [
+        (["train", "table1-row01", "--out", "{out}"], 'train needs accelerate: pip install "imgcal[train]"'),
+        ([*CALIBRATE, "{out}", "--first-guess", "vit"], 'calibrate needs timm: pip install "imgcal[train]"'),
+        (
+            ["compare", "data/models/vit-O10-cube8.safetensors", "data/models/cnn-O10-cube8.safetensors"],
+            'compare needs timm: pip install "imgcal[train]"',
+        ),
+        (
+            ["evaluate", "--rig", "O10", "--object", "cube8", "--out", "{out}"],
+            '--out needs matplotlib: pip install "imgcal[report]"',
+        ),
+    ],
+)
+def test_what_needs_an_extra_says_so(arguments: list[str], needs: str, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    done = without_extras(*(argument.format(out=out) for argument in arguments))
+    assert said(done) == [f"imgcal: {needs}"]
+    assert done.returncode == 2
+    assert not out.exists()
+
+
+def test_points_need_no_extra_to_start_from(tmp_path: Path) -> None:
+    done = without_extras(*CALIBRATE, str(tmp_path / "out"), "--first-guess", "points", "--no-report")
+    assert done.returncode == 0, done.stderr
+    assert "network alone" in done.stdout
