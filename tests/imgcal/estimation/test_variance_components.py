@@ -80,12 +80,47 @@ def test_a_calibration_reports_the_residuals_of_the_rig_that_it_returns(seed) ->
     assert difference.abs().max() < 1e-6
 
 
-def test_what_does_not_come_to_rest_is_refused(o10, asymmetric8, monkeypatch) -> None:
-    table, _ = two_captures(o10, asymmetric8, 0.3)
-    assert calibrate(table, o10, asymmetric8).model_error > 0
-    monkeypatch.setattr(variance_components, "ROUNDS", 1)
-    with pytest.raises(RefusedError, match="have not come to rest after 1 fits"):
-        calibrate(table, o10, asymmetric8)
+def fits_made(monkeypatch) -> list[int]:
+    """Number of fits of each calibration from now on, the latest last."""
+    counts: list[int] = []
+    settle, fit = calibration.settle, variance_components._fit
+
+    def counted(*args, **kwargs):
+        counts[-1] += 1
+        return fit(*args, **kwargs)
+
+    def started(*args, **kwargs):
+        counts.append(0)
+        return settle(*args, **kwargs)
+
+    monkeypatch.setattr(variance_components, "_fit", counted)
+    monkeypatch.setattr(calibration, "settle", started)
+    return counts
+
+
+def test_what_does_not_come_to_rest_is_refused_after_forty_fits(monkeypatch) -> None:
+    """Captures whose labels leave and come back without end (of four hundred like these, three need 38 fits or more).
+
+    Which ones they are hangs on the last digits: most of these four, on any machine.
+    """
+    counts, endless = fits_made(monkeypatch), 0
+    for seed in (421, 501, 572, 645):
+        rig, obj, table = hard(seed)
+        with pytest.raises(RefusedError) as refusal:
+            calibrate(table, rig, obj)
+        said = f"have not come to rest after {variance_components.ROUNDS} fits" in str(refusal.value)
+        assert max(counts) == variance_components.ROUNDS if said else max(counts) > 10
+        endless += said
+        counts.clear()
+    assert endless >= 2
+
+
+def test_ordinary_captures_come_to_rest_in_a_few_fits(o10, asymmetric8, monkeypatch) -> None:
+    counts = fits_made(monkeypatch)
+    for noise in (0.05, 0.3):
+        table, _ = two_captures(o10, asymmetric8, noise)
+        assert (calibrate(table, o10, asymmetric8).model_error > 0) == (noise > 0.05)
+    assert max(counts) <= 6
 
 
 def test_a_solution_of_another_problem_is_not_returned(o10, asymmetric8, monkeypatch) -> None:

@@ -262,9 +262,25 @@ def test_a_rig_without_working_distance_is_refused():
         build(NetworkConfig(preset="points"), factory, load_object("cube8"), DRIFT.std(factory))
 
 
-def test_every_preset_has_a_sound_variant():
-    for preset in PRESETS:
-        assert NetworkConfig(preset=preset).variant() == PRESETS[preset]
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_changes_in_what_is_named_and_predicts_rigs(preset):
+    small_image = {"vit": {"depth": 1}, "cnn": {"depths": [1, 1, 1, 1], "dims": [8, 8, 16, 16]}}
+    change = {
+        "paper-points": {"width": 32, "depth": 1},
+        "paper-cnn1d": {"width": 32, "depth": 1},
+        "paper-vit": {"backbone": "vit_tiny_patch16_224", "options": small_image["vit"], "bottleneck": 16},
+        "paper-cnn2d": {"backbone": "convnext_atto", "options": small_image["cnn"], "bottleneck": 16},
+    }.get(preset, {"trunk": {"width": 32, "depth": 1}})
+    before, after = PRESETS[preset].model_dump(), NetworkConfig(preset=preset, change=change).variant().model_dump()
+    wanted = {**change, "trunk": {**before["trunk"], **change["trunk"]}} if "trunk" in change else change
+    assert after == before | wanted
+    assert PRESETS[preset].model_dump() == before
+    network = make(preset, **change)
+    given = views(network, snapshots(network))
+    for prediction in network(given):
+        cameras = prediction.cameras_from_object
+        assert cameras.focal_length.shape == (3, 4, 2) and cameras.cam_from_rig.translation.shape == (3, 4, 3)
+        assert torch.isfinite(project_fiducials(cameras, network.obj)).all()
 
 
 def test_rescaled_weights_say_the_same_of_another_drift():

@@ -56,13 +56,22 @@ def test_a_training_learns_and_tells(experiment, tmp_path):
     assert found.metrics["validation_re_px"] == validated[1]["validation_re_px"]
 
 
-def test_the_logged_loss_is_what_is_minimized(experiment, tmp_path, monkeypatch):
-    setup = experiment("training.steps=1", "training.log_every=1", "training.validation_rigs=0")
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_refined_loss_is_minimized_with_the_others_and_logged(experiment, tmp_path, monkeypatch, sign):
+    """As heavy as this, it alone says where the first step goes: focal lengths become shorter, or longer."""
+    once = ("training.steps=1", "training.log_every=1", "training.validation_rigs=0")
+    setup = experiment(*once, "optimizer.clip=null", "schedule.warmup=0.0")
     train(setup, tmp_path / "plain")
-    monkeypatch.setattr(engine, "refined_loss", lambda *_: 7.0)
-    train(setup, tmp_path / "more")
+
+    def heavy(prediction, batch, source, *_):
+        return sign * 1e6 * (prediction.rig.focal_length / source.factory.focal_length).mean()
+
+    monkeypatch.setattr(engine, "refined_loss", heavy)
+    run = train(setup, tmp_path / "more")
     plain, more = (read_metrics(tmp_path / name / "metrics.jsonl")[0]["loss"] for name in ("plain", "more"))
-    assert more == pytest.approx(plain + 7.0)
+    assert more - plain == pytest.approx(sign * 1e6, rel=1e-6)  # the untrained toy has the factory's focal lengths
+    steps = run.plain.head.bias.detach()[:-9].unflatten(0, (run.source.factory.cameras, -1))[:, 6:8]
+    assert (steps * sign < 0).all()
 
 
 def test_the_result_is_the_running_mean(experiment, tmp_path):

@@ -189,15 +189,22 @@ def test_every_extra_term_counts(truth, spread, asymmetric8):
         assert total(**{name: 1.0}) > plain
 
 
-def test_the_second_stage_of_the_paper(truth, spread, asymmetric8):
-    prediction = off_by(truth, steps(spread))
-    config = LossConfig(kind="paper", paper=PaperLoss(reprojection_from=100))
-    before, after = (compound([prediction], truth, asymmetric8, config, step, spread).total for step in (99, 100))
-    cameras, true_cameras = prediction.cameras_from_object, truth.cameras_from_object
-    first = 100 * parameter_rmse(cameras, true_cameras) + 100 * geodesic(cameras, true_cameras).mean()
-    torch.testing.assert_close(before, first)
-    difference = project_fiducials(cameras, asymmetric8) - project_fiducials(true_cameras, asymmetric8)
-    torch.testing.assert_close(after, first + 0.01 * reprojection_rmse(difference))
+def test_the_paper_begins_without_pixels_and_adds_their_rmse_in_its_second_stage(truth, spread, asymmetric8):
+    """Principal points that are 3 and 4 px off move every fiducial by that, wherever it is."""
+    shift = torch.tensor([3.0, 4.0], dtype=torch.float64)
+    prediction = replace(truth, rig=replace(truth.rig, principal_point=truth.rig.principal_point + shift))
+    other = replace(asymmetric8, points=0.5 * asymmetric8.points.flip(0))
+
+    def total(step, obj=asymmetric8, weight=0.01):
+        paper = PaperLoss(reprojection_from=100, lambda2=weight)
+        return compound([prediction], truth, obj, LossConfig(kind="paper", paper=paper), step, spread).total.item()
+
+    first = total(0)
+    assert first > 0
+    assert total(99) == total(99, weight=7.0) == total(99, other) == first
+    assert total(100) == total(10**6)
+    for weight in (0.01, 2.0):
+        assert total(100, weight=weight) - first == pytest.approx(weight * math.sqrt((3**2 + 4**2) / 2))
 
 
 def test_later_passes_weigh_more(truth, spread, asymmetric8):
