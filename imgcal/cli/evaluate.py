@@ -6,7 +6,6 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from math import radians
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -143,7 +142,7 @@ def _conditions(models: list[Model], setting: Setting) -> Conditions:
         low, high = setting.phi
         if not 0 <= low <= high <= 180:
             raise InputError(f"--phi: found {low:g} {high:g}, expected two angles from 0 to 180, the smaller first")
-        poses = replace(poses, phi=(radians(low), radians(high)))
+        poses = replace(poses, phi_deg=(low, high))
     return replace(
         known,
         pose_range=poses,

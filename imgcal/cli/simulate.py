@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -118,10 +117,7 @@ class Simulate:
         return kinds[self.drift]
 
     def _pose_range(self) -> PoseRange:
-        theta, phi, alpha = (
-            (math.radians(a), math.radians(b)) for a, b in (self.theta_deg, self.phi_deg, self.alpha_deg)
-        )
-        return PoseRange(theta, phi, alpha)
+        return PoseRange(self.theta_deg, self.phi_deg, self.alpha_deg)
 
 
 def _write_truth(truth: Truth, folder: Path) -> None:

@@ -48,9 +48,7 @@ class Model:
     def conditions(self) -> Conditions:
         """What it was trained for, without corruption."""
         experiment = self.checkpoint.experiment
-        return Conditions(
-            self.checkpoint.rig, self.checkpoint.obj, experiment.poses.pose_range(), experiment.drift.drift()
-        )
+        return Conditions(self.checkpoint.rig, self.checkpoint.obj, experiment.poses, experiment.drift)
 
 
 def load_models(

@@ -95,7 +95,7 @@ def markdown(report: Report) -> str:
 def describe(evaluation: Evaluation) -> str:
     """One line on what the rigs were."""
     known, protocol = evaluation.conditions, evaluation.protocol
-    phi = " to ".join(f"{math.degrees(angle):g}" for angle in known.pose_range.phi)
+    phi = " to ".join(f"{angle:g}" for angle in known.pose_range.phi_deg)
     drift = ", ".join(f"{name} {value:g}" for name, value in vars(known.drift).items())
     wrong = ", ".join(f"{name} {value:g}" for name, value in vars(known.corruption).items() if value)
     return (
@@ -218,7 +218,7 @@ def _conditions(conditions: Conditions) -> dict[str, Any]:
     return {
         "rig": conditions.rig.name,
         "object": conditions.obj.name,
-        "poses_deg": {name: [math.degrees(angle) for angle in limits] for name, limits in vars(poses).items()},
+        "poses_deg": {name.removesuffix("_deg"): list(limits) for name, limits in vars(poses).items()},
         "drift": {"kind": "relative" if isinstance(drift, RelativeDrift) else "physical"} | vars(drift),
         "corruption": dict(vars(conditions.corruption)),
         "sigma_px": conditions.sigma,

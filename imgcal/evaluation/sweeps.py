@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -18,8 +17,7 @@ def _at_kappa(conditions: Conditions, value: float) -> Conditions:
 
 
 def _at_phi(conditions: Conditions, value: float) -> Conditions:
-    phi = math.radians(value)
-    return replace(conditions, pose_range=replace(conditions.pose_range, phi=(phi, phi)))
+    return replace(conditions, pose_range=replace(conditions.pose_range, phi_deg=(value, value)))
 
 
 def _at_corruption(kind: str) -> Callable[[Conditions, float], Conditions]:

@@ -4,12 +4,13 @@ from .detections_csv import MARGIN, load_detections, save_detections
 from .frames import Frame, read_frame, write_frame, write_image
 from .json_text import read_json
 from .names import find_file, nearest, title_of
-from .object_csv import load_object, save_object
+from .object_csv import load_object, object_from_text, object_text, save_object
 from .publication import publishing
 from .resources import data_path, shipped_names
-from .rig_yaml import RigCovariance, load_rig, load_rig_covariance, save_rig
+from .rig_yaml import RigCovariance, load_rig, load_rig_covariance, rig_from_text, rig_text, save_rig
 from .safetensors_file import read_tensors, read_texts, write_tensors
-from .yaml_file import Flow, StrictModel, parse_yaml, read_yaml, validated, yaml_text
+from .validation import StrictModel, StrictRecord, validated
+from .yaml_file import Flow, parse_yaml, read_yaml, yaml_text
 
 __all__ = [
     "MARGIN",
@@ -18,6 +19,7 @@ __all__ = [
     "Frame",
     "RigCovariance",
     "StrictModel",
+    "StrictRecord",
     "data_path",
     "find_file",
     "load_detections",
@@ -25,6 +27,8 @@ __all__ = [
     "load_rig",
     "load_rig_covariance",
     "nearest",
+    "object_from_text",
+    "object_text",
     "open_capture",
     "open_input",
     "parse_yaml",
@@ -35,6 +39,8 @@ __all__ = [
     "read_texts",
     "read_yaml",
     "replacing",
+    "rig_from_text",
+    "rig_text",
     "save_capture_settings",
     "save_detections",
     "save_object",

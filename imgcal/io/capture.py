@@ -21,7 +21,8 @@ from imgcal.io.detections_csv import load_detections
 from imgcal.io.frames import IMAGE_SUFFIXES, TIFF_SUFFIXES, VIDEO_SUFFIXES, Frame, Video, count_frames, read_frame
 from imgcal.io.names import is_file_name, natural_key, nearest
 from imgcal.io.publication import is_unfinished
-from imgcal.io.yaml_file import StrictModel, read_yaml, validated, yaml_text
+from imgcal.io.validation import StrictModel, validated
+from imgcal.io.yaml_file import read_yaml, yaml_text
 from imgcal.messages import listed
 from imgcal.types import CameraRig, Detections
 

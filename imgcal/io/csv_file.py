@@ -10,7 +10,7 @@ import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
+from typing import BinaryIO, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,13 +37,14 @@ class Chunk:
     path: Path
     first_row: int  # data rows before this chunk
     columns: dict[str, tuple[str, ...]]
+    content: bytes | None = None  # of the file, where there is none at `path`
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
 
     def fail(self, row: int, problem: str) -> NoReturn:
         """Raise the error of a row of this chunk."""
-        fail_row(self.path, self.first_row + row, problem)
+        fail_row(self.path, self.first_row + row, problem, self.content)
 
     def numbers(self, name: str, plausible: Range, expected: str, whole: bool = False) -> Numbers:
         """Convert a column to numbers.
@@ -72,13 +73,16 @@ class Chunk:
         return values
 
 
-def read_chunks(path: Path, required: Sequence[str], optional: Sequence[str]) -> Iterator[Chunk]:
+def read_chunks(
+    path: Path, required: Sequence[str], optional: Sequence[str], content: bytes | None = None
+) -> Iterator[Chunk]:
     """Read a CSV file with a header; blank lines are skipped.
 
     Args:
         path: the file, with or without gzip compression.
         required: columns that must be there, in any order.
         optional: columns that may be there.
+        content: what the file holds, where there is none: `path` is then only what errors begin with.
 
     Yields:
         Chunks of at most `CHUNK` rows; none when the file has only a header.
@@ -86,7 +90,7 @@ def read_chunks(path: Path, required: Sequence[str], optional: Sequence[str]) ->
     Raises:
         InputError: unreadable, truncated or binary file, wrong header, a row of another length.
     """
-    with _Text(path) as rows:
+    with _Text(path, content) as rows:
         header = [cell.strip() for cell in next(rows, [])]
         _check_header(path, header, required, optional)
         for first in itertools.count(0, CHUNK):
@@ -96,29 +100,35 @@ def read_chunks(path: Path, required: Sequence[str], optional: Sequence[str]) ->
             lengths = np.fromiter(map(len, chunk), dtype=np.int64, count=len(chunk))
             if (lengths != len(header)).any():
                 row = int((lengths != len(header)).argmax())
-                fail_row(path, first + row, f"found {lengths[row]} cells, expected {len(header)}: {','.join(header)}")
-            yield Chunk(path, first, dict(zip(header, zip(*chunk, strict=True), strict=True)))
+                problem = f"found {lengths[row]} cells, expected {len(header)}: {','.join(header)}"
+                fail_row(path, first + row, problem, content)
+            yield Chunk(path, first, dict(zip(header, zip(*chunk, strict=True), strict=True)), content)
 
 
 class _Text:
     """Context manager: the non-blank rows of a CSV file; every reading failure becomes an `InputError`."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, content: bytes | None = None) -> None:
+        self.path, self.content = path, content
 
     def __enter__(self) -> Iterator[list[str]]:
-        check_regular(self.path)
-        try:
-            self.file = open(self.path, "rb")
-            magic = self.file.read(2)
-            self.file.seek(0)
-        except OSError as error:
-            raise InputError(f"{self.path}: cannot be read: {error.strerror or error}") from error
+        self.file = self._opened()
+        magic = self.file.read(2)
+        self.file.seek(0)
         self.binary = gzip.GzipFile(fileobj=self.file) if magic == GZIP_MAGIC else self.file
         # utf-8-sig: spreadsheets put a byte order mark in front of the header.
         self.text = io.TextIOWrapper(self.binary, encoding="utf-8-sig", newline="")
         self.reader = csv.reader(self._lines(), strict=True)
         return filter(None, self.reader)
+
+    def _opened(self) -> BinaryIO:
+        if self.content is not None:
+            return io.BytesIO(self.content)
+        check_regular(self.path)
+        try:
+            return open(self.path, "rb")
+        except OSError as error:
+            raise InputError(f"{self.path}: cannot be read: {error.strerror or error}") from error
 
     def _lines(self) -> Iterator[str]:
         for number in itertools.count(1):
@@ -174,9 +184,9 @@ def _check_header(path: Path, header: list[str], required: Sequence[str], option
         raise InputError(f"{path}: found no column {', '.join(missing)}; {expected}")
 
 
-def fail_row(path: Path, row: int, problem: str) -> NoReturn:
+def fail_row(path: Path, row: int, problem: str, content: bytes | None = None) -> NoReturn:
     """Raise the error of a data row; blank lines and quoted line breaks shift its line, found by reading again."""
-    text = _Text(path)
+    text = _Text(path, content)
     with text as rows:
         next(itertools.islice(rows, row + 1, None))
         line = text.reader.line_num

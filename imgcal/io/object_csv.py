@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -36,8 +37,25 @@ def load_object(path: str | Path) -> CalibrationObject:
     Raises:
         InputError: one line with the file, the line, what was found and what was expected.
     """
-    path = find_file(path, "objects", ".csv")
-    chunks = list(islice(read_chunks(path, ("x", "y", "z"), ("name", "radius", "tolerance")), 2))
+    return _read(find_file(path, "objects", ".csv"))
+
+
+def object_from_text(text: str, where: str, name: str = "object") -> CalibrationObject:
+    """Read an object from what its file holds, the result of `object_text`.
+
+    Args:
+        text: the CSV.
+        where: what errors begin with.
+        name: of the object.
+
+    Raises:
+        InputError: as `load_object`.
+    """
+    return replace(_read(Path(where), text.encode(errors="replace")), name=name)
+
+
+def _read(path: Path, content: bytes | None = None) -> CalibrationObject:
+    chunks = list(islice(read_chunks(path, ("x", "y", "z"), ("name", "radius", "tolerance"), content), 2))
     count = sum(map(len, chunks))
     if not 4 <= count <= limits.MOST_FIDUCIALS:
         found = count if count < 4 else f"more than {limits.MOST_FIDUCIALS}"
@@ -69,10 +87,15 @@ def save_object(obj: CalibrationObject, path: str | Path) -> None:
     Raises:
         InputError: the file cannot be written, or a name could not be read again.
     """
+    write_text(path, object_text(obj, path))
+
+
+def object_text(obj: CalibrationObject, where: str | Path = "object") -> str:
+    """Make what `save_object` writes; errors begin with `where`."""
     names = obj.fiducial_names
     for row, name in enumerate(names):
         if not _is_name(name) or name in names[:row]:
-            raise InputError(f"{path}: not written: found the name {shortened(name)!r}, expected {NAME}")
+            raise InputError(f"{where}: not written: found the name {shortened(name)!r}, expected {NAME}")
     columns: list[list[str]] = [[f"{value!r}" for value in axis] for axis in obj.points.double().T.tolist()]
     header = ["x", "y", "z"]
     if names:
@@ -88,7 +111,7 @@ def save_object(obj: CalibrationObject, path: str | Path) -> None:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)
     writer.writerows(zip(*columns, strict=True))
-    write_text(path, text.getvalue())
+    return text.getvalue()
 
 
 def _is_name(name: str) -> bool:

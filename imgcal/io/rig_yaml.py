@@ -16,7 +16,8 @@ from imgcal.errors import InputError
 from imgcal.geometry import RigidTransform, rotation_from_vector, vector_from_rotation
 from imgcal.io.atomic import write_text
 from imgcal.io.names import LONGEST_NAME, find_file, is_file_name, title_of
-from imgcal.io.yaml_file import Flow, FlowMap, StrictModel, read_yaml, validated, yaml_text
+from imgcal.io.validation import StrictModel, validated
+from imgcal.io.yaml_file import Flow, FlowMap, read_yaml, record_from_yaml, yaml_text
 from imgcal.messages import listed, quoted
 from imgcal.types import PARAMETER_NAMES, PARAMETERS, CameraRig, RigPrior, limits
 
@@ -166,25 +167,17 @@ def load_rig(path: str | Path) -> CameraRig:
         InputError: one line with the file, the camera, what was found and what was expected.
     """
     content, path = _read(path)
-    cameras = content.cameras
+    return _rig_of(content, title_of(path))
 
-    def column(values: list[list[float]]) -> Tensor:
-        return torch.tensor(values, dtype=torch.float64)
 
-    return CameraRig(
-        focal_length=column([camera.focal_length for camera in cameras]),
-        principal_point=column([camera.principal_point for camera in cameras]),
-        distortion=column([camera.distortion for camera in cameras]),
-        cam_from_rig=RigidTransform(
-            rotation_from_vector(column([camera.cam_from_rig.rotation_vector for camera in cameras])),
-            column([camera.cam_from_rig.translation for camera in cameras]),
-        ),
-        image_size=torch.tensor([camera.image_size for camera in cameras]),
-        camera_names=tuple(camera.name for camera in cameras),
-        name=content.name if content.name is not None else title_of(path),
-        working_distance=content.working_distance,
-        prior=None if content.prior is None else RigPrior(**content.prior.model_dump()),
-    )
+def rig_from_text(text: str, where: str) -> CameraRig:
+    """Read a rig from what its file holds, the result of `rig_text`; errors begin with `where`, as does its name.
+
+    Raises:
+        InputError: as `load_rig`.
+    """
+    content = record_from_yaml(text.encode(errors="replace"), where, _RigFile, FORMAT, ENTRY_NAMES)
+    return _rig_of(content, where)
 
 
 def load_rig_covariance(path: str | Path) -> RigCovariance | None:
@@ -211,8 +204,15 @@ def save_rig(rig: CameraRig, path: str | Path, covariance: RigCovariance | None 
     Raises:
         InputError: the file cannot be written, or the rig could not be read again (NaN, for example).
     """
+    write_text(path, rig_text(rig, path, covariance, full))
+
+
+def rig_text(
+    rig: CameraRig, where: str | Path = "rig", covariance: RigCovariance | None = None, full: bool = False
+) -> str:
+    """Make what `save_rig` writes; errors begin with `where`."""
     if rig.batch_shape:
-        raise InputError(f"{path}: found a batch of rigs of shape {tuple(rig.batch_shape)}, expected one rig")
+        raise InputError(f"{where}: found a batch of rigs of shape {tuple(rig.batch_shape)}, expected one rig")
     content: dict[str, Any] = {"format": FORMAT, "name": rig.name}
     if rig.working_distance is not None:
         content["working_distance"] = rig.working_distance
@@ -220,14 +220,37 @@ def save_rig(rig: CameraRig, path: str | Path, covariance: RigCovariance | None 
     if rig.prior is not None:
         content["prior"] = {key: float(value) for key, value in vars(rig.prior).items()}
     if covariance is not None:
-        content["covariance"] = _covariance_entry(covariance, full, path)
-    validated(content, _RigFile, f"{path}: not written", ENTRY_NAMES)
-    write_text(path, yaml_text(content))
+        content["covariance"] = _covariance_entry(covariance, full, where)
+    validated(content, _RigFile, f"{where}: not written", ENTRY_NAMES)
+    return yaml_text(content)
 
 
 def _read(path: str | Path) -> tuple[_RigFile, Path]:
     path = find_file(path, "rigs", ".yaml")
     return read_yaml(path, _RigFile, FORMAT, ENTRY_NAMES), path
+
+
+def _rig_of(content: _RigFile, name: str) -> CameraRig:
+    """The rig of a file; `name` is for one without."""
+    cameras = content.cameras
+
+    def column(values: list[list[float]]) -> Tensor:
+        return torch.tensor(values, dtype=torch.float64)
+
+    return CameraRig(
+        focal_length=column([camera.focal_length for camera in cameras]),
+        principal_point=column([camera.principal_point for camera in cameras]),
+        distortion=column([camera.distortion for camera in cameras]),
+        cam_from_rig=RigidTransform(
+            rotation_from_vector(column([camera.cam_from_rig.rotation_vector for camera in cameras])),
+            column([camera.cam_from_rig.translation for camera in cameras]),
+        ),
+        image_size=torch.tensor([camera.image_size for camera in cameras]),
+        camera_names=tuple(camera.name for camera in cameras),
+        name=content.name if content.name is not None else name,
+        working_distance=content.working_distance,
+        prior=None if content.prior is None else RigPrior(**content.prior.model_dump()),
+    )
 
 
 def _camera_entry(rig: CameraRig, camera: int, covariance: RigCovariance | None) -> dict[str, Any]:
@@ -251,14 +274,14 @@ def _camera_entry(rig: CameraRig, camera: int, covariance: RigCovariance | None)
     return entry
 
 
-def _covariance_entry(covariance: RigCovariance, full: bool, path: str | Path) -> dict[str, Any]:
+def _covariance_entry(covariance: RigCovariance, full: bool, where: str | Path) -> dict[str, Any]:
     entry: dict[str, Any] = {}
     if covariance.reference_camera is not None:
         entry["reference_camera"] = covariance.reference_camera
     entry["parameters"] = Flow(PARAMETER_NAMES)
     if full:
         if covariance.matrix is None:
-            raise InputError(f"{path}: not written: found no covariance matrix, expected one with full=True")
+            raise InputError(f"{where}: not written: found no covariance matrix, expected one with full=True")
         entry["matrix"] = [Flow(row) for row in covariance.matrix.double().tolist()]
     return entry
 

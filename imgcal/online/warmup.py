@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -41,7 +40,7 @@ def warm_up() -> None:
     rig = load_rig(RIG).resized(torch.tensor(SIZE))
     obj = load_object(OBJECT)
     generator = torch.Generator().manual_seed(0)
-    poses = PoseRange((0.0, 2 * math.pi), (0.0, 0.5), (0.0, 0.0))
+    poses = PoseRange(phi_deg=(0.0, 28.6), alpha_deg=(0.0, 0.0))
     truth = simulate_truth(rig, obj, SNAPSHOTS, generator, RelativeDrift(0.01, 0.01), poses)
     for depth in (8, 16):
         _from_frames(truth, rig, obj, SensorModel(bit_depth=depth), generator)

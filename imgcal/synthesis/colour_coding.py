@@ -2,33 +2,33 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from imgcal.errors import InputError
 from imgcal.geometry import resized_pixels
+from imgcal.io import StrictRecord
 from imgcal.types import CalibrationObject
 from renderers import splat
 
 LEVELS = 255  # largest grey level of images as they are saved
-LEAST_SIZE, MOST_SIZE = 8, 4096
 
 
 @dataclass(frozen=True)
-class ImageOptions:
-    """Size of the images, and of the dots in them."""
+class ImageOptions(StrictRecord):
+    """Size of the images, and of the dots in them; also the block `images` of an experiment file."""
 
-    size: int = 224  # pixels, width and height
-    dot: float = 1.5  # pixels of the image, standard deviation of a dot
+    size: Annotated[int, Field(ge=8, le=4096)] = 224  # pixels, width and height
+    dot: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.5  # pixels of the image, standard deviation of a dot
 
     def __post_init__(self) -> None:
-        if not LEAST_SIZE <= self.size <= MOST_SIZE:
-            raise InputError(f"image size: found {self.size}, expected {LEAST_SIZE} to {MOST_SIZE} pixels")
-        if not (math.isfinite(self.dot) and 0 < self.dot < self.size):
-            raise InputError(f"dot: found {self.dot}, expected more than 0 and less than the {self.size} pixels")
+        super().__post_init__()
+        if not self.dot < self.size:
+            raise InputError(f"dot: found {self.dot}, expected less than the {self.size} pixels of the image")
 
     def from_sensor(self, uv: Tensor, image_size: Tensor) -> Tensor:
         """Take sensor pixels (*B, C, N, 2) to pixels of the image by the pixel-centre rule u' + 1/2 = s (u + 1/2)."""

@@ -2,33 +2,33 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields
+from typing import Annotated
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
-from imgcal.errors import InputError
+from imgcal.io import StrictRecord
 from imgcal.types import Views
 
 SWAPPED, FALSE = 1, 2
 
+Noise = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1)]
+
 
 @dataclass(frozen=True)
-class Corruption:
-    """How much goes wrong. Shares are of fiducials in one camera's view; each is drawn on its own."""
+class Corruption(StrictRecord):
+    """How much goes wrong. Shares are of fiducials in one camera's view; each is drawn on its own.
 
-    noise: float = 0.0  # pixels, one standard deviation of each axis, Gaussian
-    missing: float = 0.0  # share that is not seen
-    swapped: float = 0.0  # share of the seen whose label is exchanged with that of another one in the same camera
-    false: float = 0.0  # share of the seen that is found somewhere else in the image, anywhere
+    It is also the block `corruption` of an experiment file.
+    """
 
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.noise) and self.noise >= 0):
-            raise InputError(f"noise: found {self.noise}, expected a standard deviation >= 0 in pixels")
-        for name in ("missing", "swapped", "false"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise InputError(f"{name}: found {getattr(self, name)}, expected a share between 0 and 1")
+    noise: Noise = 0.0  # pixels, one standard deviation of each axis, Gaussian
+    missing: Share = 0.0  # share that is not seen
+    swapped: Share = 0.0  # share of the seen whose label is exchanged with that of another one in the same camera
+    false: Share = 0.0  # share of the seen that is found somewhere else in the image, anywhere
 
     @property
     def nothing(self) -> bool:

@@ -6,45 +6,69 @@ Source: paper section 4.1. Random numbers come from an explicit `torch.Generator
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Annotated, Any
 
 import torch
+from pydantic import BeforeValidator, Field, TypeAdapter
 from torch import Tensor
 
 from imgcal.errors import InputError, RefusedError
 from imgcal.geometry import Projection, RigidTransform, euler_from_rotation, rotate, rotation_from_euler
+from imgcal.io import StrictRecord
+from imgcal.messages import shortened
 from imgcal.types import PARAMETERS, CalibrationObject, CameraRig, RigPrior
 
-LARGEST_SPREAD = 1e6  # of a drift, in any unit
+Angle = Annotated[float, Field(ge=-360, le=360)]
+Kappa = Annotated[float, Field(ge=0, lt=1)]
+Spread = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
+
+
+def _pair(values: Any) -> Any:
+    """Take a list for the tuple that it is in a file."""
+    if isinstance(values, list | tuple) and len(values) != 2:
+        raise ValueError(f"found {len(values)} values, expected 2")
+    return tuple(values) if isinstance(values, list) else values
+
+
+Interval = Annotated[tuple[Angle, Angle], BeforeValidator(_pair)]
 
 
 @dataclass(frozen=True)
-class PoseRange:
-    """Where the rig may be: on the hemisphere around the object, looking at it, rolled about its axis. All in rad."""
+class PoseRange(StrictRecord):
+    """Where the rig may be: on the hemisphere around the object, looking at it, rolled about its axis.
 
-    theta: tuple[float, float] = (0.0, 2 * math.pi)  # azimuth
-    phi: tuple[float, float] = (0.0, math.pi / 2)  # angle from the zenith
-    alpha: tuple[float, float] = (0.0, 2 * math.pi)  # roll
+    In degrees, the smaller angle first. It is also the block `poses` of an experiment file.
+    """
+
+    theta_deg: Interval = (0.0, 360.0)  # azimuth
+    phi_deg: Interval = (0.0, 90.0)  # angle from the zenith
+    alpha_deg: Interval = (0.0, 360.0)  # roll
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, (low, high) in vars(self).items():
+            if low > high:
+                raise InputError(f"{name}: found [{low:g}, {high:g}], expected the smaller angle first")
+
+    @property
+    def radians(self) -> tuple[tuple[float, float], ...]:
+        """Limits of theta, phi and alpha in rad."""
+        return tuple((math.radians(low), math.radians(high)) for low, high in vars(self).values())
 
     @classmethod
     def overhead(cls) -> PoseRange:
         """Stay at the zenith with any roll: the paper's "fixed overhead" rows."""
-        return cls(theta=(0.0, 0.0), phi=(0.0, 0.0))
+        return cls(theta_deg=(0.0, 0.0), phi_deg=(0.0, 0.0))
 
 
 @dataclass(frozen=True)
-class RelativeDrift:
-    """The paper's perturbation: every value times 1 + delta, delta uniform in [-kappa, kappa]."""
+class RelativeDrift(StrictRecord):
+    """The paper's perturbation: every value times 1 + delta, delta uniform in [-kappa, kappa]; 0.025 is 2.5 %."""
 
-    kappa_intrinsics: float = 0.025
-    kappa_extrinsics: float = 0.025
-
-    def __post_init__(self) -> None:
-        for name in ("kappa_intrinsics", "kappa_extrinsics"):
-            value = getattr(self, name)
-            if not 0 <= value < 1:
-                raise InputError(f"{name}: found {value}, expected 0 <= kappa < 1 (0.025 is 2.5 %)")
+    kappa_intrinsics: Kappa = 0.025
+    kappa_extrinsics: Kappa = 0.025
 
     def apply(self, rig: CameraRig, generator: torch.Generator, *batch: int) -> CameraRig:
         """Disturb focal lengths, principal points, distortion; Euler angles and positions of the cameras in the rig.
@@ -90,21 +114,14 @@ class RelativeDrift:
 
 
 @dataclass(frozen=True)
-class PhysicalDrift:
+class PhysicalDrift(StrictRecord):
     """Gaussian drift in physical units, for real rigs; each number is one standard deviation."""
 
-    rotation_deg: float = 0.5  # each axis
-    position: float = 2.0  # mm, each axis
-    focal_length: float = 0.01  # relative
-    principal_point: float = 5.0  # pixels
-    distortion: float = 0.005  # absolute
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not 0 <= value <= LARGEST_SPREAD:
-                raise InputError(
-                    f"{name}: found {value}, expected a standard deviation >= 0, at most {LARGEST_SPREAD:g}"
-                )
+    rotation_deg: Spread = 0.5  # each axis
+    position: Spread = 2.0  # mm, each axis
+    focal_length: Spread = 0.01  # relative
+    principal_point: Spread = 5.0  # pixels
+    distortion: Spread = 0.005  # absolute
 
     def apply(self, rig: CameraRig, generator: torch.Generator, *batch: int) -> CameraRig:
         """Disturb every parameter of every camera independently: (*batch, *B) rigs."""
@@ -118,7 +135,31 @@ class PhysicalDrift:
         return as_prior.std(rig)
 
 
-Drift = RelativeDrift | PhysicalDrift
+def drift_of(block: Any) -> Any:
+    """Make a drift of the block of an experiment file, in which what is not named does not drift.
+
+    Args:
+        block: a mapping, or a drift, which is returned as it is.
+
+    Raises:
+        ValueError: kappas beside physical units, unknown keys or impossible values (pydantic's ValidationError).
+    """
+    if isinstance(block, RelativeDrift | PhysicalDrift):
+        return block
+    if not isinstance(block, Mapping):
+        raise ValueError(f"found {shortened(repr(block))}, expected kappas or physical units by name")
+    values = {name: value for name, value in block.items() if value is not None}
+    named = sorted(map(str, values))
+    relative = [name for name in named if name.startswith("kappa")]
+    if relative and len(relative) < len(named):
+        physical = next(name for name in named if name not in relative)
+        raise ValueError(f"found {relative[0]} and {physical}, expected kappas or physical units, not both")
+    kind = PhysicalDrift if named and not relative else RelativeDrift
+    return TypeAdapter(kind).validate_python({field.name: 0.0 for field in fields(kind)} | values)
+
+
+Drift = Annotated[RelativeDrift | PhysicalDrift, BeforeValidator(drift_of)]
+"""A value in Python; in an experiment file the block `drift`."""
 
 
 @dataclass(frozen=True)
@@ -198,7 +239,7 @@ def sample_rig_from_object(
         (B,) rig_from_object: the object's centroid at (0, 0, working_distance), R_focus, then the roll R_random.
     """
     draws = torch.rand((3, count), generator=generator, dtype=centroid.dtype, device=centroid.device)
-    low, high = centroid.new_tensor((pose_range.theta, pose_range.phi, pose_range.alpha)).unsqueeze(-2).unbind(-1)
+    low, high = centroid.new_tensor(pose_range.radians).unsqueeze(-2).unbind(-1)
     angles = torch.lerp(low, high, draws)
     (st, sp, sa), (ct, cp, ca) = angles.sin(), angles.cos()
     # R_random times R_focus, whose rows are the unit vectors of azimuth and zenith angle and the viewing direction.

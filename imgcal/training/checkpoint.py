@@ -28,7 +28,6 @@ from imgcal.io import (
 )
 from imgcal.messages import shortened
 from imgcal.networks import Trunk
-from imgcal.synthesis import ImageOptions
 from imgcal.training.experiment import Experiment
 from imgcal.types import CalibrationObject, CameraRig
 
@@ -51,7 +50,7 @@ class Checkpoint:
     @property
     def drift_std(self) -> Tensor:
         """Spread of the parameters that the network was trained for: (C, 15) float64, the prior of a refinement."""
-        return self.experiment.drift.drift().std(self.rig)
+        return self.experiment.drift.std(self.rig)
 
 
 def build_network(experiment: Experiment, rig: CameraRig, obj: CalibrationObject) -> nn.Module:
@@ -61,12 +60,12 @@ def build_network(experiment: Experiment, rig: CameraRig, obj: CalibrationObject
         InputError: the experiment says how to draw images, and its network takes points.
     """
     single = torch.float32
-    spread = experiment.drift.drift().std(rig).to(single)
+    spread = experiment.drift.std(rig).to(single)
     network: nn.Module = networks.build(experiment.network, rig.to(single), obj, spread)
     if experiment.images is not None:
         if network.image_options is None:
             raise InputError(f"images: found this block, but the network {experiment.network.preset} takes points")
-        network.image_options = ImageOptions(**experiment.images.model_dump())  # type: ignore[assignment]
+        network.image_options = experiment.images  # type: ignore[assignment]
     return network
 
 
@@ -106,7 +105,7 @@ def save_network(
         for name, tensor in network.state_dict().items()
     }
     texts = {
-        "experiment": json.dumps(experiment.model_dump()),
+        "experiment": json.dumps(experiment.model_dump(mode="json")),
         "metrics": json.dumps(metrics),
         **_texts_of(network.factory if rig is None else rig, network.obj),  # type: ignore[arg-type]
     }
@@ -174,7 +173,7 @@ def warm_start(path: str | Path, network: nn.Module) -> tuple[str, ...]:
     trunk = getattr(network, "trunk", None)
     if isinstance(trunk, Trunk):
         experiment, _ = _read_records(path, texts)
-        trunk.rescale(experiment.drift.drift().std(_from_texts(path, texts)[0]))
+        trunk.rescale(experiment.drift.std(_from_texts(path, texts)[0]))
     return tuple(name for name in own if name not in fitting)
 
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from imgcal.errors import InputError, RefusedError
 from imgcal.io import write_tensors
-from imgcal.synthesis import Corruption, ImageOptions, Snapshots
+from imgcal.synthesis import ImageOptions, Snapshots
 from imgcal.training.checkpoint import build_network, save_network, warm_start, without_pretrained
 from imgcal.training.data import Batch, Source, object_to
 from imgcal.training.end_to_end import refined_loss
@@ -144,9 +144,9 @@ def prepare(experiment: Experiment, folder: Path, resume: bool = False) -> Run:
     source = Source(
         factory.to(torch.float32, device),
         object_to(obj, device),
-        experiment.drift.drift(),
-        experiment.poses.pose_range(),
-        Corruption(**experiment.corruption.model_dump()),
+        experiment.drift,
+        experiment.poses,
+        experiment.corruption,
         cast(ImageOptions | None, network.image_options),
     )
     seed = settings.seed * 4096 + accelerator.process_index

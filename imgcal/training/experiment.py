@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,6 +12,7 @@ from imgcal.errors import InputError
 from imgcal.io import (
     Flow,
     StrictModel,
+    StrictRecord,
     find_file,
     load_object,
     load_rig,
@@ -24,18 +24,16 @@ from imgcal.io import (
 )
 from imgcal.messages import quoted
 from imgcal.networks import NetworkConfig
-from imgcal.synthesis import Drift, PhysicalDrift, PoseRange, RelativeDrift
+from imgcal.synthesis import Corruption, Drift, ImageOptions, PoseRange
 from imgcal.training.losses import LossConfig
 from imgcal.types import CalibrationObject, CameraRig
 
 FORMAT = "imgcal-experiment/1"
 
-Kappa = Annotated[float, Field(ge=0, lt=1)]
 Spread = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Positive = Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1, le=10**9)]
-Interval = Annotated[list[Annotated[float, Field(ge=-360, le=360)]], Field(min_length=2, max_length=2)]
 
 
 class PaperRow(StrictModel):
@@ -44,73 +42,6 @@ class PaperRow(StrictModel):
     table: str
     row: Count
     re_px: Positive | None = None
-
-
-class PosesConfig(StrictModel):
-    """Where the rig may be, in degrees; the smaller angle first."""
-
-    theta_deg: Interval = Field(default=[0.0, 360.0])  # azimuth
-    phi_deg: Interval = Field(default=[0.0, 90.0])  # angle from the zenith
-    alpha_deg: Interval = Field(default=[0.0, 360.0])  # roll
-
-    @model_validator(mode="after")
-    def _in_order(self) -> PosesConfig:
-        for name in ("theta_deg", "phi_deg", "alpha_deg"):
-            low, high = getattr(self, name)
-            if low > high:
-                raise ValueError(f"{name}: found [{low:g}, {high:g}], expected the smaller angle first")
-        return self
-
-    def pose_range(self) -> PoseRange:
-        """The same in radians."""
-        theta, phi, alpha = (
-            (math.radians(low), math.radians(high)) for low, high in (self.theta_deg, self.phi_deg, self.alpha_deg)
-        )
-        return PoseRange(theta, phi, alpha)
-
-
-class DriftConfig(StrictModel):
-    """The paper's relative drift or a physical one; what is not named does not drift."""
-
-    kappa_intrinsics: Kappa | None = None
-    kappa_extrinsics: Kappa | None = None
-    rotation_deg: Spread | None = None  # one standard deviation, each axis
-    position: Spread | None = None  # mm, each axis
-    focal_length: Spread | None = None  # relative
-    principal_point: Spread | None = None  # pixels
-    distortion: Spread | None = None  # absolute
-
-    @model_validator(mode="after")
-    def _one_kind(self) -> DriftConfig:
-        named = sorted(name for name, value in self if value is not None)
-        relative = [name for name in named if name.startswith("kappa")]
-        if relative and len(relative) < len(named):
-            physical = next(name for name in named if name not in relative)
-            raise ValueError(f"found {relative[0]} and {physical}, expected kappas or physical units, not both")
-        return self
-
-    def drift(self) -> Drift:
-        """The drift these numbers describe."""
-        values = {name: value for name, value in self if value is not None}
-        if values and not any(name.startswith("kappa") for name in values):
-            return PhysicalDrift(**{name: values.get(name, 0.0) for name in PhysicalDrift.__dataclass_fields__})
-        return RelativeDrift(self.kappa_intrinsics or 0.0, self.kappa_extrinsics or 0.0)
-
-
-class ImagesConfig(StrictModel):
-    """How the images of image variants are drawn."""
-
-    size: Annotated[int, Field(ge=8, le=4096)] = 224  # pixels, width and height
-    dot: Positive = 1.5  # pixels, standard deviation of a dot
-
-
-class CorruptionConfig(StrictModel):
-    """What goes wrong in the views during training: `imgcal.synthesis.corruption.Corruption`."""
-
-    noise: Spread = 0.0  # pixels, one standard deviation of each axis
-    missing: Fraction = 0.0  # share of the fiducials that is not seen
-    swapped: Fraction = 0.0  # share of the seen whose label is another one's
-    false: Fraction = 0.0  # share of the seen that is found anywhere else
 
 
 class OptimizerConfig(StrictModel):
@@ -173,11 +104,11 @@ class Experiment(StrictModel):
     paper: PaperRow | None = None
     rig: str  # shipped name or path
     object: str  # shipped name or path
-    poses: PosesConfig = PosesConfig()
-    drift: DriftConfig
+    poses: PoseRange = PoseRange()
+    drift: Drift
     network: NetworkConfig
-    images: ImagesConfig | None = None
-    corruption: CorruptionConfig = CorruptionConfig()
+    images: ImageOptions | None = None  # how the images of image variants are drawn
+    corruption: Corruption = Corruption()  # what goes wrong in the views during training
     loss: LossConfig = LossConfig()
     optimizer: OptimizerConfig = OptimizerConfig()
     schedule: ScheduleConfig = ScheduleConfig()
@@ -217,7 +148,7 @@ def changed(experiment: Experiment, *changes: str) -> Experiment:
 
 
 def as_written(experiment: Experiment) -> dict[str, Any]:
-    """The plain values that were given, without defaults."""
+    """The plain values of the blocks that were given, without defaults where a block knows what it was given."""
     return experiment.model_dump(exclude_unset=True)
 
 
@@ -241,7 +172,9 @@ def _resolved(model: StrictModel) -> dict[str, Any]:
 def _plain(value: Any) -> Any:
     if isinstance(value, StrictModel):
         return _resolved(value)
-    return Flow(value) if isinstance(value, list) else value
+    if isinstance(value, StrictRecord):
+        return {name: _plain(field) for name, field in vars(value).items()}
+    return Flow(value) if isinstance(value, list | tuple) else value
 
 
 def _apply(content: dict[str, Any], change: str) -> None:

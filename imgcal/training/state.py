@@ -39,7 +39,7 @@ def save_state(path: str | Path, state: State) -> None:
         InputError: the file cannot be written.
     """
     tensors = {f"{part}/{name}": tensor for part, named in state.tensors.items() for name, tensor in named.items()}
-    texts = {"values": json.dumps(state.values), "experiment": json.dumps(state.experiment.model_dump())}
+    texts = {"values": json.dumps(state.values), "experiment": json.dumps(state.experiment.model_dump(mode="json"))}
     write_tensors(path, tensors, FORMAT, texts)
 
 
@@ -56,7 +56,7 @@ def load_state(path: str | Path, experiment: Experiment) -> State:
             raise ValueError("no mapping")
     except (KeyError, ValueError) as error:
         raise InputError(f"{path}: found no readable state in it: the file is damaged") from error
-    difference = first_difference(saved, experiment.model_dump())
+    difference = first_difference(saved, experiment.model_dump(mode="json"))
     if difference:
         key, was, now = difference
         raise InputError(

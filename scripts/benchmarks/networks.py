@@ -94,7 +94,7 @@ def _row(network: torch.nn.Module, parts: Calls, timings: Mapping[str, Timing], 
 
 def _views(trained: Checkpoint, network: torch.nn.Module) -> Views:
     """What the cameras of one drifted rig see."""
-    factory, drift = trained.rig.to(torch.float32), trained.experiment.drift.drift()
+    factory, drift = trained.rig.to(torch.float32), trained.experiment.drift
     seen = synthesize(factory, trained.obj, 1, torch.Generator().manual_seed(0), drift=drift).projection
     options = network.image_options
     if options is None:

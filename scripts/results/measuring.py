@@ -26,7 +26,7 @@ from imgcal.evaluation import (
     sweep,
 )
 from imgcal.io import read_texts
-from imgcal.synthesis import Corruption
+from imgcal.synthesis import Corruption, RelativeDrift
 from imgcal.training import read_metrics
 from imgcal.training.checkpoint import FORMAT
 from scripts.output import surroundings
@@ -129,11 +129,12 @@ def swept(source: Source, count: int, device: str) -> dict[str, Any]:
     """Evaluate one network against perturbation and angle, everything else as in its training."""
     [model] = load_models([source.path], device=device)
     methods = {NETWORK: model.method, WITHOUT: BASELINES[WITHOUT]}
+    drift = model.conditions.drift
     result: dict[str, Any] = {
         "experiment": model.checkpoint.experiment.name,
         "sha256": source.sha256,
         "rigs": count,
-        "trained_kappa": model.checkpoint.experiment.drift.kappa_intrinsics,
+        "trained_kappa": drift.kappa_intrinsics if isinstance(drift, RelativeDrift) else None,
         "surroundings": surroundings(device),
     }
     for axis in ("kappa", "phi"):

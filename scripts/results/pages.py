@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from imgcal.networks import Images, PaperImages
+from imgcal.synthesis import RelativeDrift
 from imgcal.training import Experiment
 from scripts.output import markdown
 from scripts.results.measuring import FACTORY, NETWORK, ROBUST, WITHOUT
@@ -158,13 +159,15 @@ def variant(experiment: Experiment) -> str:
 def label(experiment: Experiment) -> str:
     """Say in a few words what an experiment is about."""
     drift, poses = experiment.drift, experiment.poses
-    where = "overhead" if poses.phi_deg == [0.0, 0.0] else "hemisphere"
-    kappas = f"{100 * (drift.kappa_intrinsics or 0):g} / {100 * (drift.kappa_extrinsics or 0):g} %"
+    where = "overhead" if poses.phi_deg == (0.0, 0.0) else "hemisphere"
+    kappas = "physical drift"
+    if isinstance(drift, RelativeDrift):
+        kappas = f"kappa {100 * drift.kappa_intrinsics:g} / {100 * drift.kappa_extrinsics:g} %"
     changes = ", ".join(f"{key} {value}" for key, value in experiment.network.change.items())
     if experiment.loss.kind == "paper" and experiment.loss.paper.lambda_scale == 1:
         changes = ", ".join(filter(None, (changes, "no value scaling")))
     network = experiment.network.preset + (f" ({changes})" if changes else "")
-    return f"{network}, {where}, {experiment.rig} {experiment.object}, kappa {kappas}"
+    return f"{network}, {where}, {experiment.rig} {experiment.object}, {kappas}"
 
 
 def mean(column: Mapping[str, Any]) -> str:

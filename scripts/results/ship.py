@@ -64,7 +64,7 @@ def error(checkpoint: Checkpoint) -> float:
     """Mean RE of a network on a few random rigs, exact points."""
     network, experiment = checkpoint.network, checkpoint.experiment
     factory, generator = checkpoint.rig.to(torch.float32), torch.Generator().manual_seed(0)
-    drift, poses = experiment.drift.drift(), experiment.poses.pose_range()
+    drift, poses = experiment.drift, experiment.poses
     made = synthesize(factory, checkpoint.obj, RIGS, generator, drift=drift, pose_range=poses)
     uv, seen = made.projection.uv, made.projection.visible
     views = Views(uv=uv, seen=seen)

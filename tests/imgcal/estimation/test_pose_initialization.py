@@ -27,7 +27,7 @@ def test_few_cameras_and_planar_objects(simulate, o10, asymmetric8, cameras: int
     points = asymmetric8.points * torch.tensor([1.0, 1.0, 0.0 if planar else 1.0], dtype=torch.float64)
     obj, rig = replace(asymmetric8, points=points), o10.select(range(cameras))
     # A plane seen edge-on, or from straight above by a single camera, is a harder question than this test asks.
-    tilted = PoseRange(phi=(0.3, 1.1))
+    tilted = PoseRange(phi_deg=(17.0, 63.0))
     poses = sample_rig_from_object(300, 850.0, points.mean(0), tilted, torch.Generator().manual_seed(0)).reshape(300, 1)
     uv = rig.project(poses.apply(points).squeeze(1)).uv.unsqueeze(1)
     observations = Observations(uv, torch.full_like(uv[..., 0], 0.05), torch.ones(uv.shape[:-1], dtype=torch.bool))

@@ -12,7 +12,7 @@ from imgcal.evaluation.protocol import Sample, draw
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.io import load_object, load_rig
 from imgcal.synthesis import Corruption
-from imgcal.synthesis.rigs import RelativeDrift
+from imgcal.synthesis.rigs import PoseRange, RelativeDrift
 from imgcal.types.prediction import Prediction
 
 Make = Callable[..., Conditions]
@@ -78,4 +78,4 @@ class Fake(nn.Module):
 
 def straight_down(conditions: Conditions) -> Conditions:
     """Only the pose that `Fake` knows, but for the object's roll."""
-    return replace(conditions, pose_range=replace(conditions.pose_range, theta=(0, 0), phi=(0, 0), alpha=(0, 0)))
+    return replace(conditions, pose_range=PoseRange(theta_deg=(0, 0), phi_deg=(0, 0), alpha_deg=(0, 0)))

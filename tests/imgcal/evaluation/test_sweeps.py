@@ -1,5 +1,3 @@
-import math
-
 import pytest
 import torch
 
@@ -21,8 +19,8 @@ def test_the_error_of_the_factory_rig_grows_with_the_perturbation(conditions):
 
 def test_the_angle_is_that_of_the_rig(conditions):
     known = AXES["phi"].at(conditions(), 30.0)
-    assert known.pose_range.phi == (math.radians(30), math.radians(30))
-    assert known.pose_range.theta == conditions().pose_range.theta
+    assert known.pose_range.phi_deg == (30, 30)
+    assert known.pose_range.theta_deg == conditions().pose_range.theta_deg
 
 
 @pytest.mark.parametrize("kind", ["noise", "missing", "swapped", "false"])

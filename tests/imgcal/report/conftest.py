@@ -78,7 +78,7 @@ def calibrated(
     drift = PhysicalDrift(rotation_deg=0.4, position=3.0)
     truth = synthesize(factory, obj, 1, generator, drift=drift).rig[0]
     poses = sample_rig_from_object(
-        snapshots, factory.working_distance or 850.0, obj.points.mean(0), PoseRange(phi=(0.0, 0.9)), generator
+        snapshots, factory.working_distance or 850.0, obj.points.mean(0), PoseRange(phi_deg=(0.0, 52.0)), generator
     )
     image = truth.expand(snapshots).project(poses.apply(obj.points))
     uv = image.uv + SIGMA * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)

@@ -85,5 +85,5 @@ def test_gradient_by_uv(asymmetric8):
 
 @pytest.mark.parametrize(("size", "dot"), [(4, 1.5), (100_000, 1.5), (224, 0.0), (224, math.nan), (224, 300.0)])
 def test_impossible_options_are_refused(size, dot):
-    with pytest.raises(InputError, match=r"image size|dot"):
+    with pytest.raises(InputError, match=r"^size: found|^dot: found"):
         ImageOptions(size, dot)

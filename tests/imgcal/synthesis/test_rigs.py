@@ -86,17 +86,17 @@ def test_rigs_are_on_the_hemisphere_and_look_at_the_object() -> None:
 
 def test_pose_ranges() -> None:
     centroid = torch.zeros(3, dtype=torch.float64)
-    narrow = PoseRange(theta=(0.1, 0.2), phi=(0.3, 0.4), alpha=(1.0, 1.0))
+    narrow = PoseRange(theta_deg=(6.0, 12.0), phi_deg=(17.0, 23.0), alpha_deg=(57.0, 57.0))
     x, y, z = sample_rig_from_object(300, 1.0, centroid, narrow, seeded()).inverse().translation.unbind(-1)
-    theta, phi = torch.atan2(y, x), z.acos()
-    assert theta.min() >= 0.1 and theta.max() <= 0.2
-    assert phi.min() >= 0.3 and phi.max() <= 0.4
+    theta, phi = torch.atan2(y, x).rad2deg(), z.acos().rad2deg()
+    assert theta.min() >= 6.0 and theta.max() <= 12.0
+    assert phi.min() >= 17.0 and phi.max() <= 23.0
     overhead = sample_rig_from_object(50, 1.0, centroid, PoseRange.overhead(), seeded()).inverse().translation
     torch.testing.assert_close(overhead, torch.tensor([0.0, 0.0, 1.0]).double().expand(50, 3))
 
 
 def test_roll_zero_leaves_the_azimuth_direction_on_the_x_axis() -> None:
-    upright = PoseRange(theta=(0.0, 0.0), phi=(math.pi / 4, math.pi / 4), alpha=(0.0, 0.0))
+    upright = PoseRange(theta_deg=(0.0, 0.0), phi_deg=(45.0, 45.0), alpha_deg=(0.0, 0.0))
     rotation = sample_rig_from_object(1, 1.0, torch.zeros(3).double(), upright, seeded()).rotation[0]
     h = math.sqrt(0.5)
     expected = torch.tensor([[0.0, 1.0, 0.0], [h, 0.0, -h], [-h, 0.0, -h]], dtype=torch.float64)

@@ -45,7 +45,7 @@ def test_a_network_comes_back(made, path):
     assert found.metrics == {"re_px": 1.5}
     assert found.experiment == experiment
     assert found.obj.name == "asymmetric8"
-    torch.testing.assert_close(found.drift_std, experiment.drift.drift().std(load_rig("T4")), rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(found.drift_std, experiment.drift.std(load_rig("T4")), rtol=1e-9, atol=1e-12)
 
 
 DEEP = '{"a":' * 200 + "1" + "}" * 200

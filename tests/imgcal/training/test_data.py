@@ -14,8 +14,8 @@ def source(experiment):
     return Source(
         setup.load_rig().to(torch.float32),
         object_to(setup.load_object(), "cpu"),
-        setup.drift.drift(),
-        setup.poses.pose_range(),
+        setup.drift,
+        setup.poses,
     )
 
 

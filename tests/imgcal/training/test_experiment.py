@@ -3,7 +3,8 @@ import math
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.synthesis.rigs import PhysicalDrift, PoseRange, RelativeDrift
+from imgcal.synthesis import ImageOptions
+from imgcal.synthesis.rigs import PhysicalDrift, PoseRange, RelativeDrift, drift_of
 from imgcal.training.experiment import changed, load_experiment, save_experiment
 from tests.imgcal.training.toy import EXPERIMENT
 
@@ -13,8 +14,8 @@ def test_what_is_not_given_has_a_default(experiment):
     assert made.training.steps == 60
     assert made.training.minutes is None
     assert made.loss.kind == "robust"
-    assert made.poses.pose_range() == PoseRange.overhead()
-    assert made.drift.drift() == RelativeDrift(0.01, 0.01)
+    assert made.poses == PoseRange.overhead()
+    assert made.drift == RelativeDrift(0.01, 0.01)
     assert made.load_rig().cameras == 4
     assert made.load_object().fiducials == 8
 
@@ -32,14 +33,27 @@ def test_a_resolved_experiment_is_the_same(experiment, tmp_path):
 
 def test_physical_drift(experiment):
     made = experiment("drift={rotation_deg: 0.5, position: 2}")
-    assert made.drift.drift() == PhysicalDrift(0.5, 2.0, 0.0, 0.0, 0.0)
-    assert experiment("drift={kappa_intrinsics: 0.1}").drift.drift() == RelativeDrift(0.1, 0.0)
+    assert made.drift == PhysicalDrift(0.5, 2.0, 0.0, 0.0, 0.0)
+    assert experiment("drift={kappa_intrinsics: 0.1}").drift == RelativeDrift(0.1, 0.0)
 
 
 def test_degrees_become_radians(experiment):
-    poses = experiment("poses={phi_deg: [10, 45]}").poses.pose_range()
-    assert poses.phi == (math.radians(10), math.radians(45))
-    assert poses.theta == poses.alpha == (0.0, 2 * math.pi)
+    poses = experiment("poses={phi_deg: [10, 45]}").poses
+    theta, phi, alpha = poses.radians
+    assert phi == (math.radians(10), math.radians(45))
+    assert theta == alpha == (0.0, 2 * math.pi)
+
+
+def test_blocks_may_say_nothing(experiment):
+    made = experiment("poses={}", "corruption={}", "drift={}", "images={}")
+    assert made.poses == PoseRange() and made.corruption.nothing
+    assert made.drift == RelativeDrift(0.0, 0.0)
+    assert made.images == ImageOptions()
+
+
+def test_drift_as_older_files_have_it():
+    values = {"kappa_intrinsics": 0.05, "kappa_extrinsics": 0.01, "rotation_deg": None, "position": None}
+    assert drift_of(values) == RelativeDrift(0.05, 0.01)
 
 
 def test_changes_are_applied_in_order(experiment):
@@ -62,6 +76,13 @@ def test_changes_are_applied_in_order(experiment):
         ("poses.phi_deg=[90, 0]", "poses: phi_deg: found [90, 0], expected the smaller angle first"),
         ("poses.phi_deg=[90]", "phi_deg: found 1 values"),
         ("corruption.noise=.inf", "corruption: noise: found inf"),
+        ("corruption.noize=1", "corruption: unknown key `noize`, nearest: noise"),
+        ("drift={positon: 1}", "drift: unknown key `positon`, nearest: position"),
+        ("drift={kapa_intrinsics: 0.1}", "drift: unknown key `kapa_intrinsics`, nearest: kappa_intrinsics"),
+        ("drift=3", "drift: found 3"),
+        ("images={size: 2}", "images: size: found 2, expected greater than or equal to 8"),
+        ("images={size: 20, dot: 30.0}", "images: dot: found 30.0, expected less than the 20 pixels"),
+        ("poses={phi_deg: [0, 400]}", "poses: phi_deg[1]: found 400, expected less than or equal to 360"),
         ("loss.kind=best", "loss: kind: found 'best'"),
         ("training.steps", "found no key and value"),
         ("=3", "found no key and value"),
