@@ -80,4 +80,8 @@ def _first(blobs: Blobs, kept: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Rows of the kept blobs without those that lie on an earlier one: components of one blob found in pieces."""
     rows = np.flatnonzero(kept)
     pixel = np.rint(blobs.uv[rows]).astype(np.int64)
-    return rows[np.sort(np.unique((pixel[:, 1] << 32) + pixel[:, 0], return_index=True)[1])]
+    places = ((pixel[:, 1] << 32) + pixel[:, 0]).tolist()
+    if len(set(places)) == len(places):
+        return rows
+    first = dict(zip(reversed(places), reversed(rows.tolist()), strict=True))
+    return np.array(sorted(first.values()))

@@ -124,7 +124,7 @@ def _of_any_size(frame: Frame, options: DetectionOptions, scale: int) -> Blobs:
     kept = usual_size(blobs, limit)
     blobs = blobs if kept.all() else blobs.select(kept)
     enough = usable(blobs).sum() >= FEW
-    if enough and screening.bulk(LARGER, 2 * LARGEST) < 0.5 * scale * np.median(blobs.contrast):
+    if enough and not screening.holds(0.5 * scale * float(np.median(blobs.contrast)), LARGER, 2 * LARGEST):
         return blobs
     wide = _find(frame, replace(options, max_radius=LARGEST), scale)
     wide = wide.select(usual_size(wide, limit))
