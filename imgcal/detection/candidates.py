@@ -159,7 +159,8 @@ def _levels(contrast: NDArray[np.generic], options: DetectionOptions, scale: int
     """Estimate what the opening leaves of an empty background, and how far above it a candidate must stand."""
     sample = np.sort(contrast[::8, ::8], axis=None, kind="stable")  # by radix: these are integers
     lower = sample[: max(1, int(0.6 * sample.size))]  # without the blobs and most of the texture
-    noise = 1.54 * float(lower.std())  # the standard deviation of a normal variable below its 60th percentile
+    spread = float(cv2.meanStdDev(lower)[1][0, 0])
+    noise = 1.54 * spread  # the standard deviation of a normal variable below its 60th percentile
     level = max(NOISE_FACTOR * noise, LEAST_CONTRAST * scale)
     if options.threshold is not None:
         level = max(level, 0.2 * options.threshold)  # a block mean holds at least this part of a small blob's peak
