@@ -61,11 +61,6 @@ class Candidates:
     label: NDArray[np.int32]  # (M,) number of the component in `labels`
     whole: NDArray[np.int64]  # (M, 4) box of what the component is a part of: its own where it is whole
 
-    @property
-    def parted(self) -> NDArray[np.bool_]:
-        """Mark the components that are parts of a larger one: (M,)."""
-        return (self.whole != self.boxes).any(1)
-
 
 def screen(frame: Frame, options: DetectionOptions, scale: int) -> Screening:
     """Find the blocks of `frame` that are brighter (darker) than their surroundings.
