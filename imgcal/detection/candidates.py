@@ -62,17 +62,14 @@ class Candidates:
     whole: NDArray[np.int64]  # (M, 4) box of what the component is a part of: its own where it is whole
 
 
-def screen(frame: Frame, options: DetectionOptions, scale: int) -> Screening:
-    """Find the blocks of `frame` that are brighter (darker) than their surroundings.
+def screen(means: Frame, options: DetectionOptions, scale: int) -> Screening:
+    """Find the blocks of a frame that are brighter (darker) than their surroundings.
 
     Args:
-        frame: (H, W) grey values.
-        options: polarity, threshold and radii.
-        scale: largest grey value, for the inversion of dark blobs.
+        means: (R, Q) grey levels of its blocks.
+        options: threshold and radii.
+        scale: largest grey value.
     """
-    means = _block_means(frame)
-    if options.polarity == "dark":
-        means = scale - means
     # An opening follows steps of the background (paper on a table), which a median would smear; blobs are smaller.
     side = math.ceil((2 * options.radius_limit + 6) / BLOCK) + 1
     background = cv2.morphologyEx(means, cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
@@ -80,7 +77,8 @@ def screen(frame: Frame, options: DetectionOptions, scale: int) -> Screening:
     floor, level = _levels(contrast, options, scale)
     local_peak = cv2.dilate(contrast, np.ones((3, 3), np.uint8))
     # Blocks that stand out, and those next to them that hold something.
-    blocks = np.flatnonzero((local_peak > int(floor + level)) & (contrast > int(floor + EDGE * level)))
+    blocks = np.flatnonzero(local_peak > int(floor + level))
+    blocks = blocks[contrast.reshape(-1)[blocks] > int(floor + EDGE * level)]
     local_peak = local_peak.ravel()[blocks] - floor
     # The mean of the 3 x 3 pixels around a pixel has 4/3 of the noise of a block mean.
     excess = np.maximum(level * 4 / 3, PEAK_FRACTION * local_peak)
@@ -104,9 +102,7 @@ def outline(frame: Frame, screening: Screening, options: DetectionOptions, scale
     level = screening.base + screening.excess
     raised, excess = np.arange(count), screening.excess
     for _ in range(LEVELS):
-        _threshold(smooth, level, labels)
-        boxes = _connect(screening.blocks, tile, labels)
-        small = (boxes[:, 2:] - boxes[:, :2]).max(1, initial=0) < largest
+        boxes, small = _connect(screening.blocks, tile, smooth, level, labels, largest)
         if small.all():
             break
         oversize = np.append(~small, False)[labels[raised + 1] - 1].any((1, 2))  # label 0, of no component: the last
@@ -116,22 +112,26 @@ def outline(frame: Frame, screening: Screening, options: DetectionOptions, scale
     whole = boxes
     if _split(screening.blocks, screening.base, tile, smooth, labels, len(boxes), saturation, level):
         merged = labels.copy()
-        _threshold(smooth, level, labels)
-        boxes = _connect(screening.blocks, tile, labels)
+        boxes, small = _connect(screening.blocks, tile, smooth, level, labels, largest)
         whole = whole[_parents(merged, labels, len(boxes))]
-        small = (boxes[:, 2:] - boxes[:, :2]).max(1, initial=0) < largest
     label = np.arange(1, len(boxes) + 1, dtype=np.int32)
     if small.all():
         return Candidates(tile, labels, boxes, label, whole)
     return Candidates(tile, labels, boxes[small], label[small], whole[small])
 
 
-def _block_means(frame: Frame) -> Frame:
-    """Average blocks of 4 x 4: (ceil(H / 4), ceil(W / 4)). Beyond the border the last row or column repeats."""
+def block_means(frame: Frame, options: DetectionOptions, scale: int) -> Frame:
+    """Average blocks of 4 x 4: (ceil(H / 4), ceil(W / 4)). Beyond the border the last row or column repeats.
+
+    Args:
+        frame: (H, W) grey values.
+        options: polarity.
+        scale: largest grey value, from which those of frames with dark blobs are subtracted.
+    """
     height, width = (-(-n // BLOCK) for n in frame.shape)
     means = np.empty((height, width), frame.dtype)
     _average(frame, np.empty(BLOCK * width, np.uint16 if frame.dtype == np.uint8 else np.uint32), means)
-    return means
+    return scale - means if options.polarity == "dark" else means
 
 
 @njit(cache=True, nogil=True)
@@ -186,16 +186,6 @@ def _smooth_tiles(frame, blocks, tile, invert):
                     smooth[k, v % BLOCK, (u - 1) % BLOCK] = np.float32(invert) - mean if invert >= 0 else mean
                 before, now = now, after
     return smooth
-
-
-@njit(cache=True, nogil=True)
-def _threshold(smooth, level, labels):
-    """Mark the pixels above the level of their tile (K,) by -1, all others by 0; tile 0 is empty."""
-    labels[0] = 0
-    for k in range(len(smooth)):
-        for i in range(BLOCK):
-            for j in range(BLOCK):
-                labels[k + 1, i, j] = -1 if smooth[k, i, j] > level[k] else 0
 
 
 @njit(cache=True, nogil=True)
@@ -297,8 +287,17 @@ def _place(tile, v, u):
 
 
 @njit(cache=True, nogil=True)
-def _connect(blocks, tile, labels):
-    """Number the components (eight neighbours) of the marked pixels from 1, in place; return their boxes (M, 4)."""
+def _connect(blocks, tile, smooth, level, labels, largest):
+    """Number the components (eight neighbours) of the pixels above the level (K,) of their tile from 1, all others 0.
+
+    Returns:
+        Their boxes (M, 4), and which are smaller than `largest` (M,).
+    """
+    labels[0] = 0
+    for k in range(len(smooth)):
+        for i in range(BLOCK):
+            for j in range(BLOCK):
+                labels[k + 1, i, j] = -1 if smooth[k, i, j] > level[k] else 0
     flat = labels.reshape(-1)
     stack = np.empty((4 * BLOCK * BLOCK * len(blocks), 2), np.int32)  # a run of L pixels touches at most L + 3 runs
     boxes = np.empty((4 * len(blocks), 4), np.int64)  # no more than four separate pixels fit into a tile
@@ -310,7 +309,12 @@ def _connect(blocks, tile, labels):
                 if labels[k + 1, i, j] < 0:
                     count += 1
                     _fill(flat, tile, top + i, left + j, count, stack, boxes[count - 1])
-    return boxes[:count] - BLOCK
+    boxes, small = boxes[:count], np.empty(count, np.bool_)
+    for c in range(count):
+        for side in range(4):
+            boxes[c, side] -= BLOCK
+        small[c] = max(boxes[c, 2] - boxes[c, 0], boxes[c, 3] - boxes[c, 1]) < largest
+    return boxes, small
 
 
 @njit(cache=True, nogil=True)

@@ -60,8 +60,7 @@ def measure(frame: Frame, candidates: Candidates, options: DetectionOptions, sca
 def _first(blobs: Blobs, kept: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Rows of the kept blobs without those that lie on an earlier one: components of one blob found in pieces."""
     rows = np.flatnonzero(kept)
-    pixel = np.rint(blobs.uv[rows]).astype(np.int64)
-    places = ((pixel[:, 1] << 32) + pixel[:, 0]).tolist()
+    places = [(round(u), round(v)) for u, v in blobs.uv[rows].tolist()]
     if len(set(places)) == len(places):
         return rows
     first = dict(zip(reversed(places), reversed(rows.tolist()), strict=True))

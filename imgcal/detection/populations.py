@@ -22,6 +22,7 @@ LEAST_BRIGHT = 3  # blobs in a frame that the bright population must have
 ONE_SIZE = 1.6  # ratio of radii of markers of one size
 LEAST_LARGE = 3  # blobs of one size beyond the usual ones that must be there
 OFTEN = 0.25  # share of a camera's frames that must have a limit for the others to take it over
+_UNUSABLE = int(UNUSABLE)
 
 
 def dim_limits(
@@ -45,7 +46,7 @@ def dim_limits(
 
 def usable(blobs: Blobs) -> NDArray[np.bool_]:
     """Mark blobs whose centres may be used: (K,)."""
-    return (blobs.flags & int(UNUSABLE)) == 0
+    return (blobs.flags & _UNUSABLE) == 0
 
 
 def usual_size(blobs: Blobs, limit: float) -> NDArray[np.bool_]:

@@ -5,7 +5,7 @@ import pytest
 from scipy.special import ndtr
 
 from imgcal.detection import DetectionOptions
-from imgcal.detection.candidates import outline, screen
+from imgcal.detection.candidates import block_means, outline, screen
 from imgcal.detection.centroids import measure
 from imgcal.detection.kernels import half_size
 from imgcal.types.observations import BlobFlag
@@ -33,7 +33,7 @@ def crowded_frame(seed, bits=8, peak=200.0):
 
 
 def candidates_of(frame, options, scale):
-    screening = screen(frame, options, scale)
+    screening = screen(block_means(frame, options, scale), options, scale)
     return screening, outline(frame, screening, options, scale)
 
 
