@@ -44,10 +44,11 @@ class Screening:
     def holds(self, height: float, least: float, most: float) -> bool:
         """Tell whether anything `height` grey levels bright is wider than `least` (px) and narrower than `most`."""
         cells = self.means[::4, ::4].copy()
-        wide, wider = (np.ones((math.ceil(width / (4 * BLOCK)),) * 2, np.uint8) for width in (least, most))
-        if int(cv2.erode(cells, wide).max()) - int(cells.min()) < height:  # nothing wide is that bright
+        wide, wider = (math.ceil(width / (4 * BLOCK)) for width in (least, most))
+        worn = cv2.erode(cells, np.ones((wide, wide), np.uint8))
+        if int(worn.max()) - int(cells.min()) < height:  # nothing at all is: so it is nearly always
             return False
-        opened = (cv2.morphologyEx(cells, cv2.MORPH_OPEN, side) for side in (wide, wider))
+        opened = (cv2.morphologyEx(cells, cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) for side in (wide, wider))
         return float(cv2.subtract(*opened).max()) >= height
 
 

@@ -126,11 +126,17 @@ def _of_any_size(frame: Frame, options: DetectionOptions, scale: int) -> Blobs:
     kept = usual_size(blobs, limit)
     blobs = blobs if kept.all() else blobs.select(kept)
     enough = np.count_nonzero(usable(blobs)) >= FEW
-    if enough and not screening.holds(0.5 * scale * float(np.median(blobs.contrast)), LARGER, 2 * LARGEST):
+    if enough and not screening.holds(0.5 * scale * _median(blobs.contrast), LARGER, 2 * LARGEST):
         return blobs
     wide = _find(frame, means, replace(options, max_radius=LARGEST), scale)
     wide = wide.select(usual_size(wide, limit))
     return wide if (wide.radius > limit).any() else blobs
+
+
+def _median(values: NDArray[np.float64]) -> float:
+    """Do what `np.median` does for some values (K,), in a tenth of the time."""
+    ordered, middle = np.sort(values), len(values) // 2
+    return float(ordered[middle] + ordered[-1 - middle]) / 2
 
 
 def _find(frame: Frame, means: Frame, options: DetectionOptions, scale: int) -> Blobs:
