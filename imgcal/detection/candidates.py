@@ -48,8 +48,8 @@ class Screening:
         worn = cv2.erode(cells, np.ones((wide, wide), np.uint8))
         if int(worn.max()) - int(cells.min()) < height:  # nothing at all is: so it is nearly always
             return False
-        opened = (cv2.morphologyEx(cells, cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) for side in (wide, wider))
-        return float(cv2.subtract(*opened).max()) >= height
+        large, larger = (cv2.morphologyEx(cells, cv2.MORPH_OPEN, np.ones((n, n), np.uint8)) for n in (wide, wider))
+        return float(cv2.subtract(large, larger).max()) >= height
 
 
 @dataclass(frozen=True)

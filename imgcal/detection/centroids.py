@@ -14,6 +14,7 @@ from imgcal.detection.candidates import Candidates
 from imgcal.detection.kernels import measure_all
 from imgcal.detection.options import DetectionOptions, Frame
 
+
 @dataclass(frozen=True)
 class Blobs:
     """Measured blobs of one snapshot, one row each; see `Detections` for the columns."""

@@ -25,9 +25,7 @@ OFTEN = 0.25  # share of a camera's frames that must have a limit for the others
 _UNUSABLE = int(UNUSABLE)
 
 
-def dim_limits(
-    contrast: NDArray[np.floating], group: NDArray[np.integer], groups: int
-) -> NDArray[np.float64]:
+def dim_limits(contrast: NDArray[np.floating], group: NDArray[np.integer], groups: int) -> NDArray[np.float64]:
     """Contrast (G,) that separates two populations of a group of blobs, 0 where there is one.
 
     Args:
