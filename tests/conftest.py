@@ -1,4 +1,4 @@
-"""Fixtures for all tests."""
+"""Fixtures for all tests, and which tests run by default."""
 
 import os
 from pathlib import Path
@@ -8,6 +8,31 @@ import pytest
 from imgcal.io import load_object, load_rig
 from imgcal.types.calibration_object import CalibrationObject
 from imgcal.types.rig import CameraRig
+
+LEFT_OUT = pytest.StashKey[int]()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--benchmarks", action="store_true", help="run the smokes of the benchmarks (minutes), too")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out the benchmarks' smokes, unless they are asked for: by --benchmarks, by -m, or by their file's name."""
+    named = any("test_benchmark" in argument for argument in config.args)
+    if config.getoption("--benchmarks") or config.option.markexpr or named:
+        return
+    left = [item for item in items if item.get_closest_marker("benchmark")]
+    if left:
+        config.stash[LEFT_OUT] = len(left)
+        config.hook.pytest_deselected(items=left)
+        items[:] = [item for item in items if item not in set(left)]
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    if left := config.stash.get(LEFT_OUT, 0):
+        terminalreporter.write_line(
+            f"{left} smokes of benchmarks were left out: run them with --benchmarks", yellow=True
+        )
 
 
 @pytest.fixture(scope="session")

@@ -5,8 +5,7 @@ import torch
 
 from imgcal.association.options import PipelineOptions
 from imgcal.io import load_object, load_rig
-from scripts.benchmarks.honesty_prediction import GATE, PAGE, RESULT, RIGS, SNAPSHOTS, Case, judge, measure, table
-from scripts.output import read_json
+from scripts.benchmarks.honesty_prediction import Case, judge, measure, table
 
 
 @pytest.mark.parametrize(("rig", "snapshots"), [("U7", 5), ("T4", 20)])
@@ -42,12 +41,3 @@ def test_all_kinds_run():
     result = measure(1, (2,))
     assert list(result["rigs"]) == ["O10", "U7", "T4", "room10"]
     assert table(result).count("\n") == 5
-
-
-def test_the_committed_result_is_complete_within_the_gate_and_on_the_page():
-    result = read_json(RESULT)
-    assert {rig: tuple(map(int, sizes)) for rig, sizes in result["rigs"].items()} == dict.fromkeys(RIGS, SNAPSHOTS)
-    for row in (row for sizes in result["rigs"].values() for row in sizes.values()):
-        assert row["captures"] >= 200 and row["refused"] == 0
-        assert all(GATE[0] < row[unit]["ratio"] < GATE[1] for unit in ("px", "mm"))
-    assert table(result) in PAGE.read_text("utf-8")

@@ -1,6 +1,10 @@
 """The suite of benchmarks: its command, its page, and how it takes times."""
 
+import sys
 import time
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
 
 import pytest
 
@@ -9,6 +13,7 @@ from scripts.benchmarks import __main__ as suite
 from scripts.timing import side_by_side
 
 
+@pytest.mark.benchmark
 def test_a_benchmark_writes_its_result_its_plot_and_the_page(tmp_path, capsys, monkeypatch):
     folder = tmp_path / "benchmarks"
     assert suite.main(["networks", "--smoke", "--out", str(folder)]) == 0
@@ -16,6 +21,33 @@ def test_a_benchmark_writes_its_result_its_plot_and_the_page(tmp_path, capsys, m
     page = (tmp_path / "benchmarks.md").read_text()
     assert "| networks | " in page and "**points-O10-cube8**" in page
     assert "networks latency" in capsys.readouterr().out
+
+
+FOLDER = Path(suite.__file__).parent
+NEEDS = {"splats_warp": "warp", "mrcal_worker": "mrcal"}  # others import their peer when it is used
+MODULES = [".".join(path.relative_to(FOLDER).with_suffix("").parts) for path in sorted(FOLDER.rglob("[a-z]*.py"))]
+WITH_COMMAND = [name for name in MODULES if "\n    command(" in (FOLDER / f"{name.replace('.', '/')}.py").read_text()]
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_every_module_can_be_imported(name):
+    needed = NEEDS.get(name.rpartition(".")[2])
+    if needed and not find_spec(needed):
+        pytest.skip(f"{needed} is not installed")
+    import_module(f"scripts.benchmarks.{name}")
+
+
+@pytest.mark.parametrize("name", ["__main__", *WITH_COMMAND])
+def test_every_command_tells_how_it_is_used(name, capsys, monkeypatch):
+    module = import_module(f"scripts.benchmarks.{name}")
+    monkeypatch.setattr(sys, "argv", [name, "--help"])
+    with pytest.raises(SystemExit) as stop:
+        module.main(["--help"]) if name == "__main__" else module.main()
+    assert not stop.value.code
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "usage:" in shown and len(shown) > 200
+    if name == "__main__":
+        assert all(option in shown for option in ("--smoke", "--out"))
 
 
 def test_every_benchmark_is_a_module_with_the_three_functions():

@@ -1,0 +1,36 @@
+"""Results of benchmarks as they are committed: whole, within what they promise, and on their pages."""
+
+from scripts.benchmarks import honesty_moves, honesty_prediction
+from scripts.output import read_json
+
+
+def test_moves_are_whole_and_shown():
+    result = read_json(honesty_moves.RESULT)
+    kinds = len(honesty_moves.SCENES)
+    assert set(result["steady"]) == set(honesty_moves.STEADY)
+    assert len(result["moves"]) == kinds * len(honesty_moves.DEGREES) * len(honesty_moves.SHARES)
+    assert len(result["images"]) == kinds * len(honesty_moves.IMAGES)
+    page = honesty_moves.PAGE.read_text("utf-8")
+    assert honesty_moves.steady_table(result) in page
+    assert all(honesty_moves.faults_table(result, part) in page for part in ("moves", "images"))
+
+
+def test_nothing_wrong_was_accepted_and_steady_rigs_were_left_alone():
+    result = read_json(honesty_moves.RESULT)
+    assert all(row["accepted"] == 0 for row in result["images"].values())
+    usual = [row for name, row in result["steady"].items() if not name.endswith("one way")]
+    assert sum(row["alarms"] for row in usual) <= 0.001 * sum(row["captures"] for row in usual)
+    # A third of a pixel in two of twenty snapshots of a wand is not to be seen.
+    plain = [row for name, row in result["moves"].items() if "0.02 deg" not in name]
+    assert sum(row["accepted"] for row in plain) <= 0.02 * sum(sum(row.values()) for row in plain)
+
+
+def test_predictions_are_complete_within_the_gate_and_on_the_page():
+    result = read_json(honesty_prediction.RESULT)
+    expected = dict.fromkeys(honesty_prediction.RIGS, honesty_prediction.SNAPSHOTS)
+    assert {rig: tuple(map(int, sizes)) for rig, sizes in result["rigs"].items()} == expected
+    low, high = honesty_prediction.GATE
+    for row in (row for sizes in result["rigs"].values() for row in sizes.values()):
+        assert row["captures"] >= 200 and row["refused"] == 0
+        assert all(low < row[unit]["ratio"] < high for unit in ("px", "mm"))
+    assert honesty_prediction.table(result) in honesty_prediction.PAGE.read_text("utf-8")
