@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.errors import InputError
+from imgcal.geometry import kernels
 from imgcal.types import CameraRig, Detections
 from renderers.compiling import njit
 
@@ -82,19 +83,12 @@ def gather(detections: Detections, rig: CameraRig) -> Blobs:
 
 @njit(cache=True)
 def _undistort(uv, count, focal, principal, distortion, ideal):
-    """Remove the distortion by fixed-point iteration: good to far less than a pixel, which is all that is needed."""
+    """Fill pixels from the principal point, without distortion; see `Blobs.ideal`."""
     for c in range(len(uv)):
         k1, k2, p1, p2, k3 = distortion[c]
         for m in range(count[c]):
             xd, yd = (uv[c, m, 0] - principal[c, 0]) / focal[c, 0], (uv[c, m, 1] - principal[c, 1]) / focal[c, 1]
-            x, y = xd, yd
-            for _ in range(10):
-                rr = x * x + y * y
-                radial = max(1 + rr * (k1 + rr * (k2 + rr * k3)), 0.2)
-                x, y = (
-                    (xd - 2 * p1 * x * y - p2 * (rr + 2 * x * x)) / radial,
-                    (yd - p1 * (rr + 2 * y * y) - 2 * p2 * x * y) / radial,
-                )
+            x, y = kernels.undistort(xd, yd, k1, k2, p1, p2, k3)
             mean = (focal[c, 0] + focal[c, 1]) / 2
             ideal[c, m, 0], ideal[c, m, 1] = mean * x, mean * y
 

@@ -12,12 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.association.blobs import Blobs
-from imgcal.estimation import Problem, Solution, lens
-from imgcal.estimation.lm_cpu import _exponential, _multiply
-from imgcal.geometry import NEAREST_DEPTH
+from imgcal.estimation import Problem, Solution
+from imgcal.geometry import NEAREST_DEPTH, kernels
 from renderers.compiling import njit
 
-FAST = {"contract", "reassoc", "nsz"}
 THRESHOLD = 3.0
 """Of the Cauchy loss of the fits, in standard deviations."""
 
@@ -121,16 +119,15 @@ def _contest(labels, squared, log_det, own, undecided, result):
                         break
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True, fastmath=kernels.FAST)
 def _factorize(blocks, coupling, kept):
     """Factorize the arrow in place; return the logarithm of its determinant, inf where it is not positive definite."""
     log_det = 0.0
     for c in range(len(blocks)):
-        part = _cholesky(blocks[c])
-        if part == np.inf:
+        if not kernels.cholesky(blocks[c]):
             return np.inf
-        log_det += part
         for i in range(15):
+            log_det += 2 * np.log(blocks[c, i, i])
             for j in range(6):
                 for k in range(i):
                     coupling[c, i, j] -= blocks[c, i, k] * coupling[c, k, j]
@@ -139,28 +136,14 @@ def _factorize(blocks, coupling, kept):
             for j in range(6):
                 for k in range(15):
                     kept[i, j] -= coupling[c, k, i] * coupling[c, k, j]
-    return log_det + _cholesky(kept)
-
-
-@njit(cache=True, fastmath=FAST)
-def _cholesky(matrix):
-    """Factorize the lower triangle in place; return the logarithm of the determinant, inf if not positive definite."""
-    log_det = 0.0
-    for j in range(len(matrix)):
-        for k in range(j):
-            matrix[j, j] -= matrix[j, k] * matrix[j, k]
-        if not matrix[j, j] > 0:
-            return np.inf
-        log_det += np.log(matrix[j, j])
-        matrix[j, j] = np.sqrt(matrix[j, j])
-        for i in range(j + 1, len(matrix)):
-            for k in range(j):
-                matrix[i, j] -= matrix[i, k] * matrix[j, k]
-            matrix[i, j] /= matrix[j, j]
+    if not kernels.cholesky(kept):
+        return np.inf
+    for i in range(6):
+        log_det += 2 * np.log(kept[i, i])
     return log_det
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True, fastmath=kernels.FAST)
 def _compare(
     rotation0, turn, position, focal, principal, distortion, spread, rotated, centre, radius_squared,
     eliminated, whitened, kept, blob_uv, blob_noise, typical_noise, blob_count, labels, extra,
@@ -171,8 +154,8 @@ def _compare(
     rotation, exponential, left = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     unit = max(1.0, np.sqrt(centre[0] ** 2 + centre[1] ** 2 + centre[2] ** 2))
     for c in range(len(rotation0)):
-        _exponential(turn[c], exponential, left)
-        _multiply(exponential, rotation0[c], rotation)
+        kernels.exponential(turn[c], exponential, left)
+        kernels.multiply(exponential, rotation0[c], rotation)
         for n in range(len(rotated)):
             _rows(
                 rotated[n], rotation, left, centre, position[c],
@@ -214,7 +197,7 @@ def _compare(
                 own[c, n] = squared[c, n, label]
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True, fastmath=kernels.FAST)
 def _rows(
     rotated, rotation, left, centre, position, focal, principal, distortion, spread, radius_squared, unit, rows, uv
 ):  # fmt: skip
@@ -228,7 +211,7 @@ def _rows(
     px = rotation[0, 0] * ox + rotation[0, 1] * oy + rotation[0, 2] * oz
     py = rotation[1, 0] * ox + rotation[1, 1] * oy + rotation[1, 2] * oz
     pz = rotation[2, 0] * ox + rotation[2, 1] * oy + rotation[2, 2] * oz
-    per_depth, log_slope, x, y, rr, xd, yd, jxx, jxy, jyy = lens(
+    per_depth, log_slope, x, y, rr, xd, yd, jxx, jxy, jyy = kernels.lens(
         px, py, max(pz, NEAREST_DEPTH), radius_squared,
         distortion[0], distortion[1], distortion[2], distortion[3], distortion[4],
     )  # fmt: skip
@@ -260,7 +243,7 @@ def _rows(
         rows[r, 25 - mixed] = focal[r] * (rr + 2 * at * at) * spread[25 - mixed]
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True, fastmath=kernels.FAST)
 def _whiten(rows, eliminated, whitened, kept, parts):
     """Apply the inverse of the arrow's triangular factor; return the covariance parts @ parts.T: uu, uv, vv."""
     for r in range(2):

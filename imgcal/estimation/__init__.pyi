@@ -16,7 +16,6 @@ from .covariance import (
 from .gauge import aligned
 from .levenberg_marquardt import Solution
 from .linearization import POSE_PARAMETERS, NormalEquations, Problem, State, linearize, moved, pose_at, rig_at
-from .lm_cpu import lens
 from .map_estimate import Estimate, EstimationOptions, conclude, estimate, make_loss, make_problem, make_start
 from .moves import find_moves
 from .object_shape import SNAPSHOTS_TO_BEND, FiducialOffset, ShapeEvidence, offsets
@@ -58,7 +57,6 @@ __all__ = [
     "flat_std",
     "initial_pose",
     "inverse_or_zero",
-    "lens",
     "linearize",
     "lm_cpu",
     "make_loss",

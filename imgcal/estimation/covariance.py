@@ -21,9 +21,8 @@ from imgcal.errors import RefusedError
 from imgcal.estimation.curvature import curvature_covariance
 from imgcal.estimation.levenberg_marquardt import Solution, factorize
 from imgcal.estimation.linearization import POSE_PARAMETERS, NormalEquations, points_at
-from imgcal.estimation.lm_cpu import cholesky, subtract_gram
 from imgcal.estimation.map_estimate import Estimate
-from imgcal.geometry import RigidTransform, cross_matrix, left_jacobian
+from imgcal.geometry import RigidTransform, cross_matrix, kernels, left_jacobian
 from imgcal.types import PARAMETERS, CameraRig
 from renderers.compiling import njit
 
@@ -156,7 +155,7 @@ def _doubles(*tensors: Tensor) -> tuple[NDArray[np.float64], ...]:
     return tuple(tensor.detach().double().numpy() for tensor in tensors)
 
 
-@njit(cache=True, fastmath={"contract", "reassoc", "nsz"})
+@njit(cache=True, fastmath=kernels.FAST)
 def _diagonal_without_poses(kept, coupling, poses, result):
     """First diagonal entries (D,) of the inverse of `kept` (K, K), less what poses (S, 6, 6) take that couple by
     (S, 6, K); overwrites `kept`, and gives nan where a factorization fails.
@@ -168,7 +167,7 @@ def _diagonal_without_poses(kept, coupling, poses, result):
         for i in range(size):
             for j in range(size):
                 lower[i, j] = poses[s, i, j]
-        determined = cholesky(lower) and determined
+        determined = kernels.cholesky(lower) and determined
         for i in range(size):
             inverse = 1 / lower[i, i]
             for j in range(wide):
@@ -178,8 +177,8 @@ def _diagonal_without_poses(kept, coupling, poses, result):
                     half[i, j] -= lower[i, k] * half[k, j]
             for j in range(wide):
                 half[i, j] *= inverse
-        subtract_gram(kept, half)
-    determined = cholesky(kept) and determined
+        kernels.subtract_gram(kept, half)
+    determined = kernels.cholesky(kept) and determined
     for j in range(len(result)):
         row[j] = 1 / kept[j, j]
         total = row[j] ** 2
@@ -242,14 +241,9 @@ def _diagonal(blocks, coupling, poses, result):
 @njit(cache=True)
 def _invert_factor(matrix):
     """Replace the lower triangle of a symmetric matrix by the inverse of its Cholesky factor, nan without one."""
-    for j in range(len(matrix)):
-        for i in range(j, len(matrix)):
-            for k in range(j):
-                matrix[i, j] -= matrix[i, k] * matrix[j, k]
-            if i == j:
-                matrix[j, j] = np.sqrt(matrix[j, j]) if matrix[j, j] > 0 else np.nan
-            else:
-                matrix[i, j] /= matrix[j, j]
+    if not kernels.cholesky(matrix):
+        for j in range(len(matrix)):
+            matrix[j, j] = np.nan
     for j in range(len(matrix)):
         matrix[j, j] = 1 / matrix[j, j]
         for i in range(j + 1, len(matrix)):

@@ -19,7 +19,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from imgcal.geometry import NEAREST_DEPTH, RigidTransform, left_jacobian, rotation_from_vector
+from imgcal.geometry import (
+    NEAREST_DEPTH,
+    RigidTransform,
+    distort_with_jacobian,
+    left_jacobian,
+    rotation_from_vector,
+)
 from imgcal.types import PARAMETERS, CameraRig
 
 POSE_PARAMETERS = 6
@@ -298,19 +304,14 @@ def _lens(points: Tensor, radius_squared: Tensor | None, focal: Tensor, distorti
     xy = points[..., :2, :] * per_depth
     x, y = xy[..., :1, :], xy[..., 1:, :]
     k1, k2, p1, p2, k3 = distortion.split(1, dim=-2)
-    xx, yy, xy2 = x * x, y * y, 2 * x * y
-    rr = xx + yy
-    radial = 1 + rr * (k1 + rr * (k2 + rr * k3))
-    growth = 2 * (k1 + rr * (2 * k2 + 3 * rr * k3))
-    by_p1 = torch.cat((xy2, rr + 2 * yy), dim=-2)
-    by_p2 = torch.cat((rr + 2 * xx, xy2), dim=-2)
-    jxx = radial + growth * xx + 2 * p1 * y + 6 * p2 * x
-    jxy = 0.5 * growth * xy2 + 2 * (p1 * x + p2 * y)
-    jyy = radial + growth * yy + 6 * p1 * y + 2 * p2 * x
+    xd, yd, jxx, jxy, jyy, rr = distort_with_jacobian(x, y, k1, k2, p1, p2, k3)
+    xy2 = 2 * x * y
+    by_p1 = torch.cat((xy2, rr + 2 * y * y), dim=-2)
+    by_p2 = torch.cat((rr + 2 * x * x, xy2), dim=-2)
     by_x = focal * per_depth * torch.cat((jxx, jxy), dim=-2)
     by_y = focal * per_depth * torch.cat((jxy, jyy), dim=-2)
     by_z = (by_x * x + by_y * y) * (log_slope / per_depth)
     by_k1 = xy * rr
     by_k2 = by_k1 * rr
     by_distortion = focal.unsqueeze(-3) * torch.stack((by_k1, by_k2, by_p1, by_p2, by_k2 * rr), dim=-3)
-    return _Lens(xy * radial + p1 * by_p1 + p2 * by_p2, torch.stack((by_x, by_y, by_z), dim=-3), by_distortion)
+    return _Lens(torch.cat((xd, yd), dim=-2), torch.stack((by_x, by_y, by_z), dim=-3), by_distortion)

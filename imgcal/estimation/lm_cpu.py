@@ -24,12 +24,11 @@ from imgcal.estimation.levenberg_marquardt import (
     pixel_rounding,
 )
 from imgcal.estimation.linearization import NormalEquations, ObjectEquations, Problem, State
-from imgcal.geometry import NEAREST_DEPTH, RigidTransform
+from imgcal.geometry import NEAREST_DEPTH, RigidTransform, kernels
 from imgcal.types import CameraRig
 from renderers.compiling import njit
 
 LOSS_CODES = {"squared": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3}
-_FAST = {"contract", "reassoc", "nsz"}  # nan and inf keep their meaning: a bad step must show
 
 
 def minimize(
@@ -178,7 +177,7 @@ def _arrays(tensors: tuple[Tensor, ...]) -> list[np.ndarray]:
     return [tensor.detach().contiguous().numpy() for tensor in tensors]
 
 
-@njit(parallel=True, cache=True, fastmath=_FAST)
+@njit(parallel=True, cache=True, fastmath=kernels.FAST)
 def _minimize_all(
     points, radius_squared, uv, root_weight, rotation0, position0, focal0, principal0, distortion0, spread, own_spread,
     offset, rotation, centre, own_offset,
@@ -196,7 +195,7 @@ def _minimize_all(
         )  # fmt: skip
 
 
-@njit(cache=True, fastmath=_FAST)
+@njit(cache=True, fastmath=kernels.FAST)
 def _minimize_rig(
     points, radius_squared, uv, root_weight, rotation0, position0, focal0, principal0, distortion0, spread, own_spread,
     offset, rotation, centre, own_offset,
@@ -264,7 +263,7 @@ def _minimize_rig(
         _copy(residual, best_blocks[7])
 
 
-@njit(cache=True, fastmath=_FAST)
+@njit(cache=True, fastmath=kernels.FAST)
 def _linearize_all(
     points, radius_squared, uv, root_weight, rotation0, position0, focal0, principal0, distortion0, spread, own_spread,
     offset, rotation, centre, own_offset,
@@ -284,7 +283,7 @@ def _linearize_all(
         cost[b] = _linearize(given, state, blocks, cameras_first, loss, threshold)
 
 
-@njit(cache=True, fastmath=_FAST)
+@njit(cache=True, fastmath=kernels.FAST)
 def _linearize(given, state, blocks, cameras_first, loss, threshold):
     """Fill the blocks of the normal equations and return the cost."""
     (
@@ -321,8 +320,8 @@ def _linearize(given, state, blocks, cameras_first, loss, threshold):
             camera_gradient[c, i] = offset[c, i]
             for j in range(15):
                 camera[c, i, j] = 1.0 if i == j else 0.0
-        _exponential(parameters[:3], turned, left)
-        _multiply(turned, rotation0[c], rotation_cam)
+        kernels.exponential(parameters[:3], turned, left)
+        kernels.multiply(turned, rotation0[c], rotation_cam)
         fx, fy = focal0[c, 0] + parameters[6], focal0[c, 1] + parameters[7]
         cx, cy = principal0[c, 0] + parameters[8], principal0[c, 1] + parameters[9]
         k1, k2, p1 = (
@@ -353,7 +352,7 @@ def _linearize(given, state, blocks, cameras_first, loss, threshold):
                     cost = np.inf
                 depth = max(point[2], NEAREST_DEPTH)
 
-                per_depth, log_slope, x, y, rr, xd, yd, jxx, jxy, jyy = lens(
+                per_depth, log_slope, x, y, rr, xd, yd, jxx, jxy, jyy = kernels.lens(
                     point[0], point[1], depth, radius_squared[n], k1, k2, p1, p2, k3
                 )
                 ru, rv = fx * xd + cx - uv[s, c, 0, n], fy * yd + cy - uv[s, c, 1, n]
@@ -415,7 +414,7 @@ def _linearize(given, state, blocks, cameras_first, loss, threshold):
     return cost
 
 
-@njit(cache=True, fastmath=_FAST)
+@njit(cache=True, fastmath=kernels.FAST)
 def _start_object(own_offset, blocks):
     """Clear the object's part of the blocks, put its prior there, and return the prior's cost."""
     _, coupling, _, border, _, _, own_gradient, _ = blocks
@@ -433,7 +432,7 @@ def _start_object(own_offset, blocks):
     return cost
 
 
-@njit(cache=True, fastmath=_FAST)
+@njit(cache=True, fastmath=kernels.FAST)
 def _add_object(rows, rows_own, ru, rv, c, s, n, blocks, cameras_first):
     """Add what one observation says of its fiducial's coordinates and of the object's scale."""
     _, coupling, _, border, _, _, own_gradient, _ = blocks
@@ -460,31 +459,7 @@ def _add_object(rows, rows_own, ru, rv, c, s, n, blocks, cameras_first):
             border[own, first + other] += rows_own[0, j] * mine_u + rows_own[1, j] * mine_v
 
 
-@njit(cache=True, fastmath=_FAST)
-def lens(px, py, depth, radius_squared, k1, k2, p1, p2, k3):
-    """Image of a point or sphere and its derivatives, like linearize._lens.
-
-    Returns:
-        x / px; the derivative of log x by depth; x, y, x^2 + y^2, the distorted x and y, and the symmetric
-        Jacobian of the distortion: xx, xy, yy.
-    """
-    squared = depth * depth
-    per_depth = depth / (squared - radius_squared)
-    log_slope = -(squared + radius_squared) / (depth * (squared - radius_squared))
-    x, y = px * per_depth, py * per_depth
-    xx, yy, xy2 = x * x, y * y, 2 * x * y
-    rr = xx + yy
-    radial = 1 + rr * (k1 + rr * (k2 + rr * k3))
-    growth = 2 * (k1 + rr * (2 * k2 + 3 * rr * k3))
-    xd = x * radial + p1 * xy2 + p2 * (rr + 2 * xx)
-    yd = y * radial + p1 * (rr + 2 * yy) + p2 * xy2
-    jxx = radial + growth * xx + 2 * p1 * y + 6 * p2 * x
-    jxy = 0.5 * growth * xy2 + 2 * (p1 * x + p2 * y)
-    jyy = radial + growth * yy + 6 * p1 * y + 2 * p2 * x
-    return per_depth, log_slope, x, y, rr, xd, yd, jxx, jxy, jyy
-
-
-@njit(cache=True, fastmath=_FAST)
+@njit(cache=True, fastmath=kernels.FAST)
 def _distribute(products, gradient, c, s, blocks, cameras_first):
     """Add the lower triangle of one camera's products with one snapshot to the blocks."""
     camera, coupling, pose, _, camera_gradient, pose_gradient, _, _ = blocks
@@ -505,7 +480,7 @@ def _distribute(products, gradient, c, s, blocks, cameras_first):
                 coupling[s, i, 15 * c + j] = products[15 + i, j]
 
 
-@njit(cache=True, fastmath=_FAST)
+@njit(cache=True, fastmath=kernels.FAST)
 def _solve(
     blocks, coupling, kept, border, right_blocks, right_kept, right_border, damping, factor, whitened, schur,
     step_blocks, step_kept, step_border,
@@ -530,7 +505,7 @@ def _solve(
     for p in range(count):
         for i in range(size):
             factor[p, i, i] *= 1 + damping
-        if not cholesky(factor[p]):
+        if not kernels.cholesky(factor[p]):
             return np.nan
         for i in range(size):
             # Forward substitution of the coupling and of the right-hand side.
@@ -544,7 +519,7 @@ def _solve(
             for j in range(wide):
                 whitened[p, i, j] *= inverse
     tall = whitened.reshape(count * size, wide)
-    subtract_gram(schur, tall)
+    kernels.subtract_gram(schur, tall)
     flat, right = np.empty(wide, dtype=schur.dtype), right_kept.reshape(-1)
     for j in range(wide):
         flat[j] = -right[j] if j < first_border else -right_border[j - first_border]
@@ -552,9 +527,9 @@ def _solve(
         forward = step_blocks[r // size, r % size]
         for j in range(wide):
             flat[j] -= tall[r, j] * forward
-    if not cholesky(schur):
+    if not kernels.cholesky(schur):
         return np.nan
-    _back_substitute_both(schur, flat)
+    kernels.cholesky_solve(schur, flat)
     gain = 0.0
     for p in range(count):
         for i in range(size):
@@ -578,53 +553,7 @@ def _solve(
     return gain
 
 
-@njit(cache=True, fastmath=_FAST)
-def subtract_gram(matrix, tall):
-    """Subtract tall.T @ tall from the lower triangle; the number of rows is divisible by three, as 6 and 15 are."""
-    # Three rows at once: the matrix is read and written a third as often.
-    for r in range(0, tall.shape[0], 3):
-        for i in range(tall.shape[1]):
-            first, second, third = tall[r, i], tall[r + 1, i], tall[r + 2, i]
-            for j in range(i + 1):
-                matrix[i, j] -= first * tall[r, j] + second * tall[r + 1, j] + third * tall[r + 2, j]
-
-
-@njit(cache=True, fastmath=_FAST)
-def cholesky(matrix):
-    """Factorize in place (lower triangle); false if not positive definite."""
-    for j in range(matrix.shape[0]):
-        diagonal = matrix[j, j]
-        for k in range(j):
-            diagonal -= matrix[j, k] * matrix[j, k]
-        if not diagonal > 0:
-            return False
-        diagonal = np.sqrt(diagonal)
-        matrix[j, j] = diagonal
-        inverse = 1 / diagonal
-        for i in range(j + 1, matrix.shape[0]):
-            value = matrix[i, j]
-            for k in range(j):
-                value -= matrix[i, k] * matrix[j, k]
-            matrix[i, j] = value * inverse
-    return True
-
-
-@njit(cache=True, fastmath=_FAST)
-def _back_substitute_both(lower, right):
-    """Solve lower @ lower.T @ x = right in place."""
-    size = len(right)
-    for i in range(size):
-        value = right[i]
-        for k in range(i):
-            value -= lower[i, k] * right[k]
-        right[i] = value / lower[i, i]
-    for i in range(size - 1, -1, -1):
-        right[i] /= lower[i, i]
-        for k in range(i):
-            right[k] -= lower[i, k] * right[i]
-
-
-@njit(cache=True, fastmath=_FAST)
+@njit(cache=True, fastmath=kernels.FAST)
 def _move(state, camera_step, pose_step, own_step, new):
     """Write the state plus a step to `new`, like linearize.moved."""
     offset, rotation, centre, own_offset = state
@@ -639,19 +568,19 @@ def _move(state, camera_step, pose_step, own_step, new):
         unit = max(1.0, np.sqrt(centre[s, 0] ** 2 + centre[s, 1] ** 2 + centre[s, 2] ** 2))
         for i in range(3):
             new_centre[s, i] = centre[s, i] + pose_step[s, 3 + i] * unit
-        _exponential(pose_step[s, :3], turned, left)
-        _multiply(turned, rotation[s], new_rotation[s])
+        kernels.exponential(pose_step[s, :3], turned, left)
+        kernels.multiply(turned, rotation[s], new_rotation[s])
 
 
-@njit(cache=True, fastmath=_FAST)
+@njit(cache=True, fastmath=kernels.FAST)
 def _turn_all(parameters, rotation0, translation0, rotation, translation):
     """Write cam_from_rig after steps of its rotation and position: with c = -R0' t0 + dc, t = -R c = E (t0 - R0 dc)."""
     turned, left = np.empty((3, 3), dtype=parameters.dtype), np.empty((3, 3), dtype=parameters.dtype)
     for b in range(parameters.shape[0]):
         for c in range(parameters.shape[1]):
             step = parameters[b, c]
-            _exponential(step[:3], turned, left)
-            _multiply(turned, rotation0[b, c], rotation[b, c])
+            kernels.exponential(step[:3], turned, left)
+            kernels.multiply(turned, rotation0[b, c], rotation[b, c])
             for i in range(3):
                 value = 0.0
                 for j in range(3):
@@ -659,39 +588,7 @@ def _turn_all(parameters, rotation0, translation0, rotation, translation):
                 translation[b, c, i] = value
 
 
-@njit(cache=True, fastmath=_FAST)
-def _exponential(vector, rotation, left):
-    """Rotation of a rotation vector and the left Jacobian there, like rotations.rotation_from_vector."""
-    squared = vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2
-    if squared < 1e-8:
-        a, b, c = 1 - squared / 6, 0.5 - squared / 24, 1 / 6 - squared / 120
-    else:
-        angle = np.sqrt(squared)
-        a, b = np.sin(angle) / angle, 2 * np.sin(0.5 * angle) ** 2 / squared
-        c = (angle - np.sin(angle)) / (squared * angle)
-    for i in range(3):
-        for j in range(3):
-            outer = vector[i] * vector[j] - (squared if i == j else 0.0)
-            unit = 1.0 if i == j else 0.0
-            rotation[i, j] = unit + b * outer
-            left[i, j] = unit + c * outer
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        rotation[k, j] += a * vector[i]
-        rotation[j, k] -= a * vector[i]
-        left[k, j] += b * vector[i]
-        left[j, k] -= b * vector[i]
-
-
-@njit(cache=True, fastmath=_FAST)
-def _multiply(first, second, result):
-    """Write a three-by-three matrix product."""
-    for i in range(3):
-        for j in range(3):
-            result[i, j] = first[i, 0] * second[0, j] + first[i, 1] * second[1, j] + first[i, 2] * second[2, j]
-
-
-@njit(cache=True, fastmath=_FAST)
+@njit(cache=True, fastmath=kernels.FAST)
 def _copy(destination, source):
     """Copy an array; a loop of its own, because that compiles several times faster than a slice assignment."""
     to, of = destination.reshape(-1), source.reshape(-1)
@@ -699,7 +596,7 @@ def _copy(destination, source):
         to[i] = of[i]
 
 
-@njit(cache=True, fastmath=_FAST)
+@njit(cache=True, fastmath=kernels.FAST)
 def _loss(squared, loss, threshold):
     """Robust loss and its slope, like robust.LOSSES."""
     if loss == 1:

@@ -1,3 +1,4 @@
+from . import kernels
 from .projection import (
     NEAREST_DEPTH,
     Projection,
@@ -30,6 +31,7 @@ __all__ = [
     "distort_with_jacobian",
     "euler_from_rotation",
     "geodesic_angle",
+    "kernels",
     "left_jacobian",
     "project_components",
     "project_cpu",

@@ -85,13 +85,10 @@ def project_components(
     inverse_depth = apparent_centre_scale(depth, radius) / depth.clamp_min(NEAREST_DEPTH)
     x, y = px * inverse_depth, py * inverse_depth
     k1, k2, p1, p2, k3 = distortion.unsqueeze(-2).unbind(-1)
-    xx, yy, xy2 = x * x, y * y, 2 * x * y
-    rr = xx + yy
-    radial = 1 + rr * (k1 + rr * (k2 + rr * k3))
+    xd, yd, _, rr = _distort(x, y, k1, k2, p1, p2, k3)
     fx, fy = focal_length.unsqueeze(-2).unbind(-1)
     cx, cy = principal_point.unsqueeze(-2).unbind(-1)
-    u = fx * (x * radial + p1 * xy2 + p2 * (rr + 2 * xx)) + cx
-    v = fy * (y * radial + p1 * (rr + 2 * yy) + p2 * xy2) + cy
+    u, v = fx * xd + cx, fy * yd + cy
     visible = is_inside(u, v, image_size) & (depth > NEAREST_DEPTH) & is_before_fold(rr, distortion)
     return Projection(torch.stack((u, v)).movedim(0, -1), depth, visible)
 
@@ -188,12 +185,22 @@ def distort_with_jacobian(
     x: Tensor, y: Tensor, k1: Tensor, k2: Tensor, p1: Tensor, p2: Tensor, k3: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Distorted point, its symmetric Jacobian (xx, xy, yy) and the squared radius."""
-    rr = x * x + y * y
-    radial = 1 + rr * (k1 + rr * (k2 + rr * k3))
+    xd, yd, radial, rr = _distort(x, y, k1, k2, p1, p2, k3)
     growth = 2 * (k1 + rr * (2 * k2 + 3 * rr * k3))
-    xd = x * radial + 2 * p1 * x * y + p2 * (rr + 2 * x * x)
-    yd = y * radial + p1 * (rr + 2 * y * y) + 2 * p2 * x * y
     jxx = radial + growth * x * x + 2 * p1 * y + 6 * p2 * x
     jxy = growth * x * y + 2 * p1 * x + 2 * p2 * y
     jyy = radial + growth * y * y + 6 * p1 * y + 2 * p2 * x
     return xd, yd, jxx, jxy, jyy, rr
+
+
+def _distort(
+    x: Tensor, y: Tensor, k1: Tensor, k2: Tensor, p1: Tensor, p2: Tensor, k3: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Distorted point, the factor of the radius, and the squared radius.
+
+    Source: Brown 1966, "Decentering Distortion of Lenses"; coefficients and their order as in OpenCV.
+    """
+    xx, yy, xy2 = x * x, y * y, 2 * x * y
+    rr = xx + yy
+    radial = 1 + rr * (k1 + rr * (k2 + rr * k3))
+    return x * radial + p1 * xy2 + p2 * (rr + 2 * xx), y * radial + p1 * (rr + 2 * yy) + p2 * xy2, radial, rr

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from imgcal.geometry import kernels
 from imgcal.geometry.projection import NEAREST_DEPTH, Projection
 from imgcal.geometry.transforms import RigidTransform
 from renderers.compiling import njit
@@ -52,14 +53,14 @@ def project_cpu(
     return Projection(torch.from_numpy(uv), torch.from_numpy(depth), torch.from_numpy(visible))
 
 
-@njit(cache=True, fastmath={"contract", "reassoc", "nsz"}, error_model="numpy")
+@njit(cache=True, fastmath=kernels.FAST, error_model="numpy")
 def _project(
     points: Array, radius_squared: Array, rotation: Array, translation: Array,
     focal_length: Array, principal_point: Array, distortion: Array, image_size: NDArray[Any], image: Array,
 ) -> None:  # fmt: skip
     # One output array and constants of the points' own type: with more of either, the inner loop is not vectorized.
     kind = points.dtype.type
-    nearest, zero, half, one, two = kind(NEAREST_DEPTH), kind(0), kind(0.5), kind(1), kind(2)
+    nearest, zero, half, one = kind(NEAREST_DEPTH), kind(0), kind(0.5), kind(1)
     for b in range(rotation.shape[0]):
         for c in range(rotation.shape[1]):
             r, t = rotation[b, c], translation[b, c]
@@ -71,7 +72,7 @@ def _project(
             k1, k2, p1, p2, k3 = distortion[b, c]
             width, height = kind(image_size[c, 0]) - half, kind(image_size[c, 1]) - half
             slope1, slope2, slope3 = kind(3) * k1, kind(5) * k2, kind(7) * k3
-            blind_from = kind(_blind_from(slope1, slope2, slope3))
+            blind_from = kind(kernels.blind_from(slope1, slope2, slope3))
             for n in range(points.shape[2]):
                 x, y, z = points[b, 0, n], points[b, 1, n], points[b, 2, n]
                 px = r00 * x + r01 * y + r02 * z + tx
@@ -80,24 +81,10 @@ def _project(
                 clamped = pz if pz > nearest else nearest
                 sphere = clamped * clamped - radius_squared[n]
                 per_depth = clamped / (sphere if sphere > half * clamped * clamped else half * clamped * clamped)
-                x, y = px * per_depth, py * per_depth
-                xx, yy, xy2 = x * x, y * y, two * x * y
-                rr = xx + yy
-                radial = one + rr * (k1 + rr * (k2 + rr * k3))
-                u = fx * (x * radial + p1 * xy2 + p2 * (rr + two * xx)) + cx
-                v = fy * (y * radial + p1 * (rr + two * yy) + p2 * xy2) + cy
+                x, y, _, _, _, rr = kernels.distort(one, px * per_depth, py * per_depth, k1, k2, p1, p2, k3)
+                u, v = fx * x + cx, fy * y + cy
                 slope = one + rr * (slope1 + rr * (slope2 + rr * slope3))
                 inside = (u >= -half) & (v >= -half) & (u <= width) & (v <= height)
                 visible = inside & (pz > nearest) & (slope > zero) & (rr < blind_from)
                 image[b, c, 0, n], image[b, c, 1, n], image[b, c, 2, n] = u, v, pz
                 image[b, c, 3, n] = one if visible else zero
-
-
-@njit(cache=True, error_model="numpy")
-def _blind_from(a: float, b: float, c: float) -> float:
-    """Squared radius at which 1 + a s + b s^2 + c s^3 has dipped to zero or below, like projection.is_before_fold."""
-    root = np.sqrt(b * b - 3 * a * c)
-    lowest = -a / (b + root) if b > 0 else (root - b) / (3 * c)
-    if lowest > 0 and 1 + lowest * (a + lowest * (b + lowest * c)) <= 0:
-        return lowest
-    return np.inf
