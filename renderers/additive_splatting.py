@@ -50,7 +50,7 @@ def profile(centre: Tensor, size: Tensor, start: Tensor | int, length: int) -> T
     return (math.sqrt(math.pi / 2) * size[..., None]) * cumulative.diff(dim=-1)
 
 
-def added(splats: Splats, image_size: tuple[int, int], out: Tensor | None = None) -> Tensor:
+def splat_additively(splats: Splats, image_size: tuple[int, int], out: Tensor | None = None) -> Tensor:
     """Draw splats into images.
 
     Args:

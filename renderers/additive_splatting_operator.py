@@ -24,8 +24,8 @@ Function = Callable[..., Any]
 _transformed: Callable[[], bool] = getattr(torch._C, "_are_functorch_transforms_active", lambda: True)
 
 
-def added(splats: Splats, image_size: tuple[int, int], out: Tensor | None = None) -> Tensor:
-    """Do the work of `additive_splatting.added`, which has the arguments, for tensors on the CPU."""
+def splat_additively(splats: Splats, image_size: tuple[int, int], out: Tensor | None = None) -> Tensor:
+    """Do the work of `additive_splatting.splat_additively`, which has the arguments, for tensors on the CPU."""
     if torch.compiler.is_compiling():
         images: Tensor = add_splats(*splats, *image_size)
         return images if out is None else out.copy_(images)
@@ -128,7 +128,7 @@ class _Gradients(torch.autograd.Function):
 def add_splats(
     uv: Tensor, sizes: Tensor, weight: Tensor, colours: Tensor, visible: Tensor, height: int, width: int
 ) -> Tensor:
-    """Draw splats: (B, K, height, width), see `additive_splatting.added`."""
+    """Draw splats: (B, K, height, width), see `additive_splatting.splat_additively`."""
     return additive_splatting_cpu.drawn(Splats(uv, sizes, weight, colours, visible), (height, width))[0]
 
 
@@ -188,7 +188,7 @@ def _images_by(visible: Tensor, image_size: tuple[int, int]) -> Function:
     """Images as a function of tensors."""
 
     def images(uv: Tensor, sizes: Tensor, weight: Tensor, colours: Tensor) -> Tensor:
-        return additive_splatting.added(Splats(uv, sizes, weight, colours, visible), image_size)
+        return additive_splatting.splat_additively(Splats(uv, sizes, weight, colours, visible), image_size)
 
     return images
 

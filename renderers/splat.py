@@ -93,18 +93,22 @@ def splat(
 
 def _add(splats: Splats, shape: tuple[int, ...], out: Tensor | None) -> Tensor:
     """Sum the splats in any order."""
-    added = additive_splatting_operator.added if splats.uv.device.type == "cpu" else additive_splatting.added
+    splat_additively = (
+        additive_splatting_operator.splat_additively
+        if splats.uv.device.type == "cpu"
+        else additive_splatting.splat_additively
+    )
     image_size = (shape[-2], shape[-1])
     if out is None:
-        return added(splats, image_size).view(shape)
+        return splat_additively(splats, image_size).view(shape)
     images, count = out.view(len(splats.uv), *shape[-3:]), len(splats.uv)
     if out.dtype == splats.uv.dtype:
-        added(splats, image_size, images)
+        splat_additively(splats, image_size, images)
         return out
     buffer = splats.uv.new_empty(min(count, IMAGES_PER_CONVERSION), *shape[-3:])
     for first in range(0, count, IMAGES_PER_CONVERSION):
         part = slice(first, min(first + IMAGES_PER_CONVERSION, count))
-        images[part] = added(Splats(*(x[part] for x in splats)), image_size, buffer[: part.stop - first])
+        images[part] = splat_additively(Splats(*(x[part] for x in splats)), image_size, buffer[: part.stop - first])
     return out
 
 

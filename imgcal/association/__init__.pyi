@@ -1,15 +1,15 @@
 from .ambiguities import lattice_shifts
 from .assignment import distances_to_nearest, mutual_nearest
-from .identification import bootstrap, identify, track
+from .identification import identify, relocalize, track
 from .options import PipelineOptions
 from .orientation import oriented
 from .result import Identity, IdentityOptions, Status
 from .series import (
-    Follower,
-    Labelled,
+    Associations,
     Progress,
     SnapshotIdentity,
-    label,
+    Tracker,
+    associate,
     matched_to_rig,
     observations_of,
     to_observations,
@@ -17,23 +17,23 @@ from .series import (
 )
 
 __all__ = [
-    "Follower",
+    "Associations",
     "Identity",
     "IdentityOptions",
-    "Labelled",
     "PipelineOptions",
     "Progress",
     "SnapshotIdentity",
     "Status",
-    "bootstrap",
+    "Tracker",
+    "associate",
     "distances_to_nearest",
     "identify",
-    "label",
     "lattice_shifts",
     "matched_to_rig",
     "mutual_nearest",
     "observations_of",
     "oriented",
+    "relocalize",
     "to_observations",
     "track",
     "without_snapshots",

@@ -18,7 +18,7 @@ MOST_SHIFTS = 8  # the smallest ones; larger ones are made of them
 
 
 @dataclass(frozen=True)
-class Motion:
+class Ambiguity:
     """A rigid motion that takes most fiducials near others; fiducial i falls onto `permutation[i]`, -1 = onto none."""
 
     rotation: NDArray[np.float64]  # (3, 3)
@@ -26,13 +26,13 @@ class Motion:
     permutation: NDArray[np.int64]  # (N,)
 
 
-def lattice_shifts(obj: CalibrationObject) -> list[Motion]:
+def lattice_shifts(obj: CalibrationObject) -> list[Ambiguity]:
     """Find the translations, smallest first, that take most fiducials onto others: the steps of a lattice."""
     return list(_lattice_shifts(obj.points.double().cpu().numpy().tobytes(), 0.01 * obj.size))
 
 
 @lru_cache(maxsize=16)
-def _lattice_shifts(coordinates: bytes, tolerance: float) -> tuple[Motion, ...]:
+def _lattice_shifts(coordinates: bytes, tolerance: float) -> tuple[Ambiguity, ...]:
     """Find the shifts once for each object: snapshots are many, objects few."""
     points = np.frombuffer(coordinates).reshape(-1, 3)
     differences = (points[None] - points[:, None]).reshape(-1, 3)
@@ -43,10 +43,10 @@ def _lattice_shifts(coordinates: bytes, tolerance: float) -> tuple[Motion, ...]:
     sums = np.stack([np.bincount(place.ravel(), weights=differences[:, i]) for i in range(3)], axis=1)
     shifts = sums[often] / counts[often, None]
     shifts = shifts[np.argsort(np.linalg.norm(shifts, axis=1), kind="stable")[:MOST_SHIFTS]]
-    return tuple(Motion(np.eye(3), shift, _onto(points, points + shift, 2 * tolerance)) for shift in shifts)
+    return tuple(Ambiguity(np.eye(3), shift, _onto(points, points + shift, 2 * tolerance)) for shift in shifts)
 
 
-def near_turns(obj: CalibrationObject, tolerance: float) -> list[Motion]:
+def near_turns(obj: CalibrationObject, tolerance: float) -> list[Ambiguity]:
     """Find the turns that take every fiducial to within `tolerance` (mm) of another, but are no symmetries.
 
     Sizes of fiducials do not count here: that they break a symmetry must be seen in the blobs.
@@ -54,13 +54,15 @@ def near_turns(obj: CalibrationObject, tolerance: float) -> list[Motion]:
     exact = {motion.permutation.tobytes() for motion in obj.symmetries}
     turns = replace(obj, radius=None).near_symmetries(min(tolerance, 0.2 * obj.size))
     return [
-        Motion(turn.rotation, turn.translation, turn.permutation)
+        Ambiguity(turn.rotation, turn.translation, turn.permutation)
         for turn in turns
         if turn.permutation.tobytes() not in exact
     ]
 
 
-def moved(pose: RigidTransform, labels: NDArray[np.int64], motions: list[Motion]) -> tuple[Poses, NDArray[np.int64]]:
+def relabelled(
+    pose: RigidTransform, labels: NDArray[np.int64], motions: list[Ambiguity]
+) -> tuple[Poses, NDArray[np.int64]]:
     """Label the blobs as if the object had made each motion backwards.
 
     Args:
@@ -81,7 +83,7 @@ def moved(pose: RigidTransform, labels: NDArray[np.int64], motions: list[Motion]
     return Poses(turns, shifts), changed
 
 
-def displacement(uv: NDArray[np.float64], motion: Motion) -> NDArray[np.float64]:
+def displacement(uv: NDArray[np.float64], motion: Ambiguity) -> NDArray[np.float64]:
     """Median distance (C,) px that a motion moves fiducials in the images (C, N, 2)."""
     falls = motion.permutation >= 0
     return np.median(np.linalg.norm(uv[:, motion.permutation[falls]] - uv[:, falls], axis=-1), axis=1)

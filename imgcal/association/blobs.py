@@ -69,9 +69,9 @@ def gather(detections: Detections, rig: CameraRig) -> Blobs:
     camera = detections.camera[rows]
     order = np.argsort(camera, kind="stable")
     rows, camera = rows[order], camera[order]
-    count = np.bincount(camera, minlength=rig.cameras)
+    count = np.bincount(camera, minlength=rig.num_cameras)
     slot = np.arange(len(rows)) - (np.cumsum(count) - count)[camera]
-    shape = (rig.cameras, max(int(count.max()), 1))
+    shape = (rig.num_cameras, max(int(count.max()), 1))
     uv, row, sigma, radius = np.full((*shape, 2), FAR), np.full(shape, -1), np.ones(shape), np.full(shape, np.nan)
     uv[camera, slot], row[camera, slot], sigma[camera, slot] = detections.uv[rows], rows, detections.sigma[rows]
     radius[camera, slot] = detections.radius[rows]
@@ -94,14 +94,14 @@ def _undistort(uv, count, focal, principal, distortion, ideal):
 
 
 @dataclass(frozen=True)
-class Spread:
+class PatternPrior:
     """How far the factory values may be off, boiled down to what moves a pattern and what bends it."""
 
     shift: NDArray[np.float64]  # (C,) pixels, one standard deviation of a pattern's place in the image
     shape: float  # relative: one standard deviation of distances within a pattern
 
 
-def spread_of(std: Tensor, rig: CameraRig, distance: float) -> Spread:
+def pattern_prior(std: Tensor, rig: CameraRig, distance: float) -> PatternPrior:
     """Boil the prior down.
 
     Args:
@@ -114,4 +114,4 @@ def spread_of(std: Tensor, rig: CameraRig, distance: float) -> Spread:
     principal, scale = np.sqrt((s[:, 8:10] ** 2).mean(1)), np.sqrt((s[:, 6:8] ** 2).mean(1)) / focal
     shift = np.sqrt(principal**2 + (focal * turn) ** 2 + (focal * travel) ** 2)
     shape = np.sqrt(scale**2 + turn**2 + travel**2 + (principal / focal) ** 2)
-    return Spread(shift, float(shape.max()))
+    return PatternPrior(shift, float(shape.max()))

@@ -34,7 +34,7 @@ class _Compared:
 
 def few(scene: Scene) -> bool:
     """Tell whether one camera alone has blobs, so few that all labellings can be compared."""
-    seen, fiducials = scene.blobs.count, scene.obj.fiducials
+    seen, fiducials = scene.blobs.count, scene.obj.num_fiducials
     blobs = int(seen.max(initial=0))
     alone = blobs >= 4 and (seen >= 4).sum() == 1
     return bool(alone) and perm(max(blobs, fiducials), min(blobs, fiducials)) <= MOST_LABELLINGS
@@ -74,16 +74,16 @@ def compare_all(scene: Scene, options: IdentityOptions) -> Identity:
 
 def _compare(scene: Scene) -> _Compared:
     """Fit every labelling from the best pose for it and, of a planar object, from its mirror image."""
-    camera, fiducials = int(scene.blobs.count.argmax()), scene.obj.fiducials
+    camera, fiducials = int(scene.blobs.count.argmax()), scene.obj.num_fiducials
     blobs = int(scene.blobs.count[camera])
     chosen = np.array(list(permutations(range(max(blobs, fiducials)), min(blobs, fiducials))))  # (K, n)
-    labels = np.full((len(chosen), scene.rig.cameras, fiducials), -1, dtype=np.int64)
+    labels = np.full((len(chosen), scene.rig.num_cameras, fiducials), -1, dtype=np.int64)
     if blobs >= fiducials:
         labels[:, camera] = chosen
     else:
         labels[np.arange(len(chosen))[:, None], camera, chosen] = np.arange(blobs)
     seen = torch.from_numpy(labels >= 0)[:, None]
-    uv = torch.from_numpy(scene.blobs.uv[np.arange(scene.rig.cameras)[:, None], np.maximum(labels, 0)])[:, None]
+    uv = torch.from_numpy(scene.blobs.uv[np.arange(scene.rig.num_cameras)[:, None], np.maximum(labels, 0)])[:, None]
     sigma = torch.ones(seen.shape, dtype=uv.dtype)
     found = initial_pose(Observations(uv, sigma, seen), scene.rig, scene.obj)[:, 0]
     poses = Poses(found.rotation.numpy(), found.translation.numpy())

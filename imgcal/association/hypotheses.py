@@ -85,7 +85,7 @@ def many(obj: CalibrationObject) -> bool:
 
     Then only outer blobs are compared with outer fiducials: what is outermost in an image is so in space.
     """
-    return _orders(obj.fiducials) > MOST_FIDUCIAL_TRIPLES
+    return _orders(obj.num_fiducials) > MOST_FIDUCIAL_TRIPLES
 
 
 def _orders(count: int) -> int:

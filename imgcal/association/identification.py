@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imgcal.association.ambiguities import Motion, differ, displacement, lattice_shifts, moved, near_turns
+from imgcal.association.ambiguities import Ambiguity, differ, displacement, lattice_shifts, near_turns, relabelled
 from imgcal.association.assignment import spacing
-from imgcal.association.blobs import Spread, gather, spread_of
+from imgcal.association.blobs import PatternPrior, gather, pattern_prior
 from imgcal.association.few import compare_all, few
 from imgcal.association.hypotheses import (
     Poses,
@@ -31,7 +31,7 @@ from imgcal.association.verify import (
     predictions,
     refine,
     rig_and_pose,
-    settle,
+    settle_labels,
     start,
 )
 from imgcal.association.voting import match, predict_ideal, vote
@@ -85,7 +85,7 @@ def identify(
         if found.accepted and found.explained >= CONVINCING:
             return found
         partial = found if partial is None and found.accepted else partial
-    anew = bootstrap(detections, rig, obj, std, options)
+    anew = relocalize(detections, rig, obj, std, options)
     return partial if partial is not None and anew.explained <= partial.explained else anew
 
 
@@ -101,7 +101,7 @@ def track(
 ) -> Identity:
     """Label the blobs of one snapshot near a pose; arguments as in `identify`, `pose_known` = it is no mere guess."""
     scene = Scene(gather(detections, rig), obj, rig, std)
-    if scene.blobs.uv[..., 0].size * obj.fiducials > MOST_PAIRS:
+    if scene.blobs.uv[..., 0].size * obj.num_fiducials > MOST_PAIRS:
         return _refused(scene, _too_many(scene))
     poses = Poses(rig_from_object.rotation.numpy()[None], rig_from_object.translation.numpy()[None])
     predicted = predict_ideal(rig, scene.obj.points.numpy(), poses)
@@ -118,7 +118,7 @@ def track(
     return _decide(scene, fits, options, pose_known)
 
 
-def bootstrap(
+def relocalize(
     detections: Detections,
     rig: CameraRig,
     obj: CalibrationObject,
@@ -136,8 +136,8 @@ def bootstrap(
     if compared is not None and compared.accepted:
         return compared
     likely = {camera: likely_blobs(scene.blobs, camera, many(obj)) for camera in cameras.tolist()}
-    hopeful = {camera: rows for camera, rows in likely.items() if len(rows) <= MOST_FALSE * obj.fiducials}
-    if not hopeful or scene.blobs.uv[..., 0].size * obj.fiducials > MOST_PAIRS:
+    hopeful = {camera: rows for camera, rows in likely.items() if len(rows) <= MOST_FALSE * obj.num_fiducials}
+    if not hopeful or scene.blobs.uv[..., 0].size * obj.num_fiducials > MOST_PAIRS:
         return _refused(scene, _too_many(scene))
     bounds = _bounds(scene, rig.working_distance or _guess_distance(scene), pose_known=False)
     generator = np.random.default_rng(options.seed)
@@ -170,7 +170,7 @@ def _decide(scene: Scene, fits: Fits, options: IdentityOptions, known_pose: bool
     """Accept the best labelling or say why not."""
     odds = (options.label_odds, options.least_label_odds)
     fits = _best(scene, fits, len(fits.labels))
-    best = settle(scene, fits.select(np.array([0])))
+    best = settle_labels(scene, fits.select(np.array([0])))
     chosen = certain(scene, best, *odds)
     share, refusal, margin = _share(scene, chosen), None, -np.inf
     if share >= options.least_share:
@@ -212,7 +212,7 @@ def _too_little(fitted: float, certain_share: float, least: float) -> str:
 
 def _share(scene: Scene, fits: Fits) -> float:
     """Labelled part of what could be seen: in each camera, the smaller of blobs and fiducials."""
-    return float((fits.labels >= 0).sum() / max(np.minimum(scene.blobs.count, scene.obj.fiducials).sum(), 1))
+    return float((fits.labels >= 0).sum() / max(np.minimum(scene.blobs.count, scene.obj.num_fiducials).sum(), 1))
 
 
 def _margin(scene: Scene, best: Fits, others: Fits) -> float:
@@ -235,33 +235,33 @@ def _against_motions(scene: Scene, best: Fits, known_pose: bool) -> tuple[Fits, 
         The best labelling found, and its margin over the best of its neighbours.
     """
     shifts = lattice_shifts(scene.obj)
-    spread = spread_of(scene.std, scene.rig, scene.rig.working_distance or _guess_distance(scene))
-    turns = [] if known_pose else near_turns(scene.obj, 2 * spread.shape * scene.obj.size)
+    prior_std = pattern_prior(scene.std, scene.rig, scene.rig.working_distance or _guess_distance(scene))
+    turns = [] if known_pose else near_turns(scene.obj, 2 * prior_std.shape * scene.obj.size)
     if not shifts and not turns:
         return best, np.inf
     for _ in range(MOST_STEPS):
         _, pose = rig_and_pose(scene, best, 0)
         labels = best.labels[0]
-        alone = _shifted_alone(scene, best, shifts, 6 * spread.shift)
+        alone = _shifted_alone(scene, best, shifts, 6 * prior_std.shift)
         together = _preferred(labels, alone)
         if together is not None:
             fit = refine(scene, start(scene, _one(pose), together[None]), stages=STAGES[:1])
             if _margin(scene, best, fit) < 0:
-                best = settle(scene, fit)
+                best = settle_labels(scene, fit)
                 continue
-        rivals = [moved(pose, labels, [motion]) for motion in shifts + turns]
+        rivals = [relabelled(pose, labels, [motion]) for motion in shifts + turns]
         rivals += [(_one(pose), rival[None]) for margin, _, rival in alone if margin < EXCLUDED]
         fits = [refine(scene, start(scene, *rival), stages=STAGES[:1]) for rival in rivals]
         margins = [_margin(scene, best, rival) for rival in fits]
         if not margins or min(margins) >= 0:
             excluded = [margin for margin, _, _ in alone if margin >= EXCLUDED]
             return best, min([np.inf, *margins, *excluded])
-        best = settle(scene, fits[int(np.argmin(margins))])
+        best = settle_labels(scene, fits[int(np.argmin(margins))])
     return best, 0.0
 
 
 def _shifted_alone(
-    scene: Scene, best: Fits, shifts: list[Motion], reach: NDArray[np.float64]
+    scene: Scene, best: Fits, shifts: list[Ambiguity], reach: NDArray[np.float64]
 ) -> list[tuple[float, int, NDArray[np.int64]]]:
     """Compare a labelling with those in which the object is shifted for one camera alone, as that camera sees it.
 
@@ -279,13 +279,13 @@ def _shifted_alone(
     """
     _, pose = rig_and_pose(scene, best, 0)
     labels, uv, found = best.labels[0], predictions(best), []
-    for camera in range(scene.rig.cameras):
+    for camera in range(scene.rig.num_cameras):
         near = [motion for motion in shifts if displacement(uv, motion)[camera] < reach[camera]]
         seen = (labels[camera] >= 0).sum() >= LEAST_ALONE
         part = scene.only(camera)
         mine = refine(part, start(part, _one(pose), labels[None, [camera]]), STAGES[:1]) if near and seen else None
         for motion in near:
-            where, shifted = moved(pose, labels, [motion])
+            where, shifted = relabelled(pose, labels, [motion])
             margin = 0.0
             if mine is not None:
                 rival = refine(part, start(part, where, shifted[:, [camera]]), STAGES[:1])
@@ -314,8 +314,8 @@ def _one(pose: RigidTransform) -> Poses:
 def _too_many(scene: Scene) -> str:
     name = scene.rig.camera_names[int(scene.blobs.count.argmax())]
     return (
-        f"too many blobs: found {scene.blobs.count.max()} in camera {name}, where an object of {scene.obj.fiducials} "
-        "fiducials is expected; raise the detection threshold, or mask what is no marker"
+        f"too many blobs: found {scene.blobs.count.max()} in camera {name}, where an object of "
+        f"{scene.obj.num_fiducials} fiducials is expected; raise the detection threshold, or mask what is no marker"
     )
 
 
@@ -330,13 +330,15 @@ def _bounds(scene: Scene, distance: float, pose_known: bool) -> tuple[float, flo
     Both follow from the prior. A pose from one camera is off as much as that camera, and its depth as much as its focal
     length, which shifts the images of cameras at other places.
     """
-    spread: Spread = spread_of(scene.std, scene.rig, distance)
+    prior_std: PatternPrior = pattern_prior(scene.std, scene.rig, distance)
     focal = float(scene.rig.focal_length.mean())
     positions = scene.rig.positions.numpy()
     baseline = float(np.linalg.norm(positions - positions.mean(0), axis=1).max())
-    parallax = 2 * spread.shape * focal * baseline / distance
-    shift = float(np.hypot(spread.shift.max() * (1.0 if pose_known else np.sqrt(2)), 0.0 if pose_known else parallax))
-    bend = 2.5 * spread.shape if pose_known else float(np.hypot(2.5 * spread.shape, APPROXIMATE))
+    parallax = 2 * prior_std.shape * focal * baseline / distance
+    shift = float(
+        np.hypot(prior_std.shift.max() * (1.0 if pose_known else np.sqrt(2)), 0.0 if pose_known else parallax)
+    )
+    bend = 2.5 * prior_std.shape if pose_known else float(np.hypot(2.5 * prior_std.shape, APPROXIMATE))
     return max(3.0, bend * focal * scene.obj.size / distance), max(10.0, 4 * shift)
 
 

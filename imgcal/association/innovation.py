@@ -59,7 +59,7 @@ def innovations(
     residual, freedom, uv = np.zeros(shape), np.zeros(shape), np.zeros((*shape, 2))
     complexity = np.full(count, np.inf)
     equations, state = solution.equations, solution.state
-    factory, step = problem.factory, state.offset * problem.spread
+    factory, step = problem.factory, state.offset * problem.prior_std
     given = [
         np.ascontiguousarray(tensor.numpy())
         for tensor in (
@@ -69,7 +69,7 @@ def innovations(
             factory.focal_length + step[..., 6:8],
             factory.principal_point + step[..., 8:10],
             factory.distortion + step[..., 10:],
-            problem.spread,
+            problem.prior_std,
             problem.points @ state.rotation[:, 0].mT,
             state.centre[:, 0],
         )
@@ -145,7 +145,7 @@ def _factorize(blocks, coupling, kept):
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _compare(
-    rotation0, turn, position, focal, principal, distortion, spread, rotated, centre, radius_squared,
+    rotation0, turn, position, focal, principal, distortion, prior_std, rotated, centre, radius_squared,
     eliminated, whitened, kept, blob_uv, blob_noise, typical_noise, blob_count, labels, extra,
     squared, log_det, own, residual, freedom, uv,
 ):  # fmt: skip
@@ -159,7 +159,7 @@ def _compare(
         for n in range(len(rotated)):
             _rows(
                 rotated[n], rotation, left, centre, position[c],
-                focal[c], principal[c], distortion[c], spread[c], radius_squared[n], unit, rows, uv[c, n],
+                focal[c], principal[c], distortion[c], prior_std[c], radius_squared[n], unit, rows, uv[c, n],
             )  # fmt: skip
             uu, uv_, vv = _whiten(rows, eliminated[c], whitened[c], kept, parts)
             label = labels[c, n]
@@ -199,7 +199,7 @@ def _compare(
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _rows(
-    rotated, rotation, left, centre, position, focal, principal, distortion, spread, radius_squared, unit, rows, uv
+    rotated, rotation, left, centre, position, focal, principal, distortion, prior_std, radius_squared, unit, rows, uv
 ):  # fmt: skip
     """Fill the Jacobian (2, 21) of a pixel by 15 whitened camera and 6 pose parameters, and the pixel.
 
@@ -225,22 +225,22 @@ def _rows(
         by = sx * rotation[0, 1] + sy * rotation[1, 1] + sz * rotation[2, 1]
         bz = sx * rotation[0, 2] + sy * rotation[1, 2] + sz * rotation[2, 2]
         for i in range(3):
-            rows[r, i] = (tx * left[0, i] + ty * left[1, i] + tz * left[2, i]) * spread[i]
-        rows[r, 3], rows[r, 4], rows[r, 5] = -bx * spread[3], -by * spread[4], -bz * spread[5]
+            rows[r, i] = (tx * left[0, i] + ty * left[1, i] + tz * left[2, i]) * prior_std[i]
+        rows[r, 3], rows[r, 4], rows[r, 5] = -bx * prior_std[3], -by * prior_std[4], -bz * prior_std[5]
         rows[r, 15], rows[r, 16], rows[r, 17] = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
         rows[r, 18], rows[r, 19], rows[r, 20] = bx * unit, by * unit, bz * unit
     for r in range(2):
         at, along, mixed = (x, xd, 12) if r == 0 else (y, yd, 13)
-        rows[r, 6 + r], rows[r, 7 - r] = along * spread[6 + r], 0.0
-        rows[r, 8 + r], rows[r, 9 - r] = spread[8 + r], 0.0
+        rows[r, 6 + r], rows[r, 7 - r] = along * prior_std[6 + r], 0.0
+        rows[r, 8 + r], rows[r, 9 - r] = prior_std[8 + r], 0.0
         power = focal[r] * at * rr
         rows[r, 10], rows[r, 11], rows[r, 14] = (
-            power * spread[10],
-            power * rr * spread[11],
-            power * rr * rr * spread[14],
+            power * prior_std[10],
+            power * rr * prior_std[11],
+            power * rr * rr * prior_std[14],
         )
-        rows[r, mixed] = focal[r] * 2 * x * y * spread[mixed]
-        rows[r, 25 - mixed] = focal[r] * (rr + 2 * at * at) * spread[25 - mixed]
+        rows[r, mixed] = focal[r] * 2 * x * y * prior_std[mixed]
+        rows[r, 25 - mixed] = focal[r] * (rr + 2 * at * at) * prior_std[25 - mixed]
 
 
 @njit(cache=True, fastmath=kernels.FAST)

@@ -21,7 +21,7 @@ class PipelineOptions:
     least_fiducials: int = 4  # different fiducials that a snapshot must show, all cameras together
     outlier: float = 5.0  # standard deviations beyond which a labelled blob is left out
     most_outliers: float = 0.25  # share of left-out blobs above which the data do not fit the object
-    largest_model_error: float = 1.0  # px: unexplained residual above which the data do not fit the camera model
+    largest_additive_noise: float = 1.0  # px: unexplained residual above which the data do not fit the camera model
     largest_drift: float = 10.0  # prior standard deviations that one factory value may be off
     widest_prior: float = 4.0  # factor by which a kind of factory values may have drifted more than the prior says
     blind_cameras: bool = False  # accept cameras that saw nothing; they keep their factory values

@@ -39,7 +39,7 @@ class Search:
         """Make so many hypotheses, let the rig vote within the bounds, fit the best; None = there is none."""
         scene, (tolerance, gate) = self.scene, self.bounds
         cameras = np.array(list(self.likely))
-        if scene.obj.planar and scene.obj.fiducials > MANY:
+        if scene.obj.planar and scene.obj.num_fiducials > MANY:
             chosen = generator.permutation(cameras)[:2]
             poses = reduce(add, (planar_poses(scene.blobs, scene.rig, camera, scene.obj) for camera in chosen))
             self.hypotheses += PLANAR_EFFORT * len(chosen)
@@ -53,7 +53,7 @@ class Search:
                 scene.blobs, scene.rig, camera, np.concatenate(drawn), self.triples, tolerance, KEPT
             )
             self.hypotheses += len(camera) * len(self.triples.triples)
-        self.hypotheses += len(poses) * scene.blobs.uv[..., 0].size * scene.obj.fiducials // VOTES_A_HYPOTHESIS
+        self.hypotheses += len(poses) * scene.blobs.uv[..., 0].size * scene.obj.num_fiducials // VOTES_A_HYPOTHESIS
         if len(poses) == 0:
             return None
         predicted = predict_ideal(scene.rig, self.triples.points, poses)

@@ -42,7 +42,7 @@ class SnapshotIdentity:
 
 
 @dataclass(frozen=True)
-class Labelled:
+class Associations:
     """Detections with a fiducial for every blob that has one, and how that was decided."""
 
     detections: Detections  # `fiducial` filled in, -1 = not used
@@ -63,13 +63,13 @@ class Labelled:
         return next((status for status in LEAST_CERTAIN_FIRST if status in found), "refused")
 
 
-def label(
+def associate(
     detections: Detections,
     rig: CameraRig,
     obj: CalibrationObject,
     options: PipelineOptions = PipelineOptions(),
     progress: Progress | None = None,
-) -> Labelled:
+) -> Associations:
     """Decide which blob is which fiducial, snapshot by snapshot.
 
     Each accepted snapshot predicts the next one. What the accepted ones say about the rig narrows the search in the
@@ -80,29 +80,29 @@ def label(
     """
     count = len(detections.snapshot_names)
     coded = _coded_snapshots(detections, count)
-    follower = Follower(rig, obj, options)
+    tracker = Tracker(rig, obj, options)
     results: dict[int, tuple[SnapshotIdentity, NDArray[np.int64]]] = {}
     rows = _rows_by_snapshot(detections, count)
 
     def decide(s: int) -> None:
         labels = detections.fiducial[rows[s]] if coded[s] else None
-        results[s] = follower.decide(detections.select(rows[s]), detections.snapshot_names[s], labels)
+        results[s] = tracker.decide(detections.select(rows[s]), detections.snapshot_names[s], labels)
 
     order: Iterable[int] = range(count)
     patience = Patience(count)
     for number, s in enumerate(progress(order, count) if progress else order):
-        if coded[s] or patience.tries(number, follower.in_vain):
+        if coded[s] or patience.tries(number, tracker.in_vain):
             decide(s)
         else:
             results[s] = SnapshotIdentity(detections.snapshot_names[s], "refused", NOT_TRIED, 0, None), rows[s] * 0 - 1
     again = [s for s in range(count) if not coded[s] and _incomplete(*results[s], detections.camera[rows[s]])]
     accepted = np.array([s for s in range(count) if results[s][0].status != "refused"])
     if len(accepted):
-        patience, follower.in_vain = Patience(len(again)), 0
+        patience, tracker.in_vain = Patience(len(again)), 0
         # Those nearest to where the object was seen first: they are the likeliest to show it.
         for number, s in enumerate(sorted(again, key=lambda s: _gap(s, accepted))):
             first = results[s][0]
-            if patience.tries(number, follower.in_vain):
+            if patience.tries(number, tracker.in_vain):
                 decide(s)
             if first.status != "refused" and results[s][0].status != "refused":
                 # The rig that it helped to find labels more of it, but says nothing new of how sure it is.
@@ -112,7 +112,7 @@ def label(
     for s in range(count):
         if results[s][0].status != "refused":
             fiducial[rows[s]] = results[s][1]
-    labelled = Labelled(replace(detections, fiducial=fiducial), tuple(results[s][0] for s in range(count)))
+    labelled = Associations(replace(detections, fiducial=fiducial), tuple(results[s][0] for s in range(count)))
     if not labelled.used:
         reasons = Counter(snapshot.reason for snapshot in labelled.snapshots if snapshot.reason != NOT_TRIED)
         reason, times = reasons.most_common(1)[0] if count else ("found no snapshot", 0)
@@ -122,7 +122,7 @@ def label(
     return labelled
 
 
-def without_snapshots(labelled: Labelled, rows: Sequence[int]) -> Labelled:
+def without_snapshots(labelled: Associations, rows: Sequence[int]) -> Associations:
     """Refuse snapshots (numbers among the used ones) whose labels lie on one line.
 
     Raises:
@@ -133,7 +133,7 @@ def without_snapshots(labelled: Labelled, rows: Sequence[int]) -> Labelled:
         snapshots[number] = replace(snapshots[number], status="refused", reason=ON_A_LINE, rig_from_object=None)
     detections = labelled.detections
     fiducial = np.where(np.isin(detections.snapshot, numbers), -1, detections.fiducial)
-    left = Labelled(replace(detections, fiducial=fiducial), tuple(snapshots))
+    left = Associations(replace(detections, fiducial=fiducial), tuple(snapshots))
     if not left.used:
         raise RefusedError(f"estimation: in every snapshot: {ON_A_LINE}; capture more, with the whole object in view")
     return left
@@ -169,7 +169,7 @@ class Patience:
         return (number - self.first_left_out) % self.stride == self.stride - 1
 
 
-class Follower:
+class Tracker:
     """Carries what earlier snapshots say, the pose and the rig, to the next one."""
 
     def __init__(
@@ -179,7 +179,7 @@ class Follower:
         check_object(obj)
         self.factory, self.obj, self.options, self.remembered = rig, obj, options, remembered
         self.rig = rig
-        self.spread = (rig.prior or RigPrior()).std(rig)
+        self.prior_std = (rig.prior or RigPrior()).std(rig)
         self.pose = None if options.start_pose is None else _checked_pose(options.start_pose, rig)
         self.alternatives = 0  # that the accepted snapshots leave open, 0 = none was accepted yet
         self.in_vain = 0  # hypotheses that were tried since something was accepted
@@ -220,7 +220,7 @@ class Follower:
         known = [] if self.pose is None else [self.pose]
         # Many captures are taken with the object at the origin of the rig's frame; it costs little to look there first.
         guesses = [] if known else [RigidTransform.identity(dtype=self.rig.focal_length.dtype)]
-        found = identify(blobs, self.rig, self.obj, self.spread, known, self.options.identity, guesses)
+        found = identify(blobs, self.rig, self.obj, self.prior_std, known, self.options.identity, guesses)
         pose = found.rig_from_object
         if not found.accepted or pose is None:
             self.in_vain += found.hypotheses
@@ -262,11 +262,11 @@ class Follower:
         parts = [to_observations(replace(b, fiducial=given), self.factory, self.obj) for b, given, _ in self.accepted]
         sigma = (torch.cat([p.sigma for p in parts]).square() + self.options.identity_error**2).sqrt()
         observations = Observations(torch.cat([p.uv for p in parts]), sigma, torch.cat([p.seen for p in parts]))
-        poses = RigidTransform.joined([p for _, _, p in self.accepted], torch.stack)
+        poses = RigidTransform.stack([p for _, _, p in self.accepted])
         fit = estimate(observations, self.factory, self.obj, poses, options=self.options.estimation)
         if bool(fit.converged):
             prior = (self.factory.prior or RigPrior()).std(self.factory)
-            self.rig, self.spread = fit.rig, torch.minimum(2 * flat_std(fit), prior)
+            self.rig, self.prior_std = fit.rig, torch.minimum(2 * flat_std(fit), prior)
 
 
 def _checked_pose(pose: RigidTransform, rig: CameraRig) -> RigidTransform:
@@ -305,7 +305,7 @@ def matched_to_rig(detections: Detections, rig: CameraRig) -> Detections:
 def to_observations(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> Observations:
     """Arrange labelled blobs densely: (S, C, N). Of two blobs with one label in a camera the last one counts."""
     snapshots = np.unique(detections.snapshot) if len(detections) else np.empty(0, dtype=np.int64)
-    shape = (max(len(snapshots), 1), rig.cameras, obj.fiducials)
+    shape = (max(len(snapshots), 1), rig.num_cameras, obj.num_fiducials)
     rows = np.flatnonzero(detections.fiducial >= 0)
     where = (np.searchsorted(snapshots, detections.snapshot[rows]), detections.camera[rows], detections.fiducial[rows])
     uv, sigma, seen = np.zeros((*shape, 2)), np.ones(shape), np.zeros(shape, dtype=bool)
@@ -315,7 +315,7 @@ def to_observations(detections: Detections, rig: CameraRig, obj: CalibrationObje
 
 
 def observations_of(
-    labelled: Labelled, rig: CameraRig, obj: CalibrationObject
+    labelled: Associations, rig: CameraRig, obj: CalibrationObject
 ) -> tuple[Observations, RigidTransform | None]:
     """Observations of the accepted snapshots, and their poses where identity found all of them."""
     used = labelled.used
@@ -325,7 +325,7 @@ def observations_of(
     )
     poses = [labelled.snapshots[s].rig_from_object for s in used]
     known = [pose for pose in poses if pose is not None]
-    return observations, RigidTransform.joined(known, torch.stack) if len(known) == len(used) else None
+    return observations, RigidTransform.stack(known) if len(known) == len(used) else None
 
 
 def _rows_by_snapshot(detections: Detections, count: int) -> list[NDArray[np.int64]]:

@@ -47,7 +47,7 @@ class Scene:
     def problem(self) -> Problem:
         """Of one labelling, without any label."""
         points, radius = self.obj.points.double(), self.obj.radius
-        centroid, cameras = points.mean(0), self.rig.cameras
+        centroid, cameras = points.mean(0), self.rig.num_cameras
         return Problem(
             uv=points.new_zeros(1, 1, cameras, 2, len(points)),
             root_weight=points.new_zeros(1, 1, cameras, len(points)),
@@ -55,7 +55,7 @@ class Scene:
             centroid=centroid,
             radius_squared=None if radius is None else radius.double().square(),
             factory=self.rig.expand(1),
-            spread=self.std.expand(1, -1, -1),
+            prior_std=self.std.expand(1, -1, -1),
         )
 
     def only(self, camera: int) -> Scene:
@@ -116,10 +116,10 @@ def refine(scene: Scene, fits: Fits, stages: tuple[float, ...] = STAGES) -> Fits
     for sigma in stages:
         fits = fit(scene, replace(fits, sigma=np.full(len(fits.labels), sigma)))
         fits = replace(fits, sigma=_residual_sigma(scene, fits), labels=_assign(fits))
-    return settle(scene, fit(scene, fits), rounds=1)
+    return settle_labels(scene, fit(scene, fits), rounds=1)
 
 
-def settle(scene: Scene, fits: Fits, rounds: int = 4) -> Fits:
+def settle_labels(scene: Scene, fits: Fits, rounds: int = 4) -> Fits:
     """Label fitted labellings again, and fit, until the labels stay or for so many rounds."""
     for _ in range(rounds):
         labels = _assign(fits)
@@ -146,7 +146,7 @@ def certain(scene: Scene, fits: Fits, odds: float, least_odds: float) -> Fits:
     # Two or three labels of one camera can support each other in the wrong place: most of what it sees must fit.
     # In a lattice, half of them can, a step away.
     most = 0.7 if lattice_shifts(scene.obj) else 0.5
-    enough = np.maximum(3, most * np.minimum(scene.blobs.count, scene.obj.fiducials))
+    enough = np.maximum(3, most * np.minimum(scene.blobs.count, scene.obj.num_fiducials))
     for _ in range(4):
         found = _found(fits)
         log_odds = _log_density(found) + surroundings
@@ -207,7 +207,7 @@ def problem_of(scene: Scene, fits: Fits) -> Problem:
     )
     if count == 1:
         return problem
-    return replace(problem, factory=scene.rig.expand(count), spread=scene.std.expand(count, -1, -1))
+    return replace(problem, factory=scene.rig.expand(count), prior_std=scene.std.expand(count, -1, -1))
 
 
 def fit(scene: Scene, fits: Fits) -> Fits:
@@ -244,8 +244,8 @@ def _size_misfit(scene: Scene, fits: Fits) -> NDArray[np.float64]:
         ratio = np.log(np.where(fits.labels >= 0, seen, np.nan) / radius.numpy())
         ratio = np.where(np.isfinite(ratio).any(-1, keepdims=True), ratio, 0.0)
         misfit = np.abs(ratio - np.nanmedian(ratio, axis=-1, keepdims=True))
-        spread = np.maximum(1.5 * np.nanmedian(misfit, axis=-1, keepdims=True), LEAST_SIZE_SPREAD)
-    return np.nansum(np.minimum((misfit / spread) ** 2, MOST_SIZE_MISFIT), axis=(1, 2))
+        prior_std = np.maximum(1.5 * np.nanmedian(misfit, axis=-1, keepdims=True), LEAST_SIZE_SPREAD)
+    return np.nansum(np.minimum((misfit / prior_std) ** 2, MOST_SIZE_MISFIT), axis=(1, 2))
 
 
 def _clutter(scene: Scene, fits: Fits) -> NDArray[np.float64]:

@@ -37,7 +37,7 @@ def predict_ideal(rig: CameraRig, points: NDArray[np.float64], poses: Poses) -> 
     """Project fiducials (N, 3) without distortion, from the principal point: (K, C, N, 2) px, -1e7 behind a camera."""
     transform = rig.cam_from_rig
     focal = rig.focal_length.mean(-1).numpy()
-    uv = np.full((len(poses.rotation), rig.cameras, len(points), 2), -1e7)
+    uv = np.full((len(poses.rotation), rig.num_cameras, len(points), 2), -1e7)
     given = (
         transform.rotation.numpy(),
         transform.translation.numpy(),

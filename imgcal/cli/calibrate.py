@@ -41,7 +41,7 @@ from imgcal.io import (
     save_rig,
     write_text,
 )
-from imgcal.pipeline import Calibration, calibrate, load_guesser, rms_length
+from imgcal.pipeline import Calibration, calibrate, load_initializer, rms_length
 from imgcal.types import PARAMETER_NAMES, CalibrationObject, CameraRig, Detections, MovedError, limits
 
 WRITTEN = ("report.html", "rig.yaml", "object.csv", "result.json")
@@ -100,8 +100,8 @@ class Calibrate:
             after_last_move=self.after_last_move,
             start_pose=start_pose(self.start_pose),
         )
-        source = open_input(self.input, complete, obj.fiducials)
-        guesser = None if self.first_guess == "none" else load_guesser(self.first_guess, rig, obj)
+        source = open_input(self.input, complete, obj.num_fiducials)
+        initializer = None if self.first_guess == "none" else load_initializer(self.first_guess, rig, obj)
         loaded = time.perf_counter()
         detections, frames = read_detections(source, self.snapshots, self.detection)
         detections = only_cameras(detections, rig)
@@ -112,7 +112,7 @@ class Calibrate:
 
         outcome: Calibration | RefusedError
         try:
-            outcome = calibrate(detections, rig, obj, options, guesser=guesser, progress=bar)
+            outcome = calibrate(detections, rig, obj, options, initializer=initializer, progress=bar)
             covariance = trusted_covariance(outcome, reference)
             seconds |= {name: value for name, value in outcome.seconds.items() if name != "detection"}
         except RefusedError as error:
@@ -222,9 +222,9 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         "rms_px_after": rms_length(calibration.residual, seen),
         "first_guess": _guess_summary(calibration),
         "chi2_per_dof": float(calibration.chi2_per_dof),
-        "model_error_px": calibration.model_error,
+        "model_error_px": calibration.additive_noise,
         "outliers": calibration.outliers,
-        "prior_too_narrow": dict(calibration.widened),
+        "prior_too_narrow": dict(calibration.prior_scale),
         "snapshots_used": len(used),
         "snapshots_rejected": len(snapshots) - len(used),
         "rejected": {s.name: s.reason for s in snapshots if s.status == "refused"},
@@ -250,7 +250,7 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
 
 
 def _guess_summary(calibration: Calibration) -> dict[str, Any] | None:
-    guess = calibration.first_guess
+    guess = calibration.initialization
     if guess is None:
         return None
     rms = rms_length(guess.residual, calibration.observations.seen)

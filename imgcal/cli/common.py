@@ -118,7 +118,7 @@ def without_cameras(rig: CameraRig, names: tuple[str, ...]) -> CameraRig:
     if unknown:
         raise InputError(f"--without: found {listed(unknown)}, expected cameras of the rig: {listed(rig.camera_names)}")
     if set(rig.camera_names) <= set(names):
-        raise InputError(f"--without: found all {rig.cameras} cameras of the rig, expected at least one to be left")
+        raise InputError(f"--without: found all {rig.num_cameras} cameras of the rig, expected at least one to be left")
     return rig.select([i for i, name in enumerate(rig.camera_names) if name not in names])
 
 

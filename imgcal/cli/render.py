@@ -12,7 +12,7 @@ import numpy as np
 import torch
 import tyro
 
-from imgcal.association import label, matched_to_rig, to_observations
+from imgcal.association import associate, matched_to_rig, to_observations
 from imgcal.cli.common import check_folder, progress, read_detections
 from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError
@@ -44,12 +44,12 @@ class Render:
         rig, obj = load_rig(self.rig), load_object(self.object)
         if any((self.out / camera).exists() for camera in rig.camera_names):
             raise InputError(f"{self.out}: found images of these cameras there already, expected a new folder")
-        detections, _ = read_detections(open_input(self.input, rig, obj.fiducials), self.snapshots, self.detection)
+        detections, _ = read_detections(open_input(self.input, rig, obj.num_fiducials), self.snapshots, self.detection)
 
         def bar(snapshots: Iterable[int], total: int) -> Iterable[int]:
             return progress(snapshots, total, "identifying")
 
-        labelled = label(matched_to_rig(detections, rig), rig, obj, progress=bar)
+        labelled = associate(matched_to_rig(detections, rig), rig, obj, progress=bar)
         kept = labelled.detections.select(np.isin(labelled.detections.snapshot, labelled.used))
         observations = to_observations(kept, rig, obj)
         with publishing(self.out, rig.camera_names, mark=rig.camera_names[-1]) as out:

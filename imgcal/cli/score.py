@@ -14,8 +14,7 @@ import tyro
 from imgcal.cli.common import progress, read_detections
 from imgcal.detection import DetectionOptions
 from imgcal.io import load_object, load_rig, open_input
-from imgcal.pipeline import Score as Scored
-from imgcal.pipeline import rms_length, score
+from imgcal.pipeline import RigScore, rms_length, score
 from imgcal.types import CameraRig
 
 
@@ -37,7 +36,7 @@ class Score:
     def run(self) -> None:
         """Score and print."""
         rig, obj = load_rig(self.rig), load_object(self.object)
-        detections, _ = read_detections(open_input(self.input, rig, obj.fiducials), self.snapshots, self.detection)
+        detections, _ = read_detections(open_input(self.input, rig, obj.num_fiducials), self.snapshots, self.detection)
 
         def bar(snapshots: Iterable[int], total: int) -> Iterable[int]:
             return progress(snapshots, total, "scoring")
@@ -45,7 +44,7 @@ class Score:
         print(json.dumps(summary(score(detections, rig, obj, progress=bar), rig), indent=2))
 
 
-def summary(scored: Scored, rig: CameraRig) -> dict[str, object]:
+def summary(scored: RigScore, rig: CameraRig) -> dict[str, object]:
     """Put a score into the form that scripts read."""
     distances = scored.distances
     per_camera = {}

@@ -91,7 +91,7 @@ class Simulate:
         truth = simulate_truth(rig, obj, self.snapshots, generator, self._drift(), self._pose_range())
         with publishing(self.out, WRITTEN, mark="frames") as out:
             self._write(truth, rig, obj, generator, out)
-        print(f"{self.snapshots} snapshots of {rig.cameras} cameras written to {self.out}", file=sys.stderr)
+        print(f"{self.snapshots} snapshots of {rig.num_cameras} cameras written to {self.out}", file=sys.stderr)
 
     def _write(
         self, truth: Truth, rig: CameraRig, obj: CalibrationObject, generator: torch.Generator, out: Path

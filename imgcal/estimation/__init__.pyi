@@ -15,15 +15,15 @@ from .covariance import (
 )
 from .gauge import aligned
 from .levenberg_marquardt import Solution
-from .linearization import POSE_PARAMETERS, NormalEquations, Problem, State, linearize, moved, pose_at, rig_at
-from .map_estimate import Estimate, EstimationOptions, conclude, estimate, make_loss, make_problem, make_start
+from .linearization import POSE_PARAMETERS, NormalEquations, Problem, State, linearize, retract, pose_at, rig_at
+from .map_estimate import Estimate, EstimationOptions, make_estimate, estimate, make_loss, make_problem, initial_state
 from .moves import find_moves
 from .object_shape import SNAPSHOTS_TO_BEND, FiducialOffset, ShapeEvidence, offsets
 from .pose_initialization import initial_pose
 from .pose_support import ON_A_LINE, UndeterminedPosesError, require_poses
 from .rig_uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian
 from .robust_losses import squared
-from .variance_components import BENT, settle
+from .variance_components import BENT, estimate_variance_components
 
 __all__ = [
     "BENT",
@@ -51,7 +51,7 @@ __all__ = [
     "block_scatter",
     "camera_covariance",
     "camera_std",
-    "conclude",
+    "make_estimate",
     "estimate",
     "find_moves",
     "flat_std",
@@ -61,8 +61,8 @@ __all__ = [
     "lm_cpu",
     "make_loss",
     "make_problem",
-    "make_start",
-    "moved",
+    "initial_state",
+    "retract",
     "object_covariance",
     "offsets",
     "pixel_jacobian",
@@ -74,7 +74,7 @@ __all__ = [
     "relative_jacobian",
     "require_poses",
     "rig_at",
-    "settle",
+    "estimate_variance_components",
     "squared",
     "whitened_covariance",
 ]

@@ -160,7 +160,7 @@ def _places(seen: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 def _screened(blocks: Blocks, places: Mapping[int, NDArray[np.int64]]) -> dict[int, float]:
     """Largest statistic of each camera over a few of its places, in one go: a step nearby shows there, too."""
-    few = {camera: rows[_spread(len(rows))] for camera, rows in places.items()}
+    few = {camera: rows[_prior_std(len(rows))] for camera, rows in places.items()}
     if not few:
         return {}
     rows = np.unique(np.concatenate(list(few.values())))
@@ -173,7 +173,7 @@ def _screened(blocks: Blocks, places: Mapping[int, NDArray[np.int64]]) -> dict[i
     return largest
 
 
-def _spread(count: int) -> NDArray[np.int64]:
+def _prior_std(count: int) -> NDArray[np.int64]:
     """Numbers of a few of so many places, denser towards either end, where a place matters more."""
     steps = LEAST_SNAPSHOTS * GROWTH ** np.arange(np.log(max(count, 2)) / np.log(GROWTH))
     near = np.unique(np.ceil(steps).astype(np.int64) - LEAST_SNAPSHOTS)

@@ -47,7 +47,7 @@ def camera_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
     Raises:
         RefusedError: the information is singular (a snapshot with too few fiducials).
     """
-    cameras = estimate.rig.cameras
+    cameras = estimate.rig.num_cameras
     covariance = whitened_covariance(estimate.solution)
     if estimate.inflation > 1:
         # The prior's unit information contributes the covariance's square; only the rest comes from the observations.
@@ -62,7 +62,7 @@ def camera_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
     if not curved:
         return result
     centre = estimate.rig.reshape(len(covariance)).map_tensors(lambda tensor, _: tensor.unsqueeze(1))
-    return result + curvature_covariance(estimate, lambda rigs, _: rigs.difference(centre).flatten(-2))
+    return result + curvature_covariance(estimate, lambda rigs, _: rigs.local(centre).flatten(-2))
 
 
 def whitened_covariance(solution: Solution) -> Tensor:
@@ -77,8 +77,8 @@ def whitened_covariance(solution: Solution) -> Tensor:
         return torch.cholesky_inverse(reduced.kept)[:, :size, :size]
     inverse = torch.cholesky_inverse(reduced.eliminated)
     half = torch.linalg.solve_triangular(reduced.eliminated.mT, reduced.whitened, upper=True).flatten(1, 2)
-    spread = torch.linalg.solve_triangular(reduced.kept, half.mT, upper=False)
-    covariance = spread.mT @ spread
+    prior_std = torch.linalg.solve_triangular(reduced.kept, half.mT, upper=False)
+    covariance = prior_std.mT @ prior_std
     blocks = covariance.unflatten(1, (cameras, PARAMETERS)).unflatten(-1, (cameras, PARAMETERS))
     blocks.diagonal(dim1=1, dim2=3).add_(inverse.permute(0, 2, 3, 1))
     return covariance
@@ -87,13 +87,13 @@ def whitened_covariance(solution: Solution) -> Tensor:
 def camera_std(estimate: Estimate) -> Tensor:
     """One standard deviation of every parameter: (*B, C, 15)."""
     variance = camera_covariance(estimate).diagonal(dim1=-2, dim2=-1)
-    return variance.clamp_min(0).sqrt().unflatten(-1, (estimate.rig.cameras, PARAMETERS))
+    return variance.clamp_min(0).sqrt().unflatten(-1, (estimate.rig.num_cameras, PARAMETERS))
 
 
 def flat_std(estimate: Estimate) -> Tensor:
     """`camera_std` without the second order, in a hundredth of the time: (*B, C, 15)."""
-    left = torch.from_numpy(remaining_variance(estimate.solution)).to(estimate.problem.spread)
-    std = left.clamp_min(0).sqrt() * estimate.problem.spread
+    left = torch.from_numpy(remaining_variance(estimate.solution)).to(estimate.problem.prior_std)
+    std = left.clamp_min(0).sqrt() * estimate.problem.prior_std
     return std.reshape(*estimate.chi2.shape, *std.shape[1:])
 
 
@@ -276,7 +276,7 @@ def relative_jacobian(rig: CameraRig, reference: int) -> Tensor:
     For cam_from_reference = R_i R_r^T, a left rotation w_i - R_i R_r^T w_r; for the position p = R_r (c_i - c_r), the
     change w_r x p + R_r (dc_i - dc_r).
     """
-    cameras, rotation, positions = rig.cameras, rig.cam_from_rig.rotation, rig.positions
+    cameras, rotation, positions = rig.num_cameras, rig.cam_from_rig.rotation, rig.positions
     to_reference = rotation[..., reference : reference + 1, :, :]
     relative = rotation @ to_reference.mT  # (*B, C, 3, 3)
     place = (to_reference @ (positions - positions[..., reference : reference + 1, :])[..., None]).squeeze(-1)
@@ -294,7 +294,7 @@ def relative_jacobian(rig: CameraRig, reference: int) -> Tensor:
 
 def relative_difference(rig: CameraRig, other: CameraRig, reference: int = 0) -> Tensor:
     """Error of a rig against another one, extrinsics relative to a reference camera: (*B, C, 15), gauge-free."""
-    return _relative_to(rig, reference).difference(_relative_to(other, reference))
+    return _relative_to(rig, reference).local(_relative_to(other, reference))
 
 
 def _relative_to(rig: CameraRig, reference: int) -> CameraRig:
@@ -307,10 +307,10 @@ def _relative_to(rig: CameraRig, reference: int) -> CameraRig:
 def _unwhitening(estimate: Estimate) -> Tensor:
     """Derivative of the parameters by the whitened offsets: (B, C, 15, 15)."""
     problem, state = estimate.problem, estimate.solution.state
-    spread = problem.spread.detach()
-    scale = torch.diag_embed(spread)
-    left = left_jacobian(state.offset[..., :3] * spread[..., :3])
-    scale[..., :3, :3] = left * spread[..., None, :3]
+    prior_std = problem.prior_std.detach()
+    scale = torch.diag_embed(prior_std)
+    left = left_jacobian(state.offset[..., :3] * prior_std[..., :3])
+    scale[..., :3, :3] = left * prior_std[..., None, :3]
     return scale
 
 
@@ -347,16 +347,16 @@ def object_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
     problem, equations = estimate.problem, estimate.solution.equations
     fiducials = len(problem.points)
     batch = estimate.chi2.shape
-    if equations.object is None or problem.object_spread is None:
+    if equations.object is None or problem.object_prior_std is None:
         return problem.points.new_zeros(*batch, 3 * fiducials, 3 * fiducials)
     reduced = estimate.solution.factorization.reduced
     if bool(reduced.failed.any()):
         raise RefusedError(UNDETERMINED)
     size = 3 * fiducials + 1
     whitened = torch.cholesky_inverse(reduced.kept)[:, -size:, -size:]
-    spread = problem.object_spread
+    prior_std = problem.object_prior_std
     jacobian = torch.cat(
-        (torch.diag_embed(spread[:, :-1]), (problem.points.flatten() * spread[:, -1:])[..., None]), dim=-1
+        (torch.diag_embed(prior_std[:, :-1]), (problem.points.flatten() * prior_std[:, -1:])[..., None]), dim=-1
     )
     flat = (jacobian @ whitened @ jacobian.mT).reshape(*batch, 3 * fiducials, 3 * fiducials)
     if not curved:

@@ -28,10 +28,10 @@ from imgcal.estimation.linearization import (
     State,
     Step,
     jacobian_at,
-    moved,
     object_columns,
     points_at,
     pose_at,
+    retract,
     rig_at,
     with_scale,
 )
@@ -70,11 +70,11 @@ def curvature_covariance(estimate: Estimate, quantity: Callable[[CameraRig, Tens
 def _moved_rigs(problem: Problem, state: State, x: Step, follow: Step, sign: int) -> tuple[CameraRig, Tensor]:
     """Rigs (B, K) and fiducials (B, K, N, 3) mm after steps of the cameras and of the object."""
     factory = problem.factory.map_tensors(lambda tensor, _: tensor.unsqueeze(1))
-    many = replace(problem, factory=factory, spread=problem.spread.unsqueeze(1))
+    many = replace(problem, factory=factory, prior_std=problem.prior_std.unsqueeze(1))
     rigs = rig_at(many, state.offset.unsqueeze(1) + sign * x.camera + follow.camera)
     points = points_at(problem, state).unsqueeze(1).expand(-1, x.camera.shape[1], -1, -1)
-    if x.object is not None and follow.object is not None and problem.object_spread is not None:
-        step = (sign * x.object + follow.object) * problem.object_spread.unsqueeze(1)
+    if x.object is not None and follow.object is not None and problem.object_prior_std is not None:
+        step = (sign * x.object + follow.object) * problem.object_prior_std.unsqueeze(1)
         points = points + problem.points * step[..., -1, None, None] + step[..., :-1].unflatten(-1, (-1, 3))
     return rigs, points
 
@@ -110,9 +110,9 @@ def _follow(problem: Problem, state: State, factorization: Factorization, x: Ste
         bend = 0.5 * (there + back) - at.residual.unsqueeze(1)  # (B, K, S, C, 2, N)
         right = -torch.einsum("bscirn,bkscrn->bksci", by_rig, bend)
         camera, pose, own = right[..., :PARAMETERS].sum(2), right[..., PARAMETERS:].sum(3), None
-        if by_object is not None and problem.object_spread is not None:
+        if by_object is not None and problem.object_prior_std is not None:
             sums = torch.einsum("bscirn,bkscrn->bkin", by_object, bend)
-            own = -object_columns(sums) * problem.object_spread.unsqueeze(1)
+            own = -object_columns(sums) * problem.object_prior_std.unsqueeze(1)
         for k in range(camera.shape[1]):
             steps.append(factorization.solve(Step(camera[:, k], pose[:, k], None if own is None else own[:, k])))
     cameras, poses = (torch.stack([step[i] for step in steps], dim=1) for i in (0, 1))  # type: ignore[misc]
@@ -125,7 +125,7 @@ def _residual(problem: Problem, state: State, step: Step, sign: int) -> Tensor:
     batch, pairs = step.camera.shape[:2]
     rows = torch.arange(batch, device=step.camera.device).repeat_interleave(pairs)
     many = problem.select(rows)
-    there = moved(many, taken(state, rows), *step.map(lambda part: sign * part.flatten(0, 1)))
+    there = retract(many, taken(state, rows), *step.map(lambda part: sign * part.flatten(0, 1)))
     points = pose_at(many, there).apply((points_at(many, there) + problem.centroid).unsqueeze(1))  # (B K, S, N, 3)
     snapshots, fiducials = points.shape[1:3]
     radius = None if problem.radius_squared is None else problem.radius_squared.sqrt().repeat(snapshots)

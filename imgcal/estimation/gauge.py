@@ -43,7 +43,7 @@ def aligned(rig: CameraRig, reference: CameraRig, points_reference: Tensor, came
     start = RigidTransform.identity(1, dtype=points_reference.dtype)
     held = torch.zeros(len(chosen), 15, dtype=points_reference.dtype)
     fit = estimate(
-        observations, rig.select(chosen), cloud, start, spread=held, options=EstimationOptions(loss="cauchy")
+        observations, rig.select(chosen), cloud, start, prior_std=held, options=EstimationOptions(loss="cauchy")
     )
     rig_from_reference = fit.rig_from_object[0]
     cam_from_rig = rig.cam_from_rig

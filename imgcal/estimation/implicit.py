@@ -14,25 +14,26 @@ import torch
 from torch import Tensor
 
 from imgcal.estimation.levenberg_marquardt import Solution
-from imgcal.estimation.linearization import Problem, State, Step, moved, points_at, pose_at, rig_at
-from imgcal.estimation.robust_losses import Loss
+from imgcal.estimation.linearization import Problem, State, Step, points_at, pose_at, retract, rig_at
+from imgcal.estimation.robust_losses import RobustKernel
 
 
-def attach_gradient(problem: Problem, solution: Solution, loss: Loss) -> State:
+def attach_gradient(problem: Problem, solution: Solution, loss: RobustKernel) -> State:
     """Return the solution's state, connected to whatever in `problem` requires a gradient."""
     factory = problem.factory
     inputs = (
-        problem.uv, problem.root_weight, problem.spread, problem.points, factory.focal_length, factory.principal_point,
-        factory.distortion, factory.cam_from_rig.rotation, factory.cam_from_rig.translation, problem.object_spread,
+        problem.uv, problem.root_weight, problem.prior_std, problem.points, problem.object_prior_std,
+        factory.focal_length, factory.principal_point, factory.distortion,
+        factory.cam_from_rig.rotation, factory.cam_from_rig.translation,
     )  # fmt: skip
     if not (torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in inputs)):
         return solution.state
     gradient = _gradient(problem, solution.state, loss, create_graph=True)
     step = _NewtonStep.apply(_inverse_hessian(_detached(problem), solution, loss), *gradient)
-    return moved(problem, solution.state, *step)
+    return retract(problem, solution.state, *step)
 
 
-def map_cost(problem: Problem, state: State, loss: Loss) -> Tensor:
+def map_cost(problem: Problem, state: State, loss: RobustKernel) -> Tensor:
     """The cost that the solver minimizes, through the projection of `CameraRig`: (B,), differentiable in everything."""
     poses = pose_at(problem, state)
     rig = rig_at(problem, state.offset)
@@ -47,11 +48,11 @@ def map_cost(problem: Problem, state: State, loss: Loss) -> Tensor:
     return cost if state.object_offset is None else cost + 0.5 * state.object_offset.square().sum(1)
 
 
-def _gradient(problem: Problem, state: State, loss: Loss, create_graph: bool) -> Step:
+def _gradient(problem: Problem, state: State, loss: RobustKernel, create_graph: bool) -> Step:
     """Gradient of the cost by a step away from `state`."""
     with torch.enable_grad():
         step = _zero_step(state)
-        cost = map_cost(problem, moved(problem, state, *step), loss).sum()
+        cost = map_cost(problem, retract(problem, state, *step), loss).sum()
         return Step(*torch.autograd.grad(cost, _parts(step), create_graph=create_graph))
 
 
@@ -62,7 +63,7 @@ def _zero_step(state: State) -> Step:
     return Step(camera, pose, own)
 
 
-def _inverse_hessian(problem: Problem, solution: Solution, loss: Loss) -> Callable[[Step], Step]:
+def _inverse_hessian(problem: Problem, solution: Solution, loss: RobustKernel) -> Callable[[Step], Step]:
     """Return the map v -> H^-1 v for the exact Hessian at the solution.
 
     Conjugate gradients on exact Hessian products, preconditioned by the Gauss-Newton factorization: a handful of
@@ -73,7 +74,7 @@ def _inverse_hessian(problem: Problem, solution: Solution, loss: Loss) -> Callab
     def product(v: Step) -> Step:
         with torch.enable_grad():
             step = _zero_step(solution.state)
-            cost = map_cost(problem, moved(problem, solution.state, *step), loss).sum()
+            cost = map_cost(problem, retract(problem, solution.state, *step), loss).sum()
             gradient = Step(*torch.autograd.grad(cost, _parts(step), create_graph=True))
             constant = Step(*(part.detach() for part in _parts(v)))
             return Step(*torch.autograd.grad(_dot(gradient, constant).sum(), _parts(step)))

@@ -18,9 +18,9 @@ from imgcal.estimation.linearization import (
     State,
     Step,
     linearize,
-    moved,
+    retract,
 )
-from imgcal.estimation.robust_losses import Loss
+from imgcal.estimation.robust_losses import RobustKernel
 from imgcal.types import PARAMETERS
 
 LEAST_DAMPING = 1e-9
@@ -49,7 +49,7 @@ class Solution:
         return factorize(self.equations)
 
 
-def minimize(problem: Problem, start: State, loss: Loss, max_iterations: int, tolerance: float) -> Solution:
+def minimize(problem: Problem, start: State, loss: RobustKernel, max_iterations: int, tolerance: float) -> Solution:
     """Minimize the MAP cost of every rig of a batch.
 
     A step that does not lower the cost, or whose factorization fails, is rejected and retried with more damping, each
@@ -77,7 +77,7 @@ def minimize(problem: Problem, start: State, loss: Loss, max_iterations: int, to
         iteration += 1
         step, gain, failed = damped_step(equations, damping)
         small = (gain <= tolerances + rounding * equations.cost) & ~failed
-        trial_state = moved(problem, state, *step)
+        trial_state = retract(problem, state, *step)
         trial = linearize(problem, trial_state, loss)
         before = equations.cost
         better = (trial.cost < before) & ~failed & ~converged

@@ -41,19 +41,19 @@ class Problem:
     centroid: Tensor  # (3,) mm in the object's frame
     radius_squared: Tensor | None  # (N,) mm^2
     factory: CameraRig  # (B,)
-    spread: Tensor  # (B, C, 15) prior standard deviation of each parameter
-    object_spread: Tensor | None = None  # (B, M) prior standard deviation of the object's parameters; None = exact
+    prior_std: Tensor  # (B, C, 15) prior standard deviation of each parameter
+    object_prior_std: Tensor | None = None  # (B, M) prior standard deviation of the object's parameters; None = exact
 
     def select(self, rows: Tensor) -> Problem:
         """Keep the given rigs, (R,) indices."""
-        spread = None if self.object_spread is None else self.object_spread[rows]
+        prior_std = None if self.object_prior_std is None else self.object_prior_std[rows]
         return replace(
             self,
             uv=self.uv[rows],
             root_weight=self.root_weight[rows],
             factory=self.factory[rows],
-            spread=self.spread[rows],
-            object_spread=spread,
+            prior_std=self.prior_std[rows],
+            object_prior_std=prior_std,
         )
 
 
@@ -93,7 +93,7 @@ class NormalEquations:
 
 def rig_at(problem: Problem, offset: Tensor) -> CameraRig:
     """Turn whitened offsets (B, C, 15) into a rig."""
-    return problem.factory.moved(offset * problem.spread)
+    return problem.factory.retract(offset * problem.prior_std)
 
 
 def pose_at(problem: Problem, state: State) -> RigidTransform:
@@ -104,9 +104,9 @@ def pose_at(problem: Problem, state: State) -> RigidTransform:
 def points_at(problem: Problem, state: State) -> Tensor:
     """Fiducials about the centroid of the object as it is given: (B, N, 3) mm in the object's frame."""
     points = problem.points.expand(len(state.offset), -1, -1)
-    if state.object_offset is None or problem.object_spread is None:
+    if state.object_offset is None or problem.object_prior_std is None:
         return points
-    offset = state.object_offset * problem.object_spread
+    offset = state.object_offset * problem.object_prior_std
     return points * (1 + offset[:, -1, None, None]) + offset[:, :-1].unflatten(-1, (-1, 3))
 
 
@@ -122,7 +122,7 @@ class Step(NamedTuple):
         return Step(function(self.camera), function(self.pose), None if self.object is None else function(self.object))
 
 
-def moved(
+def retract(
     problem: Problem, state: State, camera_step: Tensor, pose_step: Tensor, object_step: Tensor | None = None
 ) -> State:
     """Add a step; see `Step`."""
@@ -198,8 +198,8 @@ def _object_equations(problem: Problem, offset: Tensor, rows: Tensor, by_fiducia
     fiducials = rows.shape[-1]
     each = with_scale(problem, by_fiducial)
     to_rest = torch.einsum("bscirn,bscjrn->bscijn", rows, each)  # (B, S, C, 22, 4, N)
-    spread = problem.object_spread
-    assert spread is not None
+    prior_std = problem.object_prior_std
+    assert prior_std is not None
 
     among = torch.einsum("bscirn,bscjrn->bijn", each, each)  # (B, 4, 4, N)
     size = 3 * fiducials + 1
@@ -208,14 +208,14 @@ def _object_equations(problem: Problem, offset: Tensor, rows: Tensor, by_fiducia
     blocks.diagonal(dim1=1, dim2=3).copy_(among[:, :3, :3])
     own[:, -1, :-1] = own[:, :-1, -1] = among[:, :3, 3].mT.flatten(1)
     own[:, -1, -1] = among[:, 3, 3].sum(-1)
-    own = own * spread[:, :, None] * spread[:, None]
-    wide = spread[:, None, None]
+    own = own * prior_std[:, :, None] * prior_std[:, None]
+    wide = prior_std[:, None, None]
     last = PARAMETERS + POSE_PARAMETERS
     return ObjectEquations(
         camera=object_columns(to_rest[..., :PARAMETERS, :, :].sum(1)) * wide,
         pose=object_columns(to_rest[..., PARAMETERS:last, :, :].sum(2)) * wide,
         own=own + torch.eye(size, dtype=own.dtype, device=own.device),
-        gradient=object_columns(to_rest[..., last, :, :].sum((1, 2))) * spread + offset,
+        gradient=object_columns(to_rest[..., last, :, :].sum((1, 2))) * prior_std + offset,
     )
 
 
@@ -248,7 +248,7 @@ def jacobian_at(problem: Problem, state: State) -> Jacobian:
     rotation of the object q x R^T d, where d is the pixel's derivative with respect to p; with respect to the
     fiducial's coordinates in the object's frame it is Q^T R^T d, where Q is the object's rotation.
     """
-    parameters = state.offset * problem.spread
+    parameters = state.offset * problem.prior_std
     turn = parameters[..., :3]
     factory = problem.factory
     rotation = (rotation_from_vector(turn) @ factory.cam_from_rig.rotation).unsqueeze(1)  # (B, 1, C, 3, 3)
@@ -272,12 +272,12 @@ def jacobian_at(problem: Problem, state: State) -> Jacobian:
     jacobian[..., 6:8, :, :].diagonal(dim1=-3, dim2=-2).copy_(lens.distorted.mT)
     jacobian[..., 8:10, :, :].diagonal(dim1=-3, dim2=-2).fill_(1)
     jacobian[..., 10:15, :, :] = lens.by_distortion
-    jacobian[..., :15, :, :] *= problem.spread[:, None, :, :, None, None]
+    jacobian[..., :15, :, :] *= problem.prior_std[:, None, :, :, None, None]
     torch.linalg.cross(rotated.unsqueeze(-2).expand_as(by_centre), by_centre, dim=-3, out=jacobian[..., 15:18, :, :])
     torch.mul(by_centre, _depth_unit(state)[:, :, None, :, None, None], out=jacobian[..., 18:21, :, :])
     jacobian[..., 21, :, :] = residual
     by_fiducial = None
-    if problem.object_spread is not None:
+    if problem.object_prior_std is not None:
         turned = state.rotation.mT.unsqueeze(2) @ by_centre.flatten(-2)
         by_fiducial = turned.unflatten(-1, by_centre.shape[-2:])
     return Jacobian(jacobian, by_fiducial, residual, behind)

@@ -44,12 +44,12 @@ def minimize(
         max_iterations: linearizations at most, for each rig.
         tolerance: see `solver.minimize`.
     """
-    own_spread, state = _object_of(problem, start)
+    own_std, state = _object_of(problem, start)
     blocks = _Blocks.of(problem)
     cost, count = blocks.cost, len(blocks.cost)
     converged = np.zeros(count, dtype=np.bool_)
     iterations = np.zeros(count, dtype=np.int64)
-    arrays = _arrays((*_given(problem), own_spread, *_parts(state), *blocks.parts, cost))
+    arrays = _arrays((*_given(problem), own_std, *_parts(state), *blocks.parts, cost))
     limits = (blocks.cameras_first, LOSS_CODES[loss], threshold, max_iterations)
     tolerances = (tolerance + pixel_rounding(problem)).numpy()
     shared = _shared(problem)
@@ -63,16 +63,16 @@ def minimize(
         numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
         _minimize_all(*shared, *arrays, converged, iterations, *limits, tolerances)  # type: ignore[call-arg]
         torch.set_num_threads(threads)
-    if not own_spread.shape[1]:
+    if not own_std.shape[1]:
         state = replace(state, object_offset=None)
     return Solution(state, blocks.equations(), torch.from_numpy(converged), int(iterations.max()))
 
 
 def linearize(problem: Problem, state: State, loss: str, threshold: float) -> NormalEquations:
     """Do the work of `linearization.linearize` for tensors on the CPU, without gradients; the loss as in `minimize`."""
-    own_spread, state = _object_of(problem, state)
+    own_std, state = _object_of(problem, state)
     blocks = _Blocks.of(problem)
-    arrays = _arrays((*_given(problem), own_spread, *_parts(state), *blocks.parts, blocks.cost))
+    arrays = _arrays((*_given(problem), own_std, *_parts(state), *blocks.parts, blocks.cost))
     _linearize_all(*_shared(problem), *arrays, blocks.cameras_first, LOSS_CODES[loss], threshold)  # type: ignore[call-arg]
     return blocks.equations()
 
@@ -96,7 +96,7 @@ class _Blocks:
     def of(cls, problem: Problem) -> _Blocks:
         """Make room for those of a problem."""
         batch, snapshots, cameras, _, fiducials = problem.uv.shape
-        own = 0 if problem.object_spread is None else problem.object_spread.shape[1]
+        own = 0 if problem.object_prior_std is None else problem.object_prior_std.shape[1]
         cameras_first = 6 * snapshots <= 15 * cameras
         shape = (cameras, 15, 6 * snapshots + own) if cameras_first else (snapshots, 6, 15 * cameras + own)
         sizes = (
@@ -134,16 +134,18 @@ class _Blocks:
 
 def _object_of(problem: Problem, state: State) -> tuple[Tensor, State]:
     """Spread of the object's parameters (B, M), M = 0 where it is exact, and a copy of the state with as many."""
-    spread = problem.uv.new_empty(len(problem.uv), 0) if problem.object_spread is None else problem.object_spread
-    offset = torch.zeros_like(spread) if state.object_offset is None else state.object_offset.clone()
-    return spread, State(state.offset.clone(), state.rotation.clone(), state.centre.clone(), offset)
+    prior_std = (
+        problem.uv.new_empty(len(problem.uv), 0) if problem.object_prior_std is None else problem.object_prior_std
+    )
+    offset = torch.zeros_like(prior_std) if state.object_offset is None else state.object_offset.clone()
+    return prior_std, State(state.offset.clone(), state.rotation.clone(), state.centre.clone(), offset)
 
 
 def _given(problem: Problem) -> tuple[Tensor, ...]:
     factory = problem.factory
     pinhole = (factory.focal_length, factory.principal_point, factory.distortion)
     rig = (factory.cam_from_rig.rotation, factory.positions, *pinhole)
-    return (problem.uv, problem.root_weight, *rig, problem.spread)
+    return (problem.uv, problem.root_weight, *rig, problem.prior_std)
 
 
 def _parts(state: State) -> tuple[Tensor, ...]:
@@ -161,7 +163,7 @@ def rig_at(problem: Problem, offset: Tensor) -> CameraRig:
     factory = problem.factory
     given = (factory.cam_from_rig.rotation, factory.cam_from_rig.translation)
     rotation, translation = (torch.empty_like(tensor, memory_format=torch.contiguous_format) for tensor in given)
-    parameters = offset * problem.spread
+    parameters = offset * problem.prior_std
     _turn_all(*_arrays((parameters, *given, rotation, translation)))
     return replace(
         factory,
@@ -179,7 +181,7 @@ def _arrays(tensors: tuple[Tensor, ...]) -> list[np.ndarray]:
 
 @njit(parallel=True, cache=True, fastmath=kernels.FAST)
 def _minimize_all(
-    points, radius_squared, uv, root_weight, rotation0, position0, focal0, principal0, distortion0, spread, own_spread,
+    points, radius_squared, uv, root_weight, rotation0, position0, focal0, principal0, distortion0, prior_std, own_std,
     offset, rotation, centre, own_offset,
     camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual,
     cost, converged, iterations, cameras_first, loss, threshold, max_iterations, tolerances,
@@ -187,7 +189,7 @@ def _minimize_all(
     for b in prange(uv.shape[0]):
         _minimize_rig(
             points, radius_squared, uv[b], root_weight[b],
-            rotation0[b], position0[b], focal0[b], principal0[b], distortion0[b], spread[b], own_spread[b],
+            rotation0[b], position0[b], focal0[b], principal0[b], distortion0[b], prior_std[b], own_std[b],
             offset[b], rotation[b], centre[b], own_offset[b], camera[b], coupling[b], pose[b], border[b],
             camera_gradient[b], pose_gradient[b], own_gradient[b], residual[b],
             cost[b : b + 1], converged[b : b + 1], iterations[b : b + 1],
@@ -197,7 +199,7 @@ def _minimize_all(
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _minimize_rig(
-    points, radius_squared, uv, root_weight, rotation0, position0, focal0, principal0, distortion0, spread, own_spread,
+    points, radius_squared, uv, root_weight, rotation0, position0, focal0, principal0, distortion0, prior_std, own_std,
     offset, rotation, centre, own_offset,
     camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual,
     cost, converged, iterations, cameras_first, loss, threshold, max_iterations, tolerance,
@@ -205,7 +207,7 @@ def _minimize_rig(
     """Levenberg-Marquardt on one rig; the outputs hold the best state and its normal equations."""
     given = (
         points, radius_squared, uv, root_weight,
-        rotation0, position0, focal0, principal0, distortion0, spread, own_spread,
+        rotation0, position0, focal0, principal0, distortion0, prior_std, own_std,
     )  # fmt: skip
     state = (offset, rotation, centre, own_offset)
     blocks = (camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual)
@@ -265,7 +267,7 @@ def _minimize_rig(
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _linearize_all(
-    points, radius_squared, uv, root_weight, rotation0, position0, focal0, principal0, distortion0, spread, own_spread,
+    points, radius_squared, uv, root_weight, rotation0, position0, focal0, principal0, distortion0, prior_std, own_std,
     offset, rotation, centre, own_offset,
     camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual,
     cost, cameras_first, loss, threshold,
@@ -273,7 +275,7 @@ def _linearize_all(
     for b in range(len(cost)):
         given = (
             points, radius_squared, uv[b], root_weight[b],
-            rotation0[b], position0[b], focal0[b], principal0[b], distortion0[b], spread[b], own_spread[b],
+            rotation0[b], position0[b], focal0[b], principal0[b], distortion0[b], prior_std[b], own_std[b],
         )  # fmt: skip
         state = (offset[b], rotation[b], centre[b], own_offset[b])
         blocks = (
@@ -288,7 +290,7 @@ def _linearize(given, state, blocks, cameras_first, loss, threshold):
     """Fill the blocks of the normal equations and return the cost."""
     (
         points, radius_squared, uv, root_weight,
-        rotation0, position0, focal0, principal0, distortion0, spread, own_spread,
+        rotation0, position0, focal0, principal0, distortion0, prior_std, own_std,
     ) = given  # fmt: skip
     offset, rotation, centre, own_offset = state
     camera, _, pose, _, camera_gradient, pose_gradient, _, residual = blocks
@@ -307,15 +309,15 @@ def _linearize(given, state, blocks, cameras_first, loss, threshold):
     parameters = np.empty(15, dtype=kind)
     rotated, point = np.empty(3, dtype=kind), np.empty(3, dtype=kind)
     derivative, back = np.empty((2, 3), dtype=kind), np.empty(3, dtype=kind)
-    bent, scale = len(own_spread) > 0, 1.0
+    bent, scale = len(own_std) > 0, 1.0
     rows_own = np.empty((2, 4), dtype=kind)
     cost = 0.0
     if bent:
         cost = _start_object(own_offset, blocks)
-        scale += own_offset[-1] * own_spread[-1]
+        scale += own_offset[-1] * own_std[-1]
     for c in range(cameras):
         for i in range(15):
-            parameters[i] = offset[c, i] * spread[c, i]
+            parameters[i] = offset[c, i] * prior_std[c, i]
             cost += 0.5 * offset[c, i] ** 2
             camera_gradient[c, i] = offset[c, i]
             for j in range(15):
@@ -337,9 +339,9 @@ def _linearize(given, state, blocks, cameras_first, loss, threshold):
             for n in range(fiducials):
                 at_x, at_y, at_z = points[n, 0], points[n, 1], points[n, 2]
                 if bent:
-                    at_x = scale * at_x + own_offset[3 * n] * own_spread[3 * n]
-                    at_y = scale * at_y + own_offset[3 * n + 1] * own_spread[3 * n + 1]
-                    at_z = scale * at_z + own_offset[3 * n + 2] * own_spread[3 * n + 2]
+                    at_x = scale * at_x + own_offset[3 * n] * own_std[3 * n]
+                    at_y = scale * at_y + own_offset[3 * n + 1] * own_std[3 * n + 1]
+                    at_z = scale * at_z + own_offset[3 * n + 2] * own_std[3 * n + 2]
                 for i in range(3):
                     rotated[i] = rotation[s, i, 0] * at_x + rotation[s, i, 1] * at_y + rotation[s, i, 2] * at_z
                 rx = rotated[0] + centre[s, 0] - position0[c, 0] - parameters[3]
@@ -386,13 +388,13 @@ def _linearize(given, state, blocks, cameras_first, loss, threshold):
                             rows_own[r, i] = (
                                 rotation[s, 0, i] * back[0] + rotation[s, 1, i] * back[1] + rotation[s, 2, i] * back[2]
                             )
-                        rows_own[r, 3] = own_spread[-1] * (
+                        rows_own[r, 3] = own_std[-1] * (
                             rows_own[r, 0] * points[n, 0]
                             + rows_own[r, 1] * points[n, 1]
                             + rows_own[r, 2] * points[n, 2]
                         )
                         for i in range(3):
-                            rows_own[r, i] *= own_spread[3 * n + i]
+                            rows_own[r, i] *= own_std[3 * n + i]
                 rows[0, 6], rows[1, 7] = xd * weight, yd * weight
                 rows[0, 8], rows[1, 9] = weight, weight
                 rows[0, 10], rows[1, 10] = fx_w * x * rr, fy_w * y * rr
@@ -401,8 +403,8 @@ def _linearize(given, state, blocks, cameras_first, loss, threshold):
                 rows[0, 13], rows[1, 13] = fx_w * (rr + 2 * x * x), fy_w * 2 * x * y
                 rows[0, 14], rows[1, 14] = rows[0, 11] * rr, rows[1, 11] * rr
                 for i in range(15):
-                    rows[0, i] *= spread[c, i]
-                    rows[1, i] *= spread[c, i]
+                    rows[0, i] *= prior_std[c, i]
+                    rows[1, i] *= prior_std[c, i]
                 ru, rv = ru * weight, rv * weight
                 if bent:
                     _add_object(rows, rows_own, ru, rv, c, s, n, blocks, cameras_first)

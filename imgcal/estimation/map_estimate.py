@@ -76,8 +76,8 @@ def estimate(
     obj: CalibrationObject,
     rig_from_object: RigidTransform | None = None,
     *,
-    spread: Tensor | None = None,
-    first_guess: CameraRig | None = None,
+    prior_std: Tensor | None = None,
+    initial_rig: CameraRig | None = None,
     options: EstimationOptions = EstimationOptions(),
 ) -> Estimate:
     """Find the rig and the object's poses that best explain the observations and the factory calibration.
@@ -91,9 +91,9 @@ def estimate(
         obj: N fiducials; a radius makes their images ellipses, whose centres are what is observed. Where it has
             tolerances, its shape is estimated too, one shape for all snapshots.
         rig_from_object: (*B, S) first guess of the poses; None = `initial_pose`.
-        spread: (*B, C, 15) standard deviation of each factory value in the order of `rig.PARAMETER_NAMES`; zero keeps a
+        prior_std: (*B, C, 15) standard deviation of each factory value in the order of `PARAMETER_NAMES`; zero keeps a
             value fixed; None = the rig's own prior, or `RigPrior()`.
-        first_guess: (*B) where to start, a network's output for example; None = the factory rig.
+        initial_rig: (*B) where to start, a network's output for example; None = the factory rig.
         options: how to minimize.
 
     Returns:
@@ -103,13 +103,13 @@ def estimate(
         InputError: shapes that do not belong together; something seen with a sigma of zero or less.
     """
     batch = observations.seen.shape[:-3]
-    problem = make_problem(observations, rig, obj, spread)
+    problem = make_problem(observations, rig, obj, prior_std)
     check_observations(observations)
     if rig_from_object is None:
         with torch.no_grad():
-            rig_from_object = initial_pose(observations, first_guess or rig, obj)
-    solution = minimize(problem, make_start(problem, rig_from_object, first_guess), options)
-    return conclude(problem, solution, implicit.attach_gradient(problem, solution, make_loss(options)), batch)
+            rig_from_object = initial_pose(observations, initial_rig or rig, obj)
+    solution = minimize(problem, initial_state(problem, rig_from_object, initial_rig), options)
+    return make_estimate(problem, solution, implicit.attach_gradient(problem, solution, make_loss(options)), batch)
 
 
 def make_loss(options: EstimationOptions) -> NamedLoss:
@@ -177,14 +177,14 @@ def equations_by_snapshot(problem: Problem, state: State, loss: NamedLoss) -> No
         root_weight=problem.root_weight[0].unsqueeze(1),
         points=points_at(problem, state)[0],
         factory=problem.factory.map_tensors(lambda tensor, _: repeated(tensor)),
-        spread=repeated(problem.spread),
-        object_spread=None,
+        prior_std=repeated(problem.prior_std),
+        object_prior_std=None,
     )
     there = State(repeated(state.offset), state.rotation[0].unsqueeze(1), state.centre[0].unsqueeze(1))
     return equations_at(alone, there, loss)
 
 
-def conclude(
+def make_estimate(
     problem: Problem, solution: levenberg_marquardt.Solution, state: State, batch: torch.Size = torch.Size()
 ) -> Estimate:
     """Say what a solution means; `state` is the solution's, possibly with a gradient."""
@@ -207,27 +207,34 @@ def conclude(
     )
 
 
-def make_problem(observations: Observations, rig: CameraRig, obj: CalibrationObject, spread: Tensor | None) -> Problem:
+def make_problem(
+    observations: Observations, rig: CameraRig, obj: CalibrationObject, prior_std: Tensor | None
+) -> Problem:
     """Flatten the batch axes and whiten: see `estimate`."""
     cameras, fiducials = observations.seen.shape[-2:]
-    if cameras != rig.cameras or fiducials != obj.fiducials or observations.uv.shape != (*observations.seen.shape, 2):
+    if (
+        cameras != rig.num_cameras
+        or fiducials != obj.num_fiducials
+        or observations.uv.shape != (*observations.seen.shape, 2)
+    ):
         raise InputError(
             f"observations: found uv {tuple(observations.uv.shape)} and seen {tuple(observations.seen.shape)}, "
-            f"expected (..., snapshots, {rig.cameras} cameras, {obj.fiducials} fiducials) and the same with coordinates"
+            f"expected (..., snapshots, {rig.num_cameras} cameras, {obj.num_fiducials} fiducials) and the same with "
+            "coordinates"
         )
     batch = observations.seen.shape[:-3]
     count = batch.numel()
     uv, sigma = observations.uv, observations.sigma
     rig = rig.to(uv.dtype)
-    if spread is None:
-        spread = (rig.prior or RigPrior()).std(rig)
+    if prior_std is None:
+        prior_std = (rig.prior or RigPrior()).std(rig)
     seen = observations.seen.reshape(count, *observations.seen.shape[-3:])
     uv = uv.reshape(count, *uv.shape[-4:])
     sigma = sigma.expand(observations.seen.shape).reshape(seen.shape)
     points = obj.points.to(uv)
     centroid = points.mean(0)
     return Problem(
-        object_spread=_object_spread(obj, uv, count),
+        object_prior_std=_object_spread(obj, uv, count),
         uv=torch.where(seen[..., None], uv, 0.0).mT.contiguous(),
         root_weight=torch.where(seen, 1 / torch.where(seen, sigma, 1.0), 0.0),
         points=points - centroid,
@@ -236,7 +243,7 @@ def make_problem(observations: Observations, rig: CameraRig, obj: CalibrationObj
         factory=rig.map_tensors(
             lambda tensor, axes: tensor.expand(*batch, *tensor.shape[-axes:]).reshape(count, *tensor.shape[-axes:])
         ),
-        spread=spread.to(uv).expand(*batch, cameras, PARAMETERS).reshape(count, cameras, PARAMETERS),
+        prior_std=prior_std.to(uv).expand(*batch, cameras, PARAMETERS).reshape(count, cameras, PARAMETERS),
     )
 
 
@@ -244,19 +251,19 @@ def _object_spread(obj: CalibrationObject, like: Tensor, count: int) -> Tensor |
     """Prior standard deviation of the object's own parameters, in the order of `State`: (B, M); None = exact."""
     if obj.exact:
         return None
-    spread = torch.cat((obj.granted.to(like).repeat_interleave(3), like.new_tensor([obj.scale_tolerance])))
-    return spread.expand(count, -1)
+    prior_std = torch.cat((obj.granted.to(like).repeat_interleave(3), like.new_tensor([obj.scale_tolerance])))
+    return prior_std.expand(count, -1)
 
 
-def make_start(problem: Problem, rig_from_object: RigidTransform, first_guess: CameraRig | None) -> State:
+def initial_state(problem: Problem, rig_from_object: RigidTransform, initial_rig: CameraRig | None) -> State:
     """Turn a first guess into a state of the problem."""
     count, snapshots = problem.uv.shape[:2]
     rotation = rig_from_object.rotation.detach().to(problem.uv).reshape(count, snapshots, 3, 3)
     translation = rig_from_object.translation.detach().to(problem.uv).reshape(count, snapshots, 3)
-    offset = torch.zeros_like(problem.spread)
-    if first_guess is not None:
-        guess = first_guess.to(problem.uv.dtype)
-        difference = guess.reshape(-1).difference(problem.factory).detach()
-        offset = torch.where(problem.spread > 0, difference / problem.spread.clamp_min(1e-30), 0.0)
-    own = None if problem.object_spread is None else torch.zeros_like(problem.object_spread)
+    offset = torch.zeros_like(problem.prior_std)
+    if initial_rig is not None:
+        guess = initial_rig.to(problem.uv.dtype)
+        difference = guess.reshape(-1).local(problem.factory).detach()
+        offset = torch.where(problem.prior_std > 0, difference / problem.prior_std.clamp_min(1e-30), 0.0)
+    own = None if problem.object_prior_std is None else torch.zeros_like(problem.object_prior_std)
     return State(offset.detach(), rotation, translation + rotation @ problem.centroid, own)

@@ -88,7 +88,7 @@ class Places:
             uv=problem.uv[:, :, copies].contiguous(),
             root_weight=root_weight,
             factory=problem.factory.select(copies),
-            spread=problem.spread[:, copies],
+            prior_std=problem.prior_std[:, copies],
         )
         start = replace(state, offset=state.offset[:, copies])
         solution = minimize(parted, start, options)
@@ -134,12 +134,12 @@ class Places:
 
     def change(self, before: int, after: int, noise: float) -> Change:
         """Difference between two places of a camera, with what is known of it."""
-        offset, spread = self.state.offset[0].numpy(), self.problem.spread[0, before].numpy()
+        offset, prior_std = self.state.offset[0].numpy(), self.problem.prior_std[0, before].numpy()
         covariance = self.blocks.covariance.reshape(len(self.camera), PARAMETERS, len(self.camera), PARAMETERS)
         joint = covariance[before, :, before] + covariance[after, :, after]
         joint = joint - covariance[before, :, after] - covariance[after, :, before]
         information: Array = np.linalg.inv(noise * joint + 1e-12 * np.eye(PARAMETERS)).astype(np.float64)
-        return Change(information, information @ (offset[after] - offset[before]), spread)
+        return Change(information, information @ (offset[after] - offset[before]), prior_std)
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ class Change:
 
     information: Array  # (15, 15)
     pull: Array  # (15,) information times the difference
-    spread: Array  # (15,) standard deviations of the prior
+    prior_std: Array  # (15,) standard deviations of the prior
 
     def gain(self, part: slice) -> float:
         """Chi-squared of the difference where only a part of the values may differ."""
@@ -166,7 +166,7 @@ class Change:
         """Kind, size and standard deviation, by the one kind of values that explains the difference best."""
         kind = max(KINDS, key=lambda name: self.gain(KINDS[name][0]))
         part, unit = KINDS[kind]
-        alone, scale = np.linalg.inv(self.information[part, part]), unit * self.spread[part]
+        alone, scale = np.linalg.inv(self.information[part, part]), unit * self.prior_std[part]
         change = alone @ self.pull[part] * scale
         length = float(np.linalg.norm(change))
         direction = change / max(length, 1e-30)

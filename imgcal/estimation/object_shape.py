@@ -21,7 +21,7 @@ from imgcal.estimation.covariance import object_covariance
 from imgcal.estimation.levenberg_marquardt import Solution, factorize
 from imgcal.estimation.linearization import Problem, State, jacobian_at, points_at, robust_weight
 from imgcal.estimation.map_estimate import Estimate, equations_at
-from imgcal.estimation.robust_losses import Loss, NamedLoss
+from imgcal.estimation.robust_losses import NamedLoss, RobustKernel
 from imgcal.types import PARAMETERS
 
 Array = NDArray[np.float64]
@@ -127,7 +127,7 @@ def shape_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> Sha
     points = points_at(problem, state)[0]
     size = 3 * len(points) + 1
     unit = torch.ones(1, size, dtype=points.dtype, device=points.device)
-    free = replace(problem, points=points, object_spread=unit)
+    free = replace(problem, points=points, object_prior_std=unit)
     equations = equations_at(free, replace(state, object_offset=torch.zeros_like(unit)), loss)
     reduced, own = factorize(equations).reduced, equations.object
     if own is None or bool(reduced.failed.any()):
@@ -139,8 +139,8 @@ def shape_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> Sha
     places = problem.points.cpu().double().numpy()
     displaced = (points.cpu().double().numpy() - places).ravel()
     tolerance, cost = np.zeros(len(places)), float(equations.cost)
-    if problem.object_spread is not None and state.object_offset is not None:
-        tolerance = problem.object_spread[0, :-1:3].cpu().double().numpy()
+    if problem.object_prior_std is not None and state.object_offset is not None:
+        tolerance = problem.object_prior_std[0, :-1:3].cpu().double().numpy()
         cost += 0.5 * float(state.object_offset.square().sum())
     return ShapeEvidence(
         information=information,
@@ -153,7 +153,7 @@ def shape_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> Sha
     )
 
 
-def pull_scatter(problem: Problem, state: State, loss: Loss) -> float:
+def pull_scatter(problem: Problem, state: State, loss: RobustKernel) -> float:
     """Variance of the snapshots' pulls about their mean, over that of noise; 1 at least, and for a few snapshots.
 
     Errors of lenses and centroids that belong to places rather than to fiducials pull differently in each snapshot.
@@ -206,31 +206,31 @@ def learnt_tolerances(shape: ShapeEvidence) -> Array:
 
 def _learn_each(shape: ShapeEvidence, size: float, floor: Array) -> Array:
     """Iterate tolerances (N,) mm that are as large as the displacements they allow, not below `floor`."""
-    spread = np.maximum(WIDE * size, floor)
+    prior_std = np.maximum(WIDE * size, floor)
     for _ in range(ROUNDS):
-        precision = np.repeat(spread**-2.0, 3)
+        precision = np.repeat(prior_std**-2.0, 3)
         covariance = np.linalg.inv(shape.information + np.diag(precision))
         square = np.square(covariance @ shape.pull).reshape(-1, 3).sum(1)
         determined = 3 - (covariance.diagonal() * precision).reshape(-1, 3).sum(1)
-        previous = spread
-        spread = np.clip(np.sqrt(square / np.maximum(determined, 1e-3)), floor, 10 * WIDE * size)
-        if np.abs(spread / previous - 1).max() < 0.01:
+        previous = prior_std
+        prior_std = np.clip(np.sqrt(square / np.maximum(determined, 1e-3)), floor, 10 * WIDE * size)
+        if np.abs(prior_std / previous - 1).max() < 0.01:
             break
-    return spread
+    return prior_std
 
 
 def _learn_one(shape: ShapeEvidence, size: float) -> float:
     """Iterate one tolerance (mm) for all fiducials."""
     _, variance, displacement = shape.directions
-    spread = WIDE * size
+    prior_std = WIDE * size
     for _ in range(ROUNDS):
-        kept = spread**2 / (variance + spread**2)  # of each displacement
-        previous = spread
-        spread = float(np.sqrt(np.square(kept * displacement).sum() / max(kept.sum(), 1e-3)))
-        spread = min(max(spread, NARROW * size), 10 * WIDE * size)
-        if abs(spread / previous - 1) < 0.01:
+        kept = prior_std**2 / (variance + prior_std**2)  # of each displacement
+        previous = prior_std
+        prior_std = float(np.sqrt(np.square(kept * displacement).sum() / max(kept.sum(), 1e-3)))
+        prior_std = min(max(prior_std, NARROW * size), 10 * WIDE * size)
+        if abs(prior_std / previous - 1) < 0.01:
             break
-    return spread
+    return prior_std
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ class RigUncertainty:
 
     def without(self, cameras: Collection[int]) -> RigUncertainty:
         """Leave cameras out, and align the others anew."""
-        kept = [i for i in range(self.rig.cameras) if i not in cameras]
+        kept = [i for i in range(self.rig.num_cameras) if i not in cameras]
         rows = torch.tensor([PARAMETERS * i + j for i in kept for j in range(PARAMETERS)], device=self.points.device)
         return rig_uncertainty(self.rig.select(kept), self.covariance[rows[:, None], rows], self.points)
 
@@ -52,7 +52,7 @@ class RigUncertainty:
                 an error, too, which means nothing.
         """
         rows = pixel_jacobian(self.rig, points).flatten(1, 2)  # (C, 2 P, 15)
-        cameras = self.rig.cameras
+        cameras = self.rig.num_cameras
         blocks = self.px_covariance.unflatten(0, (cameras, PARAMETERS)).unflatten(-1, (cameras, PARAMETERS))
         own = blocks.diagonal(dim1=0, dim2=2).permute(2, 0, 1)  # (C, 15, 15)
         variance = ((rows @ own) * rows).sum(-1).unflatten(1, (-1, 2)).sum(-1)
@@ -151,7 +151,7 @@ def rigid_motion(rig: CameraRig, centre: Tensor) -> Tensor:
     keeps its pixels.
     """
     turn = rig.cam_from_rig.rotation
-    motion = turn.new_zeros(rig.cameras, PARAMETERS, 6)
+    motion = turn.new_zeros(rig.num_cameras, PARAMETERS, 6)
     motion[:, 0:3, 0:3] = -turn
     motion[:, 3:6, 0:3] = -cross_matrix(rig.positions - centre)
     motion[:, 3:6, 3:6] = torch.eye(3, dtype=turn.dtype, device=turn.device)

@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-Loss = Callable[[Tensor], tuple[Tensor, Tensor]]
+RobustKernel = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
 def squared(d2: Tensor) -> tuple[Tensor, Tensor]:
@@ -36,7 +36,7 @@ def geman_mcclure(d2: Tensor, threshold: float = 3.0) -> tuple[Tensor, Tensor]:
     return d2 * share, share.square()
 
 
-LOSSES: dict[str, Loss] = {"squared": squared, "huber": huber, "cauchy": cauchy, "geman_mcclure": geman_mcclure}
+LOSSES: dict[str, RobustKernel] = {"squared": squared, "huber": huber, "cauchy": cauchy, "geman_mcclure": geman_mcclure}
 
 
 @dataclass(frozen=True)

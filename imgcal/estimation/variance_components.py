@@ -56,19 +56,19 @@ class FitOptions(Protocol):
 
 
 @dataclass(frozen=True)
-class SettledFit:
+class VarianceComponents:
     """A fit whose noise, outliers, object and prior agree with its residuals."""
 
     problem: Problem
     solution: Solution
     sigma: NDArray[np.floating]  # (S, C, N) px, with the model error
     seen: NDArray[np.bool_]  # (S, C, N) labels that fit
-    model_error: float  # px
-    widened: Mapping[str, float]
+    additive_noise: float  # px
+    prior_scale: Mapping[str, float]
     shape: ShapeEvidence | None = None  # what the residuals say about the object; None = not asked
 
 
-def settle(
+def estimate_variance_components(
     problem: Problem,
     starts: Sequence[tuple[State, float]],
     variance: NDArray[np.floating],
@@ -76,7 +76,7 @@ def settle(
     options: FitOptions,
     examine: bool = True,
     alike: bool = False,
-) -> SettledFit:
+) -> VarianceComponents:
     """Fit, ask the residuals for noise, outliers, the object and the prior's width, and fit again until they stay.
 
     Args:
@@ -94,12 +94,12 @@ def settle(
         RefusedError: no minimum was found, or noise, outliers, object and prior do not come to rest.
         UndeterminedPosesError: without outliers some snapshots do not say where the object is.
     """
-    (state, model_error), *later = starts
+    (state, additive_noise), *later = starts
     loss = make_loss(options.estimation)
-    widened: dict[str, float] = {}
+    prior_scale: dict[str, float] = {}
     kept, unexamined, shape = labels, examine, None
     for _ in range(ROUNDS):
-        seen, noise = kept, variance + model_error**2
+        seen, noise = kept, variance + additive_noise**2
         problem, solution, squared = _fit(problem, state, noise, seen, options)
         if unexamined and not later and bool(solution.converged):
             # Before outliers are left out: all labels of a fiducial that is off its place may be among them.
@@ -113,7 +113,7 @@ def settle(
         kept = seen & (squared <= options.outlier**2 * noise)
         require_poses(kept, problem.points)
         if later and not (bool(solution.converged) and (kept == labels).all()):
-            (state, model_error), *later = later
+            (state, additive_noise), *later = later
             kept = labels
             continue
         later = []
@@ -122,8 +122,8 @@ def settle(
             raise RefusedError(f"estimation: no minimum after {solution.iterations} iterations (RMS {rms:.3g} px)")
         state, remaining = solution.state, remaining_variance(solution)[0]
         taken = 6 * len(seen) + float((1 - remaining).sum())
-        previous, model_error = model_error, _model_error(squared[seen], variance[seen], taken)
-        if abs(model_error - previous) > 0.02 * previous or (kept != seen).any():
+        previous, additive_noise = additive_noise, _additive_noise(squared[seen], variance[seen], taken)
+        if abs(additive_noise - previous) > 0.02 * previous or (kept != seen).any():
             continue
         if examine:
             shape, free = _examine(problem, solution, loss, options, 0.0, alike)
@@ -131,9 +131,9 @@ def settle(
                 (problem, state), kept = free, labels
                 continue
         too_narrow = _too_narrow(state.offset[0].numpy(), remaining)
-        if not too_narrow or max(widened.values(), default=1.0) > options.widest_prior:
-            return SettledFit(problem, solution, np.sqrt(noise), seen, model_error, widened, shape)
-        widened |= {kind: widened.get(kind, 1.0) * factor for kind, factor in too_narrow.items()}
+        if not too_narrow or max(prior_scale.values(), default=1.0) > options.widest_prior:
+            return VarianceComponents(problem, solution, np.sqrt(noise), seen, additive_noise, prior_scale, shape)
+        prior_scale |= {kind: prior_scale.get(kind, 1.0) * factor for kind, factor in too_narrow.items()}
         problem, state = _widen(problem, state, too_narrow)
     raise RefusedError(
         f"estimation: noise, outliers and prior have not come to rest after {ROUNDS} fits: the rig has changed far "
@@ -174,16 +174,16 @@ def _examine(
 def _free_object(
     shape: ShapeEvidence, problem: Problem, solution: Solution, loss: NamedLoss, options: FitOptions
 ) -> tuple[Problem, State] | None:
-    spread = learnt_tolerances(shape)
-    if not (spread > 1.01 * shape.tolerance).any():
+    prior_std = learnt_tolerances(shape)
+    if not (prior_std > 1.01 * shape.tolerance).any():
         return None
-    before = problem.object_spread
+    before = problem.object_prior_std
     scale = problem.points.new_zeros(1) if before is None else before[0, -1:]
-    free = torch.cat((torch.from_numpy(spread).to(problem.uv).repeat_interleave(3), scale))
+    free = torch.cat((torch.from_numpy(prior_std).to(problem.uv).repeat_interleave(3), scale))
     # The displacements stay, in new units; where a tolerance is still zero there was none.
     displaced = (points_at(problem, solution.state)[0] - problem.points).flatten()
     whitened = torch.where(free > 0, torch.cat((displaced, torch.zeros_like(scale))) / free.clamp_min(1e-30), 0.0)
-    problem = replace(problem, object_spread=free[None])
+    problem = replace(problem, object_prior_std=free[None])
     state = replace(solution.state, object_offset=whitened[None])
     found = minimize(problem, state, options.estimation)
     # Where snapshots disagree about the fiducials, something else than the object is behind it.
@@ -198,15 +198,15 @@ def _require_scale(shape: ShapeEvidence, problem: Problem, solution: Solution, l
     How far they have moved otherwise says how far the prior can be trusted to know them.
     """
     position = KINDS["position"]
-    offset, spread = (tensor[0, :, position].numpy() for tensor in (solution.state.offset, problem.spread))
-    places = problem.factory.positions[0].numpy() + offset * spread
-    direction = np.where(spread > 0, (places - places.mean(0)) / np.maximum(spread, 1e-30), 0.0).ravel()
+    offset, prior_std = (tensor[0, :, position].numpy() for tensor in (solution.state.offset, problem.prior_std))
+    places = problem.factory.positions[0].numpy() + offset * prior_std
+    direction = np.where(prior_std > 0, (places - places.mean(0)) / np.maximum(prior_std, 1e-30), 0.0).ravel()
     along = float(direction @ offset.ravel()) ** 2 / max(float(direction @ direction), 1e-30)
     freedom = float((1 - remaining_variance(solution)[0, :, position]).sum())
     usual = (float(np.square(offset).sum()) - along) / max(freedom, 1.0)
     usual = usual if usual > 1 + 2 * (2 / max(freedom, 1.0)) ** 0.5 else 1.0
     error, deviation = shape.scale_error
-    granted = 0.0 if problem.object_spread is None else float(problem.object_spread[0, -1])
+    granted = 0.0 if problem.object_prior_std is None else float(problem.object_prior_std[0, -1])
     if MOST_SCALE > abs(error) > max(least, WRONG_SCALE * np.hypot(deviation * usual**0.5, granted)):
         size = "larger" if error > 0 else "smaller"
         raise RefusedError(
@@ -229,7 +229,7 @@ def _fit(
     return problem, solution, np.square(solution.equations.residual[0].numpy()).sum(-2)
 
 
-def _model_error(squared: NDArray[np.floating], variance: NDArray[np.floating], taken: float) -> float:
+def _additive_noise(squared: NDArray[np.floating], variance: NDArray[np.floating], taken: float) -> float:
     """Standard deviation (px, each axis) that residuals hold beyond the blobs' own sigma; 0 = insignificant.
 
     The median of squared distances over two axes is 1.386 for unit noise, whatever a minority of outliers does.
@@ -277,7 +277,7 @@ def _too_narrow(offset: NDArray[np.floating], remaining: NDArray[np.float64]) ->
 
 def _widen(problem: Problem, state: State, factors: Mapping[str, float]) -> tuple[Problem, State]:
     """Widen the prior; the state, counted in prior standard deviations, stays where it is."""
-    scale = torch.ones_like(problem.spread[0, 0])
+    scale = torch.ones_like(problem.prior_std[0, 0])
     for kind, factor in factors.items():
         scale[KINDS[kind]] = factor
-    return replace(problem, spread=problem.spread * scale), replace(state, offset=state.offset / scale)
+    return replace(problem, prior_std=problem.prior_std * scale), replace(state, offset=state.offset / scale)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from imgcal.estimation import Problem, State, initial_pose, make_problem, make_start, moved, pose_at, rig_at
+from imgcal.estimation import Problem, State, initial_pose, initial_state, make_problem, pose_at, retract, rig_at
 from imgcal.types import PARAMETERS, CalibrationObject, CameraRig, Observations, Prediction, pack21, unpack21
 
 Array = NDArray[np.float64]
@@ -34,7 +34,7 @@ def pnp(uv: Tensor, seen: Tensor, factory: CameraRig, obj: CalibrationObject, ot
         otherwise: (B,) taken for cameras that see fewer than four fiducials, or where OpenCV fails.
     """
     points = _numpy(obj.points)
-    lenses = [_intrinsics(factory, camera) for camera in range(factory.cameras)]
+    lenses = [_intrinsics(factory, camera) for camera in range(factory.num_cameras)]
 
     def solve(camera: int, uv: Array, seen: NDArray[np.bool_]) -> _Camera | None:
         matrix, distortion = lenses[camera]
@@ -53,7 +53,7 @@ def calibrate_cameras(
     seen, values are held at the factory's until there are as many equations: k3, k2 and p1, p2; k1; principal point.
     """
     points = _numpy(obj.points)
-    lenses = [_intrinsics(factory, camera) for camera in range(factory.cameras)]
+    lenses = [_intrinsics(factory, camera) for camera in range(factory.num_cameras)]
     run: Any = cv2.calibrateCamera  # its stubs know half of what it takes
     sizes = [(int(width), int(height)) for width, height in factory.image_size.tolist()]
 
@@ -98,7 +98,7 @@ def _camera_by_camera(
     cameras = pack21(otherwise.cameras_from_object).clone()
     places, flags = _numpy(uv), seen.cpu().numpy()
     for row in range(len(uv)):
-        for camera in range(factory.cameras):
+        for camera in range(factory.num_cameras):
             found = solve(camera, places[row, camera], flags[row, camera])
             if found is not None:
                 cameras[row, camera] = torch.from_numpy(found.numbers)
@@ -147,7 +147,7 @@ def _numpy(tensor: Tensor) -> Array:
 
 
 def bundle_adjustment(
-    observations: Observations, factory: CameraRig, obj: CalibrationObject, spread: Tensor
+    observations: Observations, factory: CameraRig, obj: CalibrationObject, prior_std: Tensor
 ) -> Prediction:
     """Minimize the MAP cost with squared loss by scipy's least_squares (MINPACK), numerical derivatives.
 
@@ -155,17 +155,17 @@ def bundle_adjustment(
         observations: (B, 1, C, N).
         factory: the factory rig, without batch axes; where the search starts, with a pose by PnP.
         obj: N fiducials.
-        spread: (C, 15) standard deviation of each factory value.
+        prior_std: (C, 15) standard deviation of each factory value.
     """
     found = []
     for row in range(len(observations.uv)):
         one = Observations(
             *(value[row : row + 1] for value in (observations.uv, observations.sigma, observations.seen))
         )
-        problem = make_problem(one, factory, obj, spread)
-        state = _least_squares(problem, make_start(problem, initial_pose(one, factory, obj), None))
+        problem = make_problem(one, factory, obj, prior_std)
+        state = _least_squares(problem, initial_state(problem, initial_pose(one, factory, obj), None))
         found.append(Prediction(rig_at(problem, state.offset), pose_at(problem, state)[:, 0]))
-    return Prediction.joined(found, torch.cat)
+    return Prediction.cat(found)
 
 
 def _least_squares(problem: Problem, start: State) -> State:
@@ -175,7 +175,7 @@ def _least_squares(problem: Problem, start: State) -> State:
 
     def at(x: Tensor) -> State:
         """States (R,) at steps (R, 15 C + 6)."""
-        return moved(problem, start, x[:, :split].unflatten(1, (cameras, PARAMETERS)), x[:, None, split:])
+        return retract(problem, start, x[:, :split].unflatten(1, (cameras, PARAMETERS)), x[:, None, split:])
 
     def residuals(x: Tensor) -> Tensor:
         state = at(x)

@@ -34,7 +34,7 @@ class Given:
     views: Views  # (B,) uv and seen
     factory: CameraRig  # without batch axes
     obj: CalibrationObject
-    spread: Tensor  # (C, 15) standard deviation of each factory value
+    prior_std: Tensor  # (C, 15) standard deviation of each factory value
     sigma: float  # pixels, noise of the points
     drawn: dict[ImageOptions, Tensor] = field(default_factory=dict)  # images, as far as somebody has asked for them
 
@@ -82,14 +82,14 @@ def factory_alone(given: Given) -> Prediction:
     a drifted rig misses by.
     """
     observations = observed(given.uv, given.seen, max(given.sigma, DRIFTED_SIGMA))
-    fixed = torch.zeros_like(given.spread)
-    return as_prediction(estimate(observations, given.factory, given.obj, spread=fixed))
+    fixed = torch.zeros_like(given.prior_std)
+    return as_prediction(estimate(observations, given.factory, given.obj, prior_std=fixed))
 
 
 def map_from_pnp(given: Given) -> Prediction:
     """MAP estimation of the whole rig from the factory rig and a pose by PnP over all cameras; Huber's loss."""
     observations = observed(given.uv, given.seen, given.sigma)
-    return as_prediction(estimate(observations, given.factory, given.obj, spread=given.spread))
+    return as_prediction(estimate(observations, given.factory, given.obj, prior_std=given.prior_std))
 
 
 def robust_from_pnp(given: Given) -> Prediction:
@@ -100,7 +100,7 @@ def robust_from_pnp(given: Given) -> Prediction:
 
 def refined_by_points(prediction: Prediction, given: Given) -> Prediction:
     """`refine_robustly` with what is given."""
-    return refine_robustly(prediction, given.views, given.factory, given.obj, given.spread, sigma=given.sigma)
+    return refine_robustly(prediction, given.views, given.factory, given.obj, given.prior_std, sigma=given.sigma)
 
 
 def pnp(given: Given) -> Prediction:
@@ -116,7 +116,7 @@ def opencv_calibrate(given: Given) -> Prediction:
 def scipy_bundle_adjustment(given: Given) -> Prediction:
     """Minimize the cost of MAP estimation, squared loss, with scipy's least_squares from a pose by PnP."""
     observations = observed(given.uv, given.seen, given.sigma)
-    return classical.bundle_adjustment(observations, given.factory, given.obj, given.spread)
+    return classical.bundle_adjustment(observations, given.factory, given.obj, given.prior_std)
 
 
 BASELINES: dict[str, Method] = {
@@ -158,7 +158,7 @@ def _refined_by_images(options: ImageOptions) -> Refine:
     def refine(prediction: Prediction, given: Given) -> Prediction:
         comparison = ImageRefinementOptions(image=options, position_noise=given.sigma)
         images = given.images(options)
-        fit, _ = refine_images(prediction, images, given.factory, given.obj, given.spread, comparison)
+        fit, _ = refine_images(prediction, images, given.factory, given.obj, given.prior_std, comparison)
         return as_prediction(fit)
 
     return refine

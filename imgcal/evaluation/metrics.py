@@ -91,7 +91,7 @@ def cramer_rao(estimate: Estimate) -> Errors:
     Args:
         estimate: (B,) with one snapshot each, by the squared loss.
     """
-    variance = relative_covariance(estimate).diagonal(dim1=-2, dim2=-1).unflatten(-1, (estimate.rig.cameras, -1))
+    variance = relative_covariance(estimate).diagonal(dim1=-2, dim2=-1).unflatten(-1, (estimate.rig.num_cameras, -1))
     return _summed_up(variance.clamp_min(0), _re_bound(estimate), estimate.rig.focal_length)
 
 

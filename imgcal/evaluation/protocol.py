@@ -209,7 +209,7 @@ class Sample:
         """MAP estimate of the true inliers from the truth, squared loss."""
         given = self.given()
         inliers = Views(uv=given.uv, seen=self.corrupted.inlier)
-        return refine_points(self.truth, inliers, given.factory, given.obj, given.spread, given.sigma, SQUARED)
+        return refine_points(self.truth, inliers, given.factory, given.obj, given.prior_std, given.sigma, SQUARED)
 
 
 def draw(conditions: Conditions, count: int, generator: torch.Generator) -> Sample:

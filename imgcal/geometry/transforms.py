@@ -28,7 +28,17 @@ class RigidTransform:
         return cls(eye, torch.zeros(*batch, 3, dtype=dtype, device=device))
 
     @classmethod
-    def joined(cls, parts: Sequence[RigidTransform], join: Join) -> RigidTransform:
+    def stack(cls, parts: Sequence[RigidTransform]) -> RigidTransform:
+        """Put several together along a new first batch axis."""
+        return cls.combine(parts, torch.stack)
+
+    @classmethod
+    def cat(cls, parts: Sequence[RigidTransform]) -> RigidTransform:
+        """Put several together along their first batch axis."""
+        return cls.combine(parts, torch.cat)
+
+    @classmethod
+    def combine(cls, parts: Sequence[RigidTransform], join: Join) -> RigidTransform:
         """Make one of several; `join` takes the list of their rotations, then of their translations."""
         return cls(join([part.rotation for part in parts]), join([part.translation for part in parts]))
 

@@ -217,7 +217,7 @@ def _read_image(path: Path, page: int, alone: bool, size: tuple[int, int] | None
 def _check_cameras(frames: Path, found: Iterable[str], rig: CameraRig) -> None:
     unknown = [camera for camera in found if camera not in rig.camera_names]
     if unknown:
-        hint = f"; put the snapshots into {frames / rig.camera_names[0]}" if rig.cameras == 1 else ""
+        hint = f"; put the snapshots into {frames / rig.camera_names[0]}" if rig.num_cameras == 1 else ""
         raise InputError(
             f"{frames}: found {listed(unknown)}, expected the cameras of rig {rig.name}: "
             f"{listed(rig.camera_names)}{nearest(unknown[0], rig.camera_names)}{hint}"

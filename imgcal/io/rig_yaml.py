@@ -216,7 +216,7 @@ def rig_text(
     content: dict[str, Any] = {"format": FORMAT, "name": rig.name}
     if rig.working_distance is not None:
         content["working_distance"] = rig.working_distance
-    content["cameras"] = [_camera_entry(rig, camera, covariance) for camera in range(rig.cameras)]
+    content["cameras"] = [_camera_entry(rig, camera, covariance) for camera in range(rig.num_cameras)]
     if rig.prior is not None:
         content["prior"] = {key: float(value) for key, value in vars(rig.prior).items()}
     if covariance is not None:

@@ -1,21 +1,21 @@
 from .config import PRESETS, Images, NetworkConfig, PaperImages, PaperPoints
 from .factory import build
 from .images import ImageNetwork, PaperImageNetwork
-from .parameterization import Decoder
+from .parameterization import Parameterization
 from .points import PaperPointNetwork, PointNetwork
-from .refiner import Trunk
+from .refiner import IterativeRefiner
 
 __all__ = [
     "PRESETS",
-    "Decoder",
     "ImageNetwork",
     "Images",
+    "IterativeRefiner",
     "NetworkConfig",
     "PaperImageNetwork",
     "PaperImages",
     "PaperPointNetwork",
     "PaperPoints",
+    "Parameterization",
     "PointNetwork",
-    "Trunk",
     "build",
 ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from imgcal.networks.config import Images, NetworkConfig, PaperImages, PaperPoints
-from imgcal.networks.parameterization import Decoder
+from imgcal.networks.parameterization import Parameterization
 from imgcal.types import CalibrationObject, CameraRig
 
 
@@ -28,7 +28,7 @@ def build(config: NetworkConfig, factory: CameraRig, obj: CalibrationObject, dri
     # timm takes seconds to import: only for those who need it.
     from imgcal.networks.points import PaperPointNetwork, PointNetwork
 
-    decoder, variant = Decoder(factory, obj, drift_std), config.variant()
+    decoder, variant = Parameterization(factory, obj, drift_std), config.variant()
     network: nn.Module
     if isinstance(variant, PaperPoints):
         network = PaperPointNetwork(variant, decoder)

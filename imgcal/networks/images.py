@@ -10,9 +10,9 @@ from torch.nn import functional
 
 from imgcal.networks.backbone import Backbone
 from imgcal.networks.config import Images, PaperImages
-from imgcal.networks.parameterization import Decoder
+from imgcal.networks.parameterization import Parameterization
 from imgcal.networks.points import PaperHeads
-from imgcal.networks.refiner import Trunk
+from imgcal.networks.refiner import IterativeRefiner
 from imgcal.networks.soft_positions import soft_positions
 from imgcal.synthesis import ImageOptions
 from imgcal.types import Prediction, Views
@@ -24,7 +24,7 @@ class PaperImageNetwork(nn.Module):
     Source: paper, supplementary section 1.2.
     """
 
-    def __init__(self, config: PaperImages, decoder: Decoder) -> None:
+    def __init__(self, config: PaperImages, decoder: Parameterization) -> None:
         super().__init__()
         self.decoder = decoder
         self.backbone = Backbone(config.backbone, config.pretrained, config.options)
@@ -56,7 +56,7 @@ class ImageNetwork(nn.Module):
 
     colours: Tensor  # (N, 3)
 
-    def __init__(self, config: Images, decoder: Decoder, colours: Tensor) -> None:
+    def __init__(self, config: Images, decoder: Parameterization, colours: Tensor) -> None:
         super().__init__()
         self.decoder = decoder
         self.register_buffer("colours", colours.to(decoder.focal_length), persistent=False)
@@ -68,7 +68,7 @@ class ImageNetwork(nn.Module):
             self.belief = nn.Conv2d(self.backbone.map_width, len(colours), 1)
             for parameter in self.belief.parameters():
                 nn.init.zeros_(parameter)
-        self.trunk = Trunk(decoder, **config.trunk.model_dump(), features=config.bottleneck)
+        self.trunk = IterativeRefiner(decoder, **config.trunk.model_dump(), features=config.bottleneck)
 
     def forward(self, views: Views) -> tuple[Prediction, ...]:
         """Predict the rig from `views.images`; one prediction a pass."""
@@ -80,9 +80,9 @@ class ImageNetwork(nn.Module):
             if not self.positions:
                 nothing = images.new_zeros((*images.shape[:2], len(self.colours)), dtype=torch.float32)
                 return self.trunk(nothing[..., None].expand(*nothing.shape, 2), nothing, bottleneck)
-            belief = self.belief(features.float())
+            heatmap_logits = self.belief(features.float())
             options = self.image_options
-            in_image, confidence = soft_positions(flat.float(), self.colours, options.dot, belief)
+            in_image, confidence = soft_positions(flat.float(), self.colours, options.dot, heatmap_logits)
             in_image = in_image.unflatten(0, images.shape[:2])
             uv = ImageOptions(images.shape[-1], options.dot).to_sensor(in_image, self.decoder.image_size)
         return self.trunk(uv, confidence.unflatten(0, images.shape[:2]), bottleneck)

@@ -28,7 +28,7 @@ class RigState:
         return RigState(self.offsets.detach(), self.rotation.detach(), self.centre.detach())
 
 
-class Decoder(nn.Module):
+class Parameterization(nn.Module):
     """Turn head outputs into predictions; holds the factory rig, the object and the spread as buffers, no weights."""
 
     focal_length: Tensor  # (C, 2)
@@ -37,12 +37,12 @@ class Decoder(nn.Module):
     rotation: Tensor  # (C, 3, 3)
     translation: Tensor  # (C, 3)
     image_size: Tensor  # (C, 2)
-    spread: Tensor  # (C, 15)
+    prior_std: Tensor  # (C, 15)
     centroid: Tensor  # (3,) mm
     centred: Tensor  # (N, 3) mm
     level: Tensor  # (3, 3)
 
-    def __init__(self, factory: CameraRig, obj: CalibrationObject, spread: Tensor) -> None:
+    def __init__(self, factory: CameraRig, obj: CalibrationObject, prior_std: Tensor) -> None:
         super().__init__()
         if factory.working_distance is None:
             raise InputError(f"rig {factory.name}: found no working_distance, expected one (mm) to start from")
@@ -56,7 +56,7 @@ class Decoder(nn.Module):
             "rotation": factory.cam_from_rig.rotation,
             "translation": factory.cam_from_rig.translation,
             "image_size": factory.image_size,
-            "spread": spread.to(factory.focal_length),
+            "prior_std": prior_std.to(factory.focal_length),
             "centroid": points.mean(0),
             "centred": points - points.mean(0),
             # Seen from the rig, an object below it that lies level has its z axis towards the cameras.
@@ -103,7 +103,7 @@ class Decoder(nn.Module):
     def prediction(self, state: RigState) -> Prediction:
         """The rig and the pose of a state: (B,)."""
         shift = state.centre - rotate(state.rotation, self.centroid.expand_as(state.centre))
-        return Prediction(self.factory.moved(state.offsets * self.spread), RigidTransform(state.rotation, shift))
+        return Prediction(self.factory.retract(state.offsets * self.prior_std), RigidTransform(state.rotation, shift))
 
     def project(self, prediction: Prediction) -> Projection:
         """Project the object's fiducials, as points: (B, C, N), without gradient."""

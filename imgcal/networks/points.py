@@ -9,8 +9,8 @@ from torch import Tensor, nn
 
 from imgcal.networks.config import PaperPoints, Points
 from imgcal.networks.layers import conv1d, mlp, transformer
-from imgcal.networks.parameterization import Decoder
-from imgcal.networks.refiner import Trunk
+from imgcal.networks.parameterization import Parameterization
+from imgcal.networks.refiner import IterativeRefiner
 from imgcal.synthesis import ImageOptions
 from imgcal.types import Prediction, Views
 
@@ -67,7 +67,7 @@ class PaperPointNetwork(nn.Module):
 
     image_options: ImageOptions | None = None
 
-    def __init__(self, config: PaperPoints, decoder: Decoder) -> None:
+    def __init__(self, config: PaperPoints, decoder: Parameterization) -> None:
         super().__init__()
         self.decoder = decoder
         cameras, fiducials = len(decoder.focal_length), len(decoder.centred)
@@ -96,14 +96,14 @@ class PaperPointNetwork(nn.Module):
 
 
 class PointNetwork(nn.Module):
-    """Our point variant: `Trunk` on the positions; fiducials that are missing are masked."""
+    """Our point variant: `IterativeRefiner` on the positions; fiducials that are missing are masked."""
 
     image_options: ImageOptions | None = None
 
-    def __init__(self, config: Points, decoder: Decoder) -> None:
+    def __init__(self, config: Points, decoder: Parameterization) -> None:
         super().__init__()
         self.decoder = decoder
-        self.trunk = Trunk(decoder, **config.trunk.model_dump())
+        self.trunk = IterativeRefiner(decoder, **config.trunk.model_dump())
 
     def forward(self, views: Views) -> tuple[Prediction, ...]:
         """Predict the rig from `views.uv` and `views.seen`; one prediction a pass."""

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from imgcal.networks.layers import conv1d, mlp, transformer, zeroed
-from imgcal.networks.parameterization import Decoder, RigState
+from imgcal.networks.parameterization import Parameterization, RigState
 from imgcal.types import PARAMETERS, Prediction
 
 RESIDUAL_SCALES = (20.0, 4.0)  # pixels, where a residual saturates; a linear part (in 100 px) stands beside
@@ -22,7 +22,7 @@ LIMIT = 5.0  # largest input of the linear parts
 LEAST_TRUST = 7.0  # largest log of a factor on sigma: a thousand sigmas, no weight at all
 
 
-class Stage(nn.Module):
+class UpdateBlock(nn.Module):
     """One pass: numbers of each camera in, parameters of each camera and of the pose out."""
 
     def __init__(
@@ -52,12 +52,12 @@ class Stage(nn.Module):
             return self.camera_head(torch.cat((encoded[:, :-1], inputs), dim=-1)), self.pose_head(encoded[:, -1])
 
 
-class Trunk(nn.Module):
+class IterativeRefiner(nn.Module):
     """Positions, and how far to trust each, to predictions coarse to fine."""
 
     def __init__(
         self,
-        decoder: Decoder,
+        decoder: Parameterization,
         *,
         encoder: str,
         width: int,
@@ -72,11 +72,11 @@ class Trunk(nn.Module):
         self.decoder, self.passes = decoder, passes
         cameras, fiducials = len(decoder.focal_length), len(decoder.centred)
         shape = (encoder, width, depth, heads)
-        self.first = Stage(3 * fiducials, features, cameras, 9, *shape)
+        self.first = UpdateBlock(3 * fiducials, features, cameras, 9, *shape)
         parts = 2 * (len(RESIDUAL_SCALES) + 2) + 1
         later = (encoder, width, later_depth, heads)
         inputs = parts * fiducials + PARAMETERS
-        self.later = Stage(inputs, features, cameras, 6, *later) if passes > 1 else None
+        self.later = UpdateBlock(inputs, features, cameras, 6, *later) if passes > 1 else None
         self.trust_head = zeroed(mlp((inputs, width, fiducials))) if trust else None
 
     def forward(self, uv: Tensor, weight: Tensor, features: Tensor | None = None) -> tuple[Prediction, ...]:
@@ -115,13 +115,13 @@ class Trunk(nn.Module):
         return tuple(predictions)
 
     @torch.no_grad()
-    def rescale(self, spread: Tensor) -> None:
+    def rescale(self, prior_std: Tensor) -> None:
         """Make weights that were trained with offsets in other units say the same in those of this network.
 
         Args:
-            spread: (C', 15) of the other training; cameras may differ, their mean counts.
+            prior_std: (C', 15) of the other training; cameras may differ, their mean counts.
         """
-        old, new = spread.to(self.decoder.spread).mean(0), self.decoder.spread.mean(0)
+        old, new = prior_std.to(self.decoder.prior_std).mean(0), self.decoder.prior_std.mean(0)
         ratio = torch.where((old > 0) & (new > 0), old / new.clamp_min(1e-30), 1.0)
         for stage in (self.first, self.later):
             if stage is not None:

@@ -16,18 +16,21 @@ LEAST_LIGHT = 0.05  # share of a full dot's light below which nothing was seen
 OUTLIER_SPREAD = 2.0  # in sizes of a dot: light farther from its centre is not one dot
 
 
-def soft_positions(images: Tensor, colours: Tensor, dot: float, belief: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def soft_positions(
+    images: Tensor, colours: Tensor, dot: float, heatmap_logits: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Locate every fiducial in every image.
 
     Args:
         images: (I, 3, H, W) colour-coded splats on black, in [0, 1].
         colours: (N, 3) of the fiducials.
         dot: standard deviation of a dot in pixels.
-        belief: (I, N, h, w) log weights of an encoder's cells, which multiply the colour's; None = colour alone.
+        heatmap_logits: (I, N, h, w) log weights of an encoder's cells, which multiply the colour's; None =
+            colour alone.
 
     Returns:
         uv (I, N, 2) pixels of the image and confidence (I, N) in [0, 1]: the share of a full dot's light that was found
-        in one place; zero where there is none, with finite positions. Differentiable in `belief`, float32.
+        in one place; zero where there is none, with finite positions. Differentiable in `heatmap_logits`, float32.
     """
     count, _, height, width = images.shape
     with torch.no_grad():
@@ -38,20 +41,20 @@ def soft_positions(images: Tensor, colours: Tensor, dot: float, belief: Tensor |
         light = (colour @ torch.nn.functional.normalize(colours.to(images), dim=-1).T) * likeness  # (M, N)
         place = torch.stack((u, v), dim=-1).to(images)
     weight = light
-    if belief is not None:
-        row, column = v * belief.shape[-2] // height, u * belief.shape[-1] // width
-        weight = light * belief[image, :, row, column].float().clamp(-8, 8).exp()
+    if heatmap_logits is not None:
+        row, column = v * heatmap_logits.shape[-2] // height, u * heatmap_logits.shape[-1] // width
+        weight = light * heatmap_logits[image, :, row, column].float().clamp(-8, 8).exp()
     first, _, _ = _centres(weight, place, image, count)
     with torch.no_grad():
         apart = (place[:, None] - first[image]).square().sum(-1) / (WINDOW * dot) ** 2
         window = torch.exp(-0.5 * apart)
-    second, found, spread = _centres(weight * window, place, image, count)
+    second, found, prior_std = _centres(weight * window, place, image, count)
     # A window of w sizes leaves w^2 / (1 + w^2) of a dot's light, and pulls its centre by the rest: undone here.
     kept = WINDOW**2 / (1 + WINDOW**2)
-    centre = first.detach() + (second - first.detach()) / kept if belief is None else second
+    centre = first.detach() + (second - first.detach()) / kept if heatmap_logits is None else second
     full = colours.to(images).norm(dim=-1) * (2 * torch.pi * dot**2) * kept
     share = (_sums(light * window, image, count) / full).clamp(0, 1)
-    confidence = torch.where((share > LEAST_LIGHT) & (spread < (OUTLIER_SPREAD * dot) ** 2), share, 0.0)
+    confidence = torch.where((share > LEAST_LIGHT) & (prior_std < (OUTLIER_SPREAD * dot) ** 2), share, 0.0)
     return torch.where((found > 0)[..., None], centre, 0.0), confidence
 
 
@@ -72,8 +75,8 @@ def _centres(weight: Tensor, place: Tensor, image: Tensor, count: int) -> tuple[
     centre = moments / safe[..., None]
     with torch.no_grad():
         squared = (place[:, None] - centre[image]).square().sum(-1)
-        spread = _sums(weight * squared, image, count) / safe
-    return centre, total, spread
+        prior_std = _sums(weight * squared, image, count) / safe
+    return centre, total, prior_std
 
 
 def _sums(values: Tensor, image: Tensor, count: int) -> Tensor:

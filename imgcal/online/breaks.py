@@ -37,7 +37,7 @@ class Series:
     residual: NDArray[np.float64]  # (S, C, N, 2) px, predicted minus observed, of all labels
     sigma: NDArray[np.float64]  # (S, C, N) px
     labels: NDArray[np.bool_]  # (S, C, N), those that the fit left out included
-    spread: NDArray[np.float64]  # (C, 6) prior standard deviation of rotation (rad) and position (mm)
+    prior_std: NDArray[np.float64]  # (C, 6) prior standard deviation of rotation (rad) and position (mm)
     offset: NDArray[np.float64]  # (C, 6) difference from the factory values, rotation and position
 
 
@@ -53,7 +53,7 @@ def series_of(fit: Estimate, labels: Observations, radius: Tensor | None) -> Ser
     if not torch.equal(fit.problem.root_weight[0] > 0, labels.seen):  # the fit knows no residuals of what it left out
         points = fit.rig_from_object.apply(fit.points_object)
         residual = fit.rig.expand(len(labels.uv)).project(points, radius).uv - labels.uv
-    spread = fit.problem.spread[0, :, :6]
+    prior_std = fit.problem.prior_std[0, :, :6]
     return Series(
         rig=fit.rig,
         rig_from_object=fit.rig_from_object,
@@ -61,8 +61,8 @@ def series_of(fit: Estimate, labels: Observations, radius: Tensor | None) -> Ser
         residual=residual.numpy(),
         sigma=labels.sigma.numpy(),
         labels=labels.seen.numpy(),
-        spread=spread.numpy(),
-        offset=(fit.solution.state.offset[0, :, :6] * spread).numpy(),
+        prior_std=prior_std.numpy(),
+        offset=(fit.solution.state.offset[0, :, :6] * prior_std).numpy(),
     )
 
 
@@ -91,7 +91,7 @@ def find_breaks(series: Series) -> Breaks:
     """
     pull, weight = _reduced(series)
     count = np.cumsum(series.labels.sum(2), axis=0)  # (S, C)
-    prior = np.where(series.spread > 0, series.spread, 1e-9) ** -2.0
+    prior = np.where(series.prior_std > 0, series.prior_std, 1e-9) ** -2.0
     before, pulled = np.cumsum(weight, axis=0)[:-1], np.cumsum(pull, axis=0)[:-1]
     after, pulled_after = weight.sum(0) - before, pull.sum(0) - pulled
     before = before + prior[:, :, None] * np.eye(6)
@@ -114,7 +114,7 @@ def find_breaks(series: Series) -> Breaks:
 
 def information(series: Series) -> NDArray[np.float64]:
     """Inverse covariance (C, 6, 6) of each camera's rotation (rad, left) and position (mm), the others being known."""
-    prior = np.where(series.spread > 0, series.spread, 1e-9) ** -2.0
+    prior = np.where(series.prior_std > 0, series.prior_std, 1e-9) ** -2.0
     return _reduced(series)[1].sum(0) + prior[:, :, None] * np.eye(6)
 
 

@@ -63,8 +63,8 @@ def without_strays(
     """
     seen = to_observations(blobs, rig, obj)
     even = replace(seen, sigma=torch.full_like(seen.sigma, options.identity_error))
-    held, robust = torch.zeros(rig.cameras, 15, dtype=seen.uv.dtype), replace(options.estimation, loss="cauchy")
-    fit = estimate(even, rig, obj, pose.reshape(1), spread=held, options=robust)
+    held, robust = torch.zeros(rig.num_cameras, 15, dtype=seen.uv.dtype), replace(options.estimation, loss="cauchy")
+    fit = estimate(even, rig, obj, pose.reshape(1), prior_std=held, options=robust)
     distance = fit.residual[0].norm(dim=-1)  # (C, N)
     usual = distance[seen.seen[0]].median() if bool(seen.seen.any()) else torch.inf
     stray = (distance > options.identity_error + MOST_APART * usual).numpy()
@@ -91,10 +91,10 @@ def astray(
         obj: the calibration object.
         pose: rig_from_object of this snapshot.
     """
-    labelled = np.bincount(blobs.camera[blobs.fiducial >= 0], minlength=rig.cameras)
-    spare = np.maximum(spare_blobs(blobs, rig.cameras) - usual, 0)
+    labelled = np.bincount(blobs.camera[blobs.fiducial >= 0], minlength=rig.num_cameras)
+    spare = np.maximum(spare_blobs(blobs, rig.num_cameras) - usual, 0)
     if not ((spare >= LEAST_BLOBS) & (labelled <= LEAST_EXPLAINED * (labelled + spare))).any():
-        return np.zeros(rig.cameras, dtype=bool)  # whatever is in view
+        return np.zeros(rig.num_cameras, dtype=bool)  # whatever is in view
     projection = rig.project(pose.apply(obj.points), obj.radius)
     size = rig.image_size.numpy()[:, None]
     uv = projection.uv.numpy()

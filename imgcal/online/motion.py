@@ -38,11 +38,11 @@ def measured_move(
     """
     rows = after.observations.seen[:, camera].any(-1).nonzero().flatten()
     given = Observations(*(getattr(after.observations, name)[rows] for name in ("uv", "sigma", "seen")))
-    spread = torch.zeros_like(after.problem.spread[0])
-    spread[camera, :6] = wide
+    prior_std = torch.zeros_like(after.problem.prior_std[0])
+    prior_std[camera, :6] = wide
     obj = replace(after.obj, points=after.points_object, tolerance=None, scale_tolerance=0.0)
     robust = EstimationOptions(loss="cauchy")
-    fit = estimate(given, before, obj, after.rig_from_object[rows], spread=spread, options=robust)
+    fit = estimate(given, before, obj, after.rig_from_object[rows], prior_std=prior_std, options=robust)
     change = (fit.solution.state.offset[0, camera, :6] * wide).numpy()
     found = information(series_of(fit, given, obj.radius))[camera]
     weight = np.linalg.inv(np.linalg.inv(known) + np.linalg.inv(found))

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imgcal.association import Follower, PipelineOptions, SnapshotIdentity, lattice_shifts
+from imgcal.association import PipelineOptions, SnapshotIdentity, Tracker, lattice_shifts
 from imgcal.detection import Blobs, DetectionOptions, Frame, detect_snapshot
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import aligned, flat_std
@@ -103,10 +103,10 @@ class Recalibrator:
         rig = rig.to(torch.float64)
         self.rig, self.obj, self.detection, self.window = rig, obj, detection, window
         self.options = replace(options, blind_cameras=True)
-        self._follower = Follower(rig, obj, self.options, remembered=0)
+        self._follower = Tracker(rig, obj, self.options, remembered=0)
         self._fit = WindowFit(rig, obj, self.options, window)
         self._recent: deque[Kept] = deque(maxlen=max(window, REMEMBERED))
-        self._spread = (rig.prior or RigPrior()).std(rig)
+        self._prior_std = (rig.prior or RigPrior()).std(rig)
         self._latest: LiveCalibration | None = None
         self._fitted: Calibration | None = None  # the same without what is kept of cameras that are not in the window
         self._last: dict[int, _Last] = {}
@@ -114,10 +114,10 @@ class Recalibrator:
         self._follows = False  # the last snapshot says where the object is now
         self._spare: deque[NDArray[np.int64]] = deque(maxlen=15)
         self._tests: deque[float] = deque(maxlen=200)
-        self._model_errors: deque[float] = deque(maxlen=10)
+        self._additive_noises: deque[float] = deque(maxlen=10)
         self._count = self._refused = 0
-        self._slips = obj.fiducials > MOST_FOLLOWED and bool(lattice_shifts(obj))
-        self._pool = ThreadPoolExecutor(min(rig.cameras, os.cpu_count() or 1))
+        self._slips = obj.num_fiducials > MOST_FOLLOWED and bool(lattice_shifts(obj))
+        self._pool = ThreadPoolExecutor(min(rig.num_cameras, os.cpu_count() or 1))
 
     def __enter__(self) -> Recalibrator:
         """Return itself."""
@@ -195,16 +195,16 @@ class Recalibrator:
         self, usable: Detections, name: str, coded: NDArray[np.int64] | None
     ) -> tuple[Detections, SnapshotIdentity]:
         """Label a snapshot by itself, with what is known of the rig."""
-        prior, follower = (self.rig.prior or RigPrior()).std(self.rig), self._follower
-        follower.rig, follower.spread = self.rig, prior
+        prior, tracker = (self.rig.prior or RigPrior()).std(self.rig), self._follower
+        tracker.rig, tracker.prior_std = self.rig, prior
         if self._latest is not None:
-            follower.rig, follower.spread = self._latest.rig, torch.minimum(2 * flat_std(self._latest), prior)
-        snapshot, labels = follower.decide(usable, name, coded)
+            tracker.rig, tracker.prior_std = self._latest.rig, torch.minimum(2 * flat_std(self._latest), prior)
+        snapshot, labels = tracker.decide(usable, name, coded)
         again = self._latest is not None and self._refused & (self._refused - 1) == 0
         if snapshot.status == "refused" and coded is None and again:
             # What was known may hold no more. Another try is dear: after 1, 2, 4, 8, ... refusals in a row.
-            follower.rig, follower.spread = self.rig, prior
-            snapshot, labels = follower.decide(usable, name, coded)
+            tracker.rig, tracker.prior_std = self.rig, prior
+            snapshot, labels = tracker.decide(usable, name, coded)
         if snapshot.status == "refused":
             self._refused += 1
             raise RefusedError(f"identity: {snapshot.reason}")
@@ -213,15 +213,15 @@ class Recalibrator:
 
     def _usual(self) -> Usual:
         """What earlier fits looked like."""
-        enough = len(self._tests) >= self.rig.cameras
+        enough = len(self._tests) >= self.rig.num_cameras
         excess = float(np.median(self._tests)) / MEDIAN if enough else None
-        return Usual(excess, max(self._model_errors)) if self._model_errors else Usual(excess)
+        return Usual(excess, max(self._additive_noises)) if self._additive_noises else Usual(excess)
 
     def _astray(self, blobs: Detections, pose: RigidTransform) -> NDArray[np.bool_]:
         """Find cameras, of which something is known, that see what may be the object where it should not be: (C,)."""
         if self._latest is None:
-            return np.zeros(self.rig.cameras, dtype=bool)
-        usual = np.median(self._spare, axis=0) if self._spare else np.zeros(self.rig.cameras)
+            return np.zeros(self.rig.num_cameras, dtype=bool)
+        usual = np.median(self._spare, axis=0) if self._spare else np.zeros(self.rig.num_cameras)
         return astray(blobs, usual, self._latest.rig, self.obj, pose)
 
     def _concluded(self, blobs: Detections, snapshot: SnapshotIdentity, least: float = 0.0) -> LiveCalibration:
@@ -232,7 +232,7 @@ class Recalibrator:
             snapshot: how they were.
             least: number of labels that must fit.
         """
-        window, found, missed = self._searched(Window((*self._recent, Kept(blobs, snapshot)), self._spread))
+        window, found, missed = self._searched(Window((*self._recent, Kept(blobs, snapshot)), self._prior_std))
         # A larger window is compared with its newest snapshot whenever it is fitted.
         doubtful = self.window == 1 and (bool(found) or self._contradicted(window.kept[-1]))
         fitted = self._fit(window, self._fitted, self._usual(), doubtful)
@@ -248,11 +248,11 @@ class Recalibrator:
         live = self._completed(result, window)
         if fitted.tests or not window.moved:
             self._tests.extend(fitted.tests)
-            self._model_errors.append(result.model_error)
+            self._additive_noises.append(result.additive_noise)
         self._recent.clear()
         self._recent.extend(window.kept)
-        self._spread = window.spread
-        self._spare.append(spare_blobs(window.kept[-1].blobs, self.rig.cameras))
+        self._prior_std = window.prior_std
+        self._spare.append(spare_blobs(window.kept[-1].blobs, self.rig.num_cameras))
         self._latest, self._fitted, self._follows = live, result, True
         self._follower.follow(result.rig_from_object[-1])
         return live
@@ -264,7 +264,7 @@ class Recalibrator:
             return False
         fitting, _ = without_strays(newest.blobs, latest.rig, self.obj, pose, self.options)
         given, left = (
-            np.bincount(blobs.camera[blobs.fiducial >= 0], minlength=self.rig.cameras)
+            np.bincount(blobs.camera[blobs.fiducial >= 0], minlength=self.rig.num_cameras)
             for blobs in (newest.blobs, fitting)
         )
         return bool(((given >= 3) & (left < 0.5 * given)).any())
@@ -276,9 +276,9 @@ class Recalibrator:
         cameras = [] if latest is None or pose is None else np.flatnonzero(self._astray(newest.blobs, pose)).tolist()
         if latest is None or pose is None or not cameras:
             return window, [], []
-        std = torch.minimum(2 * flat_std(latest), self._spread)
+        std = torch.minimum(2 * flat_std(latest), self._prior_std)
         for camera in cameras:
-            wide = widened(self._spread, latest.rig, [camera], pose, self.obj, RELEARNT)
+            wide = widened(self._prior_std, latest.rig, [camera], pose, self.obj, RELEARNT)
             labelled = found_again(newest.blobs, camera, latest.rig, self.obj, pose, std, self.options)
             labelled = self._resected(window, camera, latest) if labelled is None else labelled
             if labelled is None:
@@ -318,7 +318,7 @@ class Recalibrator:
             self._last |= {c: _Last(self._latest.rig, std[c], _seen(self._fitted)) for c in left}
         states: dict[str, CameraState] = {}
         rig, factory = result.rig, result.problem.factory
-        spread = result.problem.spread.clone()
+        prior_std = result.problem.prior_std.clone()
         for camera, name in enumerate(self.rig.camera_names):
             if camera in self._lost:
                 states[name] = "astray"
@@ -331,9 +331,11 @@ class Recalibrator:
             last = self._last[camera]
             there = aligned(last.rig, rig, _places(result), sorted(last.seen & inside))
             rig, factory = _with_camera(rig, there, camera), _with_camera(factory, there.expand(1), camera)
-            spread[0, camera] = torch.maximum(last.std, window.spread[camera]) if camera in self._lost else last.std
+            prior_std[0, camera] = (
+                torch.maximum(last.std, window.prior_std[camera]) if camera in self._lost else last.std
+            )
         values = {entry.name: getattr(result, entry.name) for entry in fields(Calibration)}
-        values |= {"rig": rig, "problem": replace(result.problem, factory=factory, spread=spread)}
+        values |= {"rig": rig, "problem": replace(result.problem, factory=factory, prior_std=prior_std)}
         values["moved"] = self._moves(result, window)
         return LiveCalibration(**values, cameras=states, restarted=window.restarted)
 
@@ -348,9 +350,9 @@ class Recalibrator:
             if camera in _seen(self._fitted):
                 known = information(series_of(self._fitted, self._fitted.observations, self.obj.radius))[camera]
             else:
-                std = self._last[camera].std if camera in self._last else self._spread[camera]
+                std = self._last[camera].std if camera in self._last else self._prior_std[camera]
                 known = np.diag(std[:6].numpy() ** -2.0)
-            move, surely = measured_move(before.rig, known, result, camera, first, window.spread[camera, :6])
+            move, surely = measured_move(before.rig, known, result, camera, first, window.prior_std[camera, :6])
             if surely > SIGNIFICANT:
                 moves.append(move)
         return tuple(moves)
@@ -364,7 +366,7 @@ def _seen(result: Calibration, snapshot: int | None = None) -> frozenset[int]:
 
 def _all_out(blobs: Detections, result: Calibration) -> set[int]:
     """Cameras in which the newest labels do not fit, or hardly any."""
-    given = np.bincount(blobs.camera[blobs.fiducial >= 0], minlength=result.rig.cameras)
+    given = np.bincount(blobs.camera[blobs.fiducial >= 0], minlength=result.rig.num_cameras)
     fit = result.observations.seen[-1].sum(-1).numpy()
     return set(np.flatnonzero((given >= 3) & (fit < LEAST_EXPLAINED * given)).tolist())
 
@@ -377,7 +379,7 @@ def _places(result: Calibration) -> Tensor:
 
 def _with_camera(rig: CameraRig, other: CameraRig, camera: int) -> CameraRig:
     """Replace the values of a camera by those that it has in another rig (of the same batch axes)."""
-    chosen = torch.arange(rig.cameras) == camera
+    chosen = torch.arange(rig.num_cameras) == camera
 
     def put(tensor: Tensor, source: Tensor, axes: int) -> Tensor:
         return torch.where(chosen.reshape(-1, *(1,) * (axes - 1)), source, tensor)

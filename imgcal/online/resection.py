@@ -146,7 +146,7 @@ def _fitted(
         observations,
         camera,
         CalibrationObject(cloud, torch.ones_like(cloud)),
-        spread=held,
+        prior_std=held,
         options=EstimationOptions(loss="cauchy"),
     )
     return replace(camera, cam_from_rig=camera.cam_from_rig @ fit.rig_from_object[0].reshape(1))

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imgcal.association import Labelled, PipelineOptions, SnapshotIdentity, to_observations
+from imgcal.association import Associations, PipelineOptions, SnapshotIdentity, to_observations
 from imgcal.errors import RefusedError
 from imgcal.estimation import Estimate, estimate, initial_pose
 from imgcal.geometry import RigidTransform
@@ -49,7 +49,7 @@ class Window:
     """Snapshots, the newest last, and how far the factory values may be off."""
 
     kept: tuple[Kept, ...]
-    spread: Tensor  # (C, 15)
+    prior_std: Tensor  # (C, 15)
     moved: Mapping[int, str] = field(default_factory=dict)  # camera -> first snapshot from its new place; "" = none yet
     restarted: bool = False  # the older snapshots were given up
 
@@ -62,11 +62,11 @@ class Window:
             wide: (C, 15) standard deviations that such a camera starts afresh from.
         """
         kept = tuple(k.without(camera) if i < first else k for i, k in enumerate(self.kept))
-        spread = self.spread.clone()
-        spread[camera, :6] = torch.maximum(spread[camera, :6], wide[camera, :6])
+        prior_std = self.prior_std.clone()
+        prior_std[camera, :6] = torch.maximum(prior_std[camera, :6], wide[camera, :6])
         name = self.kept[first].snapshot.name if first < len(self.kept) else ""
         kept = tuple(k for k in kept if (k.blobs.fiducial >= 0).any())  # of others, nothing is left
-        return replace(self, kept=kept, spread=spread, moved={**self.moved, camera: name})
+        return replace(self, kept=kept, prior_std=prior_std, moved={**self.moved, camera: name})
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Usual:
     """What fits of a rig look like while nothing moves."""
 
     excess: float | None = None  # how much larger than by noise alone the test for moves is; None = not known yet
-    model_error: float = float("inf")  # px
+    additive_noise: float = float("inf")  # px
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class WindowFit:
         Raises:
             RefusedError: the new snapshot cannot even be fitted by itself.
         """
-        for _ in range(self.rig.cameras):
+        for _ in range(self.rig.num_cameras):
             result = self._tried(window, latest)
             series, first = self._series(window, result, usual, doubtful)
             if series is None:
@@ -120,7 +120,7 @@ class WindowFit:
                 if result is not None and not window.moved and not doubtful:
                     return Fitted(result, window, tuple(breaks.statistic[-1][breaks.statistic[-1] > 0].tolist()))
                 break
-            wide = widened(window.spread, series.rig, [camera], series.rig_from_object[-1], self.obj, RELEARNT)
+            wide = widened(window.prior_std, series.rig, [camera], series.rig_from_object[-1], self.obj, RELEARNT)
             window, doubtful = window.after_move(camera, first[number], wide), False
         if result is not None:
             return self._relabelled(result, window)
@@ -145,11 +145,11 @@ class WindowFit:
         if result is not None and not doubtful:
             if len(result.labelled.used) < 2:
                 return None, []
-            plain = result.outliers == 0 and result.model_error == 0
+            plain = result.outliers == 0 and result.additive_noise == 0
             labels = result.observations if plain else self._observations(result.labelled)
             noise = labels.sigma.square()
             # A move is no noise, though a fit takes it for that: what is usual, or as much as the blobs' own, counts.
-            model = noise.clamp_min(usual.model_error**2).clamp_max(result.model_error**2)
+            model = noise.clamp_min(usual.additive_noise**2).clamp_max(result.additive_noise**2)
             labels = replace(labels, sigma=(noise + model).sqrt())
             first = len(window.kept) - len(kept)
             return series_of(result, labels, self.obj.radius), [first + used for used in result.labelled.used]
@@ -178,34 +178,30 @@ class WindowFit:
         return Fitted(second, more, ())
 
     def _fit(self, window: Window, latest: Calibration | None) -> Calibration:
-        labelled = joined(window.kept[-self.size :], self.rig)
-        result = fit_labelled(labelled, self.rig, self.obj, self.options, latest=latest, spread=window.spread)
+        labelled = stacked(window.kept[-self.size :], self.rig)
+        result = fit_labelled(labelled, self.rig, self.obj, self.options, latest=latest, prior_std=window.prior_std)
         if (now := result.labelled.snapshots[-1]).status == "refused":
             raise RefusedError(f"estimation: {now.reason}")
         return result
 
     def rough(self, window: Window) -> tuple[Estimate, Observations]:
         """Fit all snapshots that are kept, in a way that no minority of wrong labels can spoil."""
-        labels = self._observations(joined(window.kept, self.rig))
+        labels = self._observations(stacked(window.kept, self.rig))
         labels = replace(labels, sigma=labels.sigma.square().add(self.options.identity_error**2).sqrt())
         known = [kept.snapshot.rig_from_object for kept in window.kept]
         poses = [pose for pose in known if pose is not None]
-        start = (
-            RigidTransform.joined(poses, torch.stack)
-            if len(poses) == len(known)
-            else initial_pose(labels, self.rig, self.obj)
-        )
+        start = RigidTransform.stack(poses) if len(poses) == len(known) else initial_pose(labels, self.rig, self.obj)
         robust = replace(self.options.estimation, loss="cauchy")
-        return estimate(labels, self.rig, self.obj, start, spread=window.spread, options=robust), labels
+        return estimate(labels, self.rig, self.obj, start, prior_std=window.prior_std, options=robust), labels
 
-    def _observations(self, labelled: Labelled) -> Observations:
+    def _observations(self, labelled: Associations) -> Observations:
         """All labels of the used snapshots."""
         detections = labelled.detections
         rows = np.isin(detections.snapshot, labelled.used) & (detections.fiducial >= 0)
         return to_observations(detections.select(rows), self.rig, self.obj)
 
 
-def joined(kept: tuple[Kept, ...], rig: CameraRig) -> Labelled:
+def stacked(kept: tuple[Kept, ...], rig: CameraRig) -> Associations:
     """Put labelled snapshots into one table."""
     tables = [k.blobs for k in kept]
     columns: dict[str, NDArray[np.generic]] = {
@@ -216,4 +212,4 @@ def joined(kept: tuple[Kept, ...], rig: CameraRig) -> Labelled:
     snapshots = tuple(k.snapshot for k in kept)
     names = tuple(snapshot.name for snapshot in snapshots)
     table = Detections(**columns, snapshot=number, camera_names=rig.camera_names, snapshot_names=names)  # type: ignore[arg-type]
-    return Labelled(table, snapshots)
+    return Associations(table, snapshots)

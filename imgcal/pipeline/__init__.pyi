@@ -1,18 +1,18 @@
-from .calibration import Calibration, Score, calibrate, fit_labelled, rms_length, score
-from .initialization import load_guesser
+from .calibration import Calibration, RigScore, calibrate, fit_labelled, rms_length, score
+from .initialization import load_initializer
 from .sources import checked_detections, checked_frames
 from .tally import DOUBTFUL, Tally
 
 __all__ = [
     "DOUBTFUL",
     "Calibration",
-    "Score",
+    "RigScore",
     "Tally",
     "calibrate",
     "checked_detections",
     "checked_frames",
     "fit_labelled",
-    "load_guesser",
+    "load_initializer",
     "rms_length",
     "score",
 ]

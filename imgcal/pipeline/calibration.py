@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from imgcal.association import Labelled, PipelineOptions, Progress, label, observations_of, without_snapshots
+from imgcal.association import Associations, PipelineOptions, Progress, associate, observations_of, without_snapshots
 from imgcal.detection import DetectionOptions
 from imgcal.errors import RefusedError
 from imgcal.estimation import (
@@ -24,15 +24,15 @@ from imgcal.estimation import (
     PredictedError,
     UndeterminedPosesError,
     block_scatter,
-    conclude,
     estimate,
+    estimate_variance_components,
     initial_pose,
+    initial_state,
+    make_estimate,
     make_loss,
     make_problem,
-    make_start,
     predicted_error,
     require_poses,
-    settle,
     whitened_covariance,
 )
 from imgcal.pipeline.checks import (
@@ -43,7 +43,7 @@ from imgcal.pipeline.checks import (
     require_same_residuals,
     require_views,
 )
-from imgcal.pipeline.initialization import FirstGuess, Guesser, residual_of
+from imgcal.pipeline.initialization import Initialization, Initializer, residual_of
 from imgcal.pipeline.object_checks import displaced, lost_fiducials, object_offsets
 from imgcal.pipeline.sources import Frames, blobs_of
 from imgcal.pipeline.steadiness import steady_part
@@ -67,18 +67,18 @@ LEAST_KEPT = 0.8
 class Calibration(Estimate):
     """An `Estimate`, with what it was made from. Snapshots are those used, in order."""
 
-    labelled: Labelled
+    labelled: Associations
     observations: Observations  # (S, C, N) as used: outliers not seen, sigma with the model error
-    model_error: float  # px, what the residuals hold beyond the blobs' own sigma
+    additive_noise: float  # px, what the residuals hold beyond the blobs' own sigma
     outliers: int  # labelled blobs left out
-    widened: Mapping[str, float]  # by kind of value: factor by which the prior was too narrow, where it was
+    prior_scale: Mapping[str, float]  # by kind of value: factor by which the prior was too narrow, where it was
     factory: CameraRig
     obj: CalibrationObject  # as it was given
     shape: tuple[FiducialOffset, ...] = ()  # where each fiducial is instead; empty = the object was taken as exact
     scale_sigma: float | None = None  # relative: an error of the object's scale four times as large would be noticed
     bent_sigma: float | None = None  # how sure it is that the object is not as estimated; None = not asked
     block_length: int = 0  # snapshots in the blocks whose scatter the covariance follows; 0 = that of the noise
-    first_guess: FirstGuess | None = None  # what a network said, where one was asked
+    initialization: Initialization | None = None  # what a network said, where one was asked
     guess_used: bool = False  # its guess was nearer to the images than the factory calibration
     seconds: Mapping[str, float] = field(default_factory=dict)  # by stage
     moved: tuple[MovedCamera, ...] = ()  # during the capture; snapshots used are those since then
@@ -91,7 +91,7 @@ class Calibration(Estimate):
             self.factory,
             self.obj.taken_as_exact(),
             self.rig_from_object,
-            spread=torch.zeros_like(self.problem.spread[0]),
+            prior_std=torch.zeros_like(self.problem.prior_std[0]),
         )
 
     @property
@@ -146,7 +146,7 @@ def calibrate(
     options: PipelineOptions = PipelineOptions(),
     *,
     detection: DetectionOptions = DetectionOptions(),
-    guesser: Guesser | None = None,
+    initializer: Initializer | None = None,
     progress: Progress | None = None,
 ) -> Calibration:
     """Recalibrate a rig from what its cameras saw.
@@ -157,7 +157,7 @@ def calibrate(
         obj: the calibration object.
         options: how sure the result must be.
         detection: how blobs are found in frames.
-        guesser: network whose first guess the estimate starts from (`imgcal.pipeline.initialization.load_guesser`).
+        initializer: network whose first guess the estimate starts from (`load_initializer`).
         progress: wraps the loop over snapshots, for a progress bar.
 
     Raises:
@@ -167,12 +167,12 @@ def calibrate(
     started, rig = time.perf_counter(), rig.to(torch.float64)
     detections = blobs_of(source, rig, obj, detection)
     found = time.perf_counter()
-    labelled = label(detections, rig, obj, options, progress)
+    labelled = associate(detections, rig, obj, options, progress)
     identified = time.perf_counter()
     labelled = _with_poses(labelled, rig, obj)
     _require_any_view(labelled, rig, obj)
     labelled, moved = steady_part(labelled, detections, rig, obj, options)
-    fit = fit_labelled(labelled, rig, obj, options, guesser)
+    fit = fit_labelled(labelled, rig, obj, options, initializer)
     require_views(fit.tally, rig)
     seconds = {
         "detection": found - started,
@@ -183,14 +183,14 @@ def calibrate(
 
 
 def fit_labelled(
-    labelled: Labelled,
+    labelled: Associations,
     rig: CameraRig,
     obj: CalibrationObject,
     options: PipelineOptions = PipelineOptions(),
-    guesser: Guesser | None = None,
+    initializer: Initializer | None = None,
     *,
     latest: Calibration | None = None,
-    spread: Tensor | None = None,
+    prior_std: Tensor | None = None,
 ) -> Calibration:
     """Estimate the rig from all labelled snapshots, leaving out what does not fit, and check that the rest does.
 
@@ -199,9 +199,9 @@ def fit_labelled(
         rig: the factory calibration.
         obj: the calibration object.
         options: how sure the result must be.
-        guesser: network whose first guess is the start, where it is nearer to the images than the factory calibration.
+        initializer: network whose first guess is the start, where it is nearer to the images than the factory rig.
         latest: what the snapshot before gave, from the same factory calibration: a start that saves time.
-        spread: (C, 15) how far the factory values may be off; None = as the rig says.
+        prior_std: (C, 15) how far the factory values may be off; None = as the rig says.
 
     Raises:
         RefusedError: a camera saw nothing, the estimate has no minimum, or the residuals do not fit.
@@ -210,7 +210,7 @@ def fit_labelled(
     labelled = given = _with_poses(labelled, rig, obj)
     while True:
         try:
-            return _fit_labelled(labelled, rig, obj, options, guesser, latest, spread)
+            return _fit_labelled(labelled, rig, obj, options, initializer, latest, prior_std)
         except UndeterminedPosesError as error:
             labelled = without_snapshots(labelled, error.rows)
             if len(labelled.used) < LEAST_KEPT * len(given.used):
@@ -221,13 +221,13 @@ def fit_labelled(
 
 
 def _fit_labelled(
-    labelled: Labelled,
+    labelled: Associations,
     rig: CameraRig,
     obj: CalibrationObject,
     options: PipelineOptions,
-    guesser: Guesser | None,
+    initializer: Initializer | None,
     latest: Calibration | None,
-    spread: Tensor | None,
+    prior_std: Tensor | None,
 ) -> Calibration:
     """Do the work of `fit_labelled` for snapshots that all have a pose."""
     observations, poses = observations_of(labelled, rig, obj)
@@ -241,21 +241,23 @@ def _fit_labelled(
             python="give labels (Detections.fiducial), use an object without symmetry, or one without tolerances",
             command="give labels (a column `fiducial`), use an object without symmetry, or one without tolerances",
         )
-    prior = (rig.prior or RigPrior()).std(rig) if spread is None else spread
+    prior = (rig.prior or RigPrior()).std(rig) if prior_std is None else prior_std
     problem = make_problem(observations, rig, _with_learnt(obj, latest), prior)
     assert poses is not None  # see `_with_poses`
-    guess = None if guesser is None else guesser.guess(observations, rig, obj)
+    guess = None if initializer is None else initializer.guess(observations, rig, obj)
     guess_used = guess is not None and _nearer(guess, Prediction(rig, poses), observations, obj)
-    state = make_start(problem, poses, None)
+    state = initial_state(problem, poses, None)
     if guess is not None and guess_used:
-        state = make_start(problem, guess.rig_from_object, guess.rig)
+        state = initial_state(problem, guess.rig_from_object, guess.rig)
     starts = [(state, options.identity_error)]
-    if latest is not None and not latest.widened:
-        change = latest.problem.spread * latest.solution.state.offset
+    if latest is not None and not latest.prior_scale:
+        change = latest.problem.prior_std * latest.solution.state.offset
         offset = torch.where(prior > 0, change / prior.clamp_min(1e-30), 0.0)
-        starts.insert(0, (replace(state, offset=offset), latest.model_error))
-    found = settle(problem, starts, variance, labels, options, examine=latest is None, alike=alike)
-    fit = conclude(found.problem, found.solution, found.solution.state)
+        starts.insert(0, (replace(state, offset=offset), latest.additive_noise))
+    found = estimate_variance_components(
+        problem, starts, variance, labels, options, examine=latest is None, alike=alike
+    )
+    fit = make_estimate(found.problem, found.solution, found.solution.state)
     require_same_residuals(fit, observations, found.seen, obj)
     shape = object_offsets(fit, found.shape, obj)
     scatter = BlockScatter()
@@ -265,9 +267,9 @@ def _fit_labelled(
         fit = replace(fit, inflation=scatter.factor)
     outliers = int(labels.sum() - found.seen.sum())
     require_cameras(found.seen, rig, options)
-    require_near_prior(fit, prior, rig, found.widened, options)
+    require_near_prior(fit, prior, rig, found.prior_scale, options)
     require_most_labels(labels, found.seen, rig)
-    require_fit(found.model_error, outliers / max(int(labels.sum()), 1), 2**0.5 * float(fit.rms), options)
+    require_fit(found.additive_noise, outliers / max(int(labels.sum()), 1), 2**0.5 * float(fit.rms), options)
     values = {name: getattr(fit, name) for name in Estimate.__dataclass_fields__}
     return Calibration(
         **values,
@@ -275,41 +277,41 @@ def _fit_labelled(
         observations=Observations(
             observations.uv, torch.from_numpy(found.sigma).to(observations.sigma), torch.from_numpy(found.seen)
         ),
-        model_error=found.model_error,
+        additive_noise=found.additive_noise,
         outliers=outliers,
-        widened=found.widened,
+        prior_scale=found.prior_scale,
         factory=rig,
         obj=obj,
         shape=shape,
         scale_sigma=None if found.shape is None else finite(found.shape.scale_error[1]),
         bent_sigma=None if found.shape is None else found.shape.bent_sigma(),
         block_length=scatter.length,
-        first_guess=guess,
+        initialization=guess,
         guess_used=guess_used,
     )
 
 
 def _with_learnt(obj: CalibrationObject, latest: Calibration | None) -> CalibrationObject:
     """The object with the tolerances that the latest result has found necessary."""
-    if latest is None or latest.problem.object_spread is None:
+    if latest is None or latest.problem.object_prior_std is None:
         return obj
-    return replace(obj, tolerance=latest.problem.object_spread[0, :-1:3])
+    return replace(obj, tolerance=latest.problem.object_prior_std[0, :-1:3])
 
 
-def _require_any_view(labelled: Labelled, rig: CameraRig, obj: CalibrationObject) -> None:
+def _require_any_view(labelled: Associations, rig: CameraRig, obj: CalibrationObject) -> None:
     """Refuse where a camera sees the object, and identity could not label any of it: worse than seeing nothing."""
     observations, poses = observations_of(labelled, rig, obj)
     assert poses is not None
     require_views(tally(labelled, observations.seen.numpy(), poses, rig, obj), rig, least_share=0.0)
 
 
-def _nearer(guess: FirstGuess, factory: Prediction, observations: Observations, obj: CalibrationObject) -> bool:
+def _nearer(guess: Initialization, factory: Prediction, observations: Observations, obj: CalibrationObject) -> bool:
     """Tell whether the start that a guess gives, its mean rig, is nearer to the images than the factory calibration."""
     start = Prediction(guess.rig, guess.rig_from_object)
     return bool(residual_of(start, observations, obj).norm() < residual_of(factory, observations, obj).norm())
 
 
-def _with_poses(labelled: Labelled, rig: CameraRig, obj: CalibrationObject) -> Labelled:
+def _with_poses(labelled: Associations, rig: CameraRig, obj: CalibrationObject) -> Associations:
     """Refuse the snapshots whose labels lie on one line; find the poses of those that came with labels."""
     observations, poses = observations_of(labelled, rig, obj)
     try:
@@ -340,10 +342,10 @@ def rms_length(residual: Tensor, seen: Tensor) -> float | None:
 
 
 @dataclass(frozen=True)
-class Score:
+class RigScore:
     """Reprojection errors of a rig that is held fixed; only the object's poses are fitted."""
 
-    labelled: Labelled
+    labelled: Associations
     residual: Tensor  # (S, C, N, 2) pixels
     seen: Tensor  # (S, C, N) bool
 
@@ -361,7 +363,7 @@ def score(
     progress: Progress | None = None,
     *,
     detection: DetectionOptions = DetectionOptions(),
-) -> Score:
+) -> RigScore:
     """Measure how well a rig explains what its cameras saw.
 
     Args:
@@ -377,12 +379,12 @@ def score(
         InputError: the data do not belong to this rig or object: other cameras, frames of another size.
     """
     rig = rig.to(torch.float64)
-    labelled = label(blobs_of(source, rig, obj, detection), rig, obj, options, progress)
+    labelled = associate(blobs_of(source, rig, obj, detection), rig, obj, options, progress)
     observations, poses = observations_of(labelled, rig, obj)
     fixed = torch.zeros(*rig.distortion.shape[:-1], 15, dtype=rig.distortion.dtype)
     # What is reported is an RMS in pixels: centres count alike, however well each was measured.
     even = replace(observations, sigma=torch.full_like(observations.sigma, options.identity_error))
-    fit = estimate(even, rig, obj.taken_as_exact(), poses, spread=fixed, options=options.estimation)
+    fit = estimate(even, rig, obj.taken_as_exact(), poses, prior_std=fixed, options=options.estimation)
     if not bool(fit.converged):
         raise RefusedError(f"score: no pose of the object fits (RMS {2**0.5 * float(fit.rms):.3g} px)")
-    return Score(labelled, fit.residual, observations.seen)
+    return RigScore(labelled, fit.residual, observations.seen)

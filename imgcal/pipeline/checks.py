@@ -27,7 +27,7 @@ LEAST_SIGHT = 0.3
 def require_cameras(seen: NDArray[np.bool_], rig: CameraRig, options: PipelineOptions) -> None:
     """Refuse where a camera has nothing that is `seen` (S, C, N)."""
     blind = [rig.camera_names[i] for i in np.flatnonzero(~seen.any(axis=(0, 2)))]
-    if blind and (not options.blind_cameras or len(blind) == rig.cameras):
+    if blind and (not options.blind_cameras or len(blind) == rig.num_cameras):
         raise RefusedError(
             f"camera {', '.join(blind)}: found no fiducial in any snapshot, expected some; nothing can be said of it",
             python="rig.select leaves a camera out, PipelineOptions(blind_cameras=True) keeps its factory values",
@@ -60,14 +60,14 @@ def require_views(counts: Tally, rig: CameraRig, least_share: float = LEAST_EXPL
         )
 
 
-def require_fit(model_error: float, outlier_share: float, rms: float, options: PipelineOptions) -> None:
+def require_fit(additive_noise: float, outlier_share: float, rms: float, options: PipelineOptions) -> None:
     """Refuse where residuals (px) or the share of left-out labels are larger than noise makes them."""
-    if model_error > options.largest_model_error:
+    if additive_noise > options.largest_additive_noise:
         raise RefusedError(
-            f"estimation: the best rig misses the blobs by {rms:.2f} px (RMS), of which {model_error:.2f} px do not "
-            f"fit their noise, expected at most {options.largest_model_error:g}: the object is not as its file says, "
-            "labels are wrong, or the lenses are of another kind",
-            python="measure the object anew; where all is right, raise PipelineOptions.largest_model_error",
+            f"estimation: the best rig misses the blobs by {rms:.2f} px (RMS), of which {additive_noise:.2f} px do not "
+            f"fit their noise, expected at most {options.largest_additive_noise:g}: the object is not as its file "
+            "says, labels are wrong, or the lenses are of another kind",
+            python="measure the object anew; where all is right, raise PipelineOptions.largest_additive_noise",
             command="measure the object anew, and look at labels given in the input",
         )
     if outlier_share > options.most_outliers:
@@ -97,14 +97,16 @@ def require_same_residuals(
 
 
 def require_near_prior(
-    fit: Estimate, prior: Tensor, rig: CameraRig, widened: Mapping[str, float], options: PipelineOptions
+    fit: Estimate, prior: Tensor, rig: CameraRig, prior_scale: Mapping[str, float], options: PipelineOptions
 ) -> None:
     """Refuse where a value, or a kind of values, is farther from the factory's than the `prior` (C, 15) can bear."""
-    offset, spread, std = (tensor.numpy() for tensor in (fit.solution.state.offset[0], fit.problem.spread[0], prior))
-    change = offset * spread
+    offset, prior_std, std = (
+        tensor.numpy() for tensor in (fit.solution.state.offset[0], fit.problem.prior_std[0], prior)
+    )
+    change = offset * prior_std
     drift = np.where(std > 0, np.abs(change) / np.maximum(std, 1e-30), 0.0)
     camera, parameter = divmod(int(drift.argmax()), drift.shape[1])
-    kind = max(widened, key=lambda name: widened[name], default="")
+    kind = max(prior_scale, key=lambda name: prior_scale[name], default="")
     if drift[camera, parameter] > options.largest_drift:
         name = PARAMETER_NAMES[parameter]
         found = (
@@ -112,11 +114,11 @@ def require_near_prior(
             f"{_with_unit(change[camera, parameter], name)}, with a tolerance (prior) of "
             f"{_with_unit(std[camera, parameter], name)} and {options.largest_drift:g} times as much accepted"
         )
-    elif kind and widened[kind] > options.widest_prior:
+    elif kind and prior_scale[kind] > options.widest_prior:
         found = (
             f"the {kind.replace('_', ' ')} of all cameras together would differ from the factory values "
-            f"{widened[kind]:.1f} times as much as its tolerance (prior) says, with {options.widest_prior:g} times as "
-            "much accepted"
+            f"{prior_scale[kind]:.1f} times as much as its tolerance (prior) says, with {options.widest_prior:g} times "
+            "as much accepted"
         )
     else:
         return

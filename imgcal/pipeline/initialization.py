@@ -18,14 +18,14 @@ from imgcal.geometry import RigidTransform, resized_pixels
 from imgcal.io import data_path, nearest, shipped_names
 from imgcal.synthesis import ImageOptions, render_views
 from imgcal.training import check_object, check_rig, load_checkpoint, read_subject
-from imgcal.types import CalibrationObject, CameraRig, Observations, Prediction, SelfMotion, Views
+from imgcal.types import CalibrationObject, CameraRig, Observations, Prediction, Symmetry, Views
 
 KINDS = ("points", "vit", "cnn")
 CHUNK = 32  # snapshots at once: their images take memory
 
 
 @dataclass(frozen=True)
-class FirstGuess:
+class Initialization:
     """What a network says about some snapshots of one rig."""
 
     name: str  # of the network
@@ -35,7 +35,7 @@ class FirstGuess:
 
 
 @dataclass(frozen=True)
-class Guesser:
+class Initializer:
     """A trained network, ready for a rig of some of its cameras and images of another size than in training."""
 
     name: str
@@ -44,7 +44,7 @@ class Guesser:
     cameras: tuple[int, ...] | None = None  # those that there are, in the order of the rig; None = all
 
     @torch.no_grad()
-    def guess(self, observations: Observations, rig: CameraRig, obj: CalibrationObject) -> FirstGuess:
+    def guess(self, observations: Observations, rig: CameraRig, obj: CalibrationObject) -> Initialization:
         """Look at every snapshot on its own.
 
         A symmetric object may have been labelled in a turn that the network has never seen: all turns are tried, and
@@ -59,16 +59,16 @@ class Guesser:
         turns = [self._turned(shown, rig, obj, motion) for motion in obj.symmetries]
         residuals = torch.stack([residual_of(turn, observations, obj) for turn in turns])  # (turns, S, C, N, 2)
         best = residuals.square().sum((2, 3, 4)).nan_to_num(torch.inf).argmin(0), torch.arange(len(observations.uv))
-        guess = Prediction.joined(turns, lambda tensors: torch.stack(tensors)[best])
-        mean = rig.moved(guess.rig.difference(rig).mean(0))
-        return FirstGuess(self.name, mean, guess.rig_from_object, residuals[best])
+        guess = Prediction.combine(turns, lambda tensors: torch.stack(tensors)[best])
+        mean = rig.retract(guess.rig.local(rig).mean(0))
+        return Initialization(self.name, mean, guess.rig_from_object, residuals[best])
 
     def _shown(self, observations: Observations, rig: CameraRig) -> Views:
         """What all cameras of the training see: those that are not there see nothing."""
         cameras = self._present
         scale = self.trained.image_size[cameras].to(observations.uv) / rig.image_size
         snapshots, _, fiducials = observations.seen.shape
-        uv = torch.zeros(snapshots, self.trained.cameras, fiducials, 2)
+        uv = torch.zeros(snapshots, self.trained.num_cameras, fiducials, 2)
         uv[:, cameras] = resized_pixels(observations.uv, scale[:, None]).float()
         seen = torch.zeros(uv.shape[:-1], dtype=torch.bool)
         seen[:, cameras] = observations.seen
@@ -76,14 +76,14 @@ class Guesser:
 
     @property
     def _present(self) -> list[int]:
-        return list(range(self.trained.cameras) if self.cameras is None else self.cameras)
+        return list(range(self.trained.num_cameras) if self.cameras is None else self.cameras)
 
-    def _turned(self, shown: Views, rig: CameraRig, obj: CalibrationObject, motion: SelfMotion) -> Prediction:
+    def _turned(self, shown: Views, rig: CameraRig, obj: CalibrationObject, motion: Symmetry) -> Prediction:
         """What the network says of an object turned by a symmetry, turned back: (S,), in the pixels of `rig`."""
         assert shown.uv is not None and shown.seen is not None
         source = torch.from_numpy(np.argsort(motion.permutation))  # fiducial whose image each label gets
         views = zip(shown.uv[:, :, source].split(CHUNK), shown.seen[:, :, source].split(CHUNK), strict=True)
-        said = Prediction.joined([self._predict(*chunk, obj) for chunk in views], torch.cat).to(rig.focal_length.dtype)
+        said = Prediction.cat([self._predict(*chunk, obj) for chunk in views]).to(rig.focal_length.dtype)
         turn = RigidTransform(torch.from_numpy(motion.rotation), torch.from_numpy(motion.translation))
         there = said.rig.select(self._present).resized(rig.image_size)
         return Prediction(there, said.rig_from_object @ turn.to(rig.focal_length.dtype))
@@ -105,7 +105,7 @@ def residual_of(prediction: Prediction, observations: Observations, obj: Calibra
     return torch.where(observations.seen[..., None], uv - observations.uv, 0.0)
 
 
-def load_guesser(name: str, rig: CameraRig, obj: CalibrationObject) -> Guesser:
+def load_initializer(name: str, rig: CameraRig, obj: CalibrationObject) -> Initializer:
     """Find the network for a rig and an object.
 
     Args:
@@ -137,10 +137,10 @@ def load_guesser(name: str, rig: CameraRig, obj: CalibrationObject) -> Guesser:
     )
 
 
-def _load(path: Path, rig: CameraRig, obj: CalibrationObject) -> Guesser:
+def _load(path: Path, rig: CameraRig, obj: CalibrationObject) -> Initializer:
     trained, trained_obj = read_subject(path)
     cameras = tuple(trained.camera_names.index(name) for name in rig.camera_names if name in trained.camera_names)
-    there = trained.select(cameras) if len(cameras) == rig.cameras else trained
-    check_rig(path, there, rig.resized(there.image_size) if rig.cameras == there.cameras else rig)
+    there = trained.select(cameras) if len(cameras) == rig.num_cameras else trained
+    check_rig(path, there, rig.resized(there.image_size) if rig.num_cameras == there.num_cameras else rig)
     check_object(path, replace(trained_obj, radius=None), replace(obj, radius=None))
-    return Guesser(path.stem, load_checkpoint(path).network, trained, cameras)
+    return Initializer(path.stem, load_checkpoint(path).network, trained, cameras)

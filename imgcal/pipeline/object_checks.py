@@ -53,10 +53,10 @@ def object_offsets(fit: Estimate, shape: ShapeEvidence | None, obj: CalibrationO
             "images either",
             **measure,
         )
-    if fit.problem.object_spread is None:
+    if fit.problem.object_prior_std is None:
         return ()
     found = offsets(fit, obj.points.double().numpy())
-    learnt = fit.problem.object_spread[0, :-1:3].numpy()
+    learnt = fit.problem.object_prior_std[0, :-1:3].numpy()
     granted = obj.granted.double().numpy()
     for offset in found:
         if learnt[offset.fiducial] <= 1.01 * granted[offset.fiducial]:

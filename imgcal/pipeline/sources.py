@@ -76,8 +76,8 @@ def checked_detections(detections: Detections, rig: CameraRig, obj: CalibrationO
     _require(
         detections,
         "fiducial",
-        detections.fiducial < obj.fiducials,
-        f"a row of the object, 0 to {obj.fiducials - 1}, or -1",
+        detections.fiducial < obj.num_fiducials,
+        f"a row of the object, 0 to {obj.num_fiducials - 1}, or -1",
     )
     _require(
         detections,

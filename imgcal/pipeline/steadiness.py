@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.stats import hypergeom
 
-from imgcal.association import Labelled, PipelineOptions, label, observations_of
+from imgcal.association import Associations, PipelineOptions, associate, observations_of
 from imgcal.errors import RefusedError
 from imgcal.estimation import CLIP, LEAST_SNAPSHOTS, Estimate, estimate, find_moves, initial_pose
 from imgcal.pipeline.tally import Tally, tally
@@ -29,8 +29,8 @@ Bools = NDArray[np.bool_]
 
 
 def steady_part(
-    labelled: Labelled, detections: Detections, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
-) -> tuple[Labelled, tuple[MovedCamera, ...]]:
+    labelled: Associations, detections: Detections, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
+) -> tuple[Associations, tuple[MovedCamera, ...]]:
     """Leave out the snapshots before the last move of a camera.
 
     Args:
@@ -56,7 +56,7 @@ def steady_part(
         first = max(names.index(move.snapshot) for move in found)
         if not options.after_last_move:
             raise MovedError(moved, total - first, total)
-        part = label(detections.of_snapshots(first, total), rig, obj, options)
+        part = associate(detections.of_snapshots(first, total), rig, obj, options)
         found = list(moves_of(part, rig, obj, options))
         if not found:
             return _with_earlier(part, labelled, first), tuple(moved)
@@ -64,7 +64,7 @@ def steady_part(
     raise MovedError(moved, total - first, total)
 
 
-def _with_earlier(part: Labelled, labelled: Labelled, first: int) -> Labelled:
+def _with_earlier(part: Associations, labelled: Associations, first: int) -> Associations:
     """Put the snapshots before a part of a capture back, refused."""
     reason = "taken before a camera moved"
     earlier = tuple(
@@ -73,11 +73,11 @@ def _with_earlier(part: Labelled, labelled: Labelled, first: int) -> Labelled:
     )
     fiducial = np.full(len(labelled.detections), -1, dtype=np.int64)
     fiducial[labelled.detections.snapshot >= first] = part.detections.fiducial
-    return Labelled(replace(labelled.detections, fiducial=fiducial), (*earlier, *part.snapshots))
+    return Associations(replace(labelled.detections, fiducial=fiducial), (*earlier, *part.snapshots))
 
 
 def moves_of(
-    labelled: Labelled, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
+    labelled: Associations, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
 ) -> tuple[MovedCamera, ...]:
     """Say which cameras moved between two snapshots.
 
@@ -105,7 +105,7 @@ class _Fit:
     tally: Tally
 
 
-def _fit(labelled: Labelled, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions) -> _Fit:
+def _fit(labelled: Associations, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions) -> _Fit:
     """Estimate one rig, no label left out, with the noise that the residuals show.
 
     Where one rig cannot fit, this is slow to settle, and need not: what it leaves is asked for steps.
@@ -118,8 +118,8 @@ def _fit(labelled: Labelled, rig: CameraRig, obj: CalibrationObject, options: Pi
         noisy = replace(observations, sigma=(own.square() + error**2).sqrt())
         start = (poses or initial_pose(observations, rig, obj)) if found is None else found.rig_from_object
         guess = None if found is None else found.rig
-        found = estimate(noisy, rig, obj, start, first_guess=guess, options=options.estimation)
-        free = max(1 - (15 * rig.cameras + 6 * len(seen)) / (2 * int(seen.sum())), 0.2)
+        found = estimate(noisy, rig, obj, start, initial_rig=guess, options=options.estimation)
+        free = max(1 - (15 * rig.num_cameras + 6 * len(seen)) / (2 * int(seen.sum())), 0.2)
         variance = found.residual.square().sum(-1)[seen].median() / (MEDIAN * free)
         error = (variance - own[seen].square().median()).clamp_min(0).sqrt()
     assert found is not None
@@ -134,13 +134,15 @@ def _lost(counts: Tally) -> Bools:
 
 
 def _labelled_afresh(
-    labelled: Labelled, lost: Bools, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
-) -> Labelled:
+    labelled: Associations, lost: Bools, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
+) -> Associations:
     """Label the snapshots in which cameras are `lost` (S, C) without what the others have taught; take those labels."""
     detections = labelled.detections
     rows = np.flatnonzero(np.isin(detections.snapshot, np.flatnonzero(lost.any(1))))
     try:
-        again = label(replace(detections.select(rows), fiducial=np.full(len(rows), -1)), rig, obj, options).detections
+        again = associate(
+            replace(detections.select(rows), fiducial=np.full(len(rows), -1)), rig, obj, options
+        ).detections
     except RefusedError:
         return labelled
     old, new = detections.fiducial[rows], again.fiducial
@@ -152,10 +154,10 @@ def _labelled_afresh(
     agreed = same >= np.maximum(LEAST_AGREEMENT * np.bincount(snapshot[both], minlength=count), 3)
     fiducial = detections.fiducial.copy()
     fiducial[rows] = np.where(here & agreed[snapshot], new, old)
-    return Labelled(replace(detections, fiducial=fiducial), labelled.snapshots)
+    return Associations(replace(detections, fiducial=fiducial), labelled.snapshots)
 
 
-def _gone(counts: Tally, labelled: Labelled, rig: CameraRig, known: set[str]) -> list[MovedCamera]:
+def _gone(counts: Tally, labelled: Associations, rig: CameraRig, known: set[str]) -> list[MovedCamera]:
     """Cameras that saw the object where it is at first, and then elsewhere, or the other way round.
 
     That snapshots in which a camera agrees and in which it does not are parted so cleanly by a moment has a probability

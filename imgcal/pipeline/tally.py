@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from imgcal.association import Labelled
+from imgcal.association import Associations
 from imgcal.geometry import RigidTransform
 from imgcal.types import CalibrationObject, CameraRig
 
@@ -47,7 +47,7 @@ class Tally:
 
 
 def tally(
-    labelled: Labelled, kept: NDArray[np.bool_], poses: RigidTransform, factory: CameraRig, obj: CalibrationObject
+    labelled: Associations, kept: NDArray[np.bool_], poses: RigidTransform, factory: CameraRig, obj: CalibrationObject
 ) -> Tally:
     """Count.
 
@@ -59,7 +59,7 @@ def tally(
         obj: N fiducials.
     """
     detections, used = labelled.detections, labelled.used
-    shape = (len(labelled.snapshots), factory.cameras)
+    shape = (len(labelled.snapshots), factory.num_cameras)
 
     def count(rows: NDArray[np.bool_]) -> Counts:
         cell = detections.snapshot[rows] * shape[1] + detections.camera[rows]

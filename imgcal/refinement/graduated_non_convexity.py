@@ -45,13 +45,13 @@ class Target:
     seen: Tensor  # (B, C, N) bool
     factory: CameraRig  # without batch axes
     obj: CalibrationObject
-    spread: Tensor  # (C, 15) standard deviations of the factory values
+    prior_std: Tensor  # (C, 15) standard deviations of the factory values
     sigma: float  # pixels, noise of the points
     factor: Tensor | None = None  # (B, C, N) on the sigma of each fiducial, as a network may say
 
     def __getitem__(self, rows: Tensor) -> Target:
         factor = None if self.factor is None else self.factor[rows]
-        return Target(self.uv[rows], self.seen[rows], self.factory, self.obj, self.spread, self.sigma, factor)
+        return Target(self.uv[rows], self.seen[rows], self.factory, self.obj, self.prior_std, self.sigma, factor)
 
     def fit(
         self,
@@ -63,7 +63,7 @@ class Target:
         """MAP estimate from a start, of all points or of the given ones."""
         views = Views(uv=self.uv if uv is None else uv, seen=self.seen if seen is None else seen)
         sigma = self.sigma if self.factor is None else self.sigma * self.factor
-        return refine_points(start, views, self.factory, self.obj, self.spread, sigma, options)
+        return refine_points(start, views, self.factory, self.obj, self.prior_std, sigma, options)
 
 
 def refine_robustly(
@@ -71,7 +71,7 @@ def refine_robustly(
     views: Views,
     factory: CameraRig,
     obj: CalibrationObject,
-    spread: Tensor,
+    prior_std: Tensor,
     *,
     sigma: float,
     options: RobustOptions = RobustOptions(),
@@ -83,7 +83,7 @@ def refine_robustly(
         views: (B,) uv and seen.
         factory: the factory rig, without batch axes.
         obj: N fiducials.
-        spread: (C, 15) standard deviation of each factory value (`Drift.std`).
+        prior_std: (C, 15) standard deviation of each factory value (`Drift.std`).
         sigma: noise of the points, pixels.
         options: what counts as an outlier.
 
@@ -94,7 +94,7 @@ def refine_robustly(
         raise ValueError("views hold no points")
     guess = prediction.detach().to(torch.float64)
     trust = None if guess.log_sigma is None else guess.log_sigma.exp()
-    target = Target(views.uv.double(), views.seen, factory.to(torch.float64), obj, spread.double(), sigma, trust)
+    target = Target(views.uv.double(), views.seen, factory.to(torch.float64), obj, prior_std.double(), sigma, trust)
     fit = target.fit(guess, AT_FIRST)
     suspect = (~fits(fit, sigma, options.fits)).nonzero().squeeze(-1)
     result = as_prediction(fit)
@@ -122,10 +122,10 @@ def _robust(guess: Prediction, target: Target, options: RobustOptions) -> Predic
         if len(rows):
             part, some = result[rows], target[rows]
             bounded = EstimationOptions(loss="geman_mcclure", threshold=limit)
-            points = mended(part, some, options.mending * limit)
+            points = undo_label_swaps(part, some, options.mending * limit)
             result = _replaced(result, rows, as_prediction(some.fit(part, bounded, points.uv, points.seen)))
     for _ in range(options.rounds):
-        points = mended(result, target, options.gate)
+        points = undo_label_swaps(result, target, options.gate)
         result = as_prediction(target.fit(result, uv=points.uv, seen=points.fits))
     worse = ~(_misfit(result, target) < _misfit(guess, target))
     rows = worse.nonzero().squeeze(-1)
@@ -149,7 +149,7 @@ def _first_round(guess: Prediction, target: Target, limits: tuple[float, ...], s
 
 
 @dataclass(frozen=True)
-class Mended:
+class UnswappedPoints:
     """Points, some under another label than they came with."""
 
     uv: Tensor  # (B, C, N, 2) pixels
@@ -157,7 +157,7 @@ class Mended:
     fits: Tensor  # (B, C, N) bool: of those, near where they are expected
 
 
-def mended(prediction: Prediction, target: Target, gate: float) -> Mended:
+def undo_label_swaps(prediction: Prediction, target: Target, gate: float) -> UnswappedPoints:
     """Give points that do not fit to other fiducials of the same camera: those that have no fitting point themselves.
 
     Args:
@@ -176,7 +176,7 @@ def mended(prediction: Prediction, target: Target, gate: float) -> Mended:
     uv, seen = target.uv.clone(), target.seen.clone()
     seen[source] = False
     uv[place], seen[place], fit[place] = target.uv[source], True, True
-    return Mended(uv, seen, fit)
+    return UnswappedPoints(uv, seen, fit)
 
 
 def mutual_nearest(distance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -195,7 +195,7 @@ def robust_pose(views: Views, factory: CameraRig, obj: CalibrationObject, sigma:
     if views.uv is None or views.seen is None:
         raise ValueError("views hold no points")
     uv, rig = views.uv.double(), factory.to(torch.float64)
-    fixed = torch.zeros_like(rig.distortion[..., :1]).expand(rig.cameras, 15)
+    fixed = torch.zeros_like(rig.distortion[..., :1]).expand(rig.num_cameras, 15)
     target = Target(uv, views.seen, rig, obj, fixed, sigma)
     pose = initial_pose(observed(uv, views.seen, sigma), rig, obj)[:, 0]
     result = Prediction(rig.expand(len(views)), pose)
@@ -213,4 +213,4 @@ def _predicted_uv(prediction: Prediction, target: Target) -> Tensor:
 
 def _replaced(whole: Prediction, rows: Tensor, part: Prediction) -> Prediction:
     """Put `part` in the place of some rigs of a batch."""
-    return Prediction.joined((whole, part), lambda pair: pair[0].index_copy(0, rows, pair[1]))
+    return Prediction.combine((whole, part), lambda pair: pair[0].index_copy(0, rows, pair[1]))

@@ -17,7 +17,7 @@ def refine_points(
     views: Views,
     factory: CameraRig,
     obj: CalibrationObject,
-    spread: Tensor,
+    prior_std: Tensor,
     sigma: Tensor | float,
     options: EstimationOptions = ROBUST,
 ) -> Estimate:
@@ -31,7 +31,7 @@ def refine_points(
         views: (B, C, N) points in pixels; `seen` None = all.
         factory: the factory rig, the centre of the prior.
         obj: N fiducials.
-        spread: (C, 15) or (B, C, 15) standard deviation of each factory value.
+        prior_std: (C, 15) or (B, C, 15) standard deviation of each factory value.
         sigma: pixels, a number or broadcastable to (B, C, N): one standard deviation of each axis.
         options: how to minimize.
 
@@ -52,8 +52,8 @@ def refine_points(
         factory.to(torch.float64),
         obj,
         guess.rig_from_object.reshape(len(uv), 1),
-        spread=spread.double(),
-        first_guess=guess.rig,
+        prior_std=prior_std.double(),
+        initial_rig=guess.rig,
         options=options,
     )
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from imgcal.errors import InputError
 from imgcal.estimation import Estimate, EstimationOptions, estimate, make_problem
 from imgcal.refinement.graduated_non_convexity import refine_robustly
-from imgcal.refinement.label_swaps import colours_at, exchanged
+from imgcal.refinement.label_swaps import colours_at, swapped_labels
 from imgcal.refinement.photometric import DotWindows, NearFit, ShiftPrior, blurred_step
 from imgcal.refinement.points import as_prediction
 from imgcal.synthesis import LEVELS, ImageOptions
@@ -57,21 +57,21 @@ def refine_images(
     images: Tensor,
     factory: CameraRig,
     obj: CalibrationObject,
-    spread: Tensor,
+    prior_std: Tensor,
     options: ImageRefinementOptions = ImageRefinementOptions(),
 ) -> tuple[Estimate, Observations]:
     """Refine a network's prediction on the images that it has seen: photometric Gauss-Newton, then MAP.
 
     Each image is compared with rendered dots, blurred at first and sharp at last, every camera on its own, which gives
     the dots' places and how well they are known; the most probable rig follows from those. Rigs that the images do not
-    confirm are tried again from there, and with dots taken for those whose places they have (`exchanged`).
+    confirm are tried again from there, and with dots taken for those whose places they have (`swapped_labels`).
 
     Args:
         prediction: (B,) first guess.
         images: (B, C, 3, size, size) in [0, 1] as `render_views` draws them.
         factory: the factory rig, the centre of the prior.
         obj: N fiducials in their colours.
-        spread: (C, 15) or (B, C, 15) standard deviation of each factory value.
+        prior_std: (C, 15) or (B, C, 15) standard deviation of each factory value.
         options: how to compare.
 
     Returns:
@@ -83,7 +83,7 @@ def refine_images(
         InputError: images of another shape than the options and the rig say.
     """
     _check(images, factory, options)
-    problem = _ImageProblem(factory.to(torch.float64), obj, spread.double(), options)
+    problem = _ImageProblem(factory.to(torch.float64), obj, prior_std.double(), options)
     guess = prediction.detach().to(torch.float64)
     guess = Prediction(guess.rig.resized(problem.size), guess.rig_from_object)
     dots = problem.look(images, guess)
@@ -135,19 +135,19 @@ class _ImageProblem:
     """
 
     def __init__(
-        self, factory: CameraRig, obj: CalibrationObject, spread: Tensor, options: ImageRefinementOptions
+        self, factory: CameraRig, obj: CalibrationObject, prior_std: Tensor, options: ImageRefinementOptions
     ) -> None:
         """Take float64; predictions given to the other methods are for images, too."""
-        self.factory, self.obj, self.spread, self.options = factory, obj, spread, options
-        self.size = torch.full((2,), options.image.size, device=spread.device)
+        self.factory, self.obj, self.prior_std, self.options = factory, obj, prior_std, options
+        self.size = torch.full((2,), options.image.size, device=prior_std.device)
         self.rig = factory.resized(self.size)
-        self.scale = options.image.size / factory.image_size.to(spread)  # (C, 2) image pixels a sensor pixel
+        self.scale = options.image.size / factory.image_size.to(prior_std)  # (C, 2) image pixels a sensor pixel
         self.unit = self.scale.prod(-1).sqrt()[:, None]  # (C, 1) the same, mean of both axes
-        units = torch.ones_like(spread)
+        units = torch.ones_like(prior_std)
         units[..., 6:10] = torch.cat((self.scale, self.scale), -1)
-        self.image_spread = spread * units
-        self.points = obj.points.to(spread)
-        self.colours = obj.colours.to(spread.device, torch.float32)
+        self.image_spread = prior_std * units
+        self.points = obj.points.to(prior_std)
+        self.colours = obj.colours.to(prior_std.device, torch.float32)
 
     def look(self, images: Tensor, guess: Prediction, known: _Dots | None = None) -> _Dots:
         """Find the dots of images (B, C, 3, H, W) near where a prediction puts them, or near where they are known."""
@@ -160,7 +160,7 @@ class _ImageProblem:
             uv = torch.where(known.believed[..., None], known.uv, uv)
         far, amplitude, light = (part.unflatten(0, batch) for part in self._far(flat, uv.flatten(0, 1), blurs))
         uv = far if known is None else uv  # of what is known, only whether it is there is asked again
-        own = torch.arange(self.obj.fiducials, device=uv.device).expand(uv.shape[:-1])
+        own = torch.arange(self.obj.num_fiducials, device=uv.device).expand(uv.shape[:-1])
         return self._measure(images, uv, amplitude > PRESENT, own, light, steps)
 
     def near(self, guess: Prediction, dots: _Dots) -> Tensor:
@@ -185,7 +185,7 @@ class _ImageProblem:
         offset = (uv - dots.uv).norm(dim=-1)
         colour = colours_at(images.flatten(0, 1), uv.flatten(0, 1), self.options.image.dot)
         fits = dots.believed & (offset < self.options.gate * dots.sigma)
-        taken = exchanged(colour.unflatten(0, uv.shape[:2]), self.colours, fits)
+        taken = swapped_labels(colour.unflatten(0, uv.shape[:2]), self.colours, fits)
         return self._measure(images, uv, taken >= 0, taken.clamp_min(0), dots.light, 2 * self.options.steps)
 
     def _agreed(self, guess: Prediction, dots: _Dots) -> Prediction:
@@ -262,8 +262,8 @@ class _ImageProblem:
             self.rig,
             self.obj,
             guess.rig_from_object.reshape(-1, 1),
-            spread=self.image_spread,
-            first_guess=guess.rig,
+            prior_std=self.image_spread,
+            initial_rig=guess.rig,
             options=self.options.estimation,
         )
         brightness = self.colours.sum(-1)
@@ -284,7 +284,7 @@ class _ImageProblem:
             result,
             rig=result.rig.resized(self.factory.image_size),
             residual=result.residual / self.scale[:, None],
-            problem=make_problem(observations, self.factory, self.obj, self.spread),
+            problem=make_problem(observations, self.factory, self.obj, self.prior_std),
         )
         return sensor, observations
 
@@ -308,7 +308,7 @@ def _check(images: Tensor, factory: CameraRig, options: ImageRefinementOptions) 
     size = options.image.size
     if size % options.pooling:
         raise InputError(f"image size: found {size}, expected a multiple of the {options.pooling} pixels of pooling")
-    if images.ndim != 5 or images.shape[1:] != (factory.cameras, 3, size, size):
+    if images.ndim != 5 or images.shape[1:] != (factory.num_cameras, 3, size, size):
         raise InputError(
-            f"images: found shape {tuple(images.shape)}, expected (rigs, {factory.cameras}, 3, {size}, {size})"
+            f"images: found shape {tuple(images.shape)}, expected (rigs, {factory.num_cameras}, 3, {size}, {size})"
         )

@@ -74,7 +74,7 @@ class ReportContent:
     seeds: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        blobs, cameras = len(self.detections), self.factory.cameras
+        blobs, cameras = len(self.detections), self.factory.num_cameras
         expected = {
             "labels": (blobs,),
             "predicted_before": (blobs, 2),
@@ -179,19 +179,19 @@ class ReportContent:
         return np.full((len(self.detections), 2), np.nan) if predicted is None else predicted - self.detections.uv
 
 
-def relative_prior_std(factory: CameraRig, reference: int = 0, spread: Tensor | None = None) -> Array:
+def relative_prior_std(factory: CameraRig, reference: int = 0, prior_std: Tensor | None = None) -> Array:
     """Standard deviation of each factory value before the data, extrinsics relative to the reference camera.
 
     Args:
         factory: the factory rig, without batch axes.
         reference: index of the reference camera.
-        spread: (C, 15) standard deviations in the rig's frame; None = the rig's own prior, or `RigPrior()`.
+        prior_std: (C, 15) standard deviations in the rig's frame; None = the rig's own prior, or `RigPrior()`.
 
     Returns:
         (C, 15), comparable with the diagonal of `estimation.relative_covariance`.
     """
     factory = factory.to(torch.float64)
-    spread = (factory.prior or RigPrior()).std(factory) if spread is None else spread.to(torch.float64)
+    prior_std = (factory.prior or RigPrior()).std(factory) if prior_std is None else prior_std.to(torch.float64)
     jacobian = relative_jacobian(factory, reference)
-    variance = jacobian.square() @ spread.flatten().square()
-    return variance.sqrt().unflatten(0, (factory.cameras, PARAMETERS)).cpu().numpy()
+    variance = jacobian.square() @ prior_std.flatten().square()
+    return variance.sqrt().unflatten(0, (factory.num_cameras, PARAMETERS)).cpu().numpy()

@@ -54,12 +54,12 @@ def drawn_fiducials(content: ReportContent) -> tuple[NDArray[np.int64], NDArray[
     if content.rig_from_object is None or content.object_points is None:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     good = np.flatnonzero(np.isfinite(content.rig_from_object.translation.cpu().numpy()).all(axis=1))
-    snapshots = good[_spread(len(good), 60)]
-    fiducials = _spread(len(content.object_points), max(LARGEST_CLOUD // max(len(snapshots), 1), 1))
+    snapshots = good[_prior_std(len(good), 60)]
+    fiducials = _prior_std(len(content.object_points), max(LARGEST_CLOUD // max(len(snapshots), 1), 1))
     return snapshots, fiducials
 
 
-def _spread(count: int, largest: int) -> NDArray[np.int64]:
+def _prior_std(count: int, largest: int) -> NDArray[np.int64]:
     return np.linspace(0, max(count - 1, 0), min(count, largest)).round().astype(np.int64)
 
 
@@ -84,9 +84,9 @@ def _exaggerated(content: ReportContent, factor: float) -> CameraRig:
     r = content.reference
     rig_from_drawn = recalibrated.cam_from_rig[r].inverse() @ factory.cam_from_rig[r]
     aligned = replace(recalibrated, cam_from_rig=recalibrated.cam_from_rig @ rig_from_drawn)
-    step = aligned.difference(factory).detach()
+    step = aligned.local(factory).detach()
     step[..., :6] *= factor
-    return factory.moved(step)
+    return factory.retract(step)
 
 
 def _exaggerations(content: ReportContent, length: float) -> tuple[list[int], int]:

@@ -125,7 +125,7 @@ class PhysicalDrift(StrictRecord):
 
     def apply(self, rig: CameraRig, generator: torch.Generator, *batch: int) -> CameraRig:
         """Disturb every parameter of every camera independently: (*batch, *B) rigs."""
-        return rig.moved(_parameters_first(torch.randn, rig, generator, batch) * self.std(rig))
+        return rig.retract(_parameters_first(torch.randn, rig, generator, batch) * self.std(rig))
 
     def std(self, rig: CameraRig) -> Tensor:
         """Standard deviation of each parameter: (*B, C, 15)."""
@@ -200,7 +200,7 @@ def synthesize(
     """
     points, radius = obj.points.to(rig.focal_length), None if obj.radius is None else obj.radius.to(rig.focal_length)
     kept: list[Snapshots] = []
-    missing, tried, failures = count, 0, torch.zeros(rig.cameras, device=points.device)
+    missing, tried, failures = count, 0, torch.zeros(rig.num_cameras, device=points.device)
     for _ in range(max_rounds):
         accepted = max(tried - int(failures.amax()), 1) / max(tried, 1)
         batch = count if not kept and not tried else min(math.ceil(1.2 * missing / accepted) + 8, 4 * count + 64)
@@ -278,13 +278,13 @@ def _take(snapshots: Snapshots, rows: Tensor) -> Snapshots:
 
 
 def _concatenate(parts: list[Snapshots]) -> Snapshots:
-    rig = CameraRig.joined([part.rig for part in parts], torch.cat)
+    rig = CameraRig.cat([part.rig for part in parts])
     projection = Projection(
         torch.cat([part.projection.uv for part in parts]),
         torch.cat([part.projection.depth for part in parts]),
         torch.cat([part.projection.visible for part in parts]),
     )
-    return Snapshots(rig, RigidTransform.joined([part.rig_from_object for part in parts], torch.cat), projection)
+    return Snapshots(rig, RigidTransform.cat([part.rig_from_object for part in parts]), projection)
 
 
 def _parameters_first(

@@ -27,7 +27,7 @@ from imgcal.io import (
     write_tensors,
 )
 from imgcal.messages import shortened
-from imgcal.networks import Trunk
+from imgcal.networks import IterativeRefiner
 from imgcal.training.experiment import Experiment
 from imgcal.types import CalibrationObject, CameraRig
 
@@ -60,8 +60,8 @@ def build_network(experiment: Experiment, rig: CameraRig, obj: CalibrationObject
         InputError: the experiment says how to draw images, and its network takes points.
     """
     single = torch.float32
-    spread = experiment.drift.std(rig).to(single)
-    network: nn.Module = networks.build(experiment.network, rig.to(single), obj, spread)
+    prior_std = experiment.drift.std(rig).to(single)
+    network: nn.Module = networks.build(experiment.network, rig.to(single), obj, prior_std)
     if experiment.images is not None:
         if network.image_options is None:
             raise InputError(f"images: found this block, but the network {experiment.network.preset} takes points")
@@ -171,7 +171,7 @@ def warm_start(path: str | Path, network: nn.Module) -> tuple[str, ...]:
         for name in fitting:
             own[name].copy_(tensors[name])
     trunk = getattr(network, "trunk", None)
-    if isinstance(trunk, Trunk):
+    if isinstance(trunk, IterativeRefiner):
         experiment, _ = _read_records(path, texts)
         trunk.rescale(experiment.drift.std(_from_texts(path, texts)[0]))
     return tuple(name for name in own if name not in fitting)
@@ -259,10 +259,11 @@ def check_object(path: str | Path, trained: CalibrationObject, obj: CalibrationO
         InputError: they differ; names the first fiducial that does.
     """
     before = f"{path}: trained for another object than {obj.name} ({trained.name})"
-    if obj.fiducials != trained.fiducials:
-        raise InputError(f"{before}: found {obj.fiducials} fiducials, expected {trained.fiducials}")
+    if obj.num_fiducials != trained.num_fiducials:
+        raise InputError(f"{before}: found {obj.num_fiducials} fiducials, expected {trained.num_fiducials}")
     columns = [
-        (o.points.double(), o.points.new_zeros(o.fiducials) if o.radius is None else o.radius) for o in (obj, trained)
+        (o.points.double(), o.points.new_zeros(o.num_fiducials) if o.radius is None else o.radius)
+        for o in (obj, trained)
     ]
     found, expected = (torch.cat((points, radius.to(points)[:, None]), 1).cpu() for points, radius in columns)
     apart = (found - expected).abs().amax(1) > SAME * max(trained.size, 1.0)

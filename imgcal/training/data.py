@@ -70,7 +70,7 @@ class Source:
             return None
         count, size = len(uv), self.images.size
         if count not in self.canvas:
-            self.canvas[count] = uv.new_empty(count, self.factory.cameras, 3, size, size)
+            self.canvas[count] = uv.new_empty(count, self.factory.num_cameras, 3, size, size)
         return self.canvas[count]
 
 

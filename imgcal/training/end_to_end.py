@@ -15,7 +15,7 @@ WORST = 200.0  # pixels: where the error of a refined rig stops to count
 
 
 def refined_loss(
-    prediction: Prediction, batch: Batch, source: Source, spread: Tensor, config: RefinedLoss
+    prediction: Prediction, batch: Batch, source: Source, prior_std: Tensor, config: RefinedLoss
 ) -> Tensor | float:
     """Weigh every fiducial as the network says, estimate the rig, and compare it with the truth.
 
@@ -23,7 +23,7 @@ def refined_loss(
         prediction: (B,) last pass, with `log_sigma`.
         batch: what the network saw, and the truth.
         source: the factory rig and the object.
-        spread: (C, 15) of the drift, the prior of the estimate.
+        prior_std: (C, 15) of the drift, the prior of the estimate.
         config: weight and noise; a weight of zero costs nothing.
 
     Returns:
@@ -42,7 +42,7 @@ def refined_loss(
         )
     with torch.autocast(batch.views.uv.device.type, enabled=False):
         sigma = config.sigma * prediction.log_sigma.double().exp()
-        fit = refine_points(prediction, batch.views, source.factory, source.obj, spread, sigma)
+        fit = refine_points(prediction, batch.views, source.factory, source.obj, prior_std, sigma)
         truth = project_fiducials(batch.truth.cameras_from_object, source.obj).double()
         re = reprojection_re(project_fiducials(as_prediction(fit).cameras_from_object, source.obj) - truth)
         counts = fit.converged & (re < WORST)

@@ -21,7 +21,7 @@ from imgcal.training.data import Batch, Source, object_to
 from imgcal.training.end_to_end import refined_loss
 from imgcal.training.experiment import Experiment, save_experiment
 from imgcal.training.log import Log
-from imgcal.training.losses import Loss, compound, project_fiducials, reprojection_re
+from imgcal.training.losses import LossTerms, compound, project_fiducials, reprojection_re
 from imgcal.training.optimization import (
     Schedule,
     make_average,
@@ -31,7 +31,7 @@ from imgcal.training.optimization import (
     restore_optimizer,
     update_average,
 )
-from imgcal.training.state import State, load_state, random_states, restore_random_states, save_state
+from imgcal.training.state import TrainingState, load_state, random_states, restore_random_states, save_state
 from imgcal.types import CalibrationObject, CameraRig
 
 RESULT, STATE, RESOLVED, BAD_BATCH = "model.safetensors", "state.safetensors", "resolved.yaml", "bad_batch.safetensors"
@@ -56,7 +56,7 @@ class Run:
     schedule: Schedule
     average: nn.Module | None  # running mean of the weights
     source: Source
-    spread: Tensor  # (C, 15) of the drift
+    prior_std: Tensor  # (C, 15) of the drift
     generator: torch.Generator  # of this process's data
     validation: list[Snapshots]
     batch_size: int  # of this process
@@ -164,7 +164,7 @@ def prepare(experiment: Experiment, folder: Path, resume: bool = False) -> Run:
         schedule=Schedule(optimizer, experiment.schedule),
         average=average,
         source=source,
-        spread=source.drift.std(factory).to(device, torch.float32),
+        prior_std=source.drift.std(factory).to(device, torch.float32),
         generator=torch.Generator(device).manual_seed(seed),
         validation=_validation_rigs(source, settings.validation_rigs, settings.batch_size // processes, device),
         batch_size=settings.batch_size // processes,
@@ -184,8 +184,8 @@ def train_step(run: Run) -> None:
     with autocast(run.experiment, run.accelerator.device):
         predictions = run.network(batch.views)
     config, weights = run.experiment.loss, run.plain.parameters()
-    loss = compound(predictions, batch.truth, run.source.obj, config, run.step, run.spread, weights)
-    refined = refined_loss(predictions[-1], batch, run.source, run.spread, config.refined)
+    loss = compound(predictions, batch.truth, run.source.obj, config, run.step, run.prior_std, weights)
+    refined = refined_loss(predictions[-1], batch, run.source, run.prior_std, config.refined)
     loss = replace(loss, total=loss.total + refined)
     run.accelerator.backward(loss.total)
     limit = run.experiment.optimizer.clip
@@ -224,7 +224,9 @@ def check_finite(run: Run) -> None:
 
 
 @torch.no_grad()
-def evaluate(network: nn.Module, batches: Iterable[Batch], obj: CalibrationObject, experiment: Experiment) -> Tensor:
+def validation_errors(
+    network: nn.Module, batches: Iterable[Batch], obj: CalibrationObject, experiment: Experiment
+) -> Tensor:
     """RE of each rig of some batches, in pixels: (R,). Batches may be made one after the other."""
     was_training = network.training
     network.eval()
@@ -247,7 +249,7 @@ def validate(run: Run, log: Log, extra: bool) -> None:
         return
     generator = torch.Generator(run.accelerator.device).manual_seed(VALIDATION_SEED)
     batches = (run.source.show(made, generator) for made in run.validation)
-    errors = evaluate(run.best_weights, batches, run.source.obj, run.experiment)
+    errors = validation_errors(run.best_weights, batches, run.source.obj, run.experiment)
     mean, median = float(errors.mean()), float(errors.median())
     log.write({"step": run.step, "validation_re_px": mean, "validation_re_median_px": median}, extra)
     log.say_summary()
@@ -284,7 +286,7 @@ def save(run: Run, metrics: dict[str, Any]) -> None:
         },
     }
     if run.accelerator.is_main_process:
-        save_state(run.folder / STATE, State(tensors, values, run.experiment))
+        save_state(run.folder / STATE, TrainingState(tensors, values, run.experiment))
         metrics = {name: value for name, value in metrics.items() if name != "lr"} | {"seconds": run.seconds}
         save_network(run.folder / RESULT, run.best_weights, run.experiment, metrics, rig=run.factory)
 
@@ -328,7 +330,7 @@ def finished(run: Run, seconds: float) -> bool:
     return progress(run, seconds) >= 1
 
 
-def _account(run: Run, batch: Batch, loss: Loss, norm: Tensor) -> None:
+def _account(run: Run, batch: Batch, loss: LossTerms, norm: Tensor) -> None:
     """Keep what the log, the schedule and the check for finite numbers will want to know."""
     total = loss.total.detach()
     run.pending = (batch, torch.stack((total, norm.detach())))

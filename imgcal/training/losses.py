@@ -81,7 +81,7 @@ class LossConfig(StrictModel):
 
 
 @dataclass(frozen=True)
-class Loss:
+class LossTerms:
     """What is minimized, and the error that people read."""
 
     total: Tensor  # () with its graph
@@ -95,9 +95,9 @@ def compound(
     obj: CalibrationObject,
     config: LossConfig,
     step: int,
-    spread: Tensor,
+    prior_std: Tensor,
     weights: Iterable[Tensor] = (),
-) -> Loss:
+) -> LossTerms:
     """Compare every pass of a network with the truth.
 
     Args:
@@ -106,7 +106,7 @@ def compound(
         obj: the object whose fiducials are projected.
         config: which terms, how heavy.
         step: steps already taken, for the paper's two stages.
-        spread: (C, 15) spread of each parameter of the rig (`Drift.std`); without one they do not count.
+        prior_std: (C, 15) spread of each parameter of the rig (`Drift.std`); without one they do not count.
         weights: parameters of the network, for the L1 regularizer.
     """
     with torch.autocast(truth.rig.focal_length.device.type, enabled=False):
@@ -115,7 +115,7 @@ def compound(
         difference = project_fiducials(cameras, obj) - project_fiducials(true_cameras, obj)
         re = reprojection_re(difference)  # (T, B)
         if config.kind == "robust":
-            terms = _robust_terms(predicted, truth, re, config.robust, spread)
+            terms = _robust_terms(predicted, truth, re, config.robust, prior_std)
             gamma = config.robust.gamma
         else:
             terms = _paper_terms(cameras, true_cameras, difference, config.paper, step)
@@ -126,7 +126,7 @@ def compound(
         if config.extra.l1:
             total = total + config.extra.l1 * l1_norm(weights)
         re = re.detach()
-    return Loss(total, re[-1], re.mean(-1))
+    return LossTerms(total, re[-1], re.mean(-1))
 
 
 def project_fiducials(cameras: CameraRig, obj: CalibrationObject) -> Tensor:
@@ -172,21 +172,21 @@ def geodesic(predicted: CameraRig, truth: CameraRig) -> Tensor:
     return geodesic_angle(predicted.cam_from_rig.rotation, truth.cam_from_rig.rotation)
 
 
-def offsets_error(predicted: CameraRig, truth: CameraRig, spread: Tensor, limit: float) -> Tensor:
+def offsets_error(predicted: CameraRig, truth: CameraRig, prior_std: Tensor, limit: float) -> Tensor:
     """Mean squared error of the rig's parameters in units of their spread.
 
     Args:
         predicted: (*B) rigs.
         truth: (B,) rigs.
-        spread: (C, 15); parameters of a spread below `LEAST_SPREAD` do not count.
+        prior_std: (C, 15); parameters of a spread below `LEAST_SPREAD` do not count.
         limit: in units of the spread: where an error stops to count.
 
     Returns:
         (*B); zero when no parameter has a spread.
     """
-    free = spread > spread.new_tensor(LEAST_SPREAD)
-    scale = torch.where(free, spread, torch.ones_like(spread)).reciprocal() * free
-    squared = (predicted.difference(truth) * scale).clamp(-limit, limit).square()
+    free = prior_std > prior_std.new_tensor(LEAST_SPREAD)
+    scale = torch.where(free, prior_std, torch.ones_like(prior_std)).reciprocal() * free
+    squared = (predicted.local(truth) * scale).clamp(-limit, limit).square()
     return squared.sum((-2, -1)) / free.sum().clamp_min(1)
 
 
@@ -222,10 +222,12 @@ def l1_norm(weights: Iterable[Tensor]) -> Tensor:
     return torch.stack([weight.float().abs().sum() for weight in weights]).sum()
 
 
-def _robust_terms(predicted: Prediction, truth: Prediction, re: Tensor, config: RobustLoss, spread: Tensor) -> Tensor:
+def _robust_terms(
+    predicted: Prediction, truth: Prediction, re: Tensor, config: RobustLoss, prior_std: Tensor
+) -> Tensor:
     """(T,) losses."""
     angle = geodesic(predicted.cameras_from_object, truth.cameras_from_object).mean(-1)
-    offsets = offsets_error(predicted.rig, truth.rig, spread, config.offsets_limit)
+    offsets = offsets_error(predicted.rig, truth.rig, prior_std, config.offsets_limit)
     pixels = config.log_re * re.log1p() + config.re * re.clamp_max(config.re_limit)
     return (pixels + config.geodesic * angle + config.offsets * offsets).mean(-1)
 
@@ -265,7 +267,7 @@ def _extra_terms(cameras: CameraRig, true_cameras: CameraRig, config: LossConfig
 
 def _stacked(predictions: Sequence[Prediction]) -> Prediction:
     """Put passes on an axis of their own, in float32 or better: (T, B)."""
-    return Prediction.joined(predictions, _stack)
+    return Prediction.combine(predictions, _stack)
 
 
 def _stack(tensors: list[Tensor]) -> Tensor:

@@ -24,7 +24,7 @@ FREE = {("name",), ("description",), ("paper",)} | {
 
 
 @dataclass(frozen=True)
-class State:
+class TrainingState:
     """Everything that the rest of a run depends on."""
 
     tensors: dict[str, dict[str, Tensor]]  # by part: network, average, optimizer, random, window
@@ -32,7 +32,7 @@ class State:
     experiment: Experiment
 
 
-def save_state(path: str | Path, state: State) -> None:
+def save_state(path: str | Path, state: TrainingState) -> None:
     """Write a state in one step; on a full disk the previous one survives.
 
     Raises:
@@ -43,7 +43,7 @@ def save_state(path: str | Path, state: State) -> None:
     write_tensors(path, tensors, FORMAT, texts)
 
 
-def load_state(path: str | Path, experiment: Experiment) -> State:
+def load_state(path: str | Path, experiment: Experiment) -> TrainingState:
     """Read a state to go on with.
 
     Raises:
@@ -66,7 +66,7 @@ def load_state(path: str | Path, experiment: Experiment) -> State:
     for key, tensor in tensors.items():
         part, name = key.split("/", 1)
         parts.setdefault(part, {})[name] = tensor
-    return State(parts, values, experiment)
+    return TrainingState(parts, values, experiment)
 
 
 def first_difference(

@@ -1,5 +1,5 @@
 from . import limits
-from .calibration_object import CalibrationObject, SelfMotion
+from .calibration_object import CalibrationObject, Symmetry
 from .limits import BLOB_RADIUS, FIDUCIAL_RADIUS, MOST_PIXELS, SIGMA, Range, check_object, check_observations, check_rig
 from .moved_camera import Kind, MovedCamera, MovedError
 from .observations import UNUSABLE, BlobFlag, Detections, Observations
@@ -25,7 +25,7 @@ __all__ = [
     "Prediction",
     "Range",
     "RigPrior",
-    "SelfMotion",
+    "Symmetry",
     "Views",
     "check_object",
     "check_observations",

@@ -14,7 +14,7 @@ from imgcal.errors import InputError
 
 
 @dataclass(frozen=True)
-class SelfMotion:
+class Symmetry:
     """A rigid motion that maps fiducials of an object onto fiducials of the same object.
 
     An estimator that gives fiducial `i` the label `permutation[i]` sees (almost) the same points.
@@ -71,7 +71,7 @@ class CalibrationObject:
         return self if self.exact else replace(self, tolerance=None, scale_tolerance=0.0)
 
     @property
-    def fiducials(self) -> int:
+    def num_fiducials(self) -> int:
         """Number of fiducials, N."""
         return len(self.points)
 
@@ -87,7 +87,7 @@ class CalibrationObject:
         return bool(singular[2] < 1e-3 * singular[0])
 
     @cached_property
-    def symmetries(self) -> tuple[SelfMotion, ...]:
+    def symmetries(self) -> tuple[Symmetry, ...]:
         """Proper rotations that map the object onto itself, the identity first; found when first asked for.
 
         With more than one, unlabelled blobs cannot decide between them, but the relations between cameras are the same
@@ -95,7 +95,7 @@ class CalibrationObject:
         """
         return self.near_symmetries(tolerance=1e-3 * self.size)
 
-    def near_symmetries(self, tolerance: float) -> tuple[SelfMotion, ...]:
+    def near_symmetries(self, tolerance: float) -> tuple[Symmetry, ...]:
         """Find rotations about the centroid that map every fiducial to within `tolerance` (mm) of one of its radius.
 
         Returns:
@@ -109,7 +109,7 @@ class CalibrationObject:
         base = _base_pair(points)
         rotations = _rotations_of_pairs(points, base, tolerance)
         moved = points @ rotations.transpose(0, 2, 1)  # (R, N, 3)
-        found: dict[bytes, SelfMotion] = {}
+        found: dict[bytes, Symmetry] = {}
         centroid = self.points.mean(0).double().cpu().numpy()
         for rotation, image in zip(rotations, moved, strict=True):
             distance = np.linalg.norm(image[:, None] - points[None], axis=-1)
@@ -121,11 +121,11 @@ class CalibrationObject:
             residual = float(np.sqrt(np.mean(nearest**2)))
             known = found.get(permutation.tobytes())
             if known is None or residual < known.residual:
-                motion = SelfMotion(rotation, centroid - rotation @ centroid, permutation, residual)
+                motion = Symmetry(rotation, centroid - rotation @ centroid, permutation, residual)
                 found[permutation.tobytes()] = motion
         identity = np.arange(len(points)).tobytes()
         rest = sorted((m for key, m in found.items() if key != identity), key=lambda m: m.residual)
-        return (SelfMotion(np.eye(3), np.zeros(3), np.arange(len(points)), 0.0), *rest)
+        return (Symmetry(np.eye(3), np.zeros(3), np.arange(len(points)), 0.0), *rest)
 
 
 def _base_pair(points: NDArray[np.float64]) -> tuple[int, int]:

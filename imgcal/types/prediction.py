@@ -71,10 +71,20 @@ class Prediction:
         return cls(rig, pose)
 
     @classmethod
-    def joined(cls, parts: Sequence[Prediction], join: Join) -> Prediction:
-        """Make one of several as `CameraRig.joined` does; `log_sigma` is left out."""
-        poses = RigidTransform.joined([part.rig_from_object for part in parts], join)
-        return cls(CameraRig.joined([part.rig for part in parts], join), poses)
+    def stack(cls, parts: Sequence[Prediction]) -> Prediction:
+        """Put several together along a new first batch axis."""
+        return cls.combine(parts, torch.stack)
+
+    @classmethod
+    def cat(cls, parts: Sequence[Prediction]) -> Prediction:
+        """Put several together along their first batch axis."""
+        return cls.combine(parts, torch.cat)
+
+    @classmethod
+    def combine(cls, parts: Sequence[Prediction], join: Join) -> Prediction:
+        """Make one of several as `CameraRig.combine` does; `log_sigma` is left out."""
+        poses = RigidTransform.combine([part.rig_from_object for part in parts], join)
+        return cls(CameraRig.combine([part.rig for part in parts], join), poses)
 
     def detach(self) -> Prediction:
         """Cut the graph."""

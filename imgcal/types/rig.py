@@ -77,7 +77,7 @@ class CameraRig:
         return self.focal_length.shape[:-2]
 
     @property
-    def cameras(self) -> int:
+    def num_cameras(self) -> int:
         """Number of cameras, C."""
         return len(self.camera_names)
 
@@ -98,7 +98,7 @@ class CameraRig:
         """
         # Components apart, and fiducials first in memory: each step then runs over one long row of all cameras.
         components = points_rig.movedim((-1, -2), (0, 1)).contiguous().unsqueeze(-1)  # (3, N, *B, 1)
-        x, y, z = components.expand(*components.shape[:-1], self.cameras).contiguous().movedim(1, -1)  # (*B, C, N)
+        x, y, z = components.expand(*components.shape[:-1], self.num_cameras).contiguous().movedim(1, -1)  # (*B, C, N)
         rows = self.cam_from_rig.rotation.unsqueeze(-3).unbind(-2)
         shifts = self.cam_from_rig.translation.unsqueeze(-2).unbind(-1)
         points_cam = []
@@ -142,7 +142,7 @@ class CameraRig:
             cam_from_rig=cam_from_object,
         )
 
-    def moved(self, step: Tensor) -> CameraRig:
+    def retract(self, step: Tensor) -> CameraRig:
         """Add a step to the parameters: (*B, C, 15), in the order of `PARAMETER_NAMES`."""
         rotation = rotation_from_vector(step[..., 0:3]) @ self.cam_from_rig.rotation
         positions = self.positions + step[..., 3:6]
@@ -154,8 +154,8 @@ class CameraRig:
             cam_from_rig=RigidTransform(rotation, -rotate(rotation, positions)),
         )
 
-    def difference(self, reference: CameraRig) -> Tensor:
-        """Invert `moved`: the step (*B, C, 15) that takes `reference` to this rig."""
+    def local(self, reference: CameraRig) -> Tensor:
+        """Invert `retract`: the step (*B, C, 15) that takes `reference` to this rig."""
         rotation = self.cam_from_rig.rotation @ reference.cam_from_rig.rotation.mT
         parts = (
             vector_from_rotation(rotation),
@@ -173,7 +173,7 @@ class CameraRig:
         Args:
             image_size: (C, 2) or (2,) pixels: new width, height.
         """
-        image_size = image_size.expand(self.cameras, 2)
+        image_size = image_size.expand(self.num_cameras, 2)
         scale = image_size.to(self.focal_length) / self.image_size.to(self.focal_length)
         return replace(
             self,
@@ -198,14 +198,24 @@ class CameraRig:
         )
 
     @classmethod
-    def joined(cls, rigs: Sequence[CameraRig], join: Join) -> CameraRig:
+    def stack(cls, parts: Sequence[CameraRig]) -> CameraRig:
+        """Put several together along a new first batch axis."""
+        return cls.combine(parts, torch.stack)
+
+    @classmethod
+    def cat(cls, parts: Sequence[CameraRig]) -> CameraRig:
+        """Put several together along their first batch axis."""
+        return cls.combine(parts, torch.cat)
+
+    @classmethod
+    def combine(cls, rigs: Sequence[CameraRig], join: Join) -> CameraRig:
         """Make one of several; `join` takes the list of their focal lengths, and so on. The rest is the first one's."""
         return replace(
             rigs[0],
             focal_length=join([rig.focal_length for rig in rigs]),
             principal_point=join([rig.principal_point for rig in rigs]),
             distortion=join([rig.distortion for rig in rigs]),
-            cam_from_rig=RigidTransform.joined([rig.cam_from_rig for rig in rigs], join),
+            cam_from_rig=RigidTransform.combine([rig.cam_from_rig for rig in rigs], join),
         )
 
     def __getitem__(self, index: object) -> CameraRig:

@@ -75,10 +75,10 @@ def carried(rig_name: str, object_name: str) -> dict[str, np.ndarray]:
     """Carry an object smoothly before a rig that is not what the factory says: unlabelled blobs, as columns."""
     rig, obj, draw = load_rig(rig_name), load_object(object_name), np.random.default_rng(3)
     rig = rig.to(torch.float64)
-    step = torch.zeros(rig.cameras, 15, dtype=torch.float64)
-    step[:, :3] = torch.from_numpy(draw.normal(0, np.radians(0.2), (rig.cameras, 3)))
-    step[:, 3:6] = torch.from_numpy(draw.normal(0, 2.0, (rig.cameras, 3)))
-    true = rig.moved(step)
+    step = torch.zeros(rig.num_cameras, 15, dtype=torch.float64)
+    step[:, :3] = torch.from_numpy(draw.normal(0, np.radians(0.2), (rig.num_cameras, 3)))
+    step[:, 3:6] = torch.from_numpy(draw.normal(0, 2.0, (rig.num_cameras, 3)))
+    true = rig.retract(step)
     in_room = rig_name == "room10"
     far = [1900.0, 1900.0, 850.0] if in_room else [25.0, 25.0, 40.0]
     turn = [2.0, 2.0, 3.0] if in_room else [0.25, 0.25, 0.4]

@@ -42,7 +42,7 @@ def blobs(
     found = true_detections(truth)
     found = found.select(draw.random(len(found)) >= missed)
     found = replace(found, uv=found.uv + NOISE * draw.standard_normal(found.uv.shape))
-    rate = np.full(truth.rig.cameras, clutter)
+    rate = np.full(truth.rig.num_cameras, clutter)
     if crowded is not None:
         rate[crowded[0]] = crowded[1]
     number = draw.poisson(np.broadcast_to(rate, (len(found.snapshot_names), len(rate)))).ravel()
@@ -119,14 +119,14 @@ def turned(rig: CameraRig, camera: int, degrees: float, axis: int = 0) -> Camera
     """Turn one camera about one of its axes."""
     step = torch.zeros_like(RigPrior().std(rig))
     step[camera, axis] = np.radians(degrees)
-    return rig.moved(step)
+    return rig.retract(step)
 
 
 def shifted(rig: CameraRig, camera: int, millimetres: float, axis: int = 0) -> CameraRig:
     """Move one camera along an axis of the rig."""
     step = torch.zeros_like(RigPrior().std(rig))
     step[camera, 3 + axis] = millimetres
-    return rig.moved(step)
+    return rig.retract(step)
 
 
 def changed_from(truth: Truth, obj: CalibrationObject, camera: int, first: int, change: Change) -> Truth:

@@ -156,7 +156,7 @@ class Classical:
         self.stream, self.pool, self.joint = stream, pool, joint
         self.points = stream.obj.points.numpy()
         self.finder = opencv_live.detector(RADIUS, thresholds)
-        self.views = [_first_view(stream, camera) for camera in range(stream.factory.cameras)]
+        self.views = [_first_view(stream, camera) for camera in range(stream.factory.num_cameras)]
 
     def update(self, snapshot: int) -> Outcome:
         frames = list(self.stream.frames[snapshot].values())
@@ -180,7 +180,7 @@ class Classical:
         assert prior is not None
         rotation = rig.cam_from_rig.rotation.numpy()
         translation = rig.cam_from_rig.translation.numpy()
-        uv = np.zeros((1, rig.cameras, len(self.points), 2))
+        uv = np.zeros((1, rig.num_cameras, len(self.points), 2))
         shown = np.zeros(uv.shape[:-1], dtype=bool)
         for c, (labels, places) in enumerate(seen):
             uv[0, c, labels], shown[0, c, labels] = places, True
@@ -195,7 +195,7 @@ class Classical:
             translation=translation,
             start_rotation=(rotation[0].T @ cv2.Rodrigues(first.rotation)[0])[None],
             start_translation=(rotation[0].T @ (first.translation - translation[0]))[None],
-            spread=prior.std(rig).numpy(),
+            prior_std=prior.std(rig).numpy(),
             image_size=(int(rig.image_size[0, 0]), int(rig.image_size[0, 1])),
             seen=shown,
         )
@@ -230,7 +230,7 @@ def misfit(rig: CameraRig, obj: CalibrationObject, uv: Tensor, seen: NDArray[np.
     """RE (px) on image points (S, C, N, 2): the rig is held, only the object's poses are fitted."""
     shown = torch.ones(uv.shape[:-1], dtype=torch.bool) if seen is None else torch.from_numpy(seen)
     observations = Observations(uv, torch.full_like(uv[..., 0], NOISE), shown)
-    return float(estimate(observations, rig, obj, spread=torch.zeros(rig.cameras, 15, dtype=uv.dtype)).rms)
+    return float(estimate(observations, rig, obj, prior_std=torch.zeros(rig.num_cameras, 15, dtype=uv.dtype)).rms)
 
 
 def _compared(

@@ -15,7 +15,7 @@ import torch
 from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
-from imgcal.association import Labelled, PipelineOptions, SnapshotIdentity, bootstrap, track
+from imgcal.association import Associations, PipelineOptions, SnapshotIdentity, relocalize, track
 from imgcal.detection import DetectionOptions, detect_snapshot
 from imgcal.io import load_object, load_rig
 from imgcal.online import Recalibrator
@@ -133,10 +133,10 @@ def of_one_snapshot(scene: Scene, seconds: float, stages: Sequence[str] = AXES["
     std = (rig.prior or RigPrior()).std(rig)
     blank = replace(scene.detections, fiducial=np.full(len(scene.detections), -1))
     told = replace(blank, sigma=np.hypot(blank.sigma, PipelineOptions().identity_error))
-    labelled = Labelled(scene.detections, (SnapshotIdentity("0", "by_tracking", "", 1, pose),))
+    labelled = Associations(scene.detections, (SnapshotIdentity("0", "by_tracking", "", 1, pose),))
     with Recalibrator(rig, obj) as live:
         cases: dict[str, Callable[[], object]] = {
-            COLD: lambda: bootstrap(told, rig, obj, std),
+            COLD: lambda: relocalize(told, rig, obj, std),
             KNOWN: lambda: track(told, rig, obj, std, pose),
             RUNNING: lambda: live.update(blank),
             LABELLED: lambda: fit_labelled(labelled, rig, obj),
@@ -150,7 +150,7 @@ def cameras_by_opencv(scene: Scene) -> None:
     """Calibrate each camera from its labelled blobs of one snapshot."""
     points = scene.obj.points.numpy()
     uv, labels = scene.truth.uv[0].numpy(), np.arange(len(points))
-    for c in range(scene.rig.cameras):
+    for c in range(scene.rig.num_cameras):
         opencv_live.calibrated(labels, uv[c], points, view_of(scene, c), _size(scene.rig))
 
 
@@ -172,7 +172,7 @@ def of_snapshots(scene: Scene, seconds: float) -> dict[str, float]:
     while not runs or (time.perf_counter() - begin < seconds and len(runs) < 5):
         runs.append(calibrate(blank, scene.rig, scene.obj).seconds)
     stages = {name: 1e3 * float(np.median([run[name] for run in runs])) for name in (IDENTITY, ESTIMATION)}
-    return stages | {OPENCV: 1e3 * scene.rig.cameras * _views_by_opencv(scene)}
+    return stages | {OPENCV: 1e3 * scene.rig.num_cameras * _views_by_opencv(scene)}
 
 
 def _views_by_opencv(scene: Scene) -> float:
@@ -217,7 +217,7 @@ def wide(rig: CameraRig, width: int, height: int) -> CameraRig:
         rig,
         focal_length=rig.focal_length * scale,
         principal_point=middle + shift,
-        image_size=size.expand(rig.cameras, 2),
+        image_size=size.expand(rig.num_cameras, 2),
     )
 
 
@@ -226,7 +226,7 @@ def _frames(scene: Scene) -> dict[str, NDArray[Any]]:
     generator = torch.Generator().manual_seed(1)
     frames: dict[str, NDArray[Any]] = {}
     model = FrameModel(clutter=replace(ClutterModel(), occluded=0.0))
-    for c in range(scene.rig.cameras):
+    for c in range(scene.rig.num_cameras):
         truth = replace(scene.truth, rig=scene.truth.rig.select([c]), uv=scene.truth.uv[:, [c]])
         frames |= next(iter(simulate_frames(truth, scene.obj, model, generator)))
     return frames

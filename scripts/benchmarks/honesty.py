@@ -98,21 +98,21 @@ def _missing(random: np.random.Generator, rig: CameraRig, obj: CalibrationObject
 
 
 def _mirrored(random: np.random.Generator, rig: CameraRig, obj: CalibrationObject, table: Detections) -> Detections:
-    camera = random.integers(rig.cameras)
+    camera = random.integers(rig.num_cameras)
     uv, mine = table.uv.copy(), table.camera == camera
     uv[mine, 0] = rig.image_size[camera, 0].item() - 1 - uv[mine, 0]
     return replace(table, uv=uv)
 
 
 def _exchanged(random: np.random.Generator, rig: CameraRig, obj: CalibrationObject, table: Detections) -> Detections:
-    a, b = random.choice(rig.cameras, 2, replace=False)
+    a, b = random.choice(rig.num_cameras, 2, replace=False)
     camera = np.where(table.camera == a, b, np.where(table.camera == b, a, table.camera))
     return replace(table, camera=camera)
 
 
 def _bumped(random: np.random.Generator, rig: CameraRig, obj: CalibrationObject, table: Detections) -> Detections:
     """Shift what one camera sees from some moment on, as a turn of 0.5 degrees does."""
-    camera, count = random.integers(rig.cameras), len(table.snapshot_names)
+    camera, count = random.integers(rig.num_cameras), len(table.snapshot_names)
     shift = (
         float(rig.focal_length[camera].mean())
         * np.radians(0.5)
@@ -195,7 +195,7 @@ def _outcome(found: Calibration, truth: CameraRig, shares: Tensor) -> str:
     ratio = (wrong / stated).square()
     if float(ratio[ratio.isfinite()].mean()) <= WRONG**2:
         return "right"
-    return "said" if found.displaced or found.moved or found.widened or found.inflation > 1 else "silent"
+    return "said" if found.displaced or found.moved or found.prior_scale or found.inflation > 1 else "silent"
 
 
 def _normalize(found: Calibration, truth: CameraRig, squares: dict[str, list[float]], inside: list[float]) -> None:

@@ -17,7 +17,7 @@ import torch
 import tyro
 
 from imgcal import PipelineOptions, RefusedError, calibrate
-from imgcal.association import label
+from imgcal.association import associate
 from imgcal.io import write_text
 from imgcal.pipeline.steadiness import moves_of
 from imgcal.types import Detections, MovedError
@@ -56,7 +56,7 @@ def steady(kind: str, fault: str, seed: int) -> bool:
         table.uv[:] += (draw.random((len(table), 1)) < 0.1) * draw.normal(0, 8, table.uv.shape)
     elif fault == "noise misstated":
         table = replace(table, sigma=table.sigma * draw.uniform(0.2, 5))
-    return bool(moves_of(label(table, rig, obj), rig, obj, PipelineOptions()))
+    return bool(moves_of(associate(table, rig, obj), rig, obj, PipelineOptions()))
 
 
 def bumped(kind: str, degrees: float, share: float, seed: int) -> str:

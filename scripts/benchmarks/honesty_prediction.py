@@ -46,8 +46,8 @@ class Case:
     def draw(self, generator: torch.Generator) -> tuple[CameraRig, Detections]:
         """Draw a true rig, and what it sees."""
         rig, obj = self.rig, self.true_object(generator)
-        spread = (rig.prior or RigPrior()).std(rig)
-        true_rig = rig.moved(spread * torch.randn(spread.shape, generator=generator, dtype=spread.dtype))
+        prior_std = (rig.prior or RigPrior()).std(rig)
+        true_rig = rig.retract(prior_std * torch.randn(prior_std.shape, generator=generator, dtype=prior_std.dtype))
         if rig.working_distance is None:
             truth = simulate_volume(true_rig, obj, self.snapshots, generator, None)
         else:
@@ -64,7 +64,7 @@ class Case:
         obj = self.obj
         if obj.exact:
             return obj
-        tolerance = torch.zeros(obj.fiducials) if obj.tolerance is None else obj.tolerance
+        tolerance = torch.zeros(obj.num_fiducials) if obj.tolerance is None else obj.tolerance
         shift = tolerance[:, None] * torch.randn(obj.points.shape, generator=generator, dtype=obj.points.dtype)
         scale = 1 + obj.scale_tolerance * torch.randn(1, generator=generator, dtype=obj.points.dtype)
         return replace(obj, points=scale * obj.points + shift)

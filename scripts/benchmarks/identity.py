@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imgcal.association import bootstrap, track
+from imgcal.association import relocalize, track
 from imgcal.geometry import RigidTransform
 from imgcal.io import load_object, load_rig
 from imgcal.synthesis import RelativeDrift, synthesize
@@ -140,8 +140,8 @@ def _ms(value: float) -> str:
 def _case(case: Case, snapshots: int, patience: float) -> dict[str, dict[str, float]]:
     """Run everything on the same snapshots in turn; peers on as many as they manage within `patience` seconds."""
     rig, obj, made = snapshots_of(case, snapshots)
-    spread = case.kappa if case.stated is None else case.stated
-    std = RelativeDrift(*[max(spread, LEAST_PRIOR)] * 2).std(rig)
+    prior_std = case.kappa if case.stated is None else case.stated
+    std = RelativeDrift(*[max(prior_std, LEAST_PRIOR)] * 2).std(rig)
     peers = None if peer("poselib") is None else Peers(rig, obj)
     _ours(made[0], rig, obj, std)  # compile
     counts: dict[str, Count] = {}
@@ -161,7 +161,7 @@ def _timed(run: Callable[[], T]) -> tuple[T, float]:
 
 def _ours(one: Snapshot, rig: CameraRig, obj: CalibrationObject, std: Tensor) -> dict[str, tuple[Labels, float]]:
     return {
-        OURS: _timed(lambda: bootstrap(one.blobs, rig, obj, std).labels),
+        OURS: _timed(lambda: relocalize(one.blobs, rig, obj, std).labels),
         OURS_KNOWN: _timed(lambda: track(one.blobs, rig, obj, std, one.pose).labels),
     }
 
@@ -219,11 +219,11 @@ def _blobs(
         order = generator.permutation(case.visible + case.false)
         places.append(np.concatenate((blobs, generator.uniform(low, high, (case.false, 2))))[order])
         labels.append(np.concatenate((seen, np.full(case.false, -1)))[order])
-    count = rig.cameras * (case.visible + case.false)
+    count = rig.num_cameras * (case.visible + case.false)
     detections = Detections(
         uv=np.concatenate(places),
         sigma=np.full(count, NOISE),
-        camera=np.repeat(np.arange(rig.cameras), case.visible + case.false),
+        camera=np.repeat(np.arange(rig.num_cameras), case.visible + case.false),
         snapshot=np.zeros(count, dtype=np.int64),
         fiducial=np.full(count, -1),
         radius=np.full(count, np.nan),
@@ -237,7 +237,7 @@ def _blobs(
 def pinholes(rig: CameraRig) -> list[p3p.Pinhole]:
     """Cameras as OpenCV has them."""
     cameras = []
-    for c in range(rig.cameras):
+    for c in range(rig.num_cameras):
         matrix = np.diag([*rig.focal_length[c].tolist(), 1.0])
         matrix[:2, 2] = rig.principal_point[c].numpy()
         pose = rig.cam_from_rig[c]

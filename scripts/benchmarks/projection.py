@@ -204,7 +204,7 @@ def _measure_values(kind: str, count: int, effort: Effort) -> dict[str, Any]:
 
 def _measure_derivatives(kind: str, count: int, effort: Effort) -> dict[str, Any]:
     scene = scene_of(kind, count)
-    shape = (count if kind == "rigs" else 1, scene.rig.cameras, len(scene.points_object), 2)
+    shape = (count if kind == "rigs" else 1, scene.rig.num_cameras, len(scene.points_object), 2)
     upstream = torch.randn(shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     cases = derivative_cases(scene, upstream)
     found = {name: np.asarray(take(run())) for name, (run, take) in cases.items()}
@@ -224,10 +224,10 @@ def _equations(scene: Scene, upstream: Tensor) -> Run:
     observed = rig.project_values(scene.points).uv - upstream
     uv = observed.mT[:, None].contiguous()
     ones = torch.ones_like(uv[..., 0, :])
-    spread = torch.ones(*rig.focal_length.shape[:2], 15, dtype=uv.dtype)
-    problem = Problem(uv, ones, (points - centroid).contiguous(), centroid, None, rig, spread)
+    prior_std = torch.ones(*rig.focal_length.shape[:2], 15, dtype=uv.dtype)
+    problem = Problem(uv, ones, (points - centroid).contiguous(), centroid, None, rig, prior_std)
     centre = scene.rig_from_object.apply(centroid[None])
-    state = State(torch.zeros_like(spread), scene.rig_from_object.rotation[:, None].contiguous(), centre)
+    state = State(torch.zeros_like(prior_std), scene.rig_from_object.rotation[:, None].contiguous(), centre)
     return lambda: lm_cpu.minimize(problem, state, "squared", 1.0, 0, 0.0).equations
 
 

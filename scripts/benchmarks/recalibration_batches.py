@@ -10,10 +10,10 @@ from imgcal.estimation import (
     camera_covariance,
     estimate,
     initial_pose,
+    initial_state,
     levenberg_marquardt,
     lm_cpu,
     make_problem,
-    make_start,
     squared,
 )
 from scripts.benchmarks.effort import Effort
@@ -31,10 +31,10 @@ def measure(effort: Effort) -> dict[str, Any]:
     def run(cases: Cases, start: bool = True) -> Callable[[], object]:
         poses = cases.start if start else None
         given = (cases.observations, cases.factory, cases.obj, poses)
-        return lambda: estimate(*given, spread=cases.spread, options=SQUARED)
+        return lambda: estimate(*given, prior_std=cases.prior_std, options=SQUARED)
 
-    problem = make_problem(one.observations, one.factory, one.obj, one.spread)
-    start = make_start(problem, one.start, None)
+    problem = make_problem(one.observations, one.factory, one.obj, one.prior_std)
+    start = initial_state(problem, one.start, None)
     compiled = lm_cpu.minimize(problem, start, "squared", 3.0, *LIMITS)
     tensors = levenberg_marquardt.minimize(problem, start, squared, *LIMITS)
     found = run(one)()

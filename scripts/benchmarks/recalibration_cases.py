@@ -32,7 +32,7 @@ class Cases:
     truth: CameraRig
     obj: CalibrationObject
     factory: CameraRig  # (B)
-    spread: Tensor  # (C, 15)
+    prior_std: Tensor  # (C, 15)
     poses: RigidTransform  # (B, S)
     observations: Observations  # (B, S, C, N)
     start: RigidTransform  # (B, S) by imgcal.estimation.pose_initialization, with the factory rig
@@ -60,7 +60,7 @@ class Cases:
             translation=factory.cam_from_rig.translation.numpy(),
             start_rotation=start.rotation.numpy(),
             start_translation=start.translation.numpy(),
-            spread=self.spread.numpy(),
+            prior_std=self.prior_std.numpy(),
             image_size=(width, height),
         )
 
@@ -69,20 +69,20 @@ def make_cases(count: int, snapshots: int, seed: int, scale: float = 1.0) -> Cas
     """Observe O10 by random poses; disturb its factory calibration by `scale` times the drift."""
     truth, obj = load_rig("O10"), load_object("asymmetric8")
     generator = torch.Generator().manual_seed(seed)
-    spread = scale * DRIFT.std(truth)
+    prior_std = scale * DRIFT.std(truth)
     poses = _poses(truth, obj, generator, count, snapshots)
     uv = _images(truth, obj, poses)
     uv = uv + NOISE * torch.randn(uv.shape, generator=generator, dtype=uv.dtype)
     observations = _observed(uv)
-    factory = truth.moved(_offsets(spread, count, generator, truth))
-    return Cases(truth, obj, factory, spread, poses, observations, initial_pose(observations, factory, obj))
+    factory = truth.retract(_offsets(prior_std, count, generator, truth))
+    return Cases(truth, obj, factory, prior_std, poses, observations, initial_pose(observations, factory, obj))
 
 
-def _offsets(spread: Tensor, count: int, generator: torch.Generator, truth: CameraRig) -> Tensor:
+def _offsets(prior_std: Tensor, count: int, generator: torch.Generator, truth: CameraRig) -> Tensor:
     """Draw (B, C, 15) errors; those that leave a camera hardly any focal length anew."""
-    offsets = spread * torch.randn(count, *spread.shape, generator=generator, dtype=spread.dtype)
+    offsets = prior_std * torch.randn(count, *prior_std.shape, generator=generator, dtype=prior_std.dtype)
     while bool((bad := ((offsets[..., 6:8] / truth.focal_length) < UNUSABLE - 1).any(-1)).any()):
-        offsets[bad] = (spread * torch.randn(offsets.shape, generator=generator, dtype=spread.dtype))[bad]
+        offsets[bad] = (prior_std * torch.randn(offsets.shape, generator=generator, dtype=prior_std.dtype))[bad]
     return offsets
 
 
@@ -130,7 +130,7 @@ def score(answers: Sequence[RigAnswer], cases: Cases, seed: int = 99, fresh: int
 def bound(cases: Cases) -> dict[str, np.ndarray]:
     """Posterior Cramer-Rao bound, one mean variance a case: what the observations and the prior leave."""
     found = estimate(
-        cases.observations, cases.factory, cases.obj, cases.poses, spread=cases.spread, first_guess=cases.truth,
+        cases.observations, cases.factory, cases.obj, cases.poses, prior_std=cases.prior_std, initial_rig=cases.truth,
         options=SQUARED,
     )  # fmt: skip
     return _of_kinds(relative_covariance(found).diagonal(dim1=-2, dim2=-1).unflatten(-1, (-1, PARAMETERS)))
@@ -162,9 +162,9 @@ def rigs(answers: Sequence[RigAnswer], like: CameraRig) -> CameraRig:
 
 def _misfit(rigs: CameraRig, observations: Observations, cases: Cases) -> np.ndarray:
     """RMS residual (B,) with fixed rigs and fitted poses."""
-    held = torch.zeros_like(cases.spread)
+    held = torch.zeros_like(cases.prior_std)
     snapshots = observations.uv.shape[1]
     every = Observations(*(value.flatten(0, 1)[:, None] for value in vars(observations).values()))
     repeated = rigs.map_tensors(lambda tensor, _: tensor.repeat_interleave(snapshots, 0))
-    found = estimate(every, repeated, cases.obj, spread=held, options=SQUARED)
+    found = estimate(every, repeated, cases.obj, prior_std=held, options=SQUARED)
     return found.rms.unflatten(0, (-1, snapshots)).square().mean(1).sqrt().nan_to_num(math.inf).numpy()

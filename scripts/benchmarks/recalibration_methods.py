@@ -75,7 +75,7 @@ def by_imgcal(cases: Cases, index: int, start: bool = True) -> RigAnswer:
     observations, factory = cases.one(index), cases.factory[index]
     poses = cases.start[index] if start else None
     begin = time.perf_counter()
-    rig = estimate(observations, factory, cases.obj, poses, spread=cases.spread, options=SQUARED).rig
+    rig = estimate(observations, factory, cases.obj, poses, prior_std=cases.prior_std, options=SQUARED).rig
     seconds = time.perf_counter() - begin
     intrinsics = (rig.focal_length.numpy(), rig.principal_point.numpy(), rig.distortion.numpy())
     return RigAnswer(*intrinsics, rig.cam_from_rig.rotation.numpy(), rig.cam_from_rig.translation.numpy(), seconds)

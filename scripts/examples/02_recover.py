@@ -16,8 +16,8 @@ uv = truth.uv + noise * torch.randn(truth.uv.shape, generator=generator, dtype=t
 observations = Observations(uv, torch.full(uv.shape[:-1], noise), torch.ones(uv.shape[:-1], dtype=torch.bool))
 result = imgcal.estimate(observations, factory, obj)
 
-before = factory.difference(truth.rig)[:, 6:8].abs().mean()
-after = result.rig.difference(truth.rig)[:, 6:8].abs().mean()
-spread = camera_std(result)[:, 6:8].mean()
-print(f"focal length error: {before:.2f} px -> {after:.2f} px, predicted spread {spread:.2f} px")
+before = factory.local(truth.rig)[:, 6:8].abs().mean()
+after = result.rig.local(truth.rig)[:, 6:8].abs().mean()
+prior_std = camera_std(result)[:, 6:8].mean()
+print(f"focal length error: {before:.2f} px -> {after:.2f} px, predicted spread {prior_std:.2f} px")
 print(f"chi2 per degree of freedom: {result.chi2_per_dof:.2f}")

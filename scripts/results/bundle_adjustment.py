@@ -128,7 +128,7 @@ def _map(sample: Sample, iterations: int) -> Column:
         observations = observed(given.uv, given.seen, given.sigma)
         pose = initial_pose(observations, given.factory, given.obj)
         start = time.perf_counter()
-        found = estimate(observations, given.factory, given.obj, pose, spread=given.spread, options=limits)
+        found = estimate(observations, given.factory, given.obj, pose, prior_std=given.prior_std, options=limits)
         seconds.append(time.perf_counter() - start)
         errors += _errors(as_prediction(found), sample, one)
     return Column(errors, seconds)

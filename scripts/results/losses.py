@@ -73,7 +73,7 @@ def main(arguments: list[str] | None = None) -> None:
 def watched(experiment: Experiment, folder: Path, options: Options) -> dict[str, Any]:
     """Train for some minutes; returns every term every few steps."""
     run = prepare(experiment, folder)
-    made = run.source.sample(options.rigs, torch.Generator(run.spread.device).manual_seed(1))
+    made = run.source.sample(options.rigs, torch.Generator(run.prior_std.device).manual_seed(1))
     batch = run.source.show(made, run.generator)
     truth, obj = batch.truth, run.source.obj
     steps: list[int] = []

@@ -129,17 +129,17 @@ def ours(cameras: int, device: str, repeats: int) -> dict[str, float]:
     """Time networks and refinement on one snapshot of one rig; medians in seconds."""
     rig, obj = ring(cameras), load_object("cube8")
     made = unhindered(rig, obj)
-    spread = DRIFT.std(rig)
+    prior_std = DRIFT.std(rig)
     uv, seen = made.projection.uv, torch.ones_like(made.projection.visible)
     views = Views(uv.to(device, torch.float32), seen.to(device))
     guess = nearby(made)
     given = Views(uv, seen)
     found = {}
     for preset in ("points", "paper-points"):
-        network = networks.build(NetworkConfig(preset=preset), rig.to(torch.float32), obj, spread.float())
+        network = networks.build(NetworkConfig(preset=preset), rig.to(torch.float32), obj, prior_std.float())
         network = network.to(device).eval()
         found[f"{preset}_s"] = median(lambda net=network: forward(net, views), repeats)  # type: ignore[misc]
-    found["refinement_s"] = median(lambda: refine_points(guess, given, rig, obj, spread, NOISE), repeats)
+    found["refinement_s"] = median(lambda: refine_points(guess, given, rig, obj, prior_std, NOISE), repeats)
     found["points_refined_s"] = found["points_s"] + found["refinement_s"]
     return found
 

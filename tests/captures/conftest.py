@@ -88,17 +88,17 @@ def fit_rig(points: Points, cameras: tuple[str, ...], image_size: tuple[int, int
 def disturbed(rig: CameraRig, points: Points, pixels: float, seed: int) -> CameraRig:
     """Turn, shift and rescale every camera by a few percent so that points move by `pixels` (RMS) in each camera."""
     generator = torch.Generator().manual_seed(seed)
-    draw = torch.randn(rig.cameras, 15, generator=generator, dtype=torch.float64)
+    draw = torch.randn(rig.num_cameras, 15, generator=generator, dtype=torch.float64)
     size = torch.cat(
         (torch.full((3,), 0.001), torch.full((3,), 1.0), torch.full((2,), 20.0), torch.full((2,), 5.0), torch.zeros(5))
     )
     step = draw * size
     for _ in range(20):
-        moved = rig.moved(step)
+        moved = rig.retract(step)
         shift = np.linalg.norm(predicted(moved, points) - predicted(rig, points), axis=1)
-        rms = np.sqrt([np.mean(shift[points.camera == c] ** 2) for c in range(rig.cameras)])
+        rms = np.sqrt([np.mean(shift[points.camera == c] ** 2) for c in range(rig.num_cameras)])
         step = step * torch.from_numpy(pixels / rms)[:, None]
-    return rig.moved(step)
+    return rig.retract(step)
 
 
 def predicted(rig: CameraRig, points: Points) -> np.ndarray:

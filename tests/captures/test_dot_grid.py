@@ -64,7 +64,7 @@ def test_the_halves_differ_by_as_much_as_they_say(grid):
     frames = [read_frame(path) for path in sorted((grid / "frames" / "cam").glob("*.png"))]
     dark = imgcal.DetectionOptions(polarity="dark")
     halves = [imgcal.calibrate({"cam": frames[part::2]}, nominal(), obj, detection=dark) for part in (0, 1)]
-    difference = halves[0].rig.difference(halves[1].rig)[0, 6:10]
+    difference = halves[0].rig.local(halves[1].rig)[0, 6:10]
     variance = sum(camera_std(half)[0, 6:10].square() for half in halves)
     assert (difference.square() / variance).mean() < 4
     alone = sum(camera_std(replace(half, inflation=1.0))[0, 6:10].square() for half in halves)

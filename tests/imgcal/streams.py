@@ -41,12 +41,12 @@ class Stream:
 
     def bumped(self, cameras, turn_deg=0.0, shift_mm=0.0):
         """The true rig with some cameras turned and shifted, in directions of their own."""
-        step = torch.zeros(self.rig.cameras, 15, dtype=torch.float64)
+        step = torch.zeros(self.rig.num_cameras, 15, dtype=torch.float64)
         for camera in cameras:
             axis, way = torch.randn(2, 3, generator=self.generator, dtype=torch.float64)
             step[camera, :3] = axis / axis.norm() * np.deg2rad(turn_deg)
             step[camera, 3:6] = way / way.norm() * shift_mm
-        return self.true.moved(step)
+        return self.true.retract(step)
 
     def blobs(self, s, rig=None, hidden: Collection[int] = (), noise=0.07, false=0.0):
         """What the cameras see in one snapshot, unlabelled and in any order; and the true labels."""
@@ -56,7 +56,7 @@ class Stream:
         visible[list(hidden)] = False
         camera, label = np.nonzero(visible)
         uv = seen.uv.numpy()[camera, label] + noise * self.random.standard_normal((len(camera), 2))
-        clutter = np.repeat(np.arange(rig.cameras), self.random.poisson(false, rig.cameras))
+        clutter = np.repeat(np.arange(rig.num_cameras), self.random.poisson(false, rig.num_cameras))
         size = rig.image_size.numpy()
         uv = np.concatenate((uv, self.random.random((len(clutter), 2)) * (size[clutter] - 1)))
         camera = np.concatenate((camera, clutter))
@@ -82,7 +82,7 @@ class Stream:
         pose = self.poses[s : s + 1]
         seen = rig.expand(1).project(pose.apply(self.obj.points), self.obj.radius)
         observations = Observations(seen.uv, torch.full_like(seen.uv[..., 0], 0.3), seen.visible)
-        held = torch.zeros(rig.cameras, 15, dtype=torch.float64)
-        fit = estimate(observations, found, self.obj, pose, spread=held, options=EstimationOptions(loss="cauchy"))
+        held = torch.zeros(rig.num_cameras, 15, dtype=torch.float64)
+        fit = estimate(observations, found, self.obj, pose, prior_std=held, options=EstimationOptions(loss="cauchy"))
         squared = fit.residual.square().sum(-1).sum((0, 2))
         return (squared / seen.visible.sum((0, 2)).clamp_min(1)).sqrt().numpy()

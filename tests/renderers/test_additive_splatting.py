@@ -38,7 +38,11 @@ def test_equals_whole_matrix_products(dtype: torch.dtype, tolerance: float, wide
     upstream = torch.randn(4, channels, *SIZE, generator=torch.Generator().manual_seed(0), dtype=dtype)
     found = []
     for path in (additive_splatting, additive_splatting_operator):
-        images = path.added(splats, SIZE) if found else path.added(Splats(*leaves(splats), splats.visible), SIZE)
+        images = (
+            path.splat_additively(splats, SIZE)
+            if found
+            else path.splat_additively(Splats(*leaves(splats), splats.visible), SIZE)
+        )
         found.append((images, *torch.autograd.grad(images, splats[:4], upstream)))
     torch.testing.assert_close(found[1][0], found[0][0], rtol=0, atol=tolerance)
     for slow, fast in zip(found[0][1:], found[1][1:], strict=True):
@@ -49,8 +53,8 @@ def test_equals_whole_matrix_products(dtype: torch.dtype, tolerance: float, wide
 def test_a_buffer_holds_the_same_images(path) -> None:
     splats = scene(3, 5)
     out = torch.full((3, 3, *SIZE), torch.nan, dtype=torch.float64)
-    assert path.added(splats, SIZE, out) is out
-    assert torch.equal(out, path.added(splats, SIZE))
+    assert path.splat_additively(splats, SIZE, out) is out
+    assert torch.equal(out, path.splat_additively(splats, SIZE))
 
 
 def test_second_gradients() -> None:
@@ -58,7 +62,7 @@ def test_second_gradients() -> None:
     uv, sizes, weight, colours = splats[:4]
     given = [x.requires_grad_() for x in (uv.nan_to_num(5.0).clamp(-5, 40), sizes + 0.5, weight, colours)]
     assert torch.autograd.gradgradcheck(
-        lambda *x: additive_splatting_operator.added(Splats(*x, splats.visible), SIZE), given, fast_mode=True
+        lambda *x: additive_splatting_operator.splat_additively(Splats(*x, splats.visible), SIZE), given, fast_mode=True
     )
 
 
@@ -66,7 +70,7 @@ def test_gradient_of_one_argument_from_an_expanded_upstream() -> None:
     splats = scene(2, 3)
     splats.uv.requires_grad_()
     found, expected = (
-        torch.autograd.grad(path.added(splats, SIZE).sum(), splats.uv)[0]
+        torch.autograd.grad(path.splat_additively(splats, SIZE).sum(), splats.uv)[0]
         for path in (additive_splatting_operator, additive_splatting)
     )
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
@@ -86,7 +90,7 @@ def test_threads_change_nothing() -> None:
     found = []
     for threads in (3, 1):
         torch.set_num_threads(threads)
-        images = additive_splatting_operator.added(Splats(*leaves(splats), splats.visible), SIZE)
+        images = additive_splatting_operator.splat_additively(Splats(*leaves(splats), splats.visible), SIZE)
         found.append((images, *torch.autograd.grad(images.square().sum(), splats[:4])))
     for many, one in zip(*found, strict=True):
         assert torch.equal(many, one)

@@ -42,7 +42,7 @@ def test_pycolmap_is_among_them() -> None:
 @pytest.mark.parametrize(("kind", "count"), KINDS)
 def test_all_find_the_same_derivatives(kind: str, count: int) -> None:
     scene = projection.scene_of(kind, count)
-    shape = (count if kind == "rigs" else 1, scene.rig.cameras, len(scene.points_object), 2)
+    shape = (count if kind == "rigs" else 1, scene.rig.num_cameras, len(scene.points_object), 2)
     upstream = torch.randn(shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     cases = projection.derivative_cases(scene, upstream)
     assert set(cases) == set(projection.COMPUTES)

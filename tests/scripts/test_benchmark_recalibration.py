@@ -57,7 +57,7 @@ def test_same_cost_has_the_same_minimum(name, snapshots):
     cases = make_cases(2, snapshots, seed=3)
     found = solved(cases, IMGCAL, name)
     ours, theirs = (rigs(answers, cases.truth) for answers in (found[IMGCAL], found[name]))
-    difference = relative_difference(ours, theirs) / cases.spread
+    difference = relative_difference(ours, theirs) / cases.prior_std
     assert difference.abs().max() < 0.01
 
 

@@ -119,7 +119,7 @@ def _add_prior(problem: Any, scene: Any, task: RigTask) -> None:
     costs: Any = peer("pycolmap.cost_functions")
     pycolmap: Any = peer("pycolmap")
     sensors = scene.rigs[1].non_ref_sensors
-    for c, variance in enumerate((task.spread / task.sigma) ** 2):
+    for c, variance in enumerate((task.prior_std / task.sigma) ** 2):
         camera = scene.cameras[c + 1]
         intrinsics = np.diag(np.concatenate((variance[6:15], np.ones(3))))
         problem.add_residual_block(pyceres.factors.NormalPrior(camera.params.copy(), intrinsics), None, [camera.params])

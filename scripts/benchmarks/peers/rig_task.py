@@ -25,7 +25,9 @@ class RigTask:
     translation: Array  # (C, 3)
     start_rotation: Array  # (S, 3, 3) rig_from_object
     start_translation: Array  # (S, 3)
-    spread: Array  # (C, 15) standard deviation of the factory values, in the order of imgcal.types.rig.PARAMETER_NAMES
+    prior_std: (
+        Array  # (C, 15) standard deviation of the factory values, in the order of imgcal.types.rig.PARAMETER_NAMES
+    )
     image_size: tuple[int, int]  # width, height
     seen: NDArray[np.bool_] | None = None  # (S, C, N), None = all; only scipy_rig looks at it
 

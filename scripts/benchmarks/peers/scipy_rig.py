@@ -67,7 +67,7 @@ class _Cost:
     def rig(self, x: Array) -> tuple[Array, Array, Array, Array, Array]:
         """Rotations (C, 3, 3), positions (C, 3), focal lengths, principal points (C, 2), distortion (C, 5)."""
         task = self.task
-        step = x[: task.spread.size].reshape(task.spread.shape) * task.spread
+        step = x[: task.prior_std.size].reshape(task.prior_std.shape) * task.prior_std
         rotation = _exponential(step[:, :3]) @ task.rotation
         position = -np.einsum("cji,cj->ci", task.rotation, task.translation) + step[:, 3:6]
         focal, principal = task.focal_length + step[:, 6:8], task.principal_point + step[:, 8:10]
@@ -77,7 +77,7 @@ class _Cost:
         rotation, position, focal, principal, distortion = self.rig(x)
         xy, _ = _seen(self._points(x)[1], rotation, position)
         uv = focal[:, None] * _distorted(xy, distortion[:, None]) + principal[:, None]
-        return np.concatenate((((uv - self.task.uv) * self.weight[..., None]).ravel(), x[: self.task.spread.size]))
+        return np.concatenate((((uv - self.task.uv) * self.weight[..., None]).ravel(), x[: self.task.prior_std.size]))
 
     def jacobian(self, x: Array) -> csr_matrix:
         task = self.task
@@ -91,24 +91,24 @@ class _Cost:
         by_point[..., 2] = -np.einsum("scnij,scnj->scni", by_xy, xy) / depth[..., None]
         by_point *= focal[:, None, :, None]
         by_rig = by_point @ rotation[:, None]
-        step = x[: task.spread.size].reshape(task.spread.shape) * task.spread
-        poses = x[task.spread.size :].reshape(-1, POSE)
+        step = x[: task.prior_std.size].reshape(task.prior_std.shape) * task.prior_std
+        poses = x[task.prior_std.size :].reshape(-1, POSE)
         full = np.zeros((*xy.shape, CAMERA + POSE))
         full[..., 0:3] = np.cross(cam[..., None, :], by_point) @ _left_jacobian(step[:, :3])[:, None]
         full[..., 3:6] = -by_rig
         full[..., 0, 6], full[..., 1, 7] = np.moveaxis(_distorted(xy, distortion[:, None]), -1, 0)
         full[..., 0, 8] = full[..., 1, 9] = 1
         full[..., 10:15] = by_distortion * focal[:, None, :, None]
-        full[..., :CAMERA] *= task.spread[:, None, None]
+        full[..., :CAMERA] *= task.prior_std[:, None, None]
         full[..., 15:18] = np.cross(turned[:, None, :, None], by_rig) @ _left_jacobian(poses[:, :3])[:, None, None]
         full[..., 18:21] = by_rig
-        data = np.concatenate(((full * self.weight[..., None, None]).ravel(), np.ones(task.spread.size)))
+        data = np.concatenate(((full * self.weight[..., None, None]).ravel(), np.ones(task.prior_std.size)))
         return csr_matrix((data, *self.pattern), shape=(len(self.pattern[1]) - 1, self.size))
 
     def _points(self, x: Array) -> tuple[Array, Array]:
         """Fiducials of every snapshot in the rig frame (S, N, 3): turned only, and with their place."""
         task = self.task
-        poses = x[task.spread.size :].reshape(-1, POSE)
+        poses = x[task.prior_std.size :].reshape(-1, POSE)
         centroid = task.points.mean(0)
         start = task.start_rotation @ centroid + task.start_translation
         turned = (task.points - centroid) @ (_exponential(poses[:, :3]) @ task.start_rotation).swapaxes(-1, -2)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association import bootstrap
+from imgcal.association import relocalize
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.types.calibration_object import CalibrationObject
@@ -26,7 +26,7 @@ def seen_by_one(o10, obj, prior, seed, extra=0):
     random, generator = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
     rig = replace(o10.select([0]), prior=prior)
     drift = torch.randn(1, 15, generator=generator, dtype=torch.float64)
-    true = rig.moved(drift * prior.std(rig))
+    true = rig.retract(drift * prior.std(rig))
     while True:
         turn = rotation_from_vector(torch.from_numpy(random.normal(0, 0.35, 3)))
         if random.random() < 0.5:  # seen from behind: lamps shine both ways
@@ -35,7 +35,7 @@ def seen_by_one(o10, obj, prior, seed, extra=0):
         shown = true.project(RigidTransform(turn, centre - turn @ obj.points.mean(0)).apply(obj.points))
         if bool(shown.visible.all()):
             break
-    truth = np.append(np.arange(obj.fiducials), np.full(extra, -1))
+    truth = np.append(np.arange(obj.num_fiducials), np.full(extra, -1))
     uv = np.concatenate((shown.uv[0].numpy(), random.uniform((0, 0), (2048, 1088), (extra, 2))))
     uv += 0.1 * random.standard_normal(uv.shape)
     order, count = random.permutation(len(uv)), len(uv)
@@ -50,7 +50,7 @@ def test_four_fiducials_in_a_plane_are_told_by_one_camera_that_is_well_known(o10
     accepted = 0
     for seed in range(20):
         rig, blobs, truth = seen_by_one(o10, four(), KNOWN, seed)
-        found = bootstrap(blobs, rig, four(), KNOWN.std(rig))
+        found = relocalize(blobs, rig, four(), KNOWN.std(rig))
         assert not (found.labels[found.labels >= 0] != truth[found.labels >= 0]).any()
         accepted += found.accepted
         if found.accepted:
@@ -64,7 +64,7 @@ def test_what_a_wide_prior_leaves_open_is_refused_in_words(extra, o10):
     reasons, wrong, accepted = [], 0, 0
     for seed in range(12):
         rig, blobs, truth = seen_by_one(o10, four(), RigPrior(), seed, extra)
-        found = bootstrap(blobs, rig, four(), RigPrior().std(rig))
+        found = relocalize(blobs, rig, four(), RigPrior().std(rig))
         wrong += int((found.labels[found.labels >= 0] != truth[found.labels >= 0]).sum())
         accepted += found.accepted
         reasons += [] if found.accepted else [found.reason]
@@ -78,13 +78,13 @@ def test_four_blobs_of_something_else_are_refused(o10):
     for seed in range(20):
         random = np.random.default_rng(seed)
         other = replace(blobs, uv=random.uniform((700, 300), (1300, 800), (4, 2)))
-        accepted += bootstrap(other, rig, four(), KNOWN.std(rig)).accepted
+        accepted += relocalize(other, rig, four(), KNOWN.std(rig)).accepted
     assert accepted == 0
 
 
 def test_a_square_is_ambiguous_to_one_camera(o10):
     square = four(100.0 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]))
     rig, blobs, truth = seen_by_one(o10, square, KNOWN, 1)
-    found = bootstrap(blobs, rig, square, KNOWN.std(rig))
+    found = relocalize(blobs, rig, square, KNOWN.std(rig))
     assert (found.status, found.alternatives) == ("ambiguous", len(square.symmetries))
     assert any((motion.permutation[truth] == found.labels).all() for motion in square.symmetries)

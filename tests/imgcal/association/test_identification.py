@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association import IdentityOptions, bootstrap, identify, track
+from imgcal.association import IdentityOptions, identify, relocalize, track
 from imgcal.errors import InputError
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.io import load_object, load_rig
@@ -16,7 +16,7 @@ from imgcal.types.observations import BlobFlag, Detections
 from imgcal.types.rig import CameraRig
 
 DRIFT = RelativeDrift(0.05, 0.05)
-Labelled = tuple[Detections, np.ndarray]
+Associations = tuple[Detections, np.ndarray]
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def make_object(points: np.ndarray) -> CalibrationObject:
 
 def snapshots(
     rig: CameraRig, obj: CalibrationObject, count: int, visible: int, false: int, seed: int = 0
-) -> tuple[Snapshots, list[Labelled]]:
+) -> tuple[Snapshots, list[Associations]]:
     """Synthetic snapshots with some fiducials missing and some blobs false, and the true fiducial of each blob."""
     made = synthesize(rig, obj, count, torch.Generator().manual_seed(seed), drift=DRIFT)
     generator = np.random.default_rng(seed)
@@ -81,7 +81,7 @@ def test_cold_start_gives_no_wrong_label(
     _, made = snapshots(o10, asymmetric, 25, visible, false)
     total = 0
     for blobs, truth in made:
-        found = bootstrap(blobs, o10, asymmetric, DRIFT.std(o10))
+        found = relocalize(blobs, o10, asymmetric, DRIFT.std(o10))
         assert found.status == "unique"
         right, wrong = agreements(found.labels, truth, asymmetric)
         assert wrong == 0
@@ -92,14 +92,14 @@ def test_cold_start_gives_no_wrong_label(
 def test_order_of_blobs_does_not_matter(o10: CameraRig, asymmetric: CalibrationObject) -> None:
     _, [(blobs, _)] = snapshots(o10, asymmetric, 1, 6, 2)
     order = np.random.default_rng(1).permutation(len(blobs))
-    straight = bootstrap(blobs, o10, asymmetric, DRIFT.std(o10))
-    shuffled = bootstrap(blobs.select(order), o10, asymmetric, DRIFT.std(o10))
+    straight = relocalize(blobs, o10, asymmetric, DRIFT.std(o10))
+    shuffled = relocalize(blobs.select(order), o10, asymmetric, DRIFT.std(o10))
     np.testing.assert_array_equal(straight.labels[order], shuffled.labels)
 
 
 def test_rig_and_pose_explain_the_labels(o10: CameraRig, asymmetric: CalibrationObject) -> None:
     _, [(blobs, _)] = snapshots(o10, asymmetric, 1, 6, 2)
-    found = bootstrap(blobs, o10, asymmetric, DRIFT.std(o10))
+    found = relocalize(blobs, o10, asymmetric, DRIFT.std(o10))
     assert found.rig is not None
     assert found.rig_from_object is not None
     named = found.labels >= 0
@@ -111,7 +111,7 @@ def test_rig_and_pose_explain_the_labels(o10: CameraRig, asymmetric: Calibration
 def test_a_cube_is_ambiguous_with_one_symmetry_element_for_all_cameras(o10: CameraRig) -> None:
     cube = load_object(data_path("objects", "cube8.csv"))
     for blobs, truth in snapshots(o10, cube, 5, 6, 2)[1]:
-        found = bootstrap(blobs, o10, cube, DRIFT.std(o10))
+        found = relocalize(blobs, o10, cube, DRIFT.std(o10))
         assert (found.status, found.alternatives) == ("ambiguous", 24)
         assert agreements(found.labels, truth, cube)[1] == 0
 
@@ -127,11 +127,11 @@ def test_other_objects_and_rigs(o10: CameraRig, asymmetric: CalibrationObject, k
         "many planar": (o10.select([0]), make_object(flat), 147, 5),
     }[kind]
     for blobs, truth in snapshots(rig, obj, 3, visible, false)[1]:
-        found = bootstrap(blobs, rig, obj, DRIFT.std(rig))
+        found = relocalize(blobs, rig, obj, DRIFT.std(rig))
         right, wrong = agreements(found.labels, truth, obj)
         assert found.accepted
         assert wrong == 0
-        assert right >= 0.9 * visible * rig.cameras
+        assert right >= 0.9 * visible * rig.num_cameras
 
 
 def test_four_fiducials_in_one_camera_are_hardly_ever_told_and_never_wrong(o10: CameraRig) -> None:
@@ -139,7 +139,7 @@ def test_four_fiducials_in_one_camera_are_hardly_ever_told_and_never_wrong(o10: 
     four = make_object(np.array([[0.0, 0, 0], [90, 10, 0], [20, 80, 10], [-30, 40, 70]]))
     refused = 0
     for blobs, truth in snapshots(rig, four, 12, 4, 0)[1]:
-        found = bootstrap(blobs, rig, four, DRIFT.std(rig))
+        found = relocalize(blobs, rig, four, DRIFT.std(rig))
         assert (found.labels == (truth if found.accepted else -1)).all()
         assert found.reason
         refused += not found.accepted
@@ -149,7 +149,7 @@ def test_four_fiducials_in_one_camera_are_hardly_ever_told_and_never_wrong(o10: 
 def test_clutter_alone_is_refused(o10: CameraRig, asymmetric: CalibrationObject) -> None:
     generator = np.random.default_rng(0)
     blobs = detections(generator.random((80, 2)) * [2048, 1088], np.repeat(np.arange(10), 8), o10)
-    assert bootstrap(blobs, o10, asymmetric, DRIFT.std(o10)).status == "refused"
+    assert relocalize(blobs, o10, asymmetric, DRIFT.std(o10)).status == "refused"
 
 
 def test_no_blobs_are_refused_with_a_reason(o10: CameraRig, asymmetric: CalibrationObject) -> None:
@@ -162,7 +162,7 @@ def test_unusable_blobs_get_no_label(o10: CameraRig, asymmetric: CalibrationObje
     _, [(blobs, _)] = snapshots(o10, asymmetric, 1, 8, 0)
     flags = blobs.flags.copy()
     flags[::9] = int(BlobFlag.BORDER)
-    found = bootstrap(replace(blobs, flags=flags), o10, asymmetric, DRIFT.std(o10))
+    found = relocalize(replace(blobs, flags=flags), o10, asymmetric, DRIFT.std(o10))
     assert found.accepted
     assert (found.labels[::9] == -1).all()
 
@@ -207,7 +207,7 @@ def test_a_lattice_finds_its_place_in_ten_cameras(o10: CameraRig) -> None:
         shown = exact.select(generator.random(len(exact)) >= 0.15)
         uv = shown.uv + 0.05 * generator.standard_normal(shown.uv.shape)
         blobs = replace(shown, uv=uv, sigma=np.full(len(shown), 0.3), fiducial=np.full(len(shown), -1))
-        found = bootstrap(blobs, o10, obj, o10.prior.std(o10))
+        found = relocalize(blobs, o10, obj, o10.prior.std(o10))
         right, wrong = agreements(found.labels, shown.fiducial, obj)
         assert wrong == 0 and right > 0.85 * len(shown)
 
@@ -215,7 +215,7 @@ def test_a_lattice_finds_its_place_in_ten_cameras(o10: CameraRig) -> None:
 def test_a_large_cloud_is_found_by_its_outer_fiducials(o10: CameraRig) -> None:
     obj = make_object(120 * (np.random.default_rng(0).random((150, 3)) - 0.5))
     _, [(blobs, truth)] = snapshots(o10, obj, 1, 140, 5)
-    found = bootstrap(blobs, o10, obj, DRIFT.std(o10))
+    found = relocalize(blobs, o10, obj, DRIFT.std(o10))
     right, wrong = agreements(found.labels, truth, obj)
     assert found.status == "unique" and wrong <= 0.01 * right and right > 0.9 * 10 * 140
 
@@ -226,7 +226,7 @@ def test_a_narrow_prior_finds_the_same(o10: CameraRig, asymmetric: CalibrationOb
     exact = true_detections(truth)
     for s in range(3):
         shown = replace(exact.select(exact.snapshot == s), snapshot_names=("0", "1", "2"))
-        found = bootstrap(replace(shown, fiducial=np.full(len(shown), -1)), o10, asymmetric, std)
+        found = relocalize(replace(shown, fiducial=np.full(len(shown), -1)), o10, asymmetric, std)
         np.testing.assert_array_equal(found.labels, shown.fiducial)
 
 
@@ -261,7 +261,7 @@ def test_sharp_centres_and_a_wide_prior_lose_no_labels(o10, asymmetric):
         blobs = true_detections(truth)
         blobs.uv[:] += noise.reshape(-1, 2).numpy()
         unlabelled = replace(blobs, fiducial=np.full(len(blobs), -1), sigma=np.full(len(blobs), 0.004))
-        identity = bootstrap(unlabelled, o10, asymmetric, std)
+        identity = relocalize(unlabelled, o10, asymmetric, std)
         assert identity.status == "unique"
         assert np.array_equal(identity.labels, blobs.fiducial)
 
@@ -273,7 +273,7 @@ def test_a_centre_that_is_off_costs_its_own_label_only(o10, asymmetric):
     blobs = true_detections(truth)
     blobs.uv[[3, 21, 47]] += (4.0, -3.0)
     unlabelled = replace(blobs, fiducial=np.full(len(blobs), -1), sigma=np.full(len(blobs), 0.3))
-    identity = bootstrap(unlabelled, o10, asymmetric, std)
+    identity = relocalize(unlabelled, o10, asymmetric, std)
     good = identity.labels == blobs.fiducial
     assert ((identity.labels == -1) | good).all()
     assert good.sum() >= len(blobs) - 3 - 3
@@ -300,6 +300,6 @@ def test_a_large_object_has_a_bounded_number_of_hypotheses(o10, asymmetric) -> N
     _, [(blobs, _)] = snapshots(o10, asymmetric, 1, 8, 0)
     points = np.random.default_rng(0).standard_normal((30, 3)) * 80
     options = IdentityOptions(most_hypotheses=100_000)
-    found = bootstrap(blobs, o10, make_object(points), DRIFT.std(o10), options)
+    found = relocalize(blobs, o10, make_object(points), DRIFT.std(o10), options)
     assert found.status == "refused"
     assert 100_000 < found.hypotheses < 100_000 + 10 * 30 * 29 * 28

@@ -12,7 +12,7 @@ from imgcal.association.innovation import THRESHOLD, contested, innovations
 from imgcal.association.verify import fit, problem_of, rig_and_pose, start
 from imgcal.estimation import lm_cpu
 from imgcal.estimation.levenberg_marquardt import Solution
-from imgcal.estimation.linearization import Problem, State, linearize, moved, pose_at, rig_at
+from imgcal.estimation.linearization import Problem, State, linearize, pose_at, retract, rig_at
 from imgcal.io import load_object, load_rig
 from imgcal.io.resources import data_path
 from imgcal.synthesis.rigs import synthesize
@@ -29,8 +29,8 @@ def test_covariance_of_an_unlabelled_fiducial_matches_the_dense_one() -> None:
     points, centroid = obj.points - obj.points.mean(0), obj.points.mean(0)
     seen = torch.ones(1, 1, 2, 8, dtype=torch.float64)
     seen[..., 0, 3] = 0
-    spread = RigPrior().std(rig)[None]
-    problem = Problem(uv.mT[None, None].contiguous(), seen / 0.5, points, centroid, None, rig.expand(1), spread)
+    prior_std = RigPrior().std(rig)[None]
+    problem = Problem(uv.mT[None, None].contiguous(), seen / 0.5, points, centroid, None, rig.expand(1), prior_std)
     centre = (pose.rotation @ centroid + pose.translation)[None, None]
     state = State(torch.zeros(1, 2, 15, dtype=torch.float64), pose.rotation[None, None], centre)
     squared = lambda d2: (d2, torch.ones_like(d2))  # noqa: E731
@@ -64,7 +64,7 @@ def test_covariance_of_an_unlabelled_fiducial_matches_the_dense_one() -> None:
     covariance = torch.linalg.inv(information)
 
     def pixel(parameters: torch.Tensor) -> torch.Tensor:
-        new = moved(problem, state, parameters[:30].view(1, 2, 15), parameters[30:].view(1, 1, 6))
+        new = retract(problem, state, parameters[:30].view(1, 2, 15), parameters[30:].view(1, 1, 6))
         return rig_at(problem, new.offset)[0].project(pose_at(problem, new)[0, 0].apply(obj.points)).uv[0, 3]
 
     jacobian = torch.autograd.functional.jacobian(pixel, torch.zeros(36, dtype=torch.float64))
@@ -94,7 +94,7 @@ def left_out(scene, labels, fits, camera, fiducial):
     noise = 1 / problem.root_weight[0, 0]  # (C, N) px, inf where there is no label
 
     def pixels(parameters):
-        at = moved(problem, state, parameters[:30].view(1, 2, 15), parameters[30:].view(1, 1, 6))
+        at = retract(problem, state, parameters[:30].view(1, 2, 15), parameters[30:].view(1, 1, 6))
         return rig_at(problem, at.offset)[0].project(pose_at(problem, at)[0, 0].apply(scene.obj.points)).uv[0:2]
 
     zero = torch.zeros(36, dtype=torch.float64)

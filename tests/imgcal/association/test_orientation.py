@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from imgcal.association.options import PipelineOptions
-from imgcal.association.series import Follower, label
+from imgcal.association.series import Tracker, associate
 from imgcal.errors import InputError
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
@@ -32,7 +32,7 @@ def turned(*vector, at=CENTRE):
 def seen(rig, obj, poses):
     """Labelled and unlabelled detections of an object at given poses, without noise."""
     uv = torch.stack([rig.project(pose.apply(obj.points)).uv for pose in poses])
-    truth = true_detections(Truth(rig, RigidTransform.joined(poses, torch.stack), uv))
+    truth = true_detections(Truth(rig, RigidTransform.stack(poses), uv))
     return truth, replace(truth, fiducial=np.full(len(truth), -1))
 
 
@@ -45,21 +45,21 @@ def at_the_origin(rig):
 def test_a_cube_is_as_ambiguous_at_the_origin_as_anywhere(o10, cube):
     for rig, at in ((o10, CENTRE), (at_the_origin(o10), torch.zeros(3, dtype=torch.float64))):
         _, blobs = seen(rig, cube, [turned(0.02, -0.01, 0.0, at=at)])
-        labelled = label(blobs, rig, cube)
+        labelled = associate(blobs, rig, cube)
         assert labelled.identity == "ambiguous"
         assert labelled.snapshots[0].alternatives == 24
 
 
 def test_what_follows_an_ambiguous_snapshot_is_as_ambiguous(o10, cube):
     _, blobs = seen(o10, cube, [turned(0.2, -0.1, 0.3 + 0.004 * s) for s in range(4)])
-    labelled = label(blobs, o10, cube)
+    labelled = associate(blobs, o10, cube)
     assert [s.status for s in labelled.snapshots] == ["ambiguous"] * 4
     assert [s.alternatives for s in labelled.snapshots] == [24] * 4
 
 
 def test_an_asymmetric_object_is_unique_and_followed(o10, asymmetric8):
     _, blobs = seen(o10, asymmetric8, [turned(0.2, -0.1, 0.3 + 0.004 * s) for s in range(3)])
-    labelled = label(blobs, o10, asymmetric8)
+    labelled = associate(blobs, o10, asymmetric8)
     assert [(s.status, s.alternatives) for s in labelled.snapshots] == [("unique", 1)] + [("by_tracking", 1)] * 2
     assert labelled.identity == "unique"
 
@@ -71,7 +71,7 @@ def test_a_given_pose_decides_which_way_round(off, o10, cube):
     for motion in cube.symmetries[:6]:
         way = torch.from_numpy(motion.rotation)
         start = RigidTransform(poses[0].rotation @ way @ turned(0.0, off, 0.0).rotation, CENTRE + 400 * off)
-        labelled = label(blobs, o10, cube, PipelineOptions(start_pose=start))
+        labelled = associate(blobs, o10, cube, PipelineOptions(start_pose=start))
         assert labelled.identity == "by_prior"
         assert [s.status for s in labelled.snapshots] == ["by_prior", "by_tracking", "by_tracking"]
         assert max(s.alternatives for s in labelled.snapshots) == 1
@@ -86,7 +86,7 @@ def test_a_given_pose_between_two_ways_round_decides_nothing(o10, cube):
     pose = turned(0.2, -0.1, 0.3)
     _, blobs = seen(o10, cube, [pose])
     start = RigidTransform(pose.rotation @ turned(0.0, 0.0, np.pi / 4).rotation, CENTRE)
-    labelled = label(blobs, o10, cube, PipelineOptions(start_pose=start))
+    labelled = associate(blobs, o10, cube, PipelineOptions(start_pose=start))
     assert (labelled.identity, labelled.snapshots[0].alternatives) == ("ambiguous", 24)
 
 
@@ -94,7 +94,7 @@ def test_the_whole_is_ambiguous_where_one_part_is(o10, cube):
     # The second pose is far from the first: what was given says nothing of it.
     poses = [turned(0.2, -0.1, 0.3), turned(-0.4, 0.5, 1.1)]
     _, blobs = seen(o10, cube, poses)
-    labelled = label(blobs, o10, cube, PipelineOptions(start_pose=poses[0]))
+    labelled = associate(blobs, o10, cube, PipelineOptions(start_pose=poses[0]))
     assert [s.status for s in labelled.snapshots] == ["by_prior", "ambiguous"]
     assert labelled.identity == "ambiguous"
 
@@ -119,7 +119,7 @@ def test_a_calibration_says_that_the_given_pose_decided(o10, cube):
 )
 def test_a_start_pose_that_is_none_is_explained(pose, o10, cube):
     with pytest.raises(InputError, match=r"start pose: found .*, expected"):
-        Follower(o10, cube, PipelineOptions(start_pose=pose))
+        Tracker(o10, cube, PipelineOptions(start_pose=pose))
 
 
 def test_a_start_pose_in_single_precision_is_accepted(o10, cube):
@@ -127,4 +127,4 @@ def test_a_start_pose_in_single_precision_is_accepted(o10, cube):
     _, blobs = seen(o10, cube, [pose])
     assert isinstance(blobs, Detections)
     options = PipelineOptions(start_pose=pose.to(torch.float32))
-    assert label(blobs, o10, cube, options).identity == "by_prior"
+    assert associate(blobs, o10, cube, options).identity == "by_prior"

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from imgcal.association import identify, series
-from imgcal.association.series import label, matched_to_rig, to_observations
+from imgcal.association.series import associate, matched_to_rig, to_observations
 from imgcal.errors import InputError, RefusedError
 from imgcal.synthesis.captures import simulate_truth, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
@@ -23,14 +23,14 @@ def without_labels(detections):
 
 
 def test_labels_are_found_again(seen, o10, asymmetric8):
-    labelled = label(without_labels(seen), o10, asymmetric8)
+    labelled = associate(without_labels(seen), o10, asymmetric8)
     assert np.array_equal(labelled.detections.fiducial, seen.fiducial)
     assert labelled.identity == "unique"
     assert labelled.used == [0, 1, 2, 3]
 
 
 def test_one_dark_snapshot_is_left_out(seen, o10, asymmetric8):
-    labelled = label(without_labels(seen.select(seen.snapshot != 2)), o10, asymmetric8)
+    labelled = associate(without_labels(seen.select(seen.snapshot != 2)), o10, asymmetric8)
     assert labelled.used == [0, 1, 3]
     assert labelled.snapshots[2].status == "refused"
     assert "blobs" in labelled.snapshots[2].reason
@@ -38,7 +38,7 @@ def test_one_dark_snapshot_is_left_out(seen, o10, asymmetric8):
 
 def test_nothing_seen_is_refused(seen, o10, asymmetric8):
     with pytest.raises(RefusedError, match="4 of 4 snapshots"):
-        label(without_labels(seen.select(seen.snapshot > 9)), o10, asymmetric8)
+        associate(without_labels(seen.select(seen.snapshot > 9)), o10, asymmetric8)
 
 
 def test_cameras_are_put_in_the_order_of_the_rig(seen, o10):
@@ -60,8 +60,8 @@ def test_observations_are_dense(seen, o10, asymmetric8):
 
 def test_rows_that_come_three_times_and_in_any_order_change_nothing(seen, o10, asymmetric8):
     rows = np.random.default_rng(0).permutation(np.repeat(np.arange(len(seen)), 3))
-    labelled = label(without_labels(seen.select(rows)), o10, asymmetric8)
-    once = label(without_labels(seen), o10, asymmetric8)
+    labelled = associate(without_labels(seen.select(rows)), o10, asymmetric8)
+    once = associate(without_labels(seen), o10, asymmetric8)
     assert labelled.used == once.used
     observed = [to_observations(found.detections, o10, asymmetric8) for found in (labelled, once)]
     assert torch.equal(observed[0].seen, observed[1].seen) and torch.equal(observed[0].uv, observed[1].uv)
@@ -72,7 +72,7 @@ def test_blobs_all_in_few_places_are_refused(fiducials, seen, o10, asymmetric8):
     few = seen.select(np.isin(seen.fiducial, np.arange(8)[fiducials]) & (seen.snapshot == 0))
     many = without_labels(few.select(np.repeat(np.arange(len(few)), 40)))
     with pytest.raises(RefusedError, match="too few blobs"):
-        label(many, o10, asymmetric8)
+        associate(many, o10, asymmetric8)
 
 
 def test_tens_of_thousands_of_snapshots_are_split_in_one_pass(seen, o10, asymmetric8, monkeypatch):
@@ -82,7 +82,7 @@ def test_tens_of_thousands_of_snapshots_are_split_in_one_pass(seen, o10, asymmet
     long = seen.select(np.tile(np.flatnonzero(seen.snapshot == 0), snapshots))
     names = tuple(map(str, range(snapshots)))
     monkeypatch.setattr(Counted, "comparisons", 0)
-    labelled = label(replace(long, snapshot=number, snapshot_names=names), o10, asymmetric8)
+    labelled = associate(replace(long, snapshot=number, snapshot_names=names), o10, asymmetric8)
     assert len(labelled.used) == snapshots
     assert Counted.comparisons < 10
 
@@ -115,7 +115,7 @@ def test_a_wrong_object_is_refused_with_an_effort_that_does_not_grow_with_the_ca
     names = tuple(map(str, range(count)))
     long = replace(seen.select(rows), snapshot=np.repeat(np.arange(count), len(seen) // 4), snapshot_names=names)
     with pytest.raises(RefusedError, match=r"explains .* snapshots( tried, 60 in all)?\)"):
-        label(without_labels(long), o10, wrong)
+        associate(without_labels(long), o10, wrong)
     effort = [found.hypotheses for found in spent]
     assert min(effort) > 0
     assert sum(effort) <= 2 * 250_000 + 2 * max(effort)
@@ -129,4 +129,4 @@ def test_what_comes_late_in_a_long_capture_is_still_found(seen, o10, asymmetric8
     number, names = np.repeat(np.arange(24), len(once)), tuple(map(str, range(24)))
     clutter = np.random.default_rng(0).uniform(0, 1, long.uv.shape) * (2048, 1088)
     long = replace(long, uv=np.where(number[:, None] < 16, clutter, long.uv), snapshot=number, snapshot_names=names)
-    assert label(without_labels(long), o10, asymmetric8).used == list(range(16, 24))
+    assert associate(without_labels(long), o10, asymmetric8).used == list(range(16, 24))

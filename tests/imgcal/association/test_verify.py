@@ -18,7 +18,7 @@ from imgcal.association.verify import (
     problem_of,
     refine,
     rig_and_pose,
-    settle,
+    settle_labels,
     start,
 )
 from imgcal.geometry.rotations import rotation_from_vector
@@ -107,7 +107,7 @@ def test_rough_labels_are_refined_to_the_true_ones(scene, snapshot) -> None:
     poses = Poses(tilted.numpy()[None], snapshot.poses().translation + 5.0)
     fits = refine(scene, start(scene, poses, rough[None]))
     np.testing.assert_array_equal(certain(scene, fits, *ODDS).labels[0], truth)
-    np.testing.assert_array_equal(settle(scene, fits).labels, fits.labels)
+    np.testing.assert_array_equal(settle_labels(scene, fits).labels, fits.labels)
 
 
 def test_a_false_blob_near_its_fiducial_is_not_certain(scene, snapshot) -> None:

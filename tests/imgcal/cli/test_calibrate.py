@@ -91,7 +91,7 @@ def test_blobs_found_by_detect_give_the_same_rig(workplace, tmp_path):
     assert calibrate(workplace, table, tmp_path / "a", "--no-report") == 0
     assert calibrate(workplace, workplace.capture, tmp_path / "b", "--no-report") == 0
     first, second = load_rig(tmp_path / "a" / "rig.yaml"), load_rig(tmp_path / "b" / "rig.yaml")
-    assert first.difference(second).abs().max() < 1e-6
+    assert first.local(second).abs().max() < 1e-6
 
 
 def test_a_camera_that_sees_nothing_is_refused_unless_allowed(workplace, tmp_path, capsys):

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from imgcal.estimation.linearization import Problem, State
-from imgcal.estimation.map_estimate import make_problem, make_start
+from imgcal.estimation.map_estimate import initial_state, make_problem
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.synthesis.rigs import Drift, PhysicalDrift, PoseRange, sample_rig_from_object
 from imgcal.types.calibration_object import CalibrationObject
@@ -25,16 +25,16 @@ class Case:
     truth: CameraRig  # (*B)
     poses: RigidTransform  # (*B, S)
     observations: Observations  # (*B, S, C, N)
-    spread: Tensor  # (C, 15)
+    prior_std: Tensor  # (C, 15)
     shape: Tensor  # (*B, N, 3) mm, the fiducials as they truly are
 
     def problem(self) -> Problem:
         """Flatten and whiten."""
-        return make_problem(self.observations, self.factory, self.obj, self.spread)
+        return make_problem(self.observations, self.factory, self.obj, self.prior_std)
 
-    def start(self, problem: Problem, shift: float = 2.0, first_guess: CameraRig | None = None) -> State:
+    def start(self, problem: Problem, shift: float = 2.0, initial_rig: CameraRig | None = None) -> State:
         """Start at the factory values, or a guess, and `shift` mm from the true poses."""
-        return make_start(problem, RigidTransform(self.poses.rotation, self.poses.translation + shift), first_guess)
+        return initial_state(problem, RigidTransform(self.poses.rotation, self.poses.translation + shift), initial_rig)
 
 
 Simulate = Callable[..., Case]
@@ -76,8 +76,8 @@ def simulate(o10: CameraRig, asymmetric8: CalibrationObject) -> Simulate:
         )
         given = obj
         if tolerance is not None or scale_tolerance:
-            spread = None if tolerance is None else torch.full((fiducials,), tolerance, dtype=torch.float64)
-            given = replace(obj, tolerance=spread, scale_tolerance=scale_tolerance)
+            prior_std = None if tolerance is None else torch.full((fiducials,), tolerance, dtype=torch.float64)
+            given = replace(obj, tolerance=prior_std, scale_tolerance=scale_tolerance)
         truth = drift.apply(factory, generator, *batch)
         count = torch.Size((*batch, snapshots)).numel()
         centroid, distance = obj.points.mean(0), factory.working_distance

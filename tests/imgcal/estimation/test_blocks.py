@@ -23,13 +23,13 @@ def scatter(found) -> BlockScatter:
 def test_white_noise_makes_no_more_scatter_than_it_should(simulate, snapshots: int) -> None:
     for seed in range(6):
         case = simulate(snapshots=snapshots, cameras=4, missing=0.2, seed=seed)
-        found = estimate(case.observations, case.factory, case.obj, spread=case.spread)
+        found = estimate(case.observations, case.factory, case.obj, prior_std=case.prior_std)
         assert scatter(found) == BlockScatter()
 
 
 def test_too_few_snapshots_say_nothing(simulate) -> None:
     case = simulate(snapshots=5, cameras=4)
-    assert scatter(estimate(case.observations, case.factory, case.obj, spread=case.spread)).length == 0
+    assert scatter(estimate(case.observations, case.factory, case.obj, prior_std=case.prior_std)).length == 0
 
 
 def wandering(simulate, blocks: int, each: int):
@@ -54,13 +54,13 @@ def test_blocks_of_a_capture_scatter_as_the_published_covariance_says(simulate) 
     for row in range(8):
         one = replace(case.observations, **{k: v[row] for k, v in vars(case.observations).items()})
         one = replace(one, sigma=torch.full_like(one.sigma, 0.075))  # what the residuals show
-        found = estimate(one, case.factory, case.obj, case.poses[row], spread=case.spread)
+        found = estimate(one, case.factory, case.obj, case.poses[row], prior_std=case.prior_std)
         measured = replace(found, inflation=scatter(found).factor)
         focal.append(found.rig.focal_length.flatten())
         flat.append(camera_std(found)[:, 6:8].flatten())
         published.append(camera_std(measured)[:, 6:8].flatten())
-    spread = torch.stack(focal) - torch.stack(focal).mean(0)
-    by_noise, by_blocks = (float((spread / torch.stack(std)).square().sum() / (7 * 8)) for std in (flat, published))
+    prior_std = torch.stack(focal) - torch.stack(focal).mean(0)
+    by_noise, by_blocks = (float((prior_std / torch.stack(std)).square().sum() / (7 * 8)) for std in (flat, published))
     assert by_noise > 2.0
     assert by_blocks < 0.7 * by_noise and by_blocks < 2.0
 
@@ -68,7 +68,7 @@ def test_blocks_of_a_capture_scatter_as_the_published_covariance_says(simulate) 
 def test_inflation_leaves_the_prior_and_the_relations_alone(simulate) -> None:
     case = simulate(snapshots=10, cameras=3)
     case.observations.seen[:, 2] = False
-    found = estimate(case.observations, case.factory, case.obj, spread=case.spread)
+    found = estimate(case.observations, case.factory, case.obj, prior_std=case.prior_std)
     plain, larger = (camera_covariance(replace(found, inflation=f), curved=False) for f in (1.0, 2.0))
     std, more = (torch.as_tensor(np.sqrt(c.diagonal().numpy())).view(3, 15) for c in (plain, larger))
     torch.testing.assert_close(more[2], std[2])  # a camera that saw nothing knows what its prior knows

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.stats import chi2
 
-from imgcal.association.series import label, observations_of
+from imgcal.association.series import associate, observations_of
 from imgcal.estimation import estimate
 from imgcal.estimation.change_points import (
     LEAST_SNAPSHOTS,
@@ -26,7 +26,7 @@ def fitted(make, snapshots, seed=0, change=None, first=0, camera=3):
     if change is not None:
         truth = damage.changed_from(truth, obj, camera, first, change)
     table = damage.blobs(truth, seed, labelled=True)
-    observations, _ = observations_of(label(table, rig, obj), rig, obj)
+    observations, _ = observations_of(associate(table, rig, obj), rig, obj)
     return estimate(observations, rig, obj), observations.seen.any(-1).numpy()
 
 

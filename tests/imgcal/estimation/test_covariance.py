@@ -19,7 +19,7 @@ from imgcal.estimation import (
     relative_difference,
 )
 from imgcal.estimation.covariance import relative_jacobian, remaining_variance
-from imgcal.estimation.linearization import moved, rig_at
+from imgcal.estimation.linearization import retract, rig_at
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.synthesis.rigs import PhysicalDrift
@@ -28,7 +28,7 @@ SQUARED = EstimationOptions(loss="squared", tolerance=1e-8)
 
 
 def run(case) -> Estimate:
-    return estimate(case.observations, case.factory, case.obj, spread=case.spread, options=SQUARED)
+    return estimate(case.observations, case.factory, case.obj, prior_std=case.prior_std, options=SQUARED)
 
 
 def dense_inverse(found: Estimate) -> torch.Tensor:
@@ -54,7 +54,7 @@ def dense_information(found: Estimate) -> torch.Tensor:
 @pytest.mark.parametrize("snapshots", [1, 3, 10, 12])  # compiled, compiled, cameras kept, and many snapshots
 def test_remaining_variance_is_the_diagonal_of_the_dense_inverse(simulate, snapshots: int) -> None:
     case = simulate(2, snapshots=snapshots, cameras=4, missing=0.1)
-    case.spread[1, 10:] = 0  # fixed values keep all of nothing
+    case.prior_std[1, 10:] = 0  # fixed values keep all of nothing
     found = run(case)
     diagonal = dense_inverse(found).diagonal(dim1=-2, dim2=-1)[:, : 4 * 15].unflatten(-1, (4, 15))
     np.testing.assert_allclose(remaining_variance(found.solution), diagonal, rtol=1e-6)
@@ -80,7 +80,7 @@ def test_equals_the_dense_inverse(simulate, snapshots: int) -> None:
 
     def physical(step: torch.Tensor) -> torch.Tensor:
         still = torch.zeros(2, snapshots, 6, dtype=torch.float64)
-        return rig_at(problem, moved(problem, state, step, still).offset).difference(here).sum(0).flatten()
+        return rig_at(problem, retract(problem, state, step, still).offset).local(here).sum(0).flatten()
 
     jacobian = torch.autograd.functional.jacobian(physical, zero).movedim(1, 0).flatten(2)  # (B, 45, 45)
     expected = jacobian @ inverse[:, :45, :45] @ jacobian.mT
@@ -113,8 +113,8 @@ def test_with_an_object_equals_the_dense_inverse(simulate, snapshots: int) -> No
         inverse.diagonal(dim1=-2, dim2=-1)[:, :45].unflatten(-1, (3, 15)),
         rtol=1e-5,
     )
-    spread = problem.object_spread[0]
-    by_offset = torch.cat((torch.diag(spread[:-1]), (problem.points.flatten() * spread[-1])[:, None]), 1)
+    prior_std = problem.object_prior_std[0]
+    by_offset = torch.cat((torch.diag(prior_std[:-1]), (problem.points.flatten() * prior_std[-1])[:, None]), 1)
     expected = by_offset @ inverse[:, -25:, -25:] @ by_offset.T
     torch.testing.assert_close(object_covariance(found), expected, rtol=1e-2, atol=1e-3)
     poses = inverse[:, 45 : 45 + 6 * snapshots, 45 : 45 + 6 * snapshots]
@@ -128,7 +128,7 @@ def test_the_estimated_object_is_as_uncertain_as_it_says(simulate) -> None:
     values, vectors = torch.linalg.eigh(object_covariance(found))
     normalized = ((vectors.mT @ error[..., None]).squeeze(-1).square() / values).mean()
     assert normalized == pytest.approx(1, abs=0.08)
-    cameras = found.rig.difference(case.truth).flatten(1)
+    cameras = found.rig.local(case.truth).flatten(1)
     solved = torch.linalg.solve(camera_covariance(found), cameras[..., None]).squeeze(-1)
     assert float((cameras * solved).sum(1).mean()) / 60 == pytest.approx(1, abs=0.08)
 
@@ -147,13 +147,13 @@ def test_shapes_and_definiteness(simulate, batch: tuple[int, ...]) -> None:
 
 def test_posterior_is_never_wider_than_the_prior(simulate) -> None:
     case = simulate(3, snapshots=4)
-    assert (camera_std(run(case)) <= case.spread * (1 + 1e-3)).all()
+    assert (camera_std(run(case)) <= case.prior_std * (1 + 1e-3)).all()
 
 
 def test_camera_that_sees_nothing_keeps_its_prior(simulate) -> None:
     case = simulate(1, cameras=4, snapshots=3)
     case.observations.seen[..., 2, :] = False
-    torch.testing.assert_close(camera_std(run(case))[0, 2], case.spread[2])
+    torch.testing.assert_close(camera_std(run(case))[0, 2], case.prior_std[2])
 
 
 @pytest.mark.parametrize("reference", [0, 2])
@@ -161,7 +161,7 @@ def test_relative_jacobian_is_the_derivative(simulate, reference: int) -> None:
     rig = simulate(cameras=3).truth
 
     def relative(step: torch.Tensor) -> torch.Tensor:
-        return relative_difference(rig.moved(step), rig, reference).flatten()
+        return relative_difference(rig.retract(step), rig, reference).flatten()
 
     expected = torch.autograd.functional.jacobian(relative, torch.zeros(3, 15, dtype=torch.float64)).flatten(1)
     torch.testing.assert_close(relative_jacobian(rig, reference), expected, rtol=1e-8, atol=1e-8)
@@ -193,7 +193,7 @@ def test_matches_the_spread_of_samples(simulate) -> None:
     case = simulate(250, snapshots=6, cameras=4, drift=drift, noise=0.2, sigma=0.2, seed=3)
     found = run(case)
     assert found.converged.all()
-    error, std = found.rig.difference(case.truth), camera_std(found)
+    error, std = found.rig.local(case.truth), camera_std(found)
     normalized = (error / std).square().mean((0, 1))
     assert ((normalized > 0.8) & (normalized < 1.2)).all()
     relative, variance = (
@@ -215,7 +215,7 @@ def test_one_snapshot_with_a_wide_prior_is_honest(simulate, kept: float, relativ
         error, covariance = relative_difference(found.rig, case.truth).flatten(1), relative_covariance(found)
         error, covariance = error[:, 15:], covariance[:, 15:, 15:]
     else:
-        error, covariance = found.rig.difference(case.truth).flatten(1), camera_covariance(found)
+        error, covariance = found.rig.local(case.truth).flatten(1), camera_covariance(found)
     scale = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     values, vectors = torch.linalg.eigh(covariance / (scale[..., None] * scale[:, None]))
     along = (vectors.mT @ (error / scale)[..., None]).squeeze(-1)
@@ -225,7 +225,7 @@ def test_one_snapshot_with_a_wide_prior_is_honest(simulate, kept: float, relativ
 def test_undetermined_pose_is_refused(simulate) -> None:
     case = simulate(1, cameras=3, snapshots=2)
     case.observations.seen[:, 1] = False
-    found = estimate(case.observations, case.factory, case.obj, case.poses, spread=case.spread)
+    found = estimate(case.observations, case.factory, case.obj, case.poses, prior_std=case.prior_std)
     for function in (camera_covariance, pose_covariance):
         with pytest.raises(RefusedError, match="every snapshot"):
             function(found)

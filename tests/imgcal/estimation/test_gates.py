@@ -13,7 +13,7 @@ from imgcal.estimation import (
     relative_difference,
 )
 from imgcal.estimation.implicit import map_cost
-from imgcal.estimation.map_estimate import PATIENCE, make_start
+from imgcal.estimation.map_estimate import PATIENCE, initial_state
 from imgcal.estimation.robust_losses import LOSSES
 from imgcal.synthesis.rigs import Drift, PhysicalDrift, RelativeDrift
 from imgcal.types.observations import Observations
@@ -23,7 +23,7 @@ SQUARED = EstimationOptions(loss="squared")
 
 def test_noise_free_snapshot_is_met_exactly(simulate) -> None:
     case = simulate(100, snapshots=1, noise=0.0, sigma=0.001, drift=RelativeDrift())
-    found = estimate(case.observations, case.factory, case.obj, spread=case.spread, options=SQUARED)
+    found = estimate(case.observations, case.factory, case.obj, prior_std=case.prior_std, options=SQUARED)
     assert found.converged.all()
     assert found.rms.max() <= 0.001
 
@@ -48,9 +48,9 @@ def normalized_square(error: Tensor, covariance: Tensor) -> Tensor:
 @pytest.mark.parametrize("drift", [RelativeDrift(0.025, 0.025), PhysicalDrift()])
 def test_efficient_and_honest(simulate, drift: Drift) -> None:
     case = simulate(200, snapshots=20, noise=0.05, sigma=0.05, drift=drift)
-    found = estimate(case.observations, case.factory, case.obj, spread=case.spread, options=SQUARED)
+    found = estimate(case.observations, case.factory, case.obj, prior_std=case.prior_std, options=SQUARED)
     assert found.converged.all()
-    error = found.rig.difference(case.truth)
+    error = found.rig.local(case.truth)
     covariance = camera_covariance(found)
     bound = covariance.diagonal(dim1=-2, dim2=-1).unflatten(1, (10, 15))[..., 6:8].mean().sqrt()
     assert error[..., 6:8].square().mean().sqrt() <= 1.1 * bound
@@ -63,9 +63,9 @@ def test_efficient_and_honest(simulate, drift: Drift) -> None:
 def test_converges_from_ten_percent(simulate) -> None:
     options = EstimationOptions()
     case = simulate(2000, snapshots=1, noise=0.05, drift=RelativeDrift(0.1, 0.1))
-    found = estimate(case.observations, case.factory, case.obj, spread=case.spread, options=options)
+    found = estimate(case.observations, case.factory, case.obj, prior_std=case.prior_std, options=options)
     problem = case.problem()
-    at_truth = map_cost(problem, make_start(problem, case.poses, case.truth), LOSSES[options.loss])
+    at_truth = map_cost(problem, initial_state(problem, case.poses, case.truth), LOSSES[options.loss])
     right = found.converged & (0.5 * found.chi2 <= at_truth)
     assert float(right.double().mean()) >= 0.999
 
@@ -74,20 +74,20 @@ def test_converges_from_ten_percent(simulate) -> None:
 def test_converges_from_far_beyond_usual_drift(simulate, snapshots: int, count: int) -> None:
     drift = PhysicalDrift(rotation_deg=6, position=60, focal_length=0.2, principal_point=60, distortion=0.02)
     case = simulate(count, snapshots=snapshots, noise=0.05, drift=drift)
-    found = estimate(case.observations, case.factory, case.obj, spread=case.spread, options=SQUARED)
+    found = estimate(case.observations, case.factory, case.obj, prior_std=case.prior_std, options=SQUARED)
     problem = case.problem()
-    at_truth = map_cost(problem, make_start(problem, case.poses, case.truth), LOSSES["squared"])
+    at_truth = map_cost(problem, initial_state(problem, case.poses, case.truth), LOSSES["squared"])
     right = found.converged & (0.5 * found.chi2 <= at_truth)
     assert float(right.double().mean()) >= 0.95  # 0.7 of the single snapshots without beginning again
 
 
 def test_beginning_again_leaves_the_others_alone(simulate) -> None:
     case = simulate(40, snapshots=1, noise=0.05, drift=PhysicalDrift(4, 40, 0.15, 40, 0.02))
-    together = estimate(case.observations, case.factory, case.obj, spread=case.spread, options=SQUARED)
-    problem, start = case.problem(), make_start(case.problem(), together.rig_from_object, None)
+    together = estimate(case.observations, case.factory, case.obj, prior_std=case.prior_std, options=SQUARED)
+    problem, start = case.problem(), initial_state(case.problem(), together.rig_from_object, None)
     assert 0 < int((~lm_cpu.minimize(problem, start, "squared", 3.0, PATIENCE, 1e-4).converged).sum()) < 40
     for row in range(0, 40, 5):
         observations = Observations(*(value[row] for value in vars(case.observations).values()))
-        alone = estimate(observations, case.factory, case.obj, spread=case.spread, options=SQUARED)
+        alone = estimate(observations, case.factory, case.obj, prior_std=case.prior_std, options=SQUARED)
         torch.testing.assert_close(together.chi2[row], alone.chi2)
         torch.testing.assert_close(together.rig[row].focal_length, alone.rig.focal_length)

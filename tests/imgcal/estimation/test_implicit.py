@@ -15,7 +15,7 @@ EXACT = {name: EstimationOptions(loss=name, tolerance=1e-18, max_iterations=40) 
 
 def scaled(case, found) -> Tensor:
     """Solution in units of the prior's standard deviations and of the pose's natural ones."""
-    camera = found.rig.difference(case.factory) / case.spread
+    camera = found.rig.local(case.factory) / case.prior_std
     return torch.cat((camera.flatten(), found.rig_from_object.translation.flatten() / 850))
 
 
@@ -33,8 +33,8 @@ def test_gradient_by_observations(simulate, loss: str, radius: float | None) -> 
             case.factory,
             case.obj,
             case.poses,
-            spread=case.spread,
-            first_guess=case.truth,
+            prior_std=case.prior_std,
+            initial_rig=case.truth,
             options=EXACT[loss],
         )
         return scaled(case, found)
@@ -51,10 +51,10 @@ def test_gradient_by_factory_values_and_spread(simulate) -> None:
     def solve(step: Tensor, logarithm: Tensor) -> Tensor:
         found = estimate(
             case.observations,
-            rig.moved(step * case.spread),
+            rig.retract(step * case.prior_std),
             case.obj,
             case.poses,
-            spread=case.spread * logarithm.exp(),
+            prior_std=case.prior_std * logarithm.exp(),
             options=EXACT["squared"],
         )
         return scaled(case, found)
@@ -70,7 +70,9 @@ def test_gradient_by_observations_when_snapshots_are_eliminated(simulate) -> Non
         observations = replace(case.observations, uv=uv)
         return scaled(
             case,
-            estimate(observations, case.factory, case.obj, case.poses, spread=case.spread, options=EXACT["squared"]),
+            estimate(
+                observations, case.factory, case.obj, case.poses, prior_std=case.prior_std, options=EXACT["squared"]
+            ),
         )
 
     assert torch.autograd.gradcheck(solve, uv, eps=1e-4, atol=1e-4, rtol=1e-3, fast_mode=True)
@@ -82,7 +84,9 @@ def test_gradient_through_an_object_that_is_estimated_too(simulate) -> None:
 
     def solve(uv: Tensor) -> Tensor:
         observations = replace(case.observations, uv=uv)
-        found = estimate(observations, case.factory, case.obj, case.poses, spread=case.spread, options=EXACT["squared"])
+        found = estimate(
+            observations, case.factory, case.obj, case.poses, prior_std=case.prior_std, options=EXACT["squared"]
+        )
         return torch.cat((scaled(case, found), found.points_object.flatten()))
 
     assert torch.autograd.gradcheck(solve, uv, eps=1e-4, atol=1e-4, rtol=1e-3, fast_mode=True)
@@ -90,20 +94,20 @@ def test_gradient_through_an_object_that_is_estimated_too(simulate) -> None:
 
 def test_value_is_the_same_with_and_without_gradient(simulate) -> None:
     case = simulate(2, cameras=3)
-    plain = estimate(case.observations, case.factory, case.obj, spread=case.spread)
+    plain = estimate(case.observations, case.factory, case.obj, prior_std=case.prior_std)
     uv = case.observations.uv.clone().requires_grad_()
-    tracked = estimate(replace(case.observations, uv=uv), case.factory, case.obj, spread=case.spread)
+    tracked = estimate(replace(case.observations, uv=uv), case.factory, case.obj, prior_std=case.prior_std)
     assert torch.equal(plain.rig.focal_length, tracked.rig.focal_length.detach())
     assert tracked.rig.focal_length.requires_grad and not plain.rig.focal_length.requires_grad
     with torch.no_grad():
-        silent = estimate(replace(case.observations, uv=uv), case.factory, case.obj, spread=case.spread)
+        silent = estimate(replace(case.observations, uv=uv), case.factory, case.obj, prior_std=case.prior_std)
     assert not silent.rig.focal_length.requires_grad
 
 
 def test_gradient_trains_every_pixel_that_is_seen(simulate) -> None:
     case = simulate(2, cameras=3, missing=0.2)
     uv = case.observations.uv.clone().requires_grad_()
-    found = estimate(replace(case.observations, uv=uv), case.factory, case.obj, spread=case.spread)
+    found = estimate(replace(case.observations, uv=uv), case.factory, case.obj, prior_std=case.prior_std)
     loss = (found.rig.focal_length - case.truth.focal_length).square().mean()
     (gradient,) = torch.autograd.grad(loss, uv)
     assert torch.isfinite(gradient).all()
@@ -114,5 +118,5 @@ def test_gradient_trains_every_pixel_that_is_seen(simulate) -> None:
 def test_object_points_are_constants(simulate) -> None:
     case = simulate(1, cameras=3)
     start = RigidTransform(case.poses.rotation.clone().requires_grad_(), case.poses.translation)
-    found = estimate(case.observations, case.factory, case.obj, start, spread=case.spread)
+    found = estimate(case.observations, case.factory, case.obj, start, prior_std=case.prior_std)
     assert not found.rig.focal_length.requires_grad  # where the iteration starts does not matter

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from imgcal.estimation.implicit import map_cost
-from imgcal.estimation.linearization import Problem, State, linearize, moved, points_at, pose_at, rig_at
+from imgcal.estimation.linearization import Problem, State, linearize, points_at, pose_at, retract, rig_at
 from imgcal.estimation.robust_losses import cauchy, squared
 
 CASES = [((), 1, 3, 5), ((1,), 2, 4, 6), ((2, 3), 2, 3, 5), ((4,), 1, 4, 4)]
@@ -17,7 +17,7 @@ def disturbed(problem: Problem, state: State) -> State:
     generator = torch.Generator().manual_seed(1)
     camera = torch.randn(state.offset.shape, generator=generator, dtype=torch.float64)
     pose = 0.03 * torch.randn(*state.centre.shape[:-1], 6, generator=generator, dtype=torch.float64)
-    return moved(problem, state, camera, pose)
+    return retract(problem, state, camera, pose)
 
 
 @pytest.mark.parametrize("radius", [None, 15.0])
@@ -35,7 +35,7 @@ def test_normal_equations_match_autograd(
 
     def whitened(camera_step: Tensor, pose_step: Tensor) -> Tensor:
         """Residuals of the data: (B, -1)."""
-        there = moved(problem, state, camera_step, pose_step)
+        there = retract(problem, state, camera_step, pose_step)
         rig, points = rig_at(problem, there.offset), pose_at(problem, there).apply(problem.points + problem.centroid)
         radii = None if problem.radius_squared is None else problem.radius_squared.sqrt().repeat(snapshots)
         uv = rig.project(points.flatten(1, 2), radii).uv.unflatten(2, (snapshots, fiducials)).permute(0, 2, 1, 4, 3)
@@ -76,16 +76,16 @@ def test_equations_of_the_object_match_autograd(
     problem = case.problem()
     state = disturbed(problem, case.start(problem))
     generator = torch.Generator().manual_seed(2)
-    own = torch.randn(problem.object_spread.shape, generator=generator, dtype=torch.float64)
+    own = torch.randn(problem.object_prior_std.shape, generator=generator, dtype=torch.float64)
     state = replace(state, object_offset=own)
     found = linearize(problem, state, squared).object
 
     def cost(*step: Tensor) -> Tensor:
-        return map_cost(problem, moved(problem, state, *step), squared).sum()
+        return map_cost(problem, retract(problem, state, *step), squared).sum()
 
     def whitened(*step: Tensor) -> Tensor:
         """Residuals of the data: (B, -1)."""
-        there = moved(problem, state, *step)
+        there = retract(problem, state, *step)
         rig, shape = rig_at(problem, there.offset), points_at(problem, there) + problem.centroid
         points = pose_at(problem, there).apply(shape.unsqueeze(1))
         radii = problem.radius_squared.sqrt().repeat(snapshots)
@@ -116,7 +116,7 @@ def test_cost_and_gradient_match_the_plain_cost(simulate, loss) -> None:
     found = linearize(problem, state, loss)
     camera = torch.zeros(2, 3, 15, dtype=torch.float64, requires_grad=True)
     pose = torch.zeros(2, 2, 6, dtype=torch.float64, requires_grad=True)
-    cost = map_cost(problem, moved(problem, state, camera, pose), loss)
+    cost = map_cost(problem, retract(problem, state, camera, pose), loss)
     torch.testing.assert_close(found.cost, cost.detach())
     by_camera, by_pose = torch.autograd.grad(cost.sum(), (camera, pose))
     torch.testing.assert_close(found.camera_gradient, by_camera, rtol=1e-8, atol=1e-6)
@@ -139,9 +139,9 @@ def test_seen_fiducial_behind_a_camera_costs_infinity(simulate) -> None:
 def test_zero_spread_leaves_a_unit_block(simulate) -> None:
     case = simulate(1, cameras=3, fiducials=5)
     problem = case.problem()
-    spread = problem.spread.clone()
-    spread[:, 1, 6] = 0
-    found = linearize(replace(problem, spread=spread), case.start(problem), squared)
+    prior_std = problem.prior_std.clone()
+    prior_std[:, 1, 6] = 0
+    found = linearize(replace(problem, prior_std=prior_std), case.start(problem), squared)
     row = torch.zeros(15, dtype=torch.float64)
     row[6] = 1
     torch.testing.assert_close(found.camera[0, 1, 6], row, rtol=0, atol=0)

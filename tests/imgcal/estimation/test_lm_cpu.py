@@ -166,7 +166,7 @@ def test_number_of_threads_is_left_alone(simulate) -> None:
 def test_rig_at_equals_the_one_in_tensors(simulate, batch: tuple[int, ...]) -> None:
     case = simulate(*batch, cameras=3, fiducials=5)
     problem = case.problem()
-    offset = torch.randn(problem.spread.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    offset = torch.randn(problem.prior_std.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     offset[0, 1, :3] = 0
     compiled, tensors = lm_cpu.rig_at(problem, offset), rig_at(problem, offset)
     torch.testing.assert_close(compiled.cam_from_rig.rotation, tensors.cam_from_rig.rotation, rtol=0, atol=1e-14)

@@ -18,7 +18,9 @@ SQUARED = EstimationOptions(loss="squared", tolerance=1e-10)
 
 
 def run(case, **changes) -> Estimate:
-    return estimate(case.observations, case.factory, case.obj, **{"spread": case.spread, "options": SQUARED, **changes})
+    return estimate(
+        case.observations, case.factory, case.obj, **{"prior_std": case.prior_std, "options": SQUARED, **changes}
+    )
 
 
 @pytest.mark.parametrize(("batch", "snapshots", "cameras"), [((), 2, 4), ((1,), 3, 4), ((2, 3), 2, 4), ((4,), 1, 4)])
@@ -43,13 +45,13 @@ def test_batch_equals_one_by_one(simulate) -> None:
     for b in range(3):
         observations = Observations(*(getattr(case.observations, name)[b] for name in ("uv", "sigma", "seen")))
         one = run(replace(case, observations=observations))
-        torch.testing.assert_close(one.rig.difference(together.rig[b]), torch.zeros(4, 15).double(), rtol=0, atol=1e-5)
+        torch.testing.assert_close(one.rig.local(together.rig[b]), torch.zeros(4, 15).double(), rtol=0, atol=1e-5)
 
 
 def test_better_than_the_factory(simulate) -> None:
     case = simulate(10, snapshots=20)
     found = run(case)
-    before, after = case.factory.difference(case.truth), found.rig.difference(case.truth)
+    before, after = case.factory.local(case.truth), found.rig.local(case.truth)
     assert (after[..., 6:10].square().mean() < 0.05 * before[..., 6:10].square().mean()).all()
     assert found.chi2_per_dof.mean() == pytest.approx(1, abs=0.05)
 
@@ -60,17 +62,17 @@ def test_camera_that_sees_nothing_keeps_its_factory_values(simulate) -> None:
     seen[..., 2, :] = False
     found = run(replace(case, observations=replace(case.observations, seen=seen)))
     assert found.converged.all()
-    assert found.rig.difference(case.factory)[:, 2].abs().max() < 1e-9
-    assert found.rig.difference(case.factory)[:, 1].abs().max() > 1
+    assert found.rig.local(case.factory)[:, 2].abs().max() < 1e-9
+    assert found.rig.local(case.factory)[:, 1].abs().max() > 1
 
 
 def test_zero_spread_fixes_a_parameter_exactly(simulate) -> None:
     case = simulate(2, cameras=4)
-    spread = case.spread.clone()
-    spread[:, 10:] = 0
-    spread[1] = 0
-    guess = case.factory.moved(0.1 * spread + 1e-3)  # a guess does not move what is fixed
-    found = run(case, spread=spread, first_guess=guess)
+    prior_std = case.prior_std.clone()
+    prior_std[:, 10:] = 0
+    prior_std[1] = 0
+    guess = case.factory.retract(0.1 * prior_std + 1e-3)  # a guess does not move what is fixed
+    found = run(case, prior_std=prior_std, initial_rig=guess)
     assert torch.equal(found.rig.distortion, case.factory.distortion.expand(2, -1, -1))
     assert torch.equal(found.rig.focal_length[:, 1], case.factory.focal_length[1].expand(2, -1))
     torch.testing.assert_close(
@@ -84,7 +86,7 @@ def test_prior_of_the_rig_is_the_default_spread(simulate) -> None:
     prior = RigPrior(focal_length=0.005, principal_point=3.0)
     rig = replace(case.factory, prior=prior)
     implicitly, explicitly = (
-        estimate(case.observations, rig, case.obj, spread=spread) for spread in (None, prior.std(rig))
+        estimate(case.observations, rig, case.obj, prior_std=prior_std) for prior_std in (None, prior.std(rig))
     )
     assert torch.equal(implicitly.rig.focal_length, explicitly.rig.focal_length)
 
@@ -93,7 +95,7 @@ def test_prior_of_the_rig_is_the_default_spread(simulate) -> None:
 def test_start_does_not_change_the_answer(simulate, snapshots: int) -> None:
     case = simulate(5, snapshots=snapshots)
     cold = run(case)
-    warm = run(case, rig_from_object=case.poses, first_guess=case.truth)
+    warm = run(case, rig_from_object=case.poses, initial_rig=case.truth)
     torch.testing.assert_close(cold.chi2, warm.chi2, rtol=1e-6, atol=1e-6)
     torch.testing.assert_close(cold.rig.focal_length, warm.rig.focal_length, rtol=0, atol=1e-3)
 
@@ -168,9 +170,9 @@ def test_shapes_that_do_not_fit_are_input_errors(simulate, o10) -> None:
 def test_relative_drift_prior(simulate) -> None:
     """Parameters that are zero in the factory have no spread under relative drift, and stay zero."""
     case = simulate(2, drift=RelativeDrift())
-    assert (case.spread == 0).any()
-    moved = run(case).rig.difference(case.factory)
-    assert not moved[:, case.spread == 0][..., 3:].abs().gt(1e-9).any()
+    assert (case.prior_std == 0).any()
+    moved = run(case).rig.local(case.factory)
+    assert not moved[:, case.prior_std == 0][..., 3:].abs().gt(1e-9).any()
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 0.4])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from imgcal.association.series import label, observations_of
+from imgcal.association.series import associate, observations_of
 from imgcal.estimation import EstimationOptions, estimate
 from imgcal.estimation.change_points import Step
 from imgcal.estimation.moves import Change, Places, find_moves
@@ -19,7 +19,7 @@ def bumped():
     """A rig estimated from a capture in which a camera was turned by 0.1 degrees."""
     rig, wand, truth = faults.wand_in_a_room(COUNT, 1)
     truth = faults.changed_from(truth, wand, CAMERA, FIRST, lambda r: faults.turned(r, CAMERA, 0.1))
-    observations, _ = observations_of(label(faults.blobs(truth, 1, labelled=True), rig, wand), rig, wand)
+    observations, _ = observations_of(associate(faults.blobs(truth, 1, labelled=True), rig, wand), rig, wand)
     fit = estimate(observations, rig, wand)
     return Places(fit.problem, fit.solution.state, tuple(range(10)), (0,) * 10), rig
 
@@ -45,12 +45,12 @@ def test_the_moment_is_found_from_a_wrong_start(bumped):
 
 
 def test_a_change_is_told_by_the_kind_that_explains_it():
-    information, step, spread = np.diag(np.full(15, 100.0)), np.zeros(15), np.ones(15)
+    information, step, prior_std = np.diag(np.full(15, 100.0)), np.zeros(15), np.ones(15)
     step[3:5] = 3.0, 4.0
-    change = Change(information, information @ step, spread)
+    change = Change(information, information @ step, prior_std)
     kind, size, sigma = change.size()
     assert (kind, size, sigma) == ("position", pytest.approx(5.0), pytest.approx(0.1))
     assert change.is_physical
     step[10:15] = 3.0  # the lens would have to change with it
-    assert not Change(information, information @ step, spread).is_physical
-    assert not Change(information, information @ (step * 0 + 0.1), spread).is_physical
+    assert not Change(information, information @ step, prior_std).is_physical
+    assert not Change(information, information @ (step * 0 + 0.1), prior_std).is_physical

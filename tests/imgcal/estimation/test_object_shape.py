@@ -16,7 +16,7 @@ LOSS = NamedLoss("huber", 3.0)
 def evidence(case, row):
     """What one of a batch of rigs says about the object."""
     one = replace(case.observations, **{k: v[row] for k, v in vars(case.observations).items()})
-    found = estimate(one, case.factory, case.obj, spread=case.spread)
+    found = estimate(one, case.factory, case.obj, prior_std=case.prior_std)
     return found, shape_evidence(found.problem, found.solution, LOSS)
 
 
@@ -43,11 +43,11 @@ def test_one_displaced_fiducial_is_found_and_no_other(simulate, fiducial: int) -
     for row in range(4):
         found, shape = evidence(case, row)
         assert shape.bent_sigma() > 10
-        spread = learnt_tolerances(shape)
-        assert np.delete(spread, fiducial).max() < 0.2 * spread[fiducial]
-        obj = replace(case.obj, tolerance=torch.from_numpy(spread))
+        prior_std = learnt_tolerances(shape)
+        assert np.delete(prior_std, fiducial).max() < 0.2 * prior_std[fiducial]
+        obj = replace(case.obj, tolerance=torch.from_numpy(prior_std))
         one = replace(case.observations, **{k: v[row] for k, v in vars(case.observations).items()})
-        fit = estimate(one, case.factory, obj, found.rig_from_object, spread=case.spread)
+        fit = estimate(one, case.factory, obj, found.rig_from_object, prior_std=case.prior_std)
         each = offsets(fit, case.obj.points.numpy())
         assert [o.fiducial for o in each if o.distance > 4 * o.sigma + 0.01] == [fiducial]
         assert each[fiducial].distance == pytest.approx(0.5, abs=4 * each[fiducial].sigma)
@@ -57,15 +57,15 @@ def test_one_displaced_fiducial_is_found_and_no_other(simulate, fiducial: int) -
 
 def test_where_many_fiducials_are_off_all_get_the_same_tolerance(simulate) -> None:
     case = simulate(snapshots=6, cameras=5, bent=0.3)
-    found = estimate(case.observations, case.factory, case.obj, spread=case.spread)
-    spread = learnt_tolerances(shape_evidence(found.problem, found.solution, LOSS))
-    assert np.ptp(spread) < 1e-9 and 0.15 < spread[0] < 0.6
+    found = estimate(case.observations, case.factory, case.obj, prior_std=case.prior_std)
+    prior_std = learnt_tolerances(shape_evidence(found.problem, found.solution, LOSS))
+    assert np.ptp(prior_std) < 1e-9 and 0.15 < prior_std[0] < 0.6
 
 
 def test_the_scale_is_told_from_the_shape(simulate) -> None:
     case = simulate(snapshots=6, cameras=10)
     larger = replace(case.obj, points=case.obj.points / 1.05)  # the true one is 5 % larger than the file says
-    found = estimate(case.observations, case.factory, larger, spread=case.spread)
+    found = estimate(case.observations, case.factory, larger, prior_std=case.prior_std)
     shape = shape_evidence(found.problem, found.solution, LOSS)
     error, deviation = shape.scale_error
     assert error == pytest.approx(0.05, abs=5 * deviation) and error > 8 * deviation
@@ -76,7 +76,7 @@ def test_granted_tolerances_are_not_suspected_and_more_is(simulate) -> None:
     for factor, low, high in ((1.0, -4.0, 4.0), (12.0, 8.0, np.inf)):
         case = simulate(snapshots=8, cameras=5, bent=0.2 * factor, tolerance=0.2)
         options = EstimationOptions(loss="squared")
-        found = estimate(case.observations, case.factory, case.obj, spread=case.spread, options=options)
+        found = estimate(case.observations, case.factory, case.obj, prior_std=case.prior_std, options=options)
         assert low < shape_evidence(found.problem, found.solution, LOSS).bent_sigma() < high
 
 
@@ -84,12 +84,12 @@ def test_errors_that_belong_to_places_scatter_from_snapshot_to_snapshot(simulate
     case = simulate(snapshots=40, cameras=5, tolerance=0.1)
     for field, low, high in ((0.0, 1.0, 1.3), (0.15, 2.0, np.inf)):
         uv = case.observations.uv + field * torch.sin(case.observations.uv.flip(-1) / 40)
-        found = estimate(replace(case.observations, uv=uv), case.factory, case.obj, spread=case.spread)
+        found = estimate(replace(case.observations, uv=uv), case.factory, case.obj, prior_std=case.prior_std)
         assert low <= pull_scatter(found.problem, found.solution.state, LOSS) < high
 
 
 def test_one_camera_does_not_know_the_scale(simulate) -> None:
     case = simulate(snapshots=4, cameras=1)
-    found = estimate(case.observations, case.factory, case.obj, spread=case.spread)
+    found = estimate(case.observations, case.factory, case.obj, prior_std=case.prior_std)
     error, deviation = shape_evidence(found.problem, found.solution, LOSS).scale_error
     assert abs(error) < 4 * deviation and deviation > 0.01

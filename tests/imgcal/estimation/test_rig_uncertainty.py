@@ -22,15 +22,15 @@ def points():
 
 def covariance_of(rig, scale=1e-3, seed=0):
     """A full, correlated covariance, small enough for first order."""
-    factor = torch.randn(15 * rig.cameras, 60, generator=torch.Generator().manual_seed(seed), dtype=F64)
-    unit = torch.tensor([1e-3] * 3 + [1.0] * 3 + [2.0] * 4 + [2e-3] * 5, dtype=F64).repeat(rig.cameras)
+    factor = torch.randn(15 * rig.num_cameras, 60, generator=torch.Generator().manual_seed(seed), dtype=F64)
+    unit = torch.tensor([1e-3] * 3 + [1.0] * 3 + [2.0] * 4 + [2e-3] * 5, dtype=F64).repeat(rig.num_cameras)
     factor = scale * unit[:, None] * factor
     return factor @ factor.mT, factor
 
 
 def test_derivatives_are_those_of_the_projection(rig, points):
     zero = torch.zeros(3, 15, dtype=F64)
-    every = torch.func.jacrev(lambda step: rig.moved(step).project(points).uv)(zero)  # (C, P, 2, C, 15)
+    every = torch.func.jacrev(lambda step: rig.retract(step).project(points).uv)(zero)  # (C, P, 2, C, 15)
     own = torch.stack([every[c, :, :, c] for c in range(3)])
     torch.testing.assert_close(pixel_jacobian(rig, points), own, rtol=1e-9, atol=1e-9)
 
@@ -46,7 +46,7 @@ def test_each_camera_may_have_points_of_its_own(rig, points):
 def test_points_that_move_with_the_rig_keep_their_pixels(rig, points):
     motion = torch.tensor([1e-6, -2e-6, 3e-6, 1e-3, 2e-3, -1e-3], dtype=F64)
     centre = points.mean(0)
-    moved = rig.moved((rigid_motion(rig, centre) @ motion).view(3, 15))
+    moved = rig.retract((rigid_motion(rig, centre) @ motion).view(3, 15))
     along = points + torch.linalg.cross(motion[:3].expand_as(points), points - centre) + motion[3:]
     torch.testing.assert_close(moved.project(along).uv, rig.project(points).uv, rtol=0, atol=1e-7)
     assert (moved.project(points).uv - rig.project(points).uv).abs().max() > 1e-4
@@ -74,7 +74,7 @@ def test_sampled_rigs_scatter_as_predicted(rig, points):
     squares = [torch.zeros(3, 10, dtype=F64), torch.zeros(10, dtype=F64)]
     shift = RigidTransform(torch.eye(3, dtype=F64)[None], torch.tensor([[30.0, -5.0, 8.0]], dtype=F64))
     for _ in range(120):
-        truth = rig.moved((factor @ torch.randn(60, generator=generator, dtype=F64)).view(3, 15))
+        truth = rig.retract((factor @ torch.randn(60, generator=generator, dtype=F64)).view(3, 15))
         # The true rig may stand anywhere.
         truth = type(truth)(**(vars(truth) | {"cam_from_rig": truth.cam_from_rig @ shift}))
         for total, error in zip(squares, true_error(found, truth, held_out), strict=True):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association.series import label
+from imgcal.association.series import associate
 from imgcal.errors import RefusedError
 from imgcal.estimation import variance_components
 from imgcal.io import load_object, load_rig
@@ -29,12 +29,12 @@ def two_captures(rig, obj, noise=0.05):
 def test_the_latest_result_is_a_start_and_no_more(noise, o10, asymmetric8):
     before, now = two_captures(o10, asymmetric8, noise)
     latest = calibrate(before, o10, asymmetric8)
-    labelled = label(now, o10, asymmetric8)
+    labelled = associate(now, o10, asymmetric8)
     fresh = fit_labelled(labelled, o10, asymmetric8)
     followed = fit_labelled(labelled, o10, asymmetric8, latest=latest)
     assert torch.equal(followed.observations.seen, fresh.observations.seen)
-    assert followed.model_error == pytest.approx(fresh.model_error, rel=0.05)
-    shift = followed.rig.difference(fresh.rig).abs() / fresh.problem.spread[0]
+    assert followed.additive_noise == pytest.approx(fresh.additive_noise, rel=0.05)
+    shift = followed.rig.local(fresh.rig).abs() / fresh.problem.prior_std[0]
     assert shift.max() < 0.02  # standard deviations of the prior: the solver stops where the cost falls by 1e-4
 
 
@@ -42,7 +42,7 @@ def test_the_latest_result_gives_way_where_a_label_does_not_fit(o10, asymmetric8
     before, now = two_captures(o10, asymmetric8)
     latest = calibrate(before, o10, asymmetric8)
     now.uv[[5, 30, 61]] += (9.0, -7.0)
-    labelled = label(now, o10, asymmetric8)
+    labelled = associate(now, o10, asymmetric8)
     fresh = fit_labelled(labelled, o10, asymmetric8)
     followed = fit_labelled(labelled, o10, asymmetric8, latest=latest)
     assert fresh.outliers >= 3
@@ -83,7 +83,7 @@ def test_a_calibration_reports_the_residuals_of_the_rig_that_it_returns(seed) ->
 def fits_made(monkeypatch) -> list[int]:
     """Number of fits of each calibration from now on, the latest last."""
     counts: list[int] = []
-    settle, fit = calibration.settle, variance_components._fit
+    estimate_variance_components, fit = calibration.estimate_variance_components, variance_components._fit
 
     def counted(*args, **kwargs):
         counts[-1] += 1
@@ -91,10 +91,10 @@ def fits_made(monkeypatch) -> list[int]:
 
     def started(*args, **kwargs):
         counts.append(0)
-        return settle(*args, **kwargs)
+        return estimate_variance_components(*args, **kwargs)
 
     monkeypatch.setattr(variance_components, "_fit", counted)
-    monkeypatch.setattr(calibration, "settle", started)
+    monkeypatch.setattr(calibration, "estimate_variance_components", started)
     return counts
 
 
@@ -119,19 +119,19 @@ def test_ordinary_captures_come_to_rest_in_a_few_fits(o10, asymmetric8, monkeypa
     counts = fits_made(monkeypatch)
     for noise in (0.05, 0.3):
         table, _ = two_captures(o10, asymmetric8, noise)
-        assert (calibrate(table, o10, asymmetric8).model_error > 0) == (noise > 0.05)
+        assert (calibrate(table, o10, asymmetric8).additive_noise > 0) == (noise > 0.05)
     assert max(counts) <= 6
 
 
 def test_a_solution_of_another_problem_is_not_returned(o10, asymmetric8, monkeypatch) -> None:
     """The last check projects with the rig that is about to be returned."""
     table, _ = two_captures(o10, asymmetric8)
-    settle = calibration.settle
+    estimate_variance_components = calibration.estimate_variance_components
 
-    def widened(*args, **kwargs):
-        found = settle(*args, **kwargs)
-        return replace(found, problem=replace(found.problem, spread=2 * found.problem.spread))
+    def prior_scale(*args, **kwargs):
+        found = estimate_variance_components(*args, **kwargs)
+        return replace(found, problem=replace(found.problem, prior_std=2 * found.problem.prior_std))
 
-    monkeypatch.setattr(calibration, "settle", widened)
+    monkeypatch.setattr(calibration, "estimate_variance_components", prior_scale)
     with pytest.raises(RefusedError, match="do not belong together"):
         calibrate(table, o10, asymmetric8)

@@ -47,14 +47,14 @@ def sample(conditions: Make) -> Callable[..., Sample]:
     return make
 
 
-def disturbed(truth: Prediction, spread: torch.Tensor, scale: float = 0.1, seed: int = 1) -> Prediction:
+def disturbed(truth: Prediction, prior_std: torch.Tensor, scale: float = 0.1, seed: int = 1) -> Prediction:
     """A prediction that is off by a share of the drift, as a network's is."""
     generator = torch.Generator().manual_seed(seed)
     batch = len(truth.rig_from_object.translation)
-    step = scale * torch.randn((batch, *spread.shape), generator=generator, dtype=spread.dtype) * spread
-    shift = 10 * scale * torch.randn((batch, 3), generator=generator, dtype=spread.dtype)
+    step = scale * torch.randn((batch, *prior_std.shape), generator=generator, dtype=prior_std.dtype) * prior_std
+    shift = 10 * scale * torch.randn((batch, 3), generator=generator, dtype=prior_std.dtype)
     pose = truth.rig_from_object
-    return Prediction(truth.rig.moved(step), RigidTransform(pose.rotation, pose.translation + shift))
+    return Prediction(truth.rig.retract(step), RigidTransform(pose.rotation, pose.translation + shift))
 
 
 class Fake(nn.Module):

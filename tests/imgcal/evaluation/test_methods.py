@@ -93,7 +93,7 @@ def test_a_network_gets_single_precision_and_its_refinement_double(sample):
     prediction = method.predict(some.given())
     assert network.calls == [torch.float32]
     assert prediction.rig.focal_length.dtype == torch.float64
-    refined = method.refine(disturbed(some.truth, some.given().spread), some.given())
+    refined = method.refine(disturbed(some.truth, some.given().prior_std), some.given())
     assert (re(refined, some) < 0.02).all()
 
 
@@ -122,6 +122,6 @@ def test_images_are_refined_by_render_and_compare(sample):
         image_options = ImageOptions()
 
     method = network_method(Looks(some.conditions))
-    guess = disturbed(some.truth, some.given().spread, 0.05)
+    guess = disturbed(some.truth, some.given().prior_std, 0.05)
     assert (re(method.refine(guess, some.given()), some) < 0.2).all()
     assert (re(guess, some) > 0.2).all()

@@ -39,7 +39,9 @@ def test_errors_of_parameters_are_in_their_units(sample):
     some = sample(2)
     step = torch.zeros(4, 15, dtype=torch.float64)
     step[1:, 2], step[1:, 3], step[:, 6:8] = 0.01, 2.0, 5.0
-    found = errors(Prediction(some.truth.rig.moved(step), some.truth.rig_from_object), some.truth, some.conditions.obj)
+    found = errors(
+        Prediction(some.truth.rig.retract(step), some.truth.rig_from_object), some.truth, some.conditions.obj
+    )
     assert torch.allclose(found.rotation_deg, torch.full((2,), 0.572957795, dtype=torch.float64))
     assert torch.allclose(found.position, torch.full((2,), 2.0, dtype=torch.float64))
     assert torch.allclose(found.focal_length, torch.full((2,), 5.0, dtype=torch.float64))

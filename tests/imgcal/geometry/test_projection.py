@@ -104,9 +104,9 @@ def test_kornia_path_trains_every_parameter(o10: CameraRig, asymmetric8: Calibra
     parts = ("rotation", "position", "focal_length", "principal_point", "distortion")
     widths = (3, 3, 2, 2, 5)
     generator = torch.Generator().manual_seed(1)
-    step = 1e-3 * torch.randn(3, o10.cameras, 15, generator=generator, dtype=torch.float64)
+    step = 1e-3 * torch.randn(3, o10.num_cameras, 15, generator=generator, dtype=torch.float64)
     leaves = [part.clone().requires_grad_() for part in step.split(widths, dim=-1)]
-    rig = o10.expand(3).moved(torch.cat(leaves, dim=-1)).from_object(snapshots.rig_from_object)
+    rig = o10.expand(3).retract(torch.cat(leaves, dim=-1)).from_object(snapshots.rig_from_object)
     points_cam = rig.cam_from_rig.apply(asymmetric8.points)
     found = project_kornia(points_cam, rig.focal_length, rig.principal_point, rig.distortion, rig.image_size)
     gradients = torch.autograd.grad((found.uv - target).square().mean(), leaves)
@@ -254,8 +254,8 @@ def test_permuting_cameras_and_fiducials_permutes_the_image(o10: CameraRig, asym
     snapshots = synthesize(o10, asymmetric8, 4, torch.Generator().manual_seed(0), drift=RelativeDrift())
     points = snapshots.rig_from_object.apply(asymmetric8.points)
     generator = torch.Generator().manual_seed(1)
-    cameras = torch.randperm(o10.cameras, generator=generator).tolist()
-    fiducials = torch.randperm(asymmetric8.fiducials, generator=generator)
+    cameras = torch.randperm(o10.num_cameras, generator=generator).tolist()
+    fiducials = torch.randperm(asymmetric8.num_fiducials, generator=generator)
     found = snapshots.rig.select(cameras).project(points[:, fiducials])
     expected = snapshots.projection
     torch.testing.assert_close(found.uv, expected.uv[:, cameras][:, :, fiducials])

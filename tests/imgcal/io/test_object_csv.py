@@ -17,7 +17,7 @@ GOOD = "x,y,z\n0,0,0\n1.5,0,0\n0,1,0\n0,0,1\n"
 @pytest.mark.parametrize(("name", "count"), [("cube8", 8), ("cube27", 27), ("sphere64", 64), ("asymmetric8", 8)])
 def test_shipped_objects_load_by_name(name: str, count: int) -> None:
     obj = load_object(name)
-    assert (obj.name, obj.fiducials) == (name, count)
+    assert (obj.name, obj.num_fiducials) == (name, count)
     assert obj.points.dtype == torch.float64
     torch.testing.assert_close(obj.colours, palette(count).double())
 

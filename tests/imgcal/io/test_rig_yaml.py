@@ -82,9 +82,9 @@ def test_reads_the_documented_example(tmp_path: Path) -> None:
 def test_shipped_rigs_load_by_name(name: str, cameras: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     rig = load_rig(name)
-    assert (rig.name, rig.cameras) == (name, cameras)
+    assert (rig.name, rig.num_cameras) == (name, cameras)
     (tmp_path / name).mkdir()  # a folder of that name, a capture perhaps, is in nobody's way
-    assert load_rig(name).cameras == cameras
+    assert load_rig(name).num_cameras == cameras
 
 
 finite = st.floats(-1e3, 1e3, allow_nan=False)
@@ -130,7 +130,7 @@ def test_covariance_round_trip(tmp_path: Path) -> None:
     loaded = load_rig_covariance(path)
     assert loaded is not None and loaded.matrix is None
     torch.testing.assert_close(loaded.std, covariance.std, rtol=1e-5, atol=0)
-    assert load_rig(path).cameras == 3
+    assert load_rig(path).num_cameras == 3
     assert max(map(len, path.read_text().splitlines())) < 300
 
 

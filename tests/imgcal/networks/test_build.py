@@ -56,7 +56,7 @@ def test_an_untrained_network_returns_the_factory_calibration(preset):
     assert len(predictions) == network.trunk.passes
     for prediction in predictions:
         assert torch.equal(prediction.rig.focal_length, network.factory.focal_length.expand(3, -1, -1))
-        assert prediction.rig.difference(network.factory).abs().max() < 1e-3
+        assert prediction.rig.local(network.factory).abs().max() < 1e-3
 
 
 @pytest.mark.parametrize("preset", ["paper-points", "paper-cnn1d"])
@@ -289,9 +289,9 @@ def test_rescaled_weights_say_the_same_of_another_drift():
     with torch.no_grad():
         for parameter in narrow.parameters():
             parameter += 0.02 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(3))
-    wide = build(narrow.config, factory, obj, 3 * narrow.decoder.spread).eval()
+    wide = build(narrow.config, factory, obj, 3 * narrow.decoder.prior_std).eval()
     wide.load_state_dict(narrow.state_dict())
-    wide.trunk.rescale(narrow.decoder.spread)
+    wide.trunk.rescale(narrow.decoder.prior_std)
     made = snapshots(narrow)
     with torch.no_grad():
         one, other = (network(views(narrow, made))[-1] for network in (narrow, wide))

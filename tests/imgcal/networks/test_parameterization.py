@@ -6,7 +6,7 @@ import torch
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.io import load_object, load_rig
-from imgcal.networks.parameterization import POSE_SHIFT, Decoder
+from imgcal.networks.parameterization import POSE_SHIFT, Parameterization
 from imgcal.synthesis.rigs import RelativeDrift, synthesize
 from imgcal.types.prediction import Prediction
 from imgcal.types.rig import pack18, pack21
@@ -19,7 +19,7 @@ B, C = 3, 4
 def decoder():
     """In float64, to compare exactly."""
     rig = load_rig("T4")
-    return Decoder(rig, load_object("asymmetric8"), DRIFT.std(rig)).double()
+    return Parameterization(rig, load_object("asymmetric8"), DRIFT.std(rig)).double()
 
 
 @pytest.fixture
@@ -43,7 +43,7 @@ def test_cameras_of_the_factory_rig_are_split_into_that_rig_and_the_pose(decoder
     found = Prediction.from_cameras(decoder.factory.from_object(pose), decoder.factory)
     torch.testing.assert_close(found.rig_from_object.rotation, pose.rotation)
     torch.testing.assert_close(found.rig_from_object.translation, pose.translation)
-    assert found.rig.difference(decoder.factory).abs().max() < 1e-6
+    assert found.rig.local(decoder.factory).abs().max() < 1e-6
 
 
 def test_splitting_leaves_cameras_where_they_are(decoder, truth):
@@ -57,14 +57,12 @@ def test_offsets_are_in_units_of_the_spread_and_poses_are_about_the_centroid(dec
     pose = 0.1 * torch.randn(B, 9, generator=random, dtype=torch.float64)
     state = decoder.start(offsets, pose)
     prediction = decoder.prediction(state)
-    torch.testing.assert_close(
-        prediction.rig.difference(decoder.factory), offsets * decoder.spread, atol=1e-8, rtol=1e-6
-    )
+    torch.testing.assert_close(prediction.rig.local(decoder.factory), offsets * decoder.prior_std, atol=1e-8, rtol=1e-6)
     at = pose[:, 6:] * POSE_SHIFT + pose.new_tensor([0.0, 0.0, decoder.working_distance])
     torch.testing.assert_close(prediction.rig_from_object.apply(decoder.centroid[None])[:, 0], at)
     step = torch.randn(B, 6, generator=random, dtype=torch.float64)
     moved = decoder.prediction(decoder.move(state, -offsets, step))
-    assert moved.rig.difference(decoder.factory).abs().max() < 1e-6
+    assert moved.rig.local(decoder.factory).abs().max() < 1e-6
     there = moved.rig_from_object.apply(decoder.centroid[None])[:, 0]
     torch.testing.assert_close(there, at + POSE_SHIFT * step[:, 3:])
 

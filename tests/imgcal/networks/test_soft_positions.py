@@ -52,10 +52,10 @@ def test_positions_move_with_the_image(apart):
 def test_belief_chooses_between_two_dots_of_one_colour():
     uv = torch.tensor([[[20.0, 20.0], [70.0, 70.0]]])
     images = splat(uv, COLOURS[:1].expand(2, 3), 1.5, (96, 96))
-    belief = torch.zeros(1, 1, 2, 2)
-    belief[..., 1, 1] = 8.0
-    belief[..., 0, 0] = -8.0
-    found, confidence = soft_positions(images, COLOURS[:1], 1.5, belief)
+    heatmap_logits = torch.zeros(1, 1, 2, 2)
+    heatmap_logits[..., 1, 1] = 8.0
+    heatmap_logits[..., 0, 0] = -8.0
+    found, confidence = soft_positions(images, COLOURS[:1], 1.5, heatmap_logits)
     assert torch.allclose(found[0, 0], uv[0, 1], atol=0.05)
     assert confidence[0, 0] > 0.8
 
@@ -63,8 +63,8 @@ def test_belief_chooses_between_two_dots_of_one_colour():
 def test_gradients_reach_the_belief():
     uv = torch.tensor([[[20.0, 20.0], [24.0, 20.0]]])
     images = splat(uv, COLOURS[:1].expand(2, 3), 1.5, (96, 96))
-    belief = torch.zeros(1, 1, 24, 24, requires_grad=True)
-    found, _ = soft_positions(images, COLOURS[:1], 1.5, belief)
+    heatmap_logits = torch.zeros(1, 1, 24, 24, requires_grad=True)
+    found, _ = soft_positions(images, COLOURS[:1], 1.5, heatmap_logits)
     found.sum().backward()
-    assert belief.grad.isfinite().all()
-    assert belief.grad.abs().max() > 0
+    assert heatmap_logits.grad.isfinite().all()
+    assert heatmap_logits.grad.abs().max() > 0

@@ -27,7 +27,7 @@ def bare(o10, asymmetric8):
         residual=np.zeros((*shape, 2)),
         sigma=np.full(shape, 0.1),
         labels=np.ones(shape, dtype=bool),
-        spread=np.tile([0.01] * 3 + [10.0] * 3, (4, 1)),
+        prior_std=np.tile([0.01] * 3 + [10.0] * 3, (4, 1)),
         offset=np.zeros((4, 6)),
     )
 
@@ -42,7 +42,7 @@ def test_derivatives_are_those_of_the_projection(bare):
     for k in range(6):
         step = torch.zeros(4, 15, dtype=torch.float64)
         step[:, k] = 1e-4
-        numeric = (pixels(bare, bare.rig.moved(step)) - pixels(bare, bare.rig.moved(-step))) / 2e-4
+        numeric = (pixels(bare, bare.rig.retract(step)) - pixels(bare, bare.rig.retract(-step))) / 2e-4
         assert np.allclose(by_camera[..., k], numeric, rtol=1e-5, atol=1e-4)
     poses, middle = bare.rig_from_object, torch.from_numpy(bare.points.mean(0))
     for k in range(6):
@@ -60,7 +60,7 @@ def test_a_break_is_found_in_its_camera_at_its_place_also_where_the_labels_were_
     step = torch.zeros(4, 15, dtype=torch.float64)
     step[2, 1] = 0.002
     residual = bare.residual.copy()
-    residual[1:] += (pixels(bare) - pixels(bare, bare.rig.moved(step)))[1:]
+    residual[1:] += (pixels(bare) - pixels(bare, bare.rig.retract(step)))[1:]
     first, camera, statistic = find_breaks(replace(bare, residual=residual)).most_significant()
     assert (first, camera) == (1, 2) and statistic > 100
     one_wrong = bare.residual.copy()
@@ -93,5 +93,5 @@ def test_noise_gives_no_more_than_chi_squared(o10, asymmetric8):
 def test_a_camera_that_sees_the_object_alone_says_nothing_of_its_place(bare):
     labels = np.zeros_like(bare.labels)
     labels[:, 1] = True
-    std = bare.spread[1]
+    std = bare.prior_std[1]
     assert np.allclose(information(replace(bare, labels=labels))[1] * std[:, None] * std, np.eye(6), atol=1e-2)

@@ -48,7 +48,7 @@ def test_a_window_of_snapshots_knows_the_rig_better(small):
             for snapshot in frames:
                 result = recalibrator.update(snapshot)
         assert len(result.labelled.snapshots) == window
-        errors.append(float(result.rig.difference(truth.rig)[:, 6:10].square().mean().sqrt()))
+        errors.append(float(result.rig.local(truth.rig)[:, 6:10].square().mean().sqrt()))
     assert errors[1] < errors[0]
 
 

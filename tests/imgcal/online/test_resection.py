@@ -25,7 +25,7 @@ def sightings(stream, camera, snapshots, turn_deg, false=1, noise=0.1):
 @pytest.mark.parametrize(("rig", "obj", "turn_deg"), [("room10", "wand4", 25.0), ("T4", "asymmetric8", 15.0)])
 def test_a_camera_turned_far_is_found(rig, obj, turn_deg):
     stream, found = Stream(rig, obj, 40), 0
-    for camera in range(stream.rig.cameras):
+    for camera in range(stream.rig.num_cameras):
         blobs, places, labels = sightings(stream, camera, [0, 12, 24, 36], turn_deg)
         if sum(len(uv) >= 5 for uv in blobs) < 2:
             continue  # it looks away now

@@ -23,9 +23,9 @@ def capture(rig, obj, snapshots=6, noise=0.05, seed=0):
 def test_an_honest_calibration(o10, asymmetric8):
     truth, table = capture(o10, asymmetric8)
     result = calibrate(table, o10, asymmetric8)
-    assert result.model_error == 0 and result.outliers <= 2 and not result.widened
+    assert result.additive_noise == 0 and result.outliers <= 2 and not result.prior_scale
     assert 0.8 < result.chi2_per_dof < 1.2
-    assert result.rig.difference(truth)[:, 6:8].abs().max() < 0.2 * o10.difference(truth)[:, 6:8].abs().max()
+    assert result.rig.local(truth)[:, 6:8].abs().max() < 0.2 * o10.local(truth)[:, 6:8].abs().max()
     assert result.before.rms > 50 * result.rms
 
 
@@ -35,7 +35,7 @@ def test_noise_that_the_blobs_do_not_know_is_measured(hidden, o10, asymmetric8):
     table.uv[:] += hidden * np.random.default_rng(1).standard_normal(table.uv.shape)
     table.sigma[:] = 0.02
     result = calibrate(table, o10, asymmetric8)
-    assert result.model_error == pytest.approx(hidden, rel=0.15)
+    assert result.additive_noise == pytest.approx(hidden, rel=0.15)
     assert 0.75 < result.chi2_per_dof < 1.3
 
 
@@ -46,7 +46,7 @@ def test_gross_outliers_are_left_out(o10, asymmetric8):
     result = calibrate(table, o10, asymmetric8)
     assert 20 <= result.outliers <= 26
     assert result.rms < 0.06
-    assert (result.rig.difference(truth)[:, 6:8]).abs().max() < 3
+    assert (result.rig.local(truth)[:, 6:8]).abs().max() < 3
 
 
 def test_two_cameras_swapped_is_refused(o10, asymmetric8):

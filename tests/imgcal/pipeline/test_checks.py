@@ -19,7 +19,7 @@ def drifted(rig, camera, parameter, deviations):
     offset = torch.zeros_like(prior)
     offset[camera, parameter] = deviations
     state = SimpleNamespace(offset=offset[None])
-    return SimpleNamespace(solution=SimpleNamespace(state=state), problem=SimpleNamespace(spread=prior[None])), prior
+    return SimpleNamespace(solution=SimpleNamespace(state=state), problem=SimpleNamespace(prior_std=prior[None])), prior
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.io import load_object, load_rig
 from imgcal.pipeline.calibration import calibrate, rms_length
-from imgcal.pipeline.initialization import KINDS, Guesser, load_guesser
+from imgcal.pipeline.initialization import KINDS, Initializer, load_initializer
 from imgcal.synthesis.captures import simulate_truth, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift, PoseRange, RelativeDrift, synthesize
 from imgcal.types import Prediction
@@ -32,7 +32,7 @@ class Oracle(nn.Module):
 
     def forward(self, views):
         assert views.uv.shape[0] == len(self.truth.rig_from_object.translation)
-        rig = self.truth.rig.moved(torch.full_like(self.truth.rig.distortion[..., :1], self.turn).expand(-1, -1, 15))
+        rig = self.truth.rig.retract(torch.full_like(self.truth.rig.distortion[..., :1], self.turn).expand(-1, -1, 15))
         return (Prediction(rig, self.truth.rig_from_object),)
 
 
@@ -50,7 +50,7 @@ def case():
 
 def test_a_guess_is_the_mean_rig_of_the_snapshots(case):
     factory, obj, observations, truth = case
-    guess = Guesser("oracle", Oracle(truth), factory).guess(observations, factory, obj)
+    guess = Initializer("oracle", Oracle(truth), factory).guess(observations, factory, obj)
     assert torch.allclose(guess.rig.focal_length, truth.rig.focal_length[0])
     assert guess.residual.abs().max() < 1e-6
     assert (guess.residual[1, 2, 3] == 0).all()
@@ -60,7 +60,7 @@ def test_images_of_another_size_are_taken(case):
     factory, obj, observations, truth = case
     half = factory.resized(factory.image_size // 2)
     small = replace(observations, uv=(observations.uv + 0.5) / 2 - 0.5)
-    guess = Guesser("oracle", Oracle(truth), factory).guess(small, half, obj)
+    guess = Initializer("oracle", Oracle(truth), factory).guess(small, half, obj)
     assert torch.allclose(guess.rig.focal_length, truth.rig.focal_length[0] / 2)
     assert guess.residual.abs().max() < 1e-6
 
@@ -68,14 +68,14 @@ def test_images_of_another_size_are_taken(case):
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_shipped_networks_are_near(case, kind):
     factory, obj, observations, _ = case
-    guess = load_guesser(kind, factory, obj).guess(observations, factory, obj)
+    guess = load_initializer(kind, factory, obj).guess(observations, factory, obj)
     assert rms_length(guess.residual, observations.seen) < 4.0
 
 
 def test_a_shipped_network_does_not_mind_a_radius(case):
     factory, obj, *_ = case
-    spheres = replace(obj, radius=torch.full((obj.fiducials,), 6.0, dtype=torch.float64))
-    assert load_guesser("points", factory, spheres).name == "points-O10-asymmetric8"
+    spheres = replace(obj, radius=torch.full((obj.num_fiducials,), 6.0, dtype=torch.float64))
+    assert load_initializer("points", factory, spheres).name == "points-O10-asymmetric8"
 
 
 @pytest.mark.parametrize(
@@ -88,13 +88,13 @@ def test_a_shipped_network_does_not_mind_a_radius(case):
 )
 def test_what_does_not_fit_is_refused(name, rig, message):
     with pytest.raises(InputError, match=message):
-        load_guesser(name, load_rig(rig), load_object("asymmetric8"))
+        load_initializer(name, load_rig(rig), load_object("asymmetric8"))
 
 
 def test_what_a_shipped_network_lacks_is_said():
     other = load_rig("T4")
     with pytest.raises(InputError, match=r"train one .* focal length of cam01: found"):
-        load_guesser("vit", other, load_object("asymmetric8"))
+        load_initializer("vit", other, load_object("asymmetric8"))
 
 
 @pytest.mark.parametrize(("turn", "used"), [(0.0, True), (0.3, False)])
@@ -104,11 +104,11 @@ def test_the_result_does_not_depend_on_the_guess(turn, used, o10, asymmetric8):
     table.uv[:] += 0.05 * np.random.default_rng(2).standard_normal(table.uv.shape)
     table.sigma[:] = 0.05
     known = Prediction(truth.rig.expand(SNAPSHOTS), truth.rig_from_object)
-    guesser = Guesser("oracle", Oracle(known, turn), o10)
-    plain, guided = calibrate(table, o10, asymmetric8), calibrate(table, o10, asymmetric8, guesser=guesser)
+    initializer = Initializer("oracle", Oracle(known, turn), o10)
+    plain, guided = calibrate(table, o10, asymmetric8), calibrate(table, o10, asymmetric8, initializer=initializer)
     assert guided.guess_used == used
-    assert guided.first_guess.name == "oracle"
-    assert plain.first_guess is None and not plain.guess_used
+    assert guided.initialization.name == "oracle"
+    assert plain.initialization is None and not plain.guess_used
     assert torch.allclose(guided.rig.focal_length, plain.rig.focal_length, atol=0.05)
 
 
@@ -127,8 +127,10 @@ class PerSnapshot(Oracle):
 def test_a_guess_is_judged_by_the_mean_rig_that_the_start_is_made_of(o10, asymmetric8):
     truth = simulate_truth(o10, asymmetric8, SNAPSHOTS, torch.Generator().manual_seed(2), PhysicalDrift())
     known = Prediction(truth.rig.expand(SNAPSHOTS), truth.rig_from_object)
-    result = calibrate(true_detections(truth), o10, asymmetric8, guesser=Guesser("oracle", PerSnapshot(known), o10))
-    assert result.first_guess.residual.abs().max() < 1e-6  # of each snapshot's own rig
+    result = calibrate(
+        true_detections(truth), o10, asymmetric8, initializer=Initializer("oracle", PerSnapshot(known), o10)
+    )
+    assert result.initialization.residual.abs().max() < 1e-6  # of each snapshot's own rig
     assert not result.guess_used
 
 
@@ -136,11 +138,11 @@ def test_a_symmetric_object_may_be_labelled_in_any_turn(o10):
     cube, generator = load_object("cube8"), torch.Generator().manual_seed(7)
     made = synthesize(o10, cube, SNAPSHOTS, generator, drift=RelativeDrift())
     sigma = torch.full(made.projection.visible.shape, 0.1, dtype=torch.float64)
-    guesser = load_guesser("points", o10, cube)
-    upright = guesser.guess(Observations(made.projection.uv, sigma, made.projection.visible), o10, cube)
+    initializer = load_initializer("points", o10, cube)
+    upright = initializer.guess(Observations(made.projection.uv, sigma, made.projection.visible), o10, cube)
     for motion in (cube.symmetries[5], cube.symmetries[17]):
         uv = made.projection.uv[:, :, motion.permutation]
-        turned = guesser.guess(Observations(uv, sigma, made.projection.visible), o10, cube)
+        turned = initializer.guess(Observations(uv, sigma, made.projection.visible), o10, cube)
         assert rms_length(turned.residual, made.projection.visible) < 1.0
         assert torch.allclose(turned.rig.focal_length, upright.rig.focal_length, atol=1e-3)
 
@@ -151,7 +153,7 @@ def test_some_cameras_in_any_order_are_enough(case, kind):
     keep = [9, 2, 4, 1]
     rig = factory.select(keep)
     some = Observations(observations.uv[:, keep], observations.sigma[:, keep], observations.seen[:, keep])
-    guess = load_guesser(kind, rig, obj).guess(some, rig, obj)
+    guess = load_initializer(kind, rig, obj).guess(some, rig, obj)
     assert guess.rig.camera_names == rig.camera_names
     assert rms_length(guess.residual, some.seen) < 4.0
     off = (guess.rig.focal_length - truth.rig.focal_length[0, keep]).abs().mean()
@@ -162,4 +164,4 @@ def test_a_camera_of_another_rig_is_refused(case):
     factory, obj, *_ = case
     stranger = replace(factory.select([0, 1, 2]), camera_names=("cam01", "cam02", "other"))
     with pytest.raises(InputError, match="no shipped network for rig O10"):
-        load_guesser("points", stranger, obj)
+        load_initializer("points", stranger, obj)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from imgcal.association.options import PipelineOptions
-from imgcal.association.series import label
+from imgcal.association.series import associate
 from imgcal.errors import RefusedError
 from imgcal.pipeline.calibration import calibrate, score
 from imgcal.pipeline.steadiness import moves_of
@@ -107,7 +107,7 @@ def test_a_camera_that_cannot_be_labelled_after_a_move_is_named_without_a_size()
     rig, obj, truth = damage.wand_in_a_room(30, 1)
     table = damage.blobs(truth, 1)
     mirrored = damage.mirrored(table, rig, CAMERA, "u")
-    first = damage.joined(table.select(table.snapshot < 18), mirrored.select(mirrored.snapshot >= 18))
+    first = damage.combine(table.select(table.snapshot < 18), mirrored.select(mirrored.snapshot >= 18))
     with pytest.raises(MovedError, match=r"cam04 moved before snapshot 00018:") as found:
         calibrate(first, rig, obj)
     assert found.value.moved[0].kind == "unknown" and found.value.moved[0].size is None
@@ -134,8 +134,8 @@ def test_a_steady_rig_is_left_alone(kind, fault):
         elif fault == "sigma":
             table.sigma[:] *= (0.2, 0.5, 2.0, 5.0)[seed]
         elif fault == "drift":
-            rig = rig.moved(3 * RigPrior().std(rig) * torch.from_numpy(draw.uniform(-1, 1, (10, 15))))
-        alarms += len(moves_of(label(table, rig, obj), rig, obj, PipelineOptions()))
+            rig = rig.retract(3 * RigPrior().std(rig) * torch.from_numpy(draw.uniform(-1, 1, (10, 15))))
+        alarms += len(moves_of(associate(table, rig, obj), rig, obj, PipelineOptions()))
     assert alarms == 0
 
 
@@ -150,7 +150,7 @@ def test_after_a_move_what_is_left_must_decide():
 def test_errors_of_the_lens_that_go_with_time_are_no_motion(seed):
     rig, obj, truth = damage.wand_in_a_room(35, seed)
     truth = damage.from_one_end_to_the_other(damage.with_lens_errors(truth, seed))
-    labelled = label(damage.blobs(truth, seed, labelled=True), rig, obj)
+    labelled = associate(damage.blobs(truth, seed, labelled=True), rig, obj)
     assert moves_of(labelled, rig, obj, PipelineOptions()) == ()
 
 
@@ -158,4 +158,4 @@ def test_a_camera_that_is_off_now_and_then_has_not_moved():
     rig, obj, truth = damage.wand_in_a_room(20, 1)
     table = damage.blobs(truth, labelled=True)
     table.uv[(table.camera == CAMERA) & (table.fiducial >= 0) & (table.snapshot % 5 == 0)] += (9.0, -7.0)
-    assert moves_of(label(table, rig, obj), rig, obj, PipelineOptions()) == ()
+    assert moves_of(associate(table, rig, obj), rig, obj, PipelineOptions()) == ()

@@ -21,7 +21,7 @@ class Scene:
 
     factory: CameraRig
     obj: CalibrationObject
-    spread: Tensor
+    prior_std: Tensor
     truth: Snapshots
 
     @classmethod
@@ -34,7 +34,7 @@ class Scene:
         """Disturb truth in all parameters, as a network would, until the reprojection error is about `error` px."""
         random = torch.Generator().manual_seed(seed)
         count = len(self.truth.rig.focal_length)
-        step = torch.randn(count, *self.spread.shape, generator=random, dtype=torch.float64) * self.spread
+        step = torch.randn(count, *self.prior_std.shape, generator=random, dtype=torch.float64) * self.prior_std
         turn, shift = torch.randn(2, count, 3, generator=random, dtype=torch.float64).unbind(0)
         pose, centroid = self.truth.rig_from_object, self.obj.points.mean(0)
         centre = pose.apply(centroid[None])[:, 0] if count else pose.translation
@@ -42,7 +42,9 @@ class Scene:
         def at(share: Tensor) -> Prediction:
             rotation = rotation_from_vector(0.03 * turn * share[:, None]) @ pose.rotation
             translation = centre + 15 * shift * share[:, None] - rotation @ centroid
-            return Prediction(self.truth.rig.moved(step * share[:, None, None]), RigidTransform(rotation, translation))
+            return Prediction(
+                self.truth.rig.retract(step * share[:, None, None]), RigidTransform(rotation, translation)
+            )
 
         share = torch.full((count,), 1e-3, dtype=torch.float64)
         for _ in range(4):

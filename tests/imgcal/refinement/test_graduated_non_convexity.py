@@ -5,14 +5,14 @@ import torch
 
 from imgcal.evaluation.metrics import errors
 from imgcal.refinement import as_prediction, refine_robustly
-from imgcal.refinement.graduated_non_convexity import Target, mended, robust_pose
+from imgcal.refinement.graduated_non_convexity import Target, robust_pose, undo_label_swaps
 from tests.imgcal.evaluation.conftest import disturbed
 
 
 def refined(some, scale=0.05, rows=slice(None)):
     given = some.given(rows)
-    guess = disturbed(some.truth, given.spread, scale)[rows]
-    return refine_robustly(guess, given.views, given.factory, given.obj, given.spread, sigma=given.sigma)
+    guess = disturbed(some.truth, given.prior_std, scale)[rows]
+    return refine_robustly(guess, given.views, given.factory, given.obj, given.prior_std, sigma=given.sigma)
 
 
 def re(prediction, some):
@@ -52,8 +52,8 @@ def test_a_rig_does_not_depend_on_the_others_of_its_batch(sample):
 def test_mending_undoes_swaps_where_the_prediction_is_good(sample):
     exact, swapped = sample(20), sample(20, swapped=0.5)
     given = swapped.given()
-    target = Target(given.uv, given.seen, given.factory, given.obj, given.spread, given.sigma)
-    points = mended(swapped.truth, target, 10.0)
+    target = Target(given.uv, given.seen, given.factory, given.obj, given.prior_std, given.sigma)
+    points = undo_label_swaps(swapped.truth, target, 10.0)
     assert not torch.equal(given.uv, exact.given().uv)
     assert torch.equal(points.uv, exact.given().uv)
     assert points.fits.all()
@@ -63,9 +63,9 @@ def test_mending_undoes_swaps_where_the_prediction_is_good(sample):
 def test_mending_gives_no_point_away_twice(sample):
     some = sample(20, noise=0.1, missing=0.3, swapped=0.5, false=0.2)
     given = some.given()
-    target = Target(given.uv, given.seen, given.factory, given.obj, given.spread, given.sigma)
+    target = Target(given.uv, given.seen, given.factory, given.obj, given.prior_std, given.sigma)
     for gate in (8.0, 1e3):
-        points = mended(some.truth, target, gate)
+        points = undo_label_swaps(some.truth, target, gate)
         assert not (points.fits & ~points.seen).any()
         for before, seen, after, left in zip(
             *(value.flatten(0, 1) for value in (given.uv, given.seen, points.uv, points.seen)), strict=True
@@ -106,7 +106,7 @@ def test_points_that_a_network_does_not_trust_count_little(sample):
     given = exact.given()
     errors_px = []
     for trust in (None, log_sigma):
-        guess = replace(disturbed(exact.truth, given.spread, 0.05), log_sigma=trust)
-        known = (replace(views, uv=uv), given.factory, given.obj, given.spread)
+        guess = replace(disturbed(exact.truth, given.prior_std, 0.05), log_sigma=trust)
+        known = (replace(views, uv=uv), given.factory, given.obj, given.prior_std)
         errors_px.append(re(refine_robustly(guess, *known, sigma=0.02), exact))
     assert (errors_px[1] < 0.5 * errors_px[0]).all()

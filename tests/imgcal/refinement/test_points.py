@@ -16,7 +16,7 @@ def found(estimate):
 def test_exact_points_leave_hardly_any_error(o10_scene, dtype):
     scene = o10_scene
     guess = scene.guess(5.0).to(dtype)
-    refined = refine_points(guess, Views(scene.truth.projection.uv), scene.factory, scene.obj, scene.spread, 0.01)
+    refined = refine_points(guess, Views(scene.truth.projection.uv), scene.factory, scene.obj, scene.prior_std, 0.01)
     assert bool(refined.converged.all()) and refined.rig.focal_length.dtype == torch.float64
     assert float(scene.error(found(refined)).max()) < 0.002
 
@@ -28,7 +28,7 @@ def test_swapped_labels_do_little_harm(o10_scene):
     for camera, first, second in ((1, 0, 3), (4, 2, 7), (7, 1, 5), (9, 6, 4)):
         swapped[:, camera, [first, second]] = uv[:, camera, [second, first]]
         right[:, camera, [first, second]] = False
-    given = scene.factory, scene.obj, scene.spread, 0.1
+    given = scene.factory, scene.obj, scene.prior_std, 0.1
     best = refine_points(scene.guess(5.0), Views(uv, right), *given)
     robust = refine_points(scene.guess(5.0), Views(swapped), *given)
     assert float(scene.error(found(robust)).mean()) < 1.3 * float(scene.error(found(best)).mean())
@@ -42,7 +42,9 @@ def test_weights_and_what_is_not_seen(o6_scene):
     seen = torch.ones(5, 6, 8, dtype=torch.bool)
     seen[:, 1, 5] = False
     options = EstimationOptions(loss="squared")
-    refined = refine_points(scene.guess(5.0), Views(uv, seen), scene.factory, scene.obj, scene.spread, sigma, options)
+    refined = refine_points(
+        scene.guess(5.0), Views(uv, seen), scene.factory, scene.obj, scene.prior_std, sigma, options
+    )
     assert float(scene.error(found(refined)).max()) < 0.05
 
 
@@ -58,7 +60,7 @@ def test_gradient_by_points_and_weights_equals_finite_differences(o6_scene, loss
     truth = scene.truth.projection.uv[:2]
 
     def error(uv, sigma):
-        refined = found(refine_points(guess, Views(uv), scene.factory, scene.obj, scene.spread, sigma, options))
+        refined = found(refine_points(guess, Views(uv), scene.factory, scene.obj, scene.prior_std, sigma, options))
         projected = refined.rig.project(refined.rig_from_object.apply(scene.obj.points)).uv
         return (projected - truth).square().sum()
 
@@ -76,7 +78,7 @@ def test_gradient_leaves_the_prediction_alone(o6_scene):
     focal = guess.rig.focal_length.clone().requires_grad_()
     guess = Prediction(replace(guess.rig, focal_length=focal), guess.rig_from_object)
     uv = scene.truth.projection.uv.clone().requires_grad_()
-    refined = refine_points(guess, Views(uv), scene.factory, scene.obj, scene.spread, 0.1)
+    refined = refine_points(guess, Views(uv), scene.factory, scene.obj, scene.prior_std, 0.1)
     refined.rig.focal_length.sum().backward()
     assert focal.grad is None and bool((uv.grad != 0).any())
 
@@ -85,5 +87,5 @@ def test_views_without_points_are_refused(o6_scene):
     scene = o6_scene
     with pytest.raises(ValueError, match="points"):
         refine_points(
-            scene.guess(3.0), Views(images=torch.zeros(5, 6, 3, 8, 8)), scene.factory, scene.obj, scene.spread, 0.1
+            scene.guess(3.0), Views(images=torch.zeros(5, 6, 3, 8, 8)), scene.factory, scene.obj, scene.prior_std, 0.1
         )

@@ -15,7 +15,7 @@ def found(refined):
 
 
 def refine(scene, guess, images, options=ImageRefinementOptions()):
-    return refine_images(guess, images, scene.factory, scene.obj, scene.spread, options)
+    return refine_images(guess, images, scene.factory, scene.obj, scene.prior_std, options)
 
 
 @pytest.mark.parametrize("start", [10.0, 40.0])
@@ -80,7 +80,7 @@ def test_rigs_and_cameras_do_not_depend_on_each_other(o6_scene):
         images[:, order],
         scene.factory.select(order),
         scene.obj,
-        scene.spread[order],
+        scene.prior_std[order],
     )
     torch.testing.assert_close(permuted.rig.focal_length, together.rig.focal_length[:, order], rtol=1e-6, atol=0)
 
@@ -94,8 +94,8 @@ def test_on_square_sensors_it_is_the_estimate_from_the_dots(o6_scene):
     truth = scene.truth.rig.resized(square).project(scene.truth.rig_from_object.apply(scene.obj.points))
     options = ImageRefinementOptions(image=ImageOptions(size=160, dot=1.3))
     images = render_views(truth.uv.float(), truth.visible, factory.image_size, scene.obj, options.image, quantise=True)
-    refined, observations = refine_images(guess, images, factory, scene.obj, scene.spread, options)
-    direct = estimate(observations, factory, scene.obj, refined.rig_from_object, spread=scene.spread)
+    refined, observations = refine_images(guess, images, factory, scene.obj, scene.prior_std, options)
+    direct = estimate(observations, factory, scene.obj, refined.rig_from_object, prior_std=scene.prior_std)
     torch.testing.assert_close(refined.rig.principal_point, direct.rig.principal_point, atol=1e-3, rtol=0)
     torch.testing.assert_close(camera_std(refined), camera_std(direct), rtol=1e-3, atol=1e-12)
     torch.testing.assert_close(refined.residual, direct.residual, atol=1e-4, rtol=0)

@@ -86,7 +86,7 @@ def calibrated(
     observations = Observations(uv, torch.full(seen.shape, SIGMA, dtype=torch.float64), seen)
     after = estimate(observations, factory, obj)
     fixed = torch.zeros(cameras, PARAMETERS, dtype=torch.float64)
-    before = estimate(observations, factory, obj, spread=fixed, options=EstimationOptions(loss="squared"))
+    before = estimate(observations, factory, obj, prior_std=fixed, options=EstimationOptions(loss="squared"))
     detections, labels, cell = _detections(observations, factory, clutter, generator)
     covariance = relative_covariance(after, 0)
     real = labels >= 0

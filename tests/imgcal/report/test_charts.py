@@ -51,9 +51,9 @@ def test_coverage_counts_fields(content: ReportContent) -> None:
     uv = d.uv.copy()
     rows = np.flatnonzero((d.camera == 2) & content.used)
     uv[rows] = np.stack((middle[np.arange(len(rows)) % 8], np.full(len(rows), 500.0)), axis=1)
-    spread = replace(content, detections=replace(d, uv=uv))
-    assert charts.covered_share(spread, 2) == 8 / 64
-    panel = str(charts.coverage_panel(spread, 2, charts.coverage_limits(spread)))
+    prior_std = replace(content, detections=replace(d, uv=uv))
+    assert charts.covered_share(prior_std, 2) == 8 / 64
+    panel = str(charts.coverage_panel(prior_std, 2, charts.coverage_limits(prior_std)))
     assert panel.count("h0") == int((d.camera == 2).sum())
 
 

@@ -47,7 +47,7 @@ def test_moved_and_undetermined_leave_out_the_reference(content: ReportContent) 
     std = np.ones((10, PARAMETERS))
     prior = np.full((10, PARAMETERS), 1.1)
     prior[4] = 10.0
-    changed = replace(content, recalibrated=content.factory.moved(step), std=std, prior_std=prior)
+    changed = replace(content, recalibrated=content.factory.retract(step), std=std, prior_std=prior)
     assert changed.moved.nonzero() == ([3], [6])
     expected = np.ones((10, PARAMETERS), dtype=bool)
     expected[4] = False
@@ -57,10 +57,10 @@ def test_moved_and_undetermined_leave_out_the_reference(content: ReportContent) 
 
 def test_prior_is_the_spread_of_sampled_rigs(content: ReportContent) -> None:
     factory, reference = content.factory, 2
-    spread = torch.full((10, PARAMETERS), 1e-3, dtype=torch.float64)
+    prior_std = torch.full((10, PARAMETERS), 1e-3, dtype=torch.float64)
     noise = torch.randn((4000, 10, PARAMETERS), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    sampled = relative_difference(factory.expand(4000).moved(noise * spread), factory, reference).std(0).numpy()
-    predicted = relative_prior_std(factory, reference, spread)
+    sampled = relative_difference(factory.expand(4000).retract(noise * prior_std), factory, reference).std(0).numpy()
+    predicted = relative_prior_std(factory, reference, prior_std)
     assert (predicted[reference, :6] == 0).all()
     np.testing.assert_allclose(sampled[reference, :6], 0, atol=1e-9)
     known = predicted > 0

@@ -34,7 +34,7 @@ def test_rows_show_changes_in_their_units(content: ReportContent) -> None:
     step[3, 0], step[3, 4], step[3, 6], step[3, 10] = np.radians(1.5), 2.0, 8.0, 0.004
     std = np.full((10, PARAMETERS), 0.05)
     std[:, :3], std[:, 10:] = np.radians(0.1), 1e-3
-    changed = replace(content, recalibrated=content.factory.moved(step), std=std)
+    changed = replace(content, recalibrated=content.factory.retract(step), std=std)
     row = camera_rows(changed)[3]
     cells = {(g[0], c.name): c for g, group in zip(GROUPS, row.groups, strict=True) for c in group}
     assert (cells["rotation (deg)", "x"].change, cells["rotation (deg)", "x"].std) == ("+1.50", "0.10")

@@ -21,7 +21,7 @@ def test_outline_of_a_sphere_lies_on_the_ellipse(o10):
     shapes = sphere_images(o10, points, radius)
     centres = o10.project(points, radius).uv
     in_cameras = o10.cam_from_rig.apply(points).numpy()
-    for camera in range(o10.cameras):
+    for camera in range(o10.num_cameras):
         alone = o10.select([camera])
         for n in range(3):
             ring = torch.from_numpy(outline(in_cameras[camera, n], float(radius[n])))

@@ -131,7 +131,7 @@ def test_bfloat16_is_for_parameters_only(made, tmp_path):
     save_network(path, network, experiment, {}, dtype=torch.bfloat16)
     tensors, _ = read_tensors(path, FORMAT)
     assert tensors["trunk.0.weight"].dtype == torch.bfloat16
-    assert torch.equal(tensors["spread"], network.spread)
+    assert torch.equal(tensors["prior_std"], network.prior_std)
     found = load_network(path)
     assert {tensor.dtype for tensor in found.state_dict().values()} == {torch.float32}
     torch.testing.assert_close(found.trunk[0].weight, network.trunk[0].weight, rtol=2**-8, atol=0.0)
@@ -159,10 +159,10 @@ def test_another_factory_value_is_refused_by_camera(path):
     step = torch.zeros(4, 15, dtype=torch.float64)
     step[1, 4] = 0.5
     with pytest.raises(InputError, match="position of cam02"):
-        load_network(path, rig.moved(step))
+        load_network(path, rig.retract(step))
     step[1, 4], step[3, 0] = 0.0, 1e-4
     with pytest.raises(InputError, match="rotation of cam04"):
-        load_network(path, rig.moved(step))
+        load_network(path, rig.retract(step))
     load_network(path, replace(rig, name="another name"))
 
 
@@ -228,11 +228,11 @@ def test_other_versions_and_kinds_are_refused(path, tmp_path):
 def test_warm_start_takes_what_fits(made, path, experiment):
     wider = experiment("rig=O10")
     network = build_network(wider, wider.load_rig(), wider.load_object())
-    spread, trunk = network.spread.clone(), network.trunk[0].weight.clone()
+    prior_std, trunk = network.prior_std.clone(), network.trunk[0].weight.clone()
     assert warm_start(path, network) == ("trunk.0.weight", "head.weight", "head.bias")
     assert torch.equal(network.trunk[0].bias, made[1].trunk[0].bias)
     assert torch.equal(network.trunk[0].weight, trunk)
-    assert torch.equal(network.spread, spread)  # buffers belong to the new rig and drift
+    assert torch.equal(network.prior_std, prior_std)  # buffers belong to the new rig and drift
     with pytest.raises(InputError, match="no parameter that fits"):
         warm_start(path, torch.nn.Linear(3, 4))
 

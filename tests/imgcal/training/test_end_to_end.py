@@ -29,11 +29,11 @@ def test_weights_learn_to_leave_outliers_out(source):
     wrong = torch.rand(batch.views.seen.shape, generator=generator) < 0.1
     batch.views.uv[wrong] += torch.tensor([0.5, -0.5])
     log_sigma = torch.zeros(wrong.shape, requires_grad=True)
-    spread = source.drift.std(source.factory)
+    prior_std = source.drift.std(source.factory)
 
     def loss():
         prediction = Prediction(batch.truth.rig, batch.truth.rig_from_object, log_sigma)
-        return refined_loss(prediction, batch, source, spread, CONFIG)
+        return refined_loss(prediction, batch, source, prior_std, CONFIG)
 
     before = loss()
     before.backward()

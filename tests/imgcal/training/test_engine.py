@@ -70,7 +70,7 @@ def test_the_refined_loss_is_minimized_with_the_others_and_logged(experiment, tm
     run = train(setup, tmp_path / "more")
     plain, more = (read_metrics(tmp_path / name / "metrics.jsonl")[0]["loss"] for name in ("plain", "more"))
     assert more - plain == pytest.approx(sign * 1e6, rel=1e-6)  # the untrained toy has the factory's focal lengths
-    steps = run.plain.head.bias.detach()[:-9].unflatten(0, (run.source.factory.cameras, -1))[:, 6:8]
+    steps = run.plain.head.bias.detach()[:-9].unflatten(0, (run.source.factory.num_cameras, -1))[:, 6:8]
     assert (steps * sign < 0).all()
 
 
@@ -199,7 +199,7 @@ def test_a_warm_start(experiment, tmp_path, capsys):
     warm = setup.training.model_copy(update={"init_from": str(tmp_path / "a" / RESULT)})
     run = train(setup.model_copy(update={"training": warm}), tmp_path / "b")
     torch.testing.assert_close(run.plain.head.weight.detach(), weights(tmp_path / "a")["head.weight"])
-    torch.testing.assert_close(run.plain.spread, setup.drift.std(setup.load_rig()).float())
+    torch.testing.assert_close(run.plain.prior_std, setup.drift.std(setup.load_rig()).float())
 
 
 def test_images_and_bf16(experiment, tmp_path, monkeypatch):
@@ -221,7 +221,7 @@ def test_bf16_stays_out_of_the_errors(experiment, tmp_path):
         def forward(self, views):
             return (batch.truth,)
 
-    assert engine.evaluate(Oracle(), [batch], run.source.obj, run.experiment).max() < 1e-3
+    assert engine.validation_errors(Oracle(), [batch], run.source.obj, run.experiment).max() < 1e-3
 
 
 def test_images_for_a_point_network_are_an_error(experiment, tmp_path):

@@ -16,8 +16,8 @@ def test_what_is_not_given_has_a_default(experiment):
     assert made.loss.kind == "robust"
     assert made.poses == PoseRange.overhead()
     assert made.drift == RelativeDrift(0.01, 0.01)
-    assert made.load_rig().cameras == 4
-    assert made.load_object().fiducials == 8
+    assert made.load_rig().num_cameras == 4
+    assert made.load_object().num_fiducials == 8
 
 
 def test_a_resolved_experiment_is_the_same(experiment, tmp_path):

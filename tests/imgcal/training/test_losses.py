@@ -41,33 +41,33 @@ def truth(o10, asymmetric8) -> Prediction:
 
 
 @pytest.fixture(scope="module")
-def spread(o10):
+def prior_std(o10):
     return DRIFT.std(o10)
 
 
 def off_by(truth: Prediction, step: torch.Tensor) -> Prediction:
-    return replace(truth, rig=truth.rig.moved(step))
+    return replace(truth, rig=truth.rig.retract(step))
 
 
-def steps(spread, seed=2):
-    return torch.randn(B, C, PARAMETERS, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * spread
+def steps(prior_std, seed=2):
+    return torch.randn(B, C, PARAMETERS, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * prior_std
 
 
 KINDS = [LossConfig(), LossConfig(kind="paper", paper=PaperLoss(reprojection_from=0))]
 
 
 @pytest.mark.parametrize("config", KINDS, ids=["robust", "paper"])
-def test_the_truth_costs_nothing_and_has_a_finite_gradient(truth, spread, asymmetric8, config):
+def test_the_truth_costs_nothing_and_has_a_finite_gradient(truth, prior_std, asymmetric8, config):
     step = torch.zeros(B, C, PARAMETERS, dtype=torch.float64, requires_grad=True)
-    loss = compound([off_by(truth, step)], truth, asymmetric8, config, 0, spread)
+    loss = compound([off_by(truth, step)], truth, asymmetric8, config, 0, prior_std)
     loss.total.backward()
     assert loss.total < 1e-5
     assert loss.re.shape == (B,) and loss.re.max() < 1e-6
     assert step.grad.isfinite().all()
 
 
-def test_the_reprojection_gradient_reaches_every_parameter(truth, spread, asymmetric8):
-    step = steps(spread).requires_grad_()
+def test_the_reprojection_gradient_reaches_every_parameter(truth, prior_std, asymmetric8):
+    step = steps(prior_std).requires_grad_()
     difference = project_fiducials(off_by(truth, step).cameras_from_object, asymmetric8) - project_fiducials(
         truth.cameras_from_object, asymmetric8
     )
@@ -108,13 +108,13 @@ def test_re_is_the_mean_over_axes_cameras_and_fiducials():
     torch.testing.assert_close(reprojection_rmse(difference), expected.square().mean().sqrt())
 
 
-def test_gradcheck(truth, spread, asymmetric8):
+def test_gradcheck(truth, prior_std, asymmetric8):
     part = replace(truth, rig=truth.rig[:2], rig_from_object=truth.rig_from_object[:2])
 
     def total(step, config):
-        return compound([off_by(part, step), off_by(part, 0.5 * step)], part, asymmetric8, config, 0, spread).total
+        return compound([off_by(part, step), off_by(part, 0.5 * step)], part, asymmetric8, config, 0, prior_std).total
 
-    step = steps(spread)[:2].requires_grad_()
+    step = steps(prior_std)[:2].requires_grad_()
     for config in KINDS:
         assert torch.autograd.gradcheck(lambda s, c=config: total(s, c), step, eps=1e-7, atol=1e-3, rtol=1e-4)
 
@@ -149,17 +149,17 @@ def test_log_cosh_is_that(truth):
     assert log_cosh(far, cameras).isfinite()
 
 
-def test_offsets_are_in_units_of_the_spread(truth, spread):
-    free = spread > spread.new_tensor(LEAST_SPREAD)
+def test_offsets_are_in_units_of_the_spread(truth, prior_std):
+    free = prior_std > prior_std.new_tensor(LEAST_SPREAD)
     assert not free.all() and free.any()  # the ring's cameras have positions of about zero along z: no drift there
-    step = (2.0 * spread * free).expand(B, -1, -1)
+    step = (2.0 * prior_std * free).expand(B, -1, -1)
     torch.testing.assert_close(
-        offsets_error(truth.rig.moved(step), truth.rig, spread, limit=10.0), torch.full((B,), 4.0).double()
+        offsets_error(truth.rig.retract(step), truth.rig, prior_std, limit=10.0), torch.full((B,), 4.0).double()
     )
-    assert offsets_error(truth.rig.moved(50 * step), truth.rig, spread, limit=3.0).max() <= 9.0
+    assert offsets_error(truth.rig.retract(50 * step), truth.rig, prior_std, limit=3.0).max() <= 9.0
     fixed = (~free).double().expand(B, -1, -1)
-    assert offsets_error(truth.rig.moved(fixed), truth.rig, spread, limit=10.0).max() < 1e-12
-    assert (offsets_error(truth.rig, truth.rig, torch.zeros_like(spread), limit=10.0) == 0).all()
+    assert offsets_error(truth.rig.retract(fixed), truth.rig, prior_std, limit=10.0).max() < 1e-12
+    assert (offsets_error(truth.rig, truth.rig, torch.zeros_like(prior_std), limit=10.0) == 0).all()
 
 
 def test_regularizers(truth):
@@ -177,19 +177,19 @@ def test_regularizers(truth):
     assert l1_norm([torch.tensor([1.0, -2.0]), torch.tensor([[3.0]])]).item() == 6.0
 
 
-def test_every_extra_term_counts(truth, spread, asymmetric8):
-    prediction, weights = off_by(truth, steps(spread)), [torch.ones(4, requires_grad=True)]
+def test_every_extra_term_counts(truth, prior_std, asymmetric8):
+    prediction, weights = off_by(truth, steps(prior_std)), [torch.ones(4, requires_grad=True)]
 
     def total(**extra):
         config = LossConfig(extra=ExtraLoss(**extra))
-        return compound([prediction], truth, asymmetric8, config, 0, spread, weights).total.item()
+        return compound([prediction], truth, asymmetric8, config, 0, prior_std, weights).total.item()
 
     plain = total()
     for name in ExtraLoss.model_fields:
         assert total(**{name: 1.0}) > plain
 
 
-def test_the_paper_begins_without_pixels_and_adds_their_rmse_in_its_second_stage(truth, spread, asymmetric8):
+def test_the_paper_begins_without_pixels_and_adds_their_rmse_in_its_second_stage(truth, prior_std, asymmetric8):
     """Principal points that are 3 and 4 px off move every fiducial by that, wherever it is."""
     shift = torch.tensor([3.0, 4.0], dtype=torch.float64)
     prediction = replace(truth, rig=replace(truth.rig, principal_point=truth.rig.principal_point + shift))
@@ -197,7 +197,7 @@ def test_the_paper_begins_without_pixels_and_adds_their_rmse_in_its_second_stage
 
     def total(step, obj=asymmetric8, weight=0.01):
         paper = PaperLoss(reprojection_from=100, lambda2=weight)
-        return compound([prediction], truth, obj, LossConfig(kind="paper", paper=paper), step, spread).total.item()
+        return compound([prediction], truth, obj, LossConfig(kind="paper", paper=paper), step, prior_std).total.item()
 
     first = total(0)
     assert first > 0
@@ -207,12 +207,12 @@ def test_the_paper_begins_without_pixels_and_adds_their_rmse_in_its_second_stage
         assert total(100, weight=weight) - first == pytest.approx(weight * math.sqrt((3**2 + 4**2) / 2))
 
 
-def test_later_passes_weigh_more(truth, spread, asymmetric8):
-    bad, good = off_by(truth, steps(spread)), off_by(truth, 0.01 * steps(spread))
+def test_later_passes_weigh_more(truth, prior_std, asymmetric8):
+    bad, good = off_by(truth, steps(prior_std)), off_by(truth, 0.01 * steps(prior_std))
     config = LossConfig(robust=RobustLoss(gamma=0.5))
 
     def total(*passes):
-        return compound(passes, truth, asymmetric8, config, 0, spread)
+        return compound(passes, truth, asymmetric8, config, 0, prior_std)
 
     one, other = total(bad).total, total(good).total
     torch.testing.assert_close(total(bad, good).total, 0.5 * one + other)
@@ -220,21 +220,21 @@ def test_later_passes_weigh_more(truth, spread, asymmetric8):
 
 
 @pytest.mark.parametrize("config", KINDS, ids=["robust", "paper"])
-def test_wild_predictions_keep_loss_and_gradient_finite_in_float32(truth, spread, asymmetric8, config):
+def test_wild_predictions_keep_loss_and_gradient_finite_in_float32(truth, prior_std, asymmetric8, config):
     single = Prediction(truth.rig.to(torch.float32), truth.rig_from_object.to(torch.float32))
     for scale in (1e2, 1e5):
-        step = (scale * steps(spread)).float().requires_grad_()
-        loss = compound([off_by(single, step)], single, asymmetric8, config, 0, spread.float())
+        step = (scale * steps(prior_std)).float().requires_grad_()
+        loss = compound([off_by(single, step)], single, asymmetric8, config, 0, prior_std.float())
         loss.total.backward()
         assert loss.total.isfinite()
         assert step.grad.isfinite().all()
 
 
-def test_geometry_stays_in_float32_under_autocast(truth, spread, asymmetric8):
+def test_geometry_stays_in_float32_under_autocast(truth, prior_std, asymmetric8):
     single = Prediction(truth.rig.to(torch.float32), truth.rig_from_object.to(torch.float32))
-    prediction = off_by(single, 1e-3 * steps(spread).float())
-    expected = compound([prediction], single, asymmetric8, LossConfig(), 0, spread.float())
+    prediction = off_by(single, 1e-3 * steps(prior_std).float())
+    expected = compound([prediction], single, asymmetric8, LossConfig(), 0, prior_std.float())
     with torch.autocast("cpu", torch.bfloat16):
-        found = compound([prediction], single, asymmetric8, LossConfig(), 0, spread.float())
+        found = compound([prediction], single, asymmetric8, LossConfig(), 0, prior_std.float())
     assert found.re.dtype == torch.float32
     torch.testing.assert_close(found.re, expected.re)

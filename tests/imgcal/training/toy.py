@@ -43,10 +43,12 @@ class Toy(nn.Module):
     def __init__(self, config, factory, obj, drift_std):
         super().__init__()
         self.config, self.factory, self.obj = config, factory, obj
-        self.register_buffer("spread", drift_std)
-        inputs = factory.cameras * obj.fiducials * 2 if self.image_options is None else factory.cameras * 3 * 4
+        self.register_buffer("prior_std", drift_std)
+        inputs = (
+            factory.num_cameras * obj.num_fiducials * 2 if self.image_options is None else factory.num_cameras * 3 * 4
+        )
         self.trunk = nn.Sequential(nn.Linear(inputs, self.width), nn.Tanh(), nn.Dropout(0.1))
-        self.head = nn.Linear(self.width, factory.cameras * PARAMETERS + 9)
+        self.head = nn.Linear(self.width, factory.num_cameras * PARAMETERS + 9)
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)
 
@@ -62,10 +64,10 @@ class Toy(nn.Module):
 
     @torch.autocast("cpu", enabled=False)
     def decoded(self, numbers):
-        steps = numbers[:, :-9].unflatten(1, (self.factory.cameras, PARAMETERS)) * self.spread
+        steps = numbers[:, :-9].unflatten(1, (self.factory.num_cameras, PARAMETERS)) * self.prior_std
         sixd = numbers[:, -9:-3] + numbers.new_tensor([1.0, 0, 0, 0, -1, 0])
         shift = 10 * numbers[:, -3:] + numbers.new_tensor([0, 0, self.factory.working_distance])
-        rig = self.factory.expand(len(numbers)).moved(steps)
+        rig = self.factory.expand(len(numbers)).retract(steps)
         return Prediction(rig, RigidTransform(rotation_from_6d(sixd), shift))
 
 

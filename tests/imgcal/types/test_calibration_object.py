@@ -11,7 +11,7 @@ from torch import Tensor
 
 from imgcal.errors import InputError
 from imgcal.io import load_object
-from imgcal.types.calibration_object import CalibrationObject, SelfMotion
+from imgcal.types.calibration_object import CalibrationObject, Symmetry
 
 
 def body(points: Tensor, radius: Tensor | None = None) -> CalibrationObject:
@@ -47,7 +47,7 @@ def test_symmetries_do_not_depend_on_where_the_body_is(seed: int) -> None:
     assert len(body(shuffled).symmetries) == 24
 
 
-def check(obj: CalibrationObject, motion: SelfMotion, tolerance: float) -> None:
+def check(obj: CalibrationObject, motion: Symmetry, tolerance: float) -> None:
     points = obj.points.numpy()
     np.testing.assert_allclose(motion.rotation @ motion.rotation.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(motion.rotation) == pytest.approx(1)
@@ -110,4 +110,4 @@ def test_unusable_objects_say_why() -> None:
     line = body(torch.tensor([[float(i), 2.0 * i, 0] for i in range(5)]))
     with pytest.raises(InputError, match="one line"):
         _ = line.symmetries
-    assert replace(line, points=TETRAHEDRON.double()).fiducials == 4
+    assert replace(line, points=TETRAHEDRON.double()).num_fiducials == 4

@@ -31,7 +31,7 @@ def test_blobs_that_cannot_be_are_named(name, value, scene):
 
 def test_observations_with_a_sigma_that_cannot_be_are_named(scene):
     rig, obj, detections = scene
-    shape = (2, rig.cameras, obj.fiducials)
+    shape = (2, rig.num_cameras, obj.num_fiducials)
     uv = torch.from_numpy(detections.uv).reshape(*shape, 2)
     for sigma in (0.0, -0.1):
         seen, sigmas = torch.ones(shape, dtype=torch.bool), torch.full(shape, 0.1, dtype=uv.dtype)

@@ -61,9 +61,9 @@ def test_packing_follows_the_paper(o10: CameraRig) -> None:
 @pytest.mark.parametrize("batch", SHAPES)
 def test_difference_inverts_moved(o10: CameraRig, batch: tuple[int, ...]) -> None:
     step = torch.rand(*batch, 10, PARAMETERS, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    moved = o10.moved(step)
+    moved = o10.retract(step)
     assert moved.batch_shape == batch
-    torch.testing.assert_close(moved.difference(o10), step)
+    torch.testing.assert_close(moved.local(o10), step)
     torch.testing.assert_close(moved.cam_from_rig.inverse().translation, moved.positions)
 
 
@@ -72,7 +72,7 @@ def test_parameter_order(o10: CameraRig, name: str, index: int) -> None:
     assert PARAMETER_NAMES[index] == name
     step = torch.zeros(10, PARAMETERS, dtype=torch.float64)
     step[:, index] = 0.01
-    moved = o10.moved(step)
+    moved = o10.retract(step)
     if name == "rotation_y":
         turn = rotation_from_euler(torch.tensor([0, 0.01, 0], dtype=torch.float64))
         torch.testing.assert_close(moved.cam_from_rig.rotation, turn @ o10.cam_from_rig.rotation)
@@ -112,7 +112,7 @@ def test_project_gradcheck(o10: CameraRig, asymmetric8: CalibrationObject) -> No
     step = torch.zeros(2, 3, PARAMETERS, dtype=torch.float64, requires_grad=True)
     points = poses(2).apply(asymmetric8.points).detach().requires_grad_()
     rig = o10.select([0, 4, 7])
-    assert torch.autograd.gradcheck(lambda s, p: rig.moved(s).project(p).uv / 1000, (step, points), atol=1e-6)
+    assert torch.autograd.gradcheck(lambda s, p: rig.retract(s).project(p).uv / 1000, (step, points), atol=1e-6)
 
 
 def test_resizing_keeps_pixel_centres(o10: CameraRig, asymmetric8: CalibrationObject) -> None:
@@ -158,4 +158,4 @@ def test_prior_standard_deviations(o10: CameraRig) -> None:
 
 def test_drifted_rigs_differ(o10: CameraRig, asymmetric8: CalibrationObject) -> None:
     snapshots = synthesize(o10, asymmetric8, 2, torch.Generator().manual_seed(0))
-    assert (snapshots.rig[0].difference(snapshots.rig[1]).abs().amax(0) > 0).sum() >= 12
+    assert (snapshots.rig[0].local(snapshots.rig[1]).abs().amax(0) > 0).sum() >= 12
