@@ -15,8 +15,8 @@ from .covariance import (
 )
 from .gauge import aligned
 from .levenberg_marquardt import Solution
-from .linearization import POSE_PARAMETERS, NormalEquations, Problem, State, linearize, retract, pose_at, rig_at
-from .map_estimate import Estimate, EstimationOptions, make_estimate, estimate, make_loss, make_problem, initial_state
+from .linearization import POSE_PARAMETERS, NormalEquations, Problem, State, linearize, pose_at, retract, rig_at
+from .map_estimate import Estimate, EstimationOptions, estimate, initial_state, make_estimate, make_loss, make_problem
 from .moves import find_moves
 from .object_shape import SNAPSHOTS_TO_BEND, FiducialOffset, ShapeEvidence, offsets
 from .pose_initialization import initial_pose
@@ -51,18 +51,18 @@ __all__ = [
     "block_scatter",
     "camera_covariance",
     "camera_std",
-    "make_estimate",
     "estimate",
+    "estimate_variance_components",
     "find_moves",
     "flat_std",
     "initial_pose",
+    "initial_state",
     "inverse_or_zero",
     "linearize",
     "lm_cpu",
+    "make_estimate",
     "make_loss",
     "make_problem",
-    "initial_state",
-    "retract",
     "object_covariance",
     "offsets",
     "pixel_jacobian",
@@ -73,8 +73,8 @@ __all__ = [
     "relative_difference",
     "relative_jacobian",
     "require_poses",
+    "retract",
     "rig_at",
-    "estimate_variance_components",
     "squared",
     "whitened_covariance",
 ]
