@@ -16,14 +16,23 @@ from .covariance import (
 from .gauge import aligned
 from .levenberg_marquardt import Solution
 from .linearization import POSE_PARAMETERS, NormalEquations, Problem, State, linearize, pose_at, retract, rig_at
-from .map_estimate import Estimate, EstimationOptions, estimate, initial_state, make_estimate, make_loss, make_problem
+from .map_estimate import (
+    Estimate,
+    EstimationOptions,
+    estimate,
+    initial_state,
+    make_estimate,
+    make_loss,
+    make_problem,
+    minimize,
+)
 from .moves import find_moves
 from .object_shape import SNAPSHOTS_TO_BEND, FiducialOffset, ShapeEvidence, offsets
 from .pose_initialization import initial_pose
 from .pose_support import ON_A_LINE, UndeterminedPosesError, require_poses
 from .rig_uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian
 from .robust_losses import squared
-from .variance_components import BENT, estimate_variance_components
+from .variance_components import BENT, ObjectQuestion, Start, estimate_variance_components
 
 __all__ = [
     "BENT",
@@ -39,11 +48,13 @@ __all__ = [
     "EstimationOptions",
     "FiducialOffset",
     "NormalEquations",
+    "ObjectQuestion",
     "PredictedError",
     "Problem",
     "RigUncertainty",
     "ShapeEvidence",
     "Solution",
+    "Start",
     "State",
     "UndeterminedPosesError",
     "WorkingVolume",
@@ -63,6 +74,7 @@ __all__ = [
     "make_estimate",
     "make_loss",
     "make_problem",
+    "minimize",
     "object_covariance",
     "offsets",
     "pixel_jacobian",

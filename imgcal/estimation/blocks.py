@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from imgcal.estimation.covariance import whitened_covariance
 from imgcal.estimation.levenberg_marquardt import Solution
 from imgcal.estimation.linearization import Problem
 from imgcal.estimation.map_estimate import equations_by_snapshot
@@ -43,18 +44,18 @@ class BlockScatter:
     length: int = 0  # snapshots in a block, where they scatter most; 0 = no more than the noise makes them
 
 
-def block_scatter(problem: Problem, solution: Solution, covariance: Tensor, loss: NamedLoss) -> BlockScatter:
+def block_scatter(problem: Problem, solution: Solution, loss: NamedLoss) -> BlockScatter:
     """Measure the scatter for one rig, B = 1.
 
     Args:
         problem: given, snapshots in the order of time.
         solution: the minimum.
-        covariance: (15 C, 15 C) of the whitened offsets, by the information.
         loss: of the fit.
     """
     snapshots, cameras = problem.uv.shape[1:3]
     if snapshots < LEAST_BLOCKS:
         return BlockScatter()
+    covariance = whitened_covariance(solution)[0]
     equations = equations_by_snapshot(problem, solution.state, loss)
     pull = (solution.state.offset - equations.camera_gradient).flatten(1)  # the prior's own pull taken out
     influence = (pull - pull.mean(0)) @ covariance  # (S, 15 C)

@@ -15,7 +15,8 @@ from functools import cached_property
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.linalg import cho_solve, solve_triangular
+from scipy.special import chdtrc, chdtri
 
 from imgcal.estimation.linearization import Problem, State
 from imgcal.estimation.map_estimate import equations_by_snapshot
@@ -71,6 +72,11 @@ class Blocks:
         return total
 
     @cached_property
+    def _factor(self) -> Array:
+        """Lower factor of the information."""
+        return np.asarray(np.linalg.cholesky(self.information))
+
+    @cached_property
     def covariance(self) -> Array:
         """Of all cameras' whitened values: (15 V, 15 V)."""
         return np.asarray(np.linalg.inv(self.information), dtype=np.float64)
@@ -80,7 +86,8 @@ class Blocks:
         """Newton's step of all cameras' values: (15 V,)."""
         gradient = self.gradient.sum(0) + self.prior
         tall = self.coupling.reshape(-1, self.prior.size)
-        return self.covariance @ (gradient.ravel() - self.pull.ravel() @ tall)
+        right = gradient.ravel() - self.pull.ravel() @ tall
+        return np.asarray(cho_solve((self._factor, True), right, check_finite=False))
 
     def statistics(self, cameras: Sequence[int], rows: NDArray[np.int64]) -> Array:
         """Score statistics of steps of some cameras before each of some snapshots, in increasing order: (R, K)."""
@@ -99,8 +106,9 @@ class Blocks:
         blocks = cross.reshape(blocks.shape)
         inner = blocks[:, number, :, chosen, :STEP].swapaxes(0, 1)  # (R, K, 8, 8)
         gradient = (score - cross @ self.downhill).reshape(*inner.shape[:3], 1)
-        known = (cross.reshape(-1, size) @ self.covariance).reshape(*inner.shape[:3], size)
-        information = inner - known @ blocks.reshape(known.shape).swapaxes(-1, -2)
+        half = solve_triangular(self._factor, cross.reshape(-1, size).T, lower=True, check_finite=False)
+        known = half.T.reshape(*inner.shape[:3], size)
+        information = inner - known @ known.swapaxes(-1, -2)
         information += np.eye(STEP) / WIDEST_STEP**2
         return (gradient * np.linalg.solve(information, gradient)).sum((-2, -1))
 
@@ -206,14 +214,14 @@ def dispersion(blocks: Blocks, seen: NDArray[np.bool_]) -> float:
         if len(rows):
             few = rows[np.unique(np.linspace(0, len(rows) - 1, 16).astype(int))]
             found.append(blocks.statistics([camera], few))
-    return max(1.0, float(np.median(np.concatenate(found))) / float(chi2.median(STEP))) if found else 1.0
+    return max(1.0, float(np.median(np.concatenate(found))) / float(chdtri(STEP, 0.5))) if found else 1.0
 
 
 def least_significant(candidates: int, error: float) -> float:
     """Statistic from which `is_significant` holds."""
-    return float(chi2.isf(error / max(candidates, 1), STEP))
+    return float(chdtri(STEP, error / max(candidates, 1)))
 
 
 def is_significant(statistic: float, candidates: int, error: float) -> bool:
     """Tell whether a statistic is larger than chance makes the largest of so many, but for an error probability."""
-    return candidates * float(chi2.sf(statistic, STEP)) < error
+    return candidates * float(chdtrc(STEP, statistic)) < error

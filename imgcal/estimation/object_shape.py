@@ -14,8 +14,7 @@ from functools import cached_property
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.stats import f as fisher
-from scipy.stats import norm
+from scipy.special import fdtrc, ndtri
 
 from imgcal.estimation.covariance import object_covariance
 from imgcal.estimation.levenberg_marquardt import Solution, factorize
@@ -82,7 +81,7 @@ class ShapeEvidence:
         _, log_det = np.linalg.slogdet(covariance)
         return -0.5 * float(displacement @ np.linalg.solve(covariance, displacement) + log_det)
 
-    @property
+    @cached_property
     def scale_error(self) -> tuple[float, float]:
         """Relative scale of the object that explains the data best, less one, and its standard deviation."""
         scale = self.points.ravel()
@@ -108,17 +107,24 @@ class ShapeEvidence:
             Zero for an object of more than `MOST_FIDUCIALS`: what is left of a lens that the model does not know looks
             like a deformed grid, too.
         """
-        if len(self.places) > MOST_FIDUCIALS:
+        ratio, mine, rest = self._ratio
+        if mine <= 0 or rest <= 0:
             return 0.0
+        return -float(ndtri(max(fdtrc(mine, rest, max(ratio / scatter, 0.0)), 1e-300)))
+
+    @cached_property
+    def _ratio(self) -> tuple[float, float, float]:
+        """F statistic of `bent_sigma` where snapshots agree, and its degrees of freedom."""
+        if len(self.places) > MOST_FIDUCIALS:
+            return 0.0, 0.0, 0.0
         _, displacement, precision = self._determined
         error, deviation = self.scale_error
         explained = float(displacement @ precision @ displacement) - (error / deviation) ** 2
         mine, rest = len(displacement) - int(np.isfinite(deviation)), self.freedom - len(displacement)
         if mine <= 0 or rest <= 0:
-            return 0.0
+            return 0.0, mine, rest
         left = max(self.chi2 - explained, 1e-12 * self.chi2) / rest
-        ratio = explained / (mine * left * scatter)
-        return float(norm.isf(max(fisher.sf(ratio, mine, rest), 1e-300)))
+        return explained / (mine * left), mine, rest
 
 
 def shape_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> ShapeEvidence | None:

@@ -8,18 +8,26 @@ Source: object-space error of Lu, Hager and Mjolsness (PAMI 2000), generalized c
 2008), quadratic form in the rotation entries as in SQPnP (Terzakis and Lourakis, ECCV 2020).
 """
 
+# Compiled functions take their types from their arguments.
+# ruff: noqa: ANN001, ANN202
+# mypy: allow-untyped-defs, no-check-untyped-defs
+
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from imgcal.geometry import RigidTransform, rotation_from_vector, undistort
+from imgcal.geometry import RigidTransform, kernels, rotation_from_vector, undistort
 from imgcal.types import CalibrationObject, CameraRig, Observations
+from renderers.compiling import njit
 
 STARTS = 8
+AT_REST = 1e-9
+"""Radians: a step that shows that a rotation is where it belongs."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +64,9 @@ def initial_pose(
     form = _quadratic_form(rays, origins, seen, centred)
     starts = torch.as_tensor(Rotation.create_group("I").as_matrix(), dtype=rays.dtype, device=rays.device)
     promising = _cost(form, starts.expand(len(rays), -1, -1, -1)).topk(STARTS, largest=False).indices
-    rotation = _minimize_on_rotations(form, starts[promising], iterations)  # (P, M, 3, 3)
+    plain = rays.device.type == "cpu" and not (torch.is_grad_enabled() and rays.requires_grad)
+    minimized = _minimize_cpu if plain else _minimize_on_rotations
+    rotation = minimized(form, starts[promising], iterations)  # (P, M, 3, 3)
 
     entries, cost = rotation.flatten(-2), _cost(form, rotation)
     translation = form.translation_constant[:, None] - entries @ form.translation_slope.mT
@@ -131,6 +141,80 @@ def _minimize_on_rotations(form: _QuadraticForm, rotation: Tensor, iterations: i
         step = step * (0.7 / length.clamp_min(0.7))
         rotation = rotation_from_vector(-step) @ rotation
     return rotation
+
+
+def _minimize_cpu(form: _QuadraticForm, rotation: Tensor, iterations: int) -> Tensor:
+    """Do the work of `_minimize_on_rotations` for tensors on the CPU, without gradients."""
+    result = rotation.double().contiguous()
+    matrix, vector = (part.detach().double().contiguous().numpy() for part in (form.matrix, form.vector))
+    _minimize_each(matrix, vector, result.numpy(), iterations)
+    return result.to(rotation.dtype)
+
+
+@njit(fastmath=kernels.FAST)
+def _minimize_each(matrix, vector, rotation, iterations):
+    """Overwrite rotations (P, M, 3, 3) by what minimizes their form: (P, 9, 9), (P, 9)."""
+    tangent, pulled, right = np.zeros((3, 9)), np.empty((4, 9)), np.empty(3)
+    square, turned, left, old = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    step = np.empty(3)
+    for p in range(rotation.shape[0]):
+        trace = 0.0
+        for i in range(9):
+            trace += matrix[p, i, i] / 9
+        for m in range(rotation.shape[1]):
+            now = rotation[p, m]
+            for _ in range(iterations):
+                for axis in range(3):
+                    j, k = (axis + 1) % 3, (axis + 2) % 3
+                    for i in range(3):
+                        tangent[axis, 3 * k + i] = now[j, i]
+                        tangent[axis, 3 * j + i] = -now[k, i]
+                for i in range(9):
+                    value = vector[p, i]
+                    for j in range(9):
+                        value += matrix[p, i, j] * now[j // 3, j % 3]
+                    pulled[3, i] = value
+                    for axis in range(3):
+                        value = 0.0
+                        for j in range(9):
+                            value += matrix[p, i, j] * tangent[axis, j]
+                        pulled[axis, i] = value
+                for axis in range(3):
+                    right[axis] = 0.0
+                    for i in range(9):
+                        right[axis] += tangent[axis, i] * pulled[3, i]
+                    for other in range(3):
+                        value = 1e-6 * trace if axis == other else 0.0
+                        for i in range(9):
+                            value += tangent[axis, i] * pulled[other, i]
+                        square[axis, other] = value
+                length = _solve_three(square, right, step)
+                for axis in range(3):
+                    step[axis] *= -0.7 / max(length, 0.7)
+                for i in range(3):
+                    for j in range(3):
+                        old[i, j] = now[i, j]
+                kernels.exponential(step, turned, left)
+                kernels.multiply(turned, old, now)
+                if length < AT_REST:
+                    break
+
+
+@njit(fastmath=kernels.FAST)
+def _solve_three(matrix, right, solution):
+    """Solve a symmetric three-by-three system by cofactors; returns the solution's length."""
+    determinant, length = 0.0, 0.0
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        determinant += matrix[0, i] * (matrix[1, j] * matrix[2, k] - matrix[1, k] * matrix[2, j])
+    for i in range(3):
+        value, a, b = 0.0, (i + 1) % 3, (i + 2) % 3
+        for j in range(3):
+            c, d = (j + 1) % 3, (j + 2) % 3
+            value += (matrix[a, c] * matrix[b, d] - matrix[a, d] * matrix[b, c]) * right[j]
+        solution[i] = value / determinant
+        length += solution[i] ** 2
+    return np.sqrt(length)
 
 
 def _solve_symmetric(matrix: Tensor, right: Tensor) -> Tensor:

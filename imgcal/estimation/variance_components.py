@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from enum import Enum
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -17,7 +19,6 @@ from imgcal.estimation.linearization import Problem, State, points_at
 from imgcal.estimation.map_estimate import EstimationOptions, make_loss, minimize
 from imgcal.estimation.object_shape import ShapeEvidence, learnt_tolerances, pull_scatter, shape_evidence
 from imgcal.estimation.pose_support import require_poses
-from imgcal.estimation.robust_losses import NamedLoss
 
 KINDS = {
     "rotation": slice(0, 3),
@@ -68,71 +69,110 @@ class VarianceComponents:
     shape: ShapeEvidence | None = None  # what the residuals say about the object; None = not asked
 
 
+class ObjectQuestion(Enum):
+    """What a fit is asked about the object."""
+
+    NONE = "it is taken as it is"
+    SHAPE = "is it what its file says? fiducials that are not in their places are freed"
+    SHAPE_OF_TURNS = "the same, but snapshots may have labels of different turns: nobody can say which are not"
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where to begin."""
+
+    state: State
+    additive_noise: float  # px
+    solution: Solution | None = None  # to which that leads with all labels, where it is known
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A solution with some noise, of some labels."""
+
+    problem: Problem
+    solution: Solution
+    noise: NDArray[np.floating]  # (S, C, N) px^2
+    seen: NDArray[np.bool_]  # (S, C, N)
+
+    @cached_property
+    def squared(self) -> NDArray[np.floating]:
+        """Squared residuals: (S, C, N) px^2."""
+        return np.square(self.solution.equations.residual[0].numpy()).sum(-2)
+
+    @cached_property
+    def remaining(self) -> NDArray[np.float64]:
+        """Part of each factory value's prior variance that the observations leave: (C, 15)."""
+        return np.asarray(remaining_variance(self.solution)[0])
+
+    @property
+    def converged(self) -> bool:
+        """A minimum was found."""
+        return bool(self.solution.converged)
+
+
 def estimate_variance_components(
     problem: Problem,
-    starts: Sequence[tuple[State, float]],
+    starts: Sequence[Start],
     variance: NDArray[np.floating],
     labels: NDArray[np.bool_],
     options: FitOptions,
-    examine: bool = True,
-    alike: bool = False,
+    question: ObjectQuestion = ObjectQuestion.SHAPE,
 ) -> VarianceComponents:
     """Fit, ask the residuals for noise, outliers, the object and the prior's width, and fit again until they stay.
 
     Args:
         problem: with the prior to begin with.
-        starts: where to begin, and with which model error (px). One by which some label does not fit gives way to the
-            next; the last one stays.
+        starts: where to begin. One by which some label does not fit gives way to the next; the last one stays.
         variance: (S, C, N) px^2, the blobs' own.
-        labels: (S, C, N) bool, what was labelled.
+        labels: (S, C, N) bool, what was labelled, and says in every snapshot where the object is.
         options: how sure the result must be.
-        examine: ask about the object, too, and free the fiducials that are not where its file says.
-        alike: each snapshot may have the labels of another turn of a symmetric object: it cannot be said which fiducial
-            is not in its place.
+        question: what to ask about the object.
 
     Raises:
         RefusedError: no minimum was found, or noise, outliers, object and prior do not come to rest.
         UndeterminedPosesError: without outliers some snapshots do not say where the object is.
     """
-    (state, additive_noise), *later = starts
-    loss = make_loss(options.estimation)
+    start, *later = starts
+    state, additive_noise, known = start.state, start.additive_noise, start.solution
     prior_scale: dict[str, float] = {}
-    kept, unexamined, shape = labels, examine, None
+    kept, unexamined, shape = labels, question is not ObjectQuestion.NONE, None
     for _ in range(ROUNDS):
-        seen, noise = kept, variance + additive_noise**2
-        problem, solution, squared = _fit(problem, state, noise, seen, options)
-        if unexamined and not later and bool(solution.converged):
+        fit, known = _fit(problem, state, variance + additive_noise**2, kept, options, known), None
+        problem, solution, seen = fit.problem, fit.solution, fit.seen
+        if unexamined and not later and fit.converged:
             # Before outliers are left out: all labels of a fiducial that is off its place may be among them.
             unexamined = False
-            shape, free = _examine(problem, solution, loss, options, GROSS_SCALE, alike)
+            shape, free = _examine(fit, options, GROSS_SCALE, question)
             if free is not None:
                 (problem, state), kept = free, labels
                 continue
         # Judged by the sigma of this fit: what a coarse fit leaves says little about fine outliers. Where a fiducial
         # was left out there is no residual: it stays out.
-        kept = seen & (squared <= options.outlier**2 * noise)
-        require_poses(kept, problem.points)
-        if later and not (bool(solution.converged) and (kept == labels).all()):
-            (state, additive_noise), *later = later
-            kept = labels
+        kept = seen & (fit.squared <= options.outlier**2 * fit.noise)
+        if (kept != seen).any():
+            require_poses(kept, problem.points)
+        if later and not (fit.converged and (kept == labels).all()):
+            start, *later = later
+            state, additive_noise, known, kept = start.state, start.additive_noise, start.solution, labels
             continue
         later = []
-        if not bool(solution.converged):
-            rms = float(np.sqrt(squared[seen].mean()))
+        if not fit.converged:
+            rms = float(np.sqrt(fit.squared[seen].mean()))
             raise RefusedError(f"estimation: no minimum after {solution.iterations} iterations (RMS {rms:.3g} px)")
-        state, remaining = solution.state, remaining_variance(solution)[0]
-        taken = 6 * len(seen) + float((1 - remaining).sum())
-        previous, additive_noise = additive_noise, _additive_noise(squared[seen], variance[seen], taken)
+        state = solution.state
+        taken = 6 * len(seen) + float((1 - fit.remaining).sum())
+        previous, additive_noise = additive_noise, _additive_noise(fit.squared[seen], variance[seen], taken)
         if abs(additive_noise - previous) > 0.02 * previous or (kept != seen).any():
             continue
-        if examine:
-            shape, free = _examine(problem, solution, loss, options, 0.0, alike)
+        if question is not ObjectQuestion.NONE:
+            shape, free = _examine(fit, options, 0.0, question)
             if free is not None:
                 (problem, state), kept = free, labels
                 continue
-        too_narrow = _too_narrow(state.offset[0].numpy(), remaining)
+        too_narrow = _too_narrow(state.offset[0].numpy(), fit.remaining)
         if not too_narrow or max(prior_scale.values(), default=1.0) > options.widest_prior:
-            return VarianceComponents(problem, solution, np.sqrt(noise), seen, additive_noise, prior_scale, shape)
+            return VarianceComponents(problem, solution, np.sqrt(fit.noise), seen, additive_noise, prior_scale, shape)
         prior_scale |= {kind: prior_scale.get(kind, 1.0) * factor for kind, factor in too_narrow.items()}
         problem, state = _widen(problem, state, too_narrow)
     raise RefusedError(
@@ -144,7 +184,7 @@ def estimate_variance_components(
 
 
 def _examine(
-    problem: Problem, solution: Solution, loss: NamedLoss, options: FitOptions, least_scale: float, alike: bool
+    fit: _Fit, options: FitOptions, least_scale: float, question: ObjectQuestion
 ) -> tuple[ShapeEvidence | None, tuple[Problem, State] | None]:
     """Ask a fit about the object; errors of its scale count from `least_scale`, relative.
 
@@ -155,24 +195,25 @@ def _examine(
     Raises:
         RefusedError: the object has another scale; or it is bent, and symmetric.
     """
-    shape = shape_evidence(problem, solution, loss)
+    shape = shape_evidence(fit.problem, fit.solution, make_loss(options.estimation))
     if shape is None:
         return None, None
-    if alike and shape.bent_sigma() >= BENT:
+    bent = shape.bent_sigma() >= BENT
+    if bent and question is ObjectQuestion.SHAPE_OF_TURNS:
         raise RefusedError(
             "object: its fiducials are not where its file says, and because it can be turned into itself, nobody can "
             "say which: each snapshot may have the labels of another turn",
             python="measure it anew, give labels (Detections.fiducial), or use an object without symmetry",
             command="measure it anew, give labels (a column `fiducial`), or use an object without symmetry",
         )
-    free = _free_object(shape, problem, solution, loss, options) if shape.bent_sigma() >= BENT else None
+    free = _free_object(shape, fit.problem, fit.solution, options) if bent else None
     if free is None:
-        _require_scale(shape, problem, solution, least_scale)
+        _require_scale(shape, fit, least_scale)
     return shape, free
 
 
 def _free_object(
-    shape: ShapeEvidence, problem: Problem, solution: Solution, loss: NamedLoss, options: FitOptions
+    shape: ShapeEvidence, problem: Problem, solution: Solution, options: FitOptions
 ) -> tuple[Problem, State] | None:
     prior_std = learnt_tolerances(shape)
     if not (prior_std > 1.01 * shape.tolerance).any():
@@ -187,22 +228,23 @@ def _free_object(
     state = replace(solution.state, object_offset=whitened[None])
     found = minimize(problem, state, options.estimation)
     # Where snapshots disagree about the fiducials, something else than the object is behind it.
+    loss = make_loss(options.estimation)
     if not bool(found.converged) or shape.bent_sigma(pull_scatter(problem, found.state, loss)) < BENT:
         return None
     return problem, found.state
 
 
-def _require_scale(shape: ShapeEvidence, problem: Problem, solution: Solution, least: float) -> None:
+def _require_scale(shape: ShapeEvidence, fit: _Fit, least: float) -> None:
     """Refuse where the cameras have moved together as a wrong scale of the object would make them.
 
     How far they have moved otherwise says how far the prior can be trusted to know them.
     """
-    position = KINDS["position"]
-    offset, prior_std = (tensor[0, :, position].numpy() for tensor in (solution.state.offset, problem.prior_std))
+    position, problem = KINDS["position"], fit.problem
+    offset, prior_std = (tensor[0, :, position].numpy() for tensor in (fit.solution.state.offset, problem.prior_std))
     places = problem.factory.positions[0].numpy() + offset * prior_std
     direction = np.where(prior_std > 0, (places - places.mean(0)) / np.maximum(prior_std, 1e-30), 0.0).ravel()
     along = float(direction @ offset.ravel()) ** 2 / max(float(direction @ direction), 1e-30)
-    freedom = float((1 - remaining_variance(solution)[0, :, position]).sum())
+    freedom = float((1 - fit.remaining[:, position]).sum())
     usual = (float(np.square(offset).sum()) - along) / max(freedom, 1.0)
     usual = usual if usual > 1 + 2 * (2 / max(freedom, 1.0)) ** 0.5 else 1.0
     error, deviation = shape.scale_error
@@ -220,13 +262,17 @@ def _require_scale(shape: ShapeEvidence, problem: Problem, solution: Solution, l
 
 
 def _fit(
-    problem: Problem, state: State, noise: NDArray[np.floating], seen: NDArray[np.bool_], options: FitOptions
-) -> tuple[Problem, Solution, NDArray[np.floating]]:
-    """Fit with a noise (px^2), and give the problem, its solution and the squared residuals, (S, C, N) px^2 both."""
+    problem: Problem,
+    state: State,
+    noise: NDArray[np.floating],
+    seen: NDArray[np.bool_],
+    options: FitOptions,
+    known: Solution | None,
+) -> _Fit:
+    """Fit what is seen (S, C, N) with a noise (px^2), unless the solution is known."""
     root_weight = torch.from_numpy(np.where(seen, noise**-0.5, 0.0)).to(problem.uv)
     problem = replace(problem, root_weight=root_weight[None])
-    solution = minimize(problem, state, options.estimation)
-    return problem, solution, np.square(solution.equations.residual[0].numpy()).sum(-2)
+    return _Fit(problem, known or minimize(problem, state, options.estimation), noise, seen)
 
 
 def _additive_noise(squared: NDArray[np.floating], variance: NDArray[np.floating], taken: float) -> float:

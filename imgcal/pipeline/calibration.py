@@ -14,27 +14,28 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from imgcal.association import Associations, PipelineOptions, Progress, associate, observations_of, without_snapshots
+from imgcal.association import Associations, PipelineOptions, Progress, associate, observations_of
 from imgcal.detection import DetectionOptions
 from imgcal.errors import RefusedError
 from imgcal.estimation import (
     BlockScatter,
     Estimate,
     FiducialOffset,
+    ObjectQuestion,
     PredictedError,
+    Solution,
+    Start,
     UndeterminedPosesError,
     block_scatter,
     estimate,
     estimate_variance_components,
-    initial_pose,
     initial_state,
     make_estimate,
     make_loss,
     make_problem,
     predicted_error,
-    require_poses,
-    whitened_covariance,
 )
+from imgcal.pipeline.arrangement import Arranged, arrange
 from imgcal.pipeline.checks import (
     require_cameras,
     require_fit,
@@ -169,17 +170,17 @@ def calibrate(
     found = time.perf_counter()
     labelled = associate(detections, rig, obj, options, progress)
     identified = time.perf_counter()
-    labelled = _with_poses(labelled, rig, obj)
-    _require_any_view(labelled, rig, obj)
-    labelled, moved = steady_part(labelled, detections, rig, obj, options)
-    fit = fit_labelled(labelled, rig, obj, options, initializer)
+    arranged = arrange(labelled, rig, obj)
+    _require_any_view(arranged, rig, obj)
+    steady = steady_part(arranged, detections, rig, obj, options)
+    fit = _fitted(steady.arranged, rig, obj, options, _Known(initializer, first=steady.first))
     require_views(fit.tally, rig)
     seconds = {
         "detection": found - started,
         "identity": identified - found,
         "estimation": time.perf_counter() - identified,
     }
-    return replace(fit, seconds=seconds, moved=moved)
+    return replace(fit, seconds=seconds, moved=steady.moved)
 
 
 def fit_labelled(
@@ -207,30 +208,42 @@ def fit_labelled(
         RefusedError: a camera saw nothing, the estimate has no minimum, or the residuals do not fit.
     """
     rig = rig.to(torch.float64)
-    labelled = given = _with_poses(labelled, rig, obj)
+    return _fitted(arrange(labelled, rig, obj), rig, obj, options, _Known(initializer, latest, prior_std))
+
+
+@dataclass(frozen=True)
+class _Known:
+    """What is known before a fit; see `fit_labelled`."""
+
+    initializer: Initializer | None = None
+    latest: Calibration | None = None
+    prior_std: Tensor | None = None
+    first: Solution | None = None  # the first of all fits, where it has been made already
+
+
+def _fitted(
+    given: Arranged, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions, known: _Known
+) -> Calibration:
+    """Do the work of `fit_labelled` for snapshots that all have a pose."""
+    arranged = given
     while True:
         try:
-            return _fit_labelled(labelled, rig, obj, options, initializer, latest, prior_std)
+            return _fitted_once(arranged, rig, obj, options, known)
         except UndeterminedPosesError as error:
-            labelled = without_snapshots(labelled, error.rows)
-            if len(labelled.used) < LEAST_KEPT * len(given.used):
+            arranged, known = arranged.without(error.rows, rig, obj), replace(known, first=None)
+            left, count = len(arranged.labelled.used), len(given.labelled.used)
+            if left < LEAST_KEPT * count:
                 raise RefusedError(
-                    f"{error} (found {len(given.used) - len(labelled.used)} of {len(given.used)} such snapshots): some "
-                    "fiducial is not where the object file says"
+                    f"{error} (found {count - left} of {count} such snapshots): some fiducial is not where the object "
+                    "file says"
                 ) from error
 
 
-def _fit_labelled(
-    labelled: Associations,
-    rig: CameraRig,
-    obj: CalibrationObject,
-    options: PipelineOptions,
-    initializer: Initializer | None,
-    latest: Calibration | None,
-    prior_std: Tensor | None,
+def _fitted_once(
+    arranged: Arranged, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions, known: _Known
 ) -> Calibration:
-    """Do the work of `fit_labelled` for snapshots that all have a pose."""
-    observations, poses = observations_of(labelled, rig, obj)
+    """Fit, unless without outliers some snapshots do not say where the object is."""
+    labelled, observations, latest = arranged.labelled, arranged.observations, known.latest
     variance, labels = observations.sigma.numpy() ** 2, observations.seen.numpy()
     require_cameras(labels, rig, options)
     alike = labelled.identity == "ambiguous" and len(labelled.used) > 1
@@ -241,29 +254,28 @@ def _fit_labelled(
             python="give labels (Detections.fiducial), use an object without symmetry, or one without tolerances",
             command="give labels (a column `fiducial`), use an object without symmetry, or one without tolerances",
         )
-    prior = (rig.prior or RigPrior()).std(rig) if prior_std is None else prior_std
+    prior = (rig.prior or RigPrior()).std(rig) if known.prior_std is None else known.prior_std
     problem = make_problem(observations, rig, _with_learnt(obj, latest), prior)
-    assert poses is not None  # see `_with_poses`
-    guess = None if initializer is None else initializer.guess(observations, rig, obj)
-    guess_used = guess is not None and _nearer(guess, Prediction(rig, poses), observations, obj)
-    state = initial_state(problem, poses, None)
+    guess = None if known.initializer is None else known.initializer.guess(observations, rig, obj)
+    guess_used = guess is not None and _nearer(guess, Prediction(rig, arranged.poses), observations, obj)
+    first = Start(initial_state(problem, arranged.poses, None), options.identity_error, known.first)
     if guess is not None and guess_used:
-        state = initial_state(problem, guess.rig_from_object, guess.rig)
-    starts = [(state, options.identity_error)]
+        first = Start(initial_state(problem, guess.rig_from_object, guess.rig), options.identity_error)
+    starts = [first]
     if latest is not None and not latest.prior_scale:
         change = latest.problem.prior_std * latest.solution.state.offset
         offset = torch.where(prior > 0, change / prior.clamp_min(1e-30), 0.0)
-        starts.insert(0, (replace(state, offset=offset), latest.additive_noise))
-    found = estimate_variance_components(
-        problem, starts, variance, labels, options, examine=latest is None, alike=alike
-    )
+        starts.insert(0, Start(replace(first.state, offset=offset), latest.additive_noise))
+    question = ObjectQuestion.NONE
+    if latest is None:
+        question = ObjectQuestion.SHAPE_OF_TURNS if alike else ObjectQuestion.SHAPE
+    found = estimate_variance_components(problem, starts, variance, labels, options, question)
     fit = make_estimate(found.problem, found.solution, found.solution.state)
     require_same_residuals(fit, observations, found.seen, obj)
     shape = object_offsets(fit, found.shape, obj)
     scatter = BlockScatter()
     if latest is None:
-        covariance = whitened_covariance(found.solution)[0]
-        scatter = block_scatter(found.problem, found.solution, covariance, make_loss(options.estimation))
+        scatter = block_scatter(found.problem, found.solution, make_loss(options.estimation))
         fit = replace(fit, inflation=scatter.factor)
     outliers = int(labels.sum() - found.seen.sum())
     require_cameras(found.seen, rig, options)
@@ -298,32 +310,16 @@ def _with_learnt(obj: CalibrationObject, latest: Calibration | None) -> Calibrat
     return replace(obj, tolerance=latest.problem.object_prior_std[0, :-1:3])
 
 
-def _require_any_view(labelled: Associations, rig: CameraRig, obj: CalibrationObject) -> None:
+def _require_any_view(arranged: Arranged, rig: CameraRig, obj: CalibrationObject) -> None:
     """Refuse where a camera sees the object, and identity could not label any of it: worse than seeing nothing."""
-    observations, poses = observations_of(labelled, rig, obj)
-    assert poses is not None
-    require_views(tally(labelled, observations.seen.numpy(), poses, rig, obj), rig, least_share=0.0)
+    labels = arranged.observations.seen.numpy()
+    require_views(tally(arranged.labelled, labels, arranged.poses, rig, obj), rig, least_share=0.0)
 
 
 def _nearer(guess: Initialization, factory: Prediction, observations: Observations, obj: CalibrationObject) -> bool:
     """Tell whether the start that a guess gives, its mean rig, is nearer to the images than the factory calibration."""
     start = Prediction(guess.rig, guess.rig_from_object)
     return bool(residual_of(start, observations, obj).norm() < residual_of(factory, observations, obj).norm())
-
-
-def _with_poses(labelled: Associations, rig: CameraRig, obj: CalibrationObject) -> Associations:
-    """Refuse the snapshots whose labels lie on one line; find the poses of those that came with labels."""
-    observations, poses = observations_of(labelled, rig, obj)
-    try:
-        require_poses(observations.seen.numpy(), obj.points)
-    except UndeterminedPosesError as error:
-        return _with_poses(without_snapshots(labelled, error.rows), rig, obj)
-    if poses is not None:
-        return labelled
-    poses, snapshots = initial_pose(observations, rig, obj), list(labelled.snapshots)
-    for row, snapshot in enumerate(labelled.used):
-        snapshots[snapshot] = replace(snapshots[snapshot], rig_from_object=poses[row])
-    return replace(labelled, snapshots=tuple(snapshots))
 
 
 def finite(value: float) -> float | None:

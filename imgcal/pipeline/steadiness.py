@@ -9,9 +9,21 @@ import torch
 from numpy.typing import NDArray
 from scipy.stats import hypergeom
 
-from imgcal.association import Associations, PipelineOptions, associate, observations_of
+from imgcal.association import Associations, PipelineOptions, associate
 from imgcal.errors import RefusedError
-from imgcal.estimation import CLIP, LEAST_SNAPSHOTS, Estimate, estimate, find_moves, initial_pose
+from imgcal.estimation import (
+    CLIP,
+    LEAST_SNAPSHOTS,
+    Problem,
+    Solution,
+    State,
+    find_moves,
+    initial_state,
+    make_problem,
+    minimize,
+    pose_at,
+)
+from imgcal.pipeline.arrangement import Arranged, arrange
 from imgcal.pipeline.tally import Tally, tally
 from imgcal.types import CalibrationObject, CameraRig, Detections, MovedCamera, MovedError
 
@@ -28,38 +40,45 @@ MOST_MOVES = 8  # parts of a capture that are looked at, one after the other
 Bools = NDArray[np.bool_]
 
 
+@dataclass(frozen=True)
+class SteadyPart:
+    """Snapshots during which no camera moved."""
+
+    arranged: Arranged  # those before the last move refused
+    moved: tuple[MovedCamera, ...] = ()  # in the order of time
+    first: Solution | None = None  # one rig for all of its labels, as `settle` begins, where it has been found already
+
+
 def steady_part(
-    labelled: Associations, detections: Detections, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
-) -> tuple[Associations, tuple[MovedCamera, ...]]:
+    arranged: Arranged, detections: Detections, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
+) -> SteadyPart:
     """Leave out the snapshots before the last move of a camera.
 
     Args:
-        labelled: all snapshots.
+        arranged: all snapshots.
         detections: the same as they were given, with the labels of the input alone.
         rig: the factory calibration.
         obj: the calibration object.
         options: whether to go on when a camera has moved.
 
-    Returns:
-        The labelled snapshots, those before the last move refused, and the moves, in the order of time.
-
     Raises:
         MovedError: a camera has moved, and the options do not say what then.
         RefusedError: after the last move no snapshot could be decided.
     """
-    part, first, moved = labelled, 0, list(moves_of(labelled, rig, obj, options))
-    if not moved:
-        return labelled, ()
-    total, found = len(labelled.snapshots), moved
+    found, solution = _moves(arranged, rig, obj, options)
+    if not found:
+        return SteadyPart(arranged, first=solution)
+    labelled, moved = arranged.labelled, list(found)
+    total, first = len(labelled.snapshots), 0
     names = [snapshot.name for snapshot in labelled.snapshots]
     for _ in range(MOST_MOVES):
         first = max(names.index(move.snapshot) for move in found)
         if not options.after_last_move:
             raise MovedError(moved, total - first, total)
         part = associate(detections.of_snapshots(first, total), rig, obj, options)
-        found = list(moves_of(part, rig, obj, options))
+        found = moves_of(part, rig, obj, options)
         if not found:
-            return _with_earlier(part, labelled, first), tuple(moved)
+            return SteadyPart(arrange(_with_earlier(part, labelled, first), rig, obj), tuple(moved))
         moved += found
     raise MovedError(moved, total - first, total)
 
@@ -79,52 +98,62 @@ def _with_earlier(part: Associations, labelled: Associations, first: int) -> Ass
 def moves_of(
     labelled: Associations, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
 ) -> tuple[MovedCamera, ...]:
-    """Say which cameras moved between two snapshots.
+    """Say which cameras moved between two snapshots, in the order of time."""
+    return _moves(arrange(labelled, rig, obj), rig, obj, options)[0]
+
+
+def _moves(
+    arranged: Arranged, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
+) -> tuple[tuple[MovedCamera, ...], Solution | None]:
+    """Do the work of `moves_of`, and give the first fit of all labels, too.
 
     A camera that has moved far is not labelled any more by what identity has learnt from the snapshots before. Such
     snapshots are labelled afresh, so that how far it moved can be measured.
     """
+    labelled = arranged.labelled
     if len(labelled.used) < 2 * LEAST_SNAPSHOTS:
-        return ()
-    fit = _fit(labelled, rig, obj, options)
-    lost = _lost(fit.tally)
+        return (), None
+    fit = _fit(arranged, rig, obj, options)
+    first, lost = fit.first, _lost(fit.tally)
     if (lost.sum(0) >= LEAST_SNAPSHOTS).any():
         again = _labelled_afresh(labelled, lost, rig, obj, options)
-        fit = _fit(again, rig, obj, options)
+        fit = _fit(arrange(again, rig, obj), rig, obj, options)
     names = tuple(labelled.snapshots[s].name for s in labelled.used)
-    found = find_moves(fit.estimate.problem, fit.estimate.solution.state, rig.camera_names, names, options.estimation)
+    found = find_moves(fit.problem, fit.state, rig.camera_names, names, options.estimation)
     gone = _gone(fit.tally, labelled, rig, {move.camera for move in found})
-    return tuple(sorted((*found, *gone), key=lambda move: names.index(move.snapshot)))
+    return tuple(sorted((*found, *gone), key=lambda move: names.index(move.snapshot))), first
 
 
 @dataclass(frozen=True)
 class _Fit:
     """One rig for all labels, however badly some of them fit."""
 
-    estimate: Estimate
+    problem: Problem
+    state: State
     tally: Tally
+    first: Solution  # with the noise that identity allows
 
 
-def _fit(labelled: Associations, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions) -> _Fit:
+def _fit(arranged: Arranged, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions) -> _Fit:
     """Estimate one rig, no label left out, with the noise that the residuals show.
 
     Where one rig cannot fit, this is slow to settle, and need not: what it leaves is asked for steps.
     """
-    observations, poses = observations_of(labelled, rig, obj)
-    own, seen = observations.sigma, observations.seen
-    error: torch.Tensor | float = options.identity_error
-    found: Estimate | None = None
+    observations = arranged.observations
+    own, seen = observations.sigma.square(), observations.seen
+    problem = make_problem(observations, rig, obj, None)
+    state, noise = initial_state(problem, arranged.poses, None), own + options.identity_error**2
+    solutions: list[Solution] = []
     for _ in range(2):
-        noisy = replace(observations, sigma=(own.square() + error**2).sqrt())
-        start = (poses or initial_pose(observations, rig, obj)) if found is None else found.rig_from_object
-        guess = None if found is None else found.rig
-        found = estimate(noisy, rig, obj, start, initial_rig=guess, options=options.estimation)
+        problem = replace(problem, root_weight=torch.where(seen, noise.rsqrt(), 0.0)[None])
+        solutions.append(minimize(problem, state, options.estimation))
+        state = solutions[-1].state
+        squared, used = solutions[-1].equations.residual[0].square().sum(-2), noise
         free = max(1 - (15 * rig.num_cameras + 6 * len(seen)) / (2 * int(seen.sum())), 0.2)
-        variance = found.residual.square().sum(-1)[seen].median() / (MEDIAN * free)
-        error = (variance - own[seen].square().median()).clamp_min(0).sqrt()
-    assert found is not None
-    fitting = (found.residual.norm(dim=-1) <= CLIP * noisy.sigma) & seen
-    return _Fit(found, tally(labelled, fitting.numpy(), found.rig_from_object, rig, obj))
+        noise = own + (squared[seen].median() / (MEDIAN * free) - own[seen].median()).clamp_min(0)
+    fitting = (squared <= CLIP**2 * used) & seen
+    poses = pose_at(problem, state)[0]
+    return _Fit(problem, state, tally(arranged.labelled, fitting.numpy(), poses, rig, obj), solutions[0])
 
 
 def _lost(counts: Tally) -> Bools:

@@ -65,7 +65,8 @@ def tally(
         cell = detections.snapshot[rows] * shape[1] + detections.camera[rows]
         return np.bincount(cell, minlength=shape[0] * shape[1]).reshape(shape)
 
-    projection = factory.expand(len(used)).project(poses.apply(obj.points.to(factory.focal_length)), obj.radius)
+    points = poses.apply(obj.points.to(factory.focal_length))
+    projection = factory.expand(len(used)).project_values(points, obj.radius)
     size = factory.image_size.numpy()[:, None]
     uv = projection.uv.numpy()
     inside = ((uv > MARGIN * size) & (uv < (1 - MARGIN) * size)).all(-1) & projection.visible.numpy()

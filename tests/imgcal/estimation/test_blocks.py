@@ -8,7 +8,6 @@ import torch
 
 from imgcal.estimation import camera_covariance, camera_std, estimate
 from imgcal.estimation.blocks import BlockScatter, block_scatter
-from imgcal.estimation.covariance import whitened_covariance
 from imgcal.estimation.robust_losses import NamedLoss
 from imgcal.geometry.transforms import RigidTransform
 
@@ -16,7 +15,7 @@ LOSS = NamedLoss("huber", 3.0)
 
 
 def scatter(found) -> BlockScatter:
-    return block_scatter(found.problem, found.solution, whitened_covariance(found.solution)[0], LOSS)
+    return block_scatter(found.problem, found.solution, LOSS)
 
 
 @pytest.mark.parametrize("snapshots", [6, 40])

@@ -68,3 +68,13 @@ def test_unseen_pixels_do_not_matter(simulate) -> None:
         for observations in (case.observations, replace(case.observations, uv=changed))
     )
     assert torch.equal(first.rotation, second.rotation)
+
+
+@pytest.mark.parametrize("cameras", [1, 4])
+def test_the_compiled_minimization_is_that_of_tensors(simulate, cameras: int) -> None:
+    case = simulate(2, snapshots=3, cameras=cameras, noise=0.3, missing=0.2)
+    compiled = initial_pose(case.observations, case.factory, case.obj)
+    watched = replace(case.factory, focal_length=case.factory.focal_length.clone().requires_grad_())
+    tensors = initial_pose(case.observations, watched, case.obj)
+    torch.testing.assert_close(compiled.rotation, tensors.rotation.detach(), rtol=0, atol=1e-9)
+    torch.testing.assert_close(compiled.translation, tensors.translation.detach(), rtol=1e-9, atol=1e-6)

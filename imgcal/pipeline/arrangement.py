@@ -1,0 +1,43 @@
+"""Associations snapshots as estimates take them: arranged densely, each with a pose to begin with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from imgcal.association import Associations, observations_of, without_snapshots
+from imgcal.estimation import UndeterminedPosesError, initial_pose, require_poses
+from imgcal.geometry import RigidTransform
+from imgcal.types import CalibrationObject, CameraRig, Observations
+
+
+@dataclass(frozen=True)
+class Arranged:
+    """Associations snapshots, all used ones of which say where the object is: S of them."""
+
+    labelled: Associations
+    observations: Observations  # (S, C, N)
+    poses: RigidTransform  # (S,) rig_from_object, the first guess
+
+    def without(self, rows: Sequence[int], rig: CameraRig, obj: CalibrationObject) -> Arranged:
+        """Refuse some of the used snapshots, by their numbers among these."""
+        return arrange(without_snapshots(self.labelled, rows), rig, obj)
+
+
+def arrange(labelled: Associations, rig: CameraRig, obj: CalibrationObject) -> Arranged:
+    """Refuse the snapshots whose labels lie on one line; find the poses of those that came with labels.
+
+    Raises:
+        RefusedError: none is left.
+    """
+    observations, poses = observations_of(labelled, rig, obj)
+    try:
+        require_poses(observations.seen.numpy(), obj.points)
+    except UndeterminedPosesError as error:
+        return arrange(without_snapshots(labelled, error.rows), rig, obj)
+    if poses is not None:
+        return Arranged(labelled, observations, poses)
+    poses, snapshots = initial_pose(observations, rig, obj), list(labelled.snapshots)
+    for row, snapshot in enumerate(labelled.used):
+        snapshots[snapshot] = replace(snapshots[snapshot], rig_from_object=poses[row])
+    return Arranged(replace(labelled, snapshots=tuple(snapshots)), observations, poses)
