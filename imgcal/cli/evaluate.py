@@ -19,7 +19,7 @@ from imgcal.extras import advice, missing
 from imgcal.io import load_object, load_rig, publishing
 
 if TYPE_CHECKING:
-    from imgcal.evaluation import Conditions, Method, Model, Protocol, Report
+    from imgcal.evaluation import Conditions, Method, Model, Protocol, Summary
     from imgcal.evaluation import Progress as Advance
 
 Axis = Literal["kappa", "phi", "noise", "missing", "swapped", "false"]
@@ -103,12 +103,12 @@ def _run(paths: tuple[Path, ...], setting: Setting, baselines: bool, out: Path |
     models = _load(paths, setting)
     conditions = _conditions(models, setting)
     methods = {model.name: model.method for model in models} | (BASELINES if baselines else {})
-    report = _measure(methods, conditions, protocol, setting)
-    report = replace(report, facts={model.name: model.facts for model in models})
-    _print(report)
+    summary = _measure(methods, conditions, protocol, setting)
+    summary = replace(summary, facts={model.name: model.facts for model in models})
+    _print(summary)
     if out is not None:
         with publishing(out, (*PLOTS, TABLES, RESULT), mark=RESULT) as folder:
-            written = write(report, folder)
+            written = write(summary, folder)
         for path in written:
             print(f"wrote {out / path.name}", file=sys.stderr)
 
@@ -151,8 +151,8 @@ def _conditions(models: list[Model], setting: Setting) -> Conditions:
     )
 
 
-def _measure(methods: Mapping[str, Method], conditions: Conditions, protocol: Protocol, setting: Setting) -> Report:
-    from imgcal.evaluation import AXES, Report, evaluate, latency, sweep
+def _measure(methods: Mapping[str, Method], conditions: Conditions, protocol: Protocol, setting: Setting) -> Summary:
+    from imgcal.evaluation import AXES, Summary, evaluate, latency, sweep
 
     fast = {name: method for name, method in methods.items() if method.most is None}
     along = replace(protocol, count=setting.sweep_count, trials=1)
@@ -164,7 +164,7 @@ def _measure(methods: Mapping[str, Method], conditions: Conditions, protocol: Pr
         sweeps = tuple(sweep(fast, conditions, axis, along, progress=advance) for axis in setting.sweep)
     repeats = {name: 50 if method.most is None else 10 for name, method in methods.items()}
     took = {name: latency(method, conditions, repeats[name]) for name, method in methods.items()}
-    return Report(evaluation, took, {}, sweeps)
+    return Summary(evaluation, took, {}, sweeps)
 
 
 @contextmanager
@@ -180,14 +180,14 @@ def _bar(total: int) -> Iterator[Advance]:
         yield lambda rigs: bar.advance(task, rigs)
 
 
-def _print(report: Report) -> None:
+def _print(summary: Summary) -> None:
     """Tables on standard output: for people on a terminal, as Markdown elsewhere."""
-    from imgcal.evaluation import describe, markdown, tables
+    from imgcal.evaluation import as_tables, describe, markdown
 
     if not sys.stdout.isatty():
-        print(markdown(report), end="")
+        print(markdown(summary), end="")
         return
     console = Console()
-    console.print(describe(report.evaluation))
-    for table in tables(report):
+    console.print(describe(summary.evaluation))
+    for table in as_tables(summary):
         console.print(table.rich())

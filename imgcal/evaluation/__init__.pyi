@@ -2,8 +2,9 @@ from .methods import BASELINES, Given, Method, network_method
 from .metrics import Errors, cramer_rao, errors, reprojection_error
 from .models import Model, load_models
 from .protocol import Conditions, Evaluation, Progress, Protocol, Row, Scores, evaluate
-from .report import PLOTS, RESULT, TABLES, Report, describe, markdown, tables, write
+from .summary import Summary
 from .sweeps import AXES, Sweep, sweep
+from .tables import PLOTS, RESULT, TABLES, as_tables, describe, markdown, write
 from .timing import latency
 
 __all__ = [
@@ -20,10 +21,11 @@ __all__ = [
     "Model",
     "Progress",
     "Protocol",
-    "Report",
     "Row",
     "Scores",
+    "Summary",
     "Sweep",
+    "as_tables",
     "cramer_rao",
     "describe",
     "errors",
@@ -34,6 +36,5 @@ __all__ = [
     "network_method",
     "reprojection_error",
     "sweep",
-    "tables",
     "write",
 ]

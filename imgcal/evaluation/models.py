@@ -12,7 +12,7 @@ import torch
 from imgcal.errors import InputError
 from imgcal.evaluation.methods import Method, network_method
 from imgcal.evaluation.protocol import Conditions
-from imgcal.evaluation.report import Facts
+from imgcal.evaluation.summary import Facts
 from imgcal.training import Checkpoint, load_checkpoint
 from imgcal.types import CalibrationObject, CameraRig
 

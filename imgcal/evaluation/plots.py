@@ -5,29 +5,26 @@ from __future__ import annotations
 import io
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from imgcal.evaluation.protocol import REFERENCE, Scores
+from imgcal.evaluation.summary import Summary
 from imgcal.evaluation.sweeps import AXES, Sweep
 from imgcal.io import write_bytes
-
-if TYPE_CHECKING:
-    from imgcal.evaluation.report import Report
 
 SIZE = (7.2, 4.4)  # inches
 LEAST, MOST = 1e-4, 1e4  # pixels that are drawn: everything below, or above, lies on the edge
 
 
-def write_plots(report: Report, folder: Path) -> list[Path]:
+def write_plots(summary: Summary, folder: Path) -> list[Path]:
     """Draw what there are data for: sweeps, training, latency against accuracy; returns the PNG files."""
-    figures = {f"error-{sweep.axis}.png": draw_sweep(sweep) for sweep in report.sweeps}
-    if any(facts.history for facts in report.facts.values()):
-        figures["training.png"] = draw_training(report)
-    if report.latencies:
-        figures["latency.png"] = draw_latency(report)
+    figures = {f"error-{sweep.axis}.png": draw_sweep(sweep) for sweep in summary.sweeps}
+    if any(facts.history for facts in summary.facts.values()):
+        figures["training.png"] = draw_training(summary)
+    if summary.latencies:
+        figures["latency.png"] = draw_latency(summary)
     for name, figure in figures.items():
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=120)
@@ -49,10 +46,10 @@ def draw_sweep(sweep: Sweep) -> Figure:
     return _with_legend(figure, axes)
 
 
-def draw_training(report: Report) -> Figure:
+def draw_training(summary: Summary) -> Figure:
     """RE over training steps: of training batches thin, of validation with points."""
     figure, axes = _figure("training step", "RE alone (px)")
-    for number, (name, facts) in enumerate(report.facts.items()):
+    for number, (name, facts) in enumerate(summary.facts.items()):
         for key, style, label in (("re_px", "-", None), ("validation_re_px", "o-", name)):
             rows = [row for row in facts.history if row.get(key) is not None]
             values = _clipped(row[key] for row in rows)
@@ -60,12 +57,12 @@ def draw_training(report: Report) -> Figure:
     return _with_legend(figure, axes)
 
 
-def draw_latency(report: Report) -> Figure:
+def draw_latency(summary: Summary) -> Figure:
     """Mean RE over the time for one rig: hollow alone, filled refined."""
     figure, axes = _figure("time for one rig, median (ms)", "mean RE (px)")
     axes.set_xscale("log")
-    for number, (name, took) in enumerate(report.latencies.items()):
-        row, colour = report.evaluation.rows[name], f"C{number}"
+    for number, (name, took) in enumerate(summary.latencies.items()):
+        row, colour = summary.evaluation.rows[name], f"C{number}"
         alone = _means([row.alone])
         axes.plot([took.alone_p50], alone, "o", mfc="none", color=colour, label=name)
         if row.refined is not None and took.refined_p50 is not None:

@@ -1,48 +1,24 @@
-"""Evaluations as JSON, as tables in Markdown and on the terminal, and as plots."""
+"""Evaluations as tables, in Markdown and on the terminal, and all files of one: values, tables, plots."""
 
 from __future__ import annotations
 
 import json
 import math
-import platform
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import torch
 from rich.table import Table as RichTable
 
-from imgcal.evaluation.protocol import REFERENCE, Conditions, Evaluation, Row, Scores
-from imgcal.evaluation.sweeps import AXES, Sweep
-from imgcal.evaluation.timing import Latency
+from imgcal.evaluation.protocol import REFERENCE, Evaluation, Row, Scores
+from imgcal.evaluation.summary import Summary, as_values
+from imgcal.evaluation.sweeps import AXES
 from imgcal.io import write_text
-from imgcal.synthesis import RelativeDrift
 
-FORMAT = "imgcal-evaluation/1"
 RESULT, TABLES = "evaluation.json", "evaluation.md"
 PLOTS = (*(f"error-{axis}.png" for axis in AXES), "training.png", "latency.png")
 MISSING = "–"
 HUGE = 1e4  # pixels and so on, above which a table does not say how much
-
-
-@dataclass(frozen=True)
-class Facts:
-    """What is known about a network beside its errors."""
-
-    parameters: int
-    size: int  # bytes of the file
-    history: tuple[dict[str, Any], ...] = ()  # rows of metrics.jsonl
-
-
-@dataclass(frozen=True)
-class Report:
-    """Everything that is written."""
-
-    evaluation: Evaluation
-    latencies: Mapping[str, Latency] = field(default_factory=dict)  # by method
-    facts: Mapping[str, Facts] = field(default_factory=dict)  # by method, of networks
-    sweeps: tuple[Sweep, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -70,11 +46,11 @@ class Table:
         return table
 
 
-def write(report: Report, folder: Path) -> list[Path]:
+def write(summary: Summary, folder: Path) -> list[Path]:
     """Write the JSON file, the tables and those plots for which there are data.
 
     Args:
-        report: what to write.
+        summary: what to write.
         folder: an existing folder.
 
     Returns:
@@ -82,14 +58,14 @@ def write(report: Report, folder: Path) -> list[Path]:
     """
     from imgcal.evaluation.plots import write_plots  # brings matplotlib along
 
-    write_text(folder / RESULT, json.dumps(as_values(report), indent=2, allow_nan=False) + "\n")
-    write_text(folder / TABLES, markdown(report))
-    return [folder / RESULT, folder / TABLES, *write_plots(report, folder)]
+    write_text(folder / RESULT, json.dumps(as_values(summary), indent=2, allow_nan=False) + "\n")
+    write_text(folder / TABLES, markdown(summary))
+    return [folder / RESULT, folder / TABLES, *write_plots(summary, folder)]
 
 
-def markdown(report: Report) -> str:
+def markdown(summary: Summary) -> str:
     """All tables, with a line on what was measured."""
-    return f"{describe(report.evaluation)}\n\n" + "\n".join(table.markdown() for table in tables(report))
+    return f"{describe(summary.evaluation)}\n\n" + "\n".join(table.markdown() for table in as_tables(summary))
 
 
 def describe(evaluation: Evaluation) -> str:
@@ -104,11 +80,11 @@ def describe(evaluation: Evaluation) -> str:
     )
 
 
-def tables(report: Report) -> tuple[Table, ...]:
+def as_tables(summary: Summary) -> tuple[Table, ...]:
     """Reprojection errors; parameters against the physical bound; what networks cost."""
-    found = [_errors_table(report.evaluation), _parameters_table(report.evaluation)]
-    if report.latencies:
-        found.append(_cost_table(report))
+    found = [_errors_table(summary.evaluation), _parameters_table(summary.evaluation)]
+    if summary.latencies:
+        found.append(_cost_table(summary))
     return tuple(found)
 
 
@@ -150,11 +126,11 @@ def _parameters_table(evaluation: Evaluation) -> Table:
     return Table("Parameters, RMS error, and ratio to the Cramer-Rao bound", header, tuple(rows))
 
 
-def _cost_table(report: Report) -> Table:
+def _cost_table(summary: Summary) -> Table:
     header = ("method", "p50 (ms)", "p99 (ms)", "refined p50 (ms)", "refined p99 (ms)", "parameters", "file (MB)")
     rows = []
-    for name, took in report.latencies.items():
-        known = report.facts.get(name)
+    for name, took in summary.latencies.items():
+        known = summary.facts.get(name)
         size = (MISSING, MISSING) if known is None else (f"{known.parameters:,}", f"{known.size / 1e6:.1f}")
         times = (took.alone_p50, took.alone_p99, took.refined_p50, took.refined_p99)
         rows.append((name, *map(_number, times), *size))
@@ -181,83 +157,3 @@ def _line(cells: Sequence[str], widths: Sequence[int]) -> str:
         for i, (cell, width) in enumerate(zip(cells, widths, strict=True))
     )
     return f"| {' | '.join((first, *others))} |"
-
-
-def as_values(report: Report) -> dict[str, Any]:
-    """The report in plain values, for scripts: keys stay; null where there is nothing or no finite number."""
-    evaluation, protocol = report.evaluation, report.evaluation.protocol
-    values = {
-        "format": FORMAT,
-        **_conditions(evaluation.conditions),
-        "count": protocol.count,
-        "trials": protocol.trials,
-        "seed": protocol.seed,
-        "machine": {
-            "processor": platform.machine(),
-            "torch": torch.__version__,
-            "threads": torch.get_num_threads(),
-            "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
-        },
-        "reference": {"name": REFERENCE} | _scores(evaluation.reference),
-        "methods": {
-            name: {
-                "alone": _scores(row.alone),
-                "refined": None if row.refined is None else _scores(row.refined),
-                "latency_ms": asdict(report.latencies[name]) if name in report.latencies else None,
-                "model": _facts(report.facts.get(name)),
-            }
-            for name, row in evaluation.rows.items()
-        },
-        "sweeps": {sweep.axis: _sweep(sweep) for sweep in report.sweeps},
-    }
-    return _finite(values)
-
-
-def _conditions(conditions: Conditions) -> dict[str, Any]:
-    drift, poses = conditions.drift, conditions.pose_range
-    return {
-        "rig": conditions.rig.name,
-        "object": conditions.obj.name,
-        "poses_deg": {name.removesuffix("_deg"): list(limits) for name, limits in vars(poses).items()},
-        "drift": {"kind": "relative" if isinstance(drift, RelativeDrift) else "physical"} | vars(drift),
-        "corruption": dict(vars(conditions.corruption)),
-        "sigma_px": conditions.sigma,
-    }
-
-
-def _scores(scores: Scores) -> dict[str, Any]:
-    return {
-        "re_px": dict(scores.statistics()),
-        "parameters": scores.parameters(),
-        "cramer_rao_ratio": scores.cramer_rao_ratios(),
-    }
-
-
-def _facts(facts: Facts | None) -> dict[str, int] | None:
-    return None if facts is None else {"parameters": facts.parameters, "bytes": facts.size}
-
-
-def _sweep(sweep: Sweep) -> dict[str, Any]:
-    def column(scores: Sequence[Scores | None]) -> list[dict[str, Any] | None]:
-        return [None if one is None else dict(one.statistics()) for one in scores]
-
-    names = list(sweep.evaluations[0].rows)
-    return {
-        "values": list(sweep.values),
-        "reference": column([evaluation.reference for evaluation in sweep.evaluations]),
-        "methods": {
-            name: {
-                "alone": column([evaluation.rows[name].alone for evaluation in sweep.evaluations]),
-                "refined": column([evaluation.rows[name].refined for evaluation in sweep.evaluations]),
-            }
-            for name in names
-        },
-    }
-
-
-def _finite(values: Any) -> Any:
-    if isinstance(values, dict):
-        return {key: _finite(value) for key, value in values.items()}
-    if isinstance(values, list | tuple):
-        return [_finite(value) for value in values]
-    return None if isinstance(values, float) and not math.isfinite(values) else values

@@ -7,7 +7,8 @@ import torch
 from imgcal.evaluation import Evaluation, Method, Protocol, Row, Scores, evaluate, network_method, sweep
 from imgcal.evaluation.methods import factory_alone
 from imgcal.evaluation.plots import draw_latency, draw_sweep, draw_training
-from imgcal.evaluation.report import Facts, Report, Table, as_values, describe, markdown, tables, write
+from imgcal.evaluation.summary import Facts, Summary, as_values
+from imgcal.evaluation.tables import Table, as_tables, describe, markdown, write
 from imgcal.evaluation.timing import Latency
 from tests.imgcal.evaluation.conftest import Fake, straight_down
 
@@ -15,11 +16,11 @@ HISTORY = ({"step": 10, "re_px": 9.0}, {"step": 20, "re_px": 5.0, "validation_re
 
 
 @pytest.fixture(scope="module")
-def report(conditions) -> Report:
+def summary(conditions) -> Summary:
     known = straight_down(conditions(kappa=0.002, noise=0.1))
     methods = {"fake": network_method(Fake(known)), "factory": Method(factory_alone)}
     few = Protocol(count=4, trials=2)
-    return Report(
+    return Summary(
         evaluate(methods, known, few),
         {"fake": Latency(1.0, 2.0, 3.0, 4.0), "factory": Latency(5.0, 6.0, None, None)},
         {"fake": Facts(1234, 5_600_000, HISTORY)},
@@ -27,8 +28,8 @@ def report(conditions) -> Report:
     )
 
 
-def test_values_are_json_with_both_columns(report):
-    values = json.loads(json.dumps(as_values(report), allow_nan=False))
+def test_values_are_json_with_both_columns(summary):
+    values = json.loads(json.dumps(as_values(summary), allow_nan=False))
     assert values["format"] == "imgcal-evaluation/1"
     assert values["rig"] == "T4"
     assert values["corruption"]["noise"] == 0.1
@@ -44,17 +45,17 @@ def test_values_are_json_with_both_columns(report):
     assert len(values["sweeps"]["noise"]["methods"]["fake"]["refined"]) == 2
 
 
-def test_what_is_not_finite_is_null(report):
-    row = report.evaluation.rows["factory"]
+def test_what_is_not_finite_is_null(summary):
+    row = summary.evaluation.rows["factory"]
     broken = replace(row.alone.trials[0], re=torch.full((4,), torch.inf, dtype=torch.float64))
-    evaluation = replace(report.evaluation, rows={"factory": Row(Scores((broken,), ()))})
-    values = as_values(Report(evaluation))
+    evaluation = replace(summary.evaluation, rows={"factory": Row(Scores((broken,), ()))})
+    values = as_values(Summary(evaluation))
     assert values["methods"]["factory"]["alone"]["re_px"]["mean"] is None
-    assert "> 10000" in markdown(Report(evaluation))
+    assert "> 10000" in markdown(Summary(evaluation))
 
 
-def test_tables_show_every_method_and_the_reference(report):
-    errors, parameters, cost = tables(report)
+def test_tables_show_every_method_and_the_reference(summary):
+    errors, parameters, cost = as_tables(summary)
     assert [row[0] for row in errors.rows] == ["fake", "factory", "MAP, true inliers"]
     assert [row[0] for row in parameters.rows] == ["fake", "fake, refined", "factory", "MAP, true inliers"]
     assert "–" in errors.rows[1]
@@ -68,19 +69,19 @@ def test_markdown_is_a_table():
     assert lines == ["### Title", "", "| method |  a |", "| :----- | -: |", "| x      |  1 |", "| longer | 22 |"]
 
 
-def test_the_description_says_what_the_rigs_were(report):
-    text = describe(report.evaluation)
+def test_the_description_says_what_the_rigs_were(summary):
+    text = describe(summary.evaluation)
     assert "Rig T4, object asymmetric8, phi 0 to 0 deg" in text
     assert "noise 0.1" in text
     exact: Evaluation = replace(
-        report.evaluation,
-        conditions=replace(report.evaluation.conditions, corruption=type(report.evaluation.conditions.corruption)()),
+        summary.evaluation,
+        conditions=replace(summary.evaluation.conditions, corruption=type(summary.evaluation.conditions.corruption)()),
     )
     assert "exact points" in describe(exact)
 
 
-def test_files_are_written(report, tmp_path):
-    files = write(report, tmp_path)
+def test_files_are_written(summary, tmp_path):
+    files = write(summary, tmp_path)
     expected = ["evaluation.json", "evaluation.md", "error-noise.png", "training.png", "latency.png"]
     assert [path.name for path in files] == expected
     assert {path.name for path in tmp_path.iterdir()} == set(expected)
@@ -88,18 +89,18 @@ def test_files_are_written(report, tmp_path):
     assert json.loads(files[0].read_text())["trials"] == 2
 
 
-def test_only_what_there_are_data_for_is_drawn(report, tmp_path):
-    assert [path.suffix for path in write(Report(report.evaluation), tmp_path)] == [".json", ".md"]
+def test_only_what_there_are_data_for_is_drawn(summary, tmp_path):
+    assert [path.suffix for path in write(Summary(summary.evaluation), tmp_path)] == [".json", ".md"]
 
 
-def test_plots_show_what_was_measured(report):
-    [axes] = draw_sweep(report.sweeps[0]).axes
+def test_plots_show_what_was_measured(summary):
+    [axes] = draw_sweep(summary.sweeps[0]).axes
     assert [line.get_label() for line in axes.lines] == ["fake", "fake, refined", "factory", "MAP, true inliers"]
     assert list(axes.lines[0].get_xdata()) == [0.0, 0.1]
-    [axes] = draw_training(report).axes
+    [axes] = draw_training(summary).axes
     assert [list(line.get_xdata()) for line in axes.lines] == [[10, 20], [20]]
     assert list(axes.lines[1].get_ydata()) == [6.0]
-    [axes] = draw_latency(report).axes
+    [axes] = draw_latency(summary).axes
     assert {line.get_label() for line in axes.lines if not line.get_label().startswith("_")} == {
         "fake",
         "fake, refined",
