@@ -1,0 +1,37 @@
+"""Messages stay readable, whatever they quote."""
+
+import pytest
+
+from imgcal.messages import LONGEST, MOST_QUOTED, listed, one_line, quoted, shortened
+
+
+@pytest.mark.parametrize("length", [0, 1, 40, 41, 10_000])
+def test_names_are_kept_or_cut(length: int) -> None:
+    found = shortened("n" * length)
+    assert found == "n" * length if length <= 40 else found == "n" * 37 + "..."
+
+
+@pytest.mark.parametrize("length", [0, MOST_QUOTED, MOST_QUOTED + 1, 10**6])
+def test_quotes_are_kept_or_cut(length: int) -> None:
+    found = quoted("q" * length)
+    assert len(found) == min(length, MOST_QUOTED) and found.endswith("...") == (length > MOST_QUOTED)
+
+
+def test_lists_say_how_many_they_leave_out() -> None:
+    assert listed([]) == "" and listed(["a", "b"]) == "a, b"
+    names = [f"camera{n:03}" for n in range(300)]
+    found = listed(iter(names))
+    assert found == "camera000, camera001, camera002, camera003, ... (300 in all)"
+    assert len(listed(["x" * 5000] * 5000)) < MOST_QUOTED + 50
+
+
+def test_one_line_is_one_line_of_text() -> None:
+    assert one_line("two\n  lines\t and   a gap ") == "two lines and a gap"
+    found = one_line("bell \a, escape \x1b[31m, a line separator \u2028, umlaut ä")
+    assert found == "bell \\x07, escape \\x1b[31m, a line separator , umlaut ä"
+    assert found.isprintable()
+
+
+def test_a_long_message_keeps_both_its_ends() -> None:
+    found = one_line("begin " + "x" * 5000 + " end")
+    assert len(found) == LONGEST and found.startswith("begin x") and found.endswith("x end") and "..." in found
