@@ -4,13 +4,33 @@ from __future__ import annotations
 
 
 class InputError(ValueError):
-    """Raise for input that cannot be used; the message names the file, what was found and what was expected."""
+    """Raise for input that cannot be used; the message names the file, what was found and what was expected.
+
+    Examples:
+        >>> import imgcal
+        >>> try:
+        ...     imgcal.load_rig("O11")
+        ... except imgcal.InputError as error:
+        ...     print(error)
+        O11: ...
+    """
 
 
 class RefusedError(RuntimeError):
     """Raise when the input is sound but cannot decide the answer (identity unclear, too few fiducials, bad fit).
 
     What helps has one wording for Python, which is part of the message, and one for the command line.
+
+    Examples:
+        >>> import torch, imgcal
+        >>> from imgcal.synthesis import simulate_truth, true_detections
+        >>> rig, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+        >>> seen = true_detections(simulate_truth(rig, obj, 1, torch.Generator().manual_seed(0), None))
+        >>> try:
+        ...     imgcal.calibrate(seen.select(seen.fiducial < 3), rig, obj)  # three fiducials are too few
+        ... except imgcal.RefusedError as error:
+        ...     print(error)
+        identity...
     """
 
     def __init__(self, reason: str, *, python: str = "", command: str = "") -> None:

@@ -27,6 +27,10 @@ def palette(count: int) -> Tensor:
     Raises:
         ValueError: A negative count, or more colours than candidates.
 
+
+    Examples:
+        >>> palette(8).shape
+        torch.Size([8, 3])
     """
     levels = np.linspace(0, 1, GRID)
     srgb = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -64,6 +64,12 @@ def splat(
 
     Convention: pixel (0, 0) is the centre of the top-left pixel, u right, v down.
 
+
+    Examples:
+        >>> uv = torch.tensor([[10.0, 12.0], [20.0, 4.0]])  # centres of two fiducials
+        >>> image = splat(uv, torch.eye(3)[:2], 1.5, (32, 24))  # red and green dots, 32 rows of 24 pixels
+        >>> image.shape, image[0, 12, 10] > image[0, 12, 13]
+        (torch.Size([3, 32, 24]), tensor(True))
     """
     if isinstance(size, int | float) and not 0 < size < math.inf:
         raise ValueError(f"size must be positive and finite, found {size}")

@@ -27,7 +27,13 @@ class Ambiguity:
 
 
 def lattice_shifts(obj: CalibrationObject) -> list[Ambiguity]:
-    """Find the translations, smallest first, that take most fiducials onto others: the steps of a lattice."""
+    """Find the translations, smallest first, that take most fiducials onto others: the steps of a lattice.
+
+    Examples:
+        >>> import imgcal
+        >>> len(lattice_shifts(imgcal.load_object("asymmetric8"))), bool(lattice_shifts(imgcal.load_object("cube27")))
+        (0, True)
+    """
     return list(_lattice_shifts(obj.points.double().cpu().numpy().tobytes(), 0.01 * obj.size))
 
 

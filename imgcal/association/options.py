@@ -11,7 +11,13 @@ from imgcal.geometry import RigidTransform
 
 @dataclass(frozen=True)
 class PipelineOptions:
-    """How sure the pipeline must be before it gives an answer."""
+    """How sure the pipeline must be before it gives an answer.
+
+    Examples:
+        >>> options = PipelineOptions(blind_cameras=True, most_outliers=0.1)
+        >>> options.blind_cameras, options.outlier
+        (True, 5.0)
+    """
 
     identity: IdentityOptions = IdentityOptions()
     estimation: EstimationOptions = EstimationOptions()

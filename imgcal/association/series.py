@@ -77,6 +77,17 @@ def associate(
 
     Raises:
         RefusedError: no snapshot could be decided.
+
+    Examples:
+        >>> import torch, imgcal
+        >>> from dataclasses import replace
+        >>> from imgcal.synthesis import simulate_truth, true_detections
+        >>> rig, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+        >>> seen = true_detections(simulate_truth(rig, obj, 2, torch.Generator().manual_seed(0), None))
+        >>> unlabelled = replace(seen, fiducial=np.full_like(seen.fiducial, -1))
+        >>> found = associate(unlabelled, rig, obj)
+        >>> found.identity, bool((found.detections.fiducial == seen.fiducial).all())
+        ('unique', True)
     """
     count = len(detections.snapshot_names)
     coded = _coded_snapshots(detections, count)

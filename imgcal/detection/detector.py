@@ -39,6 +39,15 @@ def detect(
 
     Raises:
         InputError: a frame is no grey image, or cameras have different numbers of snapshots.
+
+    Examples:
+        >>> import imgcal
+        >>> from imgcal.io import data_path, open_capture
+        >>> capture = open_capture(data_path("samples", "O10"))
+        >>> _, frames = next(iter(capture.snapshots(0, 1)))  # {camera: (H, W) array}
+        >>> blobs = imgcal.detect(frames)
+        >>> len(blobs.camera_names), bool((blobs.sigma[blobs.usable] < 0.1).all())
+        (10, True)
     """
     options = options or DetectionOptions()
     names = tuple(frames)

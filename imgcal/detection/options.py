@@ -21,6 +21,13 @@ class DetectionOptions:
     """What counts as a blob.
 
     Radii are those of the disc of equal area: sqrt(integrated brightness / peak brightness / pi).
+
+    Examples:
+        >>> DetectionOptions(polarity="dark", min_radius=2.0).radius_limit
+        16.0
+        >>> DetectionOptions(min_radius=0.0)
+        Traceback (most recent call last):
+        imgcal.errors.InputError: radius limits: found 0.0 to 16.0, expected 0 < min < max <= 500 px
     """
 
     polarity: Polarity = "bright"  # markers brighter or darker than what is around them

@@ -30,7 +30,13 @@ EXCEPTIONAL = 2.0
 
 @dataclass(frozen=True)
 class WorkingVolume:
-    """A box along the axes of the rig frame."""
+    """A box along the axes of the rig frame.
+
+    Examples:
+        >>> volume = WorkingVolume(torch.tensor([-100.0, -100.0, 700.0]), torch.tensor([100.0, 100.0, 1000.0]))
+        >>> volume.grid(3).shape, volume.contains(torch.tensor([0.0, 0.0, 850.0]))
+        (torch.Size([3, 3, 3, 3]), tensor(True))
+    """
 
     low: Tensor  # (3,) mm
     high: Tensor  # (3,) mm
@@ -53,6 +59,18 @@ class PredictedError:
     All are expected (RMS) lengths, of the calibration's errors alone where nothing else is said. Pixels: image of a
     point by the true rig against that by this one. Millimetres: a point seen by all cameras that have it in view,
     without noise, triangulated with this rig, against the true point.
+
+    Examples:
+        >>> import imgcal
+        >>> from imgcal.synthesis import PhysicalDrift, simulate_truth
+        >>> from imgcal.types import Observations
+        >>> factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+        >>> truth = simulate_truth(factory, obj, 5, torch.Generator().manual_seed(1), PhysicalDrift())
+        >>> seen = torch.ones(truth.uv.shape[:-1], dtype=torch.bool)
+        >>> observations = Observations(truth.uv, torch.full(seen.shape, 0.05), seen)
+        >>> error = predicted_error(imgcal.estimate(observations, factory, obj))
+        >>> 0 < error.median_mm < error.p95_mm, 0 < error.median_px < error.p95_px
+        (True, True)
     """
 
     volume: WorkingVolume
@@ -153,6 +171,20 @@ def predicted_error(
     Raises:
         InputError: an estimate with batch axes.
         RefusedError: the information is singular.
+
+    Examples:
+        >>> import imgcal
+        >>> from imgcal.synthesis import PhysicalDrift, simulate_truth
+        >>> from imgcal.types import Observations
+        >>> factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+        >>> truth = simulate_truth(factory, obj, 5, torch.Generator().manual_seed(1), PhysicalDrift())
+        >>> seen = torch.ones(truth.uv.shape[:-1], dtype=torch.bool)
+        >>> observations = Observations(truth.uv, torch.full(seen.shape, 0.05), seen)
+        >>> result = imgcal.estimate(observations, factory, obj)
+        >>> low, high = torch.tensor([[-50.0, -50.0, 800.0], [50.0, 50.0, 900.0]], dtype=torch.float64)
+        >>> volume = WorkingVolume(low, high)
+        >>> predicted_error(result, volume=volume).median_px < 0.1
+        True
     """
     if calibration.rig.batch_shape:
         raise InputError(

@@ -85,7 +85,20 @@ def whitened_covariance(solution: Solution) -> Tensor:
 
 
 def camera_std(estimate: Estimate) -> Tensor:
-    """One standard deviation of every parameter: (*B, C, 15)."""
+    """One standard deviation of every parameter: (*B, C, 15).
+
+    Examples:
+        >>> import imgcal
+        >>> from imgcal.synthesis import PhysicalDrift, simulate_truth
+        >>> from imgcal.types import Observations
+        >>> factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+        >>> truth = simulate_truth(factory, obj, 5, torch.Generator().manual_seed(1), PhysicalDrift())
+        >>> seen = torch.ones(truth.uv.shape[:-1], dtype=torch.bool)
+        >>> observations = Observations(truth.uv, torch.full(seen.shape, 0.05), seen)
+        >>> std = camera_std(imgcal.estimate(observations, factory, obj))
+        >>> std.shape, float(std[0, 6]) < 0.02 * float(factory.focal_length[0, 0])  # the prior: 2 %
+        (torch.Size([4, 15]), True)
+    """
     variance = camera_covariance(estimate).diagonal(dim1=-2, dim2=-1)
     return variance.clamp_min(0).sqrt().unflatten(-1, (estimate.rig.num_cameras, PARAMETERS))
 

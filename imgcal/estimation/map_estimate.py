@@ -33,7 +33,12 @@ COARSE_TOLERANCE = 0.1
 
 @dataclass(frozen=True)
 class EstimationOptions:
-    """How to minimize."""
+    """How to minimize.
+
+    Examples:
+        >>> EstimationOptions(loss="cauchy").threshold
+        3.0
+    """
 
     loss: Literal["squared", "huber", "cauchy", "geman_mcclure"] = "huber"
     threshold: float = 3.0  # standard deviations, where the loss stops being quadratic
@@ -43,7 +48,22 @@ class EstimationOptions:
 
 @dataclass(frozen=True)
 class Estimate:
-    """The most probable rig, the object's poses, and how well they are known. `covariance.py` reads the last part."""
+    """The most probable rig, the object's poses, and how well they are known. `covariance.py` reads the last part.
+
+    Examples:
+        >>> import imgcal
+        >>> from imgcal.synthesis import PhysicalDrift, simulate_truth
+        >>> from imgcal.types import Observations
+        >>> factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+        >>> truth = simulate_truth(factory, obj, 5, torch.Generator().manual_seed(1), PhysicalDrift())
+        >>> seen = torch.ones(truth.uv.shape[:-1], dtype=torch.bool)
+        >>> observations = Observations(truth.uv, torch.full(seen.shape, 0.05), seen)
+        >>> result = estimate(observations, factory, obj)
+        >>> result.rig.focal_length.shape, result.residual.shape  # one rig; snapshots, cameras, fiducials, (u, v)
+        (torch.Size([4, 2]), torch.Size([5, 4, 8, 2]))
+        >>> float(result.chi2_per_dof) < 1  # no noise was added
+        True
+    """
 
     rig: CameraRig  # (*B)
     rig_from_object: RigidTransform  # (*B, S)
@@ -101,6 +121,18 @@ def estimate(
 
     Raises:
         InputError: shapes that do not belong together; something seen with a sigma of zero or less.
+
+    Examples:
+        >>> import imgcal
+        >>> from imgcal.synthesis import PhysicalDrift, simulate_truth
+        >>> from imgcal.types import Observations
+        >>> factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+        >>> truth = simulate_truth(factory, obj, 5, torch.Generator().manual_seed(1), PhysicalDrift())
+        >>> seen = torch.ones(truth.uv.shape[:-1], dtype=torch.bool)
+        >>> observations = Observations(truth.uv, torch.full(seen.shape, 0.05), seen)
+        >>> result = estimate(observations, factory, obj)
+        >>> bool(result.converged), float(result.rms) < 0.01
+        (True, True)
     """
     batch = observations.seen.shape[:-3]
     problem = make_problem(observations, rig, obj, prior_std)

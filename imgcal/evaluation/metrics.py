@@ -62,6 +62,15 @@ def reprojection_error(predicted: CameraRig, truth: CameraRig, obj: CalibrationO
 
     Returns:
         (B,) pixels. A fiducial behind a predicted camera counts with the finite, huge pixel that projection gives it.
+
+    Examples:
+        >>> import imgcal
+        >>> from imgcal.synthesis import synthesize
+        >>> rig, obj = imgcal.load_rig("T4"), imgcal.load_object("cube8")
+        >>> drawn = synthesize(rig, obj, 2, torch.Generator().manual_seed(0))
+        >>> cameras = drawn.rig.from_object(drawn.rig_from_object)
+        >>> reprojection_error(cameras, cameras, obj)
+        tensor([0., 0.], dtype=torch.float64)
     """
     batch = torch.broadcast_shapes(predicted.batch_shape, truth.batch_shape)
     dtype = torch.promote_types(predicted.focal_length.dtype, truth.focal_length.dtype)

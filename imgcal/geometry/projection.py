@@ -18,7 +18,15 @@ NEAREST_DEPTH = 1e-3
 
 @dataclass(frozen=True)
 class Projection:
-    """Image of points in cameras; `visible` alone says whether a pixel means anything."""
+    """Image of points in cameras; `visible` alone says whether a pixel means anything.
+
+    Examples:
+        >>> import imgcal
+        >>> rig, obj = imgcal.load_rig("O10"), imgcal.load_object("cube8")
+        >>> seen = rig.project(obj.points + obj.points.new_tensor([0.0, 0.0, rig.working_distance]))
+        >>> seen.uv.shape, bool(seen.visible.all())
+        (torch.Size([10, 8, 2]), True)
+    """
 
     uv: Tensor  # (*B, C, N, 2) pixels, always finite for finite input
     depth: Tensor  # (*B, C, N) mm along the optical axis
@@ -26,7 +34,12 @@ class Projection:
 
 
 def resized_pixels(uv: Tensor, scale: Tensor | float) -> Tensor:
-    """Take pixels to the same image in another size, by the pixel-centre rule u' + 1/2 = scale (u + 1/2)."""
+    """Take pixels to the same image in another size, by the pixel-centre rule u' + 1/2 = scale (u + 1/2).
+
+    Examples:
+        >>> resized_pixels(torch.tensor([0.0, 9.0]), 0.5)
+        tensor([-0.2500,  4.2500])
+    """
     return (uv + 0.5) * scale - 0.5
 
 
@@ -166,6 +179,11 @@ def undistort(xy_distorted: Tensor, distortion: Tensor, iterations: int = 8) -> 
     Returns:
         (*B, C, N, 2) undistorted coordinates and (*B, C, N) bool: converged, and before the fold. Where false, the
         coordinates are the distorted ones.
+
+    Examples:
+        >>> xy, converged = undistort(torch.tensor([[[0.1, 0.2]]]), torch.tensor([[0.1, 0.0, 0.0, 0.0, 0.0]]))
+        >>> xy.round(decimals=4), bool(converged.all())
+        (tensor([[[0.0995, 0.1990]]]), True)
     """
     k1, k2, p1, p2, k3 = distortion.unsqueeze(-2).unbind(-1)
     xd, yd = xy_distorted.unbind(-1)

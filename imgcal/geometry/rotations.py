@@ -38,6 +38,12 @@ def rotation_from_vector(vector: Tensor) -> Tensor:
         (*B, 3, 3) rotation matrices.
 
     Source: Rodrigues' formula, I + a [w] + b [w]^2 with a = sin(t)/t and b = (1 - cos(t))/t^2.
+
+    Examples:
+        >>> rotation_from_vector(torch.tensor([0.0, 0.0, torch.pi / 2])).round(decimals=6) + 0.0
+        tensor([[ 0., -1.,  0.],
+                [ 1.,  0.,  0.],
+                [ 0.,  0.,  1.]])
     """
     x, y, z = vector.unbind(-1)
     squared = x * x + y * y + z * z
@@ -90,6 +96,10 @@ def vector_from_rotation(rotation: Tensor) -> Tensor:
         (*B, 3) rad. At exactly pi the sign of the axis is arbitrary.
 
     Source: quaternion of the largest of the four candidates (Shepperd 1978), then 2 atan2(|v|, w) v/|v|.
+
+    Examples:
+        >>> vector_from_rotation(rotation_from_vector(torch.tensor([0.1, -0.2, 0.3])))
+        tensor([ 0.1000, -0.2000,  0.3000])
     """
     quaternion = _quaternion_from_rotation(rotation)
     w, v = quaternion[..., :1], quaternion[..., 1:]
@@ -163,6 +173,10 @@ def geodesic_angle(first: Tensor, second: Tensor) -> Tensor:
         (*B,) rad in [0, pi], with a finite gradient everywhere (zero where the two are equal).
 
     Source: |R1 - R2|_F = 2 sqrt(2) sin(angle / 2); accurate at small angles, unlike the arc cosine of the trace.
+
+    Examples:
+        >>> geodesic_angle(torch.eye(3), rotation_from_vector(torch.tensor([0.0, 0.25, 0.0])))
+        tensor(0.2500)
     """
     squared = (first - second).square().sum((-2, -1)) / 8
     trace = (first * second).sum((-2, -1))

@@ -14,7 +14,17 @@ Join = Callable[[list[Tensor]], Tensor]
 
 @dataclass(frozen=True)
 class RigidTransform:
-    """Rotation, then translation: `points_destination = rotation @ points_source + translation`."""
+    """Rotation, then translation: `points_destination = rotation @ points_source + translation`.
+
+    Examples:
+        >>> quarter_turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        >>> rig_from_object = RigidTransform(quarter_turn, torch.tensor([0.0, 0.0, 850.0]))
+        >>> rig_from_object.apply(torch.tensor([[10.0, 0.0, 0.0]]))
+        tensor([[  0.,  10., 850.]])
+        >>> object_from_rig = rig_from_object.inverse()
+        >>> (object_from_rig @ rig_from_object).translation
+        tensor([0., 0., 0.])
+    """
 
     rotation: Tensor  # (*B, 3, 3)
     translation: Tensor  # (*B, 3) mm

@@ -117,6 +117,12 @@ def open_capture(folder: str | Path, rig: CameraRig | None = None) -> Capture:
 
     Raises:
         InputError: one line with the file or folder, what was found and what was expected.
+
+    Examples:
+        >>> from imgcal.io import data_path
+        >>> capture = open_capture(data_path("samples", "O10"))
+        >>> len(capture.camera_names), len(capture.snapshot_names)
+        (10, 4)
     """
     folder = Path(folder)
     frames = folder / "frames"

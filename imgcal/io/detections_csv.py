@@ -35,7 +35,7 @@ MARGIN = 5.0  # pixels outside the image that are still taken: centres of cut di
 
 
 def load_detections(path: str | Path, rig: CameraRig | None = None, fiducials: int | None = None) -> Detections:
-    """Read detections; a million rows take a few seconds.
+    r"""Read detections; a million rows take a few seconds.
 
     Args:
         path: CSV file, with or without gzip compression.
@@ -47,6 +47,15 @@ def load_detections(path: str | Path, rig: CameraRig | None = None, fiducials: i
 
     Raises:
         InputError: one line with the file, the line, what was found and what was expected.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> import imgcal
+        >>> rows = ["snapshot,camera,u,v", "0,cam01,100.5,50.25", "0,cam02,400,300"]
+        >>> _ = Path("blobs.csv").write_text("\n".join(rows))
+        >>> blobs = imgcal.load_detections("blobs.csv")
+        >>> blobs.camera_names, blobs.uv[0], blobs.fiducial  # -1 = unlabelled
+        (('cam01', 'cam02'), array([100.5 ,  50.25]), array([-1, -1]))
     """
     path = Path(path)
     cameras = {} if rig is None else {name: index for index, name in enumerate(rig.camera_names)}
@@ -88,6 +97,15 @@ def save_detections(detections: Detections, path: str | Path) -> None:
 
     Raises:
         InputError: the file cannot be written, or a name could not be read again.
+
+    Examples:
+        >>> import torch, imgcal
+        >>> from imgcal.synthesis import simulate_truth, true_detections
+        >>> rig, obj = imgcal.load_rig("T4"), imgcal.load_object("cube8")
+        >>> blobs = true_detections(simulate_truth(rig, obj, 2, torch.Generator().manual_seed(0), None))
+        >>> imgcal.save_detections(blobs, "blobs.csv.gz")
+        >>> len(imgcal.load_detections("blobs.csv.gz", rig)) == len(blobs) == 2 * 4 * 8
+        True
     """
     path = Path(path)
     for name in (*detections.camera_names, *detections.snapshot_names):

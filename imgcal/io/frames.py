@@ -100,6 +100,12 @@ def write_frame(path: str | Path, frame: Frame) -> None:
 
     Raises:
         InputError: the file cannot be written, or the frame is of another kind.
+
+    Examples:
+        >>> import numpy as np
+        >>> write_frame("frame.png", np.full((4, 6), 1000, dtype=np.uint16))
+        >>> read_frame("frame.png").shape, int(read_frame("frame.png").max())
+        ((4, 6), 1000)
     """
     path = Path(path)
     if path.suffix.lower() != ".png":

@@ -36,6 +36,12 @@ def load_object(path: str | Path) -> CalibrationObject:
 
     Raises:
         InputError: one line with the file, the line, what was found and what was expected.
+
+    Examples:
+        >>> import imgcal
+        >>> obj = imgcal.load_object("cube8")
+        >>> obj.points.shape, obj.radius
+        (torch.Size([8, 3]), None)
     """
     return _read(find_file(path, "objects", ".csv"))
 

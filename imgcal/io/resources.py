@@ -17,5 +17,10 @@ def data_path(*parts: str) -> Path:
 
 
 def shipped_names(kind: str, suffix: str) -> tuple[str, ...]:
-    """List the bare names of what is shipped: `shipped_names("rigs", ".yaml")` holds "O10"."""
+    """List the bare names of what is shipped: `shipped_names("rigs", ".yaml")` holds "O10".
+
+    Examples:
+        >>> shipped_names("rigs", ".yaml")
+        ('O10', 'O6', 'T4', 'U7', 'room10')
+    """
     return tuple(sorted(path.stem for path in data_path(kind).glob(f"*{suffix}")))

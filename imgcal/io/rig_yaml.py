@@ -165,6 +165,12 @@ def load_rig(path: str | Path) -> CameraRig:
 
     Raises:
         InputError: one line with the file, the camera, what was found and what was expected.
+
+    Examples:
+        >>> import imgcal
+        >>> rig = imgcal.load_rig("O10")
+        >>> rig.name, rig.cameras, rig.working_distance
+        ('O10', 10, 850.14)
     """
     content, path = _read(path)
     return _rig_of(content, title_of(path))
@@ -203,6 +209,12 @@ def save_rig(rig: CameraRig, path: str | Path, covariance: RigCovariance | None 
 
     Raises:
         InputError: the file cannot be written, or the rig could not be read again (NaN, for example).
+
+    Examples:
+        >>> import imgcal
+        >>> imgcal.save_rig(imgcal.load_rig("T4").select([0, 1]), "pair.yaml")
+        >>> imgcal.load_rig("pair.yaml").camera_names
+        ('cam01', 'cam02')
     """
     write_text(path, rig_text(rig, path, covariance, full))
 

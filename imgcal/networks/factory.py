@@ -24,6 +24,18 @@ def build(config: NetworkConfig, factory: CameraRig, obj: CalibrationObject, dri
 
     Raises:
         InputError: an unknown backbone, or a rig without working distance.
+
+    Examples:
+        >>> import torch, imgcal
+        >>> from imgcal.networks import NetworkConfig
+        >>> from imgcal.synthesis import RelativeDrift, synthesize
+        >>> from imgcal.types import Views
+        >>> factory, obj = imgcal.load_rig("T4").to(torch.float32), imgcal.load_object("cube8")
+        >>> network = build(NetworkConfig(preset="points"), factory, obj, RelativeDrift().std(factory))
+        >>> uv = synthesize(factory, obj, 2, torch.Generator().manual_seed(0)).projection.uv
+        >>> passes = network(Views(uv, torch.ones(uv.shape[:-1], dtype=torch.bool)))
+        >>> len(passes), passes[-1].rig.focal_length.shape  # coarse to fine; rigs, cameras, (fx, fy)
+        (3, torch.Size([2, 4, 2]))
     """
     # timm takes seconds to import: only for those who need it.
     from imgcal.networks.points import PaperPointNetwork, PointNetwork

@@ -77,6 +77,18 @@ class Recalibrator:
     """Keeps what the next snapshot needs: the last pose, what the rig has shown itself to be, a pool of threads.
 
     Memory does not grow with the number of snapshots. A context manager: leaving it ends the threads.
+
+    Examples:
+        >>> import torch, imgcal
+        >>> from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
+        >>> factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+        >>> truth = simulate_truth(factory, obj, 4, torch.Generator().manual_seed(1), PhysicalDrift())
+        >>> blobs = true_detections(truth)
+        >>> with imgcal.Recalibrator(factory, obj, window=3) as live:
+        ...     for snapshot in range(4):
+        ...         result = live.update(blobs.of_snapshots(snapshot, snapshot + 1))
+        >>> result.cameras["cam01"], len(result.labelled.used)
+        ('seen', 3)
     """
 
     def __init__(

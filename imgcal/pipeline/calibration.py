@@ -66,7 +66,19 @@ LEAST_KEPT = 0.8
 
 @dataclass(frozen=True)
 class Calibration(Estimate):
-    """An `Estimate`, with what it was made from. Snapshots are those used, in order."""
+    """An `Estimate`, with what it was made from. Snapshots are those used, in order.
+
+    Examples:
+        >>> import torch, imgcal
+        >>> from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
+        >>> factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+        >>> truth = simulate_truth(factory, obj, 4, torch.Generator().manual_seed(1), PhysicalDrift())
+        >>> result = imgcal.calibrate(true_detections(truth), factory, obj)
+        >>> float(result.before.rms) > 5, float(result.rms) < 0.01
+        (True, True)
+        >>> result.outliers, result.displaced, result.moved
+        (0, (), ())
+    """
 
     labelled: Associations
     observations: Observations  # (S, C, N) as used: outliers not seen, sigma with the model error
@@ -164,6 +176,15 @@ def calibrate(
     Raises:
         RefusedError: the data cannot decide; the message says why.
         InputError: the data do not belong to this rig or object: other cameras, frames of another size.
+
+    Examples:
+        >>> import torch, imgcal
+        >>> from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
+        >>> factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+        >>> truth = simulate_truth(factory, obj, 4, torch.Generator().manual_seed(1), PhysicalDrift())
+        >>> result = imgcal.calibrate(true_detections(truth), factory, obj)
+        >>> result.identity, result.rig.camera_names == factory.camera_names
+        ('coded', True)
     """
     started, rig = time.perf_counter(), rig.to(torch.float64)
     detections = blobs_of(source, rig, obj, detection)
@@ -373,6 +394,17 @@ def score(
     Raises:
         RefusedError: no snapshot could be decided.
         InputError: the data do not belong to this rig or object: other cameras, frames of another size.
+
+    Examples:
+        >>> import torch, imgcal
+        >>> from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
+        >>> factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+        >>> truth = simulate_truth(factory, obj, 4, torch.Generator().manual_seed(1), PhysicalDrift())
+        >>> blobs = true_detections(truth)
+        >>> float(imgcal.score(blobs, truth.rig, obj).distances.max()) < 1e-3
+        True
+        >>> float(imgcal.score(blobs, factory, obj).distances.mean()) > 5
+        True
     """
     rig = rig.to(torch.float64)
     labelled = associate(blobs_of(source, rig, obj, detection), rig, obj, options, progress)

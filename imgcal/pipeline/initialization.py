@@ -115,6 +115,11 @@ def load_initializer(name: str, rig: CameraRig, obj: CalibrationObject) -> Initi
 
     Raises:
         InputError: no such file, or no network for this rig and object.
+
+    Examples:
+        >>> import imgcal
+        >>> load_guesser("points", imgcal.load_rig("O10"), imgcal.load_object("cube8")).name
+        'points-O10-cube8'
     """
     if name not in KINDS:
         if not Path(name).is_file():

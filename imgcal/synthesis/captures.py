@@ -49,6 +49,14 @@ def simulate_truth(
 
     Raises:
         RefusedError: the drifted rig cannot see the object.
+
+    Examples:
+        >>> import imgcal
+        >>> from imgcal.synthesis import PhysicalDrift
+        >>> rig, obj = imgcal.load_rig("T4"), imgcal.load_object("cube8")
+        >>> truth = simulate_truth(rig, obj, 3, torch.Generator().manual_seed(0), PhysicalDrift())
+        >>> truth.uv.shape  # snapshots, cameras, fiducials, (u, v)
+        torch.Size([3, 4, 8, 2])
     """
     # The first snapshot decides about the drift too, so that the rig is one that sees the object at all.
     first = synthesize(rig, obj, 1, generator, drift=drift, pose_range=pose_range)
@@ -114,7 +122,14 @@ def simulate_frames(
 
 
 def true_detections(truth: Truth) -> Detections:
-    """The exact image points of what is seen as labelled detections, without noise."""
+    """The exact image points of what is seen as labelled detections, without noise.
+
+    Examples:
+        >>> import imgcal
+        >>> rig, obj = imgcal.load_rig("T4"), imgcal.load_object("cube8")
+        >>> len(true_detections(simulate_truth(rig, obj, 3, torch.Generator().manual_seed(0), None))) == 3 * 4 * 8
+        True
+    """
     snapshots, cameras, fiducials = truth.uv.shape[:3]
     snapshot, camera, fiducial = (a.reshape(-1) for a in np.indices((snapshots, cameras, fiducials)))
     count = len(snapshot)

@@ -197,6 +197,13 @@ def synthesize(
         RefusedError: too few random rigs see everything; the message names the camera that fails most.
 
     Source: paper section 4.1: hemisphere point, R_focus, R_random, perturbation, visibility check.
+
+    Examples:
+        >>> import imgcal
+        >>> rig, obj = imgcal.load_rig("O10").to(torch.float32), imgcal.load_object("cube8")
+        >>> snapshots = synthesize(rig, obj, 16, torch.Generator().manual_seed(0))
+        >>> snapshots.projection.uv.shape, bool(snapshots.projection.visible.all())
+        (torch.Size([16, 10, 8, 2]), True)
     """
     points, radius = obj.points.to(rig.focal_length), None if obj.radius is None else obj.radius.to(rig.focal_length)
     kept: list[Snapshots] = []

@@ -132,6 +132,11 @@ def load_experiment(path: str | Path, changes: Iterable[str] = ()) -> Experiment
 
     Raises:
         InputError: one line with the file or the change, what was found and what was expected.
+
+    Examples:
+        >>> experiment = load_experiment("table1-row13", ["training.batch_size=8"])
+        >>> experiment.network.preset, experiment.training.batch_size
+        ('vit', 8)
     """
     path = find_file(path, "experiments", ".yaml")
     return changed(read_yaml(path, Experiment, FORMAT), *changes)

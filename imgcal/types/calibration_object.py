@@ -28,7 +28,15 @@ class Symmetry:
 
 @dataclass(frozen=True)
 class CalibrationObject:
-    """Fiducials on a rigid body."""
+    """Fiducials on a rigid body.
+
+    Examples:
+        >>> from renderers import palette
+        >>> points = torch.tensor([[0.0, 0.0, 0.0], [50.0, 0.0, 0.0], [0.0, 80.0, 0.0], [0.0, 0.0, 120.0]])
+        >>> obj = CalibrationObject(points, palette(4), radius=torch.full((4,), 5.0), name="corner")
+        >>> obj.fiducials, obj.exact, obj.planar
+        (4, True, False)
+    """
 
     points: Tensor  # (N, 3) mm in the object's frame
     colours: Tensor  # (N, 3) in [0, 1], for colour-coded rendering

@@ -30,6 +30,16 @@ class Detections:
     """Blobs of all cameras and snapshots as flat columns, one row a blob.
 
     Convention: pixel (0, 0) is the centre of the top-left pixel; u right, v down.
+
+    Examples:
+        >>> blobs = Detections(
+        ...     uv=np.array([[100.0, 50.0], [400.0, 300.0]]), sigma=np.array([0.05, 0.05]), camera=np.array([0, 1]),
+        ...     snapshot=np.array([0, 0]), fiducial=np.array([-1, -1]), radius=np.array([3.0, 3.0]),
+        ...     flags=np.array([0, BlobFlag.BORDER], dtype=np.uint8),
+        ...     camera_names=("left", "right"), snapshot_names=("0",),
+        ... )
+        >>> len(blobs), blobs.usable
+        (2, array([ True, False]))
     """
 
     uv: NDArray[np.float64]  # (M, 2) pixels
@@ -68,7 +78,15 @@ class Detections:
 
 @dataclass(frozen=True)
 class Observations:
-    """Labelled fiducials, dense: what each camera saw of each fiducial in each snapshot."""
+    """Labelled fiducials, dense: what each camera saw of each fiducial in each snapshot.
+
+    Examples:
+        >>> snapshots, cameras, fiducials = 3, 10, 8
+        >>> uv = torch.zeros(snapshots, cameras, fiducials, 2)
+        >>> seen = torch.ones(uv.shape[:-1], dtype=torch.bool)
+        >>> Observations(uv, torch.full(seen.shape, 0.1), seen).seen.shape
+        torch.Size([3, 10, 8])
+    """
 
     uv: Tensor  # (*B, S, C, N, 2) pixels; any finite value where not seen
     sigma: Tensor  # (*B, S, C, N) pixels, one standard deviation of each axis

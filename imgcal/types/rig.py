@@ -34,7 +34,17 @@ PARAMETER_NAMES = (
 
 @dataclass(frozen=True)
 class RigPrior:
-    """One standard deviation of each factory value: how far a camera may have drifted."""
+    """One standard deviation of each factory value: how far a camera may have drifted.
+
+    Examples:
+        >>> import imgcal
+        >>> rig = imgcal.load_rig("T4")
+        >>> prior = RigPrior(focal_length=0.01, position=2.0)
+        >>> prior.std(rig).shape  # four cameras, 15 parameters
+        torch.Size([4, 15])
+        >>> prior.std(rig)[0, 3:6]  # mm
+        tensor([2., 2., 2.], dtype=torch.float64)
+    """
 
     focal_length: float = 0.02  # relative
     principal_point: float = 10.0  # pixels
@@ -59,7 +69,19 @@ class RigPrior:
 
 @dataclass(frozen=True)
 class CameraRig:
-    """Cameras fixed to a common frame: whatever the factory says it is; only relations between cameras matter."""
+    """Cameras fixed to a common frame: whatever the factory says it is; only relations between cameras matter.
+
+    Examples:
+        >>> import imgcal
+        >>> rig = imgcal.load_rig("O10")
+        >>> rig.cameras, rig.camera_names[:2], rig.focal_length.shape
+        (10, ('cam01', 'cam02'), torch.Size([10, 2]))
+        >>> points_rig = torch.tensor([[0.0, 0.0, 850.0]], dtype=torch.float64)
+        >>> rig.project(points_rig).uv.shape  # of one point in every camera
+        torch.Size([10, 1, 2])
+        >>> rig.select([0, 1]).camera_names
+        ('cam01', 'cam02')
+    """
 
     focal_length: Tensor  # (*B, C, 2) pixels: fx, fy
     principal_point: Tensor  # (*B, C, 2) pixels: cx, cy
@@ -262,6 +284,11 @@ def pack21(rig: CameraRig) -> Tensor:
 
     Returns:
         (*B, C, 21). Convention: distortion in our order k1, k2, p1, p2, k3; the paper lists k1, k2, k3, p1, p2.
+
+    Examples:
+        >>> import imgcal
+        >>> pack21(imgcal.load_rig("T4")).shape
+        torch.Size([4, 21])
     """
     return torch.cat((rig.cam_from_rig.rotation.flatten(-2), _pack_rest(rig)), dim=-1)
 
