@@ -169,7 +169,7 @@ def load_rig(path: str | Path) -> CameraRig:
     Examples:
         >>> import imgcal
         >>> rig = imgcal.load_rig("O10")
-        >>> rig.name, rig.cameras, rig.working_distance
+        >>> rig.name, rig.num_cameras, rig.working_distance
         ('O10', 10, 850.14)
     """
     content, path = _read(path)

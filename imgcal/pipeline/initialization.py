@@ -118,7 +118,7 @@ def load_initializer(name: str, rig: CameraRig, obj: CalibrationObject) -> Initi
 
     Examples:
         >>> import imgcal
-        >>> load_guesser("points", imgcal.load_rig("O10"), imgcal.load_object("cube8")).name
+        >>> load_initializer("points", imgcal.load_rig("O10"), imgcal.load_object("cube8")).name
         'points-O10-cube8'
     """
     if name not in KINDS:

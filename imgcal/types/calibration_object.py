@@ -34,7 +34,7 @@ class CalibrationObject:
         >>> from renderers import palette
         >>> points = torch.tensor([[0.0, 0.0, 0.0], [50.0, 0.0, 0.0], [0.0, 80.0, 0.0], [0.0, 0.0, 120.0]])
         >>> obj = CalibrationObject(points, palette(4), radius=torch.full((4,), 5.0), name="corner")
-        >>> obj.fiducials, obj.exact, obj.planar
+        >>> obj.num_fiducials, obj.exact, obj.planar
         (4, True, False)
     """
 

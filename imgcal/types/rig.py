@@ -74,7 +74,7 @@ class CameraRig:
     Examples:
         >>> import imgcal
         >>> rig = imgcal.load_rig("O10")
-        >>> rig.cameras, rig.camera_names[:2], rig.focal_length.shape
+        >>> rig.num_cameras, rig.camera_names[:2], rig.focal_length.shape
         (10, ('cam01', 'cam02'), torch.Size([10, 2]))
         >>> points_rig = torch.tensor([[0.0, 0.0, 850.0]], dtype=torch.float64)
         >>> rig.project(points_rig).uv.shape  # of one point in every camera
