@@ -331,9 +331,10 @@ def observations_of(
     """Observations of the accepted snapshots, and their poses where identity found all of them."""
     used = labelled.used
     detections = labelled.detections
-    observations = to_observations(
-        detections.select(np.isin(detections.snapshot, used) & (detections.fiducial >= 0)), rig, obj
-    )
+    rows = detections.fiducial >= 0
+    if len(used) < len(labelled.snapshots):
+        rows &= np.isin(detections.snapshot, used)
+    observations = to_observations(detections if rows.all() else detections.select(rows), rig, obj)
     poses = [labelled.snapshots[s].rig_from_object for s in used]
     known = [pose for pose in poses if pose is not None]
     return observations, RigidTransform.stack(known) if len(known) == len(used) else None

@@ -144,7 +144,10 @@ def _object_of(problem: Problem, state: State) -> tuple[Tensor, State]:
 def _given(problem: Problem) -> tuple[Tensor, ...]:
     factory = problem.factory
     pinhole = (factory.focal_length, factory.principal_point, factory.distortion)
-    rig = (factory.cam_from_rig.rotation, factory.positions, *pinhole)
+    # The rig's own `positions` are those of tensors, and wait for a dozen of small operations.
+    rotation, translation = factory.cam_from_rig.rotation.detach(), factory.cam_from_rig.translation.detach()
+    positions = -(rotation.numpy().swapaxes(-1, -2) @ translation.numpy()[..., None])[..., 0]
+    rig = (rotation, torch.from_numpy(positions), *pinhole)
     return (problem.uv, problem.root_weight, *rig, problem.prior_std)
 
 

@@ -33,6 +33,8 @@ def require_poses(seen: NDArray[np.bool_], points: Tensor) -> None:
     """
     shown, where = seen.any(1), points.detach().cpu().double().numpy()
     whole = _breadth(where)
+    if whole > 0 and shown.all():
+        return
     # What is seen repeats itself: thousands of snapshots show few different parts of an object.
     parts, which = np.unique(shown, axis=0, return_inverse=True)
     narrow = np.array([_breadth(where[part]) <= LEAST_BREADTH * whole for part in parts])[which.reshape(-1)]

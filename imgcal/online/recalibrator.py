@@ -22,6 +22,7 @@ from imgcal.estimation import aligned, flat_std
 from imgcal.geometry import RigidTransform
 from imgcal.online.breaks import MEDIAN, information, series_of
 from imgcal.online.following import (
+    LEAST_BLOBS,
     LEAST_EXPLAINED,
     astray,
     found_again,
@@ -190,8 +191,8 @@ class Recalibrator:
         latest = self._latest
         if latest is None or not self._follows or self._slips:
             return None
-        points = latest.rig_from_object[-1].apply(latest.points_object)
-        predicted = latest.rig.project(points, self.obj.radius).uv.numpy()  # (C, N, 2)
+        points = latest.rig_from_object[-1:].apply(latest.points_object)
+        predicted = latest.rig.expand(1).project_values(points, self.obj.radius).uv[0].numpy()  # (C, N, 2)
         named = replace(blobs, fiducial=near_prediction(blobs, predicted))
         blobs, pose = without_strays(named, latest.rig, latest.object, latest.rig_from_object[-1], self.options)
         before = int(latest.observations.seen[-1].sum())
@@ -231,7 +232,7 @@ class Recalibrator:
 
     def _astray(self, blobs: Detections, pose: RigidTransform) -> NDArray[np.bool_]:
         """Find cameras, of which something is known, that see what may be the object where it should not be: (C,)."""
-        if self._latest is None:
+        if self._latest is None or spare_blobs(blobs, self.rig.num_cameras).max() < LEAST_BLOBS:
             return np.zeros(self.rig.num_cameras, dtype=bool)
         usual = np.median(self._spare, axis=0) if self._spare else np.zeros(self.rig.num_cameras)
         return astray(blobs, usual, self._latest.rig, self.obj, pose)

@@ -163,8 +163,8 @@ class WindowFit:
         if not moved:
             return Fitted(result, window, ())
         newest = window.kept[-1]
-        points = result.rig_from_object[-1].apply(result.points_object)
-        predicted = result.rig.project(points, self.obj.radius).uv.numpy()
+        points = result.rig_from_object[-1:].apply(result.points_object)
+        predicted = result.rig.expand(1).project_values(points, self.obj.radius).uv[0].numpy()
         named = near_prediction(newest.blobs, predicted)
         again = np.where(np.isin(newest.blobs.camera, moved), named, newest.blobs.fiducial)
         better = replace(newest, blobs=replace(newest.blobs, fiducial=again))

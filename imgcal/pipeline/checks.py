@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -88,11 +87,11 @@ def require_same_residuals(
     """
     points = fit.rig_from_object.apply(fit.points_object.unsqueeze(-3)).to(fit.rig.focal_length)
     uv = fit.rig.expand(len(points)).project_values(points, obj.radius).uv  # (S, C, N, 2)
-    difference = (uv - observations.uv - fit.residual)[torch.from_numpy(seen)]
-    if not bool((difference.abs() < SAME_PIXEL).all()):
+    difference = np.abs(uv.numpy() - observations.uv.numpy() - fit.residual.numpy())[seen]
+    if not (difference < SAME_PIXEL).all():
         raise RefusedError(
             "estimation: the rig that was found and its residuals do not belong together (up to "
-            f"{float(difference.abs().max()):.2g} px apart): please report this with the data"
+            f"{difference.max():.2g} px apart): please report this with the data"
         )
 
 

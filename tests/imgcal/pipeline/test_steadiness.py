@@ -107,7 +107,7 @@ def test_a_camera_that_cannot_be_labelled_after_a_move_is_named_without_a_size()
     rig, obj, truth = damage.wand_in_a_room(30, 1)
     table = damage.blobs(truth, 1)
     mirrored = damage.mirrored(table, rig, CAMERA, "u")
-    first = damage.combine(table.select(table.snapshot < 18), mirrored.select(mirrored.snapshot >= 18))
+    first = damage.joined(table.select(table.snapshot < 18), mirrored.select(mirrored.snapshot >= 18))
     with pytest.raises(MovedError, match=r"cam04 moved before snapshot 00018:") as found:
         calibrate(first, rig, obj)
     assert found.value.moved[0].kind == "unknown" and found.value.moved[0].size is None
