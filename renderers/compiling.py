@@ -8,11 +8,12 @@ be read but not written, such as that of an image that was warmed up when it was
 from __future__ import annotations
 
 import atexit
+import contextlib
 import gc
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -20,6 +21,11 @@ from typing import Any, TypeVar, cast
 
 import numba
 from numba.core import event
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -34,13 +40,40 @@ def njit(**options: Any) -> Callable[[Function], Function]:
         # Numba chooses the folder when it decorates. Only then: what others compile is theirs to keep.
         before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, cache_folder()  # type: ignore[attr-defined]
         try:
-            return cast(Function, numba.njit(**options)(function))
+            return cast(Function, _saved_alone(numba.njit(**options)(function)))
         except RuntimeError:  # nowhere to write: compiled anew in every process
             return cast(Function, numba.njit(**(options | {"cache": False}))(function))
         finally:
             numba.config.CACHE_DIR = before  # type: ignore[attr-defined]
 
     return decorate
+
+
+def _saved_alone(compiled: Any) -> Any:
+    """Let no other process save at the same time.
+
+    Numba numbers the files of a function's signatures without a lock: of two processes that save two of them at once,
+    one may find the code of the other under its own name.
+    """
+    cache = compiled._cache
+    save = cache.save_overload
+
+    def save_overload(*arguments: Any) -> None:
+        with _alone():
+            save(*arguments)
+
+    cache.save_overload = save_overload
+    return compiled
+
+
+@contextlib.contextmanager
+def _alone() -> Iterator[None]:
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):  # a file system without locks, or a folder that cannot be written
+            if fcntl and cache_folder():
+                lock = stack.enter_context(Path(cache_folder(), ".lock").open("a"))
+                fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
 
 
 class _Rest(event.Listener):

@@ -128,3 +128,51 @@ def test_the_garbage_collector_rests_while_ours_is_compiled_and_works_again_afte
         assert gc.isenabled()
     finally:
         event.unregister("numba:compile", watch)
+
+
+def test_wart_numba_saves_two_signatures_at_once_under_one_name(tmp_path: Path) -> None:
+    """Hence the lock: without it, one of them is later given the code of the other."""
+    source = f"""
+import threading, numba
+import numba.core.caching as caching
+
+together = threading.Barrier(2)
+load = caching.IndexDataCacheFile._load_index
+
+def twins():
+    files = [caching.IndexDataCacheFile({str(tmp_path)!r}, "f-1.py", "stamp") for _ in range(2)]
+    def meet(file):
+        found = load(file)
+        together.wait()
+        return found
+    caching.IndexDataCacheFile._load_index = meet
+    threads = [threading.Thread(target=file.save, args=(key, key)) for file, key in zip(files, ("a", "b"))]
+    [thread.start() for thread in threads]
+    [thread.join() for thread in threads]
+
+twins()
+"""
+    subprocess.run([sys.executable, "-c", source], check=True)
+    assert len(list(tmp_path.glob("*.nbc"))) == 1
+
+
+@pytest.mark.skipif(compiling.fcntl is None, reason="there are no such locks on Windows")
+def test_one_process_at_a_time_saves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiling, "cache_folder", lambda: str(tmp_path))
+    held = []
+
+    def save(self: object, *arguments: object) -> None:
+        with (tmp_path / ".lock").open("a") as lock:
+            try:
+                compiling.fcntl.flock(lock, compiling.fcntl.LOCK_EX | compiling.fcntl.LOCK_NB)
+            except BlockingIOError:
+                held.append(arguments)
+
+    monkeypatch.setattr(numba.core.caching.FunctionCache, "save_overload", save)
+
+    @compiling.njit()
+    def thrice(x: float) -> float:
+        return 3 * x
+
+    assert thrice(1.5) == 4.5
+    assert len(held) == 1
