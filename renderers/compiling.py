@@ -114,6 +114,12 @@ def cache_folder() -> str:
     return str(folder) if writable else _linked(folder)
 
 
+def is_shared() -> bool:
+    """Tell whether other processes find what this one compiles, and this one what they do."""
+    given = numba.config.CACHE_DIR  # type: ignore[attr-defined]
+    return fcntl is not None and cache_folder() == str(Path(given) if given else _user_folder())
+
+
 def _user_folder() -> Path:
     user = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or Path("~/.cache").expanduser()
     try:

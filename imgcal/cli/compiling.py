@@ -1,17 +1,28 @@
-"""Telling that the first run of a command on a machine waits for its functions to be compiled."""
+"""The first run of a command on a machine waits for its functions to be compiled: it says so, and has help."""
 
 from __future__ import annotations
 
 import contextlib
+import os
+import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
+
+import imgcal
 
 HINT = "compiling for this machine, once after installation; `imgcal warmup` does it ahead of time"
+HELP = "from imgcal.online import warm_up_fits; warm_up_fits()"
+NEEDED_LAST = "lm_cpu.*"  # files of the cache that show that there is nothing to help with
 
 
 @contextlib.contextmanager
-def tells_of_compiling(hint: str = HINT) -> Iterator[list[object]]:
+def tells_of_compiling(hint: str = HINT, helped: bool = False) -> Iterator[list[object]]:
     """Say so on standard error when the first function is compiled.
+
+    Args:
+        hint: what to say.
+        helped: compile in a second process what a calibration needs last, while this one compiles what it needs first.
 
     Yields:
         A list that gets an entry for each function that is compiled.
@@ -22,10 +33,15 @@ def tells_of_compiling(hint: str = HINT) -> Iterator[list[object]]:
         return
     from numba.core import event
 
+    helpers: list[subprocess.Popen[bytes]] = []
+
     class Told(event.Listener):
         def on_start(self, happening: event.Event) -> None:
             if not compiled:
                 print(f"imgcal: {hint}", file=sys.stderr, flush=True)
+                if helped and is_of_use():
+                    with contextlib.suppress(OSError):  # alone, then
+                        helpers.append(start_helper())
             compiled.append(happening.data)
 
         def on_end(self, happening: event.Event) -> None:
@@ -37,3 +53,25 @@ def tells_of_compiling(hint: str = HINT) -> Iterator[list[object]]:
         yield compiled
     finally:
         event.unregister("numba:compile", listener)
+        for helper in helpers:  # what is not done by now is not needed
+            helper.terminate()
+            helper.wait()
+
+
+def is_of_use() -> bool:
+    """Tell whether a second process can compile beside this one, and leave it where this one finds it."""
+    from renderers.compiling import cache_folder, is_shared
+
+    several = len(os.sched_getaffinity(0)) > 1 if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1) > 1
+    return bool(several and sys.executable and is_shared() and not any(Path(cache_folder()).rglob(NEEDED_LAST)))
+
+
+def start_helper() -> subprocess.Popen[bytes]:
+    """Compile the fits in a second process, which has this package and says nothing."""
+    # Not from the current folder, which anybody may have filled.
+    path = os.pathsep.join(filter(None, (str(Path(imgcal.__file__).parents[1]), os.environ.get("PYTHONPATH"))))
+    environment = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
+    nothing = subprocess.DEVNULL
+    return subprocess.Popen(
+        [sys.executable, "-P", "-c", HELP], stdin=nothing, stdout=nothing, stderr=nothing, env=environment
+    )

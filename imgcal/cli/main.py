@@ -78,7 +78,8 @@ def main(arguments: list[str] | None = None) -> int:
     debug = DEBUG in given
     try:
         command = parse([argument for argument in given if argument != DEBUG])
-        with tells_of_compiling() if "warmup" not in given[:2] else contextlib.nullcontext():
+        helped = "calibrate" in given[:2]
+        with tells_of_compiling(helped=helped) if "warmup" not in given[:2] else contextlib.nullcontext():
             command.run()
     except SystemExit as stop:  # help was asked for
         return DONE if stop.code is None else int(stop.code)

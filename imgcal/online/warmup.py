@@ -29,6 +29,8 @@ from renderers import SensorModel, palette
 
 RIG, OBJECT, SIZE = "T4", "asymmetric8", (512, 272)
 SNAPSHOTS = 3
+DRIFT = RelativeDrift(0.01, 0.01)
+POSES = PoseRange(phi_deg=(0.0, 28.6), alpha_deg=(0.0, 0.0))
 MANY = 12  # enough to ask for moves, for blocks, and for what is known in the way of long captures
 
 
@@ -37,11 +39,8 @@ def warm_up() -> None:
 
     Takes seconds where everything is there already. What is compiled holds for rigs, objects and frames of any size.
     """
-    rig = load_rig(RIG).resized(torch.tensor(SIZE))
-    obj = load_object(OBJECT)
-    generator = torch.Generator().manual_seed(0)
-    poses = PoseRange(phi_deg=(0.0, 28.6), alpha_deg=(0.0, 0.0))
-    truth = simulate_truth(rig, obj, SNAPSHOTS, generator, RelativeDrift(0.01, 0.01), poses)
+    rig, obj, generator = load_rig(RIG).resized(torch.tensor(SIZE)), load_object(OBJECT), _seeded()
+    truth = simulate_truth(rig, obj, SNAPSHOTS, generator, DRIFT, POSES)
     for depth in (8, 16):
         _from_frames(truth, rig, obj, SensorModel(bit_depth=depth), generator)
     exact = true_detections(truth)
@@ -49,15 +48,27 @@ def warm_up() -> None:
         calibrate(exact, rig, obj)
         score(exact, rig, obj)
     with _whatever_comes():
-        calibrate(
-            true_detections(simulate_truth(rig, obj, MANY, generator, RelativeDrift(0.01, 0.01), poses)), rig, obj
-        )
+        calibrate(true_detections(simulate_truth(rig, obj, MANY, generator, DRIFT, POSES)), rig, obj)
     _of_a_plane(rig, generator)
     _of_bloomed_lamps()
     seen = torch.ones(truth.uv.shape[:-1], dtype=torch.bool)
     for uv in (truth.uv, truth.uv.float()):  # of `imgcal render`, and of the networks
         render_views(uv, seen, rig.image_size, obj, ImageOptions(32, 1.5))
         rig.to(uv.dtype).expand(1).project_values(obj.points.to(uv.dtype)[None])
+
+
+def warm_up_fits() -> None:
+    """Compile what a calibration needs last: its fits, and what a network is shown before them."""
+    rig, obj = load_rig(RIG).resized(torch.tensor(SIZE)), load_object(OBJECT)
+    truth = simulate_truth(rig, obj, SNAPSHOTS, _seeded(), DRIFT, POSES)
+    with _whatever_comes():
+        calibrate(true_detections(truth), rig, obj)
+    seen = torch.ones(truth.uv.shape[:-1], dtype=torch.bool)
+    render_views(truth.uv.float(), seen, rig.image_size, obj, ImageOptions(32, 1.5))
+
+
+def _seeded() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
 
 
 def _from_frames(

@@ -1,6 +1,15 @@
-import numba
+import os
+import time
+from pathlib import Path
 
-from imgcal.cli.compiling import HINT, tells_of_compiling
+import numba
+import pytest
+from numba import config
+
+import renderers.compiling
+from imgcal.cli import compiling
+from imgcal.cli.compiling import HINT, NEEDED_LAST, tells_of_compiling
+from imgcal.estimation import lm_cpu
 
 
 def test_compiling_is_told_once_and_counted(capsys):
@@ -13,3 +22,47 @@ def test_compiling_is_told_once_and_counted(capsys):
         pass
     numba.njit(lambda x: x + 3)(1)
     assert capsys.readouterr().err == ""
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(renderers.compiling, "cache_folder", lambda: str(tmp_path))
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
+    return tmp_path
+
+
+@pytest.mark.skipif(renderers.compiling.fcntl is None, reason="no help on Windows")
+def test_a_second_process_helps_once_and_ends_with_the_command(cache, monkeypatch, capfd):
+    said = "import pathlib, time, imgcal; print('a word'); "
+    monkeypatch.setattr(compiling, "HELP", said + f"pathlib.Path({str(cache / 'here')!r}).touch(); time.sleep(60)")
+    started = []
+    start = compiling.start_helper
+    monkeypatch.setattr(compiling, "start_helper", lambda: started.append(start()) or started[-1])
+    with tells_of_compiling(helped=True):
+        for plus in (1, 2):
+            numba.njit(lambda x, plus=plus: x + plus)(1)
+        deadline = time.monotonic() + 60
+        while not (cache / "here").exists() and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert started[0].poll() is None
+    assert (cache / "here").exists() and len(started) == 1
+    assert started[0].returncode not in (None, 0)  # it was ended
+    assert capfd.readouterr() == ("", f"imgcal: {HINT}\n")
+
+
+def test_no_help_where_it_is_of_no_use(cache, monkeypatch):
+    assert compiling.is_of_use() == (renderers.compiling.fcntl is not None)
+    with monkeypatch.context() as one:
+        one.setattr(os, "sched_getaffinity", lambda _: {0}, raising=False)
+        assert not compiling.is_of_use()
+    with monkeypatch.context() as elsewhere:  # a folder of this process alone
+        elsewhere.setattr(renderers.compiling, "cache_folder", lambda: "/tmp/imgcal-compiled-x")
+        assert not compiling.is_of_use()
+    (cache / "estimation_0").mkdir()
+    (cache / "estimation_0" / "lm_cpu._minimize_rig-1.py311.nbi").touch()
+    assert not compiling.is_of_use()
+
+
+def test_what_shows_that_no_help_is_needed_is_a_module_of_compiled_functions():
+    assert lm_cpu.__file__ and Path(lm_cpu.__file__).match(NEEDED_LAST)
