@@ -65,6 +65,7 @@ def warm_up_fits() -> None:
         calibrate(true_detections(truth), rig, obj)
     seen = torch.ones(truth.uv.shape[:-1], dtype=torch.bool)
     render_views(truth.uv.float(), seen, rig.image_size, obj, ImageOptions(32, 1.5))
+    rig.to(torch.float32).expand(1).project_values(obj.points.float()[None])
 
 
 def _seeded() -> torch.Generator:
