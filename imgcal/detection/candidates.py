@@ -41,12 +41,15 @@ class Screening:
         """Blocks in a column and in a row of the frame."""
         return self.means.shape[0], self.means.shape[1]
 
-    def bulk(self, least: float, most: float) -> float:
-        """Grey levels of the brightest thing that is wider than `least` (px) and narrower than `most`."""
+    def holds(self, height: float, least: float, most: float) -> bool:
+        """Tell whether anything `height` grey levels bright is wider than `least` (px) and narrower than `most`."""
         cells = self.means[::4, ::4].copy()
-        sides = (math.ceil(width / (4 * BLOCK)) for width in (least, most))
-        wide, wider = (cv2.morphologyEx(cells, cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) for side in sides)
-        return float(cv2.subtract(wide, wider).max())
+        wide, wider = (math.ceil(width / (4 * BLOCK)) for width in (least, most))
+        worn = cv2.erode(cells, np.ones((wide, wide), np.uint8))
+        if int(worn.max()) - int(cells.min()) < height:  # nothing at all is: so it is nearly always
+            return False
+        large, larger = (cv2.morphologyEx(cells, cv2.MORPH_OPEN, np.ones((n, n), np.uint8)) for n in (wide, wider))
+        return float(cv2.subtract(large, larger).max()) >= height
 
 
 @dataclass(frozen=True)
@@ -59,23 +62,15 @@ class Candidates:
     label: NDArray[np.int32]  # (M,) number of the component in `labels`
     whole: NDArray[np.int64]  # (M, 4) box of what the component is a part of: its own where it is whole
 
-    @property
-    def parted(self) -> NDArray[np.bool_]:
-        """Mark the components that are parts of a larger one: (M,)."""
-        return (self.whole != self.boxes).any(1)
 
-
-def screen(frame: Frame, options: DetectionOptions, scale: int) -> Screening:
-    """Find the blocks of `frame` that are brighter (darker) than their surroundings.
+def screen(means: Frame, options: DetectionOptions, scale: int) -> Screening:
+    """Find the blocks of a frame that are brighter (darker) than their surroundings.
 
     Args:
-        frame: (H, W) grey values.
-        options: polarity, threshold and radii.
-        scale: largest grey value, for the inversion of dark blobs.
+        means: (R, Q) grey levels of its blocks.
+        options: threshold and radii.
+        scale: largest grey value.
     """
-    means = _block_means(frame)
-    if options.polarity == "dark":
-        means = scale - means
     # An opening follows steps of the background (paper on a table), which a median would smear; blobs are smaller.
     side = math.ceil((2 * options.radius_limit + 6) / BLOCK) + 1
     background = cv2.morphologyEx(means, cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
@@ -83,7 +78,8 @@ def screen(frame: Frame, options: DetectionOptions, scale: int) -> Screening:
     floor, level = _levels(contrast, options, scale)
     local_peak = cv2.dilate(contrast, np.ones((3, 3), np.uint8))
     # Blocks that stand out, and those next to them that hold something.
-    blocks = np.flatnonzero((local_peak > int(floor + level)) & (contrast > int(floor + EDGE * level)))
+    blocks = np.flatnonzero(local_peak > int(floor + level))
+    blocks = blocks[contrast.reshape(-1)[blocks] > int(floor + EDGE * level)]
     local_peak = local_peak.ravel()[blocks] - floor
     # The mean of the 3 x 3 pixels around a pixel has 4/3 of the noise of a block mean.
     excess = np.maximum(level * 4 / 3, PEAK_FRACTION * local_peak)
@@ -107,64 +103,36 @@ def outline(frame: Frame, screening: Screening, options: DetectionOptions, scale
     level = screening.base + screening.excess
     raised, excess = np.arange(count), screening.excess
     for _ in range(LEVELS):
-        _threshold(smooth, level, labels)
-        boxes = _connect(screening.blocks, tile, labels)
-        small = (boxes[:, 2:] - boxes[:, :2]).max(1, initial=0) < largest
+        boxes, small = _connect(screening.blocks, tile, smooth, level, labels, largest)
         if small.all():
             break
         oversize = np.append(~small, False)[labels[raised + 1] - 1].any((1, 2))  # label 0, of no component: the last
         raised, excess = raised[oversize], LEVEL_STEP * excess[oversize]
         level[raised] = screening.base[raised] + excess
     saturation = 0.995 * scale if options.saturation is None else options.saturation
-    whole, clipped = boxes, smooth.max(initial=-1) >= saturation
-    merged = labels.copy() if clipped else labels
-    if clipped and _split(screening, tile, smooth, level, merged, saturation):
-        _threshold(smooth, level, labels)
-        boxes = _connect(screening.blocks, tile, labels)
+    whole = boxes
+    if _split(screening.blocks, screening.base, tile, smooth, labels, len(boxes), saturation, level):
+        merged = labels.copy()
+        boxes, small = _connect(screening.blocks, tile, smooth, level, labels, largest)
         whole = whole[_parents(merged, labels, len(boxes))]
-        small = (boxes[:, 2:] - boxes[:, :2]).max(1, initial=0) < largest
-    return Candidates(tile, labels, boxes[small], np.flatnonzero(small).astype(np.int32) + 1, whole[small])
+    label = np.arange(1, len(boxes) + 1, dtype=np.int32)
+    if small.all():
+        return Candidates(tile, labels, boxes, label, whole)
+    return Candidates(tile, labels, boxes[small], label[small], whole[small])
 
 
-def _split(
-    screening: Screening,
-    tile: NDArray[np.int32],
-    smooth: NDArray[np.float32],
-    level: NDArray[np.floating],
-    labels: NDArray[np.int32],
-    saturation: float,
-) -> bool:
-    """Raise levels (K,) where that parts a component into several clipped peaks, which the light around them joins.
+def block_means(frame: Frame, options: DetectionOptions, scale: int) -> Frame:
+    """Average blocks of 4 x 4: (ceil(H / 4), ceil(W / 4)). Beyond the border the last row or column repeats.
 
-    Returns:
-        Whether there is any.
+    Args:
+        frame: (H, W) grey values.
+        options: polarity.
+        scale: largest grey value, from which those of frames with dark blobs are subtracted.
     """
-    count = int(labels.max(initial=0))
-    tops = _heights(smooth, screening.base, labels, count, saturation)  # above the base, 0 = not clipped
-    if not tops.any():
-        return False
-    trial, top = np.empty_like(labels), tops[labels[1:]].max((1, 2))
-    # What the highest level parts, and the lowest level that parts it as much.
-    most, chosen = np.ones(count + 1, np.int64), np.zeros(count + 1)
-    for part in SPLIT_AT[::-1]:
-        _threshold(smooth, np.maximum(level, screening.base + part * top), trial)
-        pieces = len(_connect(screening.blocks, tile, trial))
-        peaks = _peaks(smooth, labels, trial, pieces, count, saturation)
-        most = np.maximum(most, peaks)
-        chosen[(peaks == most) & (most > 1)] = part
-        if not (peaks > 1).any():
-            break
-    height = (chosen * tops)[labels[1:]].max((1, 2), initial=0)
-    level[:] = np.where(height > 0, np.maximum(level, screening.base + height), level)
-    return bool(chosen.any())
-
-
-def _block_means(frame: Frame) -> Frame:
-    """Average blocks of 4 x 4: (ceil(H / 4), ceil(W / 4)). Beyond the border the last row or column repeats."""
     height, width = (-(-n // BLOCK) for n in frame.shape)
     means = np.empty((height, width), frame.dtype)
     _average(frame, np.empty(BLOCK * width, np.uint16 if frame.dtype == np.uint8 else np.uint32), means)
-    return means
+    return scale - means if options.polarity == "dark" else means
 
 
 @njit(cache=True, nogil=True)
@@ -187,7 +155,8 @@ def _levels(contrast: NDArray[np.generic], options: DetectionOptions, scale: int
     """Estimate what the opening leaves of an empty background, and how far above it a candidate must stand."""
     sample = np.sort(contrast[::8, ::8], axis=None, kind="stable")  # by radix: these are integers
     lower = sample[: max(1, int(0.6 * sample.size))]  # without the blobs and most of the texture
-    noise = 1.54 * float(lower.std())  # the standard deviation of a normal variable below its 60th percentile
+    spread = float(cv2.meanStdDev(lower)[1][0, 0])
+    noise = 1.54 * spread  # the standard deviation of a normal variable below its 60th percentile
     level = max(NOISE_FACTOR * noise, LEAST_CONTRAST * scale)
     if options.threshold is not None:
         level = max(level, 0.2 * options.threshold)  # a block mean holds at least this part of a small blob's peak
@@ -201,56 +170,102 @@ def _smooth_tiles(frame, blocks, tile, invert):
     `invert` is the grey value from which dark frames are subtracted, -1 = bright.
     """
     height, width = frame.shape
+    columns = np.uint32(tile.shape[1] - 2)
     smooth = np.empty((len(blocks), BLOCK, BLOCK), np.float32)
     smooth[:] = -1
     for k in range(len(blocks)):
-        row, column = blocks[k] // (tile.shape[1] - 2), blocks[k] % (tile.shape[1] - 2)
+        row, column = np.int64(np.uint32(blocks[k]) // columns), np.int64(np.uint32(blocks[k]) % columns)
         tile[row + 1, column + 1] = k + 1
         for v in range(row * BLOCK, min(row * BLOCK + BLOCK, height)):
-            for u in range(column * BLOCK, min(column * BLOCK + BLOCK, width)):
-                total = 0
-                for y in range(v - 1, v + 2):
-                    for x in range(u - 1, u + 2):
-                        total += frame[min(max(y, 0), height - 1), min(max(x, 0), width - 1)]
-                mean = np.float32(total) / np.float32(9)
-                smooth[k, v % BLOCK, u % BLOCK] = np.float32(invert) - mean if invert >= 0 else mean
+            above, middle, below = frame[max(v - 1, 0)], frame[v], frame[min(v + 1, height - 1)]
+            before, now = np.int32(0), np.int32(0)  # sums of three pixels in a column
+            for u in range(column * BLOCK - 1, min(column * BLOCK + BLOCK, width) + 1):
+                at = min(max(u, 0), width - 1)
+                after = np.int32(above[at]) + np.int32(middle[at]) + np.int32(below[at])
+                if u > column * BLOCK:
+                    mean = np.float32(before + now + after) / np.float32(9)
+                    smooth[k, v % BLOCK, (u - 1) % BLOCK] = np.float32(invert) - mean if invert >= 0 else mean
+                before, now = now, after
     return smooth
 
 
 @njit(cache=True, nogil=True)
-def _threshold(smooth, level, labels):
-    """Mark the pixels above the level of their tile (K,) by -1, all others by 0; tile 0 is empty."""
-    labels[0] = 0
+def _split(blocks, base, tile, smooth, labels, count, saturation, level):
+    """Raise levels (K,) where that parts one of `count` components into several clipped peaks, joined by their light.
+
+    Only what is connected to clipped pixels is followed, a small part of all that is bright.
+
+    Returns:
+        Whether there is any.
+    """
+    tops = np.zeros(count + 1)  # height above the base of each component that is clipped, 0 of all others
+    bright, many = np.empty(len(smooth), np.int64), 0  # tiles with clipped pixels
     for k in range(len(smooth)):
+        found = False
         for i in range(BLOCK):
             for j in range(BLOCK):
-                labels[k + 1, i, j] = -1 if smooth[k, i, j] > level[k] else 0
+                name = labels[k + 1, i, j]
+                if smooth[k, i, j] >= saturation and name > 0:
+                    tops[name], found = max(tops[name], smooth[k, i, j] - base[k]), True
+        bright[many] = k
+        many += found
+    if many == 0:
+        return False
+    parts, stack = np.zeros(labels.shape, np.int32), np.empty((4 * smooth.size, 2), np.int32)
+    # What the highest level parts, and the lowest level that parts it as much.
+    most, chosen = np.ones(count + 1, np.int64), np.zeros(count + 1)
+    for trial in range(1, len(SPLIT_AT) + 1):
+        part, parted = SPLIT_AT[len(SPLIT_AT) - trial], False
+        for k in range(len(smooth)):
+            top = _highest(labels, k, tops)
+            for i in range(BLOCK if top > 0 else 0):
+                for j in range(BLOCK):
+                    parts[k + 1, i, j] = -1 if smooth[k, i, j] > max(level[k], base[k] + part * top) else 0
+        peaks = _count_peaks(blocks, bright[:many], tile, smooth, labels, parts, count, saturation, stack)
+        for name in range(1, count + 1):
+            most[name], parted = max(most[name], peaks[name]), parted or peaks[name] > 1
+            if peaks[name] == most[name] > 1:
+                chosen[name] = part
+        if not parted:
+            break
+    parted = False
+    for name in range(1, count + 1):
+        parted = parted or chosen[name] > 0
+        tops[name] *= chosen[name]
+    for k in range(len(smooth) if parted else 0):
+        height = _highest(labels, k, tops)
+        if height > 0:
+            level[k] = max(level[k], base[k] + height)
+    return parted
 
 
 @njit(cache=True, nogil=True)
-def _heights(smooth, base, labels, count, saturation):
-    """Height (count + 1,) above the base of each component that is clipped, 0 of all others."""
-    heights = np.zeros(count + 1)
-    for k in range(len(smooth)):
-        for i in range(BLOCK):
-            for j in range(BLOCK):
-                if labels[k + 1, i, j] > 0 and smooth[k, i, j] >= saturation:
-                    heights[labels[k + 1, i, j]] = max(heights[labels[k + 1, i, j]], smooth[k, i, j] - base[k])
-    return heights
+def _highest(labels, k, values):
+    """Largest value of the components that have pixels in a tile, at least 0."""
+    highest = 0.0
+    for i in range(BLOCK):
+        for j in range(BLOCK):
+            highest = max(highest, values[labels[k + 1, i, j]])
+    return highest
 
 
 @njit(cache=True, nogil=True)
-def _peaks(smooth, labels, parts, pieces, count, saturation):
-    """Number of clipped peaks (count + 1,) in each component of `labels`, of the `parts` into which a level cuts it."""
-    clipped, parent = np.zeros(pieces + 1, np.int64), np.zeros(pieces + 1, np.int64)
-    for k in range(len(smooth)):
-        for i in range(BLOCK):
-            for j in range(BLOCK):
-                parent[parts[k + 1, i, j]] = labels[k + 1, i, j]
-                clipped[parts[k + 1, i, j]] += smooth[k, i, j] >= saturation
+def _count_peaks(blocks, bright, tile, smooth, labels, parts, count, saturation, stack):
+    """Number of clipped peaks (count + 1,) in each component of `labels`; `parts` marks the pixels above a level."""
+    flat, box, pieces = parts.reshape(-1), np.zeros(4, np.int64), 0
+    clipped = np.zeros(BLOCK * BLOCK * len(bright) + 1, np.int64)
     peaks = np.zeros(count + 1, np.int64)
-    for piece in range(1, pieces + 1):
-        peaks[parent[piece]] += clipped[piece] >= LEAST_CLIPPED
+    for k in bright:
+        top, left = _corner(blocks[k], tile)
+        for i in range(BLOCK):
+            for j in range(BLOCK):
+                if smooth[k, i, j] >= saturation and parts[k + 1, i, j] != 0:
+                    if parts[k + 1, i, j] < 0:
+                        pieces += 1
+                        _fill(flat, tile, top + i, left + j, pieces, stack, box)
+                    piece = parts[k + 1, i, j]
+                    clipped[piece] += 1
+                    peaks[labels[k + 1, i, j]] += clipped[piece] == LEAST_CLIPPED
     return peaks
 
 
@@ -273,43 +288,67 @@ def _place(tile, v, u):
 
 
 @njit(cache=True, nogil=True)
-def _connect(blocks, tile, labels):
-    """Number the components (eight neighbours) of the marked pixels from 1, in place; return their boxes (M, 4)."""
-    columns, flat = tile.shape[1] - 2, labels.reshape(-1)
+def _connect(blocks, tile, smooth, level, labels, largest):
+    """Number the components (eight neighbours) of the pixels above the level (K,) of their tile from 1, all others 0.
+
+    Returns:
+        Their boxes (M, 4), and which are smaller than `largest` (M,).
+    """
+    labels[0] = 0
+    for k in range(len(smooth)):
+        for i in range(BLOCK):
+            for j in range(BLOCK):
+                labels[k + 1, i, j] = -1 if smooth[k, i, j] > level[k] else 0
+    flat = labels.reshape(-1)
     stack = np.empty((4 * BLOCK * BLOCK * len(blocks), 2), np.int32)  # a run of L pixels touches at most L + 3 runs
     boxes = np.empty((4 * len(blocks), 4), np.int64)  # no more than four separate pixels fit into a tile
     count = 0
     for k in range(len(blocks)):
-        # Pixels are counted from the empty blocks around the frame.
-        top, left = BLOCK * (blocks[k] // columns + 1), BLOCK * (blocks[k] % columns + 1)
+        top, left = _corner(blocks[k], tile)
         for i in range(BLOCK):
             for j in range(BLOCK):
-                if labels[k + 1, i, j] >= 0:
-                    continue
-                box = boxes[count]
-                count += 1
-                box[0], box[1], box[2], box[3] = left + j, top + i, left + j, top + i
-                stack[0, 0], stack[0, 1], size = top + i, left + j, 1
-                while size:
-                    size -= 1
-                    v, first = stack[size, 0], stack[size, 1]
-                    # The whole run of marked pixels in this row, then the runs that touch it above and below.
-                    while flat[_place(tile, v, first - 1)] < 0:
-                        first -= 1
-                    last = first
-                    while flat[_place(tile, v, last)] < 0:
-                        flat[_place(tile, v, last)] = count
-                        last += 1
-                    if last == first:
-                        continue
-                    box[0], box[1] = min(box[0], first), min(box[1], v)
-                    box[2], box[3] = max(box[2], last - 1), max(box[3], v)
-                    for y in (v - 1, v + 1):
-                        inside = False
-                        for x in range(first - 1, last + 1):
-                            marked = flat[_place(tile, y, x)] < 0
-                            if marked and not inside:
-                                stack[size, 0], stack[size, 1] = y, x
-                                size += 1
-                            inside = marked
-    return boxes[:count] - BLOCK
+                if labels[k + 1, i, j] < 0:
+                    count += 1
+                    _fill(flat, tile, top + i, left + j, count, stack, boxes[count - 1])
+    boxes, small = boxes[:count], np.empty(count, np.bool_)
+    for c in range(count):
+        for side in range(4):
+            boxes[c, side] -= BLOCK
+        small[c] = max(boxes[c, 2] - boxes[c, 0], boxes[c, 3] - boxes[c, 1]) < largest
+    return boxes, small
+
+
+@njit(cache=True, nogil=True)
+def _corner(block, tile):
+    """First pixel (v, u) of a block, counted from the empty blocks around the frame."""
+    columns = tile.shape[1] - 2
+    return BLOCK * (block // columns + 1), BLOCK * (block % columns + 1)
+
+
+@njit(cache=True, nogil=True)
+def _fill(flat, tile, v, u, number, stack, box):
+    """Number the component of a marked pixel, and fill in its box; pixels are counted as in `_place`."""
+    box[0], box[1], box[2], box[3] = u, v, u, v
+    stack[0, 0], stack[0, 1], size = v, u, 1
+    while size:
+        size -= 1
+        v, first = stack[size, 0], stack[size, 1]
+        # The whole run of marked pixels in this row, then the runs that touch it above and below.
+        while flat[_place(tile, v, first - 1)] < 0:
+            first -= 1
+        last = first
+        while flat[_place(tile, v, last)] < 0:
+            flat[_place(tile, v, last)] = number
+            last += 1
+        if last == first:
+            continue
+        box[0], box[1] = min(box[0], first), min(box[1], v)
+        box[2], box[3] = max(box[2], last - 1), max(box[3], v)
+        for y in (v - 1, v + 1):
+            inside = False
+            for x in range(first - 1, last + 1):
+                marked = flat[_place(tile, y, x)] < 0
+                if marked and not inside:
+                    stack[size, 0], stack[size, 1] = y, x
+                    size += 1
+                inside = marked

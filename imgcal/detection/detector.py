@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from imgcal.detection.candidates import outline, screen
+from imgcal.detection.candidates import block_means, outline, screen
 from imgcal.detection.centroids import Blobs, measure
 from imgcal.detection.options import DetectionOptions, Frame, checked_frame, checked_mask, full_scale
 from imgcal.detection.populations import usable, usual_size, without_dim
@@ -114,9 +114,10 @@ def _detect_one(frame: Frame, name: str, mask: NDArray[np.bool_] | None, options
     """Detect the blobs of one checked frame; their camera is 0."""
     scale = full_scale(frame, options.bit_depth, name)
     contiguous = frame if frame.flags.c_contiguous else frame.copy()
-    blobs = (
-        _of_any_size(contiguous, options, scale) if options.max_radius is None else _find(contiguous, options, scale)
-    )
+    if options.max_radius is None:
+        blobs = _of_any_size(contiguous, options, scale)
+    else:
+        blobs = _find(contiguous, block_means(contiguous, options, scale), options, scale)
     if mask is not None:
         blobs.flags[_inside(mask, blobs.uv)] |= np.uint8(BlobFlag.MASKED)
     return blobs
@@ -128,20 +129,27 @@ def _of_any_size(frame: Frame, options: DetectionOptions, scale: int) -> Blobs:
     What is found first shows most of the larger ones, too. A frame with hardly any blob, or with something large and
     bright, is searched again.
     """
-    limit, screening = options.radius_limit, screen(frame, options, scale)
+    limit, means = options.radius_limit, block_means(frame, options, scale)
+    screening = screen(means, options, scale)
     blobs = measure(frame, outline(frame, screening, options, scale), replace(options, max_radius=LARGER), scale)
     kept = usual_size(blobs, limit)
     blobs = blobs if kept.all() else blobs.select(kept)
-    enough = usable(blobs).sum() >= FEW
-    if enough and screening.bulk(LARGER, 2 * LARGEST) < 0.5 * scale * np.median(blobs.contrast):
+    enough = np.count_nonzero(usable(blobs)) >= FEW
+    if enough and not screening.holds(0.5 * scale * _median(blobs.contrast), LARGER, 2 * LARGEST):
         return blobs
-    wide = _find(frame, replace(options, max_radius=LARGEST), scale)
+    wide = _find(frame, means, replace(options, max_radius=LARGEST), scale)
     wide = wide.select(usual_size(wide, limit))
     return wide if (wide.radius > limit).any() else blobs
 
 
-def _find(frame: Frame, options: DetectionOptions, scale: int) -> Blobs:
-    return measure(frame, outline(frame, screen(frame, options, scale), options, scale), options, scale)
+def _median(values: NDArray[np.float64]) -> float:
+    """Do what `np.median` does for some values (K,), in a tenth of the time."""
+    ordered, middle = np.sort(values), len(values) // 2
+    return float(ordered[middle] + ordered[-1 - middle]) / 2
+
+
+def _find(frame: Frame, means: Frame, options: DetectionOptions, scale: int) -> Blobs:
+    return measure(frame, outline(frame, screen(means, options, scale), options, scale), options, scale)
 
 
 def _inside(mask: NDArray[np.bool_], uv: NDArray[np.float64]) -> NDArray[np.bool_]:

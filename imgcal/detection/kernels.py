@@ -19,6 +19,8 @@ from imgcal.detection.moments import find_centroid, find_ramp, find_shape
 from imgcal.types import BlobFlag
 from renderers.compiling import njit
 
+HALF_SIZES = (7, 10, 14, 20, 29, 42, 60)  # px; windows of 2 h + 1
+REACH = 4  # px from a component to the end of its window: the skirt and a ring that is clear of it
 RING = 2  # px, width of the frame of a window from which the background is taken
 CLIP = (4.0, 9.0)  # standard deviations of a 3 x 3 mean below which a pixel is background: weak blob, bright blob
 CLIP_PEAK = 0.1  # of the peak: where the clip lies between the two
@@ -37,19 +39,19 @@ SMALLEST_SIGMA = 0.0005  # px, what sampling by pixels leaves without any noise
 # exposures (2 to 15 times full scale) in the tests.
 CLIPPED_SIGMA = 0.045
 CLIPPED_FIT = 0.01  # the same where clipped pixels are left out of a fit
-_MERGED, _SATURATED = int(BlobFlag.MERGED), int(BlobFlag.SATURATED)
+_MERGED, _SATURATED, _BORDER = int(BlobFlag.MERGED), int(BlobFlag.SATURATED), int(BlobFlag.BORDER)
 _FAR = 200  # px^2; with two distances added to it still within 8 bit
 
 
 @njit(cache=True, nogil=True)
 def measure_all(
-    frame, tile, labels, boxes, label, parted, half_size, invert, saturation, limits,
+    frame, tile, labels, boxes, label, whole, full_scale, invert, saturation, limits,
     uv, sigma, radius, contrast, flags, kept,
 ):  # fmt: skip
     """Fill the columns of all candidates of a frame."""
     widest = 0
-    for k in range(len(half_size)):
-        widest = max(widest, half_size[k])
+    for k in range(len(boxes)):
+        widest = max(widest, half_size(boxes[k], whole[k]))
     side = 2 * widest + 1 + 2 * MARGIN
     scratch, ring = np.empty((4, side * side), np.float32), np.empty((4, 4 * RING * side), np.float32)
     fit = np.empty((ROWS, MOST), np.float32)
@@ -57,8 +59,9 @@ def measure_all(
     least, smallest, largest, longest = limits
     for k in range(len(boxes)):
         u, v = (boxes[k, 0] + boxes[k, 2]) // 2, (boxes[k, 1] + boxes[k, 3]) // 2
-        noise, slope, plane = _background(frame, u, v, half_size[k], invert, ring)
-        first, rows, columns = _area(frame, boxes[k], u, v, half_size[k])
+        half = half_size(boxes[k], whole[k])
+        noise, slope, plane = _background(frame, u, v, half, invert, ring)
+        first, rows, columns = _area(frame, boxes[k], u, v, half)
         shape, pixels = (rows, columns), rows * columns  # contiguous arrays: only these are vectorized
         grey, smooth = scratch[0, :pixels].reshape(shape), scratch[1, :pixels].reshape(shape)
         weight, ramp = scratch[2, :pixels].reshape(shape), scratch[3, :pixels].reshape(shape)
@@ -70,21 +73,21 @@ def measure_all(
         saddle = _claim(own, other, crowded, smooth, weight)
         scale = _weigh(smooth, noise, weight)
         peak, peak_mean, brightness = _find_peaks(grey, smooth, weight)
-        radius[k], contrast[k] = np.sqrt(brightness / peak / np.pi), peak
+        radius[k], contrast[k] = np.sqrt(brightness / peak / np.pi), peak / full_scale
+        stands_out = peak >= least and peak_mean > SIGNIFICANT / 3 * noise
+        if not (stands_out and smallest <= radius[k] <= largest):
+            continue
         x, y = offsets[0, :pixels], offsets[1, :pixels]
         # What was found of a flat patch is all of it.
         patch = (boxes[k, 2] - boxes[k, 0] + 1) * (boxes[k, 3] - boxes[k, 1] + 1) > brightness / peak
         elongation, two_peaked, middle, moments = find_shape(grey, weight, x, y, peak_mean / 2, patch)
-        kept[k] = (
-            smallest <= radius[k] <= largest and peak >= least
-            and peak_mean > SIGNIFICANT / 3 * noise and elongation <= longest
-        )  # fmt: skip
+        kept[k] = elongation <= longest
         if not kept[k]:
             continue
         clipped = brightest >= saturation and _is_saturated(frame, first, invert, saturation, weight)
         shared = min(saddle / peak_mean, 1.0)  # light, where others are as near
-        merged = two_peaked or shared > (CROWDED_CLIPPED if clipped and parted[k] else CROWDED)
-        flags[k] = clipped * _SATURATED + merged * _MERGED
+        merged = two_peaked or shared > (CROWDED_CLIPPED if clipped and _differ(boxes[k], whole[k]) else CROWDED)
+        flags[k] = clipped * _SATURATED + merged * _MERGED + _is_at_border(boxes[k], frame) * _BORDER
         known = x0 = y0 = residual = 0.0
         if not flags[k] & _MERGED:
             start = start_of(peak, radius[k], clipped, moments, middle)
@@ -103,6 +106,32 @@ def measure_all(
             variance += clipped * CLIPPED_SIGMA**2 / max(radius[k], 1.0)
         variance += clipped * shared**3 * (SHARED * radius[k]) ** 2
         uv[k, 0], uv[k, 1], sigma[k] = u + x0, v + y0, np.sqrt(variance + SMALLEST_SIGMA**2)
+
+
+@njit(cache=True, nogil=True)
+def half_size(box, whole):
+    """Half size of the window around a box: the smallest that holds what it is a part of.
+
+    Only around that is the background.
+    """
+    u, v = (box[0] + box[2]) // 2, (box[1] + box[3]) // 2
+    reach = max(whole[2] - u, u - whole[0], whole[3] - v, v - whole[1]) + REACH
+    for half in HALF_SIZES:
+        if half >= reach:
+            return half
+    return HALF_SIZES[-1]
+
+
+@njit(cache=True, nogil=True)
+def _differ(box, whole):
+    """Tell whether a component is a part of a larger one."""
+    return box[0] != whole[0] or box[1] != whole[1] or box[2] != whole[2] or box[3] != whole[3]
+
+
+@njit(cache=True, nogil=True)
+def _is_at_border(box, frame):
+    """Tell whether a box comes within a pixel of the border."""
+    return min(box[0], box[1]) <= 1 or box[2] >= frame.shape[1] - 2 or box[3] >= frame.shape[0] - 2
 
 
 @njit(cache=True, nogil=True)

@@ -22,26 +22,29 @@ LEAST_BRIGHT = 3  # blobs in a frame that the bright population must have
 ONE_SIZE = 1.6  # ratio of radii of markers of one size
 LEAST_LARGE = 3  # blobs of one size beyond the usual ones that must be there
 OFTEN = 0.25  # share of a camera's frames that must have a limit for the others to take it over
+_UNUSABLE = int(UNUSABLE)
 
 
-def dim_limit(contrast: NDArray[np.floating]) -> float:
-    """Contrast that separates two populations, 0 where there is one.
+def dim_limits(contrast: NDArray[np.floating], group: NDArray[np.integer], groups: int) -> NDArray[np.float64]:
+    """Contrast (G,) that separates two populations of a group of blobs, 0 where there is one.
 
     Args:
         contrast: (K,) peaks above the background, shares of full scale.
+        group: (K,) which group each belongs to, 0 to G - 1.
+        groups: G.
     """
-    ordered = np.sort(contrast)[::-1]
-    above, below = ordered[LEAST_BRIGHT - 1 : -1], ordered[LEAST_BRIGHT:]
-    if not len(below):
-        return 0.0
-    ratio = np.where((below < DIM) & (above > DIM), above / np.maximum(below, 1e-9), 0.0)
-    widest = int(ratio.argmax())
-    return float(np.sqrt(above[widest] * below[widest])) if ratio[widest] >= GAP else 0.0
+    bright = contrast > DIM
+    above, below = np.full(groups, np.inf), np.zeros(groups)  # the ends of the gap about `DIM`
+    np.minimum.at(above, group[bright], contrast[bright])
+    np.maximum.at(below, group[~bright], contrast[~bright])
+    apart = (below < DIM) & (above / np.maximum(below, 1e-9) >= GAP)
+    apart &= np.bincount(group[bright], minlength=groups) >= LEAST_BRIGHT
+    return np.where(apart, np.sqrt(np.where(apart, above, 0.0) * below), 0.0)
 
 
 def usable(blobs: Blobs) -> NDArray[np.bool_]:
     """Mark blobs whose centres may be used: (K,)."""
-    return (blobs.flags & int(UNUSABLE)) == 0
+    return (blobs.flags & _UNUSABLE) == 0
 
 
 def usual_size(blobs: Blobs, limit: float) -> NDArray[np.bool_]:
@@ -64,14 +67,22 @@ def without_dim(shots: Sequence[Blobs], options: DetectionOptions) -> list[Blobs
 
     A frame that shows too few markers to tell takes over the usual limit of its camera.
     """
-    if options.dim_blobs or options.threshold is not None:
+    if options.dim_blobs or options.threshold is not None or not shots:
         return list(shots)
-    kept = [np.ones(len(shot.uv), bool) for shot in shots]
-    for camera in range(1 + max((int(shot.camera.max(initial=-1)) for shot in shots), default=-1)):
-        rows = [np.flatnonzero(shot.camera == camera) for shot in shots]
-        limits = np.array([dim_limit(shot.contrast[mine]) for shot, mine in zip(shots, rows, strict=True)])
-        shown = sum(len(mine) > 0 for mine in rows)
-        usual = np.median(limits[limits > 0]) if (limits > 0).sum() > OFTEN * shown else 0.0
-        for shot, mine, keep, limit in zip(shots, rows, kept, limits, strict=True):
-            keep[mine] = shot.contrast[mine] >= (limit or usual)
-    return [shot.select(keep) for shot, keep in zip(shots, kept, strict=True)]
+    contrast = np.concatenate([shot.contrast for shot in shots])
+    if contrast.min(initial=1.0) > DIM:
+        return list(shots)
+    camera = np.concatenate([shot.camera for shot in shots])
+    cameras, counts = int(camera.max()) + 1, [len(shot.uv) for shot in shots]
+    frame = np.repeat(np.arange(len(shots)), counts) * cameras + camera
+    shown = np.bincount(frame, minlength=len(shots) * cameras).reshape(-1, cameras) > 0
+    limits = dim_limits(contrast, frame, shown.size).reshape(shown.shape)
+    for own, some in zip(limits.T, shown.sum(0), strict=True):
+        known = own[own > 0]
+        if len(known) > OFTEN * some:
+            own[own == 0] = np.median(known)
+    kept = contrast >= limits.reshape(-1)[frame]
+    return [
+        shot if keep.all() else shot.select(keep)
+        for shot, keep in zip(shots, np.split(kept, np.cumsum(counts)[:-1]), strict=True)
+    ]
