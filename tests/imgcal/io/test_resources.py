@@ -9,7 +9,7 @@ def test_what_ships_is_there_and_can_be_read() -> None:
     assert "O10" in rigs and "asymmetric8" in objects
     assert list(rigs) == sorted(rigs)
     for name in rigs:
-        assert load_rig(name).num_cameras == load_rig(data_path("rigs", f"{name}.yaml")).cameras > 0
+        assert load_rig(name).num_cameras == load_rig(data_path("rigs", f"{name}.yaml")).num_cameras > 0
     for name in objects:
         assert load_object(name).num_fiducials >= 3
     assert shipped_names("nothing", ".yaml") == ()
