@@ -42,7 +42,8 @@ class Train:
         # Imported late: accelerate and TensorBoard take seconds, which the other commands should not wait.
         import torch
 
-        from imgcal.training import RESULT, STATE, finished, load_experiment, train
+        from imgcal.cli.training_folder import RESULT, STATE, train_in
+        from imgcal.training import finished, load_experiment
 
         changes = [change for changes in self.set for change in changes]
         changes += [] if self.minutes is None else [f"training.minutes={float(self.minutes)!r}"]
@@ -56,7 +57,7 @@ class Train:
         if experiment.training.threads is not None:
             torch.set_num_threads(experiment.training.threads)
         with _asked_to_stop() as stop:
-            run = train(experiment, self.out, self.resume, stop)
+            run = train_in(self.out, experiment, self.resume, stop)
         run.accelerator.end_training()
         if not finished(run, run.seconds):
             raise KeyboardInterrupt(

@@ -9,10 +9,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from imgcal.estimation import estimate
 from imgcal.evaluation import classical
+from imgcal.networks import Network
 from imgcal.refinement import (
     ImageRefinementOptions,
     as_prediction,
@@ -130,14 +131,14 @@ BASELINES: dict[str, Method] = {
 """The competitors, by the name they have in tables. Slow ones get the first `most` rigs of every trial."""
 
 
-def network_method(network: nn.Module, batch: int | None = None) -> Method:
+def network_method(network: Network, batch: int | None = None) -> Method:
     """Make a method of a network in evaluation mode, on whatever device it is; refinement runs on the CPU.
 
     Args:
         network: takes `Views`, returns predictions coarse to fine (`imgcal.networks`).
         batch: rigs at once at most; None = 512 for points, 32 for images.
     """
-    options: ImageOptions | None = network.image_options  # type: ignore[assignment]
+    options = network.image_options
     device = next((parameter.device for parameter in network.parameters()), torch.device("cpu"))
 
     @torch.no_grad()

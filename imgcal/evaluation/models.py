@@ -13,7 +13,8 @@ from imgcal.errors import InputError
 from imgcal.evaluation.methods import Method, network_method
 from imgcal.evaluation.protocol import Conditions
 from imgcal.evaluation.summary import Facts
-from imgcal.training import Checkpoint, load_checkpoint
+from imgcal.io import read_metrics
+from imgcal.networks import Checkpoint, load_checkpoint
 from imgcal.types import CalibrationObject, CameraRig
 
 METRICS = "metrics.jsonl"
@@ -91,8 +92,4 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 
 def _history(path: Path) -> tuple[dict[str, Any], ...]:
-    if not path.is_file():
-        return ()
-    from imgcal.training import read_metrics
-
     return tuple(read_metrics(path))

@@ -3,6 +3,7 @@ from .capture import Capture, open_capture, open_input, save_capture_settings
 from .detections_csv import MARGIN, load_detections, save_detections
 from .frames import Frame, read_frame, write_frame, write_image
 from .json_text import read_json
+from .metrics import read_metrics
 from .names import find_file, nearest, title_of
 from .object_csv import load_object, object_from_text, object_text, save_object
 from .publication import publishing
@@ -35,6 +36,7 @@ __all__ = [
     "publishing",
     "read_frame",
     "read_json",
+    "read_metrics",
     "read_tensors",
     "read_texts",
     "read_yaml",

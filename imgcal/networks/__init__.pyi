@@ -1,16 +1,28 @@
-from .config import PRESETS, Images, NetworkConfig, PaperImages, PaperPoints
-from .factory import build
+from .checkpoint import (
+    Checkpoint,
+    load_checkpoint,
+    load_network,
+    read_subject,
+    save_checkpoint,
+    warm_start,
+)
+from .config import PRESETS, Images, NetworkConfig, NetworkSpec, PaperImages, PaperPoints, without_pretrained
+from .factory import build, build_network
 from .images import ImageNetwork, PaperImageNetwork
+from .network import Network
 from .parameterization import Parameterization
 from .points import PaperPointNetwork, PointNetwork
-from .refiner import IterativeRefiner
+from .randomness import drawing_from
+from .subject import check_object, check_rig
 
 __all__ = [
     "PRESETS",
+    "Checkpoint",
     "ImageNetwork",
     "Images",
-    "IterativeRefiner",
+    "Network",
     "NetworkConfig",
+    "NetworkSpec",
     "PaperImageNetwork",
     "PaperImages",
     "PaperPointNetwork",
@@ -18,4 +30,14 @@ __all__ = [
     "Parameterization",
     "PointNetwork",
     "build",
+    "build_network",
+    "check_object",
+    "check_rig",
+    "drawing_from",
+    "load_checkpoint",
+    "load_network",
+    "read_subject",
+    "save_checkpoint",
+    "warm_start",
+    "without_pretrained",
 ]

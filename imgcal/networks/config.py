@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from imgcal.io import StrictModel, nearest
 from imgcal.messages import shortened
 from imgcal.networks.backbone_options import MOST_WEIGHTS, check_options
+from imgcal.synthesis import Drift, ImageOptions, PoseRange
 
 Width = Annotated[int, Field(ge=1, le=4096)]
 Count = Annotated[int, Field(ge=1, le=64)]
@@ -137,6 +138,31 @@ class NetworkConfig(StrictModel):
         """
         preset = PRESETS[self.preset]
         return type(preset).model_validate(_merged(preset.model_dump(), self.change, self.preset), strict=False)
+
+
+class NetworkSpec(StrictModel):
+    """The blocks of an experiment that say what a network is and what it is trained for; others are kept as they are.
+
+    `imgcal.training.Experiment` is one, with all other blocks in words.
+    """
+
+    model_config = ConfigDict(extra="allow")
+
+    network: NetworkConfig
+    images: ImageOptions | None = None  # how the images of image variants are drawn
+    poses: PoseRange = PoseRange()
+    drift: Drift
+
+
+Spec = TypeVar("Spec", bound=NetworkSpec)
+
+
+def without_pretrained(spec: Spec) -> Spec:
+    """The same without published weights, which are not to be asked for where others replace them."""
+    if "pretrained" not in spec.network.change:
+        return spec
+    plain = spec.network.model_copy(update={"change": {**spec.network.change, "pretrained": False}})
+    return spec.model_copy(update={"network": plain})
 
 
 def one_of(names: Iterable[str]) -> str:

@@ -2,28 +2,41 @@
 
 from __future__ import annotations
 
-from torch import Tensor, nn
+import torch
+from torch import Tensor
 
-from imgcal.networks.config import Images, NetworkConfig, PaperImages, PaperPoints
+from imgcal.errors import InputError
+from imgcal.networks.config import Images, NetworkConfig, NetworkSpec, PaperImages, PaperPoints
+from imgcal.networks.network import Network
 from imgcal.networks.parameterization import Parameterization
+from imgcal.networks.randomness import drawing_from
+from imgcal.synthesis import ImageOptions
 from imgcal.types import CalibrationObject, CameraRig
 
 
-def build(config: NetworkConfig, factory: CameraRig, obj: CalibrationObject, drift_std: Tensor) -> nn.Module:
-    """Make an untrained network; its weights come from torch's default generator.
+def build(
+    config: NetworkConfig,
+    factory: CameraRig,
+    obj: CalibrationObject,
+    drift_std: Tensor,
+    generator: torch.Generator,
+    images: ImageOptions | None = None,
+) -> Network:
+    """Make an untrained network.
 
     Args:
         config: which network.
         factory: the factory rig, float32, without batch axes.
         obj: the calibration object.
         drift_std: (C, 15) spread of the rig's parameters, the unit of predicted offsets (`Drift.std`).
+        generator: of its weights, on the CPU; torch's default generators are left alone.
+        images: how the images of image variants are drawn; None = as large as their encoder takes them.
 
     Returns:
-        A module that takes `Views` and returns one `Prediction` a pass, coarse to fine. Attributes: `image_options`
-        (None for point variants), `factory`, `obj`, `config`.
+        A network in training mode, on the CPU.
 
     Raises:
-        InputError: an unknown backbone, or a rig without working distance.
+        InputError: an unknown backbone, a rig without working distance, or `images` for a point variant.
 
     Examples:
         >>> import torch, imgcal
@@ -31,7 +44,8 @@ def build(config: NetworkConfig, factory: CameraRig, obj: CalibrationObject, dri
         >>> from imgcal.synthesis import RelativeDrift, synthesize
         >>> from imgcal.types import Views
         >>> factory, obj = imgcal.load_rig("T4").to(torch.float32), imgcal.load_object("cube8")
-        >>> network = build(NetworkConfig(preset="points"), factory, obj, RelativeDrift().std(factory))
+        >>> weights = torch.Generator().manual_seed(0)
+        >>> network = build(NetworkConfig(preset="points"), factory, obj, RelativeDrift().std(factory), weights)
         >>> uv = synthesize(factory, obj, 2, torch.Generator().manual_seed(0)).projection.uv
         >>> passes = network(Views(uv, torch.ones(uv.shape[:-1], dtype=torch.bool)))
         >>> len(passes), passes[-1].rig.focal_length.shape  # coarse to fine; rigs, cameras, (fx, fy)
@@ -41,18 +55,24 @@ def build(config: NetworkConfig, factory: CameraRig, obj: CalibrationObject, dri
     from imgcal.networks.points import PaperPointNetwork, PointNetwork
 
     decoder, variant = Parameterization(factory, obj, drift_std), config.variant()
-    network: nn.Module
-    if isinstance(variant, PaperPoints):
-        network = PaperPointNetwork(variant, decoder)
-    elif isinstance(variant, PaperImages):
-        from imgcal.networks.images import PaperImageNetwork
+    if images is not None and not isinstance(variant, Images | PaperImages):
+        raise InputError(f"images: found this block, but the network {config.preset} takes points")
+    with drawing_from(generator):
+        if isinstance(variant, PaperImages):
+            from imgcal.networks.images import PaperImageNetwork
 
-        network = PaperImageNetwork(variant, decoder)
-    elif isinstance(variant, Images):
-        from imgcal.networks.images import ImageNetwork
+            return PaperImageNetwork(variant, decoder, images)
+        if isinstance(variant, Images):
+            from imgcal.networks.images import ImageNetwork
 
-        network = ImageNetwork(variant, decoder, obj.colours)
-    else:
-        network = PointNetwork(variant, decoder)
-    network.factory, network.obj, network.config = factory, obj, config  # type: ignore[assignment]
-    return network
+            return ImageNetwork(variant, decoder, images)
+        if isinstance(variant, PaperPoints):
+            return PaperPointNetwork(variant, decoder)
+        return PointNetwork(variant, decoder)
+
+
+def build_network(spec: NetworkSpec, rig: CameraRig, obj: CalibrationObject, generator: torch.Generator) -> Network:
+    """Make the untrained network of an experiment, with float32 factory values; see `build`."""
+    single = torch.float32
+    prior_std = spec.drift.std(rig).to(single)
+    return build(spec.network, rig.to(single), obj, prior_std, generator, spec.images)

@@ -10,6 +10,7 @@ from torch.nn import functional
 
 from imgcal.networks.backbone import Backbone
 from imgcal.networks.config import Images, PaperImages
+from imgcal.networks.network import Network
 from imgcal.networks.parameterization import Parameterization
 from imgcal.networks.points import PaperHeads
 from imgcal.networks.refiner import IterativeRefiner
@@ -18,17 +19,17 @@ from imgcal.synthesis import ImageOptions
 from imgcal.types import Prediction, Views
 
 
-class PaperImageNetwork(nn.Module):
+class PaperImageNetwork(Network):
     """The paper's image variant: each image on its own through an encoder, bottleneck to 128, five heads.
 
     Source: paper, supplementary section 1.2.
     """
 
-    def __init__(self, config: PaperImages, decoder: Parameterization) -> None:
-        super().__init__()
-        self.decoder = decoder
-        self.backbone = Backbone(config.backbone, config.pretrained, config.options)
-        self.image_options: ImageOptions = ImageOptions(size=max(self.backbone.size))
+    def __init__(self, config: PaperImages, decoder: Parameterization, images: ImageOptions | None = None) -> None:
+        """Make the layers; images are as large as the encoder takes them unless `images` says otherwise."""
+        backbone = Backbone(config.backbone, config.pretrained, config.options)
+        super().__init__(decoder, images or ImageOptions(size=max(backbone.size)))
+        self.backbone = backbone
         self.bottleneck = nn.Linear(self.backbone.pooled_width, config.bottleneck)
         self.heads = PaperHeads(config.bottleneck, config.head_widths)
 
@@ -46,7 +47,7 @@ class PaperImageNetwork(nn.Module):
         return groups | self.heads.groups()
 
 
-class ImageNetwork(nn.Module):
+class ImageNetwork(Network):
     """Our image variant: an encoder weighs where each fiducial may be, positions go to the trunk in float32.
 
     The encoder's map gives each fiducial a belief over the image, zero at first, that multiplies the likeness of
@@ -54,18 +55,16 @@ class ImageNetwork(nn.Module):
     `positions: false` the pooled feature is all that the trunk is told, as in the paper.
     """
 
-    colours: Tensor  # (N, 3)
-
-    def __init__(self, config: Images, decoder: Parameterization, colours: Tensor) -> None:
-        super().__init__()
-        self.decoder = decoder
-        self.register_buffer("colours", colours.to(decoder.focal_length), persistent=False)
-        self.backbone = Backbone(config.backbone, config.pretrained, config.options)
-        self.image_options: ImageOptions = ImageOptions(size=max(self.backbone.size))
+    def __init__(self, config: Images, decoder: Parameterization, images: ImageOptions | None = None) -> None:
+        """Make the layers; images are as large as the encoder takes them unless `images` says otherwise."""
+        backbone = Backbone(config.backbone, config.pretrained, config.options)
+        drawn = images or ImageOptions(size=max(backbone.size))
+        super().__init__(decoder, drawn)
+        self.backbone, self.dot = backbone, drawn.dot
         self.bottleneck = nn.Linear(self.backbone.pooled_width, config.bottleneck)
         self.positions = config.positions
         if config.positions:
-            self.belief = nn.Conv2d(self.backbone.map_width, len(colours), 1)
+            self.belief = nn.Conv2d(self.backbone.map_width, len(decoder.colours), 1)
             for parameter in self.belief.parameters():
                 nn.init.zeros_(parameter)
         self.trunk = IterativeRefiner(decoder, **config.trunk.model_dump(), features=config.bottleneck)
@@ -78,13 +77,12 @@ class ImageNetwork(nn.Module):
         bottleneck = functional.gelu(self.bottleneck(pooled)).float().unflatten(0, images.shape[:2])
         with torch.autocast(images.device.type, enabled=False):
             if not self.positions:
-                nothing = images.new_zeros((*images.shape[:2], len(self.colours)), dtype=torch.float32)
+                nothing = images.new_zeros((*images.shape[:2], len(self.decoder.colours)), dtype=torch.float32)
                 return self.trunk(nothing[..., None].expand(*nothing.shape, 2), nothing, bottleneck)
             heatmap_logits = self.belief(features.float())
-            options = self.image_options
-            in_image, confidence = soft_positions(flat.float(), self.colours, options.dot, heatmap_logits)
+            in_image, confidence = soft_positions(flat.float(), self.decoder.colours, self.dot, heatmap_logits)
             in_image = in_image.unflatten(0, images.shape[:2])
-            uv = ImageOptions(images.shape[-1], options.dot).to_sensor(in_image, self.decoder.image_size)
+            uv = ImageOptions(images.shape[-1], self.dot).to_sensor(in_image, self.decoder.image_size)
         return self.trunk(uv, confidence.unflatten(0, images.shape[:2]), bottleneck)
 
     def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:

@@ -38,6 +38,10 @@ class Parameterization(nn.Module):
     translation: Tensor  # (C, 3)
     image_size: Tensor  # (C, 2)
     prior_std: Tensor  # (C, 15)
+    points: Tensor  # (N, 3) mm
+    colours: Tensor  # (N, 3)
+    radius: Tensor | None  # (N,) mm
+    tolerance: Tensor | None  # (N,) mm
     centroid: Tensor  # (3,) mm
     centred: Tensor  # (N, 3) mm
     level: Tensor  # (3, 3)
@@ -46,7 +50,7 @@ class Parameterization(nn.Module):
         super().__init__()
         if factory.working_distance is None:
             raise InputError(f"rig {factory.name}: found no working_distance, expected one (mm) to start from")
-        self._like = factory
+        self._factory, self._obj = factory, obj  # for what they hold beside tensors
         self.working_distance = factory.working_distance
         points = obj.points.to(factory.focal_length)
         buffers = {
@@ -57,13 +61,17 @@ class Parameterization(nn.Module):
             "translation": factory.cam_from_rig.translation,
             "image_size": factory.image_size,
             "prior_std": prior_std.to(factory.focal_length),
+            "points": points,
+            "colours": obj.colours.to(points),
+            "radius": None if obj.radius is None else obj.radius.to(points),
+            "tolerance": None if obj.tolerance is None else obj.tolerance.to(points),
             "centroid": points.mean(0),
             "centred": points - points.mean(0),
             # Seen from the rig, an object below it that lies level has its z axis towards the cameras.
             "level": torch.diag(torch.tensor((1.0, -1.0, -1.0))),
         }
         for name, tensor in buffers.items():
-            self.register_buffer(name, tensor.clone(), persistent=False)
+            self.register_buffer(name, None if tensor is None else tensor.clone(), persistent=False)
         # Takes a fiducial's distance from the principal point, over f, to about one.
         self.unit = factory.working_distance / float(self.centred.norm(dim=-1).mean())
 
@@ -71,13 +79,19 @@ class Parameterization(nn.Module):
     def factory(self) -> CameraRig:
         """The factory rig, float32, on the network's device."""
         return replace(
-            self._like,
+            self._factory,
             focal_length=self.focal_length,
             principal_point=self.principal_point,
             distortion=self.distortion,
             cam_from_rig=RigidTransform(self.rotation, self.translation),
             image_size=self.image_size,
         )
+
+    @property
+    def obj(self) -> CalibrationObject:
+        """The calibration object, float32, on the network's device."""
+        tensors = {"points": self.points, "colours": self.colours, "radius": self.radius, "tolerance": self.tolerance}
+        return replace(self._obj, **tensors)  # type: ignore[arg-type]
 
     def normalized(self, uv: Tensor) -> Tensor:
         """Pixels (B, C, N, 2) to numbers of about one, by the factory's intrinsics."""

@@ -9,9 +9,9 @@ from torch import Tensor, nn
 
 from imgcal.networks.config import PaperPoints, Points
 from imgcal.networks.layers import conv1d, mlp, transformer
+from imgcal.networks.network import Network
 from imgcal.networks.parameterization import Parameterization
 from imgcal.networks.refiner import IterativeRefiner
-from imgcal.synthesis import ImageOptions
 from imgcal.types import Prediction, Views
 
 CIE_NOISE = 0.01  # standard deviation of the noise on the one-hot camera identities
@@ -59,17 +59,14 @@ class PaperHeads(nn.Module):
         return {name: head.parameters() for name, head in zip(PAPER_OUTPUTS, self.heads, strict=True)}
 
 
-class PaperPointNetwork(nn.Module):
+class PaperPointNetwork(Network):
     """The paper's point variant: linear embedding of a camera's fiducials, CIE, encoder, five heads.
 
     Source: paper, supplementary section 1.1.
     """
 
-    image_options: ImageOptions | None = None
-
     def __init__(self, config: PaperPoints, decoder: Parameterization) -> None:
-        super().__init__()
-        self.decoder = decoder
+        super().__init__(decoder)
         cameras, fiducials = len(decoder.focal_length), len(decoder.centred)
         self.embed = nn.Linear(2 * fiducials, config.width)
         self.identity = CameraIdentity(cameras, config.width) if config.camera_identity else nn.Identity()
@@ -95,14 +92,11 @@ class PaperPointNetwork(nn.Module):
         return {"encoder": [*self.embed.parameters(), *self.encoder.parameters()]} | self.heads.groups()
 
 
-class PointNetwork(nn.Module):
+class PointNetwork(Network):
     """Our point variant: `IterativeRefiner` on the positions; fiducials that are missing are masked."""
 
-    image_options: ImageOptions | None = None
-
     def __init__(self, config: Points, decoder: Parameterization) -> None:
-        super().__init__()
-        self.decoder = decoder
+        super().__init__(decoder)
         self.trunk = IterativeRefiner(decoder, **config.trunk.model_dump())
 
     def forward(self, views: Views) -> tuple[Prediction, ...]:

@@ -7,17 +7,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from imgcal.errors import InputError
 from imgcal.geometry import RigidTransform, resized_pixels
 from imgcal.io import data_path, nearest, shipped_names
-from imgcal.synthesis import ImageOptions, render_views
-from imgcal.training import check_object, check_rig, load_checkpoint, read_subject
+from imgcal.networks import Network, check_object, check_rig, load_checkpoint, read_subject
+from imgcal.synthesis import render_views
 from imgcal.types import CalibrationObject, CameraRig, Observations, Prediction, Symmetry, Views
 
 KINDS = ("points", "vit", "cnn")
@@ -39,7 +38,7 @@ class Initializer:
     """A trained network, ready for a rig of some of its cameras and images of another size than in training."""
 
     name: str
-    network: nn.Module
+    network: Network
     trained: CameraRig  # factory rig of the training
     cameras: tuple[int, ...] | None = None  # those that there are, in the order of the rig; None = all
 
@@ -89,7 +88,7 @@ class Initializer:
         return Prediction(there, said.rig_from_object @ turn.to(rig.focal_length.dtype))
 
     def _predict(self, uv: Tensor, seen: Tensor, obj: CalibrationObject) -> Prediction:
-        options = cast(ImageOptions | None, self.network.image_options)
+        options = self.network.image_options
         views = Views(uv=uv, seen=seen)
         if options is not None:
             views = Views(images=render_views(uv, seen, self.trained.image_size, obj, options, quantise=True))

@@ -1,4 +1,4 @@
-"""Training of the networks: experiment files, checkpoints, and the engine (`imgcal.training.engine.train`)."""
+"""Training of the networks: experiment files, and the engine (`imgcal.training.train`)."""
 
 import lazy_loader as lazy
 

@@ -1,32 +1,23 @@
-from .checkpoint import (
-    Checkpoint,
-    build_network,
-    check_object,
-    check_rig,
-    load_checkpoint,
-    load_network,
-    read_subject,
-    save_network,
-)
-from .engine import RESULT, STATE, finished, train
-from .experiment import Experiment, load_experiment, save_experiment
-from .log import read_metrics
+from .callbacks import Callbacks, DivergedError
+from .engine import Run, finished, prepare, progress, train, train_step
+from .experiment import Experiment, changed, experiment_of, load_experiment, save_experiment
+from .state import TrainingState, load_state, save_state
 
 __all__ = [
-    "RESULT",
-    "STATE",
-    "Checkpoint",
+    "Callbacks",
+    "DivergedError",
     "Experiment",
-    "build_network",
-    "check_object",
-    "check_rig",
+    "Run",
+    "TrainingState",
+    "changed",
+    "experiment_of",
     "finished",
-    "load_checkpoint",
     "load_experiment",
-    "load_network",
-    "read_metrics",
-    "read_subject",
+    "load_state",
+    "prepare",
+    "progress",
     "save_experiment",
-    "save_network",
+    "save_state",
     "train",
+    "train_step",
 ]

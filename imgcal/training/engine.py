@@ -1,26 +1,27 @@
-"""The training loop: accelerate (one process or several, CPU or GPU), exact resume, a log, one result."""
+"""The training loop: accelerate (one process or several, CPU or GPU), exact resume.
+
+It writes nothing and leaves torch's default generators alone: what it has to tell goes to `Callbacks`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from time import monotonic
-from typing import Any, cast
+from typing import Any
 
 import torch
 from accelerate import Accelerator
 from accelerate.utils import broadcast
 from torch import Tensor, nn
 
-from imgcal.errors import InputError, RefusedError
-from imgcal.io import write_tensors
-from imgcal.synthesis import ImageOptions, Snapshots
-from imgcal.training.checkpoint import build_network, save_network, warm_start, without_pretrained
+from imgcal.errors import InputError
+from imgcal.networks import Checkpoint, Network, build_network, drawing_from, warm_start, without_pretrained
+from imgcal.synthesis import Snapshots
+from imgcal.training.callbacks import Callbacks, DivergedError
 from imgcal.training.data import Batch, Source, object_to
 from imgcal.training.end_to_end import refined_loss
-from imgcal.training.experiment import Experiment, save_experiment
-from imgcal.training.log import Log
+from imgcal.training.experiment import Experiment
 from imgcal.training.losses import LossTerms, compound, project_fiducials, reprojection_re
 from imgcal.training.optimization import (
     Schedule,
@@ -31,10 +32,8 @@ from imgcal.training.optimization import (
     restore_optimizer,
     update_average,
 )
-from imgcal.training.state import TrainingState, load_state, random_states, restore_random_states, save_state
+from imgcal.training.state import TrainingState, random_states, restore_random_states
 from imgcal.types import CalibrationObject, CameraRig
-
-RESULT, STATE, RESOLVED, BAD_BATCH = "model.safetensors", "state.safetensors", "resolved.yaml", "bad_batch.safetensors"
 
 WINDOW = ("losses", "passes")  # names of `Run.window`'s columns in the state
 
@@ -47,17 +46,18 @@ class Run:
     """A training under way."""
 
     experiment: Experiment
-    folder: Path
     accelerator: Accelerator
     factory: CameraRig  # float64
+    obj: CalibrationObject  # float64
     network: nn.Module  # as it is trained: wrapped when there are several processes
-    plain: nn.Module  # the same without the wrapping
+    plain: Network  # the same without the wrapping
     optimizer: torch.optim.Optimizer
     schedule: Schedule
-    average: nn.Module | None  # running mean of the weights
+    average: Network | None  # running mean of the weights
     source: Source
     prior_std: Tensor  # (C, 15) of the drift
     generator: torch.Generator  # of this process's data
+    dropout: tuple[torch.Generator, ...]  # what its layers draw from: one on the CPU, one on another device
     validation: list[Snapshots]
     batch_size: int  # of this process
     untrained: tuple[str, ...]  # parameters that a warm start did not find
@@ -66,6 +66,8 @@ class Run:
     began: float = field(default_factory=lambda: monotonic())
     judged: Tensor | None = None  # (2,) sum of losses and their number since the schedule last judged
     window: list[tuple[Tensor, Tensor]] = field(default_factory=list)  # losses and mean RE of passes since the last log
+    metrics: dict[str, Any] = field(default_factory=dict)  # the latest of each name that were due
+    latest: dict[str, Any] = field(default_factory=dict)  # the latest of each name
     pending: tuple[Batch, Tensor] | None = None  # last batch, its (2,) loss and gradient norm: not yet looked at
 
     @property
@@ -74,60 +76,64 @@ class Run:
         return self.elapsed + monotonic() - self.began
 
     @property
-    def best_weights(self) -> nn.Module:
+    def best_weights(self) -> Network:
         """The network that is the result: the running mean where there is one."""
         return self.plain if self.average is None else self.average
 
 
 def train(
     experiment: Experiment,
-    folder: str | Path,
-    resume: bool = False,
+    callbacks: Callbacks | None = None,
+    state: TrainingState | None = None,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> Run:
     """Train the network of an experiment.
 
     Args:
         experiment: what to train, on what, for how long.
-        folder: gets model.safetensors, state.safetensors, resolved.yaml, metrics.jsonl and TensorBoard's files.
-        resume: go on from `folder`/state.safetensors.
-        should_stop: asked after every step of the main process; True = save and return early.
+        callbacks: told how it goes; None = nobody is.
+        state: go on from this one, which `Callbacks.on_checkpoint` was given.
+        should_stop: asked after every step of the main process; True = make a checkpoint and return early.
 
     Returns:
         The run as it ended; `finished(run, run.seconds)` tells whether it came to its end.
 
     Raises:
-        InputError: unusable experiment, checkpoint or folder.
-        RefusedError: the loss or its gradient is not finite; the batch is saved.
+        InputError: unusable experiment, or a state that does not belong to it.
+        DivergedError: the loss or its gradient is not finite.
     """
-    run = prepare(experiment, Path(folder), resume)
-    if run.accelerator.is_main_process:
-        run.folder.mkdir(parents=True, exist_ok=True)
-        save_experiment(experiment, run.folder / RESOLVED)
-    log = Log(run.folder, run.step, run.accelerator.is_main_process)
-    with log:
-        _announce(run, log)
-        seconds, stop = run.seconds, False
-        logged = (run.step, seconds)
-        while not (stop or finished(run, seconds)):
-            run.schedule.set_progress(progress(run, seconds))
-            train_step(run)
-            seconds, stop = _agreed(run, should_stop())
-            due = experiment.training
-            last = stop or finished(run, seconds)
-            extra = run.step % due.log_every != 0
-            if last or not extra:
-                logged = _log(run, log, logged, seconds, extra)
-            extra = run.step % due.validate_every != 0
-            if run.validation and (last or not extra):
-                validate(run, log, extra)
-            if last or run.step % due.save_every == 0:
-                save(run, log.last)
+    run = prepare(experiment, state)
+    told = callbacks if callbacks is not None and run.accelerator.is_main_process else Callbacks()
+    told.on_start(run)
+    try:
+        _take_steps(run, told, should_stop)
+    finally:
+        told.on_end(run)
     return run
 
 
-def prepare(experiment: Experiment, folder: Path, resume: bool = False) -> Run:
-    """Build everything a run needs: untrained, or as it was when the state in `folder` was saved."""
+def _take_steps(run: Run, told: Callbacks, should_stop: Callable[[], bool]) -> None:
+    """Train until the end, or until somebody wants to stop."""
+    due = run.experiment.training
+    seconds, stop = run.seconds, False
+    logged = (run.step, seconds)
+    while not (stop or finished(run, seconds)):
+        run.schedule.set_progress(progress(run, seconds))
+        train_step(run)
+        seconds, stop = _agreed(run, should_stop())
+        last = stop or finished(run, seconds)
+        extra = run.step % due.log_every != 0
+        if last or not extra:
+            logged = _log(run, told, logged, seconds, extra)
+        extra = run.step % due.validate_every != 0
+        if run.validation and (last or not extra):
+            validate(run, told, extra)
+        if last or run.step % due.save_every == 0:
+            save(run, told)
+
+
+def prepare(experiment: Experiment, state: TrainingState | None = None) -> Run:
+    """Build everything a run needs: untrained, or as it was when a state was made."""
     settings = experiment.training
     # Without a GPU, accelerate joins several processes only where it is told to stay on the CPU.
     accelerator = Accelerator(cpu=settings.device == "cpu" or not torch.accelerator.is_available())
@@ -137,9 +143,9 @@ def prepare(experiment: Experiment, folder: Path, resume: bool = False) -> Run:
             f"training: batch_size: found {settings.batch_size}, expected a multiple of the {processes} processes"
         )
     factory, obj = experiment.load_rig(), experiment.load_object()
-    torch.manual_seed(settings.seed)
-    network = build_network(without_pretrained(experiment) if resume else experiment, factory, obj)
-    untrained = () if resume or settings.init_from is None else warm_start(settings.init_from, network)
+    weights = torch.Generator().manual_seed(settings.seed)
+    network = build_network(experiment if state is None else without_pretrained(experiment), factory, obj, weights)
+    untrained = () if state is not None or settings.init_from is None else warm_start(settings.init_from, network)
     plain = network.to(device)
     source = Source(
         factory.to(torch.float32, device),
@@ -147,17 +153,16 @@ def prepare(experiment: Experiment, folder: Path, resume: bool = False) -> Run:
         experiment.drift,
         experiment.poses,
         experiment.corruption,
-        cast(ImageOptions | None, network.image_options),
+        network.image_options,
     )
     seed = settings.seed * 4096 + accelerator.process_index
-    torch.manual_seed(seed)
     optimizer = make_optimizer(plain, experiment.optimizer)
     average = None if experiment.optimizer.ema is None else make_average(plain)
     run = Run(
         experiment=experiment,
-        folder=folder,
         accelerator=accelerator,
         factory=factory,
+        obj=obj,
         network=accelerator.prepare(plain),
         plain=plain,
         optimizer=optimizer,
@@ -166,12 +171,13 @@ def prepare(experiment: Experiment, folder: Path, resume: bool = False) -> Run:
         source=source,
         prior_std=source.drift.std(factory).to(device, torch.float32),
         generator=torch.Generator(device).manual_seed(seed),
+        dropout=tuple(torch.Generator(kind).manual_seed(seed) for kind in {"cpu": 0, str(device): 0}),
         validation=_validation_rigs(source, settings.validation_rigs, settings.batch_size // processes, device),
         batch_size=settings.batch_size // processes,
         untrained=untrained,
     )
-    if resume:
-        load(run)
+    if state is not None:
+        restore(run, state)
     return run
 
 
@@ -181,7 +187,7 @@ def train_step(run: Run) -> None:
     check_finite(run)  # the step before this one: its numbers are there by now
     batch = run.source.show(made, run.generator)
     run.optimizer.zero_grad(set_to_none=True)
-    with autocast(run.experiment, run.accelerator.device):
+    with drawing_from(*run.dropout), autocast(run.experiment, run.accelerator.device):
         predictions = run.network(batch.views)
     config, weights = run.experiment.loss, run.plain.parameters()
     loss = compound(predictions, batch.truth, run.source.obj, config, run.step, run.prior_std, weights)
@@ -206,7 +212,7 @@ def check_finite(run: Run) -> None:
     """Stop when the last step's loss or gradient was not finite.
 
     Raises:
-        RefusedError: with the place of the batch; the state on disk is from before.
+        DivergedError: with the batch; the last checkpoint is from before.
     """
     if run.pending is None:
         return
@@ -215,12 +221,8 @@ def check_finite(run: Run) -> None:
     loss, norm = numbers.tolist()
     if torch.tensor([loss, norm]).isfinite().all():
         return
-    name = BAD_BATCH if run.accelerator.num_processes == 1 else f"{run.accelerator.process_index}_{BAD_BATCH}"
-    write_tensors(run.folder / name, batch.tensors(), "imgcal-batch/1", {"step": str(run.step - 1)})
-    raise RefusedError(
-        f"{run.folder}: step {run.step}: loss {loss:g}, norm of its gradient {norm:g}; the batch is in {name}; "
-        f"{STATE}, if there, is from before: go on from it with --resume after changing the experiment, or start again"
-    )
+    several = run.accelerator.num_processes > 1
+    raise DivergedError(run.step, loss, norm, batch, run.accelerator.process_index if several else None)
 
 
 @torch.no_grad()
@@ -242,8 +244,8 @@ def validation_errors(
     return torch.cat(errors)
 
 
-def validate(run: Run, log: Log, extra: bool) -> None:
-    """Log the error of the weights as they would be the result, on rigs that are always the same; see `Log.write`."""
+def validate(run: Run, told: Callbacks, extra: bool) -> None:
+    """Tell the error of the weights as they would be the result, on rigs that are always the same; see `_tell`."""
     check_finite(run)
     if not run.accelerator.is_main_process:
         return
@@ -251,20 +253,15 @@ def validate(run: Run, log: Log, extra: bool) -> None:
     batches = (run.source.show(made, generator) for made in run.validation)
     errors = validation_errors(run.best_weights, batches, run.source.obj, run.experiment)
     mean, median = float(errors.mean()), float(errors.median())
-    log.write({"step": run.step, "validation_re_px": mean, "validation_re_median_px": median}, extra)
-    log.say_summary()
+    _tell(run, told, {"step": run.step, "validation_re_px": mean, "validation_re_median_px": median}, extra)
 
 
-def save(run: Run, metrics: dict[str, Any]) -> None:
-    """Write the state, and the network as it would be the result now; all processes must call this together.
-
-    Raises:
-        InputError: a file cannot be written; the previous ones survive.
-    """
+def save(run: Run, told: Callbacks) -> None:
+    """Give away the state, and the network as it would be the result now; all processes must call this together."""
     check_finite(run)
     gathered = {
         name: run.accelerator.gather(state.to(run.accelerator.device)[None])
-        for name, state in random_states(run.generator).items()
+        for name, state in random_states(run.generator, run.dropout).items()
     }
     judged = None if run.judged is None else run.judged.tolist()
     values = {
@@ -274,6 +271,7 @@ def save(run: Run, metrics: dict[str, Any]) -> None:
         "optimizer": optimizer_settings(run.optimizer),
         "schedule": run.schedule.state(),
         "judged": judged,
+        "metrics": run.metrics,
     }
     tensors = {
         "network": run.plain.state_dict(),
@@ -286,30 +284,31 @@ def save(run: Run, metrics: dict[str, Any]) -> None:
         },
     }
     if run.accelerator.is_main_process:
-        save_state(run.folder / STATE, TrainingState(tensors, values, run.experiment))
-        metrics = {name: value for name, value in metrics.items() if name != "lr"} | {"seconds": run.seconds}
-        save_network(run.folder / RESULT, run.best_weights, run.experiment, metrics, rig=run.factory)
+        metrics = {name: value for name, value in run.latest.items() if name != "lr"} | {"seconds": run.seconds}
+        checkpoint = Checkpoint(run.best_weights, run.factory, run.obj, run.experiment, metrics)
+        told.on_checkpoint(run, TrainingState(tensors, values, run.experiment), checkpoint)
 
 
-def load(run: Run) -> None:
-    """Go on where the state in the run's folder was saved.
+def restore(run: Run, state: TrainingState) -> None:
+    """Go on where a state was made.
 
     Raises:
-        InputError: no state there, damaged, or of another experiment or number of processes.
+        InputError: it is that of another number of processes.
     """
-    path = run.folder / STATE
-    state = load_state(path, run.experiment)
     values, tensors, index = state.values, state.tensors, run.accelerator.process_index
     if values["processes"] != run.accelerator.num_processes:
         expected = values["processes"]
-        raise InputError(f"{path}: found {run.accelerator.num_processes} processes, expected {expected} as before")
+        raise InputError(f"training: found {run.accelerator.num_processes} processes, expected {expected} as before")
     run.plain.load_state_dict(tensors["network"])
     if run.average is not None:
         run.average.load_state_dict(tensors["average"])
     restore_optimizer(run.optimizer, tensors["optimizer"], values["optimizer"])
     run.schedule.restore(values["schedule"])
-    restore_random_states(run.generator, {name: rows[index] for name, rows in tensors["random"].items()})
+    states = {name: rows[index] for name, rows in tensors["random"].items()}
+    restore_random_states(run.generator, run.dropout, states)
     run.step, run.elapsed, run.began = values["step"], values["elapsed"], monotonic()
+    run.metrics = dict(values.get("metrics", {}))
+    run.latest = dict(run.metrics)
     if "window" in tensors:
         columns = (tensors["window"][name][index].to(run.accelerator.device).unbind() for name in WINDOW)
         run.window = list(zip(*columns, strict=True))
@@ -354,8 +353,16 @@ def _agreed(run: Run, stop: bool) -> tuple[float, bool]:
     return seconds, bool(stopping)
 
 
-def _log(run: Run, log: Log, logged: tuple[int, float], seconds: float, extra: bool) -> tuple[int, float]:
-    """Write the means since the last time; returns where the next means begin. See `Log.write` for `extra`."""
+def _tell(run: Run, told: Callbacks, row: dict[str, Any], extra: bool) -> None:
+    """Keep plain values and pass them on. An `extra` row is not due: the run ends here, for now."""
+    run.latest |= row
+    if not extra:
+        run.metrics |= row
+    told.on_metrics(run, row, not extra)
+
+
+def _log(run: Run, told: Callbacks, logged: tuple[int, float], seconds: float, extra: bool) -> tuple[int, float]:
+    """Tell the means since the last time; returns where the next means begin."""
     totals, passes = (torch.stack(column) for column in zip(*run.window, strict=True))
     if not extra:
         run.window.clear()
@@ -366,22 +373,10 @@ def _log(run: Run, log: Log, logged: tuple[int, float], seconds: float, extra: b
     row["lr"] = max(group["lr"] for group in run.optimizer.param_groups)
     row["rigs_per_s"] = steps * run.experiment.training.batch_size / max(duration, 1e-9)
     row["seconds"] = seconds
-    log.write(row, extra)
-    log.show(progress(run, seconds))
+    _tell(run, told, row, extra)
     return run.step, seconds
 
 
 def _validation_rigs(source: Source, rigs: int, batch_size: int, device: torch.device) -> list[Snapshots]:
     generator = torch.Generator(device).manual_seed(VALIDATION_SEED)
     return [source.sample(min(batch_size, rigs - start), generator) for start in range(0, rigs, batch_size)]
-
-
-def _announce(run: Run, log: Log) -> None:
-    count = sum(parameter.numel() for parameter in run.plain.parameters())
-    where = f"{run.accelerator.num_processes} x {run.accelerator.device.type}"
-    again = f", from step {run.step} on" if run.step else ""
-    log.say(f"{run.experiment.name}: {count:,} parameters, {where}{again}")
-    if run.untrained:
-        parts = sorted({name.partition(".")[0] for name in run.untrained})
-        count = len(run.untrained)
-        log.say(f"{run.experiment.training.init_from}: nothing fits {count} tensors of {', '.join(parts)}: untrained")

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from imgcal.errors import InputError
 from imgcal.io import (
@@ -23,12 +23,15 @@ from imgcal.io import (
     yaml_text,
 )
 from imgcal.messages import quoted
-from imgcal.networks import NetworkConfig
-from imgcal.synthesis import Corruption, Drift, ImageOptions, PoseRange
+from imgcal.networks import NetworkSpec
+from imgcal.synthesis import Corruption
 from imgcal.training.losses import LossConfig
 from imgcal.types import CalibrationObject, CameraRig
 
 FORMAT = "imgcal-experiment/1"
+
+# Keys as people write them: first what it is about.
+ORDER = ("format", "name", "description", "paper", "rig", "object", "poses", "drift", "network", "images")
 
 Spread = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -95,8 +98,10 @@ class TrainingConfig(StrictModel):
         return self
 
 
-class Experiment(StrictModel):
-    """What an experiment file holds."""
+class Experiment(NetworkSpec):
+    """What an experiment file holds: the blocks of `NetworkSpec` and all others."""
+
+    model_config = ConfigDict(extra="forbid")
 
     format: Literal["imgcal-experiment/1"]
     name: Annotated[str, Field(min_length=1, max_length=200)]
@@ -104,10 +109,6 @@ class Experiment(StrictModel):
     paper: PaperRow | None = None
     rig: str  # shipped name or path
     object: str  # shipped name or path
-    poses: PoseRange = PoseRange()
-    drift: Drift
-    network: NetworkConfig
-    images: ImageOptions | None = None  # how the images of image variants are drawn
     corruption: Corruption = Corruption()  # what goes wrong in the views during training
     loss: LossConfig = LossConfig()
     optimizer: OptimizerConfig = OptimizerConfig()
@@ -142,6 +143,17 @@ def load_experiment(path: str | Path, changes: Iterable[str] = ()) -> Experiment
     return changed(read_yaml(path, Experiment, FORMAT), *changes)
 
 
+def experiment_of(spec: NetworkSpec) -> Experiment:
+    """Read all of what a network was trained by: `Checkpoint.experiment`.
+
+    Raises:
+        InputError: it is no experiment of this version.
+    """
+    if isinstance(spec, Experiment):
+        return spec
+    return validated(spec.model_dump(mode="json"), Experiment, "experiment of a network")
+
+
 def changed(experiment: Experiment, *changes: str) -> Experiment:
     """Set values of an experiment: `training.steps=100`, `drift={rotation_deg: 0.5}`; validated when all are set."""
     if not changes:
@@ -159,7 +171,8 @@ def as_written(experiment: Experiment) -> dict[str, Any]:
 
 def resolved_text(experiment: Experiment) -> str:
     """All values, defaults included, as YAML."""
-    return yaml_text(_resolved(experiment))
+    values = _resolved(experiment)
+    return yaml_text({name: values[name] for name in dict.fromkeys((*ORDER, *values)) if name in values})
 
 
 def save_experiment(experiment: Experiment, path: str | Path) -> None:

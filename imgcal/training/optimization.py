@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -14,6 +14,8 @@ from torch.optim.lr_scheduler import ReduceLROnPlateau
 from imgcal.errors import InputError
 from imgcal.io import nearest
 from imgcal.training.experiment import OptimizerConfig, ScheduleConfig
+
+Module = TypeVar("Module", bound=nn.Module)
 
 
 def make_optimizer(network: nn.Module, config: OptimizerConfig) -> torch.optim.Optimizer:
@@ -96,10 +98,11 @@ def cosine(progress: float, config: ScheduleConfig) -> float:
     return config.final + (1 - config.final) * 0.5 * (1 + math.cos(math.pi * along))
 
 
-def make_average(network: nn.Module) -> nn.Module:
+def make_average(network: Module) -> Module:
     """Copy a network whose weights are to become the running mean of the other's."""
     average = copy.deepcopy(network)
-    return average.requires_grad_(False)
+    average.requires_grad_(False)
+    return average
 
 
 @torch.no_grad()

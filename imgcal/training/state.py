@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ class TrainingState:
     """Everything that the rest of a run depends on."""
 
     tensors: dict[str, dict[str, Tensor]]  # by part: network, average, optimizer, random, window
-    values: dict[str, Any]  # plain values: step, elapsed, processes, settings of the optimizer, schedule, judged
+    values: dict[str, Any]  # plain: step, elapsed, processes, settings of the optimizer, schedule, judged, metrics
     experiment: Experiment
 
 
@@ -87,17 +87,16 @@ def first_difference(
     return None
 
 
-def random_states(generator: torch.Generator) -> dict[str, Tensor]:
-    """States of the data's generator and of the default ones, from which dropout draws."""
-    states = {"data": generator.get_state(), "cpu": torch.get_rng_state()}
-    if generator.device.type == "cuda":
-        states["cuda"] = torch.cuda.get_rng_state(generator.device)
-    return states
+def random_states(generator: torch.Generator, dropout: Iterable[torch.Generator]) -> dict[str, Tensor]:
+    """States of the data's generator, and by device of those from which layers draw."""
+    return {"data": generator.get_state()} | {own.device.type: own.get_state() for own in dropout}
 
 
-def restore_random_states(generator: torch.Generator, states: Mapping[str, Tensor]) -> None:
+def restore_random_states(
+    generator: torch.Generator, dropout: Iterable[torch.Generator], states: Mapping[str, Tensor]
+) -> None:
     """Invert `random_states`."""
-    generator.set_state(states["data"])
-    torch.set_rng_state(states["cpu"])
-    if "cuda" in states and generator.device.type == "cuda":
-        torch.cuda.set_rng_state(states["cuda"], generator.device)
+    generator.set_state(states["data"].cpu())
+    for own in dropout:
+        if own.device.type in states:
+            own.set_state(states[own.device.type].cpu())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -11,11 +10,10 @@ from typing import Any
 import torch
 
 from imgcal.io import data_path
-from imgcal.networks import NetworkConfig, build
+from imgcal.networks import Checkpoint, Network, NetworkConfig, build, load_checkpoint
 from imgcal.refinement import refine_images, refine_points
 from imgcal.synthesis import render_views, synthesize
-from imgcal.training import Checkpoint, load_checkpoint, load_experiment
-from imgcal.training.engine import prepare, train_step
+from imgcal.training import load_experiment, prepare, train_step
 from imgcal.types import Views
 from scripts.benchmarks.effort import Effort
 from scripts.output import BLUE, GREY, figure, markdown
@@ -92,18 +90,18 @@ def _row(network: torch.nn.Module, parts: Calls, timings: Mapping[str, Timing], 
     return {"parameters": count} | {part: timings[f"{name}\n{part}"].values() for part in parts}
 
 
-def _views(trained: Checkpoint, network: torch.nn.Module) -> Views:
+def _views(trained: Checkpoint, network: Network) -> Views:
     """What the cameras of one drifted rig see."""
     factory, drift = trained.rig.to(torch.float32), trained.experiment.drift
     seen = synthesize(factory, trained.obj, 1, torch.Generator().manual_seed(0), drift=drift).projection
     options = network.image_options
     if options is None:
         return Views(uv=seen.uv, seen=seen.visible)
-    images = render_views(seen.uv, seen.visible, factory.image_size, trained.obj, options, quantise=True)  # type: ignore[arg-type]
+    images = render_views(seen.uv, seen.visible, factory.image_size, trained.obj, options, quantise=True)
     return Views(images=images)
 
 
-def _forward(network: torch.nn.Module, trained: Checkpoint) -> Callable[[], object]:
+def _forward(network: Network, trained: Checkpoint) -> Callable[[], object]:
     views = _views(trained, network)
     return lambda: network(views)
 
@@ -124,19 +122,19 @@ def _calls(trained: Checkpoint) -> Calls:
     return {"alone": lambda: network(views), "refined": refined}
 
 
-def _untrained(preset: str, like: Checkpoint) -> torch.nn.Module:
-    return build(NetworkConfig(preset=preset), like.rig.to(torch.float32), like.obj, like.drift_std.float()).eval()
+def _untrained(preset: str, like: Checkpoint) -> Network:
+    rig, spread, weights = like.rig.to(torch.float32), like.drift_std.float(), torch.Generator()
+    return build(NetworkConfig(preset=preset), rig, like.obj, spread, weights).eval()
 
 
 def _throughput(name: str, steps: int) -> dict[str, float]:
     """Everything a training step does: synthesis, drawing, forward, loss, backward, optimizer."""
-    with tempfile.TemporaryDirectory() as folder:
-        experiment = load_experiment(name, ["training.validation_rigs=0", "training.device=cpu", "training.threads=1"])
-        run = prepare(experiment, Path(folder))
+    experiment = load_experiment(name, ["training.validation_rigs=0", "training.device=cpu", "training.threads=1"])
+    run = prepare(experiment)
+    train_step(run)
+    start = time.perf_counter()
+    for _ in range(steps):
         train_step(run)
-        start = time.perf_counter()
-        for _ in range(steps):
-            train_step(run)
-        seconds = time.perf_counter() - start
+    seconds = time.perf_counter() - start
     batch = experiment.training.batch_size
     return {"batch_size": batch, "rigs_per_s": steps * batch / seconds}

@@ -24,7 +24,8 @@ from imgcal.io import (
     save_rig,
     yaml_text,
 )
-from imgcal.training import build_network, load_experiment, save_network
+from imgcal.networks import Checkpoint, build_network, save_checkpoint
+from imgcal.training import load_experiment
 from scripts.fuzz.mutations import NAMES, VALUES, mutated
 
 SIZE = (256, 136)  # pixels: small frames are quick
@@ -123,8 +124,8 @@ def _network(folder: Path) -> None:
     (folder / "experiment.yaml").write_text(yaml_text(content))
     experiment = load_experiment(folder / "experiment.yaml")
     rig, obj = experiment.load_rig(), experiment.load_object()
-    torch.manual_seed(0)
-    save_network(folder / "model.safetensors", build_network(experiment, rig, obj), experiment, {"re_px": 1.0}, rig=rig)
+    network = build_network(experiment, rig, obj, torch.Generator().manual_seed(0))
+    save_checkpoint(folder / "model.safetensors", Checkpoint(network, rig, obj, experiment, {"re_px": 1.0}))
 
 
 def _damage(path: Path, random: Random) -> str:

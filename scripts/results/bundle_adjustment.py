@@ -29,9 +29,9 @@ from imgcal.evaluation import BASELINES, Conditions, Given, network_method, repr
 from imgcal.evaluation.protocol import Sample, draw
 from imgcal.geometry import vector_from_rotation
 from imgcal.io import load_object, load_rig
+from imgcal.networks import load_network
 from imgcal.refinement import as_prediction, observed
 from imgcal.synthesis import PoseRange, RelativeDrift
-from imgcal.training import load_network
 from imgcal.types import CameraRig, Prediction, pack21
 from scripts.output import BLUE, GREEN, GREY, RED, RESULTS, command, figure, surroundings, write_json
 

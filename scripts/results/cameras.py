@@ -20,6 +20,7 @@ from imgcal.evaluation import BASELINES, Conditions, Given, Method, load_models,
 from imgcal.evaluation.protocol import draw
 from imgcal.io import load_object, load_rig, write_text
 from imgcal.synthesis import RelativeDrift
+from imgcal.training import experiment_of
 from imgcal.types import CameraRig, Prediction
 from scripts.output import ROOT, command, make_folder
 
@@ -85,7 +86,7 @@ def _chosen(options: Options) -> tuple[Conditions, Method, str]:
         name = "factory, pose fitted"
         return Conditions(rig, obj, drift=RelativeDrift()), BASELINES[name], name
     [model] = load_models([options.model])
-    name = model.checkpoint.experiment.name + (" + refinement" if options.refined else "")
+    name = experiment_of(model.checkpoint.experiment).name + (" + refinement" if options.refined else "")
     return model.conditions, model.method, name
 
 

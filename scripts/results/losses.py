@@ -8,7 +8,6 @@ so that a CPU gets somewhere; the second stage, with reprojection, begins after 
 from __future__ import annotations
 
 import sys
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
@@ -19,9 +18,8 @@ import tyro
 from torch import Tensor
 
 from imgcal.errors import InputError
-from imgcal.training import Experiment, load_experiment
-from imgcal.training.engine import Run, check_finite, prepare, train_step
-from imgcal.training.experiment import changed
+from imgcal.training import Experiment, Run, changed, load_experiment, prepare, train_step
+from imgcal.training.engine import check_finite
 from imgcal.training.losses import (
     distortion_size,
     focal_ratio,
@@ -61,8 +59,7 @@ def main(arguments: list[str] | None = None) -> None:
         raise InputError(f"--minutes: found {options.minutes:g}, expected more than 0")
     loss = f"loss={{kind: paper, paper: {{reprojection_from: {NEVER}}}}}"
     experiment = changed(load_experiment(options.experiment), *options.set, loss, "training.validation_rigs=0")
-    with tempfile.TemporaryDirectory() as folder:
-        result = surroundings() | watched(experiment, Path(folder), options)
+    result = surroundings() | watched(experiment, options)
     write_json(options.out / "losses.json", result)
     draw(result, options.out / "losses.png")
     for name, values in result["losses"].items():
@@ -70,9 +67,9 @@ def main(arguments: list[str] | None = None) -> None:
         print(f"{name:20s} {values[0]:12.5g} -> {values[-1]:12.5g}" + ("" if at_truth is None else f"  {at_truth:.5g}"))
 
 
-def watched(experiment: Experiment, folder: Path, options: Options) -> dict[str, Any]:
+def watched(experiment: Experiment, options: Options) -> dict[str, Any]:
     """Train for some minutes; returns every term every few steps."""
-    run = prepare(experiment, folder)
+    run = prepare(experiment)
     made = run.source.sample(options.rigs, torch.Generator(run.prior_std.device).manual_seed(1))
     batch = run.source.show(made, run.generator)
     truth, obj = batch.truth, run.source.obj

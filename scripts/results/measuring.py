@@ -25,10 +25,10 @@ from imgcal.evaluation import (
     load_models,
     sweep,
 )
-from imgcal.io import read_texts
+from imgcal.io import read_metrics, read_texts
+from imgcal.networks.checkpoint import FORMAT
 from imgcal.synthesis import Corruption, RelativeDrift
-from imgcal.training import read_metrics
-from imgcal.training.checkpoint import FORMAT
+from imgcal.training import experiment_of
 from scripts.output import surroundings
 
 NOISE = Corruption(noise=0.1)
@@ -91,7 +91,7 @@ def measure(source: Source, effort: Effort, device: str, trained_on: str) -> dic
         trained_on: the machine of its training, in words.
     """
     [model] = load_models([source.path], device=device)
-    name, images = model.checkpoint.experiment.name, model.method.images is not None
+    name, images = experiment_of(model.checkpoint.experiment).name, model.method.images is not None
     count = min(effort.count, effort.image_count) if images else effort.count
     exact = Protocol(count, effort.trials)
     few = Protocol(min(effort.extra, count), effort.trials)
@@ -131,7 +131,7 @@ def swept(source: Source, count: int, device: str) -> dict[str, Any]:
     methods = {NETWORK: model.method, WITHOUT: BASELINES[WITHOUT]}
     drift = model.conditions.drift
     result: dict[str, Any] = {
-        "experiment": model.checkpoint.experiment.name,
+        "experiment": experiment_of(model.checkpoint.experiment).name,
         "sha256": source.sha256,
         "rigs": count,
         "trained_kappa": drift.kappa_intrinsics if isinstance(drift, RelativeDrift) else None,
@@ -146,7 +146,7 @@ def swept(source: Source, count: int, device: str) -> dict[str, Any]:
 
 def training_of(model: Model, trained_on: str) -> dict[str, Any]:
     """What a training took."""
-    metrics, experiment = model.checkpoint.metrics, model.checkpoint.experiment
+    metrics, experiment = model.checkpoint.metrics, experiment_of(model.checkpoint.experiment)
     start = experiment.training.init_from
     return {
         "minutes": metrics.get("seconds", 0.0) / 60,

@@ -136,7 +136,9 @@ def ours(cameras: int, device: str, repeats: int) -> dict[str, float]:
     given = Views(uv, seen)
     found = {}
     for preset in ("points", "paper-points"):
-        network = networks.build(NetworkConfig(preset=preset), rig.to(torch.float32), obj, prior_std.float())
+        network = networks.build(
+            NetworkConfig(preset=preset), rig.to(torch.float32), obj, prior_std.float(), torch.Generator()
+        )
         network = network.to(device).eval()
         found[f"{preset}_s"] = median(lambda net=network: forward(net, views), repeats)  # type: ignore[misc]
     found["refinement_s"] = median(lambda: refine_points(guess, given, rig, obj, prior_std, NOISE), repeats)

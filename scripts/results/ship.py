@@ -6,18 +6,18 @@ Usage: python -m scripts.results.ship out/runs/shipped-points-asymmetric8 out/ru
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, cast
+from typing import Annotated
 
 import torch
 import tyro
 
 from imgcal.errors import InputError
 from imgcal.evaluation import reprojection_error
-from imgcal.synthesis import ImageOptions, render_views, synthesize
-from imgcal.training import Checkpoint, Experiment, load_checkpoint, save_network
-from imgcal.training.experiment import changed
+from imgcal.networks import Checkpoint, load_checkpoint, save_checkpoint
+from imgcal.synthesis import render_views, synthesize
+from imgcal.training import Experiment, changed, experiment_of
 from imgcal.types import Views
 from scripts.output import command, make_folder
 
@@ -41,10 +41,10 @@ def main(arguments: list[str]) -> None:
     make_folder(options.out)
     for run in options.runs:
         trained = load_checkpoint(run / "model.safetensors")
-        experiment = portable(trained.experiment)
+        experiment = portable(experiment_of(trained.experiment))
         kind = experiment.name.split("-")[1]
         path = options.out / f"{kind}-{experiment.rig}-{experiment.object}.safetensors"
-        save_network(path, trained.network, experiment, trained.metrics, torch.bfloat16, rig=trained.rig)
+        save_checkpoint(path, replace(trained, experiment=experiment), torch.bfloat16)
         before, after = error(trained), error(load_checkpoint(path))
         print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, RE {before:.3f} px, in bf16 {after:.3f} px")
 
@@ -55,7 +55,8 @@ def portable(experiment: Experiment) -> Experiment:
     if start is None:
         return experiment
     return changed(
-        experiment, f"training.init_from=out/runs/{load_checkpoint(start).experiment.name}/model.safetensors"
+        experiment,
+        f"training.init_from=out/runs/{experiment_of(load_checkpoint(start).experiment).name}/model.safetensors",
     )
 
 
@@ -68,7 +69,7 @@ def error(checkpoint: Checkpoint) -> float:
     made = synthesize(factory, checkpoint.obj, RIGS, generator, drift=drift, pose_range=poses)
     uv, seen = made.projection.uv, made.projection.visible
     views = Views(uv=uv, seen=seen)
-    options = cast(ImageOptions | None, network.image_options)
+    options = network.image_options
     if options is not None:
         images = render_views(uv, seen, factory.image_size, checkpoint.obj, options, quantise=True)
         views = Views(images=images)

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from imgcal.errors import InputError
-from imgcal.training import build_network, load_experiment, save_network
-from imgcal.training.experiment import changed
+from imgcal.networks import Checkpoint, build_network, save_checkpoint
+from imgcal.training import changed, load_experiment
 
 FOLDER = Path(__file__).parents[2] / "scripts" / "results"
 PAGE = Path(__file__).parents[2] / "docs" / "results.md"
@@ -36,8 +36,9 @@ def trained(tmp_path):
         run.mkdir(parents=True)
         rows = [{"step": step, "re_px": 90.0 / step, "seconds": 60.0 * step} for step in range(1, 131)]
         (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-        network = build_network(experiment, rig, obj)
-        save_network(run / "model.safetensors", network, experiment, {"step": 130, "seconds": 7800.0}, rig=rig)
+        network = build_network(experiment, rig, obj, torch.Generator().manual_seed(0))
+        checkpoint = Checkpoint(network, rig, obj, experiment, {"step": 130, "seconds": 7800.0})
+        save_checkpoint(run / "model.safetensors", checkpoint)
         return run / "model.safetensors"
 
     return make

@@ -5,7 +5,7 @@ import torch
 
 from imgcal.cli.main import main
 from imgcal.io import load_object, load_rig
-from imgcal.training.checkpoint import build_network, save_network
+from imgcal.networks import Checkpoint, build_network, save_checkpoint
 from imgcal.training.experiment import load_experiment
 
 EXPERIMENT = """
@@ -38,9 +38,9 @@ def models(tmp_path_factory):
     paths = [folder / "first.safetensors", folder / "second" / "model.safetensors"]
     paths[1].parent.mkdir()
     for seed, path in enumerate(paths):
-        torch.manual_seed(seed)
-        network = build_network(experiment, load_rig("T4"), load_object("asymmetric8"))
-        save_network(path, network, experiment, {})
+        subject = (load_rig("T4"), load_object("asymmetric8"))
+        network = build_network(experiment, *subject, torch.Generator().manual_seed(seed))
+        save_checkpoint(path, Checkpoint(network, *subject, experiment, {}))
     (paths[1].parent / "metrics.jsonl").write_text('{"step": 1, "re_px": 5.0}\n{"step": 2, "validation_re_px": 4.0}\n')
     return [paths[0], paths[1].parent]
 

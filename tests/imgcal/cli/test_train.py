@@ -2,18 +2,16 @@ import signal
 
 import pytest
 
-from imgcal import networks
 from imgcal.cli.main import main
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, load_rig, read_metrics
+from imgcal.networks import load_network
 from imgcal.training import engine
-from imgcal.training.checkpoint import load_network
-from imgcal.training.log import read_metrics
 from tests.imgcal.training.toy import EXPERIMENT, Toy
 
 
 @pytest.fixture
 def experiment(tmp_path, monkeypatch):
-    monkeypatch.setattr(networks, "build", Toy)
+    monkeypatch.setattr("imgcal.networks.factory.build", Toy)
     path = tmp_path / "toy.yaml"
     path.write_text(EXPERIMENT)
     return path

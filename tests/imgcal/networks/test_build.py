@@ -5,8 +5,8 @@ import torch
 
 from imgcal.errors import InputError
 from imgcal.io import load_object, load_rig
-from imgcal.networks import PRESETS, NetworkConfig, build
-from imgcal.synthesis.colour_coding import render_views
+from imgcal.networks import PRESETS, NetworkConfig, build, drawing_from
+from imgcal.synthesis.colour_coding import ImageOptions, render_views
 from imgcal.synthesis.rigs import RelativeDrift, synthesize
 from imgcal.training.losses import project_fiducials
 from imgcal.types import Views
@@ -17,8 +17,8 @@ SMALL = ["points", "points-one-pass", "points-cnn1d", "vit", "cnn", "vit-pooled"
 
 def make(preset, rig="T4", obj="asymmetric8", **change):
     factory, thing = load_rig(rig).to(torch.float32), load_object(obj)
-    torch.manual_seed(0)
-    return build(NetworkConfig(preset=preset, change=change), factory, thing, DRIFT.std(factory)).eval()
+    weights = torch.Generator().manual_seed(0)
+    return build(NetworkConfig(preset=preset, change=change), factory, thing, DRIFT.std(factory), weights).eval()
 
 
 def snapshots(network, count=3, drift=DRIFT):
@@ -259,7 +259,7 @@ def test_a_rig_without_working_distance_is_refused():
 
     factory = replace(load_rig("T4").to(torch.float32), working_distance=None)
     with pytest.raises(InputError, match="working_distance"):
-        build(NetworkConfig(preset="points"), factory, load_object("cube8"), DRIFT.std(factory))
+        build(NetworkConfig(preset="points"), factory, load_object("cube8"), DRIFT.std(factory), torch.Generator())
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -284,12 +284,13 @@ def test_every_preset_changes_in_what_is_named_and_predicts_rigs(preset):
 
 
 def test_rescaled_weights_say_the_same_of_another_drift():
+    config = NetworkConfig(preset="points", change={"trunk": {"trust": True}})
     narrow = make("points", trunk={"trust": True})
     factory, obj = narrow.factory, narrow.obj
     with torch.no_grad():
         for parameter in narrow.parameters():
             parameter += 0.02 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(3))
-    wide = build(narrow.config, factory, obj, 3 * narrow.decoder.prior_std).eval()
+    wide = build(config, factory, obj, 3 * narrow.decoder.prior_std, torch.Generator()).eval()
     wide.load_state_dict(narrow.state_dict())
     wide.trunk.rescale(narrow.decoder.prior_std)
     made = snapshots(narrow)
@@ -310,3 +311,49 @@ def test_every_parameter_is_in_one_group(preset):
         assert {"rotation", "translation", "focal_length", "principal_point", "distortion"} < set(
             network.parameter_groups()
         )
+
+
+def tensors_of(record):
+    """Every tensor that a rig or an object holds."""
+    inner = [vars(value) if hasattr(value, "__dict__") else {} for value in vars(record).values()]
+    values = [*vars(record).values(), *(value for one in inner for value in one.values())]
+    return [value for value in values if isinstance(value, torch.Tensor)]
+
+
+@pytest.mark.parametrize("preset", ["points", "paper-points", "vit"])
+def test_a_network_moves_as_a_whole(preset):
+    change = {"width": 32, "depth": 1} if preset == "paper-points" else {}
+    moved = make(preset, **change).to("meta")
+    held = [*moved.parameters(), *moved.buffers(), *tensors_of(moved.factory), *tensors_of(moved.obj)]
+    assert {tensor.device.type for tensor in held} == {"meta"}
+
+
+def test_weights_come_from_the_generator_alone():
+    torch.manual_seed(5)
+    before = torch.get_rng_state()
+    one, same = make("points"), make("points")
+    assert torch.equal(torch.get_rng_state(), before)
+    assert all(torch.equal(a, b) for a, b in zip(one.parameters(), same.parameters(), strict=True))
+    first = one.trunk.first.embed[0]
+    torch.manual_seed(0)  # as torch would draw them after a seed of its own
+    assert torch.equal(first.weight, torch.nn.Linear(first.in_features, first.out_features).weight)
+
+
+def test_layers_draw_from_a_generator_that_goes_on():
+    layer, generator = torch.nn.Dropout(0.5), torch.Generator().manual_seed(3)
+    with drawing_from(generator):
+        first = layer(torch.ones(100))
+    with pytest.raises(ZeroDivisionError), drawing_from(generator):
+        raise ZeroDivisionError
+    with drawing_from(generator):
+        second = layer(torch.ones(100))
+    torch.manual_seed(3)
+    assert torch.equal(torch.cat((first, second)), torch.cat((layer(torch.ones(100)), layer(torch.ones(100)))))
+
+
+def test_images_are_drawn_as_is_asked_for():
+    factory, thing = load_rig("T4").to(torch.float32), load_object("asymmetric8")
+    given = (factory, thing, DRIFT.std(factory), torch.Generator(), ImageOptions(size=64, dot=2.0))
+    assert build(NetworkConfig(preset="vit"), *given).image_options == ImageOptions(size=64, dot=2.0)
+    with pytest.raises(InputError, match="the network points takes points"):
+        build(NetworkConfig(preset="points"), *given)

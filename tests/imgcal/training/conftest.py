@@ -1,23 +1,15 @@
 import pytest
 
-from imgcal import networks
-from imgcal.training.experiment import Experiment, load_experiment
-from tests.imgcal.training.toy import EXPERIMENT, Toy
+from tests.imgcal.training.toy import Toy, experiments
 
 
 @pytest.fixture(autouse=True)
 def toy(monkeypatch):
     """Every network that is built is the toy."""
-    monkeypatch.setattr(networks, "build", Toy)
+    monkeypatch.setattr("imgcal.networks.factory.build", Toy)
 
 
 @pytest.fixture
 def experiment(tmp_path):
     """Make the toy's experiment with some values changed."""
-
-    def make(*changes: str) -> Experiment:
-        path = tmp_path / "toy.yaml"
-        path.write_text(EXPERIMENT)
-        return load_experiment(path, changes)
-
-    return make
+    return experiments(tmp_path)

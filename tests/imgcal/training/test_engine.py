@@ -1,18 +1,20 @@
+import copy
 import json
 import resource
 
 import pytest
 import torch
 
-from imgcal import networks
+from imgcal.cli.training_folder import BAD_BATCH, RESULT, STATE
 from imgcal.errors import InputError, RefusedError
+from imgcal.io import read_metrics
 from imgcal.io.safetensors_file import read_tensors
+from imgcal.networks import load_checkpoint
 from imgcal.training import engine
-from imgcal.training.checkpoint import load_checkpoint
-from imgcal.training.engine import BAD_BATCH, RESULT, STATE, finished, progress, train
+from imgcal.training.callbacks import Callbacks, DivergedError
+from imgcal.training.engine import finished, progress
 from imgcal.training.experiment import load_experiment
-from imgcal.training.log import read_metrics
-from tests.imgcal.training.toy import Toy, ToyOfImages
+from tests.imgcal.training.toy import Toy, ToyOfImages, train
 
 
 def weights(folder):
@@ -167,7 +169,7 @@ class Diverging(Toy):
 
 
 def test_a_loss_that_is_not_finite_stops_with_the_batch(experiment, tmp_path, monkeypatch):
-    monkeypatch.setattr(networks, "build", Diverging)
+    monkeypatch.setattr("imgcal.networks.factory.build", Diverging)
     with pytest.raises(RefusedError, match=r"step 6: loss nan, norm of its gradient nan; the batch is in bad_batch"):
         train(experiment("training.save_every=5"), tmp_path)
     tensors, texts = read_tensors(tmp_path / BAD_BATCH, "imgcal-batch/1")
@@ -203,7 +205,7 @@ def test_a_warm_start(experiment, tmp_path, capsys):
 
 
 def test_images_and_bf16(experiment, tmp_path, monkeypatch):
-    monkeypatch.setattr(networks, "build", ToyOfImages)
+    monkeypatch.setattr("imgcal.networks.factory.build", ToyOfImages)
     setup = experiment("training.precision=bf16", "training.steps=4", "images={size: 20, dot: 1.0}")
     run = train(setup, tmp_path)
     assert run.source.images.size == 20
@@ -224,7 +226,8 @@ def test_bf16_stays_out_of_the_errors(experiment, tmp_path):
     assert engine.validation_errors(Oracle(), [batch], run.source.obj, run.experiment).max() < 1e-3
 
 
-def test_images_for_a_point_network_are_an_error(experiment, tmp_path):
+def test_images_for_a_point_network_are_an_error(experiment, tmp_path, monkeypatch):
+    monkeypatch.undo()  # the real networks
     with pytest.raises(InputError, match="the network points takes points"):
         train(experiment("images={size: 32}"), tmp_path / "new")
     assert not (tmp_path / "new").exists()
@@ -234,3 +237,50 @@ def test_the_paper_preset_trains(experiment, tmp_path):
     run = train(experiment("loss={kind: paper, paper: {reprojection_from: 10}}", "optimizer.kind=adam"), tmp_path)
     losses = [row["loss"] for row in read_metrics(tmp_path / "metrics.jsonl") if "loss" in row]
     assert run.step == 60 and losses[-1] < losses[0]
+
+
+class Recorder(Callbacks):
+    """Keeps what it is told."""
+
+    def __init__(self):
+        self.told, self.rows, self.state = [], [], None
+
+    def on_start(self, run):
+        self.told.append(("start", run.step))
+
+    def on_metrics(self, run, row, due):
+        self.told.append(("metrics", run.step))
+        self.rows.append((timeless(row), due))
+
+    def on_checkpoint(self, run, state, checkpoint):
+        self.told.append(("checkpoint", run.step))
+        self.state, self.metrics = copy.deepcopy(state), dict(checkpoint.metrics)
+
+    def on_end(self, run):
+        self.told.append(("end", run.step))
+
+
+def test_a_training_in_memory_writes_nothing_and_leaves_the_default_generator_alone(experiment, tmp_path, monkeypatch):
+    setup = experiment("training.steps=40", "training.validate_every=20")
+    before, random = sorted(tmp_path.rglob("*")), torch.get_rng_state()
+    monkeypatch.chdir(tmp_path)
+    whole, parts, rest = Recorder(), Recorder(), Recorder()
+    expected = engine.train(setup, whole)
+    engine.train(setup, parts, should_stop=stopping_at(17))
+    found = engine.train(setup, rest, parts.state)
+    assert torch.equal(torch.get_rng_state(), random) and sorted(tmp_path.rglob("*")) == before
+    assert torch.equal(found.plain.head.weight, expected.plain.head.weight)
+    assert (parts.told[-1], rest.told[-1]) == (("end", 17), ("end", 40))
+    assert rest.told[:2] == [("start", 17), ("metrics", 20)]
+    due = [row for row, due in parts.rows + rest.rows if due]
+    assert due == [row for row, _ in whole.rows] and len(due) == 6
+    assert timeless(rest.metrics) == timeless(whole.metrics)
+
+
+def test_a_training_that_fails_says_that_it_ends(experiment, monkeypatch):
+    monkeypatch.setattr("imgcal.networks.factory.build", Diverging)
+    recorder = Recorder()
+    with pytest.raises(DivergedError, match="step 6: loss nan") as caught:
+        engine.train(experiment(), recorder)
+    assert recorder.told == [("start", 0), ("end", 6)]
+    assert caught.value.batch.views.uv.shape == (12, 4, 8, 2) and caught.value.process is None

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import torch
 
+from imgcal.cli.training_folder import RESULT, STATE
+from imgcal.io import read_metrics
 from imgcal.io.safetensors_file import read_tensors, read_texts
-from imgcal.training.engine import RESULT, STATE, train
-from imgcal.training.log import read_metrics
-from tests.imgcal.training.toy import EXPERIMENT
+from tests.imgcal.training.toy import EXPERIMENT, train
 
 ROOT = Path(__file__).parents[3]
 TOY = "tests.imgcal.training.toy"

@@ -3,13 +3,15 @@
 import torch
 from torch import nn
 
-from imgcal import networks
 from imgcal.cli.main import run as command
+from imgcal.cli.training_folder import train_in
 from imgcal.geometry.rotations import rotation_from_6d
 from imgcal.geometry.transforms import RigidTransform
+from imgcal.networks import Network, Parameterization, drawing_from, factory
 from imgcal.synthesis.colour_coding import ImageOptions
 from imgcal.training import engine
 from imgcal.training.engine import save
+from imgcal.training.experiment import load_experiment
 from imgcal.types.prediction import Prediction
 from imgcal.types.rig import PARAMETERS
 
@@ -34,16 +36,19 @@ training:
 """
 
 
-class Toy(nn.Module):
+class Toy(Network):
     """Two passes of one small network on the points; dropout draws from the default generator."""
 
-    image_options: ImageOptions | None = None
+    takes: ImageOptions | None = None
     width = 24
 
-    def __init__(self, config, factory, obj, drift_std):
-        super().__init__()
-        self.config, self.factory, self.obj = config, factory, obj
+    def __init__(self, config, factory, obj, drift_std, generator, images=None):
+        super().__init__(Parameterization(factory, obj, drift_std), self.takes and (images or self.takes))
         self.register_buffer("prior_std", drift_std)
+        with drawing_from(generator):
+            self.make_layers(factory, obj)
+
+    def make_layers(self, factory, obj):
         inputs = (
             factory.num_cameras * obj.num_fiducials * 2 if self.image_options is None else factory.num_cameras * 3 * 4
         )
@@ -72,17 +77,33 @@ class Toy(nn.Module):
 
 
 class ToyOfImages(Toy):
-    image_options = ImageOptions(size=16, dot=1.0)
+    takes = ImageOptions(size=16, dot=1.0)
 
 
-def save_and_compare(run, metrics):
+def experiments(folder):
+    """Return a function that makes the toy's experiment with some values changed."""
+
+    def make(*changes):
+        path = folder / "toy.yaml"
+        path.write_text(EXPERIMENT)
+        return load_experiment(path, changes)
+
+    return make
+
+
+def train(experiment, folder, resume=False, should_stop=lambda: False):
+    """Train in a folder, as the command does."""
+    return train_in(folder, experiment, resume, should_stop)
+
+
+def save_and_compare(run, told):
     """Save, and make sure that all processes hold the same weights."""
-    save(run, metrics)
+    save(run, told)
     copies = run.accelerator.gather(run.plain.head.weight.detach()[None].clone())
     assert (copies == copies[0]).all()
 
 
 if __name__ == "__main__":
-    networks.build = Toy
+    factory.build = Toy
     engine.save = save_and_compare
     command()

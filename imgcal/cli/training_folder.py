@@ -1,0 +1,135 @@
+"""The folder of a training run: what `imgcal train` writes and shows."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from torch.utils.tensorboard import SummaryWriter
+
+from imgcal.errors import InputError, RefusedError
+from imgcal.io import read_metrics, write_tensors, write_text
+from imgcal.networks import Checkpoint, save_checkpoint
+from imgcal.training import (
+    Callbacks,
+    DivergedError,
+    Experiment,
+    Run,
+    TrainingState,
+    load_state,
+    progress,
+    save_experiment,
+    save_state,
+    train,
+)
+
+RESULT, STATE, RESOLVED, METRICS = "model.safetensors", "state.safetensors", "resolved.yaml", "metrics.jsonl"
+BAD_BATCH = "bad_batch.safetensors"
+EXTRA = "extra"  # key of a row that a longer run does not have
+
+
+def train_in(
+    folder: str | Path, experiment: Experiment, resume: bool = False, should_stop: Callable[[], bool] = lambda: False
+) -> Run:
+    """Train, and write model, state, resolved experiment and metrics into a folder.
+
+    Args:
+        folder: made if need be, once all input has been found usable.
+        experiment: what to train, on what, for how long.
+        resume: go on from the state in the folder.
+        should_stop: see `imgcal.training.train`.
+
+    Raises:
+        InputError: unusable experiment, state or folder.
+        RefusedError: the loss or its gradient is not finite; the batch is saved.
+    """
+    folder = Path(folder)
+    state = load_state(folder / STATE, experiment) if resume else None
+    try:
+        return train(experiment, TrainingFolder(folder), state, should_stop)
+    except DivergedError as error:
+        name = BAD_BATCH if error.process is None else f"{error.process}_{BAD_BATCH}"
+        write_tensors(folder / name, error.batch.tensors(), "imgcal-batch/1", {"step": str(error.step - 1)})
+        raise RefusedError(
+            f"{folder}: {error}; the batch is in {name}; {STATE}, if there, is from before: go on from it with "
+            "--resume after changing the experiment, or start again"
+        ) from error
+
+
+class TrainingFolder(Callbacks):
+    """Writes what a training tells into a folder, and shows it on standard error."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.metrics = folder / METRICS
+
+    def on_start(self, run: Run) -> None:
+        """Make the folder and open the logs; what a run would not have logged without a stop is dropped."""
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{self.folder}: cannot be made: {error.strerror or error}") from error
+        save_experiment(run.experiment, self.folder / RESOLVED)
+        kept = [row for row in read_metrics(self.metrics) if row["step"] <= run.step and not row.get(EXTRA)]
+        write_text(self.metrics, "".join(json.dumps(row) + "\n" for row in (kept if run.step else [])))
+        self.board = SummaryWriter(str(self.folder / "tensorboard"), purge_step=run.step + 1 if run.step else None)
+        self.console = Console(file=sys.stderr)
+        columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+        self.bar = Progress(*columns, console=self.console, disable=not self.console.is_terminal)
+        self.task = self.bar.add_task("training", total=1.0)
+        self.bar.start()
+        self._announce(run)
+
+    def on_metrics(self, run: Run, row: dict[str, Any], due: bool) -> None:
+        """Append a row to metrics.jsonl and to TensorBoard; show it."""
+        try:
+            with open(self.metrics, "a") as file:
+                file.write(json.dumps(row if due else row | {EXTRA: True}) + "\n")
+        except OSError as error:
+            raise InputError(f"{self.metrics}: cannot be written: {error.strerror or error}") from error
+        for name, value in row.items():
+            if name != "step" and isinstance(value, float | int):
+                self.board.add_scalar(name, value, row["step"])
+        if "seconds" in row:
+            self.bar.update(self.task, completed=progress(run, row["seconds"]), description=_summary(run.latest))
+        else:
+            self._say(_summary(run.latest))
+
+    def on_checkpoint(self, run: Run, state: TrainingState, checkpoint: Checkpoint) -> None:
+        """Write both; where a file cannot be written the previous one survives."""
+        save_state(self.folder / STATE, state)
+        save_checkpoint(self.folder / RESULT, checkpoint)
+
+    def on_end(self, run: Run) -> None:
+        """Close the logs."""
+        self.bar.stop()
+        self.board.close()
+
+    def _announce(self, run: Run) -> None:
+        count = sum(parameter.numel() for parameter in run.plain.parameters())
+        where = f"{run.accelerator.num_processes} x {run.accelerator.device.type}"
+        again = f", from step {run.step} on" if run.step else ""
+        self._say(f"{run.experiment.name}: {count:,} parameters, {where}{again}")
+        if run.untrained:
+            parts = ", ".join(sorted({name.partition(".")[0] for name in run.untrained}))
+            start = run.experiment.training.init_from
+            self._say(f"{start}: nothing fits {len(run.untrained)} tensors of {parts}: untrained")
+
+    def _say(self, text: str) -> None:
+        self.console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def _summary(latest: dict[str, Any]) -> str:
+    """Put the latest numbers into one line."""
+    words = [f"step {latest.get('step', 0)}"]
+    for name, label in (("re_px", "RE"), ("validation_re_px", "validation RE")):
+        if name in latest:
+            words.append(f"{label} {latest[name]:.3g} px")
+    if "rigs_per_s" in latest:
+        words.append(f"{latest['rigs_per_s']:.0f} rigs/s")
+    return "  ".join(words)

@@ -1,0 +1,36 @@
+"""Layers that draw from a given generator: torch's initializers and dropout ask the process's default one only."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+
+@contextmanager
+def drawing_from(*generators: torch.Generator) -> Iterator[None]:
+    """Put generators in the place of the default ones of their devices, which are afterwards as they were.
+
+    Default generators belong to the process: other threads must not draw meanwhile.
+
+    Args:
+        generators: one a device; each goes on where the block has left it.
+    """
+    defaults = [_default(generator.device) for generator in generators]
+    before = [default.get_state() for default in defaults]
+    for default, generator in zip(defaults, generators, strict=True):
+        default.set_state(generator.get_state())
+    try:
+        yield
+    finally:
+        for default, generator, state in zip(defaults, generators, before, strict=True):
+            generator.set_state(default.get_state())
+            default.set_state(state)
+
+
+def _default(device: torch.device) -> torch.Generator:
+    if device.type == "cpu":
+        return torch.default_generator
+    module = torch.get_device_module(device)
+    return module.default_generators[module.current_device() if device.index is None else device.index]
