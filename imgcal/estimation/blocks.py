@@ -58,10 +58,10 @@ def block_scatter(problem: Problem, solution: Solution, loss: NamedLoss) -> Bloc
     covariance = whitened_covariance(solution)[0]
     equations = equations_by_snapshot(problem, solution.state, loss)
     pull = (solution.state.offset - equations.camera_gradient).flatten(1)  # the prior's own pull taken out
-    influence = (pull - pull.mean(0)) @ covariance  # (S, 15 C)
-    by_noise = covariance - covariance @ covariance  # the rest is the prior's
+    pull = pull - pull.mean(0)
     found, size = BlockScatter(), 1
-    kinds = [_whitened(influence, by_noise, part, cameras) for part in POOLED]
+    numbers = torch.arange(PARAMETERS * cameras).view(cameras, PARAMETERS)
+    kinds = [_whitened(pull, covariance, numbers[:, part].flatten()) for part in POOLED]
     while snapshots // size >= LEAST_BLOCKS:
         count = snapshots // size
         for whitened in kinds:
@@ -74,14 +74,15 @@ def block_scatter(problem: Problem, solution: Solution, loss: NamedLoss) -> Bloc
     return found
 
 
-def _whitened(influence: Tensor, by_noise: Tensor, part: slice, cameras: int) -> Tensor:
-    """Influences (S, 15 C) on the parameters of a kind, along directions (S, D) in which noise makes their sum vary by
-    one; parameters of which the data say nothing are left out.
+def _whitened(pull: Tensor, covariance: Tensor, rows: Tensor) -> Tensor:
+    """Influences (S, D) of pulls (S, 15 C) on parameters of a kind, along directions in which noise makes their sum
+    vary by one; parameters of which the data say nothing are left out.
     """
-    rows = torch.arange(PARAMETERS * cameras).view(cameras, PARAMETERS)[:, part].flatten()
-    rows = rows[by_noise.diagonal()[rows] > LEAST_SAID]
-    block = by_noise[rows[:, None], rows]
-    scale = block.diagonal().sqrt()
-    values, vectors = torch.linalg.eigh(block / (scale[:, None] * scale))
-    known = values > LEAST_CORRELATED
-    return influence[:, rows] / scale @ vectors[:, known] * values[known].rsqrt()
+    columns = covariance[:, rows]
+    by_noise = covariance[rows[:, None], rows] - columns.mT @ columns  # the rest is the prior's
+    influence, known = pull @ columns, by_noise.diagonal() > LEAST_SAID
+    by_noise, influence = by_noise[known][:, known], influence[:, known]
+    scale = by_noise.diagonal().sqrt()
+    values, vectors = torch.linalg.eigh(by_noise / (scale[:, None] * scale))
+    sure = values > LEAST_CORRELATED
+    return influence / scale @ vectors[:, sure] * values[sure].rsqrt()

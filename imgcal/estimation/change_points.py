@@ -35,7 +35,7 @@ MOST_TIMES = 128
 """Places of a step that are tried in one pass; longer captures are searched in two."""
 GROWTH = 1.5
 """Of the number of snapshots on the shorter side, from one place to the next where a step is first looked for."""
-NEARBY = 0.4
+NEARBY = 0.5
 """Of its statistic that a step keeps at the nearest of these places, at least; four fifths are expected."""
 
 Array = NDArray[np.float64]

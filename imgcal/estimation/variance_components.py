@@ -84,6 +84,7 @@ class Start:
     state: State
     additive_noise: float  # px
     solution: Solution | None = None  # to which that leads with all labels, where it is known
+    nearer: State | None = None  # what a fit with the noise of these residuals has found already
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,7 @@ class _Fit:
     solution: Solution
     noise: NDArray[np.floating]  # (S, C, N) px^2
     seen: NDArray[np.bool_]  # (S, C, N)
+    variance: NDArray[np.floating]  # (S, C, N) px^2, the blobs' own
 
     @cached_property
     def squared(self) -> NDArray[np.floating]:
@@ -105,10 +107,21 @@ class _Fit:
         """Part of each factory value's prior variance that the observations leave: (C, 15)."""
         return np.asarray(remaining_variance(self.solution)[0])
 
+    @cached_property
+    def additive_noise(self) -> float:
+        """What the residuals hold beyond the blobs' own sigma, px; see `_additive_noise`."""
+        taken = 6 * len(self.seen) + float((1 - self.remaining).sum())
+        return _additive_noise(self.squared[self.seen], self.variance[self.seen], taken)
+
     @property
     def converged(self) -> bool:
         """A minimum was found."""
         return bool(self.solution.converged)
+
+    def is_clean(self, outlier: float) -> bool:
+        """Tell whether all labels fit as well as their own sigma says, but for `outlier` standard deviations."""
+        within = self.squared[self.seen] <= outlier**2 * self.variance[self.seen]
+        return self.converged and bool(within.all()) and self.additive_noise == 0
 
 
 def estimate_variance_components(
@@ -137,10 +150,11 @@ def estimate_variance_components(
     state, additive_noise, known = start.state, start.additive_noise, start.solution
     prior_scale: dict[str, float] = {}
     kept, unexamined, shape = labels, question is not ObjectQuestion.NONE, None
+    nearer = start.nearer
     for _ in range(ROUNDS):
-        fit, known = _fit(problem, state, variance + additive_noise**2, kept, options, known), None
+        fit, known = _fit(problem, state, additive_noise, variance, kept, options, known), None
         problem, solution, seen = fit.problem, fit.solution, fit.seen
-        if unexamined and not later and fit.converged:
+        if unexamined and not later and fit.converged and not fit.is_clean(options.outlier):
             # Before outliers are left out: all labels of a fiducial that is off its place may be among them.
             unexamined = False
             shape, free = _examine(fit, options, GROSS_SCALE, question)
@@ -155,21 +169,23 @@ def estimate_variance_components(
         if later and not (fit.converged and (kept == labels).all()):
             start, *later = later
             state, additive_noise, known, kept = start.state, start.additive_noise, start.solution, labels
+            nearer = start.nearer
             continue
         later = []
         if not fit.converged:
             rms = float(np.sqrt(fit.squared[seen].mean()))
             raise RefusedError(f"estimation: no minimum after {solution.iterations} iterations (RMS {rms:.3g} px)")
-        state = solution.state
-        taken = 6 * len(seen) + float((1 - fit.remaining).sum())
-        previous, additive_noise = additive_noise, _additive_noise(fit.squared[seen], variance[seen], taken)
+        state, nearer = nearer or solution.state, None
+        previous, additive_noise = additive_noise, fit.additive_noise
         if abs(additive_noise - previous) > 0.02 * previous or (kept != seen).any():
             continue
         if question is not ObjectQuestion.NONE:
+            unexamined = False
             shape, free = _examine(fit, options, 0.0, question)
             if free is not None:
                 (problem, state), kept = free, labels
                 continue
+        state = solution.state
         too_narrow = _too_narrow(state.offset[0].numpy(), fit.remaining)
         if not too_narrow or max(prior_scale.values(), default=1.0) > options.widest_prior:
             return VarianceComponents(problem, solution, np.sqrt(fit.noise), seen, additive_noise, prior_scale, shape)
@@ -264,15 +280,17 @@ def _require_scale(shape: ShapeEvidence, fit: _Fit, least: float) -> None:
 def _fit(
     problem: Problem,
     state: State,
-    noise: NDArray[np.floating],
+    additive_noise: float,
+    variance: NDArray[np.floating],
     seen: NDArray[np.bool_],
     options: FitOptions,
     known: Solution | None,
 ) -> _Fit:
-    """Fit what is seen (S, C, N) with a noise (px^2), unless the solution is known."""
+    """Fit what is seen (S, C, N) with the blobs' own variance (px^2) and more (px), unless the solution is known."""
+    noise = variance + additive_noise**2
     root_weight = torch.from_numpy(np.where(seen, noise**-0.5, 0.0)).to(problem.uv)
     problem = replace(problem, root_weight=root_weight[None])
-    return _Fit(problem, known or minimize(problem, state, options.estimation), noise, seen)
+    return _Fit(problem, known or minimize(problem, state, options.estimation), noise, seen, variance)
 
 
 def _additive_noise(squared: NDArray[np.floating], variance: NDArray[np.floating], taken: float) -> float:

@@ -194,7 +194,7 @@ def calibrate(
     arranged = arrange(labelled, rig, obj)
     _require_any_view(arranged, rig, obj)
     steady = steady_part(arranged, detections, rig, obj, options)
-    fit = _fitted(steady.arranged, rig, obj, options, _Known(initializer, first=steady.first))
+    fit = _fitted(steady.arranged, rig, obj, options, _Known(initializer, fits=steady.fits))
     require_views(fit.tally, rig)
     seconds = {
         "detection": found - started,
@@ -239,7 +239,7 @@ class _Known:
     initializer: Initializer | None = None
     latest: Calibration | None = None
     prior_std: Tensor | None = None
-    first: Solution | None = None  # the first of all fits, where it has been made already
+    fits: tuple[Solution, ...] = ()  # of all labels, where they have been made already; see `SteadyPart`
 
 
 def _fitted(
@@ -251,7 +251,7 @@ def _fitted(
         try:
             return _fitted_once(arranged, rig, obj, options, known)
         except UndeterminedPosesError as error:
-            arranged, known = arranged.without(error.rows, rig, obj), replace(known, first=None)
+            arranged, known = arranged.without(error.rows, rig, obj), replace(known, fits=())
             left, count = len(arranged.labelled.used), len(given.labelled.used)
             if left < LEAST_KEPT * count:
                 raise RefusedError(
@@ -279,7 +279,9 @@ def _fitted_once(
     problem = make_problem(observations, rig, _with_learnt(obj, latest), prior)
     guess = None if known.initializer is None else known.initializer.guess(observations, rig, obj)
     guess_used = guess is not None and _nearer(guess, Prediction(rig, arranged.poses), observations, obj)
-    first = Start(initial_state(problem, arranged.poses, None), options.identity_error, known.first)
+    first = Start(initial_state(problem, arranged.poses, None), options.identity_error)
+    if known.fits:
+        first = replace(first, solution=known.fits[0], nearer=known.fits[-1].state)
     if guess is not None and guess_used:
         first = Start(initial_state(problem, guess.rig_from_object, guess.rig), options.identity_error)
     starts = [first]

@@ -46,7 +46,7 @@ class SteadyPart:
 
     arranged: Arranged  # those before the last move refused
     moved: tuple[MovedCamera, ...] = ()  # in the order of time
-    first: Solution | None = None  # one rig for all of its labels, as `settle` begins, where it has been found already
+    fits: tuple[Solution, ...] = ()  # of one rig to all labels: with the noise that identity allows, with their own
 
 
 def steady_part(
@@ -65,9 +65,9 @@ def steady_part(
         MovedError: a camera has moved, and the options do not say what then.
         RefusedError: after the last move no snapshot could be decided.
     """
-    found, solution = _moves(arranged, rig, obj, options)
+    found, fits = _moves(arranged, rig, obj, options)
     if not found:
-        return SteadyPart(arranged, first=solution)
+        return SteadyPart(arranged, fits=fits)
     labelled, moved = arranged.labelled, list(found)
     total, first = len(labelled.snapshots), 0
     names = [snapshot.name for snapshot in labelled.snapshots]
@@ -104,24 +104,24 @@ def moves_of(
 
 def _moves(
     arranged: Arranged, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
-) -> tuple[tuple[MovedCamera, ...], Solution | None]:
-    """Do the work of `moves_of`, and give the first fit of all labels, too.
+) -> tuple[tuple[MovedCamera, ...], tuple[Solution, ...]]:
+    """Do the work of `moves_of`, and give the fits of all labels, too.
 
     A camera that has moved far is not labelled any more by what identity has learnt from the snapshots before. Such
     snapshots are labelled afresh, so that how far it moved can be measured.
     """
     labelled = arranged.labelled
     if len(labelled.used) < 2 * LEAST_SNAPSHOTS:
-        return (), None
+        return (), ()
     fit = _fit(arranged, rig, obj, options)
-    first, lost = fit.first, _lost(fit.tally)
+    fits, lost = fit.fits, _lost(fit.tally)
     if (lost.sum(0) >= LEAST_SNAPSHOTS).any():
         again = _labelled_afresh(labelled, lost, rig, obj, options)
         fit = _fit(arrange(again, rig, obj), rig, obj, options)
     names = tuple(labelled.snapshots[s].name for s in labelled.used)
     found = find_moves(fit.problem, fit.state, rig.camera_names, names, options.estimation)
     gone = _gone(fit.tally, labelled, rig, {move.camera for move in found})
-    return tuple(sorted((*found, *gone), key=lambda move: names.index(move.snapshot))), first
+    return tuple(sorted((*found, *gone), key=lambda move: names.index(move.snapshot))), fits
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class _Fit:
     problem: Problem
     state: State
     tally: Tally
-    first: Solution  # with the noise that identity allows
+    fits: tuple[Solution, ...]  # with the noise that identity allows, with that of the residuals
 
 
 def _fit(arranged: Arranged, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions) -> _Fit:
@@ -153,7 +153,7 @@ def _fit(arranged: Arranged, rig: CameraRig, obj: CalibrationObject, options: Pi
         noise = own + (squared[seen].median() / (MEDIAN * free) - own[seen].median()).clamp_min(0)
     fitting = (squared <= CLIP**2 * used) & seen
     poses = pose_at(problem, state)[0]
-    return _Fit(problem, state, tally(arranged.labelled, fitting.numpy(), poses, rig, obj), solutions[0])
+    return _Fit(problem, state, tally(arranged.labelled, fitting.numpy(), poses, rig, obj), tuple(solutions))
 
 
 def _lost(counts: Tally) -> Bools:
