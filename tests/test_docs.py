@@ -11,6 +11,7 @@ from urllib.parse import unquote
 import pytest
 
 import imgcal
+from imgcal.training import load_experiment
 
 mkdocs = pytest.importorskip("mkdocs", reason="the extra docs is not installed")
 
@@ -107,3 +108,10 @@ def test_the_house_is_drawn_with_all_its_rooms() -> None:
     house = (ROOT / "CONTRIBUTING.md").read_text().partition("## The house")[2].partition("## ")[0]
     drawn = {name for line in house.splitlines() if line.startswith("    ") for name in re.findall(r"[a-z]+", line)}
     assert {room.removeprefix("imgcal.") for room in ROOMS} | {"cli", "renderers"} <= drawn
+
+
+def test_the_experiment_that_is_shown_can_be_trained(tmp_path: Path) -> None:
+    shown = re.findall(r"```yaml\n(.*?)```", (ROOT / "docs" / "train.md").read_text(), re.DOTALL)[0]
+    path = tmp_path / "my-rig.yaml"
+    path.write_text(shown.replace("factory.yaml", "O10").replace("object.csv", "asymmetric8"))
+    assert load_experiment(path).training.minutes == 30
