@@ -41,10 +41,13 @@ class Screening:
         """Blocks in a column and in a row of the frame."""
         return self.means.shape[0], self.means.shape[1]
 
-    def holds(self, height: float, least: float, most: float) -> bool:
-        """Tell whether anything `height` grey levels bright is wider than `least` (px) and narrower than `most`."""
-        cells = self.means[::4, ::4].copy()
-        wide, wider = (math.ceil(width / (4 * BLOCK)) for width in (least, most))
+    def holds(self, height: float, least: float, most: float, step: int = 1) -> bool:
+        """Tell whether anything `height` grey levels bright is wider than `least` (px) and narrower than `most`.
+
+        Only one block in `step` is looked at, along each axis.
+        """
+        cells = self.means[::step, ::step].copy()
+        wide, wider = (math.ceil(width / (step * BLOCK)) for width in (least, most))
         worn = cv2.erode(cells, np.ones((wide, wide), np.uint8))
         if int(worn.max()) - int(cells.min()) < height:  # nothing at all is: so it is nearly always
             return False
@@ -77,13 +80,8 @@ def screen(means: Frame, options: DetectionOptions, scale: int) -> Screening:
     contrast = cv2.subtract(means, background)
     floor, level = _levels(contrast, options, scale)
     local_peak = cv2.dilate(contrast, np.ones((3, 3), np.uint8))
-    # Blocks that stand out, and those next to them that hold something.
-    blocks = np.flatnonzero(local_peak > int(floor + level))
-    blocks = blocks[contrast.reshape(-1)[blocks] > int(floor + EDGE * level)]
-    local_peak = local_peak.ravel()[blocks] - floor
-    # The mean of the 3 x 3 pixels around a pixel has 4/3 of the noise of a block mean.
-    excess = np.maximum(level * 4 / 3, PEAK_FRACTION * local_peak)
-    return Screening(blocks, background.ravel()[blocks] + floor, excess, means)
+    blocks, base, excess = _select(contrast, local_peak, background, floor, level)
+    return Screening(blocks, base, excess, means)
 
 
 def outline(frame: Frame, screening: Screening, options: DetectionOptions, scale: int) -> Candidates:
@@ -161,6 +159,26 @@ def _levels(contrast: NDArray[np.generic], options: DetectionOptions, scale: int
     if options.threshold is not None:
         level = max(level, 0.2 * options.threshold)  # a block mean holds at least this part of a small blob's peak
     return float(sample[sample.size // 2]), level
+
+
+@njit(cache=True, nogil=True)
+def _select(contrast, local_peak, background, floor, level):
+    """Blocks that stand out, and those next to them that hold something: their places (K,), base and excess."""
+    columns, count = contrast.shape[1], 0
+    blocks = np.empty(contrast.size, np.int64)
+    for row in range(len(contrast)):
+        own, near = contrast[row], local_peak[row]
+        for column in range(columns):
+            if near[column] > int(floor + level) and own[column] > int(floor + EDGE * level):
+                blocks[count] = row * columns + column
+                count += 1
+    base, excess = np.empty(count), np.empty(count)
+    for k in range(count):
+        row, column = blocks[k] // columns, blocks[k] % columns
+        base[k] = background[row, column] + floor
+        # The mean of the 3 x 3 pixels around a pixel has 4/3 of the noise of a block mean.
+        excess[k] = max(level * 4 / 3, PEAK_FRACTION * (local_peak[row, column] - floor))
+    return blocks[:count], base, excess
 
 
 @njit(cache=True, nogil=True)

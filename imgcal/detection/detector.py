@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from imgcal.detection.candidates import block_means, outline, screen
 from imgcal.detection.centroids import Blobs, measure
 from imgcal.detection.options import DetectionOptions, Frame, checked_frame, checked_mask, full_scale
-from imgcal.detection.populations import usable, usual_size, without_dim
+from imgcal.detection.populations import DIMMER, usable, usual_size, without_dim
 from imgcal.errors import InputError
 from imgcal.types import BlobFlag, Detections
 
@@ -126,17 +126,18 @@ def _detect_one(frame: Frame, name: str, mask: NDArray[np.bool_] | None, options
 def _of_any_size(frame: Frame, options: DetectionOptions, scale: int) -> Blobs:
     """Find blobs of the usual sizes, and larger ones where there are several of one size.
 
-    What is found first shows most of the larger ones, too. A frame with hardly any blob, or with something large and
-    bright, is searched again.
+    What is found first shows most of the larger ones, too. A frame without any blob, or with something large and as
+    bright as blobs are, is searched again; that is looked for more closely where there is hardly any blob.
     """
     limit, means = options.radius_limit, block_means(frame, options, scale)
     screening = screen(means, options, scale)
     blobs = measure(frame, outline(frame, screening, options, scale), replace(options, max_radius=LARGER), scale)
     kept = usual_size(blobs, limit)
     blobs = blobs if kept.all() else blobs.select(kept)
-    enough = np.count_nonzero(usable(blobs)) >= FEW
-    if enough and not screening.holds(0.5 * scale * _median(blobs.contrast), LARGER, 2 * LARGEST):
-        return blobs
+    if len(blobs.uv):
+        least, step = (LARGER, 4) if np.count_nonzero(usable(blobs)) >= FEW else (limit, 1)
+        if not screening.holds(DIMMER * scale * _median(blobs.contrast), least, 2 * LARGEST, step):
+            return blobs
     wide = _find(frame, means, replace(options, max_radius=LARGEST), scale)
     wide = wide.select(usual_size(wide, limit))
     return wide if (wide.radius > limit).any() else blobs

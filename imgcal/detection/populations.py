@@ -20,6 +20,7 @@ GAP = 3.0  # ratio of neighbouring contrasts between two populations
 DIM = 0.08  # of full scale: the dim population is below, the bright one above
 LEAST_BRIGHT = 3  # blobs in a frame that the bright population must have
 ONE_SIZE = 1.6  # ratio of radii of markers of one size
+DIMMER = 0.5  # of the usual contrast of those of usual size: dimmer ones are no larger markers
 LEAST_LARGE = 3  # blobs of one size beyond the usual ones that must be there
 OFTEN = 0.25  # share of a camera's frames that must have a limit for the others to take it over
 _UNUSABLE = int(UNUSABLE)
@@ -56,7 +57,7 @@ def usual_size(blobs: Blobs, limit: float) -> NDArray[np.bool_]:
     if large.sum() >= LEAST_LARGE:
         ratio = blobs.radius / np.median(blobs.radius[large])
         alike = large & (ratio < ONE_SIZE) & (ratio > 1 / ONE_SIZE)
-        least = 0.5 * np.median(blobs.contrast[small]) if small.any() else 0.0
+        least = DIMMER * np.median(blobs.contrast[small]) if small.any() else 0.0
         if (alike & (blobs.contrast >= least)).sum() >= LEAST_LARGE:
             return small | alike
     return small

@@ -112,13 +112,13 @@ def bound(cell: Cell, rng: np.random.Generator, places: int = 12) -> float:
     return float(np.sqrt(np.mean(variances)))
 
 
-def rig_frames(shape: tuple[int, int], cameras: int = 10) -> dict[str, NDArray[np.uint8]]:
-    """Frames of a rig: 8 fiducials of radius 3 to 5 px and 2 false blobs in each."""
+def rig_frames(shape: tuple[int, int], cameras: int = 10, blobs: int = 10) -> dict[str, NDArray[np.uint8]]:
+    """Frames of a rig: 8 fiducials of radius 3 to 5 px and 2 false blobs in each, or the first ones of these."""
     rng = np.random.default_rng(1)
     background = np.linspace(15, 40, shape[1])[None, :]
     frames = {}
     for camera in range(cameras):
-        uv = rng.permutation(scattered(shape, 64, rng))[:10]
+        uv = rng.permutation(scattered(shape, 64, rng))[:blobs]
         radius = np.concatenate([rng.uniform(3, 5, 8), rng.uniform(1.5, 6, 2)])[: len(uv)]
         light = draw_discs(shape, uv, radius, background=background)
         frames[f"cam{camera:02d}"] = exposed(light, 2.0, rng).astype(np.uint8)

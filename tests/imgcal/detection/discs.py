@@ -51,6 +51,25 @@ def draw_discs(
     return frame
 
 
+def draw_lamps(
+    shape: tuple[int, int],
+    uv: NDArray[np.float64],
+    peak: float,
+    *,
+    radius: float = 3.0,
+    halo: float = 0.04,
+    reach: float = 6.0,
+) -> NDArray[np.float64]:
+    """Draw discs with soft edges and halos that decay with `reach` px, `peak` times full scale: (H, W) grey levels."""
+    v, u = np.mgrid[: shape[0], : shape[1]].astype(float)
+    light = np.full(shape, 20.0)
+    for place in uv:
+        away = np.hypot(u - place[0], v - place[1])
+        soft = 1 / (1 + np.exp(np.minimum((away - radius) / 0.9, 500)))
+        light += 255 * peak * ((1 - halo) * soft + halo * np.exp(-away / reach))
+    return light
+
+
 def draw_patches(
     shape: tuple[int, int],
     corners: NDArray[np.float64],

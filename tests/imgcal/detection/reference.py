@@ -6,21 +6,46 @@ import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt, uniform_filter
 
-from imgcal.detection import fitting, kernels
+from imgcal.detection import candidates, fitting, kernels
 from imgcal.detection import moments as moments_of
 from imgcal.types.observations import BlobFlag
 
 
 def components(frame, screening, invert=None):
     """Number the pixels that exceed the level of their block: labels (H, W), 0 = none."""
-    level = np.full(screening.shape, np.inf)
-    level.ravel()[screening.blocks] = screening.base + screening.excess
-    level = np.kron(level, np.ones((4, 4)))[: frame.shape[0], : frame.shape[1]]
+    level = pixels(of_blocks(screening, screening.base + screening.excess, np.inf), frame.shape)
+    return connected(smoothed(frame, invert) > level)
+
+
+def parted_components(frame, screening, saturation, invert=None):
+    """Number them once more where clipped peaks within one are parted."""
+    base, level = (of_blocks(screening, x, np.inf) for x in (screening.base, screening.base + screening.excess))
+    smooth, labels = smoothed(frame, invert), components(frame, screening, invert)
+    return connected(smooth > pixels(split(smooth, labels, level, base, saturation), frame.shape))
+
+
+def of_blocks(screening, values, others):
+    """Values (K,) of the screened blocks, and of all other ones: (R, Q)."""
+    image = np.full(screening.shape, others)
+    image.ravel()[screening.blocks] = values
+    return image
+
+
+def pixels(blocks, shape):
+    """Values (R, Q) of blocks as those of their pixels (H, W)."""
+    return np.kron(blocks, np.ones((4, 4)))[: shape[0], : shape[1]]
+
+
+def smoothed(frame, invert=None):
+    """Average the 3 x 3 pixels around each one: (H, W)."""
     total = cv2.boxFilter(frame, cv2.CV_32F, (3, 3), normalize=False, borderType=cv2.BORDER_REPLICATE)
     smooth = total / np.float32(9)  # ties with the level are decided by the last bit
-    if invert is not None:
-        smooth = np.float32(invert) - smooth
-    return cv2.connectedComponents((smooth > level).astype(np.uint8), connectivity=8)[1]
+    return smooth if invert is None else np.float32(invert) - smooth
+
+
+def connected(marked):
+    """Number the components (eight neighbours) of a mask (H, W)."""
+    return cv2.connectedComponents(marked.astype(np.uint8), connectivity=8)[1]
 
 
 def boxes_of(labels):
@@ -193,3 +218,32 @@ def phi(t):
     odd = np.polynomial.Polynomial(np.stack([np.zeros(6), fitting.PHI.astype(float)], 1).ravel())
     t = np.clip(t, -fitting.END, fitting.END)
     return 0.5 + odd(t), odd.deriv()(t)
+
+
+def split(smooth, labels, level, base, saturation):
+    """Levels (R, Q) of blocks, raised where that parts clipped peaks within one component of `labels` (H, W).
+
+    `smooth` (H, W) are means of 3 x 3 pixels, `level` and `base` (R, Q) those of the blocks.
+    """
+
+    def highest(values):  # of the components that have pixels in a block
+        image = np.pad(values[labels], [(0, -n % 4) for n in smooth.shape])
+        return image.reshape(level.shape[0], 4, level.shape[1], 4).max((1, 3))
+
+    clipped, count = (smooth >= saturation) & (labels > 0), labels.max()
+    tops = np.zeros(count + 1)
+    np.maximum.at(tops, labels[clipped], smooth[clipped] - pixels(base, smooth.shape)[clipped])
+    most, chosen = np.ones(count + 1, int), np.zeros(count + 1)
+    for part in candidates.SPLIT_AT[::-1]:
+        trial = np.maximum(level, base + part * highest(tops))
+        pieces = connected((labels > 0) & (smooth > pixels(trial, smooth.shape)))
+        peaks = np.zeros(count + 1, int)
+        for piece in range(1, pieces.max() + 1):
+            inside = pieces == piece
+            peaks[labels[inside][0]] += clipped[inside].sum() >= candidates.LEAST_CLIPPED
+        most = np.maximum(most, peaks)
+        chosen[(peaks == most) & (most > 1)] = part
+        if (peaks < 2).all():
+            break
+    height = highest(chosen * tops)
+    return np.where(height > 0, np.maximum(level, base + height), level)

@@ -5,19 +5,9 @@ import pytest
 
 from imgcal.detection import DetectionOptions, detect_frame
 from imgcal.types.observations import BlobFlag
-from tests.imgcal.detection.discs import exposed, nearest
+from tests.imgcal.detection.discs import draw_lamps, exposed, nearest
 
 SHAPE = (160, 160)
-
-
-def lamps(uv, peak, reach=6.0, halo=0.04, radius=3.0):
-    """Discs with soft edges and halos that decay with `reach` px, `peak` times full scale: (H, W) grey levels."""
-    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
-    light = np.full(SHAPE, 20.0)
-    for place in uv:
-        away = np.hypot(u - place[0], v - place[1])
-        light += 255 * peak * ((1 - halo) / (1 + np.exp((away - radius) / 0.9)) + halo * np.exp(-away / reach))
-    return light
 
 
 def three(kind, gap, rng):
@@ -35,7 +25,7 @@ def test_three_bloomed_lamps_are_told_apart(kind, peak):
     rng, normalized = np.random.default_rng(0), []
     for _ in range(6):
         uv = three(kind, 20.0, rng)
-        blobs = detect_frame(exposed(lamps(uv, peak), 1.5, rng), DetectionOptions())
+        blobs = detect_frame(exposed(draw_lamps(SHAPE, uv, peak), 1.5, rng), DetectionOptions())
         rows, distance = nearest(blobs.uv, uv)
         assert distance.max() < 1.0 and len(set(rows)) == 3
         assert (blobs.flags[rows] == BlobFlag.SATURATED).all()
@@ -47,5 +37,5 @@ def test_lamps_that_are_one_clipped_area_are_not_measured_as_one():
     rng = np.random.default_rng(1)
     for kind in ("triangle", "row"):
         for peak in (40.0, 80.0):
-            blobs = detect_frame(exposed(lamps(three(kind, 14.0, rng), peak), 1.5, rng), DetectionOptions())
+            blobs = detect_frame(exposed(draw_lamps(SHAPE, three(kind, 14.0, rng), peak), 1.5, rng), DetectionOptions())
             assert ((blobs.flags & BlobFlag.MERGED) > 0).all()

@@ -10,7 +10,7 @@ from imgcal.detection.centroids import measure
 from imgcal.detection.kernels import half_size
 from imgcal.types.observations import BlobFlag
 from tests.imgcal.detection import reference
-from tests.imgcal.detection.discs import draw_discs, exposed, scattered
+from tests.imgcal.detection.discs import draw_discs, draw_lamps, exposed, scattered
 
 SHAPE = (243, 322)  # no multiples of the blocks
 
@@ -58,6 +58,22 @@ def test_components_are_those_of_opencv(seed, polarity):
     assert pairs.shape[1] == expected.max() + 1  # one to one, background included
     order = pairs[1, np.argsort(pairs[0])][1:]
     np.testing.assert_array_equal(found.boxes, reference.boxes_of(expected)[order - 1])
+
+
+@pytest.mark.parametrize("peak", [1.5, 2.0, 4.0, 10.0])
+@pytest.mark.parametrize("polarity", ["bright", "dark"])
+def test_clipped_peaks_are_parted_as_in_the_reference(peak, polarity):
+    rng, invert = np.random.default_rng(0), None
+    uv = scattered(SHAPE, 60, rng)
+    uv = np.concatenate([uv, uv + rng.uniform(4, 11, uv.shape)])
+    frame = exposed(draw_lamps(SHAPE, uv, peak), 1.5, rng)
+    if polarity == "dark":
+        frame, invert = 255 - frame, 255
+    screening, found = candidates_of(frame, DetectionOptions(polarity=polarity, max_radius=60.0), 255)
+    expected = reference.parted_components(frame, screening, 0.995 * 255, invert)
+    pairs = np.unique(np.stack([image_of(found, frame.shape).ravel(), expected.ravel()]), axis=1)
+    assert pairs.shape[1] == expected.max() + 1 == len(np.unique(found.labels))
+    assert (found.boxes != found.whole).any(1).sum() >= 8
 
 
 @pytest.mark.parametrize(

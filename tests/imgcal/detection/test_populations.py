@@ -79,6 +79,16 @@ def test_markers_larger_than_usual_are_found_where_there_are_several(radius):
     assert (found.flags == 0).all()
 
 
+@pytest.mark.parametrize("small", [1, 3, 6])
+def test_larger_markers_are_found_beside_small_ones(small):
+    rng = np.random.default_rng(7)
+    uv = scattered((600, 800), 160, rng)[: small + 4]
+    frame = exposed(draw_discs((600, 800), uv, np.append(np.full(small, 4.0), np.full(4, 30.0))), 2.0, rng)
+    found = detect_frame(frame, DetectionOptions())
+    assert len(found.uv) == small + 4
+    assert nearest(found.uv, uv)[1].max() < 0.1
+
+
 def test_two_large_lamps_beside_small_markers_are_none():
     rng = np.random.default_rng(6)
     uv = scattered((600, 800), 160, rng)
