@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.detection import DetectionOptions, detect_snapshot
-from imgcal.io import open_capture
+from imgcal.io import data_path, open_capture
 from scripts.benchmarks.blob_scenes import BACKGROUND, CELLS, Cell, View, bound, rig_frames, view
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.peer import versions
 from scripts.benchmarks.peers.blob_finders import FINDERS, SLOW, Known, present
-from scripts.output import BLUE, GREEN, GREY, RED, ROOT, figure, markdown
+from scripts.output import BLUE, GREEN, GREY, RED, figure, markdown
 from scripts.timing import side_by_side
 from tests.imgcal.detection.discs import nearest
 
@@ -123,7 +123,7 @@ def times(effort: Effort) -> dict[str, dict[str, float]]:
 
 def rig_times(effort: Effort) -> dict[str, Any]:
     """Time ten frames in memory to blobs with one and two threads; OpenCV's components of the same for reference."""
-    shape, sample = effort.pick((1088, 2048), (240, 320)), open_capture(ROOT / "data" / "samples" / "O10")
+    shape, sample = effort.pick((1088, 2048), (240, 320)), open_capture(data_path("samples", "O10"))
     drawn = rig_frames(shape)
     scenes = {
         "2048 x 1088, 10 blobs": drawn,
