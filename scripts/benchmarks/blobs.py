@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from imgcal.detection import DetectionOptions, detect_snapshot
+from imgcal.detection import DetectionOptions, Frame, detect_snapshot
 from imgcal.io import data_path, open_capture
 from scripts.benchmarks.blob_scenes import BACKGROUND, CELLS, Cell, View, bound, rig_frames, view
 from scripts.benchmarks.effort import Effort
@@ -125,7 +125,7 @@ def rig_times(effort: Effort) -> dict[str, Any]:
     """Time ten frames in memory to blobs with one and two threads; OpenCV's components of the same for reference."""
     shape, sample = effort.pick((1088, 2048), (240, 320)), open_capture(data_path("samples", "O10"))
     drawn = rig_frames(shape)
-    scenes = {
+    scenes: dict[str, Mapping[str, Frame | None]] = {
         "2048 x 1088, 10 blobs": drawn,
         "2048 x 1088, 3 blobs": rig_frames(shape, blobs=3),
         "1024 x 544, the sample": next(frames for _, frames in sample.snapshots()),
