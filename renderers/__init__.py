@@ -15,6 +15,7 @@ from renderers.infrared import (
 from renderers.palette import palette
 from renderers.reference import ellipse_reference, splat_reference
 from renderers.splat import splat
+from renderers.tracing import is_traced
 
 __all__ = [
     "BlobRange",
@@ -26,6 +27,7 @@ __all__ = [
     "ellipse_reference",
     "expose",
     "infrared_frames",
+    "is_traced",
     "palette",
     "render_blobs",
     "sample_clutter",

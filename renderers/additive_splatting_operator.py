@@ -15,13 +15,11 @@ from torch import Tensor
 
 from renderers import additive_splatting, additive_splatting_cpu
 from renderers.additive_splatting import Splats
+from renderers.tracing import is_traced
 
 SPLATS = "Tensor uv, Tensor sizes, Tensor weight, Tensor colours, Tensor visible"
 
 Function = Callable[..., Any]
-
-# Whether code runs under `torch.func`; where PyTorch does not say so, everything is done as if it did, somewhat slower.
-_transformed: Callable[[], bool] = getattr(torch._C, "_are_functorch_transforms_active", lambda: True)
 
 
 def splat_additively(splats: Splats, image_size: tuple[int, int], out: Tensor | None = None) -> Tensor:
@@ -32,7 +30,7 @@ def splat_additively(splats: Splats, image_size: tuple[int, int], out: Tensor | 
     if out is not None:
         additive_splatting_cpu.draw(out, splats)
         return out
-    if _transformed():
+    if is_traced():
         return _Added.apply(*splats, *image_size)[0]
     images = _AddedPlainly.apply(*splats, *image_size)
     return images

@@ -14,8 +14,19 @@ from .covariance import (
     whitened_covariance,
 )
 from .gauge import aligned
+from .implicit import map_cost
 from .levenberg_marquardt import Solution
-from .linearization import POSE_PARAMETERS, NormalEquations, Problem, State, linearize, pose_at, retract, rig_at
+from .linearization import (
+    POSE_PARAMETERS,
+    NormalEquations,
+    Problem,
+    State,
+    linearize,
+    points_at,
+    pose_at,
+    retract,
+    rig_at,
+)
 from .map_estimate import (
     Estimate,
     EstimationOptions,
@@ -25,7 +36,9 @@ from .map_estimate import (
     make_loss,
     make_problem,
     minimize,
+    object_prior_std,
 )
+from .map_operator import encoded, map_state
 from .moves import find_moves
 from .object_shape import SNAPSHOTS_TO_BEND, FiducialOffset, ShapeEvidence, offsets
 from .pose_initialization import initial_pose
@@ -62,6 +75,7 @@ __all__ = [
     "block_scatter",
     "camera_covariance",
     "camera_std",
+    "encoded",
     "estimate",
     "estimate_variance_components",
     "find_moves",
@@ -74,10 +88,14 @@ __all__ = [
     "make_estimate",
     "make_loss",
     "make_problem",
+    "map_cost",
+    "map_state",
     "minimize",
     "object_covariance",
+    "object_prior_std",
     "offsets",
     "pixel_jacobian",
+    "points_at",
     "pose_at",
     "pose_covariance",
     "predicted_error",

@@ -136,8 +136,21 @@ class _NewtonStep(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        camera, pose, own = ctx.inverse_hessian(Step(*gradients))
-        return None, -camera, -pose, None if own is None else -own
+        found = _Solve.apply(ctx.inverse_hessian, *gradients)
+        return (None, *(None if part is None else -part for part in found))
+
+
+class _Solve(torch.autograd.Function):
+    """H^-1 v, with H symmetric and held constant: derivatives in forward direction come from the transpose of this."""
+
+    @staticmethod
+    def forward(ctx: Any, inverse_hessian: Callable[[Step], Step], *vector: Tensor) -> Step:
+        ctx.inverse_hessian = inverse_hessian
+        return tuple(inverse_hessian(Step(*vector)))  # type: ignore[return-value]
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        return (None, *_Solve.apply(ctx.inverse_hessian, *gradients))
 
 
 def _detached(problem: Problem) -> Problem:

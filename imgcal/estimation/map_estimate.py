@@ -266,7 +266,7 @@ def make_problem(
     points = obj.points.to(uv)
     centroid = points.mean(0)
     return Problem(
-        object_prior_std=_object_spread(obj, uv, count),
+        object_prior_std=None if obj.exact else object_prior_std(obj).to(uv).expand(count, -1),
         uv=torch.where(seen[..., None], uv, 0.0).mT.contiguous(),
         root_weight=torch.where(seen, 1 / torch.where(seen, sigma, 1.0), 0.0),
         points=points - centroid,
@@ -279,12 +279,9 @@ def make_problem(
     )
 
 
-def _object_spread(obj: CalibrationObject, like: Tensor, count: int) -> Tensor | None:
-    """Prior standard deviation of the object's own parameters, in the order of `State`: (B, M); None = exact."""
-    if obj.exact:
-        return None
-    prior_std = torch.cat((obj.granted.to(like).repeat_interleave(3), like.new_tensor([obj.scale_tolerance])))
-    return prior_std.expand(count, -1)
+def object_prior_std(obj: CalibrationObject) -> Tensor:
+    """Prior standard deviation of the object's own parameters, in the order of `State`: (M,)."""
+    return torch.cat((obj.granted.repeat_interleave(3), obj.points.new_tensor([obj.scale_tolerance])))
 
 
 def initial_state(problem: Problem, rig_from_object: RigidTransform, initial_rig: CameraRig | None) -> State:

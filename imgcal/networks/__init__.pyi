@@ -13,6 +13,7 @@ from .network import Network
 from .parameterization import Parameterization
 from .points import PaperPointNetwork, PointNetwork
 from .randomness import drawing_from
+from .soft_positions import find_soft_positions
 from .subject import check_object, check_rig
 
 __all__ = [
@@ -34,6 +35,7 @@ __all__ = [
     "check_object",
     "check_rig",
     "drawing_from",
+    "find_soft_positions",
     "load_checkpoint",
     "load_network",
     "read_subject",

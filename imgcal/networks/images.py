@@ -14,7 +14,7 @@ from imgcal.networks.network import Network
 from imgcal.networks.parameterization import Parameterization
 from imgcal.networks.points import PaperHeads
 from imgcal.networks.refiner import IterativeRefiner
-from imgcal.networks.soft_positions import soft_positions
+from imgcal.networks.soft_positions import find_soft_positions
 from imgcal.synthesis import ImageOptions
 from imgcal.types import Prediction, Views
 
@@ -80,7 +80,7 @@ class ImageNetwork(Network):
                 nothing = images.new_zeros((*images.shape[:2], len(self.decoder.colours)), dtype=torch.float32)
                 return self.trunk(nothing[..., None].expand(*nothing.shape, 2), nothing, bottleneck)
             heatmap_logits = self.belief(features.float())
-            in_image, confidence = soft_positions(flat.float(), self.decoder.colours, self.dot, heatmap_logits)
+            in_image, confidence = find_soft_positions(flat.float(), self.decoder.colours, self.dot, heatmap_logits)
             in_image = in_image.unflatten(0, images.shape[:2])
             uv = ImageOptions(images.shape[-1], self.dot).to_sensor(in_image, self.decoder.image_size)
         return self.trunk(uv, confidence.unflatten(0, images.shape[:2]), bottleneck)

@@ -9,6 +9,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from imgcal.operators import Operator, Tensors
+from renderers import is_traced
+
 DARK = 8 / 255  # pixels below are background: quantization has left them no hue
 HUE_TOLERANCE = 0.06  # rad, how far a pixel's hue may lie from a fiducial's; the first 8 colours are 0.3 apart
 WINDOW = 2.0  # in sizes of a dot: the second look is through a Gaussian window around the first one's centre
@@ -16,8 +19,8 @@ LEAST_LIGHT = 0.05  # share of a full dot's light below which nothing was seen
 OUTLIER_SPREAD = 2.0  # in sizes of a dot: light farther from its centre is not one dot
 
 
-def soft_positions(
-    images: Tensor, colours: Tensor, dot: float, heatmap_logits: Tensor | None = None
+def find_soft_positions(
+    images: Tensor, colours: Tensor, dot: float, heatmap_logits: Tensor | None = None, *, through_window: bool = False
 ) -> tuple[Tensor, Tensor]:
     """Locate every fiducial in every image.
 
@@ -27,11 +30,25 @@ def soft_positions(
         dot: standard deviation of a dot in pixels.
         heatmap_logits: (I, N, h, w) log weights of an encoder's cells, which multiply the colour's; None =
             colour alone.
+        through_window: the gradient also goes the way through the place of the second look's window; without it, it is
+            the one by what is within the window, which is steadier in training.
 
     Returns:
         uv (I, N, 2) pixels of the image and confidence (I, N) in [0, 1]: the share of a full dot's light that was found
-        in one place; zero where there is none, with finite positions. Differentiable in `heatmap_logits`, float32.
+        in one place; zero where there is none, with finite positions. Differentiable in `heatmap_logits`, in the dtype
+        of `images`.
     """
+    if not is_traced():
+        return _soft_positions(images, colours, dot, heatmap_logits, through_window)
+    given = images.new_zeros(len(images), 0, 1, 1) if heatmap_logits is None else heatmap_logits.to(images.dtype)
+    uv, confidence = OPERATOR(images, colours, given, options=f"{float(dot)!r} {int(through_window)}")
+    return uv, confidence
+
+
+def _soft_positions(
+    images: Tensor, colours: Tensor, dot: float, heatmap_logits: Tensor | None, through_window: bool
+) -> tuple[Tensor, Tensor]:
+    """Do the work of `find_soft_positions`; how many pixels are looked at depends on the images."""
     count, _, height, width = images.shape
     with torch.no_grad():
         pixels = images.amax(1)
@@ -43,18 +60,18 @@ def soft_positions(
     weight = light
     if heatmap_logits is not None:
         row, column = v * heatmap_logits.shape[-2] // height, u * heatmap_logits.shape[-1] // width
-        weight = light * heatmap_logits[image, :, row, column].float().clamp(-8, 8).exp()
+        weight = light * heatmap_logits[image, :, row, column].to(light.dtype).clamp(-8, 8).exp()
     first, _, _ = _centres(weight, place, image, count)
-    with torch.no_grad():
+    with torch.set_grad_enabled(torch.is_grad_enabled() and through_window):
         apart = (place[:, None] - first[image]).square().sum(-1) / (WINDOW * dot) ** 2
         window = torch.exp(-0.5 * apart)
-    second, found, prior_std = _centres(weight * window, place, image, count)
+    second, found, spread = _centres(weight * window, place, image, count)
     # A window of w sizes leaves w^2 / (1 + w^2) of a dot's light, and pulls its centre by the rest: undone here.
     kept = WINDOW**2 / (1 + WINDOW**2)
     centre = first.detach() + (second - first.detach()) / kept if heatmap_logits is None else second
     full = colours.to(images).norm(dim=-1) * (2 * torch.pi * dot**2) * kept
     share = (_sums(light * window, image, count) / full).clamp(0, 1)
-    confidence = torch.where((share > LEAST_LIGHT) & (prior_std < (OUTLIER_SPREAD * dot) ** 2), share, 0.0)
+    confidence = torch.where((share > LEAST_LIGHT) & (spread < (OUTLIER_SPREAD * dot) ** 2), share, 0.0)
     return torch.where((found > 0)[..., None], centre, 0.0), confidence
 
 
@@ -75,10 +92,35 @@ def _centres(weight: Tensor, place: Tensor, image: Tensor, count: int) -> tuple[
     centre = moments / safe[..., None]
     with torch.no_grad():
         squared = (place[:, None] - centre[image]).square().sum(-1)
-        prior_std = _sums(weight * squared, image, count) / safe
-    return centre, total, prior_std
+        spread = _sums(weight * squared, image, count) / safe
+    return centre, total, spread
 
 
 def _sums(values: Tensor, image: Tensor, count: int) -> Tensor:
     """Sum rows (M, N) by image: (I, N)."""
     return values.new_zeros(count, values.shape[-1]).index_add(0, image, values)
+
+
+def _compute(inputs: Tensors, options: str) -> Tensors:
+    images, colours, heatmap_logits = inputs
+    dot, through_window = options.split()
+    given = heatmap_logits if heatmap_logits.shape[1] else None
+    return _soft_positions(images, colours, float(dot), given, through_window == "1")
+
+
+def _like(inputs: Tensors, options: str) -> Tensors:
+    images, colours, _ = inputs
+    confidence = images.new_empty(len(images), len(colours))
+    return images.new_empty(*confidence.shape, 2), confidence
+
+
+OPERATOR = Operator(
+    name="soft_positions",
+    inputs=("images", "colours", "heatmap_logits"),
+    outputs=("uv", "confidence"),
+    differentiable=frozenset(("heatmap_logits", "uv", "confidence")),
+    batched=frozenset(("images", "heatmap_logits")),
+    compute=_compute,
+    attach=lambda inputs, outputs, options: _compute(inputs, options),
+    like=_like,
+)

@@ -6,9 +6,10 @@ import torch
 from torch import Tensor
 
 from imgcal.errors import InputError
+from imgcal.nn import project_fiducials, reprojection_re
 from imgcal.refinement import as_prediction, refine_points
 from imgcal.training.data import Batch, Source
-from imgcal.training.losses import RefinedLoss, project_fiducials, reprojection_re
+from imgcal.training.losses import RefinedLoss
 from imgcal.types import Prediction
 
 WORST = 200.0  # pixels: where the error of a refined rig stops to count

@@ -17,12 +17,13 @@ from torch import Tensor, nn
 
 from imgcal.errors import InputError
 from imgcal.networks import Checkpoint, Network, build_network, drawing_from, warm_start, without_pretrained
+from imgcal.nn import project_fiducials, reprojection_re
 from imgcal.synthesis import Snapshots
 from imgcal.training.callbacks import Callbacks, DivergedError
 from imgcal.training.data import Batch, Source, object_to
 from imgcal.training.end_to_end import refined_loss
 from imgcal.training.experiment import Experiment
-from imgcal.training.losses import LossTerms, compound, project_fiducials, reprojection_re
+from imgcal.training.losses import LossTerms, compound
 from imgcal.training.optimization import (
     Schedule,
     make_average,

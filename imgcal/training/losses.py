@@ -16,13 +16,10 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from imgcal.geometry import geodesic_angle, project_kornia
+from imgcal.geometry import geodesic_angle
 from imgcal.io import StrictModel
+from imgcal.nn import project_fiducials, reprojection_re
 from imgcal.types import CalibrationObject, CameraRig, Prediction, pack21
-
-# Nearer points (mm) are projected at this depth, differences are cut at this size (pixels): what an untrained network
-# predicts behind a camera would overflow float32, whose gradient is then nan even where the loss itself is clamped.
-LEAST_DEPTH, LARGEST_DIFFERENCE = 50.0, 1e6
 
 # Parameters of smaller spread (rad, mm, pixels, pixels, 1) are fixed: float32 cannot tell their offsets from rounding.
 LEAST_SPREAD = (1e-6,) * 3 + (1e-3,) * 3 + (1e-3,) * 2 + (1e-3,) * 2 + (1e-7,) * 5
@@ -129,31 +126,9 @@ def compound(
     return LossTerms(total, re[-1], re.mean(-1))
 
 
-def project_fiducials(cameras: CameraRig, obj: CalibrationObject) -> Tensor:
-    """Project the fiducials through kornia into cameras given in the object's frame.
-
-    Args:
-        cameras: (*B) rigs whose cam_from_rig is cam_from_object.
-        obj: radius of spherical fiducials included.
-
-    Returns:
-        (*B, C, N, 2) pixels, finite for finite cameras.
-    """
-    points = cameras.cam_from_rig.apply(obj.points.to(cameras.focal_length))
-    points = torch.cat((points[..., :2], points[..., 2:].clamp_min(LEAST_DEPTH)), dim=-1)
-    radius = None if obj.radius is None else obj.radius.to(points)
-    lens = (cameras.focal_length, cameras.principal_point, cameras.distortion)
-    return project_kornia(points, *lens, cameras.image_size, radius).uv
-
-
-def reprojection_re(difference: Tensor) -> Tensor:
-    """RE of each rig, in pixels, of differences between images (*B, C, N, 2) of the fiducials: (*B)."""
-    return _root(_squared(difference).mean((-3, -2, -1)))
-
-
 def reprojection_rmse(difference: Tensor) -> Tensor:
     """L_eps of the paper: one RMSE over all of (B, C, N, 2) pixels."""
-    return _root(_squared(difference).mean())
+    return reprojection_re(difference.flatten(0, -3))
 
 
 def parameter_rmse(predicted: CameraRig, truth: CameraRig, lambda_scale: float = 1000.0) -> Tensor:
@@ -281,10 +256,6 @@ def _scaled_difference(predicted: CameraRig, truth: CameraRig, lambda_scale: flo
     scale = difference.new_ones(21)
     scale[:9] = scale[16:] = lambda_scale
     return difference * scale
-
-
-def _squared(difference: Tensor) -> Tensor:
-    return difference.clamp(-LARGEST_DIFFERENCE, LARGEST_DIFFERENCE).square()
 
 
 def _root(mean_square: Tensor) -> Tensor:

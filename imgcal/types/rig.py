@@ -21,6 +21,7 @@ from imgcal.geometry import (
     sixd_from_rotation,
     vector_from_rotation,
 )
+from renderers import is_traced
 
 PARAMETERS = 15
 """Free parameters of a camera, in this order: rotation (3, rad), position (3, mm), focal length (2, pixels), principal
@@ -138,7 +139,7 @@ class CameraRig:
             points_rig: (B, N, 3) mm, for the (B,) rigs of this one; same floating-point type.
             radius: (N,) mm of spherical fiducials; None = points.
         """
-        if points_rig.device.type != "cpu":
+        if points_rig.device.type != "cpu" or is_traced():
             with torch.no_grad():
                 return self.project(points_rig, radius)
         lens = (self.focal_length, self.principal_point, self.distortion)

@@ -18,6 +18,7 @@ import tyro
 from torch import Tensor
 
 from imgcal.errors import InputError
+from imgcal.nn import project_fiducials
 from imgcal.training import Experiment, Run, changed, load_experiment, prepare, train_step
 from imgcal.training.engine import check_finite
 from imgcal.training.losses import (
@@ -29,7 +30,6 @@ from imgcal.training.losses import (
     log_cosh,
     parameter_rmse,
     principal_point_shift,
-    project_fiducials,
     reprojection_rmse,
 )
 from imgcal.types import CalibrationObject, Prediction

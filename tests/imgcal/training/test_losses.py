@@ -6,6 +6,7 @@ import torch
 
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
+from imgcal.nn import project_fiducials, reprojection_re
 from imgcal.synthesis.rigs import RelativeDrift, synthesize
 from imgcal.training.losses import (
     LEAST_SPREAD,
@@ -23,8 +24,6 @@ from imgcal.training.losses import (
     offsets_error,
     parameter_rmse,
     principal_point_shift,
-    project_fiducials,
-    reprojection_re,
     reprojection_rmse,
 )
 from imgcal.types.prediction import Prediction

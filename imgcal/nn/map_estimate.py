@@ -1,0 +1,139 @@
+"""`MapEstimate`: the most probable rig as a layer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from torch import Tensor, nn
+
+from imgcal.estimation import (
+    EstimationOptions,
+    Problem,
+    State,
+    encoded,
+    initial_state,
+    make_loss,
+    make_problem,
+    map_cost,
+    map_state,
+    object_prior_std,
+    points_at,
+    pose_at,
+    rig_at,
+)
+from imgcal.geometry import RigidTransform
+from imgcal.nn.held import HeldObject, HeldRig
+from imgcal.nn.pytrees import register
+from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior
+
+
+@dataclass(frozen=True)
+class MapSolution:
+    """The most probable rig, and the object's poses. Gradients flow through all but `converged`."""
+
+    rig: CameraRig  # (*B)
+    rig_from_object: RigidTransform  # (*B, S)
+    points_object: Tensor  # (*B, N, 3) mm, the fiducials as estimated; as given where the object is exact
+    chi2: Tensor  # (*B) sum of squared whitened residuals (robust), data and prior
+    dof: Tensor  # (*B) expected chi2
+    converged: Tensor  # (*B) bool: must be looked at; a rig that has not converged is returned where it ended
+
+
+register(MapSolution)
+
+
+class MapEstimate(nn.Module):
+    """Find the rig and the object's poses that best explain labelled fiducials and the factory calibration.
+
+    The gradient is that of the solution, by the implicit function theorem, whatever the way to it: to the pixels and
+    their sigmas, to the factory rig and how far it may have drifted. One opaque operator in a compiled or exported
+    graph; derivatives in both directions, under `torch.func.vmap`, but not second ones.
+
+    Args:
+        factory: the factory rig, (*B) or without batch axes; its prior says how far cameras may have drifted.
+        obj: N fiducials (mm); where it has tolerances, its shape is estimated too.
+        prior_std: (*B, C, 15) standard deviation of each factory value in the order of `PARAMETER_NAMES`; zero keeps a
+            value fixed; None = the rig's own prior.
+        options: how to minimize.
+
+    Shape:
+        - observations: uv (*B, S, C, N, 2) pixels, sigma (*B, S, C, N) pixels, seen (*B, S, C, N).
+        - factory, prior_std: in the place of what the module holds; None = that.
+        - rig_from_object: (*B, S) where to start; None = found from the observations.
+        - initial_rig: (*B) rigs where to start; None = the factory rig.
+        - Output: `MapSolution`.
+
+    Source: docs/method.md; implicit differentiation as in Gould et al., "Deep Declarative Networks" (PAMI 2022).
+
+    Example:
+        >>> import imgcal, torch
+        >>> rig, obj = imgcal.load_rig("O10"), imgcal.load_object("asymmetric8")
+        >>> pose = imgcal.RigidTransform.identity(1, dtype=rig.focal_length.dtype)
+        >>> pose.translation[0, 2] = rig.working_distance
+        >>> uv = rig.project(pose.apply(obj.points)).uv.requires_grad_()
+        >>> sigma, seen = torch.full_like(uv[..., 0], 0.1), torch.ones_like(uv[..., 0], dtype=torch.bool)
+        >>> solution = MapEstimate(rig, obj)(imgcal.Observations(uv, sigma.detach(), seen))
+        >>> bool(solution.converged)
+        True
+        >>> solution.rig.focal_length.sum().backward()
+        >>> uv.grad.shape
+        torch.Size([1, 10, 8, 2])
+    """
+
+    prior_std: Tensor
+    object_prior_std: Tensor | None
+
+    def __init__(
+        self,
+        factory: CameraRig,
+        obj: CalibrationObject,
+        prior_std: Tensor | None = None,
+        options: EstimationOptions = EstimationOptions(),
+    ) -> None:
+        super().__init__()
+        self.factory, self.obj = HeldRig(factory), HeldObject(obj)
+        prior_std = (factory.prior or RigPrior()).std(factory) if prior_std is None else prior_std
+        self.register_buffer("prior_std", prior_std.clone(), persistent=False)
+        self.register_buffer("object_prior_std", None if obj.exact else object_prior_std(obj), persistent=False)
+        self.options, self._encoded = options, encoded(options)
+
+    def forward(
+        self,
+        observations: Observations,
+        factory: CameraRig | None = None,
+        prior_std: Tensor | None = None,
+        rig_from_object: RigidTransform | None = None,
+        initial_rig: CameraRig | None = None,
+    ) -> MapSolution:
+        """Estimate."""
+        factory = self.factory() if factory is None else factory
+        problem = self._problem(observations, factory, self.prior_std if prior_std is None else prior_std)
+        state, converged = map_state(problem, self._start(problem, rig_from_object, initial_rig), self._encoded)
+        return self._solution(problem, state, converged, observations.seen)
+
+    def _problem(self, observations: Observations, factory: CameraRig, prior_std: Tensor) -> Problem:
+        problem = make_problem(observations, factory, self.obj(), prior_std)
+        if self.object_prior_std is None:
+            return problem
+        return replace(problem, object_prior_std=self.object_prior_std.to(problem.uv).expand(len(problem.uv), -1))
+
+    def _start(self, problem: Problem, rig_from_object: RigidTransform | None, initial_rig: CameraRig | None) -> State:
+        if rig_from_object is None:  # no poses: the operator finds them
+            new, count = problem.uv.new_zeros, len(problem.uv)
+            poses = RigidTransform(new(count, 0, 3, 3), new(count, 0, 3))
+            return initial_state(replace(problem, uv=problem.uv[:, :0]), poses, initial_rig)
+        return initial_state(problem, rig_from_object, initial_rig)
+
+    def _solution(self, problem: Problem, state: State, converged: Tensor, seen: Tensor) -> MapSolution:
+        batch = seen.shape[:-3]
+        cost = map_cost(problem, state, make_loss(self.options))
+        dof = 2 * seen.flatten(-3).sum(-1) - 6 * seen.shape[-3]
+        points = points_at(problem, state) + problem.centroid
+        return MapSolution(
+            rig=rig_at(problem, state.offset).reshape(*batch),
+            rig_from_object=pose_at(problem, state).reshape(*batch, seen.shape[-3]),
+            points_object=points.reshape(*batch, *points.shape[1:]),
+            chi2=(2 * cost).reshape(batch),
+            dof=dof,
+            converged=converged.reshape(batch),
+        )

@@ -1,0 +1,117 @@
+"""`ReprojectionLoss`: how far the fiducials are from where they should be, in pixels; projected by kornia."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from imgcal.geometry import project_kornia
+from imgcal.nn.held import HeldObject
+from imgcal.types import CalibrationObject, CameraRig, Prediction
+
+# Nearer points (mm) are projected at this depth, differences are cut at this size (pixels): what an untrained network
+# predicts behind a camera would overflow float32, whose gradient is then nan even where the loss itself is clamped.
+LEAST_DEPTH, LARGEST_DIFFERENCE = 50.0, 1e6
+
+
+class ReprojectionLoss(nn.Module):
+    """Root mean squared difference between pixel coordinates of fiducials.
+
+    Computed in float32 or better, whatever autocast is on: bfloat16 would round a coordinate of 1234.567 to 1232.
+    Finite with finite gradients also for cameras that have fiducials behind them.
+
+    Args:
+        obj: N fiducials (mm); those with a radius are spheres, whose apparent centres are projected.
+        reduction: "mean" over rigs, "sum", or "none".
+
+    Shape:
+        - prediction: (*B) rigs of C cameras, and poses.
+        - target: the true (*B) prediction, or (*B, C, N, 2) pixels where fiducials are.
+        - seen: (*B, C, N) bool: which count; None = all.
+        - Output: pixels, () or with reduction "none" (*B); zero where nothing counts.
+
+    Source: paper section 4.3; projection through `kornia.geometry.calibration.distort_points`.
+
+    Example:
+        >>> import imgcal
+        >>> rig, obj = imgcal.load_rig("O10"), imgcal.load_object("asymmetric8")
+        >>> pose = imgcal.RigidTransform.identity(dtype=rig.focal_length.dtype)
+        >>> pose.translation[2] = rig.working_distance
+        >>> target = rig.project(pose.apply(obj.points)).uv
+        >>> round(ReprojectionLoss(obj)(Prediction(rig, pose), target + 1).item(), 6)
+        1.0
+    """
+
+    def __init__(self, obj: CalibrationObject, reduction: Literal["mean", "sum", "none"] = "mean") -> None:
+        super().__init__()
+        if reduction not in ("mean", "sum", "none"):
+            raise ValueError(f"reduction must be 'mean', 'sum' or 'none', found {reduction!r}")
+        self.obj, self.reduction = HeldObject(obj), reduction
+
+    def forward(self, prediction: Prediction, target: Prediction | Tensor, seen: Tensor | None = None) -> Tensor:
+        """Compare."""
+        with torch.autocast(prediction.rig.focal_length.device.type, enabled=False):
+            obj = self.obj()
+            uv = project_fiducials(_exact(prediction).cameras_from_object, obj)
+            if isinstance(target, Prediction):
+                target = project_fiducials(_exact(target).cameras_from_object, obj)
+            each = reprojection_re(uv - target, seen)
+        if self.reduction == "none":
+            return each
+        return each.mean() if self.reduction == "mean" else each.sum()
+
+    def extra_repr(self) -> str:
+        """Say what is configured."""
+        return f"reduction={self.reduction!r}"
+
+
+def project_fiducials(cameras: CameraRig, obj: CalibrationObject) -> Tensor:
+    """Project the fiducials through kornia into cameras given in the object's frame.
+
+    Args:
+        cameras: (*B) rigs whose cam_from_rig is cam_from_object.
+        obj: radius of spherical fiducials included.
+
+    Returns:
+        (*B, C, N, 2) pixels, finite for finite cameras.
+    """
+    points = cameras.cam_from_rig.apply(obj.points.to(cameras.focal_length))
+    points = torch.cat((points[..., :2], points[..., 2:].clamp_min(LEAST_DEPTH)), dim=-1)
+    radius = None if obj.radius is None else obj.radius.to(points)
+    lens = (cameras.focal_length, cameras.principal_point, cameras.distortion)
+    return project_kornia(points, *lens, cameras.image_size, radius).uv
+
+
+def reprojection_re(difference: Tensor, seen: Tensor | None = None) -> Tensor:
+    """Root mean squared coordinate of differences, for each rig.
+
+    Args:
+        difference: (*B, C, N, 2) pixels between two images of the fiducials.
+        seen: (*B, C, N) bool: which count, the others may be anything; None = all.
+
+    Returns:
+        (*B) pixels.
+    """
+    if seen is None:
+        return root(squared(difference).mean((-3, -2, -1)))
+    counted = torch.where(seen[..., None], difference, 0.0)
+    mean = squared(counted).sum((-3, -2, -1)) / (2 * seen.sum((-2, -1))).clamp_min(1)
+    return root(mean)
+
+
+def squared(difference: Tensor) -> Tensor:
+    """Square differences in pixels, as far as float32 can hold them."""
+    return difference.clamp(-LARGEST_DIFFERENCE, LARGEST_DIFFERENCE).square()
+
+
+def root(mean_square: Tensor) -> Tensor:
+    """Square root whose gradient at zero is zero instead of infinite."""
+    return mean_square.clamp_min(1e-20).sqrt()
+
+
+def _exact(prediction: Prediction) -> Prediction:
+    """Take half precision to float32."""
+    dtype = prediction.rig.focal_length.dtype
+    return prediction.to(torch.float32) if dtype in (torch.bfloat16, torch.float16) else prediction
