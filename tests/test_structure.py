@@ -1,4 +1,4 @@
-"""The structure that CONTRIBUTING draws: imports point down, and rooms know each other by what they export."""
+"""The structure that CONTRIBUTING draws: imports point down, rooms know each other by what they export, tests mirror."""
 
 import ast
 from pathlib import Path
@@ -42,3 +42,26 @@ def test_private_names_stay_where_they_are() -> None:
         if module.startswith(("imgcal", "renderers")) and name.startswith("_") and name != "__version__"
     ]
     assert not taken, taken
+
+
+# Modules whose tests stand elsewhere, or that hold no logic.
+TESTED_ELSEWHERE = {
+    "imgcal/association/options.py": "values only",
+    "imgcal/association/result.py": "values only",
+    "imgcal/cli/describe.py": "cli/test_calibrate reads the reports that it makes",
+    "imgcal/cli/detect.py": "cli/test_main, test_warmup",
+    "imgcal/cli/interruption.py": "cli/test_main, in processes of their own",
+    "imgcal/cli/training_folder.py": "training/test_engine, cli/test_train",
+    "imgcal/cli/warmup.py": "online/test_warmup",
+    "imgcal/evaluation/plots.py": "evaluation/test_tables",
+    "imgcal/evaluation/summary.py": "evaluation/test_tables",
+    "imgcal/pipeline/arrangement.py": "pipeline/test_calibration, test_steadiness",
+    "imgcal/training/callbacks.py": "training/test_engine",
+}
+
+
+def test_tests_mirror_the_tree() -> None:
+    modules = [path for package in ("imgcal", "renderers") for path in (ROOT / package).rglob("*.py")]
+    names = [path.relative_to(ROOT) for path in modules if path.name not in ("__init__.py", "__main__.py")]
+    without = {str(name) for name in names if not (ROOT / "tests" / name.with_name(f"test_{name.name}")).is_file()}
+    assert without == set(TESTED_ELSEWHERE)

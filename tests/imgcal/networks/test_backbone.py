@@ -1,0 +1,83 @@
+"""Encoders of timm: any of them fits, none comes from a place."""
+
+import pytest
+import torch
+
+from imgcal.errors import InputError
+from tests.imgcal.networks.making import make, snapshots, views
+
+
+@pytest.mark.parametrize(
+    ("backbone", "options"),
+    [
+        ("swin_tiny_patch4_window7_224", {"embed_dim": 24, "depths": [1, 1], "num_heads": [1, 2]}),  # channels last
+        ("mixer_s32_224", {}),  # tokens, and none before the patches
+        ("mobilenetv3_small_050", {}),  # a pooled feature of another width than the map's
+        ("deit_tiny_distilled_patch16_224", {"depth": 1}),  # two tokens before the patches
+    ],
+)
+def test_any_backbone_fits(backbone, options):
+    network = make("vit", backbone=backbone, options=options)
+    with torch.no_grad():
+        images = torch.rand(2, 3, 224, 224, generator=torch.Generator().manual_seed(0))
+        shifted = images.clone()
+        shifted[1, :, 112:] = 0  # the lower half of one image
+        (pooled, here), (_, there) = network.backbone(images), network.backbone(shifted)
+        assert pooled.shape == (2, network.bottleneck.in_features)
+        assert here.shape[:2] == (2, network.belief.in_channels)
+        assert here.shape[2] == here.shape[3]
+        apart = (here - there).abs().sum(1)
+        assert apart[0].max() == 0
+        assert apart[1, -1].mean() > apart[1, 0].mean()  # rows are rows
+        assert len(network(views(network, snapshots(network)))) == network.trunk.passes
+
+
+@pytest.mark.parametrize(
+    ("backbone", "options", "size"),
+    [
+        ("vit_tiny_patch16_384", {"depth": 1}, 384),
+        ("vit_small_patch14_dinov2", {"depth": 1}, 518),
+        ("vit_small_patch14_reg4_dinov2", {"depth": 1, "img_size": 224}, 224),
+        ("eva02_tiny_patch14_336", {"depth": 1}, 336),
+    ],
+)
+def test_a_backbone_gets_images_of_its_own_size(backbone, options, size):
+    network = make("vit", backbone=backbone, options=options)
+    assert network.backbone.size == (size, size) and network.image_options.size == size
+    with torch.no_grad():
+        assert len(network(views(network, snapshots(network)))) == network.trunk.passes
+
+
+@pytest.mark.parametrize(
+    "backbone", ["local-dir:/tmp/evil", "hf-hub:evil/vit", "/tmp/evil", "../vit_tiny_patch16_224", "x" * 150]
+)
+def test_a_backbone_is_no_place(backbone, monkeypatch):
+    monkeypatch.setattr("imgcal.networks.backbone.timm.create_model", None)
+    with pytest.raises(InputError, match="expected a timm model"):
+        make("vit", backbone=backbone, options={})
+
+
+def test_options_that_do_not_go_together_are_one_line():
+    for options in ({"embed_dim": 100, "num_heads": 3}, {"patch_size": 0}, {"dims": [8]}, {"depth": [1, 2]}):
+        with pytest.raises(InputError, match="backbone vit_tiny_patch16_224") as caught:
+            make("vit", options=options)
+        assert "\n" not in str(caught.value) and len(str(caught.value)) < 500
+
+
+def test_the_weights_of_a_backbone_are_counted_before_they_are_made(monkeypatch):
+    with pytest.raises(InputError, match=r"1,842,\d+,\d+ weights, expected at most"):
+        make("vit", backbone="vit_gigantic_patch14_224", options={})
+
+
+def test_an_unknown_backbone_is_refused():
+    with pytest.raises(InputError, match="nearest: vit_tiny_patch16_224"):
+        make("vit", backbone="vit_tiny_patch16_225")
+
+
+def test_pretrained_weights_that_cannot_be_loaded_say_what_to_do(monkeypatch, tmp_path):
+    def offline(*_, **__):
+        raise OSError("no route to host")
+
+    monkeypatch.setattr("imgcal.networks.backbone.timm.create_model", offline)
+    with pytest.raises(InputError, match="HF_HOME"):
+        make("vit", pretrained=True)
