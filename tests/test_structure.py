@@ -1,4 +1,4 @@
-"""The structure that CONTRIBUTING draws: imports point down, rooms know each other by what they export, tests mirror."""
+"""The structure that CONTRIBUTING draws: imports point down, rooms export what others use, tests mirror the tree."""
 
 import ast
 from pathlib import Path
