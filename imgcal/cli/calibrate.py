@@ -28,7 +28,6 @@ from imgcal.cli.counts import blobs_by_camera, counts_by_camera, counts_by_snaps
 from imgcal.cli.describe import describe, describe_refusal
 from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError, RefusedError
-from imgcal.estimation import relative_covariance
 from imgcal.extras import advice, missing
 from imgcal.io import (
     RigCovariance,
@@ -187,7 +186,7 @@ def trusted_covariance(calibration: Calibration, reference: int) -> RigCovarianc
         RefusedError: some camera is known so badly that the approximation behind the figures breaks down.
     """
     names = calibration.rig.camera_names
-    covariance = RigCovariance.from_matrix(relative_covariance(calibration, reference), names[reference])
+    covariance = RigCovariance.from_matrix(calibration.estimate.covariance(reference), names[reference])
     bad = ~(covariance.std <= WORST_STD)
     if bool(bad.any()):
         camera, parameter = bad.nonzero()[0].tolist()
@@ -242,7 +241,7 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         "covariance": {
             "from": "scatter between blocks of snapshots" if calibration.block_length else "noise of the blobs",
             "block_length": calibration.block_length,
-            "inflation": calibration.inflation,
+            "inflation": calibration.estimate.inflation,
         },
         "predicted_error": calibration.predicted_error.summary(),
         "seconds": seconds,

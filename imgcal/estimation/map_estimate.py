@@ -78,6 +78,12 @@ class Estimate:
     inflation: float = field(default=1.0, kw_only=True)
     """Factor on what noise adds to standard deviations, where blocks of snapshots scatter more: `block_scatter`."""
 
+    def covariance(self, reference: int = 0) -> Tensor:
+        """Covariance of the cameras relative to one of them: (*B, 15 C, 15 C); see `relative_covariance`."""
+        from imgcal.estimation.covariance import relative_covariance  # it builds on this module
+
+        return relative_covariance(self, reference)
+
     @property
     def chi2_per_dof(self) -> Tensor:
         """About 1 where residuals fit the noise and the prior: (*B)."""

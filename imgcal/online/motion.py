@@ -38,7 +38,7 @@ def measured_move(
     """
     rows = after.observations.seen[:, camera].any(-1).nonzero().flatten()
     given = Observations(*(getattr(after.observations, name)[rows] for name in ("uv", "sigma", "seen")))
-    prior_std = torch.zeros_like(after.problem.prior_std[0])
+    prior_std = torch.zeros_like(after.estimate.problem.prior_std[0])
     prior_std[camera, :6] = wide
     obj = replace(after.obj, points=after.points_object, tolerance=None, scale_tolerance=0.0)
     robust = EstimationOptions(loss="cauchy")

@@ -211,7 +211,7 @@ class Recalibrator:
         prior, tracker = (self.rig.prior or RigPrior()).std(self.rig), self._follower
         tracker.rig, tracker.prior_std = self.rig, prior
         if self._latest is not None:
-            tracker.rig, tracker.prior_std = self._latest.rig, torch.minimum(2 * flat_std(self._latest), prior)
+            tracker.rig, tracker.prior_std = self._latest.rig, torch.minimum(2 * flat_std(self._latest.estimate), prior)
         snapshot, labels = tracker.decide(usable, name, coded)
         again = self._latest is not None and self._refused & (self._refused - 1) == 0
         if snapshot.status == "refused" and coded is None and again:
@@ -289,7 +289,7 @@ class Recalibrator:
         cameras = [] if latest is None or pose is None else np.flatnonzero(self._astray(newest.blobs, pose)).tolist()
         if latest is None or pose is None or not cameras:
             return window, [], []
-        std = torch.minimum(2 * flat_std(latest), self._prior_std)
+        std = torch.minimum(2 * flat_std(latest.estimate), self._prior_std)
         for camera in cameras:
             wide = widened(self._prior_std, latest.rig, [camera], pose, self.obj, RELEARNT)
             labelled = found_again(newest.blobs, camera, latest.rig, self.obj, pose, std, self.options)
@@ -327,11 +327,11 @@ class Recalibrator:
         """Give cameras that are not in the window what was last known of them, and say what holds for each."""
         inside, now = _seen(result), _seen(result, -1)
         if self._fitted is not None and self._latest is not None and (left := _seen(self._fitted) - inside):
-            std = flat_std(self._latest)
+            std = flat_std(self._latest.estimate)
             self._last |= {c: _Last(self._latest.rig, std[c], _seen(self._fitted)) for c in left}
         states: dict[str, CameraState] = {}
-        rig, factory = result.rig, result.problem.factory
-        prior_std = result.problem.prior_std.clone()
+        estimate, problem = result.estimate, result.estimate.problem
+        rig, factory, prior_std = result.rig, problem.factory, problem.prior_std.clone()
         for camera, name in enumerate(self.rig.camera_names):
             if camera in self._lost:
                 states[name] = "astray"
@@ -348,7 +348,8 @@ class Recalibrator:
                 torch.maximum(last.std, window.prior_std[camera]) if camera in self._lost else last.std
             )
         values = {entry.name: getattr(result, entry.name) for entry in fields(Calibration)}
-        values |= {"rig": rig, "problem": replace(result.problem, factory=factory, prior_std=prior_std)}
+        problem = replace(problem, factory=factory, prior_std=prior_std)
+        values["estimate"] = replace(estimate, rig=rig, problem=problem)
         values["moved"] = self._moves(result, window)
         return LiveCalibration(**values, cameras=states, restarted=window.restarted)
 
@@ -361,7 +362,8 @@ class Recalibrator:
                 moves.append(MovedCamera(name, first or window.kept[-1].snapshot.name, "unknown"))
                 continue
             if camera in _seen(self._fitted):
-                known = information(series_of(self._fitted, self._fitted.observations, self.obj.radius))[camera]
+                fitted = self._fitted
+                known = information(series_of(fitted.estimate, fitted.observations, self.obj.radius))[camera]
             else:
                 std = self._last[camera].std if camera in self._last else self._prior_std[camera]
                 known = np.diag(std[:6].numpy() ** -2.0)

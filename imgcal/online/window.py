@@ -152,7 +152,7 @@ class WindowFit:
             model = noise.clamp_min(usual.additive_noise**2).clamp_max(result.additive_noise**2)
             labels = replace(labels, sigma=(noise + model).sqrt())
             first = len(window.kept) - len(kept)
-            return series_of(result, labels, self.obj.radius), [first + used for used in result.labelled.used]
+            return series_of(result.estimate, labels, self.obj.radius), [first + used for used in result.labelled.used]
         if len(window.kept) < 2:
             return None, []
         return series_of(*self.rough(window), self.obj.radius), list(range(len(window.kept)))

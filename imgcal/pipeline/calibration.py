@@ -35,6 +35,7 @@ from imgcal.estimation import (
     make_problem,
     predicted_error,
 )
+from imgcal.geometry import RigidTransform
 from imgcal.pipeline.arrangement import Arranged, arrange
 from imgcal.pipeline.checks import (
     require_cameras,
@@ -65,8 +66,8 @@ LEAST_KEPT = 0.8
 
 
 @dataclass(frozen=True)
-class Calibration(Estimate):
-    """An `Estimate`, with what it was made from. Snapshots are those used, in order.
+class Calibration:
+    """A recalibrated rig, with what it was made from. Snapshots are those used, in order.
 
     Examples:
         >>> import torch, imgcal
@@ -80,6 +81,7 @@ class Calibration(Estimate):
         (0, (), ())
     """
 
+    estimate: Estimate  # without batch axes: the rig, the poses, and how well they are known
     labelled: Associations
     observations: Observations  # (S, C, N) as used: outliers not seen, sigma with the model error
     additive_noise: float  # px, what the residuals hold beyond the blobs' own sigma
@@ -96,6 +98,36 @@ class Calibration(Estimate):
     seconds: Mapping[str, float] = field(default_factory=dict)  # by stage
     moved: tuple[MovedCamera, ...] = ()  # during the capture; snapshots used are those since then
 
+    @property
+    def rig(self) -> CameraRig:
+        """The recalibrated rig."""
+        return self.estimate.rig
+
+    @property
+    def rig_from_object(self) -> RigidTransform:
+        """The object's pose in each snapshot: (S,)."""
+        return self.estimate.rig_from_object
+
+    @property
+    def points_object(self) -> Tensor:
+        """The fiducials as estimated: (N, 3) mm; as given where the object is exact."""
+        return self.estimate.points_object
+
+    @property
+    def residual(self) -> Tensor:
+        """Predicted minus observed: (S, C, N, 2) pixels; zero where not seen."""
+        return self.estimate.residual
+
+    @property
+    def rms(self) -> Tensor:
+        """RMS reprojection error of the seen fiducials, over both axes: () pixels."""
+        return self.estimate.rms
+
+    @property
+    def chi2_per_dof(self) -> Tensor:
+        """About 1 where residuals fit the noise and the prior: ()."""
+        return self.estimate.chi2_per_dof
+
     @cached_property
     def before(self) -> Estimate:
         """The factory rig as it stands on the same observations: only the poses are fitted."""
@@ -104,7 +136,7 @@ class Calibration(Estimate):
             self.factory,
             self.obj.taken_as_exact(),
             self.rig_from_object,
-            prior_std=torch.zeros_like(self.problem.prior_std[0]),
+            prior_std=torch.zeros_like(self.estimate.problem.prior_std[0]),
         )
 
     @property
@@ -144,7 +176,7 @@ class Calibration(Estimate):
     @cached_property
     def predicted_error(self) -> PredictedError:
         """How good the rig is over the working volume."""
-        return predicted_error(self)
+        return predicted_error(self.estimate)
 
     @property
     def identity(self) -> str:
@@ -286,7 +318,7 @@ def _fitted_once(
         first = Start(initial_state(problem, guess.rig_from_object, guess.rig), options.identity_error)
     starts = [first]
     if latest is not None and not latest.prior_scale:
-        change = latest.problem.prior_std * latest.solution.state.offset
+        change = latest.estimate.problem.prior_std * latest.estimate.solution.state.offset
         offset = torch.where(prior > 0, change / prior.clamp_min(1e-30), 0.0)
         starts.insert(0, Start(replace(first.state, offset=offset), latest.additive_noise))
     question = ObjectQuestion.NONE
@@ -305,9 +337,8 @@ def _fitted_once(
     require_near_prior(fit, prior, rig, found.prior_scale, options)
     require_most_labels(labels, found.seen, rig)
     require_fit(found.additive_noise, outliers / max(int(labels.sum()), 1), 2**0.5 * float(fit.rms), options)
-    values = {name: getattr(fit, name) for name in Estimate.__dataclass_fields__}
     return Calibration(
-        **values,
+        estimate=fit,
         labelled=labelled,
         observations=Observations(
             observations.uv, torch.from_numpy(found.sigma).to(observations.sigma), torch.from_numpy(found.seen)
@@ -328,9 +359,8 @@ def _fitted_once(
 
 def _with_learnt(obj: CalibrationObject, latest: Calibration | None) -> CalibrationObject:
     """The object with the tolerances that the latest result has found necessary."""
-    if latest is None or latest.problem.object_prior_std is None:
-        return obj
-    return replace(obj, tolerance=latest.problem.object_prior_std[0, :-1:3])
+    learnt = None if latest is None else latest.estimate.problem.object_prior_std
+    return obj if learnt is None else replace(obj, tolerance=learnt[0, :-1:3])
 
 
 def _require_any_view(arranged: Arranged, rig: CameraRig, obj: CalibrationObject) -> None:

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from imgcal import Calibration, PipelineOptions, RefusedError, calibrate, load_object, load_rig
 from imgcal.association import to_observations
-from imgcal.estimation import estimate, relative_covariance, relative_difference
+from imgcal.estimation import estimate, relative_difference
 from imgcal.estimation.variance_components import KINDS
 from imgcal.evaluation.true_error import true_error
 from imgcal.io import write_text
@@ -195,13 +195,13 @@ def _outcome(found: Calibration, truth: CameraRig, shares: Tensor) -> str:
     ratio = (wrong / stated).square()
     if float(ratio[ratio.isfinite()].mean()) <= WRONG**2:
         return "right"
-    return "said" if found.displaced or found.moved or found.prior_scale or found.inflation > 1 else "silent"
+    return "said" if found.displaced or found.moved or found.prior_scale or found.estimate.inflation > 1 else "silent"
 
 
 def _normalize(found: Calibration, truth: CameraRig, squares: dict[str, list[float]], inside: list[float]) -> None:
     """Errors relative to the first camera in units of their standard deviations; its own extrinsics do not count."""
     error = relative_difference(found.rig, truth).flatten()
-    covariance = relative_covariance(found)
+    covariance = found.estimate.covariance()
     std = covariance.diagonal().clamp_min(0).sqrt()
     free = std > 1e-12
     ratio = torch.where(free, error / std.clamp_min(1e-30), torch.nan).view(-1, 15)

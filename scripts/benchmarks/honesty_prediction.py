@@ -85,7 +85,7 @@ def judge(case: Case, captures: int, seed: int, options: PipelineOptions) -> dic
         truth, table = case.draw(generator)
         shares = torch.rand(HELD_OUT, 3, generator=generator, dtype=torch.float64)
         try:
-            predicted = predicted_error(calibrate(table, case.rig, case.obj, options))
+            predicted = predicted_error(calibrate(table, case.rig, case.obj, options).estimate)
         except RefusedError:
             refused += 1
             continue

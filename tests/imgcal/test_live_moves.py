@@ -159,9 +159,10 @@ def test_a_camera_that_is_out_keeps_its_last_values():
         for s, result in enumerate(run(stream, live, range(4, 30), hidden=[1]), start=4):
             assert result.cameras["cam02"] == ("recent" if s < 6 else "kept")
             assert stream.errors(result.rig, s).max() < 0.5
-        kept = result.problem.prior_std[0, 1]
+        kept = result.estimate.problem.prior_std[0, 1]
     assert torch.allclose(result.rig.focal_length[1], last.rig.focal_length[1], atol=2.0)
-    assert (kept <= last.problem.prior_std[0, 1]).all() and (kept[6:8] < 0.5 * last.problem.prior_std[0, 1, 6:8]).all()
+    before = last.estimate.problem.prior_std[0, 1]
+    assert (kept <= before).all() and (kept[6:8] < 0.5 * before[6:8]).all()
 
 
 def test_one_camera_without_frames_stops_nothing():
@@ -191,7 +192,7 @@ def test_a_camera_that_has_seen_nothing_has_the_factory_values_and_prior():
         result = run(stream, live, range(3), hidden=[3])[-1]
     assert result.cameras["cam04"] == "factory"
     assert torch.equal(result.rig.focal_length[3], stream.rig.focal_length[3])
-    assert torch.allclose(result.problem.prior_std[0, 3], stream.rig.prior.std(stream.rig)[3])
+    assert torch.allclose(result.estimate.problem.prior_std[0, 3], stream.rig.prior.std(stream.rig)[3])
 
 
 def test_blobs_that_fit_nowhere_are_said_and_do_not_spoil_the_others():

@@ -6,6 +6,7 @@ import torch
 
 from imgcal.association.options import PipelineOptions
 from imgcal.errors import RefusedError
+from imgcal.estimation import relative_covariance
 from imgcal.pipeline.calibration import calibrate, score
 from imgcal.synthesis.captures import simulate_truth, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
@@ -27,6 +28,10 @@ def test_an_honest_calibration(o10, asymmetric8):
     assert 0.8 < result.chi2_per_dof < 1.2
     assert result.rig.local(truth)[:, 6:8].abs().max() < 0.2 * o10.local(truth)[:, 6:8].abs().max()
     assert result.before.rms > 50 * result.rms
+    covariance = result.estimate.covariance(reference=2)
+    assert torch.equal(covariance, relative_covariance(result.estimate, 2))
+    focal = covariance.diagonal().unflatten(0, (-1, 15))[:, 6:8].sqrt()
+    assert ((result.rig.focal_length - truth.focal_length).abs() < 5 * focal).all()
 
 
 @pytest.mark.parametrize("hidden", [0.15, 0.4])

@@ -110,7 +110,7 @@ def test_a_right_object_stays_exact_and_costs_nothing() -> None:
     for rig_name, snapshots in (("room10", 20), ("O10", 3), ("T4", 1)):
         rig, obj, _, _, table = capture(rig_name, snapshots, right)
         found = calibrate(table, rig, obj)
-        assert found.problem.object_prior_std is None and found.shape == () and found.displaced == ()
+        assert found.estimate.problem.object_prior_std is None and found.shape == () and found.displaced == ()
         assert torch.equal(found.points_object, obj.points)
 
 
@@ -128,7 +128,7 @@ def jumping_cube(bend, seed: int = 0):
 def test_of_a_symmetric_object_nobody_says_which_fiducial_is_off() -> None:
     rig, obj, table = jumping_cube(right)
     found = calibrate(table, rig, obj)
-    assert found.identity == "ambiguous" and found.displaced == () and found.problem.object_prior_std is None
+    assert found.identity == "ambiguous" and found.displaced == () and found.estimate.problem.object_prior_std is None
     with pytest.raises(RefusedError, match="turned into itself"):
         calibrate(table, rig, replace(obj, tolerance=torch.full((8,), 0.2, dtype=torch.float64)))
     rig, obj, table = jumping_cube(moved(1, (0.5, 0, 0)))
@@ -170,7 +170,7 @@ def test_a_rig_in_single_precision_gives_the_same(labelled: bool) -> None:
 
 def test_granted_tolerances_make_the_errors_honest() -> None:
     """Fiducials off by 0.2 mm at random: errors of the rig in units of what the covariance says."""
-    from imgcal.estimation import relative_covariance, relative_difference
+    from imgcal.estimation import relative_difference
 
     normalized = []
     for seed in range(8):
@@ -180,7 +180,7 @@ def test_granted_tolerances_make_the_errors_honest() -> None:
         )
         found = calibrate(table, rig, replace(obj, tolerance=torch.full((8,), 0.2, dtype=torch.float64)))
         error = relative_difference(found.rig, true_rig).flatten()[15:]
-        covariance = relative_covariance(found)[15:, 15:]
+        covariance = found.estimate.covariance()[15:, 15:]
         scale = covariance.diagonal().sqrt()
         values, vectors = torch.linalg.eigh(covariance / (scale[:, None] * scale))
         normalized.append(float(((vectors.mT @ (error / scale)).square() / values).mean()))
