@@ -306,7 +306,14 @@ def relative_jacobian(rig: CameraRig, reference: int) -> Tensor:
 
 
 def relative_difference(rig: CameraRig, other: CameraRig, reference: int = 0) -> Tensor:
-    """Error of a rig against another one, extrinsics relative to a reference camera: (*B, C, 15), gauge-free."""
+    """Error of a rig against another one, extrinsics relative to a reference camera: (*B, C, 15), gauge-free.
+
+    Examples:
+        >>> import imgcal
+        >>> rig = imgcal.load_rig("T4")
+        >>> float(relative_difference(rig, rig).abs().max()) < 1e-12
+        True
+    """
     return _relative_to(rig, reference).local(_relative_to(other, reference))
 
 

@@ -54,6 +54,18 @@ def initial_pose(
     Returns:
         (*B, S) rig_from_object with the smallest object-space error among those in front of the cameras. Meant as a
         start: it does not weigh pixels by distance.
+
+    Examples:
+        >>> import imgcal
+        >>> from imgcal.synthesis import PhysicalDrift, simulate_truth
+        >>> from imgcal.types import Observations
+        >>> factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+        >>> truth = simulate_truth(factory, obj, 5, torch.Generator().manual_seed(1), PhysicalDrift())
+        >>> seen = torch.ones(truth.uv.shape[:-1], dtype=torch.bool)
+        >>> observations = Observations(truth.uv, torch.full(seen.shape, 0.05), seen)
+        >>> poses = initial_pose(observations, truth.rig, obj)
+        >>> float((poses.translation - truth.rig_from_object.translation).norm(dim=-1).max()) < 1  # mm
+        True
     """
     batch = observations.seen.shape[:-2]
     points = obj.points.to(observations.uv)

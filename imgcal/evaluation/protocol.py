@@ -161,6 +161,15 @@ def evaluate(
 
     Raises:
         RefusedError: too few random rigs see the whole object.
+
+    Examples:
+        >>> import imgcal
+        >>> from imgcal.evaluation import BASELINES
+        >>> conditions = Conditions(imgcal.load_rig("T4"), imgcal.load_object("cube8"))
+        >>> name = "factory, pose fitted"
+        >>> evaluation = evaluate({name: BASELINES[name]}, conditions, Protocol(count=4, trials=1, bound_count=4))
+        >>> list(evaluation.rows) == [name]
+        True
     """
     done: dict[str, list[_Collected]] = {name: [] for name in methods}
     reference: list[Errors] = []

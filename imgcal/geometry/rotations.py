@@ -16,6 +16,11 @@ def rotation_from_6d(sixd: Tensor) -> Tensor:
         (*B, 3, 3) rotation matrices. Parallel or zero columns are singular: the result is then not a rotation.
 
     Source: Zhou et al., CVPR 2019; paper section 3, "6D Rotation Parameterization".
+
+    Examples:
+        >>> turned = rotation_from_vector(torch.tensor([0.1, -0.2, 0.3]))
+        >>> torch.allclose(rotation_from_6d(sixd_from_rotation(turned)), turned, atol=1e-6)
+        True
     """
     first = torch.nn.functional.normalize(sixd[..., :3], dim=-1)
     second = sixd[..., 3:] - (first * sixd[..., 3:]).sum(-1, keepdim=True) * first
@@ -80,7 +85,12 @@ def left_jacobian(vector: Tensor) -> Tensor:
 
 
 def cross_matrix(vector: Tensor) -> Tensor:
-    """Matrix of the cross product, `cross_matrix(a) @ b = a x b`: (*B, 3) -> (*B, 3, 3)."""
+    """Matrix of the cross product, `cross_matrix(a) @ b = a x b`: (*B, 3) -> (*B, 3, 3).
+
+    Examples:
+        >>> cross_matrix(torch.tensor([1.0, 0.0, 0.0])) @ torch.tensor([0.0, 1.0, 0.0])
+        tensor([0., 0., 1.])
+    """
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
     return torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), dim=-1).unflatten(-1, (3, 3))
@@ -133,7 +143,13 @@ def _quaternion_from_rotation(rotation: Tensor) -> Tensor:
 
 
 def rotation_from_euler(angles: Tensor) -> Tensor:
-    """Rotate by Euler angles (a, b, c) about the fixed x, y, z axes, Rz(c) Ry(b) Rx(a): (*B, 3) rad -> (*B, 3, 3)."""
+    """Rotate by Euler angles (a, b, c) about the fixed x, y, z axes, Rz(c) Ry(b) Rx(a): (*B, 3) rad -> (*B, 3, 3).
+
+    Examples:
+        >>> angles = torch.tensor([0.1, -0.2, 0.3])
+        >>> euler_from_rotation(rotation_from_euler(angles))
+        tensor([ 0.1000, -0.2000,  0.3000])
+    """
     (sa, sb, sc), (ca, cb, cc) = angles.sin().unbind(-1), angles.cos().unbind(-1)
     entries = (
         cc * cb, cc * sb * sa - sc * ca, cc * sb * ca + sc * sa,

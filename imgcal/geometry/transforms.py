@@ -87,7 +87,12 @@ class RigidTransform:
 
 
 def rotate(rotation: Tensor, vector: Tensor) -> Tensor:
-    """Rotate one vector by each matrix: (*B, 3, 3), (*B, 3) -> (*B, 3); faster than products of tiny matrices."""
+    """Rotate one vector by each matrix: (*B, 3, 3), (*B, 3) -> (*B, 3); faster than products of tiny matrices.
+
+    Examples:
+        >>> rotate(torch.eye(3), torch.tensor([1.0, 2.0, 3.0]))
+        tensor([1., 2., 3.])
+    """
     first, second, third = rotation.unbind(-1)
     x, y, z = vector.split(1, dim=-1)
     return first * x + second * y + third * z

@@ -92,6 +92,12 @@ def save_object(obj: CalibrationObject, path: str | Path) -> None:
 
     Raises:
         InputError: the file cannot be written, or a name could not be read again.
+
+    Examples:
+        >>> import imgcal
+        >>> save_object(imgcal.load_object("cube8"), "mine.csv")
+        >>> imgcal.load_object("mine.csv").name
+        'mine'
     """
     write_text(path, object_text(obj, path))
 

@@ -222,7 +222,13 @@ def save_rig(rig: CameraRig, path: str | Path, covariance: RigCovariance | None 
 def rig_text(
     rig: CameraRig, where: str | Path = "rig", covariance: RigCovariance | None = None, full: bool = False
 ) -> str:
-    """Make what `save_rig` writes; errors begin with `where`."""
+    """Make what `save_rig` writes; errors begin with `where`.
+
+    Examples:
+        >>> import imgcal
+        >>> rig_text(imgcal.load_rig("T4")).splitlines()[:2]
+        ['format: imgcal-rig/1', 'name: T4']
+    """
     if rig.batch_shape:
         raise InputError(f"{where}: found a batch of rigs of shape {tuple(rig.batch_shape)}, expected one rig")
     content: dict[str, Any] = {"format": FORMAT, "name": rig.name}

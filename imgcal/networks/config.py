@@ -117,7 +117,12 @@ PRESETS: dict[str, Variant] = {
 
 
 class NetworkConfig(StrictModel):
-    """The block `network` of an experiment file: a preset, and what is changed in it."""
+    """The block `network` of an experiment file: a preset, and what is changed in it.
+
+    Examples:
+        >>> NetworkConfig(preset="points", change={"trunk": {"passes": 2}}).variant().trunk.passes
+        2
+    """
 
     preset: str
     change: dict[str, Any] = Field(default={})  # values of the preset to replace, by name; groups within groups

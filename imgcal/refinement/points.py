@@ -41,6 +41,17 @@ def refine_points(
     Raises:
         ValueError: views without points.
         InputError: shapes that do not belong together.
+
+    Examples:
+        >>> import imgcal
+        >>> from imgcal.synthesis import RelativeDrift, synthesize
+        >>> factory, obj = imgcal.load_rig("T4"), imgcal.load_object("cube8")
+        >>> drawn = synthesize(factory, obj, 3, torch.Generator().manual_seed(0))
+        >>> views = Views(drawn.projection.uv, torch.ones(drawn.projection.uv.shape[:-1], dtype=torch.bool))
+        >>> start = Prediction(factory.expand(3), drawn.rig_from_object)  # what a network might say
+        >>> refined = refine_points(start, views, factory, obj, RelativeDrift().std(factory), sigma=0.1)
+        >>> bool(refined.converged.all()), float(refined.rms.max()) < 0.1
+        (True, True)
     """
     if views.uv is None:
         raise ValueError("refine_points needs views with points")

@@ -67,6 +67,13 @@ def render_views(
 
     Raises:
         ValueError: shapes that do not belong together, or `out` while gradients are recorded.
+
+    Examples:
+        >>> import imgcal
+        >>> obj, image_size = imgcal.load_object("cube8"), torch.tensor([[2048, 1088]])
+        >>> uv = torch.rand(1, 8, 2, generator=torch.Generator().manual_seed(0)) * image_size
+        >>> render_views(uv, torch.ones(1, 8, dtype=torch.bool), image_size, obj, ImageOptions(size=64)).shape
+        torch.Size([1, 3, 64, 64])
     """
     points = options.from_sensor(uv, image_size)
     colours = obj.colours.to(points)

@@ -40,6 +40,12 @@ class PoseRange(StrictRecord):
     """Where the rig may be: on the hemisphere around the object, looking at it, rolled about its axis.
 
     In degrees, the smaller angle first. It is also the block `poses` of an experiment file.
+
+    Examples:
+        >>> PoseRange(phi_deg=(0.0, 60.0)).phi_deg
+        (0.0, 60.0)
+        >>> PoseRange.overhead().phi_deg
+        (0.0, 0.0)
     """
 
     theta_deg: Interval = (0.0, 360.0)  # azimuth
@@ -65,7 +71,15 @@ class PoseRange(StrictRecord):
 
 @dataclass(frozen=True)
 class RelativeDrift(StrictRecord):
-    """The paper's perturbation: every value times 1 + delta, delta uniform in [-kappa, kappa]; 0.025 is 2.5 %."""
+    """The paper's perturbation: every value times 1 + delta, delta uniform in [-kappa, kappa]; 0.025 is 2.5 %.
+
+    Examples:
+        >>> import imgcal
+        >>> rig = imgcal.load_rig("T4")
+        >>> drifted = RelativeDrift(0.025, 0.025).apply(rig, torch.Generator().manual_seed(0))
+        >>> bool(((drifted.focal_length / rig.focal_length - 1).abs() <= 0.025).all())
+        True
+    """
 
     kappa_intrinsics: Kappa = 0.025
     kappa_extrinsics: Kappa = 0.025
@@ -115,7 +129,13 @@ class RelativeDrift(StrictRecord):
 
 @dataclass(frozen=True)
 class PhysicalDrift(StrictRecord):
-    """Gaussian drift in physical units, for real rigs; each number is one standard deviation."""
+    """Gaussian drift in physical units, for real rigs; each number is one standard deviation.
+
+    Examples:
+        >>> import imgcal
+        >>> PhysicalDrift(position=2.0).std(imgcal.load_rig("T4"))[0, 3:6]  # mm
+        tensor([2., 2., 2.], dtype=torch.float64)
+    """
 
     rotation_deg: Spread = 0.5  # each axis
     position: Spread = 2.0  # mm, each axis

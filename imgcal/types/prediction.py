@@ -14,7 +14,13 @@ from imgcal.types.rig import CameraRig
 
 @dataclass(frozen=True)
 class Views:
-    """One snapshot of each rig, as the networks take it: labelled points, colour-coded images, or both."""
+    """One snapshot of each rig, as the networks take it: labelled points, colour-coded images, or both.
+
+    Examples:
+        >>> uv = torch.zeros(2, 10, 8, 2)  # rigs, cameras, fiducials, (u, v)
+        >>> len(Views(uv=uv, seen=torch.ones(2, 10, 8, dtype=torch.bool)))
+        2
+    """
 
     uv: Tensor | None = None  # (B, C, N, 2) pixels of the sensor; any finite value where not seen
     seen: Tensor | None = None  # (B, C, N) bool

@@ -300,7 +300,14 @@ def pack18(rig: CameraRig) -> Tensor:
 
 
 def unpack21(packed: Tensor, like: CameraRig) -> CameraRig:
-    """Invert `pack21`; names and image sizes come from `like`."""
+    """Invert `pack21`; names and image sizes come from `like`.
+
+    Examples:
+        >>> import imgcal
+        >>> rig = imgcal.load_rig("T4")
+        >>> torch.equal(unpack21(pack21(rig), like=rig).focal_length, rig.focal_length)
+        True
+    """
     return _unpack(packed[..., :9].unflatten(-1, (3, 3)), packed[..., 9:], like)
 
 
