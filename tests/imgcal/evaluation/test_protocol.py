@@ -8,7 +8,6 @@ from imgcal.evaluation import BASELINES, Conditions, Method, Protocol, evaluate,
 from imgcal.evaluation.methods import factory_alone
 from imgcal.evaluation.metrics import KINDS, Errors
 from imgcal.evaluation.protocol import LEAST_SIGMA, Scores
-from imgcal.evaluation.timing import latency
 from tests.imgcal.evaluation.conftest import Fake, straight_down
 
 FACTORY = {"factory": Method(factory_alone)}
@@ -88,7 +87,7 @@ def test_methods_are_told_the_noise(conditions):
     told = []
 
     def listen(given):
-        told.append((given.sigma, given.spread))
+        told.append((given.sigma, given.prior_std))
         return factory_alone(given)
 
     for noise in (0.0, 0.3):
@@ -102,16 +101,6 @@ def test_methods_are_told_the_noise(conditions):
 def test_nothing_to_do_is_refused(name):
     with pytest.raises(InputError, match=name):
         Protocol(**{name: 0})
-
-
-def test_latency_has_a_second_figure_where_there_is_a_refinement(conditions):
-    known = straight_down(conditions(kappa=0.002))
-    alone = latency(FACTORY["factory"], known, repeats=2)
-    assert 0 < alone.alone_p50 <= alone.alone_p99
-    assert alone.refined_p50 is None
-    both = latency(network_method(Fake(known)), known, repeats=2)
-    assert both.refined_p50 is not None
-    assert both.refined_p50 > both.alone_p50
 
 
 def singular(given):
