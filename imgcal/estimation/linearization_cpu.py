@@ -1,0 +1,288 @@
+"""Residuals and normal equations on CPUs: `linearization.py` compiled to one loop a rig, without temporaries.
+
+Layouts: `lm_cpu._Blocks`; what fits each camera and what each snapshot is summed up before it is written. The object's
+own parameters stand behind the coupled ones, and have a border of their own.
+"""
+
+# Compiled functions take their types from their arguments.
+# ruff: noqa: ANN001, ANN201, ANN202
+# mypy: allow-untyped-defs, no-check-untyped-defs
+
+from __future__ import annotations
+
+import numpy as np
+
+from imgcal.geometry import NEAREST_DEPTH, kernels
+from renderers.compiling import njit
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def linearize_all(
+    points, radius_squared, uv, root_weight, rotation0, position0, focal0, principal0, distortion0, prior_std, own_std,
+    offset, rotation, centre, own_offset,
+    camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual,
+    cost, cameras_first, loss, threshold,
+):  # fmt: skip
+    """Fill the blocks and the costs of all rigs of a batch."""
+    for b in range(len(cost)):
+        given = (
+            points, radius_squared, uv[b], root_weight[b],
+            rotation0[b], position0[b], focal0[b], principal0[b], distortion0[b], prior_std[b], own_std[b],
+        )  # fmt: skip
+        state = (offset[b], rotation[b], centre[b], own_offset[b])
+        blocks = (
+            camera[b], coupling[b], pose[b], border[b], camera_gradient[b], pose_gradient[b], own_gradient[b],
+            residual[b],
+        )  # fmt: skip
+        cost[b] = linearize_rig(given, state, blocks, cameras_first, loss, threshold)
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def linearize_rig(given, state, blocks, cameras_first, loss, threshold):
+    """Fill the blocks of the normal equations and return the cost."""
+    (
+        points, radius_squared, uv, root_weight,
+        rotation0, position0, focal0, principal0, distortion0, prior_std, own_std,
+    ) = given  # fmt: skip
+    offset, rotation, centre, own_offset = state
+    camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual = blocks
+    snapshots, cameras, fiducials = root_weight.shape
+    kind = uv.dtype
+    for s in range(snapshots):
+        for i in range(6):
+            pose_gradient[s, i] = 0
+            for j in range(6):
+                pose[s, i, j] = 0
+    rows = np.zeros((2, 21), dtype=kind)
+    products = np.empty((21, 21), dtype=kind)
+    gradient = np.empty(21, dtype=kind)
+    turned, left, rotation_cam = (
+        np.empty((3, 3), dtype=kind),
+        np.empty((3, 3), dtype=kind),
+        np.empty((3, 3), dtype=kind),
+    )
+    parameters = np.empty(15, dtype=kind)
+    rotated, point = np.empty(3, dtype=kind), np.empty(3, dtype=kind)
+    derivative, back = np.empty((2, 3), dtype=kind), np.empty(3, dtype=kind)
+    bent, scale = len(own_std) > 0, 1.0
+    rows_own = np.empty((2, 4), dtype=kind)
+    cost = 0.0
+    if bent:
+        cost = _start_object(own_offset, coupling, border, own_gradient)
+        scale += own_offset[-1] * own_std[-1]
+    for c in range(cameras):
+        for i in range(15):
+            parameters[i] = offset[c, i] * prior_std[c, i]
+            cost += 0.5 * offset[c, i] ** 2
+            camera_gradient[c, i] = offset[c, i]
+            for j in range(15):
+                camera[c, i, j] = 1.0 if i == j else 0.0
+        kernels.exponential(parameters, turned, left)
+        kernels.multiply(turned, rotation0[c], rotation_cam)
+        fx, fy = focal0[c, 0] + parameters[6], focal0[c, 1] + parameters[7]
+        cx, cy = principal0[c, 0] + parameters[8], principal0[c, 1] + parameters[9]
+        k1, k2, p1 = (
+            distortion0[c, 0] + parameters[10],
+            distortion0[c, 1] + parameters[11],
+            distortion0[c, 2] + parameters[12],
+        )
+        p2, k3 = distortion0[c, 3] + parameters[13], distortion0[c, 4] + parameters[14]
+        for s in range(snapshots):
+            for i in range(21):
+                gradient[i] = 0
+                for j in range(i + 1):
+                    products[i, j] = 0
+            unit = max(1.0, np.sqrt(centre[s, 0] ** 2 + centre[s, 1] ** 2 + centre[s, 2] ** 2))
+            for n in range(fiducials):
+                at_x, at_y, at_z = points[n, 0], points[n, 1], points[n, 2]
+                if bent:
+                    at_x = scale * at_x + own_offset[3 * n] * own_std[3 * n]
+                    at_y = scale * at_y + own_offset[3 * n + 1] * own_std[3 * n + 1]
+                    at_z = scale * at_z + own_offset[3 * n + 2] * own_std[3 * n + 2]
+                for i in range(3):
+                    rotated[i] = rotation[s, i, 0] * at_x + rotation[s, i, 1] * at_y + rotation[s, i, 2] * at_z
+                rx = rotated[0] + centre[s, 0] - position0[c, 0] - parameters[3]
+                ry = rotated[1] + centre[s, 1] - position0[c, 1] - parameters[4]
+                rz = rotated[2] + centre[s, 2] - position0[c, 2] - parameters[5]
+                for i in range(3):
+                    point[i] = rotation_cam[i, 0] * rx + rotation_cam[i, 1] * ry + rotation_cam[i, 2] * rz
+                weight = root_weight[s, c, n]
+                if weight > 0 and point[2] <= NEAREST_DEPTH:
+                    cost = np.inf
+                depth = max(point[2], NEAREST_DEPTH)
+
+                per_depth, log_slope, x, y, rr, xd, yd, jxx, jxy, jyy = kernels.lens(
+                    point[0], point[1], depth, radius_squared[n], k1, k2, p1, p2, k3
+                )
+                ru, rv = fx * xd + cx - uv[s, c, 0, n], fy * yd + cy - uv[s, c, 1, n]
+                residual[s, c, 0, n], residual[s, c, 1, n] = ru, rv
+                if weight == 0:
+                    continue
+                value, slope = _loss((ru * ru + rv * rv) * weight * weight, loss, threshold)
+                cost += 0.5 * value
+                weight *= np.sqrt(slope)
+                fx_w, fy_w = fx * weight, fy * weight
+                derivative[0, 0], derivative[0, 1] = fx_w * per_depth * jxx, fx_w * per_depth * jxy
+                derivative[0, 2] = fx_w * log_slope * (jxx * x + jxy * y)
+                derivative[1, 0], derivative[1, 1] = fy_w * per_depth * jxy, fy_w * per_depth * jyy
+                derivative[1, 2] = fy_w * log_slope * (jxy * x + jyy * y)
+
+                for r in range(2):
+                    d0, d1, d2 = derivative[r, 0], derivative[r, 1], derivative[r, 2]
+                    t0 = point[1] * d2 - point[2] * d1
+                    t1 = point[2] * d0 - point[0] * d2
+                    t2 = point[0] * d1 - point[1] * d0
+                    for i in range(3):
+                        rows[r, i] = left[0, i] * t0 + left[1, i] * t1 + left[2, i] * t2
+                        back[i] = rotation_cam[0, i] * d0 + rotation_cam[1, i] * d1 + rotation_cam[2, i] * d2
+                        rows[r, 3 + i] = -back[i]
+                        rows[r, 18 + i] = back[i] * unit
+                    rows[r, 15] = rotated[1] * back[2] - rotated[2] * back[1]
+                    rows[r, 16] = rotated[2] * back[0] - rotated[0] * back[2]
+                    rows[r, 17] = rotated[0] * back[1] - rotated[1] * back[0]
+                    if bent:
+                        for i in range(3):
+                            rows_own[r, i] = (
+                                rotation[s, 0, i] * back[0] + rotation[s, 1, i] * back[1] + rotation[s, 2, i] * back[2]
+                            )
+                        rows_own[r, 3] = own_std[-1] * (
+                            rows_own[r, 0] * points[n, 0]
+                            + rows_own[r, 1] * points[n, 1]
+                            + rows_own[r, 2] * points[n, 2]
+                        )
+                        for i in range(3):
+                            rows_own[r, i] *= own_std[3 * n + i]
+                rows[0, 6], rows[1, 7] = xd * weight, yd * weight
+                rows[0, 8], rows[1, 9] = weight, weight
+                rows[0, 10], rows[1, 10] = fx_w * x * rr, fy_w * y * rr
+                rows[0, 11], rows[1, 11] = rows[0, 10] * rr, rows[1, 10] * rr
+                rows[0, 12], rows[1, 12] = fx_w * 2 * x * y, fy_w * (rr + 2 * y * y)
+                rows[0, 13], rows[1, 13] = fx_w * (rr + 2 * x * x), fy_w * 2 * x * y
+                rows[0, 14], rows[1, 14] = rows[0, 11] * rr, rows[1, 11] * rr
+                for i in range(15):
+                    rows[0, i] *= prior_std[c, i]
+                    rows[1, i] *= prior_std[c, i]
+                ru, rv = ru * weight, rv * weight
+                if bent:
+                    _add_object(rows, rows_own, ru, rv, c, s, n, coupling, border, own_gradient, cameras_first)
+                for i in range(21):
+                    gradient[i] += rows[0, i] * ru + rows[1, i] * rv
+                    for j in range(i + 1):
+                        products[i, j] += rows[0, i] * rows[0, j] + rows[1, i] * rows[1, j]
+            _distribute(products, gradient, c, s, camera, coupling, pose, camera_gradient, pose_gradient, cameras_first)
+    return cost
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _start_object(own_offset, coupling, border, own_gradient):
+    """Clear the object's part of the blocks, put its prior there, and return the prior's cost."""
+    size, wide = border.shape
+    first, cost = wide - size, 0.0
+    for p in range(coupling.shape[0]):
+        for i in range(coupling.shape[1]):
+            for j in range(first, wide):
+                coupling[p, i, j] = 0
+    for i in range(size):
+        for j in range(wide):
+            border[i, j] = 1.0 if j == first + i else 0.0
+        own_gradient[i] = own_offset[i]
+        cost += 0.5 * own_offset[i] ** 2
+    return cost
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _add_object(rows, rows_own, ru, rv, c, s, n, coupling, border, own_gradient, cameras_first):
+    """Add what one observation says of its fiducial's coordinates and of the object's scale."""
+    size, wide = border.shape
+    first, last = wide - size, size - 1
+    for k in range(4):
+        own = 3 * n + k if k < 3 else last
+        mine_u, mine_v = rows_own[0, k], rows_own[1, k]
+        own_gradient[own] += mine_u * ru + mine_v * rv
+        for i in range(15):
+            product = rows[0, i] * mine_u + rows[1, i] * mine_v
+            if cameras_first:
+                coupling[c, i, first + own] += product
+            else:
+                border[own, 15 * c + i] += product
+        for i in range(6):
+            product = rows[0, 15 + i] * mine_u + rows[1, 15 + i] * mine_v
+            if cameras_first:
+                border[own, 6 * s + i] += product
+            else:
+                coupling[s, i, first + own] += product
+        for j in range(k + 1):
+            other = 3 * n + j if j < 3 else last
+            border[own, first + other] += rows_own[0, j] * mine_u + rows_own[1, j] * mine_v
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _distribute(products, gradient, c, s, camera, coupling, pose, camera_gradient, pose_gradient, cameras_first):
+    """Add the lower triangle of one camera's products with one snapshot to the blocks."""
+    for i in range(15):
+        camera_gradient[c, i] += gradient[i]
+        for j in range(i + 1):
+            camera[c, i, j] += products[i, j]
+            camera[c, j, i] = camera[c, i, j]
+    for i in range(6):
+        pose_gradient[s, i] += gradient[15 + i]
+        for j in range(i + 1):
+            pose[s, i, j] += products[15 + i, 15 + j]
+            pose[s, j, i] = pose[s, i, j]
+        for j in range(15):
+            if cameras_first:
+                coupling[c, j, 6 * s + i] = products[15 + i, j]
+            else:
+                coupling[s, i, 15 * c + j] = products[15 + i, j]
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _loss(squared, loss, threshold):
+    """Robust loss and its slope, like robust.LOSSES."""
+    if loss == 1:
+        if squared <= threshold**2:
+            return squared, 1.0
+        distance = np.sqrt(squared)
+        return 2 * threshold * distance - threshold**2, threshold / distance
+    if loss == 2:
+        ratio = squared / threshold**2
+        return threshold**2 * np.log1p(ratio), 1 / (1 + ratio)
+    if loss == 3:
+        share = threshold**2 / (threshold**2 + squared)
+        return squared * share, share * share
+    return squared, 1.0
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def move(state, camera_step, pose_step, own_step, new):
+    """Write the state plus a step to `new`, like `linearization.moved`."""
+    offset, rotation, centre, own_offset = state
+    new_offset, new_rotation, new_centre, new_own_offset = new
+    for i in range(len(own_offset)):
+        new_own_offset[i] = own_offset[i] + own_step[i]
+    for c in range(len(offset)):
+        for i in range(15):
+            new_offset[c, i] = offset[c, i] + camera_step[c, i]
+    turned, left = np.empty((3, 3), dtype=offset.dtype), np.empty((3, 3), dtype=offset.dtype)
+    for s in range(len(centre)):
+        unit = max(1.0, np.sqrt(centre[s, 0] ** 2 + centre[s, 1] ** 2 + centre[s, 2] ** 2))
+        for i in range(3):
+            new_centre[s, i] = centre[s, i] + pose_step[s, 3 + i] * unit
+        kernels.exponential(pose_step[s], turned, left)
+        kernels.multiply(turned, rotation[s], new_rotation[s])
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def turn_all(parameters, rotation0, translation0, rotation, translation):
+    """Write cam_from_rig after steps of its rotation and position: with c = -R0' t0 + dc, t = -R c = E (t0 - R0 dc)."""
+    turned, left = np.empty((3, 3), dtype=parameters.dtype), np.empty((3, 3), dtype=parameters.dtype)
+    for b in range(parameters.shape[0]):
+        for c in range(parameters.shape[1]):
+            step = parameters[b, c]
+            kernels.exponential(step, turned, left)
+            kernels.multiply(turned, rotation0[b, c], rotation[b, c])
+            for i in range(3):
+                value = 0.0
+                for j in range(3):
+                    value += turned[i, j] * translation0[b, c, j] - rotation[b, c, i, j] * step[3 + j]
+                translation[b, c, i] = value
