@@ -53,6 +53,7 @@ TESTED_ELSEWHERE = {
     "imgcal/cli/interruption.py": "cli/test_main, in processes of their own",
     "imgcal/cli/training_folder.py": "training/test_engine, cli/test_train",
     "imgcal/cli/warmup.py": "online/test_warmup",
+    "imgcal/estimation/map_operator.py": "test_operators, nn/test_map_estimate",
     "imgcal/evaluation/plots.py": "evaluation/test_tables",
     "imgcal/evaluation/summary.py": "evaluation/test_tables",
     "imgcal/pipeline/arrangement.py": "pipeline/test_calibration, test_steadiness",
