@@ -6,6 +6,8 @@ tested against them. Names, units and layouts are theirs. Rigs of a batch run in
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numba
@@ -61,14 +63,23 @@ def minimize(
         )
         state, blocks = State(*(part[best : best + 1] for part in _parts(state))), blocks.only(best)
     else:
-        # Both use OpenMP: the compiled loop obeys torch's number of threads, and must not leave its own behind.
-        threads = torch.get_num_threads()
-        numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
-        _minimize_all(*shared, *given, *arrays, converged, iterations, *limits, tolerances)  # type: ignore[call-arg]
-        torch.set_num_threads(threads)
+        with _threads_of_torch():
+            _minimize_all(*shared, *given, *arrays, converged, iterations, *limits, tolerances)  # type: ignore[call-arg]
     if not own_std.shape[1]:
         state = replace(state, object_offset=None)
     return Solution(state, blocks.equations(), torch.from_numpy(converged), int(iterations.max()))
+
+
+@contextmanager
+def _threads_of_torch() -> Iterator[None]:
+    """Let compiled loops use as many threads as torch. Both use OpenMP, and have afterwards what they had before."""
+    threads, compiled = torch.get_num_threads(), numba.get_num_threads()
+    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
+    try:
+        yield
+    finally:
+        numba.set_num_threads(compiled)
+        torch.set_num_threads(threads)  # the last word: numba's setting is OpenMP's, too
 
 
 def linearize(problem: Problem, state: State, loss: str, threshold: float) -> NormalEquations:

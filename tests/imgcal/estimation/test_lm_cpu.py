@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import partial
 
+import numba
 import pytest
 import torch
 
@@ -158,8 +159,10 @@ def test_zero_iterations_evaluate_the_start(simulate) -> None:
 def test_number_of_threads_is_left_alone(simulate) -> None:
     case = simulate(4, cameras=3, fiducials=5)
     problem = case.problem()
+    compiled = numba.get_num_threads()
     lm_cpu.minimize(problem, case.start(problem), "squared", 3.0, 20, 1e-4)
     assert torch.get_num_threads() == 1  # as set for these tests
+    assert numba.get_num_threads() == compiled  # as many as there are cores, but for these tests
 
 
 @pytest.mark.parametrize("batch", [(), (3,)])
