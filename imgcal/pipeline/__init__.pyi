@@ -1,5 +1,6 @@
-from .calibration import Calibration, RigScore, calibrate, fit_labelled, rms_length, score
+from .calibration import Calibration, calibrate, fit_labelled
 from .initialization import load_initializer
+from .scoring import RigScore, rms_length, score
 from .sources import checked_detections, checked_frames
 from .tally import DOUBTFUL, Tally
 

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association.options import PipelineOptions
 from imgcal.errors import RefusedError
 from imgcal.estimation import relative_covariance
-from imgcal.pipeline.calibration import calibrate, score
+from imgcal.pipeline.calibration import calibrate
 from imgcal.synthesis.captures import simulate_truth, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
 
@@ -73,9 +72,3 @@ def test_a_refusal_names_what_python_offers(o10, asymmetric8):
     with pytest.raises(RefusedError, match=r"PipelineOptions\(blind_cameras=True\)") as refusal:
         calibrate(table.select(table.camera != 3), o10, asymmetric8)
     assert "--" not in str(refusal.value) and "--blind-cameras" in refusal.value.for_command
-
-
-def test_a_score_needs_no_prior(o10, asymmetric8):
-    truth, table = capture(o10, asymmetric8, noise=0.0)
-    assert score(table, truth, asymmetric8).distances.max() < 1e-6
-    assert score(table, o10, asymmetric8, PipelineOptions()).distances.mean() > 1

@@ -11,7 +11,7 @@ from imgcal.errors import InputError
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.io import load_object, load_rig
-from imgcal.pipeline.calibration import calibrate, rms_length
+from imgcal.pipeline import calibrate, rms_length
 from imgcal.pipeline.initialization import KINDS, Initializer, load_initializer
 from imgcal.synthesis.captures import simulate_truth, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift, PoseRange, RelativeDrift, synthesize

@@ -9,7 +9,7 @@ import torch
 from imgcal.errors import InputError
 from imgcal.io import load_object, load_rig
 from imgcal.online.recalibrator import Recalibrator
-from imgcal.pipeline.calibration import calibrate, score
+from imgcal.pipeline import calibrate, score
 from imgcal.synthesis.captures import FrameModel, simulate_frames, simulate_truth, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
 

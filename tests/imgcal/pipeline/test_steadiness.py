@@ -7,7 +7,7 @@ import torch
 from imgcal.association.options import PipelineOptions
 from imgcal.association.series import associate
 from imgcal.errors import RefusedError
-from imgcal.pipeline.calibration import calibrate, score
+from imgcal.pipeline import calibrate, score
 from imgcal.pipeline.steadiness import moves_of
 from imgcal.synthesis.captures import Truth
 from imgcal.types.moved_camera import MovedError

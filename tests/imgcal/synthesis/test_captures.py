@@ -5,7 +5,7 @@ import torch
 
 from imgcal.detection import DetectionOptions, detect
 from imgcal.io import load_object, load_rig
-from imgcal.pipeline.calibration import score
+from imgcal.pipeline import score
 from imgcal.synthesis.captures import FrameModel, simulate_frames, simulate_truth, simulate_volume, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift, RelativeDrift
 from renderers import SensorModel

@@ -1,0 +1,20 @@
+import pytest
+import torch
+
+from imgcal.association.options import PipelineOptions
+from imgcal.pipeline.scoring import rms_length, score
+from imgcal.synthesis.captures import simulate_truth, true_detections
+from imgcal.synthesis.rigs import PhysicalDrift
+
+
+def test_a_score_needs_no_prior(o10, asymmetric8):
+    truth = simulate_truth(o10, asymmetric8, 6, torch.Generator().manual_seed(0), PhysicalDrift())
+    table = true_detections(truth)
+    assert score(table, truth.rig, asymmetric8).distances.max() < 1e-6
+    assert score(table, o10, asymmetric8, PipelineOptions()).distances.mean() > 1
+
+
+def test_the_rms_is_of_lengths_and_of_what_was_seen():
+    residual = torch.tensor([[3.0, 4.0], [0.0, 1.0], [100.0, 100.0]])
+    assert rms_length(residual, torch.tensor([True, True, False])) == pytest.approx((26 / 2) ** 0.5)
+    assert rms_length(residual, torch.zeros(3, dtype=torch.bool)) is None
