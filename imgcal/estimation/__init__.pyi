@@ -14,7 +14,7 @@ from .covariance import (
     whitened_covariance,
 )
 from .gauge import aligned
-from .implicit import map_cost
+from .implicit import attach_gradient, map_cost
 from .levenberg_marquardt import Solution
 from .linearization import (
     POSE_PARAMETERS,
@@ -30,6 +30,7 @@ from .linearization import (
 from .map_estimate import (
     Estimate,
     EstimationOptions,
+    equations_at,
     estimate,
     initial_state,
     make_estimate,
@@ -72,10 +73,12 @@ __all__ = [
     "UndeterminedPosesError",
     "WorkingVolume",
     "aligned",
+    "attach_gradient",
     "block_scatter",
     "camera_covariance",
     "camera_std",
     "encoded",
+    "equations_at",
     "estimate",
     "estimate_variance_components",
     "find_moves",

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from imgcal.geometry import resized_pixels
 from imgcal.networks.backbone import Backbone
 from imgcal.networks.config import Images, PaperImages
 from imgcal.networks.network import Network
@@ -82,7 +83,8 @@ class ImageNetwork(Network):
             heatmap_logits = self.belief(features.float())
             in_image, confidence = find_soft_positions(flat.float(), self.decoder.colours, self.dot, heatmap_logits)
             in_image = in_image.unflatten(0, images.shape[:2])
-            uv = ImageOptions(images.shape[-1], self.dot).to_sensor(in_image, self.decoder.image_size)
+            scale = self.decoder.image_size.to(in_image) / images.shape[-1]
+            uv = resized_pixels(in_image, scale[:, None])
         return self.trunk(uv, confidence.unflatten(0, images.shape[:2]), bottleneck)
 
     def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:

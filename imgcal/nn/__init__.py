@@ -8,6 +8,7 @@ imgcal pytrees.
 from imgcal.nn import pytrees  # noqa: F401  registers the value types
 from imgcal.nn.map_estimate import MapEstimate, MapSolution
 from imgcal.nn.project_rig import ProjectRig
+from imgcal.nn.render_and_compare import RefinedImages, RenderAndCompare
 from imgcal.nn.reprojection_loss import ReprojectionLoss, project_fiducials, reprojection_re
 from imgcal.nn.soft_positions import SoftPositions
 from imgcal.nn.splat_renderer import SplatRenderer
@@ -16,6 +17,8 @@ __all__ = [
     "MapEstimate",
     "MapSolution",
     "ProjectRig",
+    "RefinedImages",
+    "RenderAndCompare",
     "ReprojectionLoss",
     "SoftPositions",
     "SplatRenderer",

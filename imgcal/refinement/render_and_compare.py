@@ -83,12 +83,18 @@ def refine_images(
         InputError: images of another shape than the options and the rig say.
     """
     _check(images, factory, options)
-    problem = _ImageProblem(factory.to(torch.float64), obj, prior_std.double(), options)
+    problem = ImageProblem(factory.to(torch.float64), obj, prior_std.double(), options)
+    return problem.on_sensor(*search(problem, prediction, images))
+
+
+@torch.no_grad()
+def search(problem: ImageProblem, prediction: Prediction, images: Tensor) -> tuple[Estimate, Dots]:
+    """Do the work of `refine_images`; the estimate is for images."""
     guess = prediction.detach().to(torch.float64)
     guess = Prediction(guess.rig.resized(problem.size), guess.rig_from_object)
     dots = problem.look(images, guess)
     result = problem.solve(dots, guess)
-    for attempt in options.attempts:
+    for attempt in problem.options.attempts:
         again = (~result.converged).nonzero().squeeze(-1)
         if len(again) == 0:
             break
@@ -105,11 +111,11 @@ def refine_images(
             new = problem.look(images[again], found[again], dots.select(again) if attempt == "near" else None)
         dots = dots.updated(again, new)
         result = problem.solve(dots, found)
-    return problem.on_sensor(result, dots)
+    return result, dots
 
 
 @dataclass(frozen=True)
-class _Dots:
+class Dots:
     """What images show, in pixels of the image."""
 
     uv: Tensor  # (B, C, N, 2)
@@ -118,16 +124,16 @@ class _Dots:
     light: Tensor  # (B, C) of all channels, in dots of a channel of 1
     colour: Tensor  # (B, C, N) the fiducial whose colour the dot has: another one's where labels are exchanged
 
-    def select(self, rows: Tensor) -> _Dots:
+    def select(self, rows: Tensor) -> Dots:
         """Keep some rigs."""
-        return _Dots(**{name: value[rows] for name, value in vars(self).items()})
+        return Dots(**{name: value[rows] for name, value in vars(self).items()})
 
-    def updated(self, rows: Tensor, new: _Dots) -> _Dots:
+    def updated(self, rows: Tensor, new: Dots) -> Dots:
         """Replace some rigs."""
-        return _Dots(**{name: value.index_copy(0, rows, getattr(new, name)) for name, value in vars(self).items()})
+        return Dots(**{name: value.index_copy(0, rows, getattr(new, name)) for name, value in vars(self).items()})
 
 
-class _ImageProblem:
+class ImageProblem:
     """The factory rig as it would be if the images were what its sensors deliver.
 
     There, one standard deviation holds for both axes of a dot; on a sensor that is not square it does not. Whitened
@@ -149,7 +155,7 @@ class _ImageProblem:
         self.points = obj.points.to(prior_std)
         self.colours = obj.colours.to(prior_std.device, torch.float32)
 
-    def look(self, images: Tensor, guess: Prediction, known: _Dots | None = None) -> _Dots:
+    def look(self, images: Tensor, guess: Prediction, known: Dots | None = None) -> Dots:
         """Find the dots of images (B, C, 3, H, W) near where a prediction puts them, or near where they are known."""
         options, flat, batch = self.options, images.flatten(0, 1), images.shape[:2]
         uv = self._places(guess)
@@ -161,18 +167,18 @@ class _ImageProblem:
         far, amplitude, light = (part.unflatten(0, batch) for part in self._far(flat, uv.flatten(0, 1), blurs))
         uv = far if known is None else uv  # of what is known, only whether it is there is asked again
         own = torch.arange(self.obj.num_fiducials, device=uv.device).expand(uv.shape[:-1])
-        return self._measure(images, uv, amplitude > PRESENT, own, light, steps)
+        return self.measure(images, uv, amplitude > PRESENT, own, light, steps)
 
-    def near(self, guess: Prediction, dots: _Dots) -> Tensor:
+    def near(self, guess: Prediction, dots: Dots) -> Tensor:
         """Tell which guesses most dots are near to: (B,) bool."""
         offset = torch.where(dots.believed, (self._places(guess) - dots.uv).norm(dim=-1), torch.nan)
         return offset.flatten(1).nanmedian(-1).values < self.options.near
 
-    def explained(self, result: Estimate, dots: _Dots) -> Tensor:
+    def explained(self, result: Estimate, dots: Dots) -> Tensor:
         """Count the dots that rigs explain, (B,): none where they contradict each other."""
         return dots.believed.sum((1, 2)) * (result.chi2_per_dof < self.options.most_chi2)
 
-    def relabel(self, images: Tensor, guess: Prediction, dots: _Dots) -> _Dots:
+    def relabel(self, images: Tensor, guess: Prediction, dots: Dots) -> Dots:
         """Find dots again that were drawn in each other's colours, by the rig that most dots agree on.
 
         Args:
@@ -186,9 +192,9 @@ class _ImageProblem:
         colour = colours_at(images.flatten(0, 1), uv.flatten(0, 1), self.options.image.dot)
         fits = dots.believed & (offset < self.options.gate * dots.sigma)
         taken = swapped_labels(colour.unflatten(0, uv.shape[:2]), self.colours, fits)
-        return self._measure(images, uv, taken >= 0, taken.clamp_min(0), dots.light, 2 * self.options.steps)
+        return self.measure(images, uv, taken >= 0, taken.clamp_min(0), dots.light, 2 * self.options.steps)
 
-    def _agreed(self, guess: Prediction, dots: _Dots) -> Prediction:
+    def _agreed(self, guess: Prediction, dots: Dots) -> Prediction:
         """Estimate rigs in spite of dots that are not what they seem."""
         typical = float(dots.sigma[dots.believed].median()) if bool(dots.believed.any()) else 1.0
         factor = torch.where(dots.believed, dots.sigma / typical, 1.0)
@@ -203,7 +209,7 @@ class _ImageProblem:
         uv = guess.rig.project(guess.rig_from_object.apply(self.points), radius).uv
         return uv.nan_to_num(size / 2).clamp(-FARTHEST * size, FARTHEST * size)
 
-    def _measure(self, images: Tensor, uv: Tensor, present: Tensor, colour: Tensor, light: Tensor, steps: int) -> _Dots:
+    def measure(self, images: Tensor, uv: Tensor, present: Tensor, colour: Tensor, light: Tensor, steps: int) -> Dots:
         """Fit dots of given colours near given places, and say which to believe.
 
         Args:
@@ -211,7 +217,7 @@ class _ImageProblem:
             uv: (B, C, N, 2) where they are expected.
             present: (B, C, N) bool: which are there.
             colour: (B, C, N) the fiducial whose colour they have; those of the present ones differ.
-            light: (B, C), see `_Dots`.
+            light: (B, C), see `Dots`.
             steps: near steps.
         """
         options, size = self.options, self.options.image.size
@@ -231,7 +237,7 @@ class _ImageProblem:
         sigma = (variance * noise + (options.position_noise * self.unit) ** 2).sqrt()
         inside = ((uv > -0.5) & (uv < size - 0.5)).all(-1)
         explained = mean_square < (options.most_residual / LEVELS) ** 2
-        return _Dots(uv, sigma, present & inside & explained & sigma.isfinite(), light, colour)
+        return Dots(uv, sigma, present & inside & explained & sigma.isfinite(), light, colour)
 
     def _far(self, flat: Tensor, uv: Tensor, blurs: tuple[float, ...]) -> tuple[Tensor, Tensor, Tensor]:
         """Take blurred steps: places (M, N, 2), amplitudes (M, N) and the light of each image (M,)."""
@@ -255,7 +261,7 @@ class _ImageProblem:
         fits = [DotWindows(some, at, self.colours, dot).fit(at, there, steps) for some, at, there in parts]
         return fits[0] if len(fits) == 1 else NearFit(*(torch.cat(column) for column in zip(*fits, strict=True)))
 
-    def solve(self, dots: _Dots, guess: Prediction) -> Estimate:
+    def solve(self, dots: Dots, guess: Prediction) -> Estimate:
         """Find the rig (for images) that explains the dots; `converged` where images and prior confirm it."""
         result = estimate(
             Observations(dots.uv.unsqueeze(1), dots.sigma.unsqueeze(1), dots.believed.unsqueeze(1)),
@@ -273,7 +279,7 @@ class _ImageProblem:
         explained = (stray < PRESENT * brightness.min()).all(-1) & (result.chi2_per_dof < self.options.most_chi2)
         return replace(result, converged=result.converged & explained)
 
-    def on_sensor(self, result: Estimate, dots: _Dots) -> tuple[Estimate, Observations]:
+    def on_sensor(self, result: Estimate, dots: Dots) -> tuple[Estimate, Observations]:
         """Take an estimate for images, and what it is from, to the sensors' pixels."""
         observations = Observations(
             self.options.image.to_sensor(dots.uv, self.factory.image_size).unsqueeze(1),

@@ -1,0 +1,95 @@
+"""`RenderAndCompare`: the rig whose images are the given ones, as a layer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from torch import Tensor, nn
+
+from imgcal.geometry import RigidTransform
+from imgcal.nn.held import HeldObject, HeldRig
+from imgcal.nn.pytrees import register
+from imgcal.refinement import ImageRefinementOptions, encoded_image_options, refine_images_anywhere
+from imgcal.types import CalibrationObject, CameraRig, Prediction, RigPrior
+
+
+@dataclass(frozen=True)
+class RefinedImages:
+    """What images say about a rig."""
+
+    rig: CameraRig  # (*B)
+    rig_from_object: RigidTransform  # (*B)
+    converged: Tensor  # (*B) bool: the images are explained; must be looked at
+
+
+register(RefinedImages)
+
+
+class RenderAndCompare(nn.Module):
+    """Refine a prediction on the colour-coded images that it was made from: photometric Gauss-Newton, then MAP.
+
+    The gradient is that of the solution, by the implicit function theorem, to the images (by their Gauss-Newton
+    curvature: exact where they are explained) and to the factory rig and its spread; none flows through the first
+    guess, which only says where to begin. One opaque operator in a compiled or exported graph; computed in float64,
+    images in float32.
+
+    Args:
+        factory: the factory rig, without batch axes; its prior says how far cameras may have drifted.
+        obj: N fiducials (mm) in their colours, taken as exact.
+        prior_std: (C, 15) standard deviation of each factory value; None = the rig's own prior.
+        options: how to compare; `options.image` says how large images and dots are.
+
+    Shape:
+        - prediction: (*B) rigs and poses.
+        - images: (*B, C, 3, size, size) in [0, 1].
+        - Output: `RefinedImages`, in the dtype of the prediction.
+
+    Source: docs/method.md; analysis by synthesis.
+
+    Example:
+        >>> import imgcal, torch
+        >>> from imgcal.nn import ProjectRig, SplatRenderer
+        >>> rig, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+        >>> pose = imgcal.RigidTransform.identity(1, dtype=rig.focal_length.dtype)
+        >>> pose.translation[0, 2] = rig.working_distance
+        >>> seen = ProjectRig(obj)(rig.resized(torch.tensor([224, 224])), pose)
+        >>> images = SplatRenderer(obj.colours, (224, 224))(seen).clamp(0, 1)
+        >>> refined = RenderAndCompare(rig, obj)(Prediction(rig.expand(1), pose), images)
+        >>> bool(refined.converged)
+        True
+    """
+
+    prior_std: Tensor
+
+    def __init__(
+        self,
+        factory: CameraRig,
+        obj: CalibrationObject,
+        prior_std: Tensor | None = None,
+        options: ImageRefinementOptions = ImageRefinementOptions(),
+    ) -> None:
+        super().__init__()
+        self.factory, self.obj = HeldRig(factory), HeldObject(obj)
+        prior_std = (factory.prior or RigPrior()).std(factory) if prior_std is None else prior_std
+        self.register_buffer("prior_std", prior_std.clone(), persistent=False)
+        self._encoded = encoded_image_options(options)
+
+    def forward(self, prediction: Prediction, images: Tensor, factory: CameraRig | None = None) -> RefinedImages:
+        """Refine; another factory rig in the place of that which the module holds."""
+        batch, dtype = images.shape[:-4], prediction.rig.focal_length.dtype
+        count = batch.numel()
+        factory = self.factory() if factory is None else factory
+        guess = Prediction(prediction.rig.expand(*batch).reshape(count), prediction.rig_from_object.reshape(count))
+        prior_std = self.prior_std.expand(count, *self.prior_std.shape[-2:])
+        flat = images.reshape(count, *images.shape[-4:])
+        rig, pose, converged = refine_images_anywhere(
+            guess, flat, factory.expand(count), self.obj(), prior_std, self._encoded
+        )
+        found = replace(
+            factory,
+            focal_length=rig.focal_length,
+            principal_point=rig.principal_point,
+            distortion=rig.distortion,
+            cam_from_rig=rig.cam_from_rig,
+        )
+        return RefinedImages(found.reshape(*batch).to(dtype), pose.reshape(*batch).to(dtype), converged.reshape(batch))
