@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils._pytree import tree_leaves
 
 import imgcal.nn  # noqa: F401  value types as pytrees
@@ -16,14 +17,11 @@ from renderers import splat
 TRUNK = {"width": 16, "heads": 2, "depth": 1, "later_depth": 1, "passes": 2}
 POINTS = {
     "points": {"trunk": TRUNK | {"trust": True}},
-    "points-cnn1d": {"trunk": TRUNK},
     "paper-points": {"width": 16, "depth": 1, "head_widths": [16]},
 }
 SMALL = {"patch_size": 56, "embed_dim": 12, "depth": 1, "num_heads": 2}
 IMAGES = {
     "vit": {"trunk": TRUNK, "options": SMALL, "bottleneck": 8},
-    "vit-pooled": {"trunk": TRUNK, "options": SMALL, "bottleneck": 8},
-    "paper-vit": {"backbone": "vit_tiny_patch16_224", "options": SMALL, "bottleneck": 8, "head_widths": [8]},
     "cnn": {"trunk": TRUNK, "options": {"depths": [1, 1, 1, 1], "dims": [4, 4, 8, 8]}, "bottleneck": 8},
 }
 
@@ -81,7 +79,8 @@ def test_gradients_of_each_sample(asymmetric8: CalibrationObject) -> None:
         predictions = torch.func.functional_call(network, weights, (Views(uv=uv[None], seen=seen[None]),))
         return predictions[-1].rig.focal_length.sum()
 
-    each = torch.func.vmap(torch.func.grad(loss), (None, 0, 0))(weights, views.uv, views.seen)
+    with sdpa_kernel(SDPBackend.MATH):  # the others are not mapped yet: PyTorch would warn, and loop
+        each = torch.func.vmap(torch.func.grad(loss), (None, 0, 0))(weights, views.uv, views.seen)
     assert views.uv is not None
     assert views.seen is not None
     total = torch.func.grad(lambda w: sum(loss(w, views.uv[i], views.seen[i]) for i in range(3)))(weights)
