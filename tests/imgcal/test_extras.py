@@ -56,7 +56,7 @@ def test_the_core_calibrates_all_but_the_report(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "needs"),
     [
-        (["train", "table1-row01", "--out", "{out}"], 'train needs accelerate: pip install "imgcal[train]"'),
+        (["train", "table1-row01", "--out", "{out}"], 'train needs tensorboard: pip install "imgcal[train]"'),
         ([*CALIBRATE, "{out}", "--first-guess", "vit"], 'calibrate needs timm: pip install "imgcal[train]"'),
         (
             ["compare", "data/models/vit-O10-cube8.safetensors", "data/models/cnn-O10-cube8.safetensors"],

@@ -45,8 +45,8 @@ def read(path: Path, text: str) -> Rig:
 
 def test_what_is_there_is_read(tmp_path: Path) -> None:
     rig = read(tmp_path / "rig.yaml", GOOD)
-    assert [camera.name for camera in rig.num_cameras] == ["left", "right"]
-    assert rig.num_cameras[1].lens.focal == [3.0] and [camera.weight for camera in rig.num_cameras] == [1, 4]
+    assert [camera.name for camera in rig.cameras] == ["left", "right"]
+    assert rig.cameras[1].lens.focal == [3.0] and [camera.weight for camera in rig.cameras] == [1, 4]
 
 
 @pytest.mark.parametrize(
