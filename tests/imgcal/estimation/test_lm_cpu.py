@@ -7,9 +7,9 @@ import numba
 import pytest
 import torch
 
-from imgcal.estimation import levenberg_marquardt, linearize, lm_cpu, rig_at
+from imgcal.estimation import levenberg_marquardt, lm_cpu
 from imgcal.estimation.levenberg_marquardt import NormalEquations, Solution
-from imgcal.estimation.robust_losses import LOSSES, NamedLoss
+from imgcal.estimation.robust_losses import LOSSES
 
 CASES = [
     ((), 1, 10, 8, None),
@@ -89,29 +89,6 @@ def test_same_minimum_with_an_object_that_is_not_exact(
         )
 
 
-@pytest.mark.parametrize("tolerance", [0.0, 0.4])
-@pytest.mark.parametrize(("batch", "snapshots", "cameras", "fiducials", "radius"), CASES)
-def test_linearization_is_that_of_tensors(
-    simulate, batch: tuple[int, ...], snapshots: int, cameras: int, fiducials: int, radius: float | None, tolerance
-) -> None:
-    size = {"snapshots": snapshots, "cameras": cameras, "fiducials": fiducials, "radius": radius}
-    case = simulate(*batch, **size, missing=0.05, tolerance=tolerance, bent=tolerance)
-    problem = case.problem()
-    state, seen = case.start(problem), problem.root_weight > 0
-    state = replace(state, offset=state.offset + 0.3)
-    if state.object_offset is not None:
-        state = replace(state, object_offset=state.object_offset - 0.2)
-    compiled = seen_only(lm_cpu.linearize(problem, state, "huber", 3.0), seen)
-    tensors = seen_only(linearize(problem, state, NamedLoss("huber", 3.0)), seen)
-    for name in ("cost", "camera", "coupling", "pose", "camera_gradient", "pose_gradient", "residual"):
-        a, b = getattr(compiled, name), getattr(tensors, name)
-        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-12 * float(b.abs().max()), msg=name)
-    assert (compiled.object is None) == (tolerance == 0)
-    for name in ("camera", "pose", "own", "gradient") if tolerance else ():
-        a, b = getattr(compiled.object, name), getattr(tensors.object, name)
-        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-12 * float(b.abs().max()), msg=name)
-
-
 def test_single_precision_stays_close(simulate) -> None:
     case = simulate(16, snapshots=2, cameras=10, fiducials=8)
     problem = case.problem()
@@ -163,17 +140,3 @@ def test_number_of_threads_is_left_alone(simulate) -> None:
     lm_cpu.minimize(problem, case.start(problem), "squared", 3.0, 20, 1e-4)
     assert torch.get_num_threads() == 1  # as set for these tests
     assert numba.get_num_threads() == compiled  # as many as there are cores, but for these tests
-
-
-@pytest.mark.parametrize("batch", [(), (3,)])
-def test_rig_at_equals_the_one_in_tensors(simulate, batch: tuple[int, ...]) -> None:
-    case = simulate(*batch, cameras=3, fiducials=5)
-    problem = case.problem()
-    offset = torch.randn(problem.prior_std.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    offset[0, 1, :3] = 0
-    compiled, tensors = lm_cpu.rig_at(problem, offset), rig_at(problem, offset)
-    torch.testing.assert_close(compiled.cam_from_rig.rotation, tensors.cam_from_rig.rotation, rtol=0, atol=1e-14)
-    torch.testing.assert_close(compiled.cam_from_rig.translation, tensors.cam_from_rig.translation, rtol=0, atol=1e-11)
-    assert torch.equal(compiled.focal_length, tensors.focal_length)
-    assert torch.equal(compiled.principal_point, tensors.principal_point)
-    assert torch.equal(compiled.distortion, tensors.distortion)
