@@ -1,0 +1,121 @@
+"""How long does the first `imgcal calibrate` on a machine compile? The sample capture, from an empty cache.
+
+Run as `python -m scripts.benchmarks.compilation`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from imgcal.cli import compiling
+from imgcal.cli.main import main as imgcal
+from scripts.output import ROOT, command, markdown, read_json, surroundings, write_json
+
+SAMPLE = ROOT / "data" / "samples" / "O10"
+RESULT = ROOT / "docs" / "benchmarks" / "compilation.json"
+WAYS = {"alone": False, "helped": True}
+
+
+def calibrate(helped: bool) -> dict[str, Any]:
+    """Calibrate the sample in this process, with its NUMBA_CACHE_DIR.
+
+    Returns:
+        Functions compiled here, CPU seconds of that in all and by module, those of all, of the helper, and seconds.
+    """
+    from numba.core import event
+
+    if not helped:
+        compiling.is_of_use = lambda: False
+    times: list[list[float]] = []
+    count = 0
+    by_module: dict[str, float] = {}
+
+    class Clock(event.Listener):
+        """CPU time of each compilation, without those that it waits for."""
+
+        def on_start(self, happening: event.Event) -> None:
+            nonlocal count
+            count += 1
+            times.append([time.thread_time(), 0.0])
+
+        def on_end(self, happening: event.Event) -> None:
+            started, inner = times.pop()
+            taken = time.thread_time() - started
+            if times:
+                times[-1][1] += taken
+            name = happening.data["dispatcher"].py_func.__module__
+            by_module[name] = by_module.get(name, 0.0) + taken - inner
+
+    event.register("numba:compile", Clock())
+    started, before = time.perf_counter(), os.times()
+    with tempfile.TemporaryDirectory() as folder:
+        files = ("--rig", str(SAMPLE / "rig.yaml"), "--object", str(SAMPLE / "object.csv"), "--out", f"{folder}/out")
+        if imgcal(["calibrate", str(SAMPLE), *files, "--first-guess", "vit"]):
+            raise SystemExit("the sample was not calibrated")
+    after = os.times()
+    return {
+        "functions": count,
+        "compiling_cpu_s": sum(by_module.values()),
+        "cpu_s": after.user + after.system - before.user - before.system,
+        "helper_cpu_s": after.children_user + after.children_system - before.children_user - before.children_system,
+        "seconds": time.perf_counter() - started,
+        "by_module": dict(sorted(by_module.items(), key=lambda item: -item[1])),
+    }
+
+
+def measure() -> dict[str, Any]:
+    """Calibrate alone and helped, each from an empty cache, and once more from the full one; processes of their own."""
+    rows = {}
+    for name, helped in WAYS.items():
+        with tempfile.TemporaryDirectory() as cache:
+            for again in ("", ", again"):
+                rows[name + again] = _in_a_process(helped, cache)
+    return {"cores": len(os.sched_getaffinity(0)), "rows": rows}
+
+
+def _in_a_process(helped: bool, cache: str) -> dict[str, Any]:
+    code = (
+        f"import json; from scripts.benchmarks import compilation; print(json.dumps(compilation.calibrate({helped})))"
+    )
+    environment = os.environ | {"NUMBA_CACHE_DIR": cache, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, stdout=subprocess.PIPE, check=True)
+    result: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return result
+
+
+def table(result: Mapping[str, Any]) -> str:
+    """Markdown."""
+    head = ["", "functions compiled", "compiling, CPU s", "command, CPU s", "helper, CPU s", "command, s"]
+    keys = ("compiling_cpu_s", "cpu_s", "helper_cpu_s", "seconds")
+    rows = [[name, str(row["functions"]), *(f"{row[key]:.1f}" for key in keys)] for name, row in result["rows"].items()]
+    return markdown(head, rows)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Measure the first calibration: a minute on an idle machine."""
+
+    out: Path = RESULT  #: file of the result
+
+
+def main() -> None:
+    """Measure, write, print."""
+    options = tyro.cli(Options, description=__doc__)
+    before = surroundings()
+    write_json(options.out, before | measure())
+    print(table(read_json(options.out)))
+
+
+if __name__ == "__main__":
+    command(main)
