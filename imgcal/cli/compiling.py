@@ -62,8 +62,18 @@ def is_of_use() -> bool:
     """Tell whether a second process can compile beside this one, and leave it where this one finds it."""
     from renderers.compiling import cache_folder, is_shared
 
-    several = len(os.sched_getaffinity(0)) > 1 if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1) > 1
-    return bool(several and sys.executable and is_shared() and not any(Path(cache_folder()).rglob(NEEDED_LAST)))
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return bool(
+        cores - _load() > 1 and sys.executable and is_shared() and not any(Path(cache_folder()).rglob(NEEDED_LAST))
+    )
+
+
+def _load() -> float:
+    """Processes that wanted a core within the last minute: one that is busy gains nothing from another process."""
+    try:
+        return os.getloadavg()[0]
+    except (AttributeError, OSError):  # not known on this system
+        return 0.0
 
 
 def start_helper() -> subprocess.Popen[bytes]:

@@ -29,6 +29,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(renderers.compiling, "cache_folder", lambda: str(tmp_path))
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
+    monkeypatch.setattr(os, "getloadavg", lambda: (0.5, 0.5, 0.5), raising=False)
     return tmp_path
 
 
@@ -55,6 +56,9 @@ def test_no_help_where_it_is_of_no_use(cache, monkeypatch):
     assert compiling.is_of_use() == (renderers.compiling.fcntl is not None)
     with monkeypatch.context() as one:
         one.setattr(os, "sched_getaffinity", lambda _: {0}, raising=False)
+        assert not compiling.is_of_use()
+    with monkeypatch.context() as busy:
+        busy.setattr(os, "getloadavg", lambda: (1.5, 0.5, 0.5), raising=False)
         assert not compiling.is_of_use()
     with monkeypatch.context() as elsewhere:  # a folder of this process alone
         elsewhere.setattr(renderers.compiling, "cache_folder", lambda: "/tmp/imgcal-compiled-x")
