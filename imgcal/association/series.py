@@ -96,8 +96,11 @@ def associate(
     rows = _rows_by_snapshot(detections, count)
 
     def decide(s: int) -> None:
-        labels = detections.fiducial[rows[s]] if coded[s] else None
-        results[s] = tracker.decide(detections.select(rows[s]), detections.snapshot_names[s], labels)
+        name = detections.snapshot_names[s]
+        if coded[s]:
+            results[s] = tracker.accept(name, detections.fiducial[rows[s]])
+        else:
+            results[s] = tracker.decide(detections.select(rows[s]), name)
 
     order: Iterable[int] = range(count)
     patience = Patience(count)
@@ -196,25 +199,30 @@ class Tracker:
         self.in_vain = 0  # hypotheses that were tried since something was accepted
         self.accepted: list[tuple[Detections, NDArray[np.int64], RigidTransform]] = []
 
-    def decide(
-        self, blobs: Detections, name: str, labels: NDArray[np.int64] | None
-    ) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
-        """Label the blobs of one snapshot; `labels` are given when they are coded."""
-        identity, status = None, "coded"
-        if labels is None:
-            identity = self._identify(blobs)
-            labels, status = identity.labels, identity.status
-        shown = len(np.unique(labels[labels >= 0]))
-        if identity is not None and not identity.accepted:
+    def accept(self, name: str, labels: NDArray[np.int64]) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
+        """Take over the labels that came with a snapshot."""
+        few = self._too_few(name, labels)
+        return few or SnapshotIdentity(name, "coded", "labelled in the input", 1, None), labels
+
+    def decide(self, blobs: Detections, name: str) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
+        """Label the blobs of one snapshot."""
+        identity = self._identify(blobs)
+        labels, pose = identity.labels, identity.rig_from_object
+        if not identity.accepted:
             return SnapshotIdentity(name, "refused", identity.reason, identity.alternatives, None), labels
-        if shown < self.options.least_fiducials:
-            reason = f"too few fiducials: found {shown}, expected at least {self.options.least_fiducials}"
-            return SnapshotIdentity(name, "refused", reason, 1, None), labels
-        if identity is None:
-            return SnapshotIdentity(name, status, "labelled in the input", 1, None), labels
-        assert identity.rig_from_object is not None  # an accepted identity has a pose
-        self._remember(blobs, labels, identity.rig_from_object)
-        return SnapshotIdentity(name, status, identity.reason, identity.alternatives, identity.rig_from_object), labels
+        if (few := self._too_few(name, labels)) is not None:
+            return few, labels
+        assert pose is not None  # an accepted identity has one
+        self._remember(blobs, labels, pose)
+        return SnapshotIdentity(name, identity.status, identity.reason, identity.alternatives, pose), labels
+
+    def _too_few(self, name: str, labels: NDArray[np.int64]) -> SnapshotIdentity | None:
+        """Refuse a snapshot that shows too few fiducials; None = it shows enough."""
+        shown = len(np.unique(labels[labels >= 0]))
+        if shown >= self.options.least_fiducials:
+            return None
+        reason = f"too few fiducials: found {shown}, expected at least {self.options.least_fiducials}"
+        return SnapshotIdentity(name, "refused", reason, 1, None)
 
     def follow(self, pose: RigidTransform) -> tuple[Status, int]:
         """Take over the pose of a snapshot that was followed from the last one.

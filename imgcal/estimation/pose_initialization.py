@@ -14,6 +14,7 @@ Source: object-space error of Lu, Hager and Mjolsness (PAMI 2000), generalized c
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +22,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from imgcal.geometry import RigidTransform, kernels, rotation_from_vector, undistort
+from imgcal.geometry import RigidTransform, kernels, rotation_from_vector, undistort, undistort_cpu
 from imgcal.types import CalibrationObject, CameraRig, Observations
 from renderers.compiling import njit
 
@@ -71,12 +72,13 @@ def initial_pose(
     points = obj.points.to(observations.uv)
     centroid = points.mean(0)
     centred = points - centroid
-    rays, origins = _rays(observations, rig)  # (P, C, N, 3), (P, C, 3)
+    given = (observations.uv, rig.focal_length, rig.principal_point, rig.distortion, rig.cam_from_rig.rotation)
+    plain = not any(t.device.type != "cpu" or (t.requires_grad and torch.is_grad_enabled()) for t in given)
+    rays, origins = _rays(observations, rig, undistort_cpu if plain else undistort)  # (P, C, N, 3), (P, C, 3)
     seen = observations.seen.reshape(-1, *observations.seen.shape[-2:]).to(rays.dtype)
     form = _quadratic_form(rays, origins, seen, centred)
     starts = torch.as_tensor(Rotation.create_group("I").as_matrix(), dtype=rays.dtype, device=rays.device)
     promising = _cost(form, starts.expand(len(rays), -1, -1, -1)).topk(STARTS, largest=False).indices
-    plain = rays.device.type == "cpu" and not (torch.is_grad_enabled() and rays.requires_grad)
     minimized = _minimize_cpu if plain else _minimize_on_rotations
     rotation = minimized(form, starts[promising], iterations)  # (P, M, 3, 3)
 
@@ -92,7 +94,9 @@ def initial_pose(
     return RigidTransform(chosen.reshape(*batch, 3, 3), shift.reshape(*batch, 3))
 
 
-def _rays(observations: Observations, rig: CameraRig) -> tuple[Tensor, Tensor]:
+def _rays(
+    observations: Observations, rig: CameraRig, undistort: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+) -> tuple[Tensor, Tensor]:
     """Viewing rays in the rig frame, rigs and snapshots flattened: unit directions (P, C, N, 3), origins (P, C, 3)."""
     dtype = observations.uv.dtype
     rig = rig.to(dtype)

@@ -8,7 +8,7 @@ from .projection import (
     resized_pixels,
     undistort,
 )
-from .projection_cpu import project_cpu
+from .projection_cpu import project_cpu, undistort_cpu
 from .rotations import (
     cross_matrix,
     euler_from_rotation,
@@ -43,5 +43,6 @@ __all__ = [
     "rotation_from_vector",
     "sixd_from_rotation",
     "undistort",
+    "undistort_cpu",
     "vector_from_rotation",
 ]

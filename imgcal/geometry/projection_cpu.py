@@ -88,3 +88,40 @@ def _project(
                 visible = inside & (pz > nearest) & (slope > zero) & (rr < blind_from)
                 image[b, c, 0, n], image[b, c, 1, n], image[b, c, 2, n] = u, v, pz
                 image[b, c, 3, n] = one if visible else zero
+
+
+def undistort_cpu(xy_distorted: Tensor, distortion: Tensor) -> tuple[Tensor, Tensor]:
+    """Do the work of `projection.undistort` for tensors on the CPU, without gradients, until nothing changes any more.
+
+    Args:
+        xy_distorted: (*B, C, N, 2) distorted coordinates on the z = 1 plane.
+        distortion: (*B, C, 5).
+    """
+    distorted = xy_distorted.detach().double().reshape(-1, 2).contiguous().numpy()
+    lenses = distortion.detach().double().unsqueeze(-2).expand(*xy_distorted.shape[:-1], 5).reshape(-1, 5).numpy()
+    xy, good = np.empty_like(distorted), np.empty(len(distorted), dtype=np.bool_)
+    _undistort(distorted, lenses, xy, good)
+    shape = xy_distorted.shape
+    return torch.from_numpy(xy).to(xy_distorted.dtype).reshape(shape), torch.from_numpy(good).reshape(shape[:-1])
+
+
+@njit(fastmath=kernels.FAST, error_model="numpy")
+def _undistort(distorted: Array, lenses: Array, xy: Array, good: NDArray[np.bool_]) -> None:
+    rounding = 64 * np.finfo(np.float64).eps
+    for m in range(len(distorted)):
+        k1, k2, p1, p2, k3 = lenses[m]
+        xd, yd = distorted[m]
+        x, y, error, rr = xd, yd, np.inf, 0.0
+        for _ in range(9):
+            ux, uy, jxx, jxy, jyy, rr = kernels.distort(1.0, x, y, k1, k2, p1, p2, k3)
+            ex, ey = ux - xd, uy - yd
+            error = max(abs(ex), abs(ey))
+            if error < 4 * np.finfo(np.float64).eps:
+                break
+            determinant = jxx * jyy - jxy * jxy
+            x, y = x - (jyy * ex - jxy * ey) / determinant, y - (jxx * ey - jxy * ex) / determinant
+        slope1, slope2, slope3 = 3 * k1, 5 * k2, 7 * k3
+        before_fold = 1 + rr * (slope1 + rr * (slope2 + rr * slope3)) > 0
+        before_fold = before_fold and rr < kernels.blind_from(slope1, slope2, slope3)
+        good[m] = error < rounding and before_fold
+        xy[m, 0], xy[m, 1] = (x, y) if good[m] else (xd, yd)

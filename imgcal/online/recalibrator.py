@@ -212,12 +212,12 @@ class Recalibrator:
         tracker.rig, tracker.prior_std = self.rig, prior
         if self._latest is not None:
             tracker.rig, tracker.prior_std = self._latest.rig, torch.minimum(2 * flat_std(self._latest.estimate), prior)
-        snapshot, labels = tracker.decide(usable, name, coded)
+        snapshot, labels = tracker.decide(usable, name) if coded is None else tracker.accept(name, coded)
         again = self._latest is not None and self._refused & (self._refused - 1) == 0
         if snapshot.status == "refused" and coded is None and again:
             # What was known may hold no more. Another try is dear: after 1, 2, 4, 8, ... refusals in a row.
             tracker.rig, tracker.prior_std = self.rig, prior
-            snapshot, labels = tracker.decide(usable, name, coded)
+            snapshot, labels = tracker.decide(usable, name)
         if snapshot.status == "refused":
             self._refused += 1
             raise RefusedError(f"identity: {snapshot.reason}")

@@ -24,6 +24,7 @@ from imgcal.geometry.projection import (
     project_kornia,
     undistort,
 )
+from imgcal.geometry.projection_cpu import undistort_cpu
 from imgcal.synthesis.rigs import RelativeDrift, synthesize
 from imgcal.types.calibration_object import CalibrationObject
 from imgcal.types.rig import CameraRig
@@ -282,3 +283,19 @@ def test_wart_kornia_projects_points_behind_the_camera() -> None:
 def test_wart_kornia_se3_turns_a_constant_into_a_parameter() -> None:
     translation = torch.zeros(1, 3)
     assert isinstance(Se3(Quaternion.identity(1), translation).t, torch.nn.Parameter)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_the_compiled_undistortion_is_that_of_tensors(dtype):
+    generator = torch.Generator().manual_seed(4)
+    xy = 2.0 * torch.rand(3, 500, 2, generator=generator, dtype=torch.float64) - 1  # some beyond the fold
+    lens = torch.tensor([[0.0] * 5, [-0.3, 0.1, 1e-3, -2e-3, 0.02], [-0.9, 0.2, 0.0, 0.0, 0.0]], dtype=torch.float64)
+    expected, good = undistort(xy, lens)
+    found, compiled = undistort_cpu(xy.to(dtype), lens.to(dtype))
+    assert found.dtype == dtype and found.shape == xy.shape
+    if dtype == torch.float64:
+        assert torch.equal(good, compiled) and 0 < int((~good).sum()) < 500
+    both = good & compiled
+    assert both.sum() > 0.99 * good.sum()
+    tolerance = 1e-13 if dtype == torch.float64 else 1e-4
+    torch.testing.assert_close(found[both].double(), expected[both], rtol=0, atol=tolerance)
