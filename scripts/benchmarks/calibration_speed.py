@@ -1,7 +1,7 @@
 """How long do `imgcal.calibrate` from labels and live updates take, beside another checkout of imgcal?
 
 Run as `python -m scripts.benchmarks.calibration_speed [--beside FOLDER]`. Both run in turn, a tenth of a second each,
-on one thread; what counts is CPU time, which other processes disturb least.
+on one thread where nothing else is said; what counts is CPU time, which other processes disturb least.
 """
 
 from __future__ import annotations
@@ -43,6 +43,8 @@ TITLES = {
     "wand1": "update, window 1, wand in a room",
     "wand5": "update, window 5, wand in a room",
     "wand20": "update, window 20, wand in a room",
+    "live20 on 2": "update, window 20, O10, two threads",
+    "wand20 on 2": "update, window 20, wand in a room, two threads",
 }
 
 
@@ -105,11 +107,11 @@ def carried(rig_name: str, object_name: str) -> dict[str, np.ndarray]:
 class Worker:
     """imgcal of a checkout, in a process of its own."""
 
-    def __init__(self, checkout: Path, folder: Path) -> None:
+    def __init__(self, checkout: Path, folder: Path, threads: int) -> None:
         """Start it: from here on it answers `run`."""
-        surely = {"PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+        surely = {"PYTHONPATH": str(checkout)} | {f"{name}_NUM_THREADS": str(threads) for name in ("OMP", "NUMBA")}
         self._process = subprocess.Popen(
-            [sys.executable, "-P", str(WORKER), str(folder)],
+            [sys.executable, "-P", str(WORKER), str(folder), str(threads)],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=checkout, env=os.environ | surely,
         )  # fmt: skip
 
@@ -128,12 +130,14 @@ def measure(checkouts: Mapping[str, Path], rounds: int, cases: tuple[str, ...]) 
     """CPU times (ms) by case and checkout: median, and the best."""
     with tempfile.TemporaryDirectory() as name:
         write_cases(Path(name))
-        workers = {title: Worker(path, Path(name)) for title, path in checkouts.items()}
-        taken: dict[str, dict[str, list[float]]] = {case: {title: [] for title in workers} for case in cases}
+        threads = {case: 2 if case.endswith(" on 2") else 1 for case in cases}
+        pairs = [(title, count) for title in checkouts for count in sorted(set(threads.values()))]
+        workers = {(title, count): Worker(checkouts[title], Path(name), count) for title, count in pairs}
+        taken: dict[str, dict[str, list[float]]] = {case: {title: [] for title in checkouts} for case in cases}
         for number in range(rounds + 1):
             for case in cases:
-                for title, worker in workers.items():
-                    times = worker.run(case, AT_ONCE)
+                for title in checkouts:
+                    times = workers[title, threads[case]].run(case.partition(" ")[0], AT_ONCE)
                     taken[case][title] += times if number else []  # the first round compiles
         for worker in workers.values():
             worker.end()

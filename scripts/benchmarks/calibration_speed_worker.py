@@ -57,7 +57,7 @@ def _there_and_back(parts: list[Detections]) -> Iterator[Detections]:
 
 def main() -> None:
     """Answer until standard input ends."""
-    torch.set_num_threads(1)
+    torch.set_num_threads(int(sys.argv[2]))
     folder, cases = Path(sys.argv[1]), dict[str, Case]()
     for line in sys.stdin:
         name, seconds = line.split()
