@@ -77,9 +77,10 @@ class Operator:
         return [value for name, value in zip(names, values, strict=True) if name in self.differentiable]
 
     def evaluate(self, inputs: Tensors, options: str) -> Tensors:
-        """Return the outputs, contiguous, without gradient."""
+        """Return the outputs, contiguous and nobody's views, without gradient."""
         with torch.no_grad():
-            return tuple(x.contiguous() for x in self.compute(tuple(x.detach() for x in inputs), options))
+            found = self.compute(tuple(x.detach() for x in inputs), options)
+            return tuple(x.clone(memory_format=torch.contiguous_format) for x in found)
 
     def gradients(self, inputs: Tensors, outputs: Tensors, upstream: Tensors, options: str) -> Tensors:
         """Pull gradients by differentiable outputs back to those by differentiable inputs."""
@@ -103,7 +104,8 @@ class Operator:
         pulled = torch.autograd.grad(attached, leaves, used, create_graph=True, allow_unused=True)
         depends = [(p, t) for p, t in zip(pulled, tangents, strict=True) if p is not None and p.requires_grad]
         ends, along = zip(*depends, strict=True)
-        return torch.autograd.grad(ends, weights, along, allow_unused=True, materialize_grads=True)
+        found = torch.autograd.grad(ends, weights, along, allow_unused=True, materialize_grads=True)
+        return tuple(x.contiguous() for x in found)
 
     def _attached(
         self, inputs: Tensors, outputs: Tensors, weights: Tensors, options: str

@@ -70,9 +70,9 @@ def pairs() -> list[Pair]:
         return project_components(points.unbind(-1), *lens, rig.image_size).uv
 
     def pinhole(points: Tensor) -> Tensor:
-        undistorted = [x.expand(RIGS, *x.shape).flatten(0, 1) for x in (intrinsics, torch.eye(4).expand(10, 4, 4))]
+        inner, outer = (x.expand(RIGS, *x.shape).flatten(0, 1) for x in (intrinsics, torch.eye(4).expand(10, 4, 4)))
         height, width = rig.image_size.float().expand(RIGS, 10, 2).flatten(0, 1).unbind(-1)[::-1]
-        return PinholeCamera(*undistorted, height, width).project(points.flatten(0, 1)).view(*points.shape[:-1], 2)
+        return PinholeCamera(inner, outer, height, width).project(points.flatten(0, 1)).view(*points.shape[:-1], 2)
 
     def ideal(points: Tensor) -> Tensor:
         return project_components(points.unbind(-1), *lens[:2], torch.zeros_like(lens[2]), rig.image_size).uv
@@ -175,8 +175,8 @@ def table(result: dict[str, Any]) -> str:
         hard = f"{row['place']}: {there}" if there else ""
         difference = f"{row['largest_difference']:.1e} {row['unit'] if row['unit'] != '1' else ''}".strip()
         rows.append([row["work"], f"`{row['kornia']}`", difference, *times, hard])
-    times = ("ours, ms", "kornia, ms", "ours with gradient, ms", "kornia with gradient, ms")
-    return markdown(("work", "kornia", "largest difference", *times, "gradient where it is hard: ours, kornia"), rows)
+    head = ("ours, ms", "kornia, ms", "ours with gradient, ms", "kornia with gradient, ms")
+    return markdown(("work", "kornia", "largest difference", *head, "gradient where it is hard: ours, kornia"), rows)
 
 
 def _finite(run: Run, inputs: tuple[Tensor, ...]) -> bool:
