@@ -17,7 +17,7 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from imgcal.detection import Blobs, DetectionOptions, detect_snapshot, without_dim
+from imgcal.detection import Blobs, DetectionOptions, detect_snapshot, to_detections, without_dim
 from imgcal.errors import InputError
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import Capture, Frame
@@ -73,19 +73,7 @@ def _detect_capture(
         for _, frames in progress(capture.snapshots(first, last), len(names), "detecting blobs"):
             shown = shown or dict(frames)
             found.append(detect_snapshot(frames, options, masks=masks, pool=pool, whole_capture=True))
-    found = without_dim(found, options)
-    columns = {
-        name: np.concatenate([getattr(blobs, name) for blobs in found]) for name in ("uv", "sigma", "radius", "flags")
-    }
-    detections = Detections(
-        **columns,
-        camera=np.concatenate([blobs.camera for blobs in found]).astype(np.int64),
-        snapshot=np.repeat(np.arange(len(found)), [len(blobs.uv) for blobs in found]),
-        fiducial=np.full(len(columns["uv"]), -1, dtype=np.int64),
-        camera_names=capture.camera_names,
-        snapshot_names=names,
-    )
-    return detections, shown
+    return to_detections(without_dim(found, options), capture.camera_names, names), shown
 
 
 def progress(items: Iterable[Item], total: int, label: str) -> Iterator[Item]:

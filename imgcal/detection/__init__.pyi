@@ -1,4 +1,4 @@
-from .centroids import Blobs
+from .centroids import Blobs, to_detections
 from .detector import detect, detect_frame, detect_snapshot
 from .options import DetectionOptions, Frame
 from .populations import without_dim
@@ -10,5 +10,6 @@ __all__ = [
     "detect",
     "detect_frame",
     "detect_snapshot",
+    "to_detections",
     "without_dim",
 ]

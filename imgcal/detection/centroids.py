@@ -5,6 +5,7 @@ Each blob is measured in a window of its own that is walked a few times while it
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from imgcal.detection.candidates import Candidates
 from imgcal.detection.kernels import measure_all
 from imgcal.detection.options import DetectionOptions, Frame
+from imgcal.types import Detections
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,30 @@ class Blobs:
     def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Blobs:
         """Keep the given rows."""
         return Blobs(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+
+def to_detections(shots: Sequence[Blobs], camera_names: tuple[str, ...], snapshot_names: tuple[str, ...]) -> Detections:
+    """Stack the blobs of one or several snapshots, none of them labelled: rows run over snapshots, then cameras.
+
+    Args:
+        shots: blobs of each snapshot, at least one.
+        camera_names: which `Blobs.camera` counts.
+        snapshot_names: one for each snapshot.
+    """
+    uv, sigma, radius, flags, camera = (
+        np.concatenate([getattr(shot, name) for shot in shots]) for name in ("uv", "sigma", "radius", "flags", "camera")
+    )
+    return Detections(
+        uv=uv,
+        sigma=sigma,
+        camera=camera,
+        snapshot=np.repeat(np.arange(len(shots)), [len(shot.uv) for shot in shots]),
+        fiducial=np.full(len(camera), -1, np.int64),
+        radius=radius,
+        flags=flags,
+        camera_names=camera_names,
+        snapshot_names=snapshot_names,
+    )
 
 
 def measure(frame: Frame, candidates: Candidates, options: DetectionOptions, scale: int) -> Blobs:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.detection.candidates import block_means, outline, screen
-from imgcal.detection.centroids import Blobs, measure
+from imgcal.detection.centroids import Blobs, measure, to_detections
 from imgcal.detection.options import DetectionOptions, Frame, checked_frame, checked_mask, full_scale
 from imgcal.detection.populations import DIMMER, usable, usual_size, without_dim
 from imgcal.errors import InputError
@@ -61,7 +61,9 @@ def detect(
         blobs = [
             detect_snapshot(snapshot, options, masks=masks, pool=pool, whole_capture=True) for snapshot in snapshots
         ]
-    return _table(without_dim(blobs, options), names)
+    digits = len(str(max(len(blobs) - 1, 0)))
+    numbers = tuple(f"{index:0{digits}d}" for index in range(len(blobs)))
+    return to_detections(without_dim(blobs, options), names, numbers)
 
 
 def detect_snapshot(
@@ -180,21 +182,3 @@ def _snapshots(frames: Mapping[str, Frame | Sequence[Frame | None] | None]) -> l
         elif len(entries) != count:
             raise InputError(f"camera {name}: found {len(entries)} snapshots, expected {count} as for other cameras")
     return [{name: entries[index] for name, entries in series.items()} for index in range(count)]
-
-
-def _table(blobs: list[Blobs], names: tuple[str, ...]) -> Detections:
-    """Stack the blobs of all snapshots; rows run over snapshots, then cameras."""
-    counts = [len(shot.uv) for shot in blobs]
-    digits = len(str(max(len(blobs) - 1, 0)))
-    camera = np.concatenate([shot.camera for shot in blobs])
-    return Detections(
-        uv=np.concatenate([shot.uv for shot in blobs]),
-        sigma=np.concatenate([shot.sigma for shot in blobs]),
-        camera=camera,
-        snapshot=np.repeat(np.arange(len(blobs)), counts),
-        fiducial=np.full(len(camera), -1, np.int64),
-        radius=np.concatenate([shot.radius for shot in blobs]),
-        flags=np.concatenate([shot.flags for shot in blobs]),
-        camera_names=names,
-        snapshot_names=tuple(f"{index:0{digits}d}" for index in range(len(blobs))),
-    )

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.association import PipelineOptions, SnapshotIdentity, Tracker, lattice_shifts
-from imgcal.detection import Blobs, DetectionOptions, Frame, detect_snapshot
+from imgcal.detection import DetectionOptions, Frame, detect_snapshot, to_detections
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import aligned, flat_std
 from imgcal.geometry import RigidTransform
@@ -181,7 +181,8 @@ class Recalibrator:
             if isinstance(frame, Sequence):
                 raise InputError(f"camera {camera}: found {len(frame)} frames, expected one of this moment, or None")
             frames[camera] = frame
-        return _table(detect_snapshot(frames, self.detection, pool=self._pool), name, self.rig)
+        blobs = detect_snapshot(frames, self.detection, pool=self._pool)
+        return to_detections([blobs], self.rig.camera_names, (name,))
 
     def _follow(self, blobs: Detections, name: str) -> LiveCalibration | None:
         """Label blobs by the last result's prediction, where the object has moved little; None = not to be trusted.
@@ -408,19 +409,4 @@ def _with_camera(rig: CameraRig, other: CameraRig, camera: int) -> CameraRig:
             put(rig.cam_from_rig.rotation, other.cam_from_rig.rotation, 3),
             put(rig.cam_from_rig.translation, other.cam_from_rig.translation, 2),
         ),
-    )
-
-
-def _table(blobs: Blobs, name: str, rig: CameraRig) -> Detections:
-    count = len(blobs.uv)
-    return Detections(
-        uv=blobs.uv,
-        sigma=blobs.sigma,
-        camera=blobs.camera,
-        snapshot=np.zeros(count, dtype=np.int64),
-        fiducial=np.full(count, -1, dtype=np.int64),
-        radius=blobs.radius,
-        flags=blobs.flags,
-        camera_names=rig.camera_names,
-        snapshot_names=(name,),
     )
