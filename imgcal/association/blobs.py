@@ -22,7 +22,7 @@ FAR = 1e6
 
 
 @dataclass(frozen=True)
-class Blobs:
+class PaddedBlobs:
     """Usable blobs of one snapshot, padded to the same number in every camera."""
 
     uv: NDArray[np.float64]  # (C, M, 2) pixels, FAR where padded
@@ -33,11 +33,11 @@ class Blobs:
     count: NDArray[np.int64]  # (C,)
     rows: int  # rows of the detections, usable or not
 
-    def only(self, camera: int) -> Blobs:
+    def only(self, camera: int) -> PaddedBlobs:
         """Keep one camera; labels keep their numbers."""
         one = [camera]
         kept = (self.uv[one], self.ideal[one], self.sigma[one], self.radius[one], self.row[one], self.count[one])
-        return Blobs(*kept, self.rows)
+        return PaddedBlobs(*kept, self.rows)
 
     def to_rows(self, labels: NDArray[np.int64]) -> NDArray[np.int64]:
         """Turn blob indices of fiducials (C, N) into fiducials of detection rows (rows,)."""
@@ -47,7 +47,7 @@ class Blobs:
         return result
 
 
-def gather(detections: Detections, rig: CameraRig) -> Blobs:
+def gather(detections: Detections, rig: CameraRig) -> PaddedBlobs:
     """Collect the usable blobs of one snapshot; of several at exactly the same place the first one.
 
     Args:
@@ -78,12 +78,12 @@ def gather(detections: Detections, rig: CameraRig) -> Blobs:
     lens = (rig.focal_length.numpy(), rig.principal_point.numpy(), rig.distortion.numpy())
     ideal = np.full(uv.shape, FAR, dtype=np.float32)
     _undistort(uv, count, *lens, ideal)
-    return Blobs(uv, ideal, sigma, radius, row, count, len(detections))
+    return PaddedBlobs(uv, ideal, sigma, radius, row, count, len(detections))
 
 
 @njit(cache=True)
 def _undistort(uv, count, focal, principal, distortion, ideal):
-    """Fill pixels from the principal point, without distortion; see `Blobs.ideal`."""
+    """Fill pixels from the principal point, without distortion; see `PaddedBlobs.ideal`."""
     for c in range(len(uv)):
         k1, k2, p1, p2, k3 = distortion[c]
         for m in range(count[c]):

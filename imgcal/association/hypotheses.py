@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, cKDTree
 
-from imgcal.association.blobs import Blobs
+from imgcal.association.blobs import PaddedBlobs
 from imgcal.association.p3p import FAST, three_point_pose, towards
 from imgcal.types import CalibrationObject, CameraRig
 from renderers.compiling import njit
@@ -93,7 +93,7 @@ def _orders(count: int) -> int:
     return count * (count - 1) * (count - 2)
 
 
-def likely_blobs(blobs: Blobs, camera: int, outer: bool) -> NDArray[np.int64]:
+def likely_blobs(blobs: PaddedBlobs, camera: int, outer: bool) -> NDArray[np.int64]:
     """List the blobs of a camera that are likely to be fiducials: those close to others.
 
     Args:
@@ -134,7 +134,7 @@ def blob_triples(
 
 
 def single_camera_poses(
-    blobs: Blobs,
+    blobs: PaddedBlobs,
     rig: CameraRig,
     cameras: NDArray[np.int64],
     triples: NDArray[np.int64],

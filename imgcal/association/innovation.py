@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from imgcal.association.blobs import Blobs
+from imgcal.association.blobs import PaddedBlobs
 from imgcal.estimation import Problem, Solution
 from imgcal.geometry import NEAREST_DEPTH, kernels
 from renderers.compiling import njit
@@ -38,7 +38,7 @@ class Innovations:
 
 
 def innovations(
-    blobs: Blobs, labels: NDArray[np.int64], sigma: NDArray[np.float64], problem: Problem, solution: Solution
+    blobs: PaddedBlobs, labels: NDArray[np.int64], sigma: NDArray[np.float64], problem: Problem, solution: Solution
 ) -> Innovations:
     """Compare predictions with blobs.
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from imgcal.association.blobs import Blobs
+from imgcal.association.blobs import PaddedBlobs
 from imgcal.association.hypotheses import Poses
 from imgcal.types import CalibrationObject, CameraRig
 
@@ -20,7 +20,7 @@ ANGLES = 180  # tried; half a step moves the rim of the pattern by 1/60 of its w
 GROWN = 12  # best ones, refined to homographies
 
 
-def planar_poses(blobs: Blobs, rig: CameraRig, camera: int, obj: CalibrationObject) -> Poses:
+def planar_poses(blobs: PaddedBlobs, rig: CameraRig, camera: int, obj: CalibrationObject) -> Poses:
     """Find poses under which one camera's blobs look like a planar object, most of which is seen.
 
     Args:

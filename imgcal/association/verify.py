@@ -15,7 +15,7 @@ from torch import Tensor
 
 from imgcal.association.ambiguities import lattice_shifts
 from imgcal.association.assignment import assign
-from imgcal.association.blobs import Blobs
+from imgcal.association.blobs import PaddedBlobs
 from imgcal.association.hypotheses import Poses
 from imgcal.association.innovation import THRESHOLD, Innovations, contested, innovations
 from imgcal.estimation import Problem, State, lm_cpu, pose_at
@@ -38,7 +38,7 @@ UNDECIDED = 2 * np.log(1e3)
 class Scene:
     """What is given: the blobs, the object, the factory rig and how far it may have drifted."""
 
-    blobs: Blobs
+    blobs: PaddedBlobs
     obj: CalibrationObject
     rig: CameraRig
     std: Tensor  # (C, 15)

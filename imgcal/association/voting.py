@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.association.assignment import mutual_nearest
-from imgcal.association.blobs import Blobs
+from imgcal.association.blobs import PaddedBlobs
 from imgcal.association.hypotheses import Poses
 from imgcal.types import CameraRig
 from renderers.compiling import njit
@@ -67,7 +67,7 @@ def _predict(rotation, translation, focal, points, turn, offset, uv):
                     uv[k, c, n, 1] = focal[c] * (r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1]) / depth
 
 
-def vote(blobs: Blobs, predicted: NDArray[np.float64], tolerance: float, gate: float) -> Votes:
+def vote(blobs: PaddedBlobs, predicted: NDArray[np.float64], tolerance: float, gate: float) -> Votes:
     """Find each camera's most popular shift.
 
     Args:
@@ -118,7 +118,7 @@ def _vote_one(predicted, ideal, number, width, gate, windows, count, shift):
 
 
 def match(
-    blobs: Blobs, predicted: NDArray[np.float64], shift: NDArray[np.float64], tolerance: float
+    blobs: PaddedBlobs, predicted: NDArray[np.float64], shift: NDArray[np.float64], tolerance: float
 ) -> NDArray[np.int64]:
     """Pair fiducials with blobs under given shifts, which are refined on the way.
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from imgcal.association.blobs import Blobs, gather
+from imgcal.association.blobs import PaddedBlobs, gather
 from imgcal.association.hypotheses import Poses
 from imgcal.association.verify import Scene
 from imgcal.geometry.transforms import RigidTransform
@@ -24,7 +24,7 @@ class Snapshot:
     rig: CameraRig  # that took it
     pose: RigidTransform  # rig_from_object
 
-    def labels(self, blobs: Blobs, fiducials: int) -> np.ndarray:
+    def labels(self, blobs: PaddedBlobs, fiducials: int) -> np.ndarray:
         """The true blob of each fiducial (C, N)."""
         result = np.full((len(blobs.row), fiducials), -1)
         for camera, rows in enumerate(blobs.row):

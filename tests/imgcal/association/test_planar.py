@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association.blobs import Blobs, gather
+from imgcal.association.blobs import PaddedBlobs, gather
 from imgcal.association.planar import _affinity, _fit_homography, _pose, _rotation, _whiten, planar_poses
 from imgcal.geometry.rotations import rotation_from_vector
 from tests.imgcal.association.scenes import degrees_between, make_object, take
@@ -49,7 +49,7 @@ def test_the_order_of_blobs_does_not_matter(flat, o10) -> None:
     blobs = gather(take(o10, flat, 1, drift=None, missing=5).detections, o10)
     order = np.random.default_rng(1).permutation(blobs.count[0])
     parts = (part[:1][:, order] for part in (blobs.uv, blobs.ideal, blobs.sigma, blobs.radius, blobs.row))
-    shuffled = Blobs(*parts, blobs.count[:1], blobs.rows)
+    shuffled = PaddedBlobs(*parts, blobs.count[:1], blobs.rows)
     one, other = planar_poses(blobs, o10, 0, flat), planar_poses(shuffled, o10, 0, flat)
     assert len(one) == len(other) > 0
     np.testing.assert_allclose(one.rotation, other.rotation, atol=1e-6)

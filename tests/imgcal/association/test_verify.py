@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association.blobs import Blobs
+from imgcal.association.blobs import PaddedBlobs
 from imgcal.association.hypotheses import Poses
 from imgcal.association.verify import (
     Scene,
@@ -154,7 +154,7 @@ def test_evidence_does_not_care_about_the_order_of_cameras_and_fiducials(scene, 
     random = np.random.default_rng(0)
     cameras, order = [2, 0, 1], random.permutation(8)
     parts = (part[cameras] for part in (scene.blobs.uv, scene.blobs.ideal, scene.blobs.sigma, scene.blobs.radius))
-    blobs = Blobs(*parts, scene.blobs.row[cameras], scene.blobs.count[cameras], scene.blobs.rows)
+    blobs = PaddedBlobs(*parts, scene.blobs.row[cameras], scene.blobs.count[cameras], scene.blobs.rows)
     radius = None if asymmetric8.radius is None else asymmetric8.radius[order]
     obj = replace(asymmetric8, points=asymmetric8.points[order], colours=asymmetric8.colours[order], radius=radius)
     other = Scene(blobs, obj, rig.select(cameras), scene.std[cameras])

@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association.blobs import FAR, Blobs, gather
+from imgcal.association.blobs import FAR, PaddedBlobs, gather
 from imgcal.association.hypotheses import Poses
 from imgcal.association.voting import match, predict_ideal, vote
 from tests.imgcal.association.scenes import take
 
 
-def blobs_at(ideal: np.ndarray, count=None) -> Blobs:
+def blobs_at(ideal: np.ndarray, count=None) -> PaddedBlobs:
     """Blobs (C, M, 2) px, counted from the principal point."""
     shape = ideal.shape[:2]
     count = np.full(shape[0], shape[1]) if count is None else count
     row = np.where(np.arange(shape[1]) < count[:, None], np.arange(shape[0] * shape[1]).reshape(shape), -1)
     ideal = np.where(row[..., None] >= 0, ideal, FAR)
-    return Blobs(ideal, ideal.astype(np.float32), np.ones(shape), np.full(shape, np.nan), row, count, row.size)
+    return PaddedBlobs(ideal, ideal.astype(np.float32), np.ones(shape), np.full(shape, np.nan), row, count, row.size)
 
 
 def test_predictions_are_projections_without_distortion(o10, asymmetric8) -> None:
@@ -92,7 +92,7 @@ def test_permuted_cameras_fiducials_and_blobs_give_permuted_votes_and_labels(o10
     random = np.random.default_rng(4)
     cameras, fiducials, slots = random.permutation(10), random.permutation(8), random.permutation(blobs.uv.shape[1])
     parts = (part[cameras][:, slots] for part in (blobs.uv, blobs.ideal, blobs.sigma, blobs.radius, blobs.row))
-    mixed = Blobs(*parts, blobs.count[cameras], blobs.rows)
+    mixed = PaddedBlobs(*parts, blobs.count[cameras], blobs.rows)
     assert (blobs.count == blobs.uv.shape[1]).all()
     shuffled = predicted[:, cameras][:, :, fiducials]
     other = vote(mixed, shuffled, 6.0, 60.0)
