@@ -57,6 +57,7 @@ TESTED_ELSEWHERE = {
     "imgcal/evaluation/summary.py": "evaluation/test_tables",
     "imgcal/pipeline/arrangement.py": "pipeline/test_calibration, test_steadiness",
     "imgcal/training/callbacks.py": "training/test_engine",
+    "imgcal/training/run.py": "values only; training/test_engine",
 }
 
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from imgcal.errors import RefusedError
 from imgcal.networks import Checkpoint
 from imgcal.training.data import Batch
+from imgcal.training.run import Run
 from imgcal.training.state import TrainingState
-
-if TYPE_CHECKING:
-    from imgcal.training.engine import Run
 
 
 class Callbacks:

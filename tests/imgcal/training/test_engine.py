@@ -139,7 +139,8 @@ def test_a_continuation_must_be_of_the_same_experiment(experiment, tmp_path):
 
 def test_time_moves_the_schedule_and_ends_the_run(experiment, tmp_path, monkeypatch):
     clock = iter(float(second) for second in range(10**6))
-    monkeypatch.setattr(engine, "monotonic", lambda: next(clock))
+    for module in ("engine", "run"):
+        monkeypatch.setattr(f"imgcal.training.{module}.monotonic", lambda: next(clock))
     setup = experiment("training={minutes: 1.0, batch_size: 6, validation_rigs: 0, device: cpu, log_every: 1}")
     run = train(setup, tmp_path)
     rows = read_metrics(tmp_path / "metrics.jsonl")
