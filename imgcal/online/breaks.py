@@ -4,6 +4,9 @@ Every snapshot pulls at every camera. While nothing moves, the pulls on a camera
 they come from. Where a camera moved between two snapshots, those before pull one way and those after pull the other,
 also where the fit has left the later ones out as outliers. The score (Lagrange multiplier) test asks how improbable the
 difference is, without another fit: for each camera and each place in the series where it may have happened.
+
+`imgcal.estimation.change_points` tests the same idea in another way. A window is asked at every snapshot, within
+milliseconds and with a few labels: here the other cameras are taken as known, and a camera turns or shifts, no more.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ def test_the_latest_result_is_a_start_and_no_more(noise, o10, asymmetric8):
     followed = fit_labelled(labelled, o10, asymmetric8, latest=latest)
     assert torch.equal(followed.observations.seen, fresh.observations.seen)
     assert followed.additive_noise == pytest.approx(fresh.additive_noise, rel=0.05)
-    shift = followed.rig.local(fresh.rig).abs() / fresh.problem.prior_std[0]
+    shift = followed.rig.local(fresh.rig).abs() / fresh.estimate.problem.prior_std[0]
     assert shift.max() < 0.02  # standard deviations of the prior: the solver stops where the cost falls by 1e-4
 
 
