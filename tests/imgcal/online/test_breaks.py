@@ -85,7 +85,7 @@ def test_noise_gives_no_more_than_chi_squared(o10, asymmetric8):
         table.uv[:] += 0.1 * np.random.default_rng(seed).standard_normal(table.uv.shape)
         fit = calibrate(table, rig, asymmetric8)
         labels = replace(to_observations(table, rig, asymmetric8), sigma=fit.observations.sigma)
-        statistics.append(find_breaks(series_of(fit, labels, None)).statistic)
+        statistics.append(find_breaks(series_of(fit.estimate, labels, None)).statistic)
     mean = float(np.mean(statistics))
     assert 3.0 < mean < 6.5 and np.max(statistics) < 30
 
