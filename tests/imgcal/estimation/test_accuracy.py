@@ -33,7 +33,7 @@ def captured(rig, obj, snapshots, noise=0.05, seed=0):
 
 @pytest.fixture(scope="module")
 def calibration(o10, asymmetric8):
-    return calibrate(captured(o10, asymmetric8, 5), o10, asymmetric8)
+    return calibrate(captured(o10, asymmetric8, 5), o10, asymmetric8).estimate
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def test_the_summary_is_plain_and_in_order(predicted):
 
 
 def test_more_snapshots_say_more(predicted, o10, asymmetric8):
-    more = predicted_error(calibrate(captured(o10, asymmetric8, 20), o10, asymmetric8))
+    more = predicted_error(calibrate(captured(o10, asymmetric8, 20), o10, asymmetric8).estimate)
     assert more.median_px < 0.7 * predicted.median_px and more.median_mm < 0.7 * predicted.median_mm
 
 
@@ -116,7 +116,7 @@ def test_an_estimate_will_do(o10, asymmetric8, predicted):
 
 def test_one_camera_triangulates_nothing(o10, asymmetric8):
     rig = o10.select([0])
-    found = predicted_error(calibrate(captured(rig, asymmetric8, 5), rig, asymmetric8)).summary()
+    found = predicted_error(calibrate(captured(rig, asymmetric8, 5), rig, asymmetric8).estimate).summary()
     assert found["median_px"] > 0 and found["seen_by_two_cameras"] == 0
     assert found["median_mm"] is None and found["p95_mm"] is None
     json.dumps(found, allow_nan=False)
@@ -125,14 +125,14 @@ def test_one_camera_triangulates_nothing(o10, asymmetric8):
 def test_a_blind_camera_has_the_factorys_errors(o10, asymmetric8):
     table = captured(o10, asymmetric8, 5)
     table = table.select(table.camera != 6)
-    found = predicted_error(calibrate(table, o10, asymmetric8, PipelineOptions(blind_cameras=True)))
+    found = predicted_error(calibrate(table, o10, asymmetric8, PipelineOptions(blind_cameras=True)).estimate)
     px = np.array(found.camera_px)
     assert found.camera_names[found.worst_camera] == "cam07"
     assert px[6] > 5 and (np.delete(px, 6) < 0.1).all()
     # All cameras alike in the triangulation: the blind one spoils it, and without it all is well.
     assert [found.camera_names[i] for i in found.exceptions] == ["cam07"]
     nine = o10.select([i for i in range(10) if i != 6])
-    others = predicted_error(calibrate(only_cameras(table, nine), nine, asymmetric8))
+    others = predicted_error(calibrate(only_cameras(table, nine), nine, asymmetric8).estimate)
     without = float(found.mm_without_exceptions.median())
     assert without == pytest.approx(others.median_mm, rel=0.02)
     assert without < found.median_mm / 10
