@@ -65,6 +65,21 @@ def test_the_truth_costs_nothing_and_has_a_finite_gradient(truth, prior_std, asy
     assert step.grad.isfinite().all()
 
 
+@pytest.mark.parametrize("config", KINDS, ids=["robust", "paper"])
+def test_the_loss_compiles_into_one_graph_and_has_a_forward_derivative(truth, prior_std, asymmetric8, config):
+    def loss(step):
+        return compound([off_by(truth, step), truth], truth, asymmetric8, config, 0, prior_std).total
+
+    step = steps(prior_std).requires_grad_()
+    compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")(step)
+    torch.testing.assert_close(compiled, loss(step))
+    (expected,) = torch.autograd.grad(loss(step), step)
+    torch.testing.assert_close(torch.autograd.grad(compiled, step)[0], expected)
+    direction = steps(prior_std, seed=3)
+    _, along = torch.func.jvp(loss, (step.detach(),), (direction,))
+    torch.testing.assert_close(along, (expected * direction).sum())
+
+
 def test_the_reprojection_gradient_reaches_every_parameter(truth, prior_std, asymmetric8):
     step = steps(prior_std).requires_grad_()
     difference = project_fiducials(off_by(truth, step).cameras_from_object, asymmetric8) - project_fiducials(
