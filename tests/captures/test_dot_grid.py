@@ -65,7 +65,7 @@ def test_the_halves_differ_by_as_much_as_they_say(grid):
     dark = imgcal.DetectionOptions(polarity="dark")
     halves = [imgcal.calibrate({"cam": frames[part::2]}, nominal(), obj, detection=dark) for part in (0, 1)]
     difference = halves[0].rig.local(halves[1].rig)[0, 6:10]
-    variance = sum(camera_std(half)[0, 6:10].square() for half in halves)
+    variance = sum(camera_std(half.estimate)[0, 6:10].square() for half in halves)
     assert (difference.square() / variance).mean() < 4
-    alone = sum(camera_std(replace(half, inflation=1.0))[0, 6:10].square() for half in halves)
+    alone = sum(camera_std(replace(half.estimate, inflation=1.0))[0, 6:10].square() for half in halves)
     assert (difference.square() / alone).mean() > 20
