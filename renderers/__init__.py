@@ -2,11 +2,11 @@
 
 from renderers.infrared import (
     BlobRange,
-    Blobs,
     Clutter,
     ClutterModel,
     InfraredFrames,
     SensorModel,
+    Spots,
     expose,
     infrared_frames,
     render_blobs,
@@ -19,11 +19,11 @@ from renderers.tracing import is_traced
 
 __all__ = [
     "BlobRange",
-    "Blobs",
     "Clutter",
     "ClutterModel",
     "InfraredFrames",
     "SensorModel",
+    "Spots",
     "ellipse_reference",
     "expose",
     "infrared_frames",

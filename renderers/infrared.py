@@ -25,7 +25,7 @@ SHARP = 0.05  # blur below which the optics count as this sharp, in pixels
 
 
 @dataclass(frozen=True)
-class Blobs:
+class Spots:
     """Ellipses of uniform brightness in pixels."""
 
     uv: Tensor  # (*B, N, 2) px, centres
@@ -74,8 +74,8 @@ class ClutterModel:
 class Clutter:
     """The truth about a frame's clutter."""
 
-    false_blobs: Blobs  # (*B, M), behind all markers
-    occluders: Blobs  # (*B, N), one for each marker, before all markers; visible where the marker is partly covered
+    false_blobs: Spots  # (*B, M), behind all markers
+    occluders: Spots  # (*B, N), one for each marker, before all markers; visible where the marker is partly covered
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class InfraredFrames:
 
 
 def infrared_frames(
-    markers: Blobs,
+    markers: Spots,
     image_size: tuple[int, int],
     sensor: SensorModel | None = None,
     *,
@@ -153,7 +153,7 @@ def infrared_frames(
 
 
 def render_blobs(
-    markers: Blobs, image_size: tuple[int, int], blur: float, *, clutter: Clutter | None = None
+    markers: Spots, image_size: tuple[int, int], blur: float, *, clutter: Clutter | None = None
 ) -> tuple[Tensor, Tensor]:
     """Render the light on the sensor, before exposure: ellipses blurred by the lens and integrated over pixels.
 
@@ -221,7 +221,7 @@ def expose(light: Tensor, sensor: SensorModel, *, generator: torch.Generator | N
 
 
 def sample_clutter(
-    model: ClutterModel, markers: Blobs, image_size: tuple[int, int], *, generator: torch.Generator | None = None
+    model: ClutterModel, markers: Spots, image_size: tuple[int, int], *, generator: torch.Generator | None = None
 ) -> Clutter:
     """Draw reflections, clutter blobs and occluders for every frame.
 
@@ -254,7 +254,7 @@ def sample_clutter(
         parts["intensity"].append(uniform(kind.intensity, kind.count))
     values = {name: torch.cat(tensors, dim=len(batch)) for name, tensors in parts.items()}
     always = torch.ones_like(values["intensity"], dtype=torch.bool)
-    false_blobs = Blobs(**values, visible=always, depth=torch.full_like(values["intensity"], math.inf))
+    false_blobs = Spots(**values, visible=always, depth=torch.full_like(values["intensity"], math.inf))
     return Clutter(false_blobs, _occluders(model, markers, uniform))
 
 
@@ -294,7 +294,7 @@ def ellipse_coverage(
     return (along_v.mT @ along_u).clamp(0, 1)
 
 
-def _occluders(model: ClutterModel, markers: Blobs, uniform: Callable[..., Tensor]) -> Blobs:
+def _occluders(model: ClutterModel, markers: Spots, uniform: Callable[..., Tensor]) -> Spots:
     """Put a dark body over one side of some markers; ``uniform(interval, *shape)`` samples (*B, *shape)."""
     # Where a marker is the unit disc, its occluder is a larger disc that reaches into it from one side.
     count, radius = markers.uv.shape[-2], 1.5
@@ -302,7 +302,7 @@ def _occluders(model: ClutterModel, markers: Blobs, uniform: Callable[..., Tenso
     distance = 1 + radius - 2 * uniform(model.occluded_diameter, count)
     direction = torch.stack([angle.cos(), angle.sin()], dim=-1) * distance[..., None]
     root = torch.linalg.cholesky_ex(markers.shape).L
-    return Blobs(
+    return Spots(
         uv=markers.uv + (root @ direction[..., None])[..., 0],
         shape=markers.shape * radius**2,
         intensity=torch.zeros_like(markers.intensity),
@@ -324,7 +324,7 @@ def _blurred_box(low: Tensor, high: Tensor, length: int, blur: float) -> Tensor:
     return (twice_integrated(edges - low[..., None]) - twice_integrated(edges - high[..., None])).diff(dim=-1)
 
 
-def _composite(canvas: Canvas, blobs: Blobs, batch: torch.Size, image_size: tuple[int, int], blur: float) -> Tensor:
+def _composite(canvas: Canvas, blobs: Spots, batch: torch.Size, image_size: tuple[int, int], blur: float) -> Tensor:
     """Draw blobs behind what is on the canvas; return the (B, N) share of each blob's area that is seen."""
     count = blobs.uv.shape[-2]
     if blobs.uv.shape != (*batch, count, 2) or blobs.shape.shape != (*batch, count, 2, 2):

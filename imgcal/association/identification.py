@@ -235,14 +235,14 @@ def _against_motions(scene: Scene, best: Fits, known_pose: bool) -> tuple[Fits, 
         The best labelling found, and its margin over the best of its neighbours.
     """
     shifts = lattice_shifts(scene.obj)
-    prior_std = pattern_prior(scene.std, scene.rig, scene.rig.working_distance or _guess_distance(scene))
-    turns = [] if known_pose else near_turns(scene.obj, 2 * prior_std.shape * scene.obj.size)
+    pattern = pattern_prior(scene.std, scene.rig, scene.rig.working_distance or _guess_distance(scene))
+    turns = [] if known_pose else near_turns(scene.obj, 2 * pattern.shape * scene.obj.size)
     if not shifts and not turns:
         return best, np.inf
     for _ in range(MOST_STEPS):
         _, pose = rig_and_pose(scene, best, 0)
         labels = best.labels[0]
-        alone = _shifted_alone(scene, best, shifts, 6 * prior_std.shift)
+        alone = _shifted_alone(scene, best, shifts, 6 * pattern.shift)
         together = _preferred(labels, alone)
         if together is not None:
             fit = refine(scene, start(scene, _one(pose), together[None]), stages=STAGES[:1])
@@ -330,15 +330,13 @@ def _bounds(scene: Scene, distance: float, pose_known: bool) -> tuple[float, flo
     Both follow from the prior. A pose from one camera is off as much as that camera, and its depth as much as its focal
     length, which shifts the images of cameras at other places.
     """
-    prior_std: PatternPrior = pattern_prior(scene.std, scene.rig, distance)
+    pattern: PatternPrior = pattern_prior(scene.std, scene.rig, distance)
     focal = float(scene.rig.focal_length.mean())
     positions = scene.rig.positions.numpy()
     baseline = float(np.linalg.norm(positions - positions.mean(0), axis=1).max())
-    parallax = 2 * prior_std.shape * focal * baseline / distance
-    shift = float(
-        np.hypot(prior_std.shift.max() * (1.0 if pose_known else np.sqrt(2)), 0.0 if pose_known else parallax)
-    )
-    bend = 2.5 * prior_std.shape if pose_known else float(np.hypot(2.5 * prior_std.shape, APPROXIMATE))
+    parallax = 2 * pattern.shape * focal * baseline / distance
+    shift = float(np.hypot(pattern.shift.max() * (1.0 if pose_known else np.sqrt(2)), 0.0 if pose_known else parallax))
+    bend = 2.5 * pattern.shape if pose_known else float(np.hypot(2.5 * pattern.shape, APPROXIMATE))
     return max(3.0, bend * focal * scene.obj.size / distance), max(10.0, 4 * shift)
 
 

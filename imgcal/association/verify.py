@@ -244,8 +244,8 @@ def _size_misfit(scene: Scene, fits: Fits) -> NDArray[np.float64]:
         ratio = np.log(np.where(fits.labels >= 0, seen, np.nan) / radius.numpy())
         ratio = np.where(np.isfinite(ratio).any(-1, keepdims=True), ratio, 0.0)
         misfit = np.abs(ratio - np.nanmedian(ratio, axis=-1, keepdims=True))
-        prior_std = np.maximum(1.5 * np.nanmedian(misfit, axis=-1, keepdims=True), LEAST_SIZE_SPREAD)
-    return np.nansum(np.minimum((misfit / prior_std) ** 2, MOST_SIZE_MISFIT), axis=(1, 2))
+        usual = np.maximum(1.5 * np.nanmedian(misfit, axis=-1, keepdims=True), LEAST_SIZE_SPREAD)
+    return np.nansum(np.minimum((misfit / usual) ** 2, MOST_SIZE_MISFIT), axis=(1, 2))
 
 
 def _clutter(scene: Scene, fits: Fits) -> NDArray[np.float64]:

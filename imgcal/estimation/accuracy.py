@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -158,8 +158,16 @@ class PredictedError:
         }
 
 
+class HasEstimate(Protocol):
+    """What holds an estimate beside other things: a `Calibration`."""
+
+    @property
+    def estimate(self) -> Estimate:
+        """The estimate."""
+
+
 def predicted_error(
-    calibration: Estimate, *, volume: WorkingVolume | None = None, covariance: Tensor | None = None
+    calibration: Estimate | HasEstimate, *, volume: WorkingVolume | None = None, covariance: Tensor | None = None
 ) -> PredictedError:
     """Predict the errors that a recalibrated rig makes where it is used.
 
@@ -186,20 +194,21 @@ def predicted_error(
         >>> predicted_error(result, volume=volume).median_px < 0.1
         True
     """
-    if calibration.rig.batch_shape:
+    found = calibration if isinstance(calibration, Estimate) else calibration.estimate
+    if found.rig.batch_shape:
         raise InputError(
-            f"predicted error: found a batch of {tuple(calibration.rig.batch_shape)} rigs, expected one rig without "
+            f"predicted error: found a batch of {tuple(found.rig.batch_shape)} rigs, expected one rig without "
             "batch axes"
         )
-    rig = without_gradient(calibration.rig)
-    volume = working_volume(calibration) if volume is None else volume
-    covariance = joint_covariance(calibration) if covariance is None else covariance
+    rig = without_gradient(found.rig)
+    volume = working_volume(found) if volume is None else volume
+    covariance = joint_covariance(found) if covariance is None else covariance
     grid = volume.grid()
     shape, points = grid.shape[:-1], grid.flatten(0, -2)
     anchors = volume.grid(ANCHORS).flatten(0, -2)
     uncertainty = rig_uncertainty(rig, covariance.detach().to(points), anchors)
     projection = rig.project(points)
-    seen, noise = projection.visible, _noise(calibration)
+    seen, noise = projection.visible, _noise(found)
     maps, depths, inside = _maps(uncertainty, volume, torch.where(seen, projection.depth, torch.nan))
     return PredictedError(
         volume=volume,

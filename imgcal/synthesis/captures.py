@@ -15,7 +15,7 @@ from imgcal.geometry import RigidTransform
 from imgcal.synthesis.rigs import Drift, PoseRange, Snapshots, synthesize
 from imgcal.synthesis.spheres import sphere_images
 from imgcal.types import BlobFlag, CalibrationObject, CameraRig, Detections
-from renderers import Blobs, ClutterModel, SensorModel, infrared_frames, sample_clutter
+from renderers import ClutterModel, SensorModel, Spots, infrared_frames, sample_clutter
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def simulate_frames(
     for pose in range(len(truth.uv)):
         points = truth.rig_from_object[pose].apply(obj.points)
         projection = rig.project(points, obj.radius)
-        markers = Blobs(
+        markers = Spots(
             uv=projection.uv,
             shape=sphere_images(rig, points, radius),
             intensity=torch.ones_like(projection.depth),
@@ -148,14 +148,14 @@ def true_detections(truth: Truth) -> Detections:
 
 
 def _frames(
-    markers: Blobs, rig: CameraRig, model: FrameModel, generator: torch.Generator
+    markers: Spots, rig: CameraRig, model: FrameModel, generator: torch.Generator
 ) -> dict[str, NDArray[np.uint8] | NDArray[np.uint16]]:
     """Render one snapshot: cameras with images of the same size together."""
     frames: dict[str, NDArray[np.uint8] | NDArray[np.uint16]] = {}
     sizes = [tuple(size) for size in rig.image_size.tolist()]
     for width, height in sorted(set(sizes)):
         cameras = [camera for camera, size in enumerate(sizes) if size == (width, height)]
-        some = Blobs(
+        some = Spots(
             markers.uv[cameras].float(),
             markers.shape[cameras].float(),
             markers.intensity[cameras].float(),

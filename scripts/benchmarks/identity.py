@@ -140,8 +140,8 @@ def _ms(value: float) -> str:
 def _case(case: Case, snapshots: int, patience: float) -> dict[str, dict[str, float]]:
     """Run everything on the same snapshots in turn; peers on as many as they manage within `patience` seconds."""
     rig, obj, made = snapshots_of(case, snapshots)
-    prior_std = case.kappa if case.stated is None else case.stated
-    std = RelativeDrift(*[max(prior_std, LEAST_PRIOR)] * 2).std(rig)
+    expected = case.kappa if case.stated is None else case.stated
+    std = RelativeDrift(*[max(expected, LEAST_PRIOR)] * 2).std(rig)
     peers = None if peer("poselib") is None else Peers(rig, obj)
     _ours(made[0], rig, obj, std)  # compile
     counts: dict[str, Count] = {}

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from renderers import Blobs, ClutterModel, SensorModel, infrared_frames, palette, render_blobs, sample_clutter, splat
+from renderers import ClutterModel, SensorModel, Spots, infrared_frames, palette, render_blobs, sample_clutter, splat
 from scripts.benchmarks.effort import Effort
 from scripts.timing import side_by_side
 
@@ -55,7 +55,7 @@ def infrared(effort: Effort) -> list[dict[str, Any]]:
     uv = torch.rand(cameras, FIDUCIALS, 2, generator=generator) * torch.tensor([size[1], size[0]])
     ones = torch.ones(cameras, FIDUCIALS)
     radius = 2 + 8 * torch.rand(cameras, FIDUCIALS, generator=generator)
-    markers = Blobs(uv, radius[..., None, None] ** 2 * torch.eye(2), ones, ones > 0, ones)
+    markers = Spots(uv, radius[..., None, None] ** 2 * torch.eye(2), ones, ones > 0, ones)
     clutter = sample_clutter(ClutterModel(occluded=0.2), markers, size, generator=generator)
     sensor = SensorModel(bit_depth=12, shot_noise=2.0, hot_pixels=1e-5)
     names: dict[str, Callable[[], object]] = {

@@ -18,6 +18,6 @@ result = imgcal.estimate(observations, factory, obj)
 
 before = factory.local(truth.rig)[:, 6:8].abs().mean()
 after = result.rig.local(truth.rig)[:, 6:8].abs().mean()
-prior_std = camera_std(result)[:, 6:8].mean()
-print(f"focal length error: {before:.2f} px -> {after:.2f} px, predicted spread {prior_std:.2f} px")
+deviation = camera_std(result)[:, 6:8].mean()
+print(f"focal length error: {before:.2f} px -> {after:.2f} px, predicted {deviation:.2f} px")
 print(f"chi2 per degree of freedom: {result.chi2_per_dof:.2f}")

@@ -174,8 +174,8 @@ def mean(column: Mapping[str, Any]) -> str:
     """Mean RE, and the spread of that mean over trials."""
     if column["mean"] is None:
         return "not finite"
-    prior_std = column["spread"]
-    return _px(column["mean"]) + ("" if prior_std is None else f" ± {prior_std:.1g}")
+    deviation = column["spread"]
+    return _px(column["mean"]) + ("" if deviation is None else f" ± {deviation:.1g}")
 
 
 def training_cells(result: Mapping[str, Any]) -> list[str]:

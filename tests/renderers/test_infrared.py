@@ -9,9 +9,9 @@ from torch import Tensor
 
 from renderers import (
     BlobRange,
-    Blobs,
     ClutterModel,
     SensorModel,
+    Spots,
     ellipse_reference,
     expose,
     infrared_frames,
@@ -23,12 +23,12 @@ SIZE = (64, 80)
 QUIET = SensorModel(read_noise=0.0, background=0.0, contrast=0.9, bit_depth=16)
 
 
-def blobs(uv: Tensor, shape: Tensor | float, depth: Tensor | None = None, intensity: float = 1.0) -> Blobs:
+def blobs(uv: Tensor, shape: Tensor | float, depth: Tensor | None = None, intensity: float = 1.0) -> Spots:
     """Make visible blobs; a number is the radius of discs."""
     if not isinstance(shape, Tensor):
         shape = shape**2 * torch.eye(2, dtype=uv.dtype).expand(*uv.shape, 2)
     ones = torch.ones_like(uv[..., 0])
-    return Blobs(uv, shape, intensity * ones, ones > 0, ones if depth is None else depth)
+    return Spots(uv, shape, intensity * ones, ones > 0, ones if depth is None else depth)
 
 
 def tilted(major: float, minor: float, angle: float) -> Tensor:

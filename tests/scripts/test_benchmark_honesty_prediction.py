@@ -31,8 +31,8 @@ def test_true_objects_spread_as_the_tolerance_says():
     drawn = torch.stack([case.true_object(generator).points for _ in range(200)])
     lengths = (drawn[:, 3] - drawn[:, 0]).norm(dim=1) / (obj.points[3] - obj.points[0]).norm()
     assert abs(float(lengths.std()) / 0.01 - 1) < 0.15
-    prior_std = (drawn - drawn.mean(0))[:, 1].std(0)
-    assert torch.allclose(prior_std[1:], torch.full((2,), 0.2, dtype=torch.float64), rtol=0.15)
+    spread = (drawn - drawn.mean(0))[:, 1].std(0)
+    assert torch.allclose(spread[1:], torch.full((2,), 0.2, dtype=torch.float64), rtol=0.15)
     assert Case(load_rig("room10"), obj, 3).true_object(generator) is obj
     assert 0.5 < judge(case, 8, 1, PipelineOptions())["px"]["ratio"] < 1.5
 

@@ -203,9 +203,9 @@ def shape(mass, x, y, patch):
     return elongation, two_peaked, middle, (moments[0, 0], moments[0, 1], moments[1, 1])
 
 
-def waist(mass, along, prior_std):
+def waist(mass, along, spread):
     """Least share of the mass at a place along the axis, of what lies on either side of it."""
-    at = along / max(1.0, prior_std / 3.5) + moments_of.PROFILE / 2
+    at = along / max(1.0, spread / 3.5) + moments_of.PROFILE / 2
     bins = np.arange(moments_of.PROFILE)
     profile = (mass[..., None] * np.clip(1 - abs(at[..., None] - bins), 0, None)).sum((0, 1))
     sides = np.array([min(profile[:i].max(), profile[i + 1 :].max()) for i in bins[1:-1]])

@@ -136,3 +136,9 @@ def test_a_blind_camera_has_the_factorys_errors(o10, asymmetric8):
     without = float(found.mm_without_exceptions.median())
     assert without == pytest.approx(others.median_mm, rel=0.02)
     assert without < found.median_mm / 10
+
+
+def test_a_calibration_is_as_good_as_its_estimate(o10, asymmetric8):
+    truth = simulate_truth(o10, asymmetric8, 3, torch.Generator().manual_seed(1), PhysicalDrift())
+    found = calibrate(true_detections(truth), o10, asymmetric8)
+    assert predicted_error(found).median_px == predicted_error(found.estimate).median_px

@@ -127,10 +127,10 @@ def test_standard_deviations_match_the_samples(o10: CameraRig, drift: Drift) -> 
     drifted = drift.apply(o10, seeded(), 20000)
     steps = drifted.local(o10.expand(20000))
     expected = drift.std(o10)
-    prior_std = steps.square().mean(0).sqrt()
+    spread = steps.square().mean(0).sqrt()
     zero = expected < 1e-9
-    assert prior_std[zero].max() < 1e-6 if zero.any() else True
-    torch.testing.assert_close(prior_std[~zero], expected[~zero], rtol=0.03, atol=1e-9)
+    assert spread[zero].max() < 1e-6 if zero.any() else True
+    torch.testing.assert_close(spread[~zero], expected[~zero], rtol=0.03, atol=1e-9)
 
 
 def test_drift_keeps_the_axes_of_the_rig(o10: CameraRig) -> None:
