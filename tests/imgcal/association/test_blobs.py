@@ -75,11 +75,11 @@ def test_patterns_of_sampled_rigs_move_and_bend_as_much_as_the_spread_says(o10, 
     points = snapshot.pose.apply(asymmetric8.points)
     drift = torch.randn(2000, 10, 15, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * std
     change = (o10.expand(2000).retract(drift).project(points).uv - o10.project(points).uv).numpy()
-    pattern = pattern_prior(std, o10, distance)
+    allowed = pattern_prior(std, o10, distance)
     shift = change.mean(2)  # (K, C, 2)
-    np.testing.assert_allclose(shift.std((0, 2)), pattern.shift, rtol=0.15)
+    np.testing.assert_allclose(shift.std((0, 2)), allowed.shift, rtol=0.15)
     pattern = o10.project(points).uv.numpy()
     pattern = pattern - pattern.mean(1, keepdims=True)
     bent = (change - shift[:, :, None]) / np.sqrt((pattern**2).sum(-1).mean(1))[:, None, None]
     # Of lengths in the pattern, at most: a turn about the view moves all of it and bends none.
-    assert 0.5 * pattern.shape < np.sqrt((bent**2).sum(-1).mean()) < 1.5 * pattern.shape
+    assert 0.5 * allowed.shape < np.sqrt((bent**2).sum(-1).mean()) < 1.5 * allowed.shape
