@@ -1,7 +1,9 @@
 """Residuals and normal equations on CPUs: `linearization.py` compiled to one loop a rig, without temporaries.
 
-Layouts: `lm_cpu._Blocks`; what fits each camera and what each snapshot is summed up before it is written. The object's
-own parameters stand behind the coupled ones, and have a border of their own.
+Three tuples of arrays go in and out: what is `given` (points of the object and their squared radii, observations and
+the roots of their weights, the factory rig, the prior, that of the object), the `state`, and the `blocks` of the normal
+equations. Layouts: `lm_cpu._Blocks`; what fits each camera and what each snapshot is summed up before it is written.
+The object's own parameters stand behind the coupled ones, and have a border of their own.
 """
 
 # Compiled functions take their types from their arguments.
@@ -17,24 +19,41 @@ from renderers.compiling import njit
 
 
 @njit(cache=True, fastmath=kernels.FAST)
-def linearize_all(
-    points, radius_squared, uv, root_weight, rotation0, position0, focal0, principal0, distortion0, prior_std, own_std,
-    offset, rotation, centre, own_offset,
-    camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual,
-    cost, cameras_first, loss, threshold,
-):  # fmt: skip
+def linearize_all(given, state, blocks, cost, cameras_first, loss, threshold):
     """Fill the blocks and the costs of all rigs of a batch."""
     for b in range(len(cost)):
-        given = (
-            points, radius_squared, uv[b], root_weight[b],
-            rotation0[b], position0[b], focal0[b], principal0[b], distortion0[b], prior_std[b], own_std[b],
-        )  # fmt: skip
-        state = (offset[b], rotation[b], centre[b], own_offset[b])
-        blocks = (
-            camera[b], coupling[b], pose[b], border[b], camera_gradient[b], pose_gradient[b], own_gradient[b],
-            residual[b],
-        )  # fmt: skip
-        cost[b] = linearize_rig(given, state, blocks, cameras_first, loss, threshold)
+        cost[b] = linearize_rig(
+            given_of(given, b), state_of(state, b), blocks_of(blocks, b), cameras_first, loss, threshold
+        )
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def given_of(given, b):
+    """What is given of one rig; the points and their radii are those of all."""
+    (
+        points, radius_squared, uv, root_weight,
+        rotation0, position0, focal0, principal0, distortion0, prior_std, own_std,
+    ) = given  # fmt: skip
+    return (
+        points, radius_squared, uv[b], root_weight[b],
+        rotation0[b], position0[b], focal0[b], principal0[b], distortion0[b], prior_std[b], own_std[b],
+    )  # fmt: skip
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def state_of(state, b):
+    """One row of a state."""
+    offset, rotation, centre, own_offset = state
+    return offset[b], rotation[b], centre[b], own_offset[b]
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def blocks_of(blocks, b):
+    """One row of normal equations."""
+    camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual = blocks
+    return (
+        camera[b], coupling[b], pose[b], border[b], camera_gradient[b], pose_gradient[b], own_gradient[b], residual[b],
+    )  # fmt: skip
 
 
 @njit(cache=True, fastmath=kernels.FAST)

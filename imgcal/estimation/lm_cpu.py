@@ -26,7 +26,15 @@ from imgcal.estimation.levenberg_marquardt import (
     pixel_rounding,
 )
 from imgcal.estimation.linearization import NormalEquations, ObjectEquations, Problem, State
-from imgcal.estimation.linearization_cpu import linearize_all, linearize_rig, move, turn_all
+from imgcal.estimation.linearization_cpu import (
+    blocks_of,
+    given_of,
+    linearize_all,
+    linearize_rig,
+    move,
+    state_of,
+    turn_all,
+)
 from imgcal.geometry import RigidTransform, kernels
 from imgcal.types import CameraRig
 from renderers.compiling import njit
@@ -52,19 +60,17 @@ def minimize(
     blocks = _Blocks.of(problem, rows=max(count, 2))
     converged = np.zeros(count, dtype=np.bool_)
     iterations = np.zeros(count, dtype=np.int64)
-    given = _arrays((*_given(problem), own_std))
-    arrays = _arrays((*_parts(state), *blocks.parts, blocks.cost))
+    shared, given = _shared(problem), _arrays((*_given(problem), own_std))
+    compiled = (_arrays(_parts(state)), _arrays(blocks.parts), *_arrays((blocks.cost,)), converged, iterations)
     limits = (blocks.cameras_first, LOSS_CODES[loss], threshold, max_iterations)
     tolerances = (tolerance + pixel_rounding(problem)).numpy()
-    shared = _shared(problem)
     if count == 1:
-        best = _minimize_rig(  # type: ignore[call-arg]
-            *shared, *(array[0] for array in given), *arrays, converged, iterations, *limits, tolerances[0]
-        )
+        one = (*shared, *(array[0] for array in given))
+        best = _minimize_rig(one, *compiled, limits, tolerances[0])  # type: ignore[call-arg]
         state, blocks = State(*(part[best : best + 1] for part in _parts(state))), blocks.only(best)
     else:
         with _threads_of_torch():
-            _minimize_all(*shared, *given, *arrays, converged, iterations, *limits, tolerances)  # type: ignore[call-arg]
+            _minimize_all((*shared, *given), *compiled, limits, tolerances)  # type: ignore[call-arg]
     if not own_std.shape[1]:
         state = replace(state, object_offset=None)
     return Solution(state, blocks.equations(), torch.from_numpy(converged), int(iterations.max()))
@@ -86,8 +92,9 @@ def linearize(problem: Problem, state: State, loss: str, threshold: float) -> No
     """Do the work of `linearization.linearize` for tensors on the CPU, without gradients; the loss as in `minimize`."""
     own_std, state = _object_of(problem, state, len(problem.uv))
     blocks = _Blocks.of(problem, len(problem.uv))
-    arrays = _arrays((*_given(problem), own_std, *_parts(state), *blocks.parts, blocks.cost))
-    linearize_all(*_shared(problem), *arrays, blocks.cameras_first, LOSS_CODES[loss], threshold)  # type: ignore[call-arg]
+    given = (*_shared(problem), *_arrays((*_given(problem), own_std)))
+    arrays = (_arrays(_parts(state)), _arrays(blocks.parts), *_arrays((blocks.cost,)))
+    linearize_all(given, *arrays, blocks.cameras_first, LOSS_CODES[loss], threshold)  # type: ignore[call-arg]
     return blocks.equations()
 
 
@@ -178,7 +185,7 @@ def _parts(state: State) -> tuple[Tensor, ...]:
     return (state.offset, state.rotation, state.centre, state.object_offset)
 
 
-def _shared(problem: Problem) -> list[np.ndarray]:
+def _shared(problem: Problem) -> tuple[np.ndarray, ...]:
     points, squared = problem.points, problem.radius_squared
     return _arrays((points, points.new_zeros(len(points)) if squared is None else squared))
 
@@ -199,79 +206,68 @@ def rig_at(problem: Problem, offset: Tensor) -> CameraRig:
     )
 
 
-def _arrays(tensors: tuple[Tensor, ...]) -> list[np.ndarray]:
+def _arrays(tensors: tuple[Tensor, ...]) -> tuple[np.ndarray, ...]:
     """Share the memory of contiguous tensors; copy the others."""
-    return [tensor.detach().contiguous().numpy() for tensor in tensors]
+    return tuple(tensor.detach().contiguous().numpy() for tensor in tensors)
 
 
 @njit(parallel=True, cache=True, fastmath=kernels.FAST)
-def _minimize_all(
-    points, radius_squared, uv, root_weight, rotation0, position0, focal0, principal0, distortion0, prior_std, own_std,
-    offset, rotation, centre, own_offset,
-    camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual,
-    cost, converged, iterations, cameras_first, loss, threshold, max_iterations, tolerances,
-):  # fmt: skip
+def _minimize_all(given, state, blocks, cost, converged, iterations, limits, tolerances):
     """Levenberg-Marquardt on all rigs of a batch; the outputs hold the best states and their normal equations."""
-    for b in prange(uv.shape[0]):
-        state = (_pair(offset[b]), _pair(rotation[b]), _pair(centre[b]), _pair(own_offset[b]))
-        blocks = (
-            _pair(camera[b]), _pair(coupling[b]), _pair(pose[b]), _pair(border[b]),
-            _pair(camera_gradient[b]), _pair(pose_gradient[b]), _pair(own_gradient[b]), _pair(residual[b]),
+    for b in prange(len(cost)):
+        own, found = state_of(state, b), blocks_of(blocks, b)
+        offset, rotation, centre, own_offset = own
+        camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual = found
+        states = (_pair(offset), _pair(rotation), _pair(centre), _pair(own_offset))
+        tried = (
+            _pair(camera), _pair(coupling), _pair(pose), _pair(border),
+            _pair(camera_gradient), _pair(pose_gradient), _pair(own_gradient), _pair(residual),
         )  # fmt: skip
         best = _minimize_rig(
-            points, radius_squared, uv[b], root_weight[b],
-            rotation0[b], position0[b], focal0[b], principal0[b], distortion0[b], prior_std[b], own_std[b],
-            *state, *blocks, cost[b : b + 1], converged[b : b + 1], iterations[b : b + 1],
-            cameras_first, loss, threshold, max_iterations, tolerances[b],
+            given_of(given, b), states, tried, cost[b : b + 1], converged[b : b + 1], iterations[b : b + 1],
+            limits, tolerances[b],
         )  # fmt: skip
-        _copy(offset[b], state[0][best])
-        _copy(rotation[b], state[1][best])
-        _copy(centre[b], state[2][best])
-        _copy(own_offset[b], state[3][best])
-        _copy(camera[b], blocks[0][best])
-        _copy(coupling[b], blocks[1][best])
-        _copy(pose[b], blocks[2][best])
-        _copy(border[b], blocks[3][best])
-        _copy(camera_gradient[b], blocks[4][best])
-        _copy(pose_gradient[b], blocks[5][best])
-        _copy(own_gradient[b], blocks[6][best])
-        _copy(residual[b], blocks[7][best])
+        _copy(offset, states[0][best])
+        _copy(rotation, states[1][best])
+        _copy(centre, states[2][best])
+        _copy(own_offset, states[3][best])
+        _copy(camera, tried[0][best])
+        _copy(coupling, tried[1][best])
+        _copy(pose, tried[2][best])
+        _copy(border, tried[3][best])
+        _copy(camera_gradient, tried[4][best])
+        _copy(pose_gradient, tried[5][best])
+        _copy(own_gradient, tried[6][best])
+        _copy(residual, tried[7][best])
 
 
 @njit(cache=True, fastmath=kernels.FAST)
-def _minimize_rig(
-    points, radius_squared, uv, root_weight, rotation0, position0, focal0, principal0, distortion0, prior_std, own_std,
-    offset, rotation, centre, own_offset,
-    camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual,
-    cost, converged, iterations, cameras_first, loss, threshold, max_iterations, tolerance,
-):  # fmt: skip
+def _minimize_rig(given, states, blocks, cost, converged, iterations, limits, tolerance):
     """Levenberg-Marquardt on one rig.
 
-    Of the state (which begins with `offset`) and of the normal equations (`camera` to `residual`) there are two rows:
-    the best so far, and the one that is tried. The state's first row is the start.
+    Args:
+        given: of one rig; see `linearization_cpu`.
+        states: two rows, the best so far and the one that is tried; the first row is the start.
+        blocks: of the normal equations, two rows as well.
+        cost: (1,) of the best.
+        converged: (1,) whether a minimum was found.
+        iterations: (1,) how many were made.
+        limits: whether cameras are eliminated first, the loss and its threshold, iterations at most.
+        tolerance: on the cost.
 
     Returns:
         The row of the best.
     """
-    given = (
-        points, radius_squared, uv, root_weight,
-        rotation0, position0, focal0, principal0, distortion0, prior_std, own_std,
-    )  # fmt: skip
-    kind, (count, size, wide) = uv.dtype, coupling.shape[1:]
+    camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, _ = blocks
+    cameras_first, loss, threshold, max_iterations = limits
+    kind, (count, size, wide) = coupling.dtype, coupling.shape[1:]
     factor, whitened = np.empty((count, size, size), kind), np.empty((count, size, wide), kind)
     schur = np.empty((wide, wide), kind)
     camera_step, pose_step = np.empty(camera_gradient.shape[1:], kind), np.empty(pose_gradient.shape[1:], kind)
     own_step = np.empty(own_gradient.shape[1], kind)
     rounding = 4 * np.finfo(kind).eps
     damping, growth, relax, best = LEAST_DAMPING, FIRST_GROWTH, RELAX, 0
-    cost[0] = linearize_rig(
-        given, (offset[0], rotation[0], centre[0], own_offset[0]),
-        (
-            camera[0], coupling[0], pose[0], border[0],
-            camera_gradient[0], pose_gradient[0], own_gradient[0], residual[0],
-        ),
-        cameras_first, loss, threshold,
-    )  # fmt: skip
+    cost[0] = linearize_rig(given, state_of(states, 0), blocks_of(blocks, 0), cameras_first, loss, threshold)
     for iteration in range(max_iterations):
         iterations[0] = iteration + 1
         b, t = best, 1 - best
@@ -287,13 +283,9 @@ def _minimize_rig(
             )  # fmt: skip
         better, small = False, False
         if np.isfinite(gain):
-            trial = (offset[t], rotation[t], centre[t], own_offset[t])
-            move((offset[b], rotation[b], centre[b], own_offset[b]), camera_step, pose_step, own_step, trial)
-            blocks = (
-                camera[t], coupling[t], pose[t], border[t],
-                camera_gradient[t], pose_gradient[t], own_gradient[t], residual[t],
-            )  # fmt: skip
-            trial_cost = linearize_rig(given, trial, blocks, cameras_first, loss, threshold)
+            trial = state_of(states, t)
+            move(state_of(states, b), camera_step, pose_step, own_step, trial)
+            trial_cost = linearize_rig(given, trial, blocks_of(blocks, t), cameras_first, loss, threshold)
             small = gain <= tolerance + rounding * cost[0]
             if trial_cost < cost[0]:
                 relax = min(max(1 - (2 * (cost[0] - trial_cost) / gain - 1) ** 3, RELAX), GREATEST_RELAX)
