@@ -171,7 +171,7 @@ def render_blobs(
 
     Examples:
         >>> one = torch.ones(1, 1)
-        >>> disc = Blobs(torch.tensor([[[16.0, 12.0]]]), 9.0 * torch.eye(2).expand(1, 1, 2, 2), one, one > 0, one)
+        >>> disc = Spots(torch.tensor([[[16.0, 12.0]]]), 9.0 * torch.eye(2).expand(1, 1, 2, 2), one, one > 0, one)
         >>> light, _ = render_blobs(disc, (24, 32), blur=0.7)
         >>> light.shape, bool(light[0, 12, 16] > light[0, 12, 20])
         (torch.Size([1, 24, 32]), True)

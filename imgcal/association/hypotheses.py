@@ -162,9 +162,11 @@ def single_camera_poses(
     score = np.zeros((len(triples), keep))
     rotation, translation = np.zeros((len(triples), keep, 3, 3)), np.zeros((len(triples), keep, 3))
     _search(
-        *towards(rays), cameras, fiducials.triples, fiducials.sides, fiducials.frames, fiducials.points,
-        fiducials.order, focal, raster, origin, 1 / cell, score, rotation, translation,
-    )  # fmt: skip
+        (*towards(rays), cameras),
+        (fiducials.triples, fiducials.sides, fiducials.frames, fiducials.points, fiducials.order),
+        (focal, raster, origin, 1 / cell),
+        (score, rotation, translation),
+    )
     found = score > 0
     camera = np.broadcast_to(cameras[:, None], found.shape)[found]
     back = rig.cam_from_rig.rotation.mT.numpy()[camera]
@@ -173,11 +175,19 @@ def single_camera_poses(
 
 
 @njit(cache=True, fastmath=FAST)
-def _search(
-    rays, directions, cameras, triples, sides, frames, points, order, focal, raster, origin, per_pixel,
-    score, rotation, translation,
-):  # fmt: skip
-    """Fill the best poses (in the camera's frame) of each triple of blobs."""
+def _search(blobs, fiducials, images, poses):
+    """Fill the best poses (in the camera's frame) of each triple of blobs.
+
+    Args:
+        blobs: of each triple the rays as `towards` turns them, its rotations, and the camera.
+        fiducials: triples, sides, frames, points and order of `FiducialTriples`.
+        images: of each camera focal length, raster of the blobs and its origin; cells a pixel.
+        poses: score, rotation and translation of the best, the best first.
+    """
+    rays, directions, cameras = blobs
+    triples, sides, frames, points, order = fiducials
+    focal, raster, origin, per_pixel = images
+    score, rotation, translation = poses
     for q in range(len(rays)):
         camera = cameras[q]
         frame, depths, turn = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
@@ -196,9 +206,8 @@ def _search(
                 x = directions[q, 0, 0] * depths[0] - turn[0, 0] * p[0] - turn[0, 1] * p[1] - turn[0, 2] * p[2]
                 y = directions[q, 0, 1] * depths[0] - turn[1, 0] * p[0] - turn[1, 1] * p[1] - turn[1, 2] * p[2]
                 z = directions[q, 0, 2] * depths[0] - turn[2, 0] * p[0] - turn[2, 1] * p[1] - turn[2, 2] * p[2]
-                value = _explained(
-                    turn, x, y, z, points, order, focal[camera], raster[camera], origin[camera], per_pixel, score[q, -1]
-                )
+                image = (focal[camera], raster[camera], origin[camera], per_pixel)
+                value = _explained(turn, (x, y, z), points, order, image, score[q, -1])
                 if value > score[q, -1]:
                     place = len(score[q]) - 1
                     while place > 0 and score[q, place - 1] < value:
@@ -216,8 +225,10 @@ def _search(
 
 
 @njit(cache=True, fastmath=FAST)
-def _explained(turn, x, y, z, points, order, focal, raster, origin, per_pixel, least):
+def _explained(turn, shift, points, order, image, least):
     """Sum over fiducials of their nearness to a blob; give up early where it cannot or will hardly reach `least`."""
+    x, y, z = shift
+    focal, raster, origin, per_pixel = image
     height, width = raster.shape
     total = 0.0
     for i in range(len(order)):

@@ -75,17 +75,18 @@ def innovations(
         )
     ]
     for k in np.flatnonzero(np.isfinite(equations.cost.numpy())):
-        # Lower factors of the cameras' blocks, of the couplings' and of the pose's: see arrow.reduce.
+        # Lower factors of the cameras' blocks, of the couplings' and of the pose's: see schur.reduce.
         eliminated = equations.camera[k].numpy().copy()
         whitened = equations.coupling[k, 0].numpy().copy()
         kept = equations.pose[k, 0].numpy().copy()
         complexity[k] = _factorize(eliminated, whitened, kept)
         if np.isfinite(complexity[k]):
-            _compare(  # type: ignore[call-arg]
-                *(array[k] for array in given), radius_squared,
-                eliminated, whitened, kept, blobs.uv, noise, typical, blobs.count, labels[k], sigma[k] ** 2,
-                squared[k], log_det[k], own[k], residual[k], freedom[k], uv[k],
-            )  # fmt: skip
+            _compare(
+                (*(array[k] for array in given), radius_squared),
+                (eliminated, whitened, kept),
+                (blobs.uv, noise, typical, blobs.count, labels[k], sigma[k] ** 2),
+                (squared[k], log_det[k], own[k], residual[k], freedom[k], uv[k]),
+            )
     return Innovations(squared, log_det, own, residual, freedom, uv, complexity)
 
 
@@ -144,12 +145,19 @@ def _factorize(blocks, coupling, kept):
 
 
 @njit(cache=True, fastmath=kernels.FAST)
-def _compare(
-    rotation0, turn, position, focal, principal, distortion, prior_std, rotated, centre, radius_squared,
-    eliminated, whitened, kept, blob_uv, blob_noise, typical_noise, blob_count, labels, extra,
-    squared, log_det, own, residual, freedom, uv,
-):  # fmt: skip
-    """Fill the outputs for one labelling."""
+def _compare(given, factors, blobs, outputs):
+    """Fill the outputs for one labelling.
+
+    Args:
+        given: the factory's rotations, and the rest of the fitted cameras, the prior, the object and its place.
+        factors: of the arrow; see `_factorize`.
+        blobs: their places, noise, usual noise and number, what they are labelled, and noise beyond their own.
+        outputs: as in `Innovations`.
+    """
+    rotation0, turn, position, focal, principal, distortion, prior_std, rotated, centre, radius_squared = given
+    eliminated, whitened, kept = factors
+    blob_uv, blob_noise, typical_noise, blob_count, labels, extra = blobs
+    squared, log_det, own, residual, freedom, uv = outputs
     rows, parts = np.empty((2, 21)), np.empty((2, 21))
     rotation, exponential, left = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     unit = max(1.0, np.sqrt(centre[0] ** 2 + centre[1] ** 2 + centre[2] ** 2))
@@ -203,8 +211,8 @@ def _rows(
 ):  # fmt: skip
     """Fill the Jacobian (2, 21) of a pixel by 15 whitened camera and 6 pose parameters, and the pixel.
 
-    To the last digit that of the fit (`fused._linearize`): where a label alone decides a parameter, nothing is left of
-    it but the difference of two almost equal numbers.
+    To the last digit that of the fit (`linearization_cpu.linearize_rig`): where a label alone decides a parameter,
+    nothing is left of it but the difference of two almost equal numbers.
     """
     ax, ay, az = rotated[0], rotated[1], rotated[2]
     ox, oy, oz = ax + centre[0] - position[0], ay + centre[1] - position[1], az + centre[2] - position[2]

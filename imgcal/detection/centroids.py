@@ -77,10 +77,12 @@ def measure(frame: Frame, candidates: Candidates, options: DetectionOptions, sca
     least = 0.0 if options.threshold is None else options.threshold
     limits = (least, options.min_radius, options.radius_limit, options.max_elongation)
     measure_all(
-        frame, candidates.tile, candidates.labels, boxes, candidates.label, candidates.whole, scale,
-        scale if options.polarity == "dark" else -1, saturation, limits,
-        blobs.uv, blobs.sigma, blobs.radius, blobs.contrast, blobs.flags, kept,
-    )  # fmt: skip
+        frame,
+        (candidates.tile, candidates.labels, boxes, candidates.label, candidates.whole),
+        (scale, scale if options.polarity == "dark" else -1, saturation),
+        limits,
+        (blobs.uv, blobs.sigma, blobs.radius, blobs.contrast, blobs.flags, kept),
+    )
     return blobs.select(_first(blobs, kept))
 
 

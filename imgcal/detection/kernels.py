@@ -40,11 +40,19 @@ _MERGED, _SATURATED, _BORDER = int(BlobFlag.MERGED), int(BlobFlag.SATURATED), in
 
 
 @njit(cache=True, nogil=True)
-def measure_all(
-    frame, tile, labels, boxes, label, whole, full_scale, invert, saturation, limits,
-    uv, sigma, radius, contrast, flags, kept,
-):  # fmt: skip
-    """Fill the columns of all candidates of a frame."""
+def measure_all(frame, candidates, levels, limits, blobs):
+    """Fill the columns of all candidates of a frame.
+
+    Args:
+        frame: (H, W) grey values.
+        candidates: tile, labels, boxes, label and whole of `Candidates`.
+        levels: largest grey value, the same or -1 where dark is bright, and from where a pixel is saturated.
+        limits: least threshold, radius from and to, greatest elongation.
+        blobs: the columns of `Blobs` but for the camera, and which candidates are kept.
+    """
+    tile, labels, boxes, label, whole = candidates
+    full_scale, invert, saturation = levels
+    uv, sigma, radius, contrast, flags, kept = blobs
     widest = 0
     for k in range(len(boxes)):
         widest = max(widest, half_size(boxes[k], whole[k]))

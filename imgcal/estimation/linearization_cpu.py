@@ -257,7 +257,7 @@ def _distribute(products, gradient, c, s, camera, coupling, pose, camera_gradien
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _loss(squared, loss, threshold):
-    """Robust loss and its slope, like robust.LOSSES."""
+    """Robust loss and its slope, like `robust_losses.LOSSES`."""
     if loss == 1:
         if squared <= threshold**2:
             return squared, 1.0
@@ -274,7 +274,7 @@ def _loss(squared, loss, threshold):
 
 @njit(cache=True, fastmath=kernels.FAST)
 def move(state, camera_step, pose_step, own_step, new):
-    """Write the state plus a step to `new`, like `linearization.moved`."""
+    """Write the state plus a step to `new`, like `linearization.retract`."""
     offset, rotation, centre, own_offset = state
     new_offset, new_rotation, new_centre, new_own_offset = new
     for i in range(len(own_offset)):
