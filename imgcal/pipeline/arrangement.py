@@ -1,4 +1,4 @@
-"""Associations snapshots as estimates take them: arranged densely, each with a pose to begin with."""
+"""Labelled snapshots as estimates take them: arranged densely, each with a pose to begin with."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from imgcal.types import CalibrationObject, CameraRig, Observations
 
 @dataclass(frozen=True)
 class Arranged:
-    """Associations snapshots, all used ones of which say where the object is: S of them."""
+    """Labelled snapshots, all used ones of which say where the object is: S of them."""
 
     labelled: Associations
     observations: Observations  # (S, C, N)

@@ -83,7 +83,7 @@ class Calibration:
 
     estimate: Estimate  # without batch axes: the rig, the poses, and how well they are known
     labelled: Associations
-    observations: Observations  # (S, C, N) as used: outliers not seen, sigma with the model error
+    observations: Observations  # (S, C, N) as used: outliers not seen, sigma with the additive noise
     additive_noise: float  # px, what the residuals hold beyond the blobs' own sigma
     outliers: int  # labelled blobs left out
     prior_scale: Mapping[str, float]  # by kind of value: factor by which the prior was too narrow, where it was
