@@ -67,6 +67,7 @@ class MapEstimate(nn.Module):
 
     Example:
         >>> import imgcal, torch
+        >>> from imgcal.nn import MapEstimate
         >>> rig, obj = imgcal.load_rig("O10"), imgcal.load_object("asymmetric8")
         >>> pose = imgcal.RigidTransform.identity(1, dtype=rig.focal_length.dtype)
         >>> pose.translation[0, 2] = rig.working_distance

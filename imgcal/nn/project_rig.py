@@ -27,6 +27,7 @@ class ProjectRig(nn.Module):
 
     Example:
         >>> import imgcal
+        >>> from imgcal.nn import ProjectRig
         >>> rig, obj = imgcal.load_rig("O10"), imgcal.load_object("asymmetric8")
         >>> pose = imgcal.RigidTransform.identity(2, 3, dtype=rig.focal_length.dtype)
         >>> pose.translation[..., 2] = rig.working_distance

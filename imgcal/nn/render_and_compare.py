@@ -29,7 +29,7 @@ class RenderAndCompare(nn.Module):
     """Refine a prediction on the colour-coded images that it was made from: photometric Gauss-Newton, then MAP.
 
     The gradient is that of the solution, by the implicit function theorem, to the images (by their Gauss-Newton
-    curvature: exact where they are explained) and to the factory rig and its spread; none flows through the first
+    curvature: exact where they are explained) and to the factory rig and its prior; none flows through the first
     guess, which only says where to begin. One opaque operator in a compiled or exported graph; computed in float64,
     images in float32.
 
@@ -48,7 +48,8 @@ class RenderAndCompare(nn.Module):
 
     Example:
         >>> import imgcal, torch
-        >>> from imgcal.nn import ProjectRig, SplatRenderer
+        >>> from imgcal.nn import ProjectRig, RenderAndCompare, SplatRenderer
+        >>> from imgcal.types import Prediction
         >>> rig, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
         >>> pose = imgcal.RigidTransform.identity(1, dtype=rig.focal_length.dtype)
         >>> pose.translation[0, 2] = rig.working_distance

@@ -36,6 +36,8 @@ class ReprojectionLoss(nn.Module):
 
     Example:
         >>> import imgcal
+        >>> from imgcal.nn import ReprojectionLoss
+        >>> from imgcal.types import Prediction
         >>> rig, obj = imgcal.load_rig("O10"), imgcal.load_object("asymmetric8")
         >>> pose = imgcal.RigidTransform.identity(dtype=rig.focal_length.dtype)
         >>> pose.translation[2] = rig.working_distance

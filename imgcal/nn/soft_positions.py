@@ -27,7 +27,7 @@ class SoftPositions(nn.Module):
 
     Example:
         >>> import torch
-        >>> from imgcal.nn import SplatRenderer
+        >>> from imgcal.nn import SoftPositions, SplatRenderer
         >>> colours, uv = torch.eye(3), torch.tensor([[10.0, 10.5], [30.5, 20.25], [50.0, 40.0]])
         >>> images = SplatRenderer(colours, (48, 64))(uv)
         >>> found, confidence = SoftPositions(colours)(images)

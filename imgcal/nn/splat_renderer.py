@@ -33,6 +33,7 @@ class SplatRenderer(nn.Module):
 
     Example:
         >>> import torch
+        >>> from imgcal.nn import SplatRenderer
         >>> renderer = SplatRenderer(torch.eye(3), image_size=(48, 64))
         >>> uv = torch.tensor([[10.0, 10.0], [30.5, 20.25], [50.0, 40.0]], requires_grad=True)
         >>> images = renderer(uv.expand(2, -1, -1))
