@@ -116,7 +116,7 @@ class Recalibrator:
         rig = rig.to(torch.float64)
         self.rig, self.obj, self.detection, self.window = rig, obj, detection, window
         self.options = replace(options, blind_cameras=True)
-        self._follower = Tracker(rig, obj, self.options, remembered=0)
+        self._tracker = Tracker(rig, obj, self.options, remembered=0)
         self._fit = WindowFit(rig, obj, self.options, window)
         self._recent: deque[Kept] = deque(maxlen=max(window, REMEMBERED))
         self._prior_std = (rig.prior or RigPrior()).std(rig)
@@ -209,7 +209,7 @@ class Recalibrator:
         self, usable: Detections, name: str, coded: NDArray[np.int64] | None
     ) -> tuple[Detections, SnapshotIdentity]:
         """Label a snapshot by itself, with what is known of the rig."""
-        prior, tracker = (self.rig.prior or RigPrior()).std(self.rig), self._follower
+        prior, tracker = (self.rig.prior or RigPrior()).std(self.rig), self._tracker
         tracker.rig, tracker.prior_std = self.rig, prior
         if self._latest is not None:
             tracker.rig, tracker.prior_std = self._latest.rig, torch.minimum(2 * flat_std(self._latest.estimate), prior)
@@ -268,7 +268,7 @@ class Recalibrator:
         self._prior_std = window.prior_std
         self._spare.append(spare_blobs(window.kept[-1].blobs, self.rig.num_cameras))
         self._latest, self._fitted, self._follows = live, result, True
-        self._follower.follow(result.rig_from_object[-1])
+        self._tracker.follow(result.rig_from_object[-1])
         return live
 
     def _contradicted(self, newest: Kept) -> bool:
