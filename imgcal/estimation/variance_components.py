@@ -62,7 +62,7 @@ class VarianceComponents:
 
     problem: Problem
     solution: Solution
-    sigma: NDArray[np.floating]  # (S, C, N) px, with the model error
+    sigma: NDArray[np.floating]  # (S, C, N) px, with the additive noise
     seen: NDArray[np.bool_]  # (S, C, N) labels that fit
     additive_noise: float  # px
     prior_scale: Mapping[str, float]

@@ -29,7 +29,7 @@ from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior
 
 @dataclass(frozen=True)
 class MapSolution:
-    """The most probable rig, and the object's poses. Gradients flow through all but `converged`."""
+    """The most probable rig, and the object's poses. Gradients flow through all but `dof` and `converged`."""
 
     rig: CameraRig  # (*B)
     rig_from_object: RigidTransform  # (*B, S)

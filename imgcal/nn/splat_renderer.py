@@ -54,6 +54,8 @@ class SplatRenderer(nn.Module):
         compositing: Literal["add", "over"] = "add",
     ) -> None:
         super().__init__()
+        if compositing not in ("add", "over"):
+            raise ValueError(f"compositing must be 'add' or 'over', found {compositing!r}")
         self.image_size, self.size, self.compositing = image_size, size, compositing
         self.register_buffer("colours", colours.clone(), persistent=False)
 

@@ -65,3 +65,8 @@ def test_vmap_and_jacobians():
 def test_inductor(compiler):
     module, uv = SplatRenderer(colours(), SIZE), places(2)
     torch.testing.assert_close(torch.compile(module, fullgraph=True)(uv), module(uv))
+
+
+def test_an_unknown_way_of_compositing_is_refused_when_the_module_is_made():
+    with pytest.raises(ValueError, match="compositing must be 'add' or 'over', found 'under'"):
+        SplatRenderer(torch.eye(3), (8, 8), compositing="under")
