@@ -28,7 +28,7 @@ def build(
         config: which network.
         factory: the factory rig, float32, without batch axes.
         obj: the calibration object.
-        drift_std: (C, 15) spread of the rig's parameters, the unit of predicted offsets (`Drift.std`).
+        drift_std: (C, 15) prior standard deviation of the parameters (`Drift.std`), the unit of predicted offsets.
         generator: of its weights, on the CPU; torch's default generators are left alone.
         images: how the images of image variants are drawn; None = as large as their encoder takes them.
 
@@ -54,21 +54,21 @@ def build(
     # timm takes seconds to import: only for those who need it.
     from imgcal.networks.points import PaperPointNetwork, PointNetwork
 
-    decoder, variant = Parameterization(factory, obj, drift_std), config.variant()
+    parameterization, variant = Parameterization(factory, obj, drift_std), config.variant()
     if images is not None and not isinstance(variant, Images | PaperImages):
         raise InputError(f"images: found this block, but the network {config.preset} takes points")
     with drawing_from(generator):
         if isinstance(variant, PaperImages):
             from imgcal.networks.images import PaperImageNetwork
 
-            return PaperImageNetwork(variant, decoder, images)
+            return PaperImageNetwork(variant, parameterization, images)
         if isinstance(variant, Images):
             from imgcal.networks.images import ImageNetwork
 
-            return ImageNetwork(variant, decoder, images)
+            return ImageNetwork(variant, parameterization, images)
         if isinstance(variant, PaperPoints):
-            return PaperPointNetwork(variant, decoder)
-        return PointNetwork(variant, decoder)
+            return PaperPointNetwork(variant, parameterization)
+        return PointNetwork(variant, parameterization)
 
 
 def build_network(spec: NetworkSpec, rig: CameraRig, obj: CalibrationObject, generator: torch.Generator) -> Network:

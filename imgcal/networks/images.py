@@ -26,10 +26,12 @@ class PaperImageNetwork(Network):
     Source: paper, supplementary section 1.2.
     """
 
-    def __init__(self, config: PaperImages, decoder: Parameterization, images: ImageOptions | None = None) -> None:
+    def __init__(
+        self, config: PaperImages, parameterization: Parameterization, images: ImageOptions | None = None
+    ) -> None:
         """Make the layers; images are as large as the encoder takes them unless `images` says otherwise."""
         backbone = Backbone(config.backbone, config.pretrained, config.options)
-        super().__init__(decoder, images or ImageOptions(size=max(backbone.size)))
+        super().__init__(parameterization, images or ImageOptions(size=max(backbone.size)))
         self.backbone = backbone
         self.bottleneck = nn.Linear(self.backbone.pooled_width, config.bottleneck)
         self.heads = PaperHeads(config.bottleneck, config.head_widths)
@@ -40,7 +42,7 @@ class PaperImageNetwork(Network):
         pooled, _ = self.backbone(images.flatten(0, 1))
         numbers = self.heads(self.bottleneck(pooled).unflatten(0, images.shape[:2]))
         with torch.autocast(images.device.type, enabled=False):
-            return (self.decoder.absolute(numbers),)
+            return (self.parameterization.absolute(numbers),)
 
     def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:
         """Parameters that may have their own learning rates."""
@@ -51,24 +53,25 @@ class PaperImageNetwork(Network):
 class ImageNetwork(Network):
     """Our image variant: an encoder weighs where each fiducial may be, positions go to the trunk in float32.
 
-    The encoder's map gives each fiducial a belief over the image, zero at first, that multiplies the likeness of
+    The encoder's map gives each fiducial heatmap logits, zero at first, that multiplies the likeness of
     colours; its pooled feature goes to the trunk beside the positions, through the bottleneck. With
     `positions: false` the pooled feature is all that the trunk is told, as in the paper.
     """
 
-    def __init__(self, config: Images, decoder: Parameterization, images: ImageOptions | None = None) -> None:
+    def __init__(self, config: Images, parameterization: Parameterization, images: ImageOptions | None = None) -> None:
         """Make the layers; images are as large as the encoder takes them unless `images` says otherwise."""
         backbone = Backbone(config.backbone, config.pretrained, config.options)
         drawn = images or ImageOptions(size=max(backbone.size))
-        super().__init__(decoder, drawn)
+        super().__init__(parameterization, drawn)
         self.backbone, self.dot = backbone, drawn.dot
         self.bottleneck = nn.Linear(self.backbone.pooled_width, config.bottleneck)
         self.positions = config.positions
         if config.positions:
-            self.belief = nn.Conv2d(self.backbone.map_width, len(decoder.colours), 1)
+            # Keys of shipped weights: `belief` makes heatmap logits, `trunk` is the iterative refiner.
+            self.belief = nn.Conv2d(self.backbone.map_width, len(parameterization.colours), 1)
             for parameter in self.belief.parameters():
                 nn.init.zeros_(parameter)
-        self.trunk = IterativeRefiner(decoder, **config.trunk.model_dump(), features=config.bottleneck)
+        self.trunk = IterativeRefiner(parameterization, **config.trunk.model_dump(), features=config.bottleneck)
 
     def forward(self, views: Views) -> tuple[Prediction, ...]:
         """Predict the rig from `views.images`; one prediction a pass."""
@@ -78,12 +81,14 @@ class ImageNetwork(Network):
         bottleneck = functional.gelu(self.bottleneck(pooled)).float().unflatten(0, images.shape[:2])
         with torch.autocast(images.device.type, enabled=False):
             if not self.positions:
-                nothing = images.new_zeros((*images.shape[:2], len(self.decoder.colours)), dtype=torch.float32)
+                nothing = images.new_zeros((*images.shape[:2], len(self.parameterization.colours)), dtype=torch.float32)
                 return self.trunk(nothing[..., None].expand(*nothing.shape, 2), nothing, bottleneck)
             heatmap_logits = self.belief(features.float())
-            in_image, confidence = find_soft_positions(flat.float(), self.decoder.colours, self.dot, heatmap_logits)
+            in_image, confidence = find_soft_positions(
+                flat.float(), self.parameterization.colours, self.dot, heatmap_logits
+            )
             in_image = in_image.unflatten(0, images.shape[:2])
-            scale = self.decoder.image_size.to(in_image) / images.shape[-1]
+            scale = self.parameterization.image_size.to(in_image) / images.shape[-1]
             uv = resized_pixels(in_image, scale[:, None])
         return self.trunk(uv, confidence.unflatten(0, images.shape[:2]), bottleneck)
 

@@ -18,26 +18,26 @@ class Network(nn.Module, ABC):
     State dictionaries hold weights only: rig, object and drift are buffers that are not saved with them.
     """
 
-    def __init__(self, decoder: Parameterization, image_options: ImageOptions | None = None) -> None:
+    def __init__(self, parameterization: Parameterization, image_options: ImageOptions | None = None) -> None:
         """Keep what all networks have.
 
         Args:
-            decoder: the parameterization: factory rig, object, and the drift that is the unit of its offsets.
+            parameterization: the parameterization: factory rig, object, and the drift that is the unit of its offsets.
             image_options: how the images are drawn that it takes; None = it takes points.
         """
         super().__init__()
-        self.decoder = decoder
+        self.parameterization = parameterization
         self.image_options = image_options
 
     @property
     def factory(self) -> CameraRig:
         """The factory rig, float32."""
-        return self.decoder.factory
+        return self.parameterization.factory
 
     @property
     def obj(self) -> CalibrationObject:
         """The calibration object, float32."""
-        return self.decoder.obj
+        return self.parameterization.obj
 
     @abstractmethod
     def forward(self, views: Views) -> tuple[Prediction, ...]:

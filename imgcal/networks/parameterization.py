@@ -19,7 +19,7 @@ POSE_TURN = 0.05  # rad that one unit of a head turns it, after the first pass
 class RigState:
     """A rig near the factory's and the object's pose, as networks move them."""
 
-    offsets: Tensor  # (B, C, 15) parameters minus factory values, in units of their spread
+    offsets: Tensor  # (B, C, 15) parameters minus factory values, in units of their prior standard deviation
     rotation: Tensor  # (B, 3, 3) rig_from_object
     centre: Tensor  # (B, 3) mm, the object's centroid in the rig
 
@@ -29,7 +29,7 @@ class RigState:
 
 
 class Parameterization(nn.Module):
-    """Turn head outputs into predictions; holds the factory rig, the object and the spread as buffers, no weights."""
+    """Turn head outputs into predictions; holds the factory rig, the object and the prior as buffers, no weights."""
 
     focal_length: Tensor  # (C, 2)
     principal_point: Tensor  # (C, 2)
@@ -101,7 +101,7 @@ class Parameterization(nn.Module):
         """Place rigs from nothing.
 
         Args:
-            offsets: (B, C, 15) in units of the spread.
+            offsets: (B, C, 15) in units of `prior_std`.
             pose: (B, 9) 6D rotation less that of a level object, then a shift from the working distance.
         """
         identity = pose.new_tensor((1.0, 0.0, 0.0, 0.0, 1.0, 0.0))
@@ -110,7 +110,7 @@ class Parameterization(nn.Module):
         return RigState(offsets, rotation, centre)
 
     def move(self, state: RigState, offsets: Tensor, pose: Tensor) -> RigState:
-        """Correct rigs: offsets (B, C, 15) in units of the spread, pose (B, 6) turn and shift."""
+        """Correct rigs: offsets (B, C, 15) in units of `prior_std`, pose (B, 6) turn and shift."""
         rotation = rotation_from_vector(POSE_TURN * pose[:, :3]) @ state.rotation
         return RigState(state.offsets + offsets, rotation, state.centre + POSE_SHIFT * pose[:, 3:])
 

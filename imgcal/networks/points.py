@@ -65,9 +65,9 @@ class PaperPointNetwork(Network):
     Source: paper, supplementary section 1.1.
     """
 
-    def __init__(self, config: PaperPoints, decoder: Parameterization) -> None:
-        super().__init__(decoder)
-        cameras, fiducials = len(decoder.focal_length), len(decoder.centred)
+    def __init__(self, config: PaperPoints, parameterization: Parameterization) -> None:
+        super().__init__(parameterization)
+        cameras, fiducials = len(parameterization.focal_length), len(parameterization.centred)
         self.embed = nn.Linear(2 * fiducials, config.width)
         self.identity = CameraIdentity(cameras, config.width) if config.camera_identity else nn.Identity()
         self.encoder = (
@@ -81,11 +81,11 @@ class PaperPointNetwork(Network):
         """Predict the rig from `views.uv`; fiducials that are not seen count as at the principal point."""
         uv, seen = points_of(views)
         with torch.autocast(uv.device.type, enabled=False):
-            positions = torch.where(seen[..., None], self.decoder.normalized(uv.float()), 0.0).flatten(-2)
+            positions = torch.where(seen[..., None], self.parameterization.normalized(uv.float()), 0.0).flatten(-2)
             embedded = self.embed(positions)  # bf16 would round a position to a pixel before it is looked at
         numbers = self.heads(self.encoder(self.identity(embedded)))
         with torch.autocast(uv.device.type, enabled=False):
-            return (self.decoder.absolute(numbers),)
+            return (self.parameterization.absolute(numbers),)
 
     def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:
         """Parameters that may have their own learning rates."""
@@ -95,9 +95,9 @@ class PaperPointNetwork(Network):
 class PointNetwork(Network):
     """Our point variant: `IterativeRefiner` on the positions; fiducials that are missing are masked."""
 
-    def __init__(self, config: Points, decoder: Parameterization) -> None:
-        super().__init__(decoder)
-        self.trunk = IterativeRefiner(decoder, **config.trunk.model_dump())
+    def __init__(self, config: Points, parameterization: Parameterization) -> None:
+        super().__init__(parameterization)
+        self.trunk = IterativeRefiner(parameterization, **config.trunk.model_dump())
 
     def forward(self, views: Views) -> tuple[Prediction, ...]:
         """Predict the rig from `views.uv` and `views.seen`; one prediction a pass."""

@@ -57,7 +57,7 @@ class IterativeRefiner(nn.Module):
 
     def __init__(
         self,
-        decoder: Parameterization,
+        parameterization: Parameterization,
         *,
         encoder: str,
         width: int,
@@ -69,8 +69,8 @@ class IterativeRefiner(nn.Module):
         features: int = 0,
     ) -> None:
         super().__init__()
-        self.decoder, self.passes = decoder, passes
-        cameras, fiducials = len(decoder.focal_length), len(decoder.centred)
+        self.parameterization, self.passes = parameterization, passes
+        cameras, fiducials = len(parameterization.focal_length), len(parameterization.centred)
         shape = (encoder, width, depth, heads)
         self.first = UpdateBlock(3 * fiducials, features, cameras, 9, *shape)
         parts = 2 * (len(RESIDUAL_SCALES) + 2) + 1
@@ -93,12 +93,12 @@ class IterativeRefiner(nn.Module):
         device = uv.device.type
         with torch.autocast(device, enabled=False):
             uv, weight = uv.float(), weight.float()
-            positions = self.decoder.normalized(uv).clamp(-LIMIT, LIMIT) * weight[..., None]
+            positions = self.parameterization.normalized(uv).clamp(-LIMIT, LIMIT) * weight[..., None]
             inputs = torch.cat((positions.flatten(-2), weight), dim=-1)
         offsets, pose = self.first(inputs, features)
         with torch.autocast(device, enabled=False):
-            state = self.decoder.start(offsets, pose)
-            predictions = [self.decoder.prediction(state)]
+            state = self.parameterization.start(offsets, pose)
+            predictions = [self.parameterization.prediction(state)]
         for _ in range(self.passes - 1):
             state = state.detach()  # each pass answers for its own error only, as in RAFT (Teed and Deng, ECCV 2020)
             with torch.autocast(device, enabled=False):
@@ -106,8 +106,8 @@ class IterativeRefiner(nn.Module):
             assert self.later is not None
             offsets, pose = self.later(inputs, features)
             with torch.autocast(device, enabled=False):
-                state = self.decoder.move(state, offsets, pose)
-                predictions.append(self.decoder.prediction(state))
+                state = self.parameterization.move(state, offsets, pose)
+                predictions.append(self.parameterization.prediction(state))
         if self.trust_head is not None:
             with torch.autocast(device, enabled=False):
                 log_sigma = self.trust_head(self._differences(state.detach(), predictions[-1], uv, weight))
@@ -121,7 +121,7 @@ class IterativeRefiner(nn.Module):
         Args:
             prior_std: (C', 15) of the other training; cameras may differ, their mean counts.
         """
-        old, new = prior_std.to(self.decoder.prior_std).mean(0), self.decoder.prior_std.mean(0)
+        old, new = prior_std.to(self.parameterization.prior_std).mean(0), self.parameterization.prior_std.mean(0)
         ratio = torch.where((old > 0) & (new > 0), old / new.clamp_min(1e-30), 1.0)
         for stage in (self.first, self.later):
             if stage is not None:
@@ -135,10 +135,10 @@ class IterativeRefiner(nn.Module):
     @torch.no_grad()
     def _differences(self, state: RigState, prediction: Prediction, uv: Tensor, weight: Tensor) -> Tensor:
         """What a later pass sees: (B, C, inputs), without gradient."""
-        projected = self.decoder.project(prediction).uv
+        projected = self.parameterization.project(prediction).uv
         residual = (projected - uv) * weight[..., None]
         scaled = [torch.tanh(residual / scale) for scale in RESIDUAL_SCALES]
-        around = self.decoder.normalized(projected)
+        around = self.parameterization.normalized(projected)
         parts = [(residual / 100).clamp(-LIMIT, LIMIT), *scaled, around.clamp(-LIMIT, LIMIT)]
         offsets = state.offsets.clamp(-LIMIT, LIMIT)
         return torch.cat((*(part.flatten(-2) for part in parts), weight, offsets), dim=-1)

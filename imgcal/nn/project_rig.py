@@ -44,5 +44,5 @@ class ProjectRig(nn.Module):
         points = self.obj.points.to(rig.focal_length)
         radius = None if self.obj.radius is None else self.obj.radius.to(points)
         if rig_from_object is not None:
-            points = rig_from_object.apply(points)
+            points = rig_from_object.to(points.dtype).apply(points)
         return rig.project(points, radius)

@@ -103,7 +103,7 @@ def compound(
         obj: the object whose fiducials are projected.
         config: which terms, how heavy.
         step: steps already taken, for the paper's two stages.
-        prior_std: (C, 15) spread of each parameter of the rig (`Drift.std`); without one they do not count.
+        prior_std: (C, 15) prior standard deviation of each parameter (`Drift.std`); without one they do not count.
         weights: parameters of the network, for the L1 regularizer.
     """
     with torch.autocast(truth.rig.focal_length.device.type, enabled=False):

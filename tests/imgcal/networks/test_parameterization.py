@@ -16,66 +16,72 @@ B, C = 3, 4
 
 
 @pytest.fixture
-def decoder():
+def parameterization():
     """In float64, to compare exactly."""
     rig = load_rig("T4")
     return Parameterization(rig, load_object("asymmetric8"), DRIFT.std(rig)).double()
 
 
 @pytest.fixture
-def truth(decoder):
-    made = synthesize(decoder.factory, load_object("asymmetric8"), B, torch.Generator().manual_seed(1), drift=DRIFT)
+def truth(parameterization):
+    made = synthesize(
+        parameterization.factory, load_object("asymmetric8"), B, torch.Generator().manual_seed(1), drift=DRIFT
+    )
     return Prediction(made.rig, made.rig_from_object)
 
 
-def test_the_18_numbers_are_scaled_by_those_of_the_rig(decoder, truth):
+def test_the_18_numbers_are_scaled_by_those_of_the_rig(parameterization, truth):
     numbers = pack18(truth.cameras_from_object)
     numbers[..., :6] -= numbers.new_tensor([1.0, 0, 0, 0, 1, 0])
-    numbers[..., 6:9] /= decoder.working_distance
-    numbers[..., 9:11] /= decoder.focal_length.mean()
-    numbers[..., 11:13] /= decoder.principal_point.mean(0)
-    found = decoder.absolute(numbers).cameras_from_object
+    numbers[..., 6:9] /= parameterization.working_distance
+    numbers[..., 9:11] /= parameterization.focal_length.mean()
+    numbers[..., 11:13] /= parameterization.principal_point.mean(0)
+    found = parameterization.absolute(numbers).cameras_from_object
     torch.testing.assert_close(pack21(found), pack21(truth.cameras_from_object))
 
 
-def test_cameras_of_the_factory_rig_are_split_into_that_rig_and_the_pose(decoder, truth):
+def test_cameras_of_the_factory_rig_are_split_into_that_rig_and_the_pose(parameterization, truth):
     pose = truth.rig_from_object
-    found = Prediction.from_cameras(decoder.factory.from_object(pose), decoder.factory)
+    found = Prediction.from_cameras(parameterization.factory.from_object(pose), parameterization.factory)
     torch.testing.assert_close(found.rig_from_object.rotation, pose.rotation)
     torch.testing.assert_close(found.rig_from_object.translation, pose.translation)
-    assert found.rig.local(decoder.factory).abs().max() < 1e-6
+    assert found.rig.local(parameterization.factory).abs().max() < 1e-6
 
 
-def test_splitting_leaves_cameras_where_they_are(decoder, truth):
-    found = Prediction.from_cameras(truth.cameras_from_object, decoder.factory)
+def test_splitting_leaves_cameras_where_they_are(parameterization, truth):
+    found = Prediction.from_cameras(truth.cameras_from_object, parameterization.factory)
     torch.testing.assert_close(pack21(found.cameras_from_object), pack21(truth.cameras_from_object))
 
 
-def test_offsets_are_in_units_of_the_spread_and_poses_are_about_the_centroid(decoder):
+def test_offsets_are_in_units_of_the_spread_and_poses_are_about_the_centroid(parameterization):
     random = torch.Generator().manual_seed(2)
     offsets = torch.randn(B, C, 15, generator=random, dtype=torch.float64)
     pose = 0.1 * torch.randn(B, 9, generator=random, dtype=torch.float64)
-    state = decoder.start(offsets, pose)
-    prediction = decoder.prediction(state)
-    torch.testing.assert_close(prediction.rig.local(decoder.factory), offsets * decoder.prior_std, atol=1e-8, rtol=1e-6)
-    at = pose[:, 6:] * POSE_SHIFT + pose.new_tensor([0.0, 0.0, decoder.working_distance])
-    torch.testing.assert_close(prediction.rig_from_object.apply(decoder.centroid[None])[:, 0], at)
+    state = parameterization.start(offsets, pose)
+    prediction = parameterization.prediction(state)
+    torch.testing.assert_close(
+        prediction.rig.local(parameterization.factory), offsets * parameterization.prior_std, atol=1e-8, rtol=1e-6
+    )
+    at = pose[:, 6:] * POSE_SHIFT + pose.new_tensor([0.0, 0.0, parameterization.working_distance])
+    torch.testing.assert_close(prediction.rig_from_object.apply(parameterization.centroid[None])[:, 0], at)
     step = torch.randn(B, 6, generator=random, dtype=torch.float64)
-    moved = decoder.prediction(decoder.move(state, -offsets, step))
-    assert moved.rig.local(decoder.factory).abs().max() < 1e-6
-    there = moved.rig_from_object.apply(decoder.centroid[None])[:, 0]
+    moved = parameterization.prediction(parameterization.move(state, -offsets, step))
+    assert moved.rig.local(parameterization.factory).abs().max() < 1e-6
+    there = moved.rig_from_object.apply(parameterization.centroid[None])[:, 0]
     torch.testing.assert_close(there, at + POSE_SHIFT * step[:, 3:])
 
 
-def test_an_untrained_pose_is_a_level_object_at_the_working_distance(decoder):
-    pose = decoder.prediction(decoder.start(torch.zeros(B, C, 15).double(), torch.zeros(B, 9).double())).rig_from_object
+def test_an_untrained_pose_is_a_level_object_at_the_working_distance(parameterization):
+    pose = parameterization.prediction(
+        parameterization.start(torch.zeros(B, C, 15).double(), torch.zeros(B, 9).double())
+    ).rig_from_object
     overhead = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)).expand(B, 3, 3)
     torch.testing.assert_close(pose.rotation, overhead)
 
 
-def test_positions_become_numbers_of_about_one(decoder, truth):
+def test_positions_become_numbers_of_about_one(parameterization, truth):
     uv = truth.rig.project(truth.rig_from_object.apply(load_object("asymmetric8").points)).uv
-    numbers = decoder.normalized(uv)
+    numbers = parameterization.normalized(uv)
     assert numbers.shape == uv.shape
     assert 0.3 < numbers.std() < 3
 

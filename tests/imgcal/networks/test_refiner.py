@@ -24,9 +24,9 @@ def test_rescaled_weights_say_the_same_of_another_drift():
     with torch.no_grad():
         for parameter in narrow.parameters():
             parameter += 0.02 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(3))
-    wide = build(config, factory, obj, 3 * narrow.decoder.prior_std, torch.Generator()).eval()
+    wide = build(config, factory, obj, 3 * narrow.parameterization.prior_std, torch.Generator()).eval()
     wide.load_state_dict(narrow.state_dict())
-    wide.trunk.rescale(narrow.decoder.prior_std)
+    wide.trunk.rescale(narrow.parameterization.prior_std)
     made = snapshots(narrow)
     with torch.no_grad():
         one, other = (network(views(narrow, made))[-1] for network in (narrow, wide))
