@@ -22,7 +22,7 @@ class Network(nn.Module, ABC):
         """Keep what all networks have.
 
         Args:
-            parameterization: the parameterization: factory rig, object, and the drift that is the unit of its offsets.
+            parameterization: factory rig, object, and the drift that is the unit of its offsets.
             image_options: how the images are drawn that it takes; None = it takes points.
         """
         super().__init__()
