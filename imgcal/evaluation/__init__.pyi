@@ -1,3 +1,4 @@
+from .encoder_check import LEAST_RISE, EncoderCheck, check_encoder
 from .methods import BASELINES, Given, Method, network_method
 from .metrics import Errors, cramer_rao, errors, reprojection_error
 from .models import Model, load_models
@@ -10,10 +11,12 @@ from .timing import latency
 __all__ = [
     "AXES",
     "BASELINES",
+    "LEAST_RISE",
     "PLOTS",
     "RESULT",
     "TABLES",
     "Conditions",
+    "EncoderCheck",
     "Errors",
     "Evaluation",
     "Given",
@@ -26,6 +29,7 @@ __all__ = [
     "Summary",
     "Sweep",
     "as_tables",
+    "check_encoder",
     "cramer_rao",
     "describe",
     "errors",

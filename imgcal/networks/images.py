@@ -36,6 +36,11 @@ class PaperImageNetwork(Network):
         self.bottleneck = nn.Linear(self.backbone.pooled_width, config.bottleneck)
         self.heads = PaperHeads(config.bottleneck, config.head_widths)
 
+    @property
+    def encoder(self) -> nn.Module:
+        """What turns images into features."""
+        return self.backbone
+
     def forward(self, views: Views) -> tuple[Prediction, ...]:
         """Predict the rig from `views.images`."""
         images = images_of(views)
@@ -72,6 +77,11 @@ class ImageNetwork(Network):
             for parameter in self.belief.parameters():
                 nn.init.zeros_(parameter)
         self.trunk = IterativeRefiner(parameterization, **config.trunk.model_dump(), features=config.bottleneck)
+
+    @property
+    def encoder(self) -> nn.Module:
+        """What turns images into features."""
+        return self.backbone
 
     def forward(self, views: Views) -> tuple[Prediction, ...]:
         """Predict the rig from `views.images`; one prediction a pass."""

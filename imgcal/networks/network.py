@@ -39,6 +39,15 @@ class Network(nn.Module, ABC):
         """The calibration object, float32."""
         return self.parameterization.obj
 
+    @property
+    def encoder(self) -> nn.Module | None:
+        """The part whose output everything behind it must live on; None = there is no such part.
+
+        `imgcal.evaluation.check_encoder` spoils what it returns (a tensor, or tuples of them; the first axis counts rigs,
+        or rigs times cameras) and sees whether that hurts.
+        """
+        return None
+
     @abstractmethod
     def forward(self, views: Views) -> tuple[Prediction, ...]:
         """Predict (B,) rigs from (B,) views: one prediction a pass, coarse to fine."""

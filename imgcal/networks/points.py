@@ -70,12 +70,17 @@ class PaperPointNetwork(Network):
         cameras, fiducials = len(parameterization.focal_length), len(parameterization.centred)
         self.embed = nn.Linear(2 * fiducials, config.width)
         self.identity = CameraIdentity(cameras, config.width) if config.camera_identity else nn.Identity()
-        self.encoder = (
+        self.layers = (
             transformer(config.width, config.depth, config.heads)
             if config.encoder == "transformer"
             else conv1d(config.width, config.depth)
         )
         self.heads = PaperHeads(config.width, config.head_widths)
+
+    @property
+    def encoder(self) -> nn.Module:
+        """What relates the cameras to one another."""
+        return self.layers
 
     def forward(self, views: Views) -> tuple[Prediction, ...]:
         """Predict the rig from `views.uv`; fiducials that are not seen count as at the principal point."""
@@ -83,13 +88,13 @@ class PaperPointNetwork(Network):
         with torch.autocast(uv.device.type, enabled=False):
             positions = torch.where(seen[..., None], self.parameterization.normalized(uv.float()), 0.0).flatten(-2)
             embedded = self.embed(positions)  # bf16 would round a position to a pixel before it is looked at
-        numbers = self.heads(self.encoder(self.identity(embedded)))
+        numbers = self.heads(self.layers(self.identity(embedded)))
         with torch.autocast(uv.device.type, enabled=False):
             return (self.parameterization.absolute(numbers),)
 
     def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:
         """Parameters that may have their own learning rates."""
-        return {"encoder": [*self.embed.parameters(), *self.encoder.parameters()]} | self.heads.groups()
+        return {"encoder": [*self.embed.parameters(), *self.layers.parameters()]} | self.heads.groups()
 
 
 class PointNetwork(Network):
