@@ -3,18 +3,17 @@ from .assignment import distances_to_nearest, mutual_nearest
 from .identification import identify, relocalize, track
 from .options import PipelineOptions
 from .orientation import oriented
+from .proposals import Proposal, Proposer, Sight, Snapshot, judge, rows_of
 from .result import Identity, IdentityOptions, Status
 from .series import (
     Associations,
     Progress,
-    SnapshotIdentity,
-    Tracker,
     associate,
     matched_to_rig,
     observations_of,
-    to_observations,
     without_snapshots,
 )
+from .tracker import SnapshotIdentity, Tracker, to_observations
 
 __all__ = [
     "Associations",
@@ -22,18 +21,24 @@ __all__ = [
     "IdentityOptions",
     "PipelineOptions",
     "Progress",
+    "Proposal",
+    "Proposer",
+    "Sight",
+    "Snapshot",
     "SnapshotIdentity",
     "Status",
     "Tracker",
     "associate",
     "distances_to_nearest",
     "identify",
+    "judge",
     "lattice_shifts",
     "matched_to_rig",
     "mutual_nearest",
     "observations_of",
     "oriented",
     "relocalize",
+    "rows_of",
     "to_observations",
     "track",
     "without_snapshots",

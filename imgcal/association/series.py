@@ -5,40 +5,29 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from imgcal.association import Identity, Status, identify, oriented
 from imgcal.association.options import PipelineOptions
+from imgcal.association.proposals import Sight
+from imgcal.association.tracker import SnapshotIdentity, Tracker, to_observations
 from imgcal.errors import InputError, RefusedError
-from imgcal.estimation import ON_A_LINE, estimate, flat_std
+from imgcal.estimation import ON_A_LINE
 from imgcal.geometry import RigidTransform
 from imgcal.messages import listed
-from imgcal.types import CalibrationObject, CameraRig, Detections, Observations, RigPrior, check_object, check_rig
-
-MOST_REMEMBERED = 64
-"""Snapshots that take part in refits of the rig while identity goes on: later ones add little to it."""
+from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
 
 NOT_TRIED = "not tried: nothing could be decided in many snapshots before"
 MOST_IN_VAIN = 8_000_000
 """Hypotheses without any success, after which only a choice of the other snapshots is tried: as many once more."""
 
+MOST_LOOKS_IN_VAIN = 8
+"""Snapshots in which a proposer finds nothing, after which it looks at no more: as often again for each success."""
 LEAST_CERTAIN_FIRST = ("ambiguous", "by_prior", "unique", "coded", "by_tracking")
 
 Progress = Callable[[Iterable[int], int], Iterable[int]]
-
-
-@dataclass(frozen=True)
-class SnapshotIdentity:
-    """What was decided about one snapshot."""
-
-    name: str
-    status: str  # coded | unique | by_prior | by_tracking | ambiguous | refused
-    reason: str
-    alternatives: int
-    rig_from_object: RigidTransform | None
 
 
 @dataclass(frozen=True)
@@ -69,11 +58,21 @@ def associate(
     obj: CalibrationObject,
     options: PipelineOptions = PipelineOptions(),
     progress: Progress | None = None,
+    sight: Sight | None = None,
 ) -> Associations:
     """Decide which blob is which fiducial, snapshot by snapshot.
 
     Each accepted snapshot predicts the next one. What the accepted ones say about the rig narrows the search in the
     following; refused ones are tried once more at the end, with the rig that all the others gave.
+
+    Args:
+        detections: blobs of all snapshots, cameras as in the rig; snapshots that come with labels keep them.
+        rig: the factory calibration.
+        obj: the calibration object.
+        options: how sure each snapshot must be.
+        progress: wraps the loop over snapshots.
+        sight: the frames, and who looks at them: at all, or where blobs decide nothing. What it measures is in the
+            result's detections.
 
     Raises:
         RefusedError: no snapshot could be decided.
@@ -93,12 +92,27 @@ def associate(
     coded = _coded_snapshots(detections, count)
     tracker = Tracker(rig, obj, options)
     results: dict[int, tuple[SnapshotIdentity, NDArray[np.int64]]] = {}
+    looked: dict[int, Detections] = {}
     rows = _rows_by_snapshot(detections, count)
+
+    def look(s: int) -> None:
+        assert sight is not None
+        name, blobs = detections.snapshot_names[s], detections.select(rows[s])
+        if tracker.looks_in_vain < MOST_LOOKS_IN_VAIN:
+            snapshot, labels, looked[s] = tracker.look(sight, s, blobs, name)
+            results[s] = snapshot, labels
+        else:
+            results[s] = SnapshotIdentity(name, "refused", NOT_TRIED, 0, None), rows[s] * 0 - 1
+
+    def camera(s: int) -> NDArray[np.int64]:
+        return looked[s].camera if s in looked else detections.camera[rows[s]]
 
     def decide(s: int) -> None:
         name = detections.snapshot_names[s]
         if coded[s]:
             results[s] = tracker.accept(name, detections.fiducial[rows[s]])
+        elif sight is not None and not sight.where_blobs_fail:
+            look(s)
         else:
             results[s] = tracker.decide(detections.select(rows[s]), name)
 
@@ -109,10 +123,10 @@ def associate(
             decide(s)
         else:
             results[s] = SnapshotIdentity(detections.snapshot_names[s], "refused", NOT_TRIED, 0, None), rows[s] * 0 - 1
-    again = [s for s in range(count) if not coded[s] and _incomplete(*results[s], detections.camera[rows[s]])]
+    again = [s for s in range(count) if not coded[s] and _incomplete(*results[s], camera(s))]
     accepted = np.array([s for s in range(count) if results[s][0].status != "refused"])
     if len(accepted):
-        patience, tracker.in_vain = Patience(len(again)), 0
+        patience, tracker.in_vain, tracker.looks_in_vain = Patience(len(again)), 0, 0
         # Those nearest to where the object was seen first: they are the likeliest to show it.
         for number, s in enumerate(sorted(again, key=lambda s: _gap(s, accepted))):
             first = results[s][0]
@@ -122,11 +136,12 @@ def associate(
                 # The rig that it helped to find labels more of it, but says nothing new of how sure it is.
                 retold = replace(results[s][0], status=first.status, alternatives=first.alternatives)
                 results[s] = retold, results[s][1]
-    fiducial = np.full(len(detections), -1, dtype=np.int64)
-    for s in range(count):
-        if results[s][0].status != "refused":
-            fiducial[rows[s]] = results[s][1]
-    labelled = Associations(replace(detections, fiducial=fiducial), tuple(results[s][0] for s in range(count)))
+    if sight is not None and sight.where_blobs_fail:
+        refused = [s for s in range(count) if results[s][0].status == "refused"]
+        for s in sorted(refused, key=lambda s: _gap(s, accepted) if len(accepted) else s):
+            look(s)
+    table = _labelled(detections, rows, results, looked)
+    labelled = Associations(table, tuple(results[s][0] for s in range(count)))
     if not labelled.used:
         reasons = Counter(snapshot.reason for snapshot in labelled.snapshots if snapshot.reason != NOT_TRIED)
         reason, times = reasons.most_common(1)[0] if count else ("found no snapshot", 0)
@@ -183,127 +198,6 @@ class Patience:
         return (number - self.first_left_out) % self.stride == self.stride - 1
 
 
-class Tracker:
-    """Carries what earlier snapshots say, the pose and the rig, to the next one."""
-
-    def __init__(
-        self, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions, remembered: int = MOST_REMEMBERED
-    ) -> None:
-        check_rig(rig)
-        check_object(obj)
-        self.factory, self.obj, self.options, self.remembered = rig, obj, options, remembered
-        self.rig = rig
-        self.prior_std = (rig.prior or RigPrior()).std(rig)
-        self.pose = None if options.start_pose is None else _checked_pose(options.start_pose, rig)
-        self.alternatives = 0  # that the accepted snapshots leave open, 0 = none was accepted yet
-        self.in_vain = 0  # hypotheses that were tried since something was accepted
-        self.accepted: list[tuple[Detections, NDArray[np.int64], RigidTransform]] = []
-
-    def accept(self, name: str, labels: NDArray[np.int64]) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
-        """Take over the labels that came with a snapshot."""
-        few = self._too_few(name, labels)
-        return few or SnapshotIdentity(name, "coded", "labelled in the input", 1, None), labels
-
-    def decide(self, blobs: Detections, name: str) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
-        """Label the blobs of one snapshot."""
-        identity = self._identify(blobs)
-        labels, pose = identity.labels, identity.rig_from_object
-        if not identity.accepted:
-            return SnapshotIdentity(name, "refused", identity.reason, identity.alternatives, None), labels
-        if (few := self._too_few(name, labels)) is not None:
-            return few, labels
-        assert pose is not None  # an accepted identity has one
-        self._remember(blobs, labels, pose)
-        return SnapshotIdentity(name, identity.status, identity.reason, identity.alternatives, pose), labels
-
-    def _too_few(self, name: str, labels: NDArray[np.int64]) -> SnapshotIdentity | None:
-        """Refuse a snapshot that shows too few fiducials; None = it shows enough."""
-        shown = len(np.unique(labels[labels >= 0]))
-        if shown >= self.options.least_fiducials:
-            return None
-        reason = f"too few fiducials: found {shown}, expected at least {self.options.least_fiducials}"
-        return SnapshotIdentity(name, "refused", reason, 1, None)
-
-    def follow(self, pose: RigidTransform) -> tuple[Status, int]:
-        """Take over the pose of a snapshot that was followed from the last one.
-
-        Returns:
-            How sure that one is: status and alternatives, which it inherits.
-        """
-        self.pose = pose
-        return ("ambiguous" if self.alternatives > 1 else "by_tracking"), max(self.alternatives, 1)
-
-    def _identify(self, blobs: Detections) -> Identity:
-        error = np.hypot(self.options.identity_error, self._tolerance_px(blobs))
-        blobs = replace(blobs, sigma=np.hypot(blobs.sigma, error))
-        known = [] if self.pose is None else [self.pose]
-        # Many captures are taken with the object at the origin of the rig's frame; it costs little to look there first.
-        guesses = [] if known else [RigidTransform.identity(dtype=self.rig.focal_length.dtype)]
-        found = identify(blobs, self.rig, self.obj, self.prior_std, known, self.options.identity, guesses)
-        pose = found.rig_from_object
-        if not found.accepted or pose is None:
-            self.in_vain += found.hypotheses
-            return found
-        if self.alternatives == 0 and self.pose is not None and found.status != "unique":
-            found = oriented(found, self.obj, self.pose)
-        elif found.status == "by_tracking":
-            status, alternatives = self.follow(pose)
-            found = replace(found, status=status, alternatives=alternatives)
-        self.alternatives, self.in_vain = found.alternatives, 0
-        return found
-
-    def _tolerance_px(self, blobs: Detections) -> float:
-        """What the object's tolerances are in the image, roughly."""
-        obj = self.obj
-        if obj.exact:
-            return 0.0
-        tolerance = 0.0 if obj.tolerance is None else float(obj.tolerance.max())
-        tolerance = float(np.hypot(tolerance, obj.scale_tolerance * obj.size))
-        distance = self.rig.working_distance
-        if distance is None and self.pose is not None:
-            centre = self.pose.apply(obj.points.mean(0, keepdim=True))[0]
-            distance = float((self.rig.positions - centre).norm(dim=-1).median())
-        if distance is not None:
-            return tolerance * float(self.rig.focal_length.mean()) / distance
-        cameras = [blobs.uv[blobs.camera == c] for c in np.unique(blobs.camera)]
-        extents = [np.linalg.norm(uv - np.median(uv, axis=0), axis=1).mean() for uv in cameras]
-        return tolerance * float(np.median(extents)) / obj.size if extents else 0.0
-
-    def _remember(self, blobs: Detections, labels: NDArray[np.int64], pose: RigidTransform) -> None:
-        """Keep the pose; refit the rig after 1, 2, 4, 8, ... accepted snapshots."""
-        self.pose = pose
-        if len(self.accepted) >= self.remembered:
-            return
-        self.accepted.append((blobs, labels, pose))
-        count = len(self.accepted)
-        if count & (count - 1):
-            return
-        parts = [to_observations(replace(b, fiducial=given), self.factory, self.obj) for b, given, _ in self.accepted]
-        sigma = (torch.cat([p.sigma for p in parts]).square() + self.options.identity_error**2).sqrt()
-        observations = Observations(torch.cat([p.uv for p in parts]), sigma, torch.cat([p.seen for p in parts]))
-        poses = RigidTransform.stack([p for _, _, p in self.accepted])
-        fit = estimate(observations, self.factory, self.obj, poses, options=self.options.estimation)
-        if bool(fit.converged):
-            prior = (self.factory.prior or RigPrior()).std(self.factory)
-            self.rig, self.prior_std = fit.rig, torch.minimum(2 * flat_std(fit), prior)
-
-
-def _checked_pose(pose: RigidTransform, rig: CameraRig) -> RigidTransform:
-    """Return a pose that a user gave, in the rig's precision.
-
-    Raises:
-        InputError: it is none.
-    """
-    shapes = tuple(pose.rotation.shape), tuple(pose.translation.shape)
-    if shapes != ((3, 3), (3,)):
-        raise InputError(f"start pose: found shapes {shapes[0]} and {shapes[1]}, expected one rotation and translation")
-    pose = pose.to(rig.focal_length.dtype)
-    off = (pose.rotation @ pose.rotation.mT - torch.eye(3, dtype=pose.rotation.dtype)).abs().max()
-    if not (bool(off < 1e-3) and bool(torch.det(pose.rotation) > 0) and bool(pose.translation.isfinite().all())):
-        raise InputError("start pose: found no rotation and finite translation, expected those of rig_from_object")
-    return pose
-
-
 def matched_to_rig(detections: Detections, rig: CameraRig) -> Detections:
     """Renumber the cameras of detections in the order of the rig.
 
@@ -321,18 +215,6 @@ def matched_to_rig(detections: Detections, rig: CameraRig) -> Detections:
     return replace(detections, camera=camera, camera_names=rig.camera_names)
 
 
-def to_observations(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> Observations:
-    """Arrange labelled blobs densely: (S, C, N). Of two blobs with one label in a camera the last one counts."""
-    snapshots = np.unique(detections.snapshot) if len(detections) else np.empty(0, dtype=np.int64)
-    shape = (max(len(snapshots), 1), rig.num_cameras, obj.num_fiducials)
-    rows = np.flatnonzero(detections.fiducial >= 0)
-    where = (np.searchsorted(snapshots, detections.snapshot[rows]), detections.camera[rows], detections.fiducial[rows])
-    uv, sigma, seen = np.zeros((*shape, 2)), np.ones(shape), np.zeros(shape, dtype=bool)
-    uv[where], sigma[where], seen[where] = detections.uv[rows], detections.sigma[rows], True
-    dtype = rig.focal_length.dtype
-    return Observations(torch.from_numpy(uv).to(dtype), torch.from_numpy(sigma).to(dtype), torch.from_numpy(seen))
-
-
 def observations_of(
     labelled: Associations, rig: CameraRig, obj: CalibrationObject
 ) -> tuple[Observations, RigidTransform | None]:
@@ -346,6 +228,32 @@ def observations_of(
     poses = [labelled.snapshots[s].rig_from_object for s in used]
     known = [pose for pose in poses if pose is not None]
     return observations, RigidTransform.stack(known) if len(known) == len(used) else None
+
+
+def _labelled(
+    detections: Detections,
+    rows: list[NDArray[np.int64]],
+    results: dict[int, tuple[SnapshotIdentity, NDArray[np.int64]]],
+    looked: dict[int, Detections],
+) -> Detections:
+    """Give the usable blobs of each snapshot their labels; those that were looked at have other blobs there."""
+    fiducial, kept, parts = np.full(len(detections), -1, dtype=np.int64), np.ones(len(detections), dtype=bool), []
+    for s, (snapshot, labels) in results.items():
+        if snapshot.status == "refused":
+            continue
+        if s not in looked:
+            fiducial[rows[s]] = labels
+            continue
+        kept[rows[s]] = False
+        parts.append(replace(looked[s], fiducial=labels, snapshot=np.full(len(labels), s)))
+    table = replace(detections, fiducial=fiducial)
+    if not parts:
+        return table
+    parts.append(table.select(kept))
+    columns = ("uv", "sigma", "camera", "snapshot", "fiducial", "radius", "flags")
+    values: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in columns}
+    table = replace(table, **values)
+    return table.select(np.lexsort((table.camera, table.snapshot)))
 
 
 def _rows_by_snapshot(detections: Detections, count: int) -> list[NDArray[np.int64]]:

@@ -1,12 +1,14 @@
 from .calibration import Calibration, calibrate, fit_labelled
 from .initialization import load_initializer
 from .scoring import RigScore, rms_length, score
-from .sources import checked_detections, checked_frames
+from .sources import Detector, DetectorName, checked_detections, checked_frames, sight_of
 from .tally import DOUBTFUL, Tally
 
 __all__ = [
     "DOUBTFUL",
     "Calibration",
+    "Detector",
+    "DetectorName",
     "RigScore",
     "Tally",
     "calibrate",
@@ -16,4 +18,5 @@ __all__ = [
     "load_initializer",
     "rms_length",
     "score",
+    "sight_of",
 ]

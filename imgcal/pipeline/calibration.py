@@ -47,7 +47,7 @@ from imgcal.pipeline.checks import (
 )
 from imgcal.pipeline.initialization import Initialization, Initializer, residual_of
 from imgcal.pipeline.object_checks import displaced, lost_fiducials, object_offsets
-from imgcal.pipeline.sources import Frames, blobs_of
+from imgcal.pipeline.sources import Detector, Frames, FramesOf, blobs_of, sight_of
 from imgcal.pipeline.steadiness import steady_part
 from imgcal.pipeline.tally import Tally, tally
 from imgcal.types import (
@@ -193,6 +193,8 @@ def calibrate(
     detection: DetectionOptions = DetectionOptions(),
     initializer: Initializer | None = None,
     progress: Progress | None = None,
+    detector: Detector = "classical",
+    frames: FramesOf | None = None,
 ) -> Calibration:
     """Recalibrate a rig from what its cameras saw.
 
@@ -204,6 +206,9 @@ def calibrate(
         detection: how blobs are found in frames.
         initializer: network whose first guess the estimate starts from (`load_initializer`).
         progress: wraps the loop over snapshots, for a progress bar.
+        detector: who finds the fiducials in frames: `classical` (blobs), or a `Proposer`. Whatever that one proposes,
+            blobs that contradict count, and identity and all checks decide as ever.
+        frames: those of a snapshot by its number, where the source is blobs that were found in them.
 
     Raises:
         RefusedError: the data cannot decide; the message says why.
@@ -221,11 +226,12 @@ def calibrate(
     started, rig = time.perf_counter(), rig.to(torch.float64)
     detections = blobs_of(source, rig, obj, detection)
     found = time.perf_counter()
-    labelled = associate(detections, rig, obj, options, progress)
+    sight = sight_of(detector, source, frames, detection)
+    labelled = associate(detections, rig, obj, options, progress, sight)
     identified = time.perf_counter()
     arranged = arrange(labelled, rig, obj)
     _require_any_view(arranged, rig, obj)
-    steady = steady_part(arranged, detections, rig, obj, options)
+    steady = steady_part(arranged, detections if sight is None else _as_given(labelled), rig, obj, options)
     fit = _fitted(steady.arranged, rig, obj, options, _Known(initializer, fits=steady.fits))
     require_views(fit.tally, rig)
     seconds = {
@@ -234,6 +240,13 @@ def calibrate(
         "estimation": time.perf_counter() - identified,
     }
     return replace(fit, seconds=seconds, moved=steady.moved)
+
+
+def _as_given(labelled: Associations) -> Detections:
+    """All blobs, also those that a proposer measured, with the labels of the input alone."""
+    coded = np.array([snapshot.status == "coded" for snapshot in labelled.snapshots])
+    detections = labelled.detections
+    return replace(detections, fiducial=np.where(coded[detections.snapshot], detections.fiducial, -1))
 
 
 def fit_labelled(

@@ -5,18 +5,23 @@ Files are checked where they are read, line by line; this is the same for values
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
+from typing import Literal, get_args
 
 import numpy as np
 
-from imgcal.association import matched_to_rig
+from imgcal.association import Proposer, Sight, matched_to_rig
 from imgcal.detection import DetectionOptions, Frame, detect
 from imgcal.errors import InputError
 from imgcal.io import MARGIN
 from imgcal.types import BLOB_RADIUS, SIGMA, CalibrationObject, CameraRig, Detections
 
 Frames = Mapping[str, Frame | Sequence[Frame | None] | None]
+FramesOf = Callable[[int], Mapping[str, Frame | None]]  # number of a snapshot -> camera name -> frame
+DetectorName = Literal["classical"]
+Detector = DetectorName | Proposer
+"""Who finds the fiducials in frames: blobs (classical), or something that proposes labels itself."""
 ROWS = tuple(field.name for field in fields(Detections) if not field.name.endswith("_names"))
 
 
@@ -34,6 +39,34 @@ def blobs_of(
     if not frames:
         raise InputError(f"frames: found no camera, expected frames of the cameras of rig {rig.name}")
     return matched_to_rig(detect(frames, options), rig)
+
+
+def sight_of(
+    detector: Detector, source: Detections | Frames, frames: FramesOf | None, detection: DetectionOptions
+) -> Sight | None:
+    """Say who looks at the frames, and at which; None = blobs alone decide.
+
+    Raises:
+        InputError: no such detector, or no frames to look at.
+    """
+    if detector == "classical":
+        return None
+    proposer = detector if not isinstance(detector, str) else _named(detector)
+    if frames is None:
+        if isinstance(source, Detections):
+            raise InputError(f"detector {proposer.name}: found blobs without frames, expected frames to look at")
+        frames = _in_memory(source)
+    return Sight(proposer, frames, detector == "auto", detection)
+
+
+def _named(detector: str) -> Proposer:
+    raise InputError(f"detector: found {detector!r:.80}, expected one of {', '.join(get_args(DetectorName))}")
+
+
+def _in_memory(source: Frames) -> FramesOf:
+    """Frames of one snapshot after another, of cameras that have one frame or many."""
+    series = {name: entry if isinstance(entry, Sequence) else (entry,) for name, entry in source.items()}
+    return lambda number: {name: frames[number] if number < len(frames) else None for name, frames in series.items()}
 
 
 def checked_frames(frames: object, rig: CameraRig) -> Frames:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from imgcal.association import Tracker, associate
 from imgcal.association.options import PipelineOptions
-from imgcal.association.series import Tracker, associate
 from imgcal.errors import InputError
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform

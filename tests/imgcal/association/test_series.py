@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association import identify, series
-from imgcal.association.series import associate, matched_to_rig, to_observations
+from imgcal.association import associate, identify, matched_to_rig, series, to_observations
 from imgcal.errors import InputError, RefusedError
 from imgcal.synthesis.captures import simulate_truth, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift

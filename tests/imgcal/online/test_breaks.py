@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association.series import to_observations
+from imgcal.association import to_observations
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.online.breaks import Series, _jacobians, find_breaks, information, series_of

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from imgcal.association import SnapshotIdentity
 from imgcal.association.options import PipelineOptions
-from imgcal.association.series import SnapshotIdentity
 from imgcal.online.window import Kept, Usual, Window, WindowFit, stacked
 from tests.imgcal.streams import Stream
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.errors import InputError
+from imgcal.association import Proposal
+from imgcal.errors import InputError, RefusedError
 from imgcal.io import load_object, load_rig
 from imgcal.online.recalibrator import Recalibrator
 from imgcal.pipeline import calibrate, score
@@ -97,3 +98,33 @@ def test_a_score_takes_frames(seen):
     rig, obj, frames, _ = seen
     truth = calibrate(frames, rig, obj).rig
     assert score(frames, truth, obj).distances.max() < 0.2
+
+
+class Watcher:
+    """Proposes nothing, and remembers what it was shown."""
+
+    name = "watcher"
+
+    def __init__(self):
+        self.shown = []
+
+    def propose(self, snapshot):
+        self.shown.append(snapshot)
+        return Proposal.declined(snapshot, "seen enough")
+
+
+def test_a_proposer_is_shown_the_frames_of_each_snapshot(o10, asymmetric8):
+    frames = {name: [np.full((1088, 2048), 7 + s, np.uint8) for s in range(2)] for name in o10.camera_names[:2]}
+    watcher = Watcher()
+    with pytest.raises(RefusedError, match="seen enough"):
+        calibrate(frames, o10, asymmetric8, detector=watcher)
+    assert [int(shown.frames["cam02"][0, 0]) for shown in watcher.shown] == [7, 8]
+    assert watcher.shown[0].rig.camera_names == o10.camera_names and len(watcher.shown[0].blobs) == 0
+
+
+def test_who_looks_needs_frames_and_a_name_that_is_known(o10, asymmetric8):
+    truth = simulate_truth(o10, asymmetric8, 1, torch.Generator().manual_seed(0), None)
+    with pytest.raises(InputError, match="without frames"):
+        calibrate(true_detections(truth), o10, asymmetric8, detector=Watcher())
+    with pytest.raises(InputError, match="detector: found 'clasical'"):
+        calibrate(true_detections(truth), o10, asymmetric8, detector="clasical")

@@ -1,0 +1,196 @@
+"""Snapshot after snapshot: what earlier ones say, the pose and the rig, helps to label the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from imgcal.association.identification import identify
+from imgcal.association.options import PipelineOptions
+from imgcal.association.orientation import oriented
+from imgcal.association.proposals import Sight, Snapshot, judge
+from imgcal.association.result import Identity, Status
+from imgcal.errors import InputError
+from imgcal.estimation import estimate, flat_std
+from imgcal.geometry import RigidTransform, geodesic_angle
+from imgcal.types import CalibrationObject, CameraRig, Detections, Observations, RigPrior, check_object, check_rig
+
+MOST_REMEMBERED = 64
+"""Snapshots that take part in refits of the rig while identity goes on: later ones add little to it."""
+
+NEARLY_KNOWN = 0.35
+"""Radians that a proposed pose may be turned against the last one to count as found by tracking."""
+
+
+@dataclass(frozen=True)
+class SnapshotIdentity:
+    """What was decided about one snapshot."""
+
+    name: str
+    status: str  # coded | unique | by_prior | by_tracking | ambiguous | refused
+    reason: str
+    alternatives: int
+    rig_from_object: RigidTransform | None
+
+
+class Tracker:
+    """Carries what earlier snapshots say, the pose and the rig, to the next one."""
+
+    def __init__(
+        self, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions, remembered: int = MOST_REMEMBERED
+    ) -> None:
+        check_rig(rig)
+        check_object(obj)
+        self.factory, self.obj, self.options, self.remembered = rig, obj, options, remembered
+        self.rig = rig
+        self.prior_std = (rig.prior or RigPrior()).std(rig)
+        self.pose = None if options.start_pose is None else _checked_pose(options.start_pose, rig)
+        self.alternatives = 0  # that the accepted snapshots leave open, 0 = none was accepted yet
+        self.in_vain = 0  # hypotheses that were tried since something was accepted
+        self.looks_in_vain = 0  # snapshots in which a proposer found nothing, less those in which it did
+        self.accepted: list[tuple[Detections, NDArray[np.int64], RigidTransform]] = []
+
+    def accept(self, name: str, labels: NDArray[np.int64]) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
+        """Take over the labels that came with a snapshot."""
+        few = self._too_few(name, labels)
+        return few or SnapshotIdentity(name, "coded", "labelled in the input", 1, None), labels
+
+    def decide(self, blobs: Detections, name: str) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
+        """Label the blobs of one snapshot."""
+        return self._concluded(self._identify(blobs), blobs, name)
+
+    def look(
+        self, sight: Sight, number: int, blobs: Detections, name: str
+    ) -> tuple[SnapshotIdentity, NDArray[np.int64], Detections]:
+        """Label one snapshot by what a proposer sees in its frames; also gives the blobs that the labels are of."""
+        known = () if self.pose is None else (self.pose,)
+        snapshot = Snapshot(
+            sight.frames(number), blobs, self.rig, self.obj, self.prior_std, known, sight.detection, sight.masks
+        )
+        proposal = sight.proposer.propose(snapshot)
+        near = False
+        if self.pose is not None and proposal.rig_from_object is not None:
+            near = bool(geodesic_angle(self.pose.rotation, proposal.rig_from_object.rotation) < NEARLY_KNOWN)
+        error = float(np.hypot(self.options.identity_error, self._tolerance_px(blobs)))
+        identity, found = judge(proposal, snapshot, self.options.identity, error=error, pose_known=near)
+        self.looks_in_vain = max(0, self.looks_in_vain + (-1 if identity.accepted else 1))
+        return *self._concluded(self._taken_over(identity), found, name), found
+
+    def _concluded(
+        self, identity: Identity, blobs: Detections, name: str
+    ) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
+        labels, pose = identity.labels, identity.rig_from_object
+        if not identity.accepted:
+            return SnapshotIdentity(name, "refused", identity.reason, identity.alternatives, None), labels
+        if (few := self._too_few(name, labels)) is not None:
+            return few, labels
+        assert pose is not None  # an accepted identity has one
+        self._remember(blobs, labels, pose)
+        return SnapshotIdentity(name, identity.status, identity.reason, identity.alternatives, pose), labels
+
+    def _too_few(self, name: str, labels: NDArray[np.int64]) -> SnapshotIdentity | None:
+        """Refuse a snapshot that shows too few fiducials; None = it shows enough."""
+        shown = len(np.unique(labels[labels >= 0]))
+        if shown >= self.options.least_fiducials:
+            return None
+        reason = f"too few fiducials: found {shown}, expected at least {self.options.least_fiducials}"
+        return SnapshotIdentity(name, "refused", reason, 1, None)
+
+    def follow(self, pose: RigidTransform) -> tuple[Status, int]:
+        """Take over the pose of a snapshot that was followed from the last one.
+
+        Returns:
+            How sure that one is: status and alternatives, which it inherits.
+        """
+        self.pose = pose
+        return ("ambiguous" if self.alternatives > 1 else "by_tracking"), max(self.alternatives, 1)
+
+    def _identify(self, blobs: Detections) -> Identity:
+        error = np.hypot(self.options.identity_error, self._tolerance_px(blobs))
+        blobs = replace(blobs, sigma=np.hypot(blobs.sigma, error))
+        known = [] if self.pose is None else [self.pose]
+        # Many captures are taken with the object at the origin of the rig's frame; it costs little to look there first.
+        guesses = [] if known else [RigidTransform.identity(dtype=self.rig.focal_length.dtype)]
+        return self._taken_over(
+            identify(blobs, self.rig, self.obj, self.prior_std, known, self.options.identity, guesses)
+        )
+
+    def _taken_over(self, found: Identity) -> Identity:
+        """See a decision in the light of those before."""
+        pose = found.rig_from_object
+        if not found.accepted or pose is None:
+            self.in_vain += found.hypotheses
+            return found
+        if self.alternatives == 0 and self.pose is not None and found.status != "unique":
+            found = oriented(found, self.obj, self.pose)
+        elif found.status == "by_tracking":
+            status, alternatives = self.follow(pose)
+            found = replace(found, status=status, alternatives=alternatives)
+        self.alternatives, self.in_vain = found.alternatives, 0
+        return found
+
+    def _tolerance_px(self, blobs: Detections) -> float:
+        """What the object's tolerances are in the image, roughly."""
+        obj = self.obj
+        if obj.exact:
+            return 0.0
+        tolerance = 0.0 if obj.tolerance is None else float(obj.tolerance.max())
+        tolerance = float(np.hypot(tolerance, obj.scale_tolerance * obj.size))
+        distance = self.rig.working_distance
+        if distance is None and self.pose is not None:
+            centre = self.pose.apply(obj.points.mean(0, keepdim=True))[0]
+            distance = float((self.rig.positions - centre).norm(dim=-1).median())
+        if distance is not None:
+            return tolerance * float(self.rig.focal_length.mean()) / distance
+        cameras = [blobs.uv[blobs.camera == c] for c in np.unique(blobs.camera)]
+        extents = [np.linalg.norm(uv - np.median(uv, axis=0), axis=1).mean() for uv in cameras]
+        return tolerance * float(np.median(extents)) / obj.size if extents else 0.0
+
+    def _remember(self, blobs: Detections, labels: NDArray[np.int64], pose: RigidTransform) -> None:
+        """Keep the pose; refit the rig after 1, 2, 4, 8, ... accepted snapshots."""
+        self.pose = pose
+        if len(self.accepted) >= self.remembered:
+            return
+        self.accepted.append((blobs, labels, pose))
+        count = len(self.accepted)
+        if count & (count - 1):
+            return
+        parts = [to_observations(replace(b, fiducial=given), self.factory, self.obj) for b, given, _ in self.accepted]
+        sigma = (torch.cat([p.sigma for p in parts]).square() + self.options.identity_error**2).sqrt()
+        observations = Observations(torch.cat([p.uv for p in parts]), sigma, torch.cat([p.seen for p in parts]))
+        poses = RigidTransform.stack([p for _, _, p in self.accepted])
+        fit = estimate(observations, self.factory, self.obj, poses, options=self.options.estimation)
+        if bool(fit.converged):
+            prior = (self.factory.prior or RigPrior()).std(self.factory)
+            self.rig, self.prior_std = fit.rig, torch.minimum(2 * flat_std(fit), prior)
+
+
+def _checked_pose(pose: RigidTransform, rig: CameraRig) -> RigidTransform:
+    """Return a pose that a user gave, in the rig's precision.
+
+    Raises:
+        InputError: it is none.
+    """
+    shapes = tuple(pose.rotation.shape), tuple(pose.translation.shape)
+    if shapes != ((3, 3), (3,)):
+        raise InputError(f"start pose: found shapes {shapes[0]} and {shapes[1]}, expected one rotation and translation")
+    pose = pose.to(rig.focal_length.dtype)
+    off = (pose.rotation @ pose.rotation.mT - torch.eye(3, dtype=pose.rotation.dtype)).abs().max()
+    if not (bool(off < 1e-3) and bool(torch.det(pose.rotation) > 0) and bool(pose.translation.isfinite().all())):
+        raise InputError("start pose: found no rotation and finite translation, expected those of rig_from_object")
+    return pose
+
+
+def to_observations(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> Observations:
+    """Arrange labelled blobs densely: (S, C, N). Of two blobs with one label in a camera the last one counts."""
+    snapshots = np.unique(detections.snapshot) if len(detections) else np.empty(0, dtype=np.int64)
+    shape = (max(len(snapshots), 1), rig.num_cameras, obj.num_fiducials)
+    rows = np.flatnonzero(detections.fiducial >= 0)
+    where = (np.searchsorted(snapshots, detections.snapshot[rows]), detections.camera[rows], detections.fiducial[rows])
+    uv, sigma, seen = np.zeros((*shape, 2)), np.ones(shape), np.zeros(shape, dtype=bool)
+    uv[where], sigma[where], seen[where] = detections.uv[rows], detections.sigma[rows], True
+    dtype = rig.focal_length.dtype
+    return Observations(torch.from_numpy(uv).to(dtype), torch.from_numpy(sigma).to(dtype), torch.from_numpy(seen))

@@ -1,0 +1,107 @@
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+
+from imgcal.association import IdentityOptions, Proposal, Sight, Snapshot, associate, judge, rows_of
+from imgcal.association.proposals import together
+from imgcal.geometry import RigidTransform, rotation_from_vector
+from imgcal.io import load_object
+from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
+
+TURN = rotation_from_vector(torch.tensor([0.0, 0.0, 0.6], dtype=torch.float64))
+
+
+@pytest.fixture(scope="module")
+def truth(o10, asymmetric8):
+    return simulate_truth(o10, asymmetric8, 2, torch.Generator().manual_seed(3), PhysicalDrift())
+
+
+@dataclass(frozen=True)
+class Oracle:
+    """Proposes the truth with some noise, or what a test makes of it; snapshots come with their numbers as frames."""
+
+    truth: object
+    labels: object = None  # permutation of the fiducials
+    margin: float = 100.0
+    name: str = "oracle"
+
+    def propose(self, snapshot):
+        number = int(snapshot.frames["number"][0, 0])
+        uv = self.truth.uv[number].double().numpy()
+        uv = uv if self.labels is None else uv[:, self.labels]
+        noise = np.random.default_rng(number).normal(0, 0.1, uv.shape)
+        some = np.full(uv.shape[:2], 0.1)
+        rows = rows_of(uv + noise, some, some > 0, 30 * some, snapshot.blobs)
+        return Proposal(rows, self.truth.rig_from_object[number], self.margin)
+
+
+def frames(number):
+    return {"number": np.full((1, 1), number)}
+
+
+def looked_at(truth, obj, rig, proposer, blobs, number=0):
+    snapshot = Snapshot(frames(number), blobs, rig, obj, rig.prior.std(rig))
+    return judge(proposer.propose(snapshot), snapshot, IdentityOptions(), error=0.3, pose_known=False)
+
+
+def blobs_of(truth, number=0, share=0.0):
+    """Some of the true blobs, without labels."""
+    seen = true_detections(truth).of_snapshots(number, number + 1)
+    kept = np.random.default_rng(0).random(len(seen)) < share
+    return replace(seen.select(kept), fiducial=np.full(int(kept.sum()), -1))
+
+
+def test_a_right_proposal_is_accepted_without_any_blob(truth, o10, asymmetric8):
+    identity, blobs = looked_at(truth, asymmetric8, o10, Oracle(truth), blobs_of(truth))
+    assert identity.status == "unique" and len(blobs) == 80 and (blobs.fiducial == -1).all()
+    assert (identity.labels >= 0).mean() > 0.95
+    assert identity.margin <= 100
+
+
+def test_labels_are_not_believed(truth, o10, asymmetric8):
+    swapped = Oracle(truth, np.array([1, 0, 2, 3, 4, 5, 7, 6]))
+    identity, _ = looked_at(truth, asymmetric8, o10, swapped, blobs_of(truth))
+    assert not identity.accepted and "agree" in identity.reason
+
+
+def test_a_wrong_pose_and_a_narrow_margin_are_refused(truth, o10, asymmetric8):
+    blobs = blobs_of(truth, share=1.0)
+    turned = RigidTransform(truth.rig_from_object.rotation @ TURN, truth.rig_from_object.translation)
+    wrong = Oracle(replace(truth, rig_from_object=turned))
+    assert not looked_at(truth, asymmetric8, o10, wrong, blobs)[0].accepted
+    narrow, _ = looked_at(truth, asymmetric8, o10, Oracle(truth, margin=5.0), blobs)
+    assert not narrow.accepted and "margin" in narrow.reason
+
+
+def test_a_symmetric_object_stays_ambiguous(o10):
+    cube8 = load_object("cube8")
+    cubes = simulate_truth(o10, cube8, 1, torch.Generator().manual_seed(3), PhysicalDrift())
+    identity, _ = looked_at(cubes, cube8, o10, Oracle(cubes), blobs_of(cubes))
+    assert (identity.status, identity.alternatives) == ("ambiguous", 24)
+
+
+def test_where_both_see_one_thing_the_better_measured_stays(truth, o10, asymmetric8):
+    blobs = blobs_of(truth, share=1.0)
+    snapshot = Snapshot(frames(0), blobs, o10, asymmetric8, o10.prior.std(o10))
+    proposed = Oracle(truth).propose(snapshot).detections
+    sharp, labels = together(replace(proposed, sigma=proposed.sigma / 10), blobs)
+    assert len(sharp) == 80 and np.allclose(sharp.sigma, 0.01) and (labels == proposed.fiducial).all()
+    dull, labels = together(replace(proposed, sigma=proposed.sigma * 10), blobs)
+    assert len(dull) == 80 and np.allclose(dull.sigma, 0.1) and (np.sort(labels) == np.sort(proposed.fiducial)).all()
+    apart = replace(proposed, uv=proposed.uv + 12, sigma=np.full(80, 30.0))
+    assert len(together(apart, blobs)[0]) > 150  # a large sigma hides no blobs that contradict
+
+
+@pytest.mark.parametrize("where_blobs_fail", [False, True])
+def test_what_was_looked_at_is_in_the_table(truth, o10, asymmetric8, where_blobs_fail):
+    some = true_detections(truth)
+    some = some.select((some.snapshot == 1) | ((some.camera == 0) & (some.fiducial < 3)))  # of the first, three blobs
+    given = replace(some, fiducial=np.full(len(some), -1))
+    found = associate(given, o10, asymmetric8, sight=Sight(Oracle(truth), frames, where_blobs_fail))
+    assert found.identity == "unique" and found.used == [0, 1]
+    table = found.detections
+    assert len(table) == 160 and (table.fiducial >= 0).mean() > 0.95 and (np.diff(table.snapshot) >= 0).all()
+    error = table.uv - truth.uv.double().numpy()[table.snapshot, table.camera, table.fiducial]
+    assert np.abs(error[table.fiducial >= 0]).max() < 0.6
