@@ -14,12 +14,13 @@ from torch.utils.tensorboard import SummaryWriter
 
 from imgcal.errors import InputError, RefusedError
 from imgcal.io import read_metrics, write_tensors, write_text
-from imgcal.networks import Checkpoint, save_checkpoint
 from imgcal.training import (
     Callbacks,
     DivergedError,
     Experiment,
+    Result,
     Run,
+    Task,
     TrainingState,
     load_state,
     progress,
@@ -96,14 +97,16 @@ class TrainingFolder(Callbacks):
             if name != "step" and isinstance(value, float | int):
                 self.board.add_scalar(name, value, row["step"])
         if "seconds" in row:
-            self.bar.update(self.task, completed=progress(run, row["seconds"]), description=_summary(run.latest))
+            self.bar.update(
+                self.task, completed=progress(run, row["seconds"]), description=_summary(run.latest, run.task)
+            )
         else:
-            self._say(_summary(run.latest))
+            self._say(_summary(run.latest, run.task))
 
-    def on_checkpoint(self, run: Run, state: TrainingState, checkpoint: Checkpoint) -> None:
+    def on_checkpoint(self, run: Run, state: TrainingState, result: Result) -> None:
         """Write both; where a file cannot be written the previous one survives."""
         save_state(self.folder / STATE, state)
-        save_checkpoint(self.folder / RESULT, checkpoint)
+        result.save(self.folder / RESULT)
 
     def on_end(self, run: Run) -> None:
         """Close the logs."""
@@ -115,21 +118,19 @@ class TrainingFolder(Callbacks):
         where = f"{run.accelerator.num_processes} x {run.accelerator.device.type}"
         again = f", from step {run.step} on" if run.step else ""
         self._say(f"{run.experiment.name}: {count:,} parameters, {where}{again}")
-        if run.untrained:
-            parts = ", ".join(sorted({name.partition(".")[0] for name in run.untrained}))
+        if run.task.untrained:
+            parts = ", ".join(sorted({name.partition(".")[0] for name in run.task.untrained}))
             start = run.experiment.training.init_from
-            self._say(f"{start}: nothing fits {len(run.untrained)} tensors of {parts}: untrained")
+            self._say(f"{start}: nothing fits {len(run.task.untrained)} tensors of {parts}: untrained")
 
     def _say(self, text: str) -> None:
         self.console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
-def _summary(latest: dict[str, Any]) -> str:
+def _summary(latest: dict[str, Any], task: Task[Any, Any]) -> str:
     """Put the latest numbers into one line."""
     words = [f"step {latest.get('step', 0)}"]
-    for name, label in (("re_px", "RE"), ("validation_re_px", "validation RE")):
-        if name in latest:
-            words.append(f"{label} {latest[name]:.3g} px")
-    if "rigs_per_s" in latest:
-        words.append(f"{latest['rigs_per_s']:.0f} rigs/s")
+    words += [shown.format(latest[name]) for name, shown in task.headline.items() if name in latest]
+    if (rate := latest.get(f"{task.unit}_per_s")) is not None:
+        words.append(f"{rate:.0f} {task.unit}/s")
     return "  ".join(words)

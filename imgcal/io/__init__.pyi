@@ -11,7 +11,7 @@ from .resources import data_path, shipped_names
 from .rig_yaml import RigCovariance, load_rig, load_rig_covariance, rig_from_text, rig_text, save_rig
 from .safetensors_file import read_tensors, read_texts, write_tensors
 from .validation import StrictModel, StrictRecord, validated
-from .yaml_file import Flow, parse_yaml, read_yaml, yaml_text
+from .yaml_file import Flow, parse_yaml, read_yaml, read_yaml_mapping, yaml_text
 
 __all__ = [
     "MARGIN",
@@ -40,6 +40,7 @@ __all__ = [
     "read_tensors",
     "read_texts",
     "read_yaml",
+    "read_yaml_mapping",
     "replacing",
     "rig_from_text",
     "rig_text",

@@ -46,13 +46,26 @@ def record_from_yaml(
     content: bytes, where: str, model: type[Model], file_format: str, entry_names: Mapping[str, str] | None = None
 ) -> Model:
     """Do the work of `read_yaml` on what a file holds; errors begin with `where`."""
+    return validated(_formatted(content, where, file_format), model, where, entry_names)
+
+
+def read_yaml_mapping(path: Path, file_format: str) -> dict[str, Any]:
+    """Read the plain values of a YAML file of which only the format is known.
+
+    Raises:
+        InputError: one line with the file, what was found and what was expected.
+    """
+    return _formatted(_content(path), str(path), file_format)
+
+
+def _formatted(content: bytes, where: str, file_format: str) -> dict[str, Any]:
     values = _parse(content, where)
     if not isinstance(values, dict):
         raise InputError(f"{where}: found {_what(values)}, expected a mapping that starts with `format: {file_format}`")
     if values.get("format") != file_format:
         found = f"`format: {reprlib.repr(values['format'])}`" if "format" in values else "no key `format`"
         raise InputError(f"{where}: found {found}, expected `format: {file_format}`")
-    return validated(values, model, where, entry_names)
+    return values
 
 
 def parse_yaml(text: str, where: str) -> Any:

@@ -50,6 +50,10 @@ class Checkpoint:
         """Spread of the parameters that the network was trained for: (C, 15) float64, the prior of a refinement."""
         return self.experiment.drift.std(self.rig)
 
+    def save(self, path: str | Path) -> None:
+        """Write it: `save_checkpoint`, in full precision."""
+        save_checkpoint(path, self)
+
 
 def save_checkpoint(path: str | Path, checkpoint: Checkpoint, dtype: torch.dtype = torch.float32) -> None:
     """Write a network and what it was trained for in one step.

@@ -1,13 +1,21 @@
 from .callbacks import Callbacks, DivergedError
 from .engine import Run, finished, prepare, progress, train, train_step
-from .experiment import Experiment, changed, experiment_of, load_experiment, save_experiment
+from .experiment import Experiment
+from .experiment_file import changed, load_experiment, save_experiment
+from .rigs import RigExperiment, RigTask, experiment_of
 from .state import TrainingState, load_state, save_state
+from .task import Loss, Result, Task
 
 __all__ = [
     "Callbacks",
     "DivergedError",
     "Experiment",
+    "Loss",
+    "Result",
+    "RigExperiment",
+    "RigTask",
     "Run",
+    "Task",
     "TrainingState",
     "changed",
     "experiment_of",

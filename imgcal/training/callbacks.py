@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from imgcal.errors import RefusedError
-from imgcal.networks import Checkpoint
-from imgcal.training.data import Batch
 from imgcal.training.run import Run
 from imgcal.training.state import TrainingState
+from imgcal.training.task import Batch, Result
 
 
 class Callbacks:
@@ -26,11 +25,14 @@ class Callbacks:
         Args:
             run: where the training stands.
             row: plain values by name: `step`, and the means since the last such row (`loss`, `re_px`, `lr`,
-                `rigs_per_s`, `seconds`), or the errors in validation (`validation_re_px`, ...).
+                `rigs_per_s`, `seconds`), or the errors in validation (`validation_re_px`, ...); the task names them.
             due: False = only told because the run ends here, for now; a longer one would not have told.
         """
 
-    def on_checkpoint(self, run: Run, state: TrainingState, checkpoint: Checkpoint) -> None:
+    def on_step(self, run: Run, seconds: float) -> None:
+        """Note that a step was taken, after so many seconds of training: called often, and must not wait."""
+
+    def on_checkpoint(self, run: Run, state: TrainingState, result: Result) -> None:
         """Take all that the rest of the run depends on, and the network as it would be the result now.
 
         Both show the run's own tensors: copy or write them before returning.

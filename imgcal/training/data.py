@@ -12,7 +12,7 @@ from imgcal.types import CalibrationObject, CameraRig, Prediction, Views
 
 
 @dataclass(frozen=True)
-class Batch:
+class RigBatch:
     """What a network sees, and what it should say."""
 
     views: Views  # (B,)
@@ -52,17 +52,17 @@ class Source:
         """Make `count` random rigs; the generator is on the training device."""
         return synthesize(self.factory, self.obj, count, generator, drift=self.drift, pose_range=self.pose_range)
 
-    def show(self, made: Snapshots, generator: torch.Generator) -> Batch:
+    def show(self, made: Snapshots, generator: torch.Generator) -> RigBatch:
         """Make what the network sees of them. Images are valid until the next call."""
         truth = Prediction(made.rig, made.rig_from_object)
         views, size = Views(uv=made.projection.uv, seen=made.projection.visible), self.factory.image_size
         if not self.corruption.nothing:
             views = self.corruption.apply(views, size, generator).views
         if self.images is None or views.uv is None or views.seen is None:
-            return Batch(views, truth)
+            return RigBatch(views, truth)
         canvas = self._canvas(views.uv)
         images = render_views(views.uv, views.seen, size, self.obj, self.images, quantise=True, out=canvas)
-        return Batch(Views(images=images), truth)
+        return RigBatch(Views(images=images), truth)
 
     def _canvas(self, uv: Tensor) -> Tensor | None:
         """Memory to draw on: drawing over it is much faster on a CPU than asking for new."""

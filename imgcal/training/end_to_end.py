@@ -8,7 +8,7 @@ from torch import Tensor
 from imgcal.errors import InputError
 from imgcal.nn import project_fiducials, reprojection_re
 from imgcal.refinement import as_prediction, refine_points
-from imgcal.training.data import Batch, Source
+from imgcal.training.data import RigBatch, Source
 from imgcal.training.losses import RefinedLoss
 from imgcal.types import Prediction
 
@@ -16,7 +16,7 @@ WORST = 200.0  # pixels: where the error of a refined rig stops to count
 
 
 def refined_loss(
-    prediction: Prediction, batch: Batch, source: Source, prior_std: Tensor, config: RefinedLoss
+    prediction: Prediction, batch: RigBatch, source: Source, prior_std: Tensor, config: RefinedLoss
 ) -> Tensor | float:
     """Weigh every fiducial as the network says, estimate the rig, and compare it with the truth.
 

@@ -54,6 +54,8 @@ def load_state(path: str | Path, experiment: Experiment) -> TrainingState:
         values, saved = read_json(texts["values"]), read_json(texts["experiment"])
         if not isinstance(values, dict) or not isinstance(saved, dict):
             raise ValueError("no mapping")
+        # Keys that are newer than the state have their defaults.
+        saved = type(experiment).model_validate(saved, strict=False).model_dump(mode="json")
     except (KeyError, ValueError) as error:
         raise InputError(f"{path}: found no readable state in it: the file is damaged") from error
     difference = first_difference(saved, experiment.model_dump(mode="json"))

@@ -25,7 +25,7 @@ from imgcal.io import (
     yaml_text,
 )
 from imgcal.networks import Checkpoint, build_network, save_checkpoint
-from imgcal.training import load_experiment
+from imgcal.training import RigExperiment, load_experiment
 from scripts.fuzz.mutations import NAMES, VALUES, mutated
 
 SIZE = (256, 136)  # pixels: small frames are quick
@@ -122,7 +122,7 @@ def _network(folder: Path) -> None:
         "training": {"steps": 1, "batch_size": 2, "validation_rigs": 0, "device": "cpu", "threads": 1},
     }
     (folder / "experiment.yaml").write_text(yaml_text(content))
-    experiment = load_experiment(folder / "experiment.yaml")
+    experiment = load_experiment(folder / "experiment.yaml", kind=RigExperiment)
     rig, obj = experiment.load_rig(), experiment.load_object()
     network = build_network(experiment, rig, obj, torch.Generator().manual_seed(0))
     save_checkpoint(folder / "model.safetensors", Checkpoint(network, rig, obj, experiment, {"re_px": 1.0}))

@@ -11,15 +11,15 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
-from typing import Any
+from typing import Any, cast
 
 import torch
 import tyro
-from torch import Tensor
+from torch import Tensor, nn
 
 from imgcal.errors import InputError
 from imgcal.nn import project_fiducials
-from imgcal.training import Experiment, Run, changed, load_experiment, prepare, train_step
+from imgcal.training import RigExperiment, RigTask, changed, load_experiment, prepare, train_step
 from imgcal.training.engine import check_finite
 from imgcal.training.losses import (
     distortion_size,
@@ -58,7 +58,8 @@ def main(arguments: list[str] | None = None) -> None:
     if not options.minutes > 0:
         raise InputError(f"--minutes: found {options.minutes:g}, expected more than 0")
     loss = f"loss={{kind: paper, paper: {{reprojection_from: {NEVER}}}}}"
-    experiment = changed(load_experiment(options.experiment), *options.set, loss, "training.validation_rigs=0")
+    chosen = load_experiment(options.experiment, kind=RigExperiment)
+    experiment = changed(chosen, *options.set, loss, "training.validation_rigs=0")
     result = surroundings() | watched(experiment, options)
     write_json(options.out / "losses.json", result)
     draw(result, options.out / "losses.png")
@@ -67,12 +68,12 @@ def main(arguments: list[str] | None = None) -> None:
         print(f"{name:20s} {values[0]:12.5g} -> {values[-1]:12.5g}" + ("" if at_truth is None else f"  {at_truth:.5g}"))
 
 
-def watched(experiment: Experiment, options: Options) -> dict[str, Any]:
+def watched(experiment: RigExperiment, options: Options) -> dict[str, Any]:
     """Train for some minutes; returns every term every few steps."""
     run = prepare(experiment)
-    made = run.source.sample(options.rigs, torch.Generator(run.prior_std.device).manual_seed(1))
-    batch = run.source.show(made, run.generator)
-    truth, obj = batch.truth, run.source.obj
+    task = cast(RigTask, run.task)
+    batch = task.batch(options.rigs, torch.Generator(task.prior_std.device).manual_seed(1))
+    truth, obj = batch.truth, task.source.obj
     steps: list[int] = []
     found: dict[str, list[float]] = {}
     second_stage: int | None = None
@@ -81,7 +82,7 @@ def watched(experiment: Experiment, options: Options) -> dict[str, Any]:
     def look() -> None:
         with torch.no_grad():
             run.plain.eval()
-            values = terms(run.plain(batch.views)[-1], truth, obj, experiment.loss.paper.lambda_scale, run)
+            values = terms(run.plain(batch.views)[-1], truth, obj, experiment.loss.paper.lambda_scale, run.plain)
             run.plain.train()
         steps.append(run.step)
         for name, value in values.items():
@@ -91,14 +92,14 @@ def watched(experiment: Experiment, options: Options) -> dict[str, Any]:
     while (part := (monotonic() - began) / (60 * options.minutes)) < 1:
         if part > 1 / 3 and second_stage is None:
             second_stage = run.step
-            run.experiment = changed(run.experiment, f"loss.paper.reprojection_from={run.step}")
+            task.experiment = changed(task.experiment, f"loss.paper.reprojection_from={run.step}")
         run.schedule.set_progress(part)
         train_step(run)
         if run.step % options.every == 0:
             look()
     check_finite(run)
     look()
-    own = terms(truth, truth, obj, 1.0, run)
+    own = terms(truth, truth, obj, 1.0, run.plain)
     return {
         "experiment": options.experiment,
         "changes": list(options.set),
@@ -112,7 +113,7 @@ def watched(experiment: Experiment, options: Options) -> dict[str, Any]:
 
 
 def terms(
-    predicted: Prediction, truth: Prediction, obj: CalibrationObject, scale: float, run: Run
+    predicted: Prediction, truth: Prediction, obj: CalibrationObject, scale: float, network: nn.Module
 ) -> dict[str, Tensor]:
     """Every term, the proposed ones first."""
     cameras, true_cameras = predicted.cameras_from_object, truth.cameras_from_object
@@ -125,7 +126,7 @@ def terms(
         "focal ratio": focal_ratio(cameras),
         "principal point": principal_point_shift(cameras),
         "large focal": inverse_focal(cameras),
-        "L1 of weights": l1_norm(run.plain.parameters()),
+        "L1 of weights": l1_norm(network.parameters()),
     }
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from imgcal.networks import Images, PaperImages
 from imgcal.synthesis import RelativeDrift
-from imgcal.training import Experiment
+from imgcal.training import RigExperiment
 from scripts.output import markdown
 from scripts.results.measuring import FACTORY, NETWORK, ROBUST, WITHOUT
 
@@ -22,7 +22,7 @@ GOALS = {1: 2.0, 2: 3.0, 3: 5.0, 4: 3.0, 5: 3.0, 6: 2.0, 7: 0.2, 8: 1.0, 9: 3.0,
 REFINED_GOALS = {"points": 0.02, "images": 0.1}
 
 
-def accuracy_table(experiments: Sequence[Experiment], results: Results) -> str:
+def accuracy_table(experiments: Sequence[RigExperiment], results: Results) -> str:
     """Table 1, our networks: both columns beside the paper's."""
     head = (
         "row",
@@ -55,7 +55,7 @@ def accuracy_table(experiments: Sequence[Experiment], results: Results) -> str:
     return markdown(head, rows)
 
 
-def background_table(experiments: Sequence[Experiment], results: Results) -> str:
+def background_table(experiments: Sequence[RigExperiment], results: Results) -> str:
     """Table 1, second half: noise, what other methods get there, and what each training took."""
     head = (
         "row",
@@ -69,7 +69,7 @@ def background_table(experiments: Sequence[Experiment], results: Results) -> str
         *TRAINING,
     )
 
-    def cells(experiment: Experiment, result: dict[str, Any]) -> list[str]:
+    def cells(experiment: RigExperiment, result: dict[str, Any]) -> list[str]:
         exact, noise = result["exact"], result["noise"]
         row = [str(row_of(experiment)), label(experiment), _px(exact[FACTORY]["mean"]), _px(exact[WITHOUT]["mean"])]
         row += [_px(noise[NETWORK]["mean"]), _px(noise[REFINED]["mean"]), _bound(noise[REFINED])]
@@ -78,11 +78,11 @@ def background_table(experiments: Sequence[Experiment], results: Results) -> str
     return _of_trained(head, experiments, results, cells)
 
 
-def paper_table(experiments: Sequence[Experiment], results: Results) -> str:
+def paper_table(experiments: Sequence[RigExperiment], results: Results) -> str:
     """Trained networks of the paper's own design."""
     head = ("row", "what", "paper's RE", "network alone", REFINED, "parameters", *TRAINING)
 
-    def cells(experiment: Experiment, result: dict[str, Any]) -> list[str]:
+    def cells(experiment: RigExperiment, result: dict[str, Any]) -> list[str]:
         exact = result["exact"]
         row = [str(row_of(experiment)), label(experiment), _paper(experiment)]
         return [
@@ -96,11 +96,11 @@ def paper_table(experiments: Sequence[Experiment], results: Results) -> str:
     return _of_trained(head, experiments, results, cells)
 
 
-def comparison_table(experiments: Sequence[Experiment], results: Results) -> str:
+def comparison_table(experiments: Sequence[RigExperiment], results: Results) -> str:
     """What single decisions are worth, in equal minutes from nothing."""
     head = ("what", "network alone", "median", "parameters", *TRAINING)
 
-    def cells(experiment: Experiment, result: dict[str, Any]) -> list[str]:
+    def cells(experiment: RigExperiment, result: dict[str, Any]) -> list[str]:
         alone = result["exact"][NETWORK]
         row = [experiment.description.partition(":")[0], mean(alone), _px(alone["median"])]
         return [*row, _millions(result["parameters"]), *training_cells(result)]
@@ -108,7 +108,7 @@ def comparison_table(experiments: Sequence[Experiment], results: Results) -> str
     return _of_trained(head, experiments, results, cells)
 
 
-def shipped_table(experiments: Sequence[Experiment], results: Results) -> str:
+def shipped_table(experiments: Sequence[RigExperiment], results: Results) -> str:
     """Size, speed and accuracy of the models that ship."""
     head = (
         "model",
@@ -139,11 +139,11 @@ def shipped_table(experiments: Sequence[Experiment], results: Results) -> str:
     return markdown(head, rows)
 
 
-def robustness_table(experiments: Sequence[Experiment], results: Results) -> str:
+def robustness_table(experiments: Sequence[RigExperiment], results: Results) -> str:
     """Median RE with outliers, everybody on the same rigs."""
     columns = ("MAP, true inliers", NETWORK, REFINED, ROBUST, WITHOUT, FACTORY)
 
-    def cells(experiment: Experiment, result: dict[str, Any]) -> list[str]:
+    def cells(experiment: RigExperiment, result: dict[str, Any]) -> list[str]:
         medians = {name: result["robustness"][name]["median"] for name in columns}
         return [experiment.name, *map(_px, medians.values()), f"{medians[REFINED] / medians[columns[0]]:.2f}"]
 
@@ -151,12 +151,12 @@ def robustness_table(experiments: Sequence[Experiment], results: Results) -> str
     return _of_trained(("model", *columns, "network + refinement / true inliers"), experiments, tried, cells)
 
 
-def variant(experiment: Experiment) -> str:
+def variant(experiment: RigExperiment) -> str:
     """Tell what the network of an experiment takes: points or images."""
     return "images" if isinstance(experiment.network.variant(), Images | PaperImages) else "points"
 
 
-def label(experiment: Experiment) -> str:
+def label(experiment: RigExperiment) -> str:
     """Say in a few words what an experiment is about."""
     drift, poses = experiment.drift, experiment.poses
     where = "overhead" if poses.phi_deg == (0.0, 0.0) else "hemisphere"
@@ -185,20 +185,20 @@ def training_cells(result: Mapping[str, Any]) -> list[str]:
     return [f"{training['minutes']:.0f}", steps, training["started_from"] or "", training["machine"]]
 
 
-def row_of(experiment: Experiment) -> int:
+def row_of(experiment: RigExperiment) -> int:
     """Row of the paper's table."""
     return experiment.paper.row if experiment.paper else 0
 
 
-def _paper(experiment: Experiment) -> str:
+def _paper(experiment: RigExperiment) -> str:
     return f"{experiment.paper.re_px:g}" if experiment.paper and experiment.paper.re_px else ""
 
 
 def _of_trained(
     head: Iterable[str],
-    experiments: Sequence[Experiment],
+    experiments: Sequence[RigExperiment],
     results: Results,
-    cells: Callable[[Experiment, dict[str, Any]], list[str]],
+    cells: Callable[[RigExperiment, dict[str, Any]], list[str]],
 ) -> str:
     """A table of the experiments that have results, and the names of those that have none."""
     rows = [cells(experiment, results[experiment.name]) for experiment in experiments if experiment.name in results]

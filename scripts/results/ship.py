@@ -17,7 +17,7 @@ from imgcal.errors import InputError
 from imgcal.evaluation import reprojection_error
 from imgcal.networks import Checkpoint, load_checkpoint, save_checkpoint
 from imgcal.synthesis import render_views, synthesize
-from imgcal.training import Experiment, changed, experiment_of
+from imgcal.training import RigExperiment, changed, experiment_of
 from imgcal.types import Views
 from scripts.output import command, make_folder
 
@@ -49,7 +49,7 @@ def main(arguments: list[str]) -> None:
         print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, RE {before:.3f} px, in bf16 {after:.3f} px")
 
 
-def portable(experiment: Experiment) -> Experiment:
+def portable(experiment: RigExperiment) -> RigExperiment:
     """Say where a warm start came from by the name of that experiment, not by a path of this machine."""
     start = experiment.training.init_from
     if start is None:

@@ -16,7 +16,7 @@ import tyro
 
 from imgcal.errors import InputError
 from imgcal.io import shipped_names, write_text
-from imgcal.training import Experiment, load_experiment
+from imgcal.training import RigExperiment, load_experiment
 from scripts.output import RESULTS, ROOT, command, read_json, replaced, write_json
 from scripts.results.charts import over_time, sweeps
 from scripts.results.measuring import Effort, Source, find, measure, swept
@@ -51,7 +51,8 @@ def main(arguments: list[str] | None = None) -> None:
     """Evaluate what is new, then write the page and the plots."""
     options = tyro.cli(Options, args=arguments, description=__doc__)
     page = _read(options.page)
-    experiments = {name: load_experiment(name) for name in shipped_names("experiments", ".yaml")}
+    shipped = {name: load_experiment(name) for name in shipped_names("experiments", ".yaml")}
+    experiments = {name: one for name, one in shipped.items() if isinstance(one, RigExperiment)}
     sources = find(options.runs, options.models)
     _check_names(options.only, sources)
     for source in sources:
@@ -72,7 +73,7 @@ def main(arguments: list[str] | None = None) -> None:
     write_text(options.page, replaced(page, texts, options.page))
 
 
-def sections(experiments: list[Experiment], results: dict[str, dict[str, Any]]) -> dict[str, str]:
+def sections(experiments: list[RigExperiment], results: dict[str, dict[str, Any]]) -> dict[str, str]:
     """Make all tables, by the name of their markers."""
     table1 = [e for e in experiments if e.paper is not None and e.paper.table == "1"]
     ours = sorted((e for e in table1 if not e.name.endswith("-paper")), key=_order)
@@ -97,7 +98,7 @@ def pictures(folder: Path) -> dict[str, str]:
     return {name: f"![{text}](results/{name}.png)" if there[name] else "Not made yet." for name, text in texts.items()}
 
 
-def _order(experiment: Experiment) -> tuple[int, str]:
+def _order(experiment: RigExperiment) -> tuple[int, str]:
     return (row_of(experiment), experiment.name)
 
 

@@ -6,7 +6,7 @@ import torch
 from imgcal.cli.main import main
 from imgcal.io import load_object, load_rig
 from imgcal.networks import Checkpoint, build_network, save_checkpoint
-from imgcal.training.experiment import load_experiment
+from imgcal.training.experiment_file import load_experiment
 
 EXPERIMENT = """
 format: imgcal-experiment/1

@@ -10,10 +10,10 @@ from imgcal.errors import InputError, RefusedError
 from imgcal.io import read_metrics
 from imgcal.io.safetensors_file import read_tensors
 from imgcal.networks import load_checkpoint
-from imgcal.training import engine
+from imgcal.training import engine, rigs
 from imgcal.training.callbacks import Callbacks, DivergedError
 from imgcal.training.engine import finished, progress
-from imgcal.training.experiment import load_experiment
+from imgcal.training.experiment_file import load_experiment
 from tests.imgcal.training.toy import Toy, ToyOfImages, train
 
 
@@ -68,11 +68,11 @@ def test_the_refined_loss_is_minimized_with_the_others_and_logged(experiment, tm
     def heavy(prediction, batch, source, *_):
         return sign * 1e6 * (prediction.rig.focal_length / source.factory.focal_length).mean()
 
-    monkeypatch.setattr(engine, "refined_loss", heavy)
+    monkeypatch.setattr(rigs, "refined_loss", heavy)
     run = train(setup, tmp_path / "more")
     plain, more = (read_metrics(tmp_path / name / "metrics.jsonl")[0]["loss"] for name in ("plain", "more"))
     assert more - plain == pytest.approx(sign * 1e6, rel=1e-6)  # the untrained toy has the factory's focal lengths
-    steps = run.plain.head.bias.detach()[:-9].unflatten(0, (run.source.factory.num_cameras, -1))[:, 6:8]
+    steps = run.plain.head.bias.detach()[:-9].unflatten(0, (run.task.source.factory.num_cameras, -1))[:, 6:8]
     assert (steps * sign < 0).all()
 
 
@@ -139,8 +139,7 @@ def test_a_continuation_must_be_of_the_same_experiment(experiment, tmp_path):
 
 def test_time_moves_the_schedule_and_ends_the_run(experiment, tmp_path, monkeypatch):
     clock = iter(float(second) for second in range(10**6))
-    for module in ("engine", "run"):
-        monkeypatch.setattr(f"imgcal.training.{module}.monotonic", lambda: next(clock))
+    monkeypatch.setattr("imgcal.training.run.monotonic", lambda: next(clock))
     setup = experiment("training={minutes: 1.0, batch_size: 6, validation_rigs: 0, device: cpu, log_every: 1}")
     run = train(setup, tmp_path)
     rows = read_metrics(tmp_path / "metrics.jsonl")
@@ -209,7 +208,7 @@ def test_images_and_bf16(experiment, tmp_path, monkeypatch):
     monkeypatch.setattr("imgcal.networks.factory.build", ToyOfImages)
     setup = experiment("training.precision=bf16", "training.steps=4", "images={size: 20, dot: 1.0}")
     run = train(setup, tmp_path)
-    assert run.source.images.size == 20
+    assert run.task.source.images.size == 20
     assert run.plain.head.weight.dtype == torch.float32
     rows = read_metrics(tmp_path / "metrics.jsonl")
     assert rows[-1]["validation_re_px"] > 0
@@ -218,13 +217,14 @@ def test_images_and_bf16(experiment, tmp_path, monkeypatch):
 def test_bf16_stays_out_of_the_errors(experiment, tmp_path):
     run = train(experiment("training.precision=bf16", "training.steps=1"), tmp_path)
     generator = torch.Generator().manual_seed(1)
-    batch = run.source.show(run.source.sample(5, generator), generator)
+    batch = run.task.batch(5, generator)
 
     class Oracle(torch.nn.Module):
         def forward(self, views):
             return (batch.truth,)
 
-    assert engine.validation_errors(Oracle(), [batch], run.source.obj, run.experiment).max() < 1e-3
+    run.task.validate = lambda predict: {"worst": float(run.task.errors(predict(batch)[-1], batch).max())}
+    assert engine.validation(run, Oracle())["worst"] < 1e-3
 
 
 def test_images_for_a_point_network_are_an_error(experiment, tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ from imgcal.networks import Network, Parameterization, drawing_from, factory
 from imgcal.synthesis.colour_coding import ImageOptions
 from imgcal.training import engine
 from imgcal.training.engine import save
-from imgcal.training.experiment import load_experiment
+from imgcal.training.experiment_file import load_experiment
 from imgcal.types.prediction import Prediction
 from imgcal.types.rig import PARAMETERS
 

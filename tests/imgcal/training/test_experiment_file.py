@@ -5,7 +5,7 @@ import pytest
 from imgcal.errors import InputError
 from imgcal.synthesis import ImageOptions
 from imgcal.synthesis.rigs import PhysicalDrift, PoseRange, RelativeDrift, drift_of
-from imgcal.training.experiment import changed, load_experiment, save_experiment
+from imgcal.training.experiment_file import changed, load_experiment, save_experiment
 from tests.imgcal.training.toy import EXPERIMENT
 
 

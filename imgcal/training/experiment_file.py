@@ -1,0 +1,138 @@
+"""Experiment files: YAML, `format: imgcal-experiment/1`; the key `task` says what is trained, and which keys it has."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar, overload
+
+from imgcal.errors import InputError
+from imgcal.io import (
+    Flow,
+    StrictModel,
+    StrictRecord,
+    find_file,
+    nearest,
+    parse_yaml,
+    read_yaml_mapping,
+    validated,
+    write_text,
+    yaml_text,
+)
+from imgcal.messages import quoted
+from imgcal.training.experiment import Experiment
+from imgcal.training.rigs import RigExperiment
+
+FORMAT = "imgcal-experiment/1"
+
+# By the key `task`; a file without it is about rigs.
+KINDS: dict[str, type[Experiment]] = {
+    "rig": RigExperiment,
+}
+
+# Keys as people write them: first what it is about.
+ORDER = ("format", "name", "description", "paper", "task", "rig", "object", "poses", "drift", "network", "images")
+
+Kind = TypeVar("Kind", bound=Experiment)
+
+
+@overload
+def load_experiment(path: str | Path, changes: Iterable[str] = ()) -> Experiment: ...
+@overload
+def load_experiment(path: str | Path, changes: Iterable[str] = (), *, kind: type[Kind]) -> Kind: ...
+def load_experiment(
+    path: str | Path, changes: Iterable[str] = (), *, kind: type[Experiment] = Experiment
+) -> Experiment:
+    """Read an experiment.
+
+    Args:
+        path: a YAML file, or the bare name of a shipped experiment when there is no such file.
+        changes: `key.key=value`, values in YAML; the last one wins.
+        kind: which it must be; `Experiment` = any.
+
+    Raises:
+        InputError: one line with the file or the change, what was found and what was expected.
+
+    Examples:
+        >>> experiment = load_experiment("table1-row13", ["training.batch_size=8"])
+        >>> experiment.task, experiment.network.preset, experiment.training.batch_size
+        ('rig', 'vit', 8)
+    """
+    path = find_file(path, "experiments", ".yaml")
+    experiment = changed(experiment_from(read_yaml_mapping(path, FORMAT), str(path)), *changes)
+    if not isinstance(experiment, kind):
+        names = ", ".join(name for name, one in KINDS.items() if issubclass(one, kind))
+        raise InputError(f"{path}: task: found {experiment.task}, expected {names}")
+    return experiment
+
+
+def experiment_from(content: Mapping[str, Any], where: str) -> Experiment:
+    """Validate the plain values of an experiment; errors begin with `where`.
+
+    Raises:
+        InputError: one line with the place, what was found and what was expected.
+    """
+    task = content.get("task", "rig")
+    if not isinstance(task, str) or task not in KINDS:
+        hint = nearest(str(task), KINDS) or f", expected one of {', '.join(KINDS)}"
+        raise InputError(f"{where}: task: found {quoted(repr(task))}{hint}")
+    return validated(dict(content), KINDS[task], where)
+
+
+def changed(experiment: Kind, *changes: str) -> Kind:
+    """Set values of an experiment: `training.steps=100`, `drift={rotation_deg: 0.5}`; validated when all are set."""
+    if not changes:
+        return experiment
+    content = as_written(experiment)
+    for change in changes:
+        _apply(content, change)
+    return validated(content, type(experiment), f"--set {quoted(' '.join(changes))}")
+
+
+def as_written(experiment: Experiment) -> dict[str, Any]:
+    """The plain values of the blocks that were given, without defaults where a block knows what it was given."""
+    return experiment.model_dump(exclude_unset=True)
+
+
+def resolved_text(experiment: Experiment) -> str:
+    """All values, defaults included, as YAML."""
+    values = _resolved(experiment)
+    return yaml_text({name: values[name] for name in dict.fromkeys((*ORDER, *values)) if name in values})
+
+
+def save_experiment(experiment: Experiment, path: str | Path) -> None:
+    """Write an experiment with all its values, so that it stays the same when a default changes."""
+    write_text(path, resolved_text(experiment))
+
+
+def _resolved(model: StrictModel) -> dict[str, Any]:
+    """All values but those that are None because nothing was given: a None that switches something off stays."""
+    fields = type(model).model_fields
+    values = {name: value for name, value in model if value is not None or fields[name].default is not None}
+    return {name: _plain(value) for name, value in values.items()}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, StrictModel):
+        return _resolved(value)
+    if isinstance(value, StrictRecord):
+        return {name: _plain(field) for name, field in vars(value).items()}
+    return Flow(value) if isinstance(value, list | tuple) else value
+
+
+def _apply(content: dict[str, Any], change: str) -> None:
+    where = f"--set {quoted(change)}"
+    key, equals, text = change.partition("=")
+    steps = key.strip().split(".")
+    if not equals or not all(steps):
+        raise InputError(f"{where}: found no key and value, expected something like training.steps=100")
+    record: Any = content
+    for step in steps[:-1]:
+        if record.get(step) is None:
+            record[step] = {}
+        record = record[step]
+        if not isinstance(record, dict):
+            raise InputError(
+                f"{where}: found the value {quoted(repr(record))} at `{quoted(step)}`, expected a group of keys"
+            )
+    record[steps[-1]] = parse_yaml(text, where)

@@ -1,0 +1,130 @@
+"""The task of rigs: what all cameras see of the object in, the whole rig out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, Literal
+
+import torch
+from pydantic import ConfigDict
+from torch import Tensor, nn
+
+from imgcal.io import load_object, load_rig, validated
+from imgcal.networks import Checkpoint, Network, NetworkSpec, build_network, warm_start, without_pretrained
+from imgcal.nn import project_fiducials, reprojection_re
+from imgcal.synthesis import Corruption
+from imgcal.training.data import RigBatch, Source, object_to
+from imgcal.training.end_to_end import refined_loss
+from imgcal.training.experiment import Experiment
+from imgcal.training.losses import LossConfig, compound
+from imgcal.training.task import Loss, Task
+from imgcal.types import CalibrationObject, CameraRig, Prediction
+
+# Seed of what must not depend on how long the training takes: validation rigs.
+VALIDATION_SEED = 20_000_003
+
+Passes = tuple[Prediction, ...]
+
+
+class RigExperiment(Experiment, NetworkSpec):
+    """A network that says where a rig's cameras are: the blocks of `NetworkSpec`, and what it learns from."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    task: Literal["rig"] = "rig"
+    rig: str  # shipped name or path
+    object: str  # shipped name or path
+    corruption: Corruption = Corruption()  # what goes wrong in the views during training
+    loss: LossConfig = LossConfig()
+
+    def load_rig(self) -> CameraRig:
+        """Read the factory rig: float64, without batch axes."""
+        return load_rig(self.rig)
+
+    def load_object(self) -> CalibrationObject:
+        """Read the calibration object: float64."""
+        return load_object(self.object)
+
+    def make_task(self, device: torch.device, batch_size: int, weights: torch.Generator, fresh: bool) -> RigTask:
+        """Build the network and its source of rigs; see `Experiment.make_task`."""
+        return RigTask(self, device, batch_size, weights, fresh)
+
+
+def experiment_of(spec: NetworkSpec) -> RigExperiment:
+    """Read all of what a network was trained by: `Checkpoint.experiment`.
+
+    Raises:
+        InputError: it is no experiment of this version.
+    """
+    if isinstance(spec, RigExperiment):
+        return spec
+    return validated(spec.model_dump(mode="json"), RigExperiment, "experiment of a network")
+
+
+class RigTask(Task[RigBatch, Passes]):
+    """Random rigs, and a loss of every pass of a network."""
+
+    unit = "rigs"
+    judged = "validation_re_px"
+    headline: ClassVar = {"re_px": "RE {:.3g} px", "validation_re_px": "validation RE {:.3g} px"}
+    network: Network
+
+    def __init__(
+        self, experiment: RigExperiment, device: torch.device, batch_size: int, weights: torch.Generator, fresh: bool
+    ) -> None:
+        """Build it; see `Experiment.make_task`."""
+        self.experiment = experiment
+        self.factory, self.obj = experiment.load_rig(), experiment.load_object()  # float64
+        spec = experiment if fresh else without_pretrained(experiment)
+        network, start = build_network(spec, self.factory, self.obj, weights), experiment.training.init_from
+        self.untrained = warm_start(start, network) if fresh and start is not None else ()
+        self.network = network.to(device)
+        self.source = Source(
+            self.factory.to(torch.float32, device),
+            object_to(self.obj, device),
+            experiment.drift,
+            experiment.poses,
+            experiment.corruption,
+            network.image_options,
+        )
+        self.prior_std = experiment.drift.std(self.factory).to(device, torch.float32)  # (C, 15)
+        fixed, count = torch.Generator(device).manual_seed(VALIDATION_SEED), experiment.training.validation_rigs
+        starts = range(0, count, batch_size)
+        self.validation = [self.source.sample(min(batch_size, count - start), fixed) for start in starts]
+
+    def batch(self, count: int, generator: torch.Generator) -> RigBatch:
+        """Make random rigs, and what their cameras see."""
+        return self.source.show(self.source.sample(count, generator), generator)
+
+    def predict(self, network: nn.Module, batch: RigBatch) -> Passes:
+        """Say what the rigs are, pass by pass."""
+        return network(batch.views)
+
+    def loss(self, answer: Passes, batch: RigBatch, step: int) -> Loss:
+        """Compare every pass with the truth."""
+        config = self.experiment.loss
+        parameters = self.network.parameters()
+        terms = compound(answer, batch.truth, self.source.obj, config, step, self.prior_std, parameters)
+        refined = refined_loss(answer[-1], batch, self.source, self.prior_std, config.refined)
+        passes = terms.passes.unbind()
+        earlier = {f"re_pass{t + 1}_px": re for t, re in enumerate(passes[:-1])}
+        return Loss(terms.total + refined, {"re_px": passes[-1], **earlier})
+
+    def validate(self, predict: Callable[[RigBatch], Passes]) -> dict[str, float]:
+        """RE in pixels of the last pass, on rigs that are always the same."""
+        if not self.validation:
+            return {}
+        generator = torch.Generator(self.prior_std.device).manual_seed(VALIDATION_SEED)
+        batches = (self.source.show(made, generator) for made in self.validation)
+        errors = torch.cat([self.errors(predict(batch)[-1], batch) for batch in batches])
+        return {"validation_re_px": float(errors.mean()), "validation_re_median_px": float(errors.median())}
+
+    def errors(self, predicted: Prediction, batch: RigBatch) -> Tensor:
+        """RE of each rig of a batch: (B,) pixels."""
+        found, true = (project_fiducials(one.cameras_from_object, self.source.obj) for one in (predicted, batch.truth))
+        return reprojection_re(found - true)
+
+    def result(self, network: nn.Module, metrics: Mapping[str, Any]) -> Checkpoint:
+        """Weights with their rig, object and experiment."""
+        assert isinstance(network, Network)  # `self.network`, or the mean of what it was
+        return Checkpoint(network, self.factory, self.obj, self.experiment, metrics)
