@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -148,4 +149,4 @@ def _slices(count: int, size: int) -> list[slice]:
     """Split so that no part has a single rig, which could not be shuffled."""
     parts = -(-count // size)
     edges = [count * part // parts for part in range(parts + 1)]
-    return [slice(*pair) for pair in zip(edges, edges[1:], strict=False)]
+    return [slice(*pair) for pair in pairwise(edges)]

@@ -43,8 +43,8 @@ class Network(nn.Module, ABC):
     def encoder(self) -> nn.Module | None:
         """The part whose output everything behind it must live on; None = there is no such part.
 
-        `imgcal.evaluation.check_encoder` spoils what it returns (a tensor, or tuples of them; the first axis counts rigs,
-        or rigs times cameras) and sees whether that hurts.
+        `imgcal.evaluation.check_encoder` spoils what it returns (a tensor, or tuples of them; the first axis counts
+        rigs, or rigs times cameras) and sees whether that hurts.
         """
         return None
 
