@@ -1,9 +1,9 @@
 from .encoder_check import LEAST_RISE, EncoderCheck, check_encoder
-from .methods import BASELINES, Given, Method, network_method
-from .metrics import Errors, cramer_rao, errors, reprojection_error
+from .methods import BASELINES, QUICK_BASELINES, Given, Method, network_method
+from .metrics import Errors, cramer_rao, errors, held_out_points, reprojection_error
 from .models import Model, load_models
 from .protocol import Conditions, Evaluation, Progress, Protocol, Row, Scores, evaluate
-from .summary import Summary
+from .summary import Facts, Summary
 from .sweeps import AXES, Sweep, sweep
 from .tables import PLOTS, RESULT, TABLES, as_tables, describe, markdown, write
 from .timing import latency
@@ -13,12 +13,14 @@ __all__ = [
     "BASELINES",
     "LEAST_RISE",
     "PLOTS",
+    "QUICK_BASELINES",
     "RESULT",
     "TABLES",
     "Conditions",
     "EncoderCheck",
     "Errors",
     "Evaluation",
+    "Facts",
     "Given",
     "Method",
     "Model",
@@ -34,6 +36,7 @@ __all__ = [
     "describe",
     "errors",
     "evaluate",
+    "held_out_points",
     "latency",
     "load_models",
     "markdown",

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import torch
 from torch import Tensor
 
-from imgcal.estimation import estimate
+from imgcal.estimation import EstimationOptions, estimate, initial_pose
 from imgcal.evaluation import classical
 from imgcal.networks import Network
 from imgcal.refinement import (
@@ -62,6 +63,7 @@ class Given:
 
 
 Predict = Callable[[Given], Prediction]
+Passes = Callable[[Given], tuple[Prediction, ...]]
 Refine = Callable[[Prediction, Given], Prediction]
 
 
@@ -71,6 +73,7 @@ class Method:
 
     predict: Predict
     refine: Refine | None = None
+    passes: Passes | None = None  # what it says pass by pass, coarse to fine; the last is what `predict` says
     most: int | None = None  # rigs of a trial that it is given: it is slow
     batch: int | None = None  # rigs at once at most: it needs much memory
     images: ImageOptions | None = None  # what it looks at, when not at points
@@ -87,10 +90,25 @@ def factory_alone(given: Given) -> Prediction:
     return as_prediction(estimate(observations, given.factory, given.obj, prior_std=fixed))
 
 
-def map_from_pnp(given: Given) -> Prediction:
+def map_from_pnp(given: Given, options: EstimationOptions = EstimationOptions()) -> Prediction:
     """MAP estimation of the whole rig from the factory rig and a pose by PnP over all cameras; Huber's loss."""
     observations = observed(given.uv, given.seen, given.sigma)
-    return as_prediction(estimate(observations, given.factory, given.obj, prior_std=given.prior_std))
+    return as_prediction(estimate(observations, given.factory, given.obj, prior_std=given.prior_std, options=options))
+
+
+def factory_from_pnp(given: Given) -> Prediction:
+    """Keep the factory rig and take the pose by PnP over all cameras: where `steps_from_factory` starts."""
+    pose = initial_pose(observed(given.uv, given.seen, given.sigma), given.factory, given.obj)[:, 0]
+    return Prediction(given.factory.expand(len(given.uv)), pose)
+
+
+def steps_from_factory(count: int) -> Predict:
+    """Make so many Levenberg-Marquardt steps of MAP estimation from the factory rig and a pose by PnP.
+
+    The same compiled steps, loss and prior as in `map_from_pnp`, which goes on until it has converged. What a network
+    alone must be measured by: it, too, is given labelled points, the factory rig and the spread of its drift.
+    """
+    return partial(map_from_pnp, options=EstimationOptions(max_iterations=count))
 
 
 def robust_from_pnp(given: Given) -> Prediction:
@@ -120,12 +138,21 @@ def scipy_bundle_adjustment(given: Given) -> Prediction:
     return classical.bundle_adjustment(observations, given.factory, given.obj, given.prior_std)
 
 
-BASELINES: dict[str, Method] = {
+STEPS = (1, 2, 3, 5)
+"""Levenberg-Marquardt steps from the factory that every table has."""
+
+QUICK_BASELINES: dict[str, Method] = {
     "factory, pose fitted": Method(factory_alone),
+    "factory, pose by PnP": Method(factory_from_pnp),
+    **{f"{count} LM step{'s'[: count > 1]} from the factory": Method(steps_from_factory(count)) for count in STEPS},
+    "MAP from PnP": Method(map_from_pnp),
+}
+"""What every network stands beside. All but the first begin with the same pose by PnP, whose time is in theirs."""
+
+BASELINES: dict[str, Method] = QUICK_BASELINES | {
     "PnP per camera, factory intrinsics": Method(pnp, most=2000),
     "OpenCV calibrateCamera per camera": Method(opencv_calibrate, most=200),
     "scipy bundle adjustment": Method(scipy_bundle_adjustment, most=50),
-    "MAP from PnP": Method(map_from_pnp),
     "PnP + robust bundle adjustment": Method(robust_from_pnp),
 }
 """The competitors, by the name they have in tables. Slow ones get the first `most` rigs of every trial."""
@@ -142,17 +169,19 @@ def network_method(network: Network, batch: int | None = None) -> Method:
     device = next((parameter.device for parameter in network.parameters()), torch.device("cpu"))
 
     @torch.no_grad()
-    def predict(given: Given) -> Prediction:
+    def passes(given: Given) -> tuple[Prediction, ...]:
         if options is None:
             views = Views(uv=given.uv.to(device, torch.float32), seen=given.seen.to(device))
         else:
             views = Views(images=given.images(options).to(device))
-        prediction: Prediction = network(views)[-1]
-        return prediction.to(torch.float64, "cpu")
+        return tuple(prediction.to(torch.float64, "cpu") for prediction in network(views))
+
+    def predict(given: Given) -> Prediction:
+        return passes(given)[-1]
 
     if options is None:
-        return Method(predict, refined_by_points, batch=batch or 512)
-    return Method(predict, _refined_by_images(options), batch=batch or 32, images=options)
+        return Method(predict, refined_by_points, passes, batch=batch or 512)
+    return Method(predict, _refined_by_images(options), passes, batch=batch or 32, images=options)
 
 
 def _refined_by_images(options: ImageOptions) -> Refine:

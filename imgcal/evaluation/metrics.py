@@ -13,6 +13,7 @@ from imgcal.estimation import (
     POSE_PARAMETERS,
     Estimate,
     NormalEquations,
+    Problem,
     linearize,
     relative_covariance,
     relative_difference,
@@ -29,6 +30,7 @@ class Errors:
     """
 
     re: Tensor  # pixels
+    held_out: Tensor  # pixels, RE on points that took no part: `held_out_points`
     focal_length: Tensor  # pixels
     focal_length_percent: Tensor  # of the true focal length
     principal_point: Tensor  # pixels
@@ -44,6 +46,8 @@ class Errors:
 
 
 KINDS = tuple(field.name for field in fields(Errors))
+HELD_OUT = 32
+"""Points on which `Errors.held_out` is measured."""
 
 
 def concatenate(parts: Sequence[Errors]) -> Errors:
@@ -72,25 +76,36 @@ def reprojection_error(predicted: CameraRig, truth: CameraRig, obj: CalibrationO
         >>> reprojection_error(cameras, cameras, obj)
         tensor([0., 0.], dtype=torch.float64)
     """
-    batch = torch.broadcast_shapes(predicted.batch_shape, truth.batch_shape)
-    dtype = torch.promote_types(predicted.focal_length.dtype, truth.focal_length.dtype)
-    device = truth.focal_length.device
-    points = obj.points.to(device, dtype).expand(*batch, -1, -1)
-    radius = None if obj.radius is None else obj.radius.to(device, dtype)
-    difference = predicted.to(dtype).project(points, radius).uv - truth.to(dtype).project(points, radius).uv
-    return difference.square().mean((-1, -2, -3)).sqrt()
+    return _rms_of_pixels(predicted, truth, obj.points, obj.radius)
+
+
+def held_out_points(obj: CalibrationObject, count: int = HELD_OUT) -> Tensor:
+    """Points of the working volume that took no part: (count, 3) mm in the object's frame, always the same ones.
+
+    Even over the ball about the object's centroid that holds all its fiducials: what the fiducials sweep over when the
+    object turns about its centre, as it does over the range of poses. A rig that fits its own eight points and bends
+    the space between and around them has a larger error here.
+    """
+    generator = torch.Generator().manual_seed(0)
+    points = obj.points.double()
+    centre = points.mean(0)
+    direction = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=points.dtype), dim=-1)
+    share = torch.rand(count, 1, generator=generator, dtype=points.dtype) ** (1 / 3)
+    return centre + (points - centre).norm(dim=-1).max() * share * direction
 
 
 @torch.no_grad()
 def errors(predicted: Prediction, truth: Prediction, obj: CalibrationObject) -> Errors:
     """Compare predictions (B,) with the truth."""
     difference = relative_difference(predicted.rig, truth.rig)
-    re = reprojection_error(predicted.cameras_from_object, truth.cameras_from_object, obj)
-    return _summed_up(difference.square(), re, truth.rig.focal_length)
+    cameras, true_cameras = predicted.cameras_from_object, truth.cameras_from_object
+    re = reprojection_error(cameras, true_cameras, obj)
+    held_out = _rms_of_pixels(cameras, true_cameras, held_out_points(obj), None)
+    return _summed_up(difference.square(), re, held_out, truth.rig.focal_length)
 
 
 @torch.no_grad()
-def cramer_rao(estimate: Estimate) -> Errors:
+def cramer_rao(estimate: Estimate, obj: CalibrationObject) -> Errors:
     """Posterior Cramer-Rao bound of every kind of error: root of the mean variance that the data and the prior leave.
 
     Evaluated at the MAP estimate from the true inliers, not at the truth: the two differ by less than the noise, and
@@ -99,17 +114,36 @@ def cramer_rao(estimate: Estimate) -> Errors:
 
     Args:
         estimate: (B,) with one snapshot each, by the squared loss.
+        obj: what was seen.
     """
     variance = relative_covariance(estimate).diagonal(dim1=-2, dim2=-1).unflatten(-1, (estimate.rig.num_cameras, -1))
-    return _summed_up(variance.clamp_min(0), _re_bound(estimate), estimate.rig.focal_length)
+    problem = estimate.problem
+    held_out = held_out_points(obj).to(problem.points) - problem.centroid
+    shape = (*problem.uv.shape[:-1], len(held_out))
+    others = replace(problem, points=held_out, radius_squared=None, uv=problem.uv.new_zeros(shape))
+    return _summed_up(
+        variance.clamp_min(0), _re_bound(estimate, problem), _re_bound(estimate, others), estimate.rig.focal_length
+    )
 
 
-def _summed_up(squares: Tensor, re: Tensor, focal_length: Tensor) -> Errors:
+def _rms_of_pixels(predicted: CameraRig, truth: CameraRig, points: Tensor, radius: Tensor | None) -> Tensor:
+    """Root mean square pixel error over cameras, points (N, 3) and both axes: (B,)."""
+    batch = torch.broadcast_shapes(predicted.batch_shape, truth.batch_shape)
+    dtype = torch.promote_types(predicted.focal_length.dtype, truth.focal_length.dtype)
+    device = truth.focal_length.device
+    points = points.to(device, dtype).expand(*batch, -1, -1)
+    radius = None if radius is None else radius.to(device, dtype)
+    difference = predicted.to(dtype).project(points, radius).uv - truth.to(dtype).project(points, radius).uv
+    return difference.square().mean((-1, -2, -3)).sqrt()
+
+
+def _summed_up(squares: Tensor, re: Tensor, held_out: Tensor, focal_length: Tensor) -> Errors:
     """Reduce squared errors or variances (B, C, 15), extrinsics relative to the first camera."""
     others = squares[..., 1:, :] if squares.shape[-2] > 1 else squares
     focal = squares[..., 6:8]
     return Errors(
         re=re,
+        held_out=held_out,
         focal_length=focal.mean((-1, -2)).sqrt(),
         focal_length_percent=100 * (focal / focal_length.square()).mean((-1, -2)).sqrt(),
         principal_point=squares[..., 8:10].mean((-1, -2)).sqrt(),
@@ -119,16 +153,16 @@ def _summed_up(squares: Tensor, re: Tensor, focal_length: Tensor) -> Errors:
     )
 
 
-def _re_bound(estimate: Estimate) -> Tensor:
-    """Root of the mean variance of all N fiducials' pixels in all cameras, seen or not: (B,)."""
-    problem, solution = estimate.problem, estimate.solution
-    every = replace(problem, root_weight=torch.ones_like(problem.root_weight))
+def _re_bound(estimate: Estimate, problem: Problem) -> Tensor:
+    """Root of the mean variance of the pixels of a problem's points in all cameras, seen or not: (B,)."""
+    solution = estimate.solution
+    every = replace(problem, root_weight=torch.ones_like(problem.uv[..., 0, :]))
     full = linearize(every, solution.state, squared)
     information = _dense(full)
     diagonal = information.diagonal(dim1=-2, dim2=-1)
     diagonal[:, : diagonal.shape[1] - POSE_PARAMETERS] -= 1  # the prior's unit matrix
     covariance = torch.cholesky_inverse(torch.linalg.cholesky(_dense(solution.equations)))
-    variance = (information * covariance).sum((-1, -2)) / (2 * problem.root_weight[0].numel())
+    variance = (information * covariance).sum((-1, -2)) / problem.uv[0].numel()
     return variance.clamp_min(0).sqrt()
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TypedDict
+from typing import Literal, TypedDict
 
 import torch
 from torch import Tensor
@@ -62,7 +62,7 @@ class Protocol:
 
 
 class Statistics(TypedDict):
-    """RE in pixels, over all rigs of all trials."""
+    """An error in pixels, over all rigs of all trials."""
 
     rigs: int
     mean: float  # over rigs, averaged over trials
@@ -72,6 +72,7 @@ class Statistics(TypedDict):
     p95: float
     p99: float
     share_under_half_px: float
+    share_under_one_px: float
 
 
 @dataclass(frozen=True)
@@ -86,10 +87,11 @@ class Scores:
         """RE of all rigs of all trials, pixels."""
         return torch.cat([trial.re for trial in self.trials])
 
-    def statistics(self) -> Statistics:
-        """Sum up RE."""
-        means = [float(trial.re.mean()) for trial in self.trials]
-        re = self.re.double()
+    def statistics(self, kind: Literal["re", "held_out"] = "re") -> Statistics:
+        """Sum up RE, on the object's own points or on those that took no part."""
+        values = [getattr(trial, kind) for trial in self.trials]
+        means = [float(trial.mean()) for trial in values]
+        re = torch.cat(values).double()
         median, p95, p99 = re.quantile(re.new_tensor((0.5, 0.95, 0.99))).tolist()
         return Statistics(
             rigs=len(re),
@@ -100,12 +102,13 @@ class Scores:
             p95=p95,
             p99=p99,
             share_under_half_px=float((re < 0.5).double().mean()),
+            share_under_one_px=float((re < 1.0).double().mean()),
         )
 
     def parameters(self) -> dict[str, float]:
-        """Root mean square over rigs of every error but RE."""
+        """Root mean square over rigs of the errors of a rig's values."""
         joined = concatenate(self.trials)
-        return {kind: _rms(getattr(joined, kind)) for kind in KINDS if kind != "re"}
+        return {kind: _rms(getattr(joined, kind)) for kind in KINDS if kind not in ("re", "held_out")}
 
     def cramer_rao_ratios(self) -> dict[str, float | None]:
         """Root mean square error over root mean square bound, on the rigs that have a bound; None where it is zero."""
@@ -121,10 +124,12 @@ class Scores:
 
 @dataclass(frozen=True)
 class Row:
-    """One method: alone, and refined where it has a refinement."""
+    """One method: alone, refined where it has a refinement, and after the first of several passes."""
 
     alone: Scores
     refined: Scores | None = None
+    one_pass: Scores | None = None
+    passes: int = 1
 
 
 @dataclass(frozen=True)
@@ -143,6 +148,8 @@ class _Collected:
 
     alone: list[Errors] = field(default_factory=list)
     refined: list[Errors] = field(default_factory=list)
+    one_pass: list[Errors] = field(default_factory=list)
+    passes: int = 1
 
 
 def evaluate(
@@ -182,7 +189,7 @@ def evaluate(
             fit = batch.reference()
             exact.append(errors(as_prediction(fit), batch.truth, conditions.obj))
             if first < protocol.bound_count and conditions.corruption.noise >= LEAST_SIGMA:
-                limits.append(cramer_rao(fit))
+                limits.append(cramer_rao(fit, conditions.obj))
             progress(len(batch))
             for name, method in methods.items():
                 _measure(name, method, batch, first, parts[name])
@@ -252,7 +259,7 @@ def _measure(name: str, method: Method, batch: Sample, first: int, into: _Collec
         given = batch.given(rows)
         truth = batch.truth[rows]
         try:
-            prediction = method.predict(given)
+            passes = method.passes(given) if method.passes is not None else (method.predict(given),)
         except torch.linalg.LinAlgError as error:
             least = int(given.seen.any(1).sum(-1).min())
             if least < LEAST_FIDUCIALS:
@@ -264,16 +271,22 @@ def _measure(name: str, method: Method, batch: Sample, first: int, into: _Collec
                 f"evaluation: {name}: a system of equations has no solution ({error}), though every rig sees at least "
                 f"{least} different fiducials: an object on one line, or a fault of this method"
             ) from error
-        into.alone.append(errors(prediction, truth, given.obj))
+        into.passes = len(passes)
+        into.alone.append(errors(passes[-1], truth, given.obj))
+        if len(passes) > 1:
+            into.one_pass.append(errors(passes[0], truth, given.obj))
         if method.refine is not None:
-            into.refined.append(errors(method.refine(prediction, given), truth, given.obj))
+            into.refined.append(errors(method.refine(passes[-1], given), truth, given.obj))
 
 
 def _row(trials: Sequence[_Collected], bounds: tuple[Errors, ...]) -> Row:
-    alone = Scores(tuple(concatenate(trial.alone) for trial in trials), bounds)
-    if not trials[0].refined:
-        return Row(alone)
-    return Row(alone, Scores(tuple(concatenate(trial.refined) for trial in trials), bounds))
+    def column(parts: Sequence[list[Errors]]) -> Scores | None:
+        return Scores(tuple(map(concatenate, parts)), bounds) if parts[0] else None
+
+    alone = column([trial.alone for trial in trials])
+    assert alone is not None  # every method predicts
+    refined, one_pass = column([trial.refined for trial in trials]), column([trial.one_pass for trial in trials])
+    return Row(alone, refined, one_pass, trials[0].passes)
 
 
 def _rms(values: Tensor) -> float:

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from imgcal.evaluation.encoder_check import EncoderCheck
 from imgcal.evaluation.protocol import REFERENCE, Conditions, Evaluation, Scores
 from imgcal.evaluation.sweeps import Sweep
 from imgcal.evaluation.timing import Latency
@@ -25,6 +26,9 @@ class Facts:
     parameters: int
     size: int  # bytes of the file
     history: tuple[dict[str, Any], ...] = ()  # rows of metrics.jsonl
+    experiment: str | None = None  # what it was trained by; the same with another seed is another run of it
+    seed: int = 0  # of its training
+    encoder: EncoderCheck | None = None  # None = it has none, or was not asked
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,19 @@ class Summary:
     latencies: Mapping[str, Latency] = field(default_factory=dict)  # by method
     facts: Mapping[str, Facts] = field(default_factory=dict)  # by method, of networks
     sweeps: tuple[Sweep, ...] = ()
+
+    def groups(self) -> dict[str, tuple[str, ...]]:
+        """Methods by the name of their line in tables: runs of one experiment that differ in the seed share a line."""
+        runs: dict[str, dict[int, str]] = {}
+        for name, facts in self.facts.items():
+            if facts.experiment is not None:
+                runs.setdefault(facts.experiment, {}).setdefault(facts.seed, name)
+        shared = {name: experiment for experiment, by in runs.items() if len(by) > 1 for name in by.values()}
+        found: dict[str, tuple[str, ...]] = {}
+        for name in self.evaluation.rows:
+            line = shared.get(name, name)
+            found[line] = (*found.get(line, ()), name)
+        return found
 
 
 def as_values(summary: Summary) -> dict[str, Any]:
@@ -55,6 +72,8 @@ def as_values(summary: Summary) -> dict[str, Any]:
         "reference": {"name": REFERENCE} | _scores(evaluation.reference),
         "methods": {
             name: {
+                "passes": row.passes,
+                "one_pass": None if row.one_pass is None else _scores(row.one_pass),
                 "alone": _scores(row.alone),
                 "refined": None if row.refined is None else _scores(row.refined),
                 "latency_ms": asdict(summary.latencies[name]) if name in summary.latencies else None,
@@ -62,6 +81,7 @@ def as_values(summary: Summary) -> dict[str, Any]:
             }
             for name, row in evaluation.rows.items()
         },
+        "seeds": {line: list(names) for line, names in summary.groups().items() if len(names) > 1},
         "sweeps": {sweep.axis: _sweep(sweep) for sweep in summary.sweeps},
     }
     return _finite(values)
@@ -82,13 +102,23 @@ def _conditions(conditions: Conditions) -> dict[str, Any]:
 def _scores(scores: Scores) -> dict[str, Any]:
     return {
         "re_px": dict(scores.statistics()),
+        "held_out_px": dict(scores.statistics("held_out")),
         "parameters": scores.parameters(),
         "cramer_rao_ratio": scores.cramer_rao_ratios(),
     }
 
 
-def _facts(facts: Facts | None) -> dict[str, int] | None:
-    return None if facts is None else {"parameters": facts.parameters, "bytes": facts.size}
+def _facts(facts: Facts | None) -> dict[str, Any] | None:
+    if facts is None:
+        return None
+    check = facts.encoder
+    return {
+        "parameters": facts.parameters,
+        "bytes": facts.size,
+        "experiment": facts.experiment,
+        "seed": facts.seed,
+        "encoder": None if check is None else asdict(check) | {"rise": check.rise, "used": check.used},
+    }
 
 
 def _sweep(sweep: Sweep) -> dict[str, Any]:

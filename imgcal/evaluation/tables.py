@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean, stdev
 
 from rich.table import Table as RichTable
 
+from imgcal.evaluation.encoder_check import LEAST_RISE
 from imgcal.evaluation.protocol import REFERENCE, Evaluation, Row, Scores
-from imgcal.evaluation.summary import Summary, as_values
+from imgcal.evaluation.summary import Facts, Summary, as_values
 from imgcal.evaluation.sweeps import AXES
 from imgcal.io import write_text
 
@@ -81,32 +83,79 @@ def describe(evaluation: Evaluation) -> str:
 
 
 def as_tables(summary: Summary) -> tuple[Table, ...]:
-    """Reprojection errors; parameters against the physical bound; what networks cost."""
-    found = [_errors_table(summary.evaluation), _parameters_table(summary.evaluation)]
+    """Reprojection errors; parameters against the physical bound; whether encoders are used; what methods cost."""
+    found = [_errors_table(summary), _parameters_table(summary)]
+    if any(facts.encoder is not None for facts in summary.facts.values()):
+        found.append(_encoder_table(summary.facts))
     if summary.latencies:
         found.append(_cost_table(summary))
     return tuple(found)
 
 
-def _errors_table(evaluation: Evaluation) -> Table:
-    numbers = ("mean", "median", "p99", "< 0.5 px")
-    header = ("method", *(f"RE {n}" for n in numbers), *(f"refined {n}" for n in numbers), "rigs")
-    rows = [
-        (name, *_errors(row.alone), *_errors(row.refined), f"{len(row.alone.re)}") for name, row in _rows(evaluation)
-    ]
-    return Table("Reprojection error RE (px), alone and refined", header, tuple(rows))
+def _errors_table(summary: Summary) -> Table:
+    header = ("method", "seeds", "RE mean", "median", "p99", "< 1 px", "< 0.5 px", "held-out median", "rigs")
+    rows = [(line.label, line.seeds, *_errors(line.scores)) for line in _lines(summary)]
+    return Table("Reprojection error RE (px)", header, tuple(rows))
 
 
-def _errors(scores: Scores | None) -> tuple[str, ...]:
-    if scores is None:
-        return (MISSING,) * 4
-    found = scores.statistics()
-    spread = "" if found["spread"] is None else f" ± {_number(found['spread'])}"
-    share = f"{100 * found['share_under_half_px']:.1f} %"
-    return _number(found["mean"]) + spread, _number(found["median"]), _number(found["p99"]), share
+def _errors(seeds: Sequence[Scores]) -> tuple[str, ...]:
+    """Cells of one line: means over training seeds, the spread of the mean RE over them, or over trials of one."""
+    found = [scores.statistics() for scores in seeds]
+    held_out = [scores.statistics("held_out")["median"] for scores in seeds]
+    means = [one["mean"] for one in found]
+    spread = stdev(means) if len(means) > 1 else found[0]["spread"]
+    return (
+        _number(fmean(means)) + ("" if spread is None else f" ± {_number(spread)}"),
+        _number(fmean(one["median"] for one in found)),
+        _number(fmean(one["p99"] for one in found)),
+        f"{100 * fmean(one['share_under_one_px'] for one in found):.1f} %",
+        f"{100 * fmean(one['share_under_half_px'] for one in found):.1f} %",
+        _number(fmean(held_out)),
+        f"{found[0]['rigs']}",
+    )
 
 
-def _parameters_table(evaluation: Evaluation) -> Table:
+@dataclass(frozen=True)
+class _Line:
+    """One stage of one method, or of all training seeds of an experiment."""
+
+    label: str
+    seeds: str
+    scores: tuple[Scores, ...]  # of each seed
+
+
+def _lines(summary: Summary) -> list[_Line]:
+    """Stages in the order in which they come: one pass (what the paper reports), all passes, refined."""
+    found = []
+    for name, members in summary.groups().items():
+        rows = [summary.evaluation.rows[member] for member in members]
+        trained = members[0] in summary.facts
+        seeds = f"{len(members)} seeds" if len(members) > 1 else "one seed" if trained else MISSING
+        for stage in ("one_pass", "alone", "refined"):
+            scores = tuple(one for row in rows if (one := getattr(row, stage)) is not None)
+            if scores:
+                found.append(_Line(name + _suffix(stage, rows[0]), seeds, scores))
+    return [*found, _Line(REFERENCE, MISSING, (summary.evaluation.reference,))]
+
+
+def _suffix(stage: str, row: Row) -> str:
+    if stage == "alone":
+        return "" if row.passes == 1 else f", {row.passes} passes"
+    return ", one pass" if stage == "one_pass" else ", refined"
+
+
+def _encoder_table(facts: Mapping[str, Facts]) -> Table:
+    header = ("network", "RE median", "shuffled", "zeroed", "noise", "rises by", "encoder is")
+    rows = []
+    for name, known in facts.items():
+        if (check := known.encoder) is not None:
+            errors = (check.untouched, check.shuffled, check.zeroed, check.noise)
+            verdict = "used" if check.used else "NOT USED"
+            rows.append((name, *map(_number, errors), f"{_number(check.rise)} x", verdict))
+    return Table(f"Encoder's output spoilt: used if RE (px, alone) rises {LEAST_RISE:g} x", header, tuple(rows))
+
+
+def _parameters_table(summary: Summary) -> Table:
     kinds = {
         "focal_length": "f (px)",
         "focal_length_percent": "f (%)",
@@ -114,16 +163,25 @@ def _parameters_table(evaluation: Evaluation) -> Table:
         "rotation_deg": "rotation (deg)",
         "position": "position (mm)",
     }
-    ratios = {"re": "RE", "focal_length": "f", "principal_point": "pp", "rotation_deg": "rot.", "position": "pos."}
+    bounded = bool(summary.evaluation.reference.bounds)
+    ratios = {
+        "re": "RE",
+        "held_out": "held-out",
+        "focal_length": "f",
+        "principal_point": "pp",
+        "rotation_deg": "rot.",
+        "position": "pos.",
+    }
+    ratios = ratios if bounded else {}
     header = ("method", *kinds.values(), *(f"{name} / bound" for name in ratios.values()))
     rows = []
-    for name, row in _rows(evaluation):
-        for label, scores in ((name, row.alone), (f"{name}, refined", row.refined)):
-            if scores is not None:
-                errors, bound = scores.parameters(), scores.cramer_rao_ratios()
-                cells = [_number(errors[kind]) for kind in kinds] + [_number(bound[kind]) for kind in ratios]
-                rows.append((label, *cells))
-    return Table("Parameters, RMS error, and ratio to the Cramer-Rao bound", header, tuple(rows))
+    for line in _lines(summary):
+        errors = [scores.parameters() for scores in line.scores]
+        bounds = [scores.cramer_rao_ratios() for scores in line.scores]
+        cells = [_number(fmean(one[kind] for one in errors)) for kind in kinds]
+        rows.append((line.label, *cells, *(_number(_mean([one[kind] for one in bounds])) for kind in ratios)))
+    title = "Parameters, RMS error" + (", and ratio to the Cramer-Rao bound" if bounded else "")
+    return Table(title, header, tuple(rows))
 
 
 def _cost_table(summary: Summary) -> Table:
@@ -137,8 +195,9 @@ def _cost_table(summary: Summary) -> Table:
     return Table("One rig at a time, and size", header, tuple(rows))
 
 
-def _rows(evaluation: Evaluation) -> list[tuple[str, Row]]:
-    return [*evaluation.rows.items(), (REFERENCE, Row(evaluation.reference))]
+def _mean(values: Sequence[float | None]) -> float | None:
+    there = [value for value in values if value is not None]
+    return fmean(there) if there else None
 
 
 def _number(value: float | None) -> str:

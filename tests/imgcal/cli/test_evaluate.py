@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from imgcal.cli.main import main
+from imgcal.evaluation import QUICK_BASELINES
 from imgcal.io import load_object, load_rig
 from imgcal.networks import Checkpoint, build_network, save_checkpoint
 from imgcal.training.experiment_file import load_experiment
@@ -52,7 +53,7 @@ def test_evaluate_takes_rig_object_poses_and_drift_from_the_model(models, tmp_pa
     assert (values["rig"], values["object"], values["count"], values["trials"]) == ("T4", "asymmetric8", 6, 2)
     assert values["poses_deg"] == {"theta": [0, 0], "phi": [0, 0], "alpha": [0, pytest.approx(10)]}
     assert values["drift"] == {"kind": "relative", "kappa_intrinsics": 0.003, "kappa_extrinsics": 0.003}
-    assert list(values["methods"]) == ["first"]
+    assert list(values["methods"]) == ["first", *QUICK_BASELINES]
     model = values["methods"]["first"]
     assert model["alone"]["re_px"]["rigs"] == model["refined"]["re_px"]["rigs"] == 12
     assert model["model"]["bytes"] == models[0].stat().st_size
@@ -80,6 +81,7 @@ def test_baselines_alone_need_rig_and_object(capsys):
     assert main(["evaluate", "--rig", "T4", *few]) == 2
     assert "--object" in capsys.readouterr().err
     assert main(["evaluate", "--no-baselines", *few]) == 2
+    assert "--object" in capsys.readouterr().err
 
 
 def test_sweeps_are_drawn(models, tmp_path):
@@ -94,8 +96,10 @@ def test_compare_puts_networks_side_by_side(models, tmp_path, capsys):
     out = tmp_path / "comparison"
     assert main(["compare", *map(str, models), *FEW, "--out", str(out)]) == 0
     values = json.loads((out / "evaluation.json").read_text())
-    assert list(values["methods"]) == ["first", "second"]
-    for row in values["methods"].values():
+    assert list(values["methods"]) == ["first", "second", *QUICK_BASELINES]
+    assert values["seeds"] == {}  # of the same experiment and seed
+    for name in ("first", "second"):
+        row = values["methods"][name]
         assert row["latency_ms"]["refined_p50"] > row["latency_ms"]["alone_p50"] > 0
         assert row["model"]["parameters"] > 0
     assert {"latency.png", "training.png"} <= {path.name for path in out.iterdir()}

@@ -3,7 +3,16 @@ from dataclasses import replace
 import pytest
 import torch
 
-from imgcal.evaluation.methods import BASELINES, factory_alone, map_from_pnp, network_method, pnp
+from imgcal.evaluation.methods import (
+    BASELINES,
+    QUICK_BASELINES,
+    factory_alone,
+    factory_from_pnp,
+    map_from_pnp,
+    network_method,
+    pnp,
+    steps_from_factory,
+)
 from imgcal.evaluation.metrics import errors
 from imgcal.synthesis.colour_coding import ImageOptions
 from imgcal.types.prediction import Prediction
@@ -36,6 +45,24 @@ def test_every_baseline_survives_views_with_hardly_any_points(sample, name):
     some.corrupted.views.seen[1, 3, :] = False
     found = BASELINES[name].predict(some.given())
     assert torch.isfinite(re(found, some)).all()
+
+
+def test_steps_from_the_factory_begin_at_pnp_and_end_at_map(sample):
+    some = sample(5, kappa=0.05, noise=0.1)
+    given = some.given()
+    ends = [errors(predict(given), some.truth, some.conditions.obj) for predict in (factory_from_pnp, map_from_pnp)]
+    steps = [errors(steps_from_factory(n)(given), some.truth, some.conditions.obj) for n in (0, 1, 2, 5)]
+    assert torch.allclose(steps[0].re, ends[0].re)
+    assert torch.allclose(steps[-1].re, ends[1].re, atol=1e-3)
+    assert (steps[1].re < 0.2 * steps[0].re).all()
+    assert (steps[2].re < 2 * ends[1].re).all()
+    assert torch.equal(factory_from_pnp(given).rig.focal_length[0], some.conditions.rig.focal_length)
+
+
+def test_every_table_has_four_numbers_of_steps():
+    names = [name for name in QUICK_BASELINES if "LM" in name]
+    assert names == [f"{n} LM step{'' if n == 1 else 's'} from the factory" for n in (1, 2, 3, 5)]
+    assert set(QUICK_BASELINES) < set(BASELINES)
 
 
 def test_the_factory_rig_stays_as_it_is(sample):

@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from imgcal.evaluation.metrics import KINDS, cramer_rao, errors, reprojection_error
+from imgcal.evaluation.metrics import KINDS, cramer_rao, errors, held_out_points, reprojection_error
 from imgcal.evaluation.protocol import Protocol, evaluate
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
@@ -62,6 +62,28 @@ def test_a_motion_of_the_rig_with_the_object_is_no_error(sample):
         assert (getattr(found, kind) < 1e-5).all(), kind
 
 
+def test_held_out_points_fill_the_ball_that_the_object_sweeps_over(sample):
+    obj = sample(1).conditions.obj
+    found, centre = held_out_points(obj, 4000), obj.points.mean(0)
+    radius = (obj.points - centre).norm(dim=-1).max()
+    distance = (found - centre).norm(dim=-1) / radius
+    assert float(distance.max()) <= 1
+    assert float((distance**3).mean()) == pytest.approx(0.5, abs=0.02)  # even over the volume
+    assert torch.allclose(found.mean(0), centre, atol=0.05 * float(radius))
+    assert torch.equal(held_out_points(obj), held_out_points(obj))
+
+
+def test_held_out_error_tells_a_rig_that_fits_its_own_points_alone(sample):
+    some = sample(1, kappa=0.0)
+    rig, pose = some.truth.rig, some.truth.rig_from_object
+    shifted = replace(rig, principal_point=rig.principal_point + torch.tensor([3.0, 4.0]))
+    found = errors(Prediction(shifted, pose), some.truth, some.conditions.obj)
+    assert torch.allclose(found.held_out, found.re)  # a shift is the same everywhere
+    bent = replace(rig, distortion=rig.distortion + torch.tensor([0.05, 0, 0, 0, 0]))
+    found = errors(Prediction(bent, pose), some.truth, some.conditions.obj)
+    assert (found.held_out - found.re).abs() > 0.01 * found.re  # a lens is not
+
+
 @pytest.mark.parametrize("missing", [0.0, 0.25])
 def test_map_of_the_true_inliers_reaches_the_bound(conditions, missing):
     known = conditions(noise=0.1, missing=missing)
@@ -71,10 +93,11 @@ def test_map_of_the_true_inliers_reaches_the_bound(conditions, missing):
 
 
 def test_the_bound_grows_with_the_noise_and_shrinks_without_drift(sample):
-    quiet, loud = (cramer_rao(sample(4, noise=noise).reference()) for noise in (0.05, 0.2))
+    some = [sample(4, noise=noise) for noise in (0.05, 0.2)]
+    quiet, loud = (cramer_rao(each.reference(), each.conditions.obj) for each in some)
     for kind in KINDS:
         assert (getattr(quiet, kind) <= getattr(loud, kind) + 1e-12).all(), kind
-    fixed = cramer_rao(sample(4, noise=0.1, kappa=0.0).reference())
+    fixed = cramer_rao((still := sample(4, noise=0.1, kappa=0.0)).reference(), still.conditions.obj)
     assert (fixed.focal_length == 0).all()
     # Six unknowns of the pose are left, of 64 equations.
     assert torch.allclose(fixed.re, torch.full((4,), 0.1 * (6 / 64) ** 0.5, dtype=torch.float64), rtol=1e-6)

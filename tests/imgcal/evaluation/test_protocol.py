@@ -25,7 +25,10 @@ def test_statistics_of_known_errors():
     assert found["spread"] == pytest.approx(2**-0.5)
     assert found["trial_means"] == pytest.approx((0.5, 1.5))
     assert found["median"] == pytest.approx(0.6)
-    assert found["share_under_half_px"] == 0.5
+    assert found["share_under_half_px"] == found["share_under_one_px"] == 0.5  # 1 px is not under 1 px
+    trial = of_re([0.0, 1.0])
+    held_out = Scores((replace(trial, held_out=torch.tensor([3.0, 5.0])),), ()).statistics("held_out")
+    assert (held_out["mean"], held_out["rigs"]) == (4.0, 2)
     assert Scores((of_re([0.0, 1.0]),), ()).statistics()["spread"] is None
 
 
@@ -69,6 +72,22 @@ def test_a_network_has_two_columns(conditions):
     assert row.refined is not None
     assert float(row.refined.re.max()) < 0.02 < float(row.alone.re.min())
     assert found.rows["factory"].refined is None
+
+
+def test_the_first_of_several_passes_has_a_column_of_its_own(conditions):
+    class Improves(Fake):
+        def forward(self, views):
+            last = super().forward(views)[-1]
+            off = replace(last.rig, principal_point=last.rig.principal_point + 50.0)
+            return replace(last, rig=off), last
+
+    known = straight_down(conditions(kappa=0.002))
+    found = evaluate({"fake": network_method(Improves(known))} | FACTORY, known, Protocol(count=3, trials=1))
+    row = found.rows["fake"]
+    assert row.passes == 2 and row.one_pass is not None
+    first, last = (scores.trials[0].principal_point for scores in (row.one_pass, row.alone))
+    assert float(first.min()) > 40 > 10 > float(last.max())
+    assert found.rows["factory"].one_pass is None and found.rows["factory"].passes == 1
 
 
 def test_progress_counts_every_rig_of_every_method_and_of_the_reference(conditions):

@@ -4,7 +4,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from imgcal.evaluation import Evaluation, Method, Protocol, Row, Scores, evaluate, network_method, sweep
+from imgcal.evaluation import EncoderCheck, Evaluation, Method, Protocol, Row, Scores, evaluate, network_method, sweep
 from imgcal.evaluation.methods import factory_alone
 from imgcal.evaluation.plots import draw_latency, draw_sweep, draw_training
 from imgcal.evaluation.summary import Facts, Summary, as_values
@@ -38,7 +38,9 @@ def test_values_are_json_with_both_columns(summary):
     assert fake["refined"]["re_px"]["mean"] < fake["alone"]["re_px"]["mean"]
     assert fake["refined"]["cramer_rao_ratio"]["re"] > 0
     assert fake["latency_ms"]["refined_p50"] == 3.0
-    assert fake["model"] == {"parameters": 1234, "bytes": 5_600_000}
+    assert (fake["model"]["parameters"], fake["model"]["bytes"]) == (1234, 5_600_000)
+    assert fake["passes"] == 2 and fake["one_pass"]["re_px"] == fake["alone"]["re_px"]
+    assert 0 < fake["refined"]["held_out_px"]["median"] < fake["alone"]["held_out_px"]["median"]
     assert values["methods"]["factory"]["refined"] is None
     assert values["methods"]["factory"]["model"] is None
     assert values["sweeps"]["noise"]["values"] == [0.0, 0.1]
@@ -56,12 +58,40 @@ def test_what_is_not_finite_is_null(summary):
 
 def test_tables_show_every_method_and_the_reference(summary):
     errors, parameters, cost = as_tables(summary)
-    assert [row[0] for row in errors.rows] == ["fake", "factory", "MAP, true inliers"]
-    assert [row[0] for row in parameters.rows] == ["fake", "fake, refined", "factory", "MAP, true inliers"]
-    assert "–" in errors.rows[1]
+    names = ["fake, one pass", "fake, 2 passes", "fake, refined", "factory", "MAP, true inliers"]
+    assert [row[0] for row in errors.rows] == [row[0] for row in parameters.rows] == names
+    assert [row[1] for row in errors.rows] == ["one seed"] * 3 + ["–"] * 2
     assert cost.rows[0][-2:] == ("1,234", "5.6")
     assert cost.rows[1][3:] == ("–", "–", "–", "–")
-    assert errors.rich().row_count == 3
+    assert errors.rich().row_count == 5
+
+
+def test_training_seeds_of_one_experiment_share_a_line(conditions):
+    known = straight_down(conditions(kappa=0.002))
+    methods = {name: network_method(Fake(known)) for name in ("a", "b", "other")}
+    evaluation = evaluate(methods, known, Protocol(count=4, trials=1))
+    worse = evaluation.rows["b"]
+    trial = worse.alone.trials[0]
+    worse = replace(worse, alone=Scores((replace(trial, re=3 * trial.re),), ()))
+    evaluation = replace(evaluation, rows=evaluation.rows | {"b": worse})
+    facts = {name: Facts(1, 1, (), "same", seed) for seed, name in enumerate("ab")}
+    summary = Summary(evaluation, facts=facts | {"other": Facts(1, 1, (), "other", 0)})
+    rows = {row[0]: row for row in as_tables(summary)[0].rows}
+    assert list(rows)[:3] == ["same, one pass", "same, 2 passes", "same, refined"] and "a, one pass" not in rows
+    mean = float(trial.re.mean())  # of seeds once and three times as large: mean 2, standard deviation root 2
+    assert rows["same, 2 passes"][1:3] == ("2 seeds", f"{2 * mean:.3g} ± {2**0.5 * mean:.3g}")
+    assert rows["other, 2 passes"][1] == "one seed" and "±" not in rows["other, 2 passes"][2]
+    assert as_values(summary)["seeds"] == {"same": ["a", "b"]}
+    again = Summary(evaluation, facts={name: replace(fact, seed=1) for name, fact in facts.items()})
+    assert all("seeds" not in row[1] for row in as_tables(again)[0].rows)  # the same seed twice says nothing of others
+
+
+def test_an_encoder_that_is_not_used_is_named(summary):
+    checks = {"fake": EncoderCheck(1.0, 1.0, 5.0, 5.0), "good": EncoderCheck(0.5, 50.0, 60.0, 70.0)}
+    known = replace(summary, facts={name: Facts(1, 1, encoder=check) for name, check in checks.items()})
+    [table] = [table for table in as_tables(known) if "spoilt" in table.title]
+    assert [row[-2:] for row in table.rows] == [("1 x", "NOT USED"), ("100 x", "used")]
+    assert as_values(known)["methods"]["fake"]["model"]["encoder"]["used"] is False
 
 
 def test_markdown_is_a_table():
