@@ -9,6 +9,7 @@ from .checkpoint import (
 from .config import PRESETS, Images, NetworkConfig, NetworkSpec, PaperImages, PaperPoints, without_pretrained
 from .factory import build, build_network
 from .images import ImageNetwork, PaperImageNetwork
+from .infrared import Evidence, InfraredConfig, InfraredNetwork, Queries, normalized
 from .network import Network
 from .parameterization import Parameterization
 from .points import PaperPointNetwork, PointNetwork
@@ -19,8 +20,11 @@ from .subject import check_object, check_rig
 __all__ = [
     "PRESETS",
     "Checkpoint",
+    "Evidence",
     "ImageNetwork",
     "Images",
+    "InfraredConfig",
+    "InfraredNetwork",
     "Network",
     "NetworkConfig",
     "NetworkSpec",
@@ -30,6 +34,7 @@ __all__ = [
     "PaperPoints",
     "Parameterization",
     "PointNetwork",
+    "Queries",
     "build",
     "build_network",
     "check_object",
@@ -38,6 +43,7 @@ __all__ = [
     "find_soft_positions",
     "load_checkpoint",
     "load_network",
+    "normalized",
     "read_subject",
     "save_checkpoint",
     "warm_start",

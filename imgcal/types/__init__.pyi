@@ -3,6 +3,7 @@ from .calibration_object import CalibrationObject, Symmetry
 from .limits import BLOB_RADIUS, FIDUCIAL_RADIUS, MOST_PIXELS, SIGMA, Range, check_object, check_observations, check_rig
 from .moved_camera import Kind, MovedCamera, MovedError
 from .observations import UNUSABLE, BlobFlag, Detections, Observations
+from .placement import CropPlacement
 from .prediction import Prediction, Views
 from .rig import PARAMETER_NAMES, PARAMETERS, CameraRig, RigPrior, pack21, unpack18, unpack21
 
@@ -17,6 +18,7 @@ __all__ = [
     "BlobFlag",
     "CalibrationObject",
     "CameraRig",
+    "CropPlacement",
     "Detections",
     "Kind",
     "MovedCamera",

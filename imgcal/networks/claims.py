@@ -1,0 +1,85 @@
+"""From evidence to claims: of all that could be a fiducial, one place at most, and no place for two fiducials."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from imgcal.networks.infrared import Evidence
+from imgcal.networks.transport import partial_transport
+
+PEAKS = 3  # places that each fiducial puts forward
+SAME = 1.0  # crop pixels within which two places are one
+STRAY = -3.0  # log odds that a place belongs to no fiducial
+
+
+@dataclass(frozen=True)
+class Claims:
+    """Where each fiducial is said to be."""
+
+    place: Tensor  # (P, N, 2) crop pixels
+    sigma: Tensor  # (P, N) crop pixels, one standard deviation of each axis
+    probability: Tensor  # (P, N) that the fiducial is there; 0 where it was not asked for
+    runner_up: Tensor  # (P, N) probability of the best other place
+
+
+def claim(evidence: Evidence, asked: Tensor) -> Claims:
+    """Let the fiducials of each crop share out the places that any of them puts forward.
+
+    Args:
+        evidence: of (P, N) queries.
+        asked: (P, N) bool, queries that count.
+    """
+    mass = _local_mass(evidence)
+    logit, place, log_sigma = _peaks(evidence, mass, asked)
+    kept = _distinct(place, logit)
+    step = evidence.cells[0, 0, 0, 1, 0] - evidence.cells[0, 0, 0, 0, 0]
+    # What every fiducial says of every place: (P, N, M).
+    along = (place[:, None] - evidence.cells[:, :, None, 0, 0]) / step
+    size = mass.shape[-1]
+    inside = ((along > -0.5) & (along < size - 0.5)).all(-1)
+    column, row = along.round().clamp(0, size - 1).long().unbind(-1)
+    said = mass.flatten(2).gather(2, row * size + column)
+    present = functional.logsigmoid(evidence.present)[..., None]
+    usable = inside & kept[:, None] & asked[..., None]
+    scores = (said + present).masked_fill(~usable, -torch.inf)
+    absent = functional.logsigmoid(-evidence.present)
+    stray = torch.full_like(logit, STRAY).masked_fill(~kept, -torch.inf)
+    shares = partial_transport(scores, absent, stray).exp()[..., :-1]
+    # Rivals that are both sure converge slowly: what is promised twice by now is divided.
+    shares = shares / shares.sum(1, keepdim=True).clamp(min=1)
+    share, best = shares.max(-1)
+    rest = shares.scatter(2, best[..., None], 0.0).amax(-1)
+    chosen = place.gather(1, best[..., None].expand(*best.shape, 2))
+    return Claims(chosen, log_sigma.gather(1, best).exp(), share * asked, rest * asked)
+
+
+def _local_mass(evidence: Evidence) -> Tensor:
+    """Logarithm of the probability of each cell and its neighbours, given that the fiducial is seen: (P, N, K, K)."""
+    shape = evidence.logits.shape
+    probability = evidence.logits.flatten(2).softmax(-1).unflatten(2, shape[2:])
+    pooled = functional.avg_pool2d(probability, 3, stride=1, padding=1) * 9
+    return pooled.clamp(1e-12, 1.0).log()
+
+
+def _peaks(evidence: Evidence, mass: Tensor, asked: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The best local maxima of all windows, in one row: log odds (P, M), place (P, M, 2), log sigma (P, M)."""
+    highest = functional.max_pool2d(evidence.logits, 3, stride=1, padding=1) == evidence.logits
+    value, index = mass.masked_fill(~highest, -torch.inf).flatten(2).topk(PEAKS, dim=-1)
+    places = (evidence.cells + evidence.offset).flatten(2, 3)
+    place = places.gather(2, index[..., None].expand(*index.shape, 2))
+    log_sigma = evidence.log_sigma.flatten(2).gather(2, index)
+    value = (value + functional.logsigmoid(evidence.present)[..., None]).masked_fill(~asked[..., None], -torch.inf)
+    return value.flatten(1), place.flatten(1, 2), log_sigma.flatten(1)
+
+
+def _distinct(place: Tensor, value: Tensor) -> Tensor:
+    """Tell which places (P, M, 2) are not a better one's neighbours, by value (P, M): (P, M) bool."""
+    order = torch.arange(value.shape[1], device=value.device)
+    near = (place[:, :, None] - place[:, None]).square().sum(-1) < SAME**2
+    equal = value[:, None] == value[:, :, None]
+    better = (value[:, None] > value[:, :, None]) | (equal & (order[None, None] < order[None, :, None]))
+    return ~(near & better).any(-1) & value.isfinite()

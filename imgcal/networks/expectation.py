@@ -1,0 +1,98 @@
+"""What the query network is asked of captured frames: crops where a rig and poses expect the object, and queries."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from imgcal.geometry import RigidTransform
+from imgcal.networks.infrared import Queries
+from imgcal.types import CalibrationObject, CameraRig, CropPlacement
+
+MARGIN = 0.06
+"""Share of the focal length that is left around the expected object: drift of 3 degrees."""
+USUAL_RADIUS = 0.05  # of an object's size, where it does not say how large its markers are
+
+Frames = Mapping[str, NDArray[np.uint8] | NDArray[np.uint16] | None]
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """Where H poses put the fiducials."""
+
+    uv: Tensor  # (H, C, N, 2) pixels
+    radius: Tensor  # (H, C, N) pixels
+    depth: Tensor  # (H, C, N) mm
+    visible: Tensor  # (H, C, N) bool
+
+    @classmethod
+    def of(cls, rig: CameraRig, obj: CalibrationObject, rig_from_object: RigidTransform) -> Expectation:
+        """Project an object at poses (H,) into a rig without batch axes."""
+        points = rig_from_object.apply(obj.points.to(rig.focal_length))
+        seen = rig.expand(len(points)).project(points)
+        size = obj.points.new_full((obj.num_fiducials,), USUAL_RADIUS * obj.size) if obj.radius is None else obj.radius
+        focal = rig.focal_length.mean(-1)[:, None]  # (C, 1)
+        radius = focal * size.to(focal) / seen.depth.clamp(min=1e-3)
+        return cls(seen.uv, radius, seen.depth, seen.visible)
+
+    def placement(self, rig: CameraRig, size: int) -> CropPlacement:
+        """Place crops around what all poses expect: (C,)."""
+        uv, visible = self.uv.movedim(0, 1).flatten(1, 2), self.visible.movedim(0, 1).flatten(1, 2)
+        return CropPlacement.around(uv, visible, MARGIN * rig.focal_length.mean(-1), size)
+
+    def queries(self, placement: CropPlacement, shift: Tensor | None = None) -> Queries:
+        """Ask for all fiducials of all poses: (H C, N).
+
+        Args:
+            placement: (C,) of the crops.
+            shift: (H, C, 2) pixels that the cameras are known to be off; None = nothing is known.
+        """
+        uv = self.uv if shift is None else self.uv + shift[..., None, :]
+        place = placement.to_crop(uv)
+        inside = ((place > -0.5) & (place < placement.size - 0.5)).all(-1) & self.visible
+        counted = self.visible.to(uv)
+        mean = (self.depth * counted).sum(-1, keepdim=True) / counted.sum(-1, keepdim=True).clamp(min=1)
+        depth = torch.where(inside, self.depth / mean.clamp(min=1e-3) - 1, 0.0)
+        place = torch.where(inside[..., None], place, placement.size / 2)
+        radius = torch.where(inside, self.radius / placement.scale[..., None], 1.0)
+        numbers = (place.float(), radius.float(), depth.float(), inside)
+        return Queries(*(part.flatten(0, 1) for part in numbers))
+
+
+def cut_crops(frames: Frames, names: tuple[str, ...], placement: CropPlacement, *, inverted: bool = False) -> Tensor:
+    """Cut crops out of frames, each pixel the mean of a block of the frame's.
+
+    Args:
+        frames: by camera; None or absent = no frame.
+        names: of the cameras, C.
+        placement: (C,) where; parts outside of the image become NaN.
+        inverted: markers are dark on bright ground.
+
+    Returns:
+        (C, S, S) float32 grey levels.
+    """
+    size = placement.size
+    crops = torch.full((len(names), size, size), torch.nan)
+    corners = (placement.corner + 0.5).round().long().tolist()
+    scales = placement.scale.long().tolist()
+    for camera, (name, (column, row), scale) in enumerate(zip(names, corners, scales, strict=True)):
+        frame = frames.get(name)
+        if frame is None:
+            continue
+        height, width = frame.shape
+        reach = size * scale
+        top, left, bottom, right = max(row, 0), max(column, 0), min(row + reach, height), min(column + reach, width)
+        if bottom <= top or right <= left:
+            continue
+        part = torch.from_numpy(frame[top:bottom, left:right].astype(np.float32))
+        around = (left - column, column + reach - right, top - row, row + reach - bottom)
+        if any(around):
+            part = functional.pad(part, around, value=torch.nan)
+        crops[camera] = functional.avg_pool2d(part[None], scale)[0]
+    return -crops if inverted else crops

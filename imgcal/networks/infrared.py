@@ -1,0 +1,174 @@
+"""The query network: where in a monochrome crop is each fiducial, seen from where the factory rig expects it.
+
+Crops go through an encoder. Around every fiducial's expected place a window is cut out of the feature map, so that a
+common displacement is the same cell for all fiducials; set blocks then compare the windows of a camera, and a head says
+for each cell whether the fiducial is there. Rig and object come in through places, sizes and relative geometry alone:
+one network serves any rig and any object.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+from torch.nn import functional
+
+from imgcal.io import StrictModel
+from imgcal.networks.infrared_encoders import STRIDE, CnnEncoder, VitEncoder
+
+GEOMETRY = 6
+"""Numbers of relative geometry a fiducial: `Queries.geometry`."""
+
+
+class InfraredConfig(StrictModel):
+    """Which query network."""
+
+    encoder: Literal["cnn", "vit"] = "cnn"
+    crop: Annotated[int, Field(ge=48, le=384, multiple_of=48)] = 96  # pixels, each way
+    channels: Annotated[int, Field(ge=1, le=128)] = 16  # of the feature map and of the windows
+    window: Annotated[int, Field(ge=4, le=64, multiple_of=2)] = 22  # cells, each way
+    blocks: Annotated[int, Field(ge=1, le=16)] = 3
+    keys: Annotated[int, Field(ge=1, le=32)] = 4  # weighted means over the fiducials beside the plain one
+
+
+@dataclass(frozen=True)
+class Queries:
+    """The fiducials that are looked for in crops, P of them, where the factory rig and a pose expect them."""
+
+    place: Tensor  # (P, N, 2) crop pixels
+    radius: Tensor  # (P, N) crop pixels, of the marker's image
+    depth: Tensor  # (P, N) distance from the camera's plane over the mean of all fiducials, minus 1
+    asked: Tensor  # (P, N) bool: expected in view
+
+    def geometry(self, size: int) -> Tensor:
+        """How the fiducials lie to one another: (P, N, 6)."""
+        asked = self.asked[..., None].to(self.place)
+        centre = (self.place * asked).sum(1, keepdim=True) / asked.sum(1, keepdim=True).clamp(min=1)
+        apart = (self.place - centre) * (4 / size)
+        length = apart.square().sum(-1, keepdim=True)
+        numbers = (apart, length, self.radius[..., None].clamp(min=0.05).log(), 5 * self.depth[..., None])
+        return torch.cat((*numbers, torch.ones_like(length)), dim=-1) * asked
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the network says of every cell of every fiducial's window, and of the fiducial as a whole."""
+
+    logits: Tensor  # (P, N, K, K) of the fiducial's cell
+    offset: Tensor  # (P, N, K, K, 2) crop pixels, from the cell's middle to the marker's
+    log_sigma: Tensor  # (P, N, K, K) of the offset's error, crop pixels, one standard deviation of each axis
+    present: Tensor  # (P, N) logit that the fiducial is seen in its window at all
+    cells: Tensor  # (P, N, K, K, 2) crop pixels, the cells' middles
+
+
+class InfraredNetwork(nn.Module):
+    """Crops and queries in, evidence out."""
+
+    def __init__(self, config: InfraredConfig = InfraredConfig()) -> None:
+        """Make an untrained network; weights come from torch's default generators (see `drawing_from`)."""
+        super().__init__()
+        self.config = config
+        width = config.channels
+        self.encoder: nn.Module = CnnEncoder(width) if config.encoder == "cnn" else VitEncoder(width, config.crop)
+        self.blocks = nn.ModuleList(SetBlock(width, config.keys) for _ in range(config.blocks))
+        self.head = nn.Sequential(nn.Conv2d(width, 2 * width, 3, padding=1), nn.GELU(), nn.Conv2d(2 * width, 4, 1))
+        self.presence = nn.Sequential(nn.Linear(2 * width + 2, 2 * width), nn.GELU(), nn.Linear(2 * width, 1))
+
+    def forward(self, crops: Tensor, queries: Queries) -> Evidence:
+        """Look for each fiducial.
+
+        Args:
+            crops: (P, S, S) grey, normalized by `normalized`.
+            queries: (P, N) fiducials.
+        """
+        return self.search(self.encoder(crops[:, None]), queries)
+
+    def search(self, features: Tensor, queries: Queries) -> Evidence:
+        """Look for each fiducial in feature maps (P, channels, S / 2, S / 2): again and again for other poses."""
+        windows, cells = aligned_windows(features, queries.place, self.config.window)
+        geometry = queries.geometry(self.config.crop).to(windows.dtype)
+        for block in self.blocks:
+            windows = block(windows, geometry, queries.asked)
+        said = self.head(windows.flatten(0, 1)).float().unflatten(0, windows.shape[:2])
+        logits = said[:, :, 0]
+        weights = logits.flatten(2).softmax(-1).to(windows.dtype)
+        attended = torch.einsum("pnk,pndk->pnd", weights, windows.flatten(3))
+        sharpness = torch.stack((logits.flatten(2).amax(-1), logits.flatten(2).logsumexp(-1)), -1).to(windows.dtype)
+        summary = torch.cat((attended, windows.flatten(3).mean(-1), sharpness), -1)
+        present = self.presence(summary).float()[..., 0]
+        offset = STRIDE * said[:, :, 1:3].movedim(2, -1)
+        return Evidence(logits, offset, said[:, :, 3].clamp(-6, 4), present, cells)
+
+    def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:
+        """Parameters that may have their own learning rates."""
+        rest = [p for name, p in self.named_parameters() if not name.startswith("encoder.")]
+        return {"encoder": self.encoder.parameters(), "decoder": rest}
+
+
+class SetBlock(nn.Module):
+    """What a window shows beside what the windows of the other fiducials show at the same displacement."""
+
+    def __init__(self, width: int, keys: int) -> None:
+        """Make it for windows of `width` channels; `keys` means over fiducials are weighted by their geometry."""
+        super().__init__()
+        self.spatial = nn.Conv2d(width, width, 3, padding=1)
+        self.geometry = nn.Linear(GEOMETRY, width)
+        self.key, self.query = nn.Linear(GEOMETRY, keys), nn.Linear(GEOMETRY, keys)
+        self.mix = nn.Conv2d(3 * width, 2 * width, 1)
+        self.out = nn.Conv2d(2 * width, width, 1)
+
+    def forward(self, windows: Tensor, geometry: Tensor, asked: Tensor) -> Tensor:
+        """Keep the shape (P, N, width, K, K).
+
+        Args:
+            windows: features around each fiducial's expected place.
+            geometry: (P, N, 6).
+            asked: (P, N) bool, fiducials that count.
+        """
+        count = asked.shape[1]
+        seen = self.spatial(windows.flatten(0, 1)).unflatten(0, (-1, count))
+        seen = functional.gelu(seen + self.geometry(geometry)[..., None, None])
+        weight = asked.to(seen.dtype) / asked.sum(1, keepdim=True).clamp(min=1)
+        mean = torch.einsum("pn,pndij->pdij", weight, seen)[:, None].expand_as(seen)
+        # Turned or stretched constellations: what fiducials see in proportion to where they lie, and back.
+        keys, queries = self.key(geometry) * weight[..., None], self.query(geometry)
+        related = torch.einsum("pmn,pndij->pmdij", queries @ keys.mT, seen)
+        mixed = self.mix(torch.cat((seen, mean, related), dim=2).flatten(0, 1))
+        return windows + self.out(functional.gelu(mixed)).unflatten(0, (-1, count))
+
+
+def aligned_windows(features: Tensor, place: Tensor, window: int) -> tuple[Tensor, Tensor]:
+    """Cut windows out of feature maps, centred at places, cell by cell of the map, bilinearly.
+
+    Args:
+        features: (P, D, G, G) maps of stride 2.
+        place: (P, N, 2) crop pixels.
+        window: cells each way, K.
+
+    Returns:
+        Windows (P, N, D, K, K), zero outside the map, and the cells' middles (P, N, K, K, 2) in crop pixels.
+    """
+    steps = STRIDE * (torch.arange(window, device=place.device, dtype=place.dtype) - (window - 1) / 2)
+    shift = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), dim=-1)
+    cells = place[:, :, None, None] + shift
+    # Cell i of the map covers crop pixels 2 i and 2 i + 1; grid_sample counts from -1 to 1 over the outer edges.
+    grid = (cells + 0.5) * (2 / (STRIDE * features.shape[-1])) - 1
+    rows = grid.flatten(1, 2).to(features.dtype)  # one tall image a crop: (P, N K, K, 2)
+    found = functional.grid_sample(features, rows, align_corners=False)
+    return found.unflatten(2, (-1, window)).movedim(2, 1), cells
+
+
+def normalized(crops: Tensor) -> Tensor:
+    """Make crops (P, S, S) comparable: less their median, over their noise, compressed; NaN (no image) becomes 0.
+
+    The noise is the median absolute difference of pixels two apart: background that changes slowly does not count.
+    """
+    level = crops.flatten(1).nanmedian(1).values[:, None, None].nan_to_num()
+    change = (crops[:, :, 2:] - crops[:, :, :-2]).abs().flatten(1).nanmedian(1).values[:, None, None].nan_to_num()
+    largest = (crops - level).abs().nan_to_num().amax((1, 2), keepdim=True)
+    noise = (change * 1.05).maximum(largest / 1000).clamp(min=1e-6)  # a median of |a - b| is 0.954 sigma
+    return torch.asinh((crops - level) / (2 * noise)).nan_to_num() / 2

@@ -1,0 +1,111 @@
+"""Encoders of monochrome crops: a dense CNN and a small ViT, with the same output stride, parameters and operations."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+STRIDE = 2
+"""Crop pixels a cell of the feature map, of either encoder."""
+
+
+class CnnEncoder(nn.Module):
+    """Strides 2, 4 and 8 in 3x3 convolutions, and an additive way back up.
+
+    Dense convolutions, since depthwise ones are slow on a CPU; no norm, since brightness is already normalized and
+    small batches would disturb one another.
+    """
+
+    def __init__(self, channels: int, widths: tuple[int, int, int] = (24, 48, 88)) -> None:
+        """Make it for crops of any size that is a multiple of 8.
+
+        Args:
+            channels: of the feature map.
+            widths: at strides 2, 4 and 8.
+        """
+        super().__init__()
+        a, b, c = widths
+        self.stem = nn.Conv2d(1, a, 3, stride=2, padding=1)
+        self.fine = Residual(a)
+        self.down_middle = nn.Conv2d(a, b, 3, stride=2, padding=1)
+        self.middle = Residual(b)
+        self.down_coarse = nn.Conv2d(b, c, 3, stride=2, padding=1)
+        self.coarse = Residual(c)
+        self.up_middle = nn.Conv2d(c, b, 1)
+        self.up_fine = nn.Conv2d(b, a, 1)
+        self.out = nn.Conv2d(a, channels, 3, padding=1)
+
+    def forward(self, crops: Tensor) -> Tensor:
+        """Turn crops (P, 1, S, S) into features (P, channels, S / 2, S / 2)."""
+        fine = self.fine(functional.gelu(self.stem(crops)))
+        middle = self.middle(functional.gelu(self.down_middle(fine)))
+        coarse = self.coarse(functional.gelu(self.down_coarse(middle)))
+        middle = middle + _twice(self.up_middle(coarse))
+        return self.out(functional.gelu(fine + _twice(self.up_fine(middle))))
+
+
+class VitEncoder(nn.Module):
+    """Patches of 6 pixels, blocks of attention over the whole crop, then each token draws its own 3 x 3 cells."""
+
+    def __init__(self, channels: int, size: int, width: int = 80, depth: int = 3, heads: int = 4) -> None:
+        """Make it for crops of one size.
+
+        Args:
+            channels: of the feature map.
+            size: crop pixels, each way; a multiple of the patch.
+            width: of the tokens.
+            depth: blocks.
+            heads: of the attention.
+        """
+        super().__init__()
+        patch = 3 * STRIDE
+        self.embed = nn.Conv2d(1, width, patch, stride=patch)
+        self.position = nn.Parameter(0.02 * torch.randn(1, (size // patch) ** 2, width))
+        self.blocks = nn.Sequential(*(AttentionBlock(width, heads) for _ in range(depth)))
+        self.norm = nn.LayerNorm(width)
+        self.out = nn.Linear(width, channels * 9)
+
+    def forward(self, crops: Tensor) -> Tensor:
+        """Turn crops (P, 1, S, S) into features (P, channels, S / 2, S / 2)."""
+        patches = self.embed(crops)
+        tokens = self.blocks(patches.flatten(2).mT + self.position)
+        cells = self.out(self.norm(tokens)).mT.unflatten(-1, patches.shape[-2:])
+        return functional.pixel_shuffle(cells, 3)
+
+
+class Residual(nn.Module):
+    """Two 3x3 convolutions beside the identity."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(width, width, 3, padding=1)
+        self.second = nn.Conv2d(width, width, 3, padding=1)
+        nn.init.normal_(self.second.weight, std=0.01)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Keep the shape (P, width, H, W)."""
+        return x + self.second(functional.gelu(self.first(x)))
+
+
+class AttentionBlock(nn.Module):
+    """Attention and MLP, each behind a LayerNorm and beside the identity."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.norm_attention, self.norm_mlp = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.to_qkv, self.from_heads = nn.Linear(width, 3 * width), nn.Linear(width, width)
+        self.mlp = nn.Sequential(nn.Linear(width, 4 * width), nn.GELU(), nn.Linear(4 * width, width))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Keep the shape (P, T, width)."""
+        # Plain products: the backward pass of the fused attention is slow on a CPU.
+        q, k, v = self.to_qkv(self.norm_attention(x)).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        weights = (q @ k.mT * q.shape[-1] ** -0.5).softmax(-1)
+        x = x + self.from_heads((weights @ v).transpose(1, 2).flatten(2))
+        return x + self.mlp(self.norm_mlp(x))
+
+
+def _twice(x: Tensor) -> Tensor:
+    return functional.interpolate(x, scale_factor=2.0, mode="nearest")

@@ -1,0 +1,82 @@
+"""What the query network is trained for: the right cell, the offset in it, how sure it is, and whether it is seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from imgcal.networks import Evidence, Queries
+from imgcal.synthesis import CropTruth
+
+
+@dataclass(frozen=True)
+class QueryLosses:
+    """Parts of the loss, each a mean over what it concerns: ()."""
+
+    cell: Tensor  # cross-entropy over the cells of a window, nats
+    offset: Tensor  # crop pixels, absolute error of an axis
+    likelihood: Tensor  # negative logarithm of the offset's likelihood, of an axis, by the predicted sigma
+    presence: Tensor  # binary cross-entropy of `present`
+
+    @property
+    def total(self) -> Tensor:
+        """The weighted sum that is trained."""
+        return self.cell + 0.5 * self.offset + 0.1 * self.likelihood + 0.5 * self.presence
+
+
+def queries_of(truth: CropTruth) -> Queries:
+    """Ask for all fiducials of rendered crops: (P, N), P = B C; what is expected outside the crop is not asked for."""
+    inside = ((truth.expected > -0.5) & (truth.expected < truth.placement.size - 0.5)).all(-1) & truth.radius.isfinite()
+    asked = inside & (truth.radius > 0)
+    parts = (truth.expected, truth.radius, truth.depth, asked)
+    return Queries(*(part.flatten(0, 1) for part in parts))
+
+
+def query_losses(evidence: Evidence, asked: Tensor, place: Tensor, seen: Tensor) -> QueryLosses:
+    """Compare evidence with where the markers are.
+
+    Args:
+        evidence: of (P, N) queries.
+        asked: (P, N) bool, queries that count.
+        place: (P, N, 2) crop pixels, the truth.
+        seen: (P, N) bool: the marker is to be seen.
+    """
+    shape = evidence.logits.shape
+    step = evidence.cells[0, 0, 0, 1, 0] - evidence.cells[0, 0, 0, 0, 0]
+    along = (place - evidence.cells[:, :, 0, 0]) / step  # cells from the first one's middle
+    inside = ((along > -0.5) & (along < shape[-1] - 0.5)).all(-1)
+    good = (asked & seen & inside).to(evidence.logits.dtype)
+    column, row = along.round().clamp(0, shape[-1] - 1).long().unbind(-1)
+    index = row * shape[-1] + column
+
+    def at(values: Tensor) -> Tensor:
+        return values.flatten(2).gather(2, index[..., None])[..., 0]
+
+    def mean(values: Tensor) -> Tensor:
+        return (torch.where(good > 0, values, 0.0)).sum() / good.sum().clamp(min=1)
+
+    cell = mean(-at(evidence.logits.flatten(2).log_softmax(-1)))
+    middle = torch.stack([at(evidence.cells[..., axis]) for axis in (0, 1)], -1)
+    offset = torch.stack([at(evidence.offset[..., axis]) for axis in (0, 1)], -1)
+    error = (middle + offset - place).abs()
+    log_sigma = at(evidence.log_sigma)
+    squared = error.detach().square().mean(-1)
+    likelihood = mean(squared / 2 * (-2 * log_sigma).exp() + log_sigma)
+    truly = asked & (~seen | inside)  # outside of the window nothing can be said
+    target = (seen & inside).to(evidence.present.dtype)
+    presence = functional.binary_cross_entropy_with_logits(evidence.present, target, reduction="none")
+    presence = (presence * truly).sum() / truly.sum().clamp(min=1)
+    return QueryLosses(cell, mean(error.clamp(max=8.0).mean(-1)), likelihood, presence)
+
+
+def evidence_at_best(evidence: Evidence) -> tuple[Tensor, Tensor, Tensor]:
+    """Where each fiducial most probably is: place (P, N, 2) crop pixels, sigma (P, N), and probability (P, N)."""
+    flat = evidence.logits.flatten(2)
+    probability, best = flat.softmax(-1).max(-1)
+    places = (evidence.cells + evidence.offset).flatten(2, 3)
+    place = places.gather(2, best[..., None, None].expand(*best.shape, 1, 2))[:, :, 0]
+    log_sigma = evidence.log_sigma.flatten(2).gather(2, best[..., None])[..., 0]
+    return place, log_sigma.exp(), probability * evidence.present.sigmoid()

@@ -1,0 +1,28 @@
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from imgcal.networks.infrared_encoders import STRIDE, CnnEncoder, VitEncoder
+
+
+def test_same_stride_parameters_and_operations() -> None:
+    sizes, operations = [], []
+    for encoder in (CnnEncoder(16), VitEncoder(16, 96)):
+        with FlopCounterMode(display=False) as counter:
+            assert encoder(torch.zeros(2, 1, 96, 96)).shape == (2, 16, 96 // STRIDE, 96 // STRIDE)
+        sizes.append(sum(p.numel() for p in encoder.parameters()))
+        operations.append(counter.get_total_flops())
+    assert max(sizes) < 1.2 * min(sizes)
+    assert max(operations) < 1.2 * min(operations)
+
+
+def test_vit_cells_lie_where_their_pixels_are() -> None:
+    # A bright patch changes the cells of its own token most: pixel_shuffle has put them in the right order.
+    torch.manual_seed(0)
+    encoder = VitEncoder(4, 48, width=16, depth=1, heads=2)
+    crop = torch.zeros(1, 1, 48, 48)
+    dark = encoder(crop)
+    crop[..., 30:36, 6:12] = 5.0
+    change = (encoder(crop) - dark).abs().sum(1)[0]
+    row, column = divmod(int(change.argmax()), 24)
+    assert 15 <= row < 18
+    assert 3 <= column < 6
