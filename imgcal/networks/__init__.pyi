@@ -10,6 +10,7 @@ from .config import PRESETS, Images, NetworkConfig, NetworkSpec, PaperImages, Pa
 from .factory import build, build_network
 from .images import ImageNetwork, PaperImageNetwork
 from .infrared import Evidence, InfraredConfig, InfraredNetwork, Queries, normalized
+from .infrared_checkpoint import InfraredCheckpoint, load_infrared
 from .network import Network
 from .parameterization import Parameterization
 from .points import PaperPointNetwork, PointNetwork
@@ -23,6 +24,7 @@ __all__ = [
     "Evidence",
     "ImageNetwork",
     "Images",
+    "InfraredCheckpoint",
     "InfraredConfig",
     "InfraredNetwork",
     "Network",
@@ -42,6 +44,7 @@ __all__ = [
     "drawing_from",
     "find_soft_positions",
     "load_checkpoint",
+    "load_infrared",
     "load_network",
     "normalized",
     "read_subject",

@@ -1,7 +1,7 @@
 from .captures import FrameModel, Truth, simulate_frames, simulate_truth, true_detections
 from .colour_coding import LEVELS, ImageOptions, render_views
 from .corruption import Corrupted, Corruption
-from .crops import CropTruth, Scenes, render_crops, sample_scenes
+from .crops import CropTruth, Scenes, host_generator, render_crops, sample_scenes
 from .rigs import Drift, PhysicalDrift, PoseRange, RelativeDrift, Snapshots, synthesize
 
 __all__ = [
@@ -18,6 +18,7 @@ __all__ = [
     "Scenes",
     "Snapshots",
     "Truth",
+    "host_generator",
     "render_crops",
     "render_views",
     "sample_scenes",

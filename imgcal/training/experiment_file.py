@@ -21,6 +21,7 @@ from imgcal.io import (
 )
 from imgcal.messages import quoted
 from imgcal.training.experiment import Experiment
+from imgcal.training.infrared_task import InfraredExperiment
 from imgcal.training.rigs import RigExperiment
 
 FORMAT = "imgcal-experiment/1"
@@ -28,6 +29,7 @@ FORMAT = "imgcal-experiment/1"
 # By the key `task`; a file without it is about rigs.
 KINDS: dict[str, type[Experiment]] = {
     "rig": RigExperiment,
+    "infrared": InfraredExperiment,
 }
 
 # Keys as people write them: first what it is about.

@@ -1,0 +1,146 @@
+"""The task of infrared crops: crops in, where each fiducial is out; any rig and any object."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar, Literal
+
+import torch
+from torch import Tensor, nn
+
+from imgcal.networks import (
+    Evidence,
+    InfraredCheckpoint,
+    InfraredConfig,
+    InfraredNetwork,
+    Queries,
+    drawing_from,
+    load_infrared,
+    normalized,
+)
+from imgcal.synthesis import host_generator, render_crops, sample_scenes
+from imgcal.training.experiment import Experiment
+from imgcal.training.infrared import evidence_at_best, queries_of, query_losses
+from imgcal.training.task import Loss, Task
+
+VALIDATION_SEED = 20_000_003
+CAMERAS = 2  # crops a rig: more rigs and objects instead of more cameras
+FIDUCIALS = (5, 12)  # of the objects
+NEAR = 2.0  # crop pixels within which a place is right
+
+
+class InfraredExperiment(Experiment):
+    """A network that finds fiducials in monochrome crops; it is for no rig and no object, so the file names none."""
+
+    task: Literal["infrared"] = "infrared"
+    network: InfraredConfig = InfraredConfig()
+
+    def make_task(self, device: torch.device, batch_size: int, weights: torch.Generator, fresh: bool) -> InfraredTask:
+        """Build the network and its source of crops; see `Experiment.make_task`."""
+        return InfraredTask(self, device, batch_size, weights, fresh)
+
+
+@dataclass(frozen=True)
+class CropBatch:
+    """Crops, what is asked of them, and what is there: P = rigs times cameras, N fiducials."""
+
+    crops: Tensor  # (P, S, S), normalized
+    queries: Queries  # (P, N)
+    place: Tensor  # (P, N, 2) crop pixels
+    seen: Tensor  # (P, N) bool
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All tensors by name."""
+        asked = {f"queries.{field.name}": getattr(self.queries, field.name) for field in fields(Queries)}
+        return {"crops": self.crops, "place": self.place, "seen": self.seen, **asked}
+
+
+class InfraredTask(Task[CropBatch, Evidence]):
+    """Random rigs that look at random objects, in crops as bad as cameras deliver them."""
+
+    unit = "crops"
+    judged = "validation_missed"
+    headline: ClassVar = {
+        "right": "{:.1%} right",
+        "wrong": "{:.1%} wrong",
+        "validation_missed": "validation missed {:.3f}",
+    }
+    network: InfraredNetwork
+
+    def __init__(
+        self,
+        experiment: InfraredExperiment,
+        device: torch.device,
+        batch_size: int,
+        weights: torch.Generator,
+        fresh: bool,
+    ) -> None:
+        """Build it; see `Experiment.make_task`."""
+        start = experiment.training.init_from
+        with drawing_from(weights):
+            network = InfraredNetwork(experiment.network)
+        if fresh and start is not None:
+            network.load_state_dict(load_infrared(start).network.state_dict())
+        self.network = network.to(device)
+        self.device = device
+        count = experiment.training.validation_rigs
+        self.sizes = [min(batch_size, count - first) for first in range(0, count, batch_size)]
+
+    def batch(self, count: int, generator: torch.Generator) -> CropBatch:
+        """Make crops of random rigs and objects; all objects of a batch have as many fiducials."""
+        low, high = FIDUCIALS
+        fiducials = int(torch.randint(low, high + 1, (), generator=host_generator(generator)))
+        truth = render_crops(sample_scenes(max(count // CAMERAS, 1), CAMERAS, fiducials, generator), generator)
+        crops, place, seen = (part.flatten(0, 1) for part in (truth.crops, truth.place, truth.seen))
+        return CropBatch(normalized(crops), queries_of(truth), place, seen)
+
+    def predict(self, network: nn.Module, batch: CropBatch) -> Evidence:
+        """Say where the fiducials are."""
+        return network(batch.crops, batch.queries)
+
+    def loss(self, answer: Evidence, batch: CropBatch, step: int) -> Loss:
+        """Compare the evidence with the truth."""
+        parts = query_losses(answer, batch.queries.asked, batch.place, batch.seen)
+        right, wrong, _ = _counts(answer, batch)
+        means = {
+            "cell": parts.cell,
+            "offset_px": parts.offset,
+            "presence": parts.presence,
+            "right": right,
+            "wrong": wrong,
+        }
+        return Loss(parts.total, {name: value.detach() for name, value in means.items()})
+
+    def validate(self, predict: Callable[[CropBatch], Evidence]) -> dict[str, float]:
+        """Right of the visible, wrong of the claimed, and the offsets' NEES, on crops that are always the same."""
+        if not self.sizes:
+            return {}
+        generator = torch.Generator(self.device).manual_seed(VALIDATION_SEED)
+        rows = []
+        for size in self.sizes:
+            batch = self.batch(size, generator)
+            rows.append(torch.stack(_counts(predict(batch), batch)))
+        right, wrong, nees = torch.stack(rows).mean(0).tolist()
+        return {
+            "validation_missed": 1 - right + wrong,
+            "validation_right": right,
+            "validation_wrong": wrong,
+            "validation_nees": nees,
+        }
+
+    def result(self, network: nn.Module, metrics: Mapping[str, Any]) -> InfraredCheckpoint:
+        """Weights and configuration."""
+        assert isinstance(network, InfraredNetwork)  # `self.network`, or the mean of what it was
+        return InfraredCheckpoint(network, metrics)
+
+
+def _counts(answer: Evidence, batch: CropBatch) -> tuple[Tensor, Tensor, Tensor]:
+    """Share of right among the visible, of wrong among the claimed, and the mean NEES of the right ones: () each."""
+    place, sigma, probability = evidence_at_best(answer)
+    squared = (place - batch.place).square().sum(-1)
+    visible, claimed = batch.queries.asked & batch.seen, batch.queries.asked & (probability > 0.5)
+    right = claimed & visible & (squared < NEAR**2)
+    share = right.sum() / visible.sum().clamp(min=1)
+    nees = torch.where(right, squared / sigma.square(), 0.0).sum() / (2 * right.sum()).clamp(min=1)
+    return share, (claimed & ~right).sum() / claimed.sum().clamp(min=1), nees
