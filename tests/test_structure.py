@@ -58,7 +58,6 @@ TESTED_ELSEWHERE = {
     "imgcal/pipeline/arrangement.py": "pipeline/test_calibration, test_steadiness",
     "imgcal/training/callbacks.py": "training/test_engine",
     "imgcal/training/continuation.py": "training/test_engine, test_processes",
-    "imgcal/training/experiment.py": "training/test_experiment_file",
     "imgcal/training/run.py": "values only; training/test_engine",
 }
 

@@ -65,7 +65,7 @@ class Calibrate:
     object: str  #: object: file, or the name of a shipped one
     out: Path  #: folder to write
     snapshots: str | None = None  #: A:B, numbers in file order from 0, B excluded
-    first_guess: str = "none"  #: where to start: none (factory rig), points, vit or cnn (shipped networks), or a file
+    first_guess: str = "none"  #: where to start: none (factory rig), points, vit, cnn (shipped), a file or run
     without: tuple[str, ...] = ()  #: cameras to leave out
     blind_cameras: bool = False  #: accept cameras that see nothing; they keep their factory values
     after_last_move: bool = False  #: where a camera moved during the capture, use the snapshots since then

@@ -56,6 +56,8 @@ class Train:
             raise InputError(f"{self.out}: found no {STATE} there, expected one to --resume from")
         if experiment.training.threads is not None:
             torch.set_num_threads(experiment.training.threads)
+        if experiment.training.tf32:
+            torch.set_float32_matmul_precision("high")
         with _asked_to_stop() as stop:
             run = train_in(self.out, experiment, self.resume, stop)
         run.accelerator.end_training()

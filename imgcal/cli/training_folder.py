@@ -9,19 +9,19 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from torch.utils.tensorboard import SummaryWriter
 
 from imgcal.errors import InputError, RefusedError
-from imgcal.io import read_metrics, write_tensors, write_text
+from imgcal.io import MODEL, read_metrics, write_tensors, write_text
 from imgcal.training import (
     Callbacks,
     DivergedError,
     Experiment,
     Result,
     Run,
-    Task,
     TrainingState,
+    finished,
     load_state,
     progress,
     save_experiment,
@@ -29,8 +29,9 @@ from imgcal.training import (
     train,
 )
 
-RESULT, STATE, RESOLVED, METRICS = "model.safetensors", "state.safetensors", "resolved.yaml", "metrics.jsonl"
+RESULT, STATE, RESOLVED, METRICS = MODEL, "state.safetensors", "resolved.yaml", "metrics.jsonl"
 BAD_BATCH = "bad_batch.safetensors"
+EVERY = 60.0  # s between two lines where there is no terminal
 EXTRA = "extra"  # key of a row that a longer run does not have
 
 
@@ -80,9 +81,11 @@ class TrainingFolder(Callbacks):
         write_text(self.metrics, "".join(json.dumps(row) + "\n" for row in (kept if run.step else [])))
         self.board = SummaryWriter(str(self.folder / "tensorboard"), purge_step=run.step + 1 if run.step else None)
         self.console = Console(file=sys.stderr)
-        columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+        words, times = TextColumn("{task.description}"), (TimeElapsedColumn(), TimeRemainingColumn())
+        columns = (words, BarColumn(), TaskProgressColumn(), *times)
+        self.said = run.elapsed
         self.bar = Progress(*columns, console=self.console, disable=not self.console.is_terminal)
-        self.task = self.bar.add_task("training", total=1.0)
+        self.shown = self.bar.add_task("training", total=1.0)
         self.bar.start()
         self._announce(run)
 
@@ -96,12 +99,18 @@ class TrainingFolder(Callbacks):
         for name, value in row.items():
             if name != "step" and isinstance(value, float | int):
                 self.board.add_scalar(name, value, row["step"])
-        if "seconds" in row:
-            self.bar.update(
-                self.task, completed=progress(run, row["seconds"]), description=_summary(run.latest, run.task)
-            )
-        else:
-            self._say(_summary(run.latest, run.task))
+        self.bar.update(self.shown, description=_summary(run))
+        if self.console.is_terminal and "seconds" not in row:  # a validation stays above the bar
+            self._say(_summary(run))
+
+    def on_step(self, run: Run, seconds: float) -> None:
+        """Move the bar; without a terminal, say a line every minute."""
+        done = progress(run, seconds)
+        self.bar.update(self.shown, completed=done)
+        if not self.console.is_terminal and seconds - self.said >= EVERY and not finished(run, seconds):
+            self.said = seconds
+            left = seconds * (1 - done) / max(done, 1e-9) / 60
+            self._say(f"{_summary(run)}  {100 * done:.0f} %, {left:.0f} min left")
 
     def on_checkpoint(self, run: Run, state: TrainingState, result: Result) -> None:
         """Write both; where a file cannot be written the previous one survives."""
@@ -109,8 +118,11 @@ class TrainingFolder(Callbacks):
         result.save(self.folder / RESULT)
 
     def on_end(self, run: Run) -> None:
-        """Close the logs."""
+        """Close the logs, and say where the training stands."""
+        self.bar.update(self.shown, description=_summary(run))
         self.bar.stop()
+        if not self.console.is_terminal:
+            self._say(_summary(run))
         self.board.close()
 
     def _announce(self, run: Run) -> None:
@@ -127,9 +139,10 @@ class TrainingFolder(Callbacks):
         self.console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
-def _summary(latest: dict[str, Any], task: Task[Any, Any]) -> str:
+def _summary(run: Run) -> str:
     """Put the latest numbers into one line."""
-    words = [f"step {latest.get('step', 0)}"]
+    latest, task = run.latest, run.task
+    words = [f"step {run.step}"]
     words += [shown.format(latest[name]) for name, shown in task.headline.items() if name in latest]
     if (rate := latest.get(f"{task.unit}_per_s")) is not None:
         words.append(f"{rate:.0f} {task.unit}/s")

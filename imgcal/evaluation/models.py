@@ -13,7 +13,7 @@ from imgcal.errors import InputError
 from imgcal.evaluation.methods import Method, network_method
 from imgcal.evaluation.protocol import Conditions
 from imgcal.evaluation.summary import Facts
-from imgcal.io import read_metrics
+from imgcal.io import MODEL, model_file, read_metrics
 from imgcal.networks import Checkpoint, load_checkpoint
 from imgcal.types import CalibrationObject, CameraRig
 
@@ -74,7 +74,7 @@ def load_models(
     models: list[Model] = []
     if not paths:
         return []
-    files = [path / "model.safetensors" if path.is_dir() else path for path in paths]
+    files = [model_file(path) for path in paths]
     for path, name in zip(files, _names(files), strict=True):
         checkpoint = load_checkpoint(path, rig, obj)
         rig, obj = rig or checkpoint.rig, obj or checkpoint.obj
@@ -85,7 +85,7 @@ def load_models(
 
 def _names(paths: Sequence[Path]) -> list[str]:
     """Short names that differ: of the file, or of the folder where a training run has put it; and folders above."""
-    parts = [(path.parent if path.stem == "model" else path.with_suffix("")).resolve().parts for path in paths]
+    parts = [(path.parent if path.name == MODEL else path.with_suffix("")).resolve().parts for path in paths]
     for depth in range(1, max(map(len, parts), default=0) + 1):
         names = ["/".join(some[-depth:]) for some in parts]
         if len(set(names)) == len(names):

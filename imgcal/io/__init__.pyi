@@ -3,8 +3,9 @@ from .capture import Capture, open_capture, open_input, save_capture_settings
 from .detections_csv import MARGIN, load_detections, save_detections
 from .frames import Frame, read_frame, write_frame, write_image
 from .json_text import read_json
+from .key_table import Key, keys_of
 from .metrics import read_metrics
-from .names import find_file, nearest, title_of
+from .names import MODEL, find_file, model_file, model_name, nearest, title_of
 from .object_csv import load_object, object_from_text, object_text, save_object
 from .publication import publishing
 from .resources import data_path, shipped_names
@@ -15,18 +16,23 @@ from .yaml_file import Flow, parse_yaml, read_yaml, read_yaml_mapping, yaml_text
 
 __all__ = [
     "MARGIN",
+    "MODEL",
     "Capture",
     "Flow",
     "Frame",
+    "Key",
     "RigCovariance",
     "StrictModel",
     "StrictRecord",
     "data_path",
     "find_file",
+    "keys_of",
     "load_detections",
     "load_object",
     "load_rig",
     "load_rig_covariance",
+    "model_file",
+    "model_name",
     "nearest",
     "object_from_text",
     "object_text",

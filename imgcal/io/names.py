@@ -11,6 +11,7 @@ from imgcal.errors import InputError
 from imgcal.io.resources import data_path, shipped_names
 
 MOST_NAMES = 8  # that a message lists
+MODEL, SUFFIX = "model.safetensors", ".safetensors"  # what `imgcal train` calls a network in the folder of a run
 LONGEST_NAME = 200  # bytes: file systems end at 255, and something is put behind
 
 
@@ -42,6 +43,30 @@ def check_regular(path: Path) -> None:
     """Raise `InputError` at a folder, a device or a pipe: reading one may wait for ever."""
     if path.exists() and not path.is_file():
         raise InputError(f"{path}: found a folder, device or pipe, expected a file")
+
+
+def model_file(path: str | Path) -> Path:
+    """Find a trained network: a file, the folder of a training run, or the bare name of a shipped one.
+
+    Returns:
+        A path that may not exist: who reads it says so.
+
+    Raises:
+        InputError: a folder without a trained network.
+    """
+    path = Path(path)
+    if path.is_dir():
+        if not (path / MODEL).is_file():
+            raise InputError(f"{path}: found a folder without {MODEL}, expected that of a training run")
+        return path / MODEL
+    if not path.exists() and str(path) in shipped_names("models", SUFFIX):
+        return data_path("models", str(path) + SUFFIX)
+    return path
+
+
+def model_name(path: Path) -> str:
+    """Name a network by its file, or by the folder where a training run has put it."""
+    return title_of(path.absolute().parent if path.name == MODEL else path)
 
 
 def find_file(path: str | Path, kind: str, suffix: str) -> Path:

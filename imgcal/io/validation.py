@@ -144,19 +144,21 @@ def _keys(record: type, location: tuple[str | int, ...]) -> list[str]:
     records = [record]
     for step in location:
         if isinstance(step, str):
-            annotations = [_annotations(one)[step] for one in records if step in _annotations(one)]
-            records = [inner for annotation in annotations for inner in _records_in(annotation)]
-    return [key for one in records for key in _annotations(one)]
+            annotations = [annotations_of(one)[step] for one in records if step in annotations_of(one)]
+            records = [inner for annotation in annotations for inner in records_in(annotation)]
+    return [key for one in records for key in annotations_of(one)]
 
 
-def _annotations(record: type) -> dict[str, Any]:
+def annotations_of(record: type) -> dict[str, Any]:
+    """Name the fields of a record, with what each may be."""
     if issubclass(record, BaseModel):
         return {name: field.annotation for name, field in record.model_fields.items()}
     hints = get_type_hints(record)
     return {field.name: hints[field.name] for field in fields(record)}  # type: ignore[arg-type]
 
 
-def _records_in(annotation: Any) -> list[type]:
+def records_in(annotation: Any) -> list[type]:
+    """Find the records that a field may hold."""
     if isinstance(annotation, type) and (issubclass(annotation, BaseModel) or is_dataclass(annotation)):
         return [annotation]
-    return [record for argument in getattr(annotation, "__args__", ()) for record in _records_in(argument)]
+    return [record for argument in getattr(annotation, "__args__", ()) for record in records_in(argument)]

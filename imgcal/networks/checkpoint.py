@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from imgcal.errors import InputError
 from imgcal.io import (
+    model_file,
     object_from_text,
     object_text,
     read_json,
@@ -126,12 +127,17 @@ def read_subject(path: str | Path) -> tuple[CameraRig, CalibrationObject]:
 def warm_start(path: str | Path, network: nn.Module) -> tuple[str, ...]:
     """Take over the parameters of a checkpoint that fit by name and shape, whatever rig or drift it was trained for.
 
+    Args:
+        path: a file, the folder of a training run, or the name of a shipped network.
+        network: takes them over.
+
     Returns:
         Names of the network's parameters that were not in the checkpoint, or had another shape there.
 
     Raises:
         InputError: the file cannot be used, or nothing in it fits.
     """
+    path = model_file(path)
     tensors, texts = read_tensors(path, FORMAT)
     own = dict(network.named_parameters())
     fitting = [name for name in own if name in tensors and tensors[name].shape == own[name].shape]

@@ -30,12 +30,12 @@ def _with_whole_heads(config: Attending) -> Attending:
 class PaperPoints(StrictModel):
     """The paper's point variant; camera by camera outputs, not offsets."""
 
-    encoder: Encoder = "transformer"
-    width: Width = 512
-    depth: Count = 8
-    heads: Count = 4
+    encoder: Encoder = "transformer"  # blocks of attention, or of one-dimensional convolution
+    width: Width = 512  # of features
+    depth: Count = 8  # blocks
+    heads: Count = 4  # of attention
     camera_identity: bool = True  # the paper's CIE
-    head_widths: Widths = (1024, 1024)
+    head_widths: Widths = (1024, 1024)  # of the hidden layers of the heads
 
     @model_validator(mode="after")
     def _divisible(self) -> PaperPoints:
@@ -45,11 +45,11 @@ class PaperPoints(StrictModel):
 class PaperImages(StrictModel):
     """The paper's image variant: one pooled feature an image."""
 
-    backbone: Annotated[str, Field(max_length=200)] = "vit_base_patch16_224"
-    pretrained: bool = False
+    backbone: Annotated[str, Field(max_length=200)] = "vit_base_patch16_224"  # any model of timm, by name
+    pretrained: bool = False  # begin with published weights of timm
     options: dict[str, Any] = Field(default={})  # further arguments of timm.create_model: backbone_options
-    bottleneck: Width = 128
-    head_widths: Widths = (128,)
+    bottleneck: Width = 128  # of the pooled feature of an image
+    head_widths: Widths = (128,)  # of the hidden layers of the heads
 
     @model_validator(mode="after")
     def _harmless(self) -> PaperImages:
@@ -60,12 +60,12 @@ class PaperImages(StrictModel):
 class TrunkConfig(StrictModel):
     """Our network from positions to a rig."""
 
-    encoder: Encoder = "transformer"
-    width: Width = 128
-    heads: Count = 4
+    encoder: Encoder = "transformer"  # blocks of attention, or of one-dimensional convolution
+    width: Width = 128  # of features
+    heads: Count = 4  # of attention
     depth: Count = 5  # blocks of the first pass
     later_depth: Count = 2  # blocks of every later pass, which share their weights
-    passes: Count = 3
+    passes: Count = 3  # each sees what the one before left over
     trust: bool = False  # predict how far the refinement may trust each fiducial
 
     @model_validator(mode="after")
@@ -82,10 +82,10 @@ class Points(StrictModel):
 class Images(StrictModel):
     """Our image variant: an encoder that also says where each fiducial is, then the same trunk."""
 
-    backbone: Annotated[str, Field(max_length=200)] = "vit_tiny_patch16_224"
-    pretrained: bool = False
+    backbone: Annotated[str, Field(max_length=200)] = "vit_tiny_patch16_224"  # any model of timm, by name
+    pretrained: bool = False  # begin with published weights of timm
     options: dict[str, Any] = Field(default={})  # further arguments of timm.create_model: backbone_options
-    bottleneck: Width = 128
+    bottleneck: Width = 128  # of the pooled feature of an image
     positions: bool = True  # hand the trunk each fiducial's position; otherwise the pooled feature alone
     trunk: TrunkConfig = TrunkConfig()
 
@@ -124,7 +124,7 @@ class NetworkConfig(StrictModel):
         2
     """
 
-    preset: str
+    preset: str  # a kind of network, by name
     change: dict[str, Any] = Field(default={})  # values of the preset to replace, by name; groups within groups
 
     @model_validator(mode="after")

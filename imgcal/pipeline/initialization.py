@@ -14,7 +14,7 @@ from torch import Tensor
 
 from imgcal.errors import InputError
 from imgcal.geometry import RigidTransform, resized_pixels
-from imgcal.io import data_path, nearest, shipped_names
+from imgcal.io import data_path, model_file, model_name, nearest, shipped_names
 from imgcal.networks import Network, check_object, check_rig, load_checkpoint, read_subject
 from imgcal.synthesis import render_views
 from imgcal.types import CalibrationObject, CameraRig, Observations, Prediction, Symmetry, Views
@@ -108,7 +108,7 @@ def load_initializer(name: str, rig: CameraRig, obj: CalibrationObject) -> Initi
     """Find the network for a rig and an object.
 
     Args:
-        name: one of `KINDS`, for the shipped networks, or a file that `imgcal train` wrote.
+        name: one of `KINDS`, for the shipped networks, or a file that `imgcal train` wrote, or its folder.
         rig: the factory rig: all cameras of the training or some of them; its images may be smaller or larger.
         obj: the object; the radius of its fiducials does not matter to a first guess.
 
@@ -121,12 +121,13 @@ def load_initializer(name: str, rig: CameraRig, obj: CalibrationObject) -> Initi
         'points-O10-cube8'
     """
     if name not in KINDS:
-        if not Path(name).is_file():
+        path = model_file(name)
+        if not path.is_file():
             raise InputError(
-                f"first guess: found `{name}`, expected none, {', '.join(KINDS)}, or a file of `imgcal train`"
-                f"{nearest(name, KINDS)}"
+                f"first guess: found `{name}`, expected none, {', '.join(KINDS)}, or what `imgcal train` wrote: a file "
+                f"or its folder{nearest(name, KINDS)}"
             )
-        return _load(Path(name), rig, obj)
+        return _load(path, rig, obj)
     shipped = [stem for stem in shipped_names("models", ".safetensors") if stem.startswith(f"{name}-")]
     reasons = []
     for stem in shipped:
@@ -147,4 +148,4 @@ def _load(path: Path, rig: CameraRig, obj: CalibrationObject) -> Initializer:
     there = trained.select(cameras) if len(cameras) == rig.num_cameras else trained
     check_rig(path, there, rig.resized(there.image_size) if rig.num_cameras == there.num_cameras else rig)
     check_object(path, replace(trained_obj, radius=None), replace(obj, radius=None))
-    return Initializer(path.stem, load_checkpoint(path).network, trained, cameras)
+    return Initializer(model_name(path), load_checkpoint(path).network, trained, cameras)

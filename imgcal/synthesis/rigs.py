@@ -81,8 +81,8 @@ class RelativeDrift(StrictRecord):
         True
     """
 
-    kappa_intrinsics: Kappa = 0.025
-    kappa_extrinsics: Kappa = 0.025
+    kappa_intrinsics: Kappa = 0.025  # of focal lengths, principal points, distortion; not named in a file = none
+    kappa_extrinsics: Kappa = 0.025  # of Euler angles and positions; not named in a file = none
 
     def apply(self, rig: CameraRig, generator: torch.Generator, *batch: int) -> CameraRig:
         """Disturb focal lengths, principal points, distortion; Euler angles and positions of the cameras in the rig.
@@ -137,7 +137,7 @@ class PhysicalDrift(StrictRecord):
         tensor([2., 2., 2.], dtype=torch.float64)
     """
 
-    rotation_deg: Spread = 0.5  # each axis
+    rotation_deg: Spread = 0.5  # each axis; physical units exclude kappas, and what a file does not name does not drift
     position: Spread = 2.0  # mm, each axis
     focal_length: Spread = 0.01  # relative
     principal_point: Spread = 5.0  # pixels

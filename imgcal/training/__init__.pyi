@@ -1,13 +1,14 @@
 from .callbacks import Callbacks, DivergedError
 from .engine import Run, finished, prepare, progress, train, train_step
 from .experiment import Experiment
-from .experiment_file import changed, load_experiment, save_experiment
+from .experiment_file import KINDS, changed, load_experiment, save_experiment
 from .infrared_task import InfraredExperiment, InfraredTask
 from .rigs import RigExperiment, RigTask, experiment_of
 from .state import TrainingState, load_state, save_state
 from .task import Loss, Result, Task
 
 __all__ = [
+    "KINDS",
     "Callbacks",
     "DivergedError",
     "Experiment",

@@ -7,8 +7,8 @@ from time import monotonic
 import torch
 
 from imgcal.errors import InputError
-from imgcal.training.optimization import optimizer_settings, optimizer_tensors, restore_optimizer
-from imgcal.training.run import Run
+from imgcal.training.optimization import make_average, optimizer_settings, optimizer_tensors, restore_optimizer
+from imgcal.training.run import Best, Run
 from imgcal.training.state import TrainingState, random_states, restore_random_states
 
 
@@ -26,11 +26,13 @@ def state_of(run: Run) -> TrainingState:
         "schedule": run.schedule.state(),
         "judged": None if run.judged is None else run.judged.tolist(),
         "metrics": run.metrics,
+        "best": run.best and {"metrics": run.best.metrics, "error": run.best.error, "since": run.best.since},
     }
     names = tuple(run.window[0]) if run.window else ()
     tensors = {
         "network": run.plain.state_dict(),
         "average": {} if run.average is None else run.average.state_dict(),
+        "best": {} if run.best is None else run.best.network.state_dict(),
         "optimizer": optimizer_tensors(run.optimizer),
         "random": gathered,
         "window": {
@@ -53,6 +55,9 @@ def restore(run: Run, state: TrainingState) -> None:
     run.plain.load_state_dict(tensors["network"])
     if run.average is not None:
         run.average.load_state_dict(tensors["average"])
+    if values.get("best") is not None:
+        run.best = Best(make_average(run.plain), **values["best"])
+        run.best.network.load_state_dict(tensors["best"])
     restore_optimizer(run.optimizer, tensors["optimizer"], values["optimizer"])
     run.schedule.restore(values["schedule"])
     states = {name: rows[index] for name, rows in tensors["random"].items()}

@@ -6,23 +6,24 @@ It knows tasks only. It writes nothing and leaves torch's default generators alo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Any
 
 import torch
 from accelerate import Accelerator
 from accelerate.utils import broadcast
-from torch import nn
+from torch import Tensor, nn
 
 from imgcal.errors import InputError
 from imgcal.networks import drawing_from
 from imgcal.training.callbacks import Callbacks, DivergedError
 from imgcal.training.continuation import restore, state_of
-from imgcal.training.experiment import Experiment
-from imgcal.training.optimization import Schedule, make_average, make_optimizer, update_average
-from imgcal.training.run import Pending, Run
+from imgcal.training.experiment import Experiment, TrainingConfig
+from imgcal.training.optimization import Schedule, freeze, learning, make_average, make_optimizer, update_average
+from imgcal.training.run import Best, Pending, Run
 from imgcal.training.state import TrainingState
-from imgcal.training.task import Loss
 
 # Steps until a GPU is asked for the numbers of the first: asking waits for it. A CPU has them at once.
 LAG = 50
@@ -76,6 +77,7 @@ def _take_steps(run: Run, told: Callbacks, should_stop: Callable[[], bool]) -> N
         extra = run.step % due.validate_every != 0
         if last or not extra:
             validate(run, told, extra)
+        last = last or finished(run, seconds)
         if last or run.step % due.save_every == 0:
             save(run, told)
 
@@ -86,16 +88,18 @@ def prepare(experiment: Experiment, state: TrainingState | None = None) -> Run:
     # Without a GPU, accelerate joins several processes only where it is told to stay on the CPU.
     accelerator = Accelerator(cpu=settings.device == "cpu" or not torch.accelerator.is_available())
     device, processes = accelerator.device, accelerator.num_processes
-    if settings.batch_size % processes:
-        raise InputError(
-            f"training: batch_size: found {settings.batch_size}, expected a multiple of the {processes} processes"
-        )
-    batch_size = settings.batch_size // processes
+    batch_size = _at_once(settings, processes)
     weights = torch.Generator().manual_seed(settings.seed)
     task = experiment.make_task(device, batch_size, weights, fresh=state is None)
+    freeze(task.network, experiment.optimizer.freeze)
+    learning(task.network)
+    if settings.channels_last:
+        task.network.to(memory_format=torch.channels_last)
     seed = settings.seed * 4096 + accelerator.process_index
     optimizer = make_optimizer(task.network, experiment.optimizer)
     average = None if experiment.optimizer.ema is None else make_average(task.network)
+    if settings.compile:
+        task.network.compile()
     run = Run(
         experiment=experiment,
         accelerator=accelerator,
@@ -114,25 +118,44 @@ def prepare(experiment: Experiment, state: TrainingState | None = None) -> Run:
     return run
 
 
+def _at_once(settings: TrainingConfig, processes: int) -> int:
+    """How much of a batch a process shows to its network at once."""
+    parts = processes * settings.accumulate
+    if settings.batch_size % parts:
+        of = f"the {processes} processes" + ("" if settings.accumulate == 1 else f" and {settings.accumulate} parts")
+        raise InputError(f"training: batch_size: found {settings.batch_size}, expected a multiple of {of}")
+    return settings.batch_size // parts
+
+
 def train_step(run: Run) -> None:
     """Take one step; only what makes the batch waits for the device, and every `LAG` steps `check_finite`."""
     if len(run.pending) >= (1 if run.accelerator.device.type == "cpu" else LAG):
         check_finite(run)
-    before = run.generator.get_state()
-    batch = run.task.batch(run.batch_size, run.generator)
+    parts = run.experiment.training.accumulate
     run.optimizer.zero_grad(set_to_none=True)
-    with drawing_from(*run.dropout), autocast(run):
-        answer = run.task.predict(run.network, batch)
-    loss = run.task.loss(answer, batch, run.step)
-    run.accelerator.backward(loss.total)
+    before, rows = [], []
+    for part in range(parts):
+        before.append(run.generator.get_state())
+        with nullcontext() if part == parts - 1 else run.accelerator.no_sync(run.network):
+            rows.append(_backward(run, parts))
     limit = run.experiment.optimizer.clip
     norm = torch.nn.utils.clip_grad_norm_(run.plain.parameters(), float("inf") if limit is None else limit)
     run.optimizer.step()
     run.step += 1
     if run.average is not None and run.experiment.optimizer.ema is not None:
         update_average(run.average, run.plain, run.step, run.experiment.optimizer.ema)
-    run.pending.append(Pending(run.step, before, torch.stack((loss.total.detach(), norm.detach()))))
-    _account(run, loss)
+    run.pending.append(Pending(run.step, before, torch.stack((*(row["loss"] for row in rows), norm.detach()))))
+    _account(run, rows)
+
+
+def _backward(run: Run, parts: int) -> dict[str, Tensor]:
+    """Add the gradient of one part of a batch; returns its loss and other numbers by name, () each."""
+    batch = run.task.batch(run.batch_size, run.generator)
+    with drawing_from(*run.dropout), autocast(run):
+        answer = run.task.predict(run.network, batch)
+    loss = run.task.loss(answer, batch, run.step)
+    run.accelerator.backward(loss.total / parts)
+    return {"loss": loss.total.detach(), **loss.means}
 
 
 def autocast(run: Run) -> torch.autocast:
@@ -155,12 +178,13 @@ def check_finite(run: Run) -> None:
     if all(finite):
         return
     first = finite.index(False)
+    *losses, norm = numbers[first].tolist()
+    part = next((part for part, loss in enumerate(losses) if not math.isfinite(loss)), len(losses) - 1)
     generator = torch.Generator(run.accelerator.device)
-    generator.set_state(pending[first].generator)
+    generator.set_state(pending[first].generators[part])
     batch = run.task.batch(run.batch_size, generator)
-    several = run.accelerator.num_processes > 1
-    loss, norm = numbers[first].tolist()
-    raise DivergedError(pending[first].step, loss, norm, batch, run.accelerator.process_index if several else None)
+    process = run.accelerator.process_index if run.accelerator.num_processes > 1 else None
+    raise DivergedError(pending[first].step, losses[part], norm, batch, process)
 
 
 @torch.no_grad()
@@ -176,17 +200,36 @@ def validation(run: Run, network: nn.Module) -> dict[str, float]:
     try:
         return run.task.validate(predict)
     finally:
-        network.train(was_training)
+        if was_training:
+            learning(network)
 
 
 def validate(run: Run, told: Callbacks, extra: bool) -> None:
     """Tell the errors of the weights as they would be the result; see `_tell`."""
     check_finite(run)
-    if not run.accelerator.is_main_process:
-        return
-    found = validation(run, run.best_weights)
-    if found:
-        _tell(run, told, {"step": run.step, **found}, extra)
+    row = {}
+    if run.accelerator.is_main_process and (found := validation(run, run.candidate)):
+        row = {"step": run.step, **found}
+        _tell(run, told, row, extra)
+    if run.experiment.training.patience is not None and not extra:
+        _keep_best(run, row)
+
+
+def _keep_best(run: Run, row: dict[str, Any]) -> None:
+    """Remember the weights if they are the best so far; all processes must call this together, the main one decides."""
+    judged = run.task.judged
+    if run.accelerator.is_main_process and judged not in row:
+        raise InputError(f"training: patience: found no {judged} to go by, expected validation_rigs to be 1 or more")
+    error = row.get(judged, 0.0)
+    if run.accelerator.num_processes > 1:
+        error = float(broadcast(torch.tensor(error, dtype=torch.float64, device=run.accelerator.device)))
+    if run.best is None:
+        run.best = Best(make_average(run.candidate), row, error)
+    elif error < run.best.error:
+        run.best.network.load_state_dict(run.candidate.state_dict())
+        run.best.metrics, run.best.error, run.best.since = row, error, 0
+    else:
+        run.best.since += 1
 
 
 def save(run: Run, told: Callbacks) -> None:
@@ -195,6 +238,8 @@ def save(run: Run, told: Callbacks) -> None:
     state = state_of(run)
     if run.accelerator.is_main_process:
         metrics = {name: value for name, value in run.latest.items() if name != "lr"} | {"seconds": run.seconds}
+        if run.best is not None:
+            metrics |= run.best.metrics
         told.on_checkpoint(run, state, run.task.result(run.best_weights, metrics))
 
 
@@ -207,14 +252,17 @@ def progress(run: Run, seconds: float) -> float:
 
 
 def finished(run: Run, seconds: float) -> bool:
-    """Tell whether the run came to its end."""
-    return progress(run, seconds) >= 1
+    """Tell whether the run came to its end, or gets no better."""
+    patience = run.experiment.training.patience
+    exhausted = run.best is not None and patience is not None and run.best.since >= patience
+    return exhausted or progress(run, seconds) >= 1
 
 
-def _account(run: Run, loss: Loss) -> None:
-    """Keep what the log and the schedule will want to know."""
-    total = loss.total.detach()
-    run.window.append({"loss": total, **loss.means})
+def _account(run: Run, rows: list[dict[str, Tensor]]) -> None:
+    """Keep what the log and the schedule will want to know: means over the parts of a batch."""
+    row = rows[0] if len(rows) == 1 else {name: torch.stack([part[name] for part in rows]).mean() for name in rows[0]}
+    total = row["loss"]
+    run.window.append(row)
     if run.experiment.schedule.kind != "plateau":
         return
     added = torch.stack((total, torch.ones_like(total)))

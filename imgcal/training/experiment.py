@@ -15,41 +15,42 @@ Spread = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Positive = Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1, le=10**9)]
+Rates = Annotated[dict[str, Positive], Field(max_length=64)]
+Betas = Annotated[list[Annotated[float, Field(ge=0, lt=1)]], Field(min_length=2, max_length=2)]
+Names = Annotated[list[str], Field(max_length=64)]
 
 
 class PaperRow(StrictModel):
     """Where the paper reports this experiment, and its result."""
 
-    table: str
-    row: Count
-    re_px: Positive | None = None
+    table: str  # of the paper: "1" or "ablation"
+    row: Count  # of the table, from 1
+    re_px: Positive | None = None  # what the paper reports
 
 
 class OptimizerConfig(StrictModel):
     """Adam or AdamW with a learning rate for each group of parameters."""
 
-    kind: Literal["adam", "adamw"] = "adamw"
-    lr: Positive = 1e-3
-    learning_rates: dict[str, Positive] = Field(
-        default={}, max_length=64
-    )  # by group of the network (encoder, trunk, heads), instead of `lr`
-    betas: Annotated[list[Annotated[float, Field(ge=0, lt=1)]], Field(min_length=2, max_length=2)] = Field(
-        default=[0.9, 0.99]
-    )
+    kind: Literal["adam", "adamw"] = "adamw"  # the algorithm
+    lr: Positive = 1e-3  # learning rate at its highest
+    learning_rates: Rates = Field(default={})  # by group of the network (encoder, heads, trunk), instead of `lr`
+    betas: Betas = Field(default=[0.9, 0.99])  # decays of the means of gradients and of their squares
     weight_decay: Spread = 0.0  # of matrices only
     clip: Positive | None = 1.0  # largest norm of the gradient
     ema: Annotated[float, Field(gt=0, lt=1)] | None = 0.999  # decay of the running mean of weights that is the result
+    freeze: Names = Field(default=[])  # groups of the network that keep the weights they begin with
+    layer_decay: Annotated[float, Field(gt=0, le=1)] | None = None  # rate of a timm layer relative to the one after it
 
 
 class ScheduleConfig(StrictModel):
     """How learning rates go: warmup and cosine to zero over the whole run, a plateau, or constant."""
 
-    kind: Literal["cosine", "plateau", "constant"] = "cosine"
+    kind: Literal["cosine", "plateau", "constant"] = "cosine"  # of the rates; plateau: down when the loss stays
     warmup: Fraction = 0.02  # cosine: part of the run
     final: Fraction = 0.0  # cosine: part of the learning rate that is left at the end
     every: Count = 100  # plateau: steps over which the loss is averaged before it is judged
     patience: Annotated[int, Field(ge=0, le=10**9)] = 10  # plateau: judgements without improvement
-    factor: Annotated[float, Field(gt=0, lt=1)] = 0.5  # plateau
+    factor: Annotated[float, Field(gt=0, lt=1)] = 0.5  # plateau: what learning rates are multiplied by
     threshold: Fraction = 1e-3  # plateau: relative improvement that counts
 
 
@@ -58,16 +59,21 @@ class TrainingConfig(StrictModel):
 
     steps: Count | None = None  # the run ends after this many steps ...
     minutes: Positive | None = None  # ... or minutes of training, whichever comes first
-    batch_size: Annotated[int, Field(ge=1, le=2**16)] = 64  # rigs a step, over all processes
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    batch_size: Annotated[int, Field(ge=1, le=2**16)] = 64  # rigs (images, ...) a step, over all processes
+    accumulate: Count = 1  # parts of a batch that are shown one after the other: less memory, gradients averaged
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0  # of weights, data and dropout
     precision: Literal["float32", "bf16"] = "float32"  # of the encoder and trunk; geometry is always float32
-    device: Literal["auto", "cpu"] = "auto"
-    threads: Annotated[int, Field(ge=1, le=256)] | None = None  # of the CPU; None = as the environment says
-    init_from: str | None = None  # a checkpoint to start the weights from
-    log_every: Count = 50  # steps
-    validate_every: Count = 500  # steps
-    validation_rigs: Annotated[int, Field(ge=0, le=10**6)] = 512  # 0 = no validation
-    save_every: Count = 500  # steps
+    device: Literal["auto", "cpu"] = "auto"  # auto: a GPU if there is one
+    threads: Annotated[int, Field(ge=1, le=256)] | None = None  # of the CPU; null = as the environment says
+    compile: bool = False  # torch.compile of the network: a minute at the start, fewer launches on a GPU
+    channels_last: bool = False  # memory order of convolutions' weights: faster on a GPU
+    tf32: bool = False  # let a GPU round float32 matrix products to TF32
+    init_from: str | None = None  # weights to start from: a file, the folder of a run, or the name of a shipped network
+    log_every: Count = 50  # steps between two rows of metrics
+    validate_every: Count = 500  # steps between two validations
+    validation_rigs: Annotated[int, Field(ge=0, le=10**6)] = 512  # rigs (images, ...) to validate on; 0 = none
+    patience: Count | None = None  # the run ends after so many validations without improvement; the best is the result
+    save_every: Count = 500  # steps between two states to resume from
 
     @model_validator(mode="after")
     def _ends(self) -> TrainingConfig:
@@ -79,9 +85,9 @@ class TrainingConfig(StrictModel):
 class Experiment(StrictModel, ABC):
     """What every experiment file holds; a subclass for each task says what is trained, and on what."""
 
-    format: Literal["imgcal-experiment/1"]
-    name: Annotated[str, Field(min_length=1, max_length=200)]
-    description: Annotated[str, Field(max_length=10_000)] = ""
+    format: Literal["imgcal-experiment/1"]  # version of the file
+    name: Annotated[str, Field(min_length=1, max_length=200)]  # of the experiment
+    description: Annotated[str, Field(max_length=10_000)] = ""  # for people
     paper: PaperRow | None = None
     task: str  # what the network is trained for
     optimizer: OptimizerConfig = OptimizerConfig()

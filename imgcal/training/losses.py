@@ -52,12 +52,12 @@ class PaperLoss(StrictModel):
 class ExtraLoss(StrictModel):
     """Weights of what the paper tried as well and found less effective; 0 = off."""
 
-    log_cosh: Weight = 0.0
-    distortion: Weight = 0.0
-    focal_ratio: Weight = 0.0
-    principal_point: Weight = 0.0
-    large_focal: Weight = 0.0
-    l1: Weight = 0.0
+    log_cosh: Weight = 0.0  # of log cosh of the differences of a camera's 21 numbers
+    distortion: Weight = 0.0  # of the absolute distortion coefficients
+    focal_ratio: Weight = 0.0  # of the squared difference of fx and fy
+    principal_point: Weight = 0.0  # of the squared distance of the principal point from the image's centre
+    large_focal: Weight = 0.0  # of 1 / (fx + fy)
+    l1: Weight = 0.0  # of the network's absolute parameters
 
 
 class RefinedLoss(StrictModel):
@@ -70,7 +70,7 @@ class RefinedLoss(StrictModel):
 class LossConfig(StrictModel):
     """The block `loss` of an experiment file."""
 
-    kind: Literal["robust", "paper"] = "robust"
+    kind: Literal["robust", "paper"] = "robust"  # our own preset, or the paper's
     robust: RobustLoss = RobustLoss()
     paper: PaperLoss = PaperLoss()
     extra: ExtraLoss = ExtraLoss()

@@ -29,21 +29,19 @@ def make_optimizer(network: nn.Module, config: OptimizerConfig) -> torch.optim.O
         InputError: a learning rate for a group that the network does not have.
     """
     groups = named_groups(network)
-    for name in config.learning_rates:
-        if name not in groups:
-            hint = nearest(name, groups) or f", expected one of {', '.join(groups)}"
-            raise InputError(f"optimizer: learning_rates: found the unknown group {name}{hint}")
+    _check_names(config.learning_rates, groups, "learning_rates")
+    scales = layer_scales(network, config.layer_decay)
     settings = []
     for name, parameters in groups.items():
-        lr = config.learning_rates.get(name, config.lr)
-        for matrices in (True, False):
-            members = [p for p in parameters if (p.ndim > 1) == matrices]
-            if members:
-                decay = config.weight_decay if matrices else 0.0
-                settings.append({"params": members, "name": name, "lr": lr, "initial_lr": lr, "weight_decay": decay})
-    kinds = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}
+        base = config.learning_rates.get(name, config.lr)
+        kinds = {(scales.get(p, 1.0), p.ndim > 1): None for p in parameters}
+        for scale, matrices in sorted(kinds, reverse=True):
+            members = [p for p in parameters if (scales.get(p, 1.0), p.ndim > 1) == (scale, matrices)]
+            lr, decay = base * scale, config.weight_decay if matrices else 0.0
+            settings.append({"params": members, "name": name, "lr": lr, "initial_lr": lr, "weight_decay": decay})
+    optimizers = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}
     first, second = config.betas
-    return kinds[config.kind](settings, betas=(first, second), fused=True)
+    return optimizers[config.kind](settings, betas=(first, second), fused=True)
 
 
 def named_groups(network: nn.Module) -> dict[str, list[nn.Parameter]]:
@@ -54,6 +52,60 @@ def named_groups(network: nn.Module) -> dict[str, list[nn.Parameter]]:
     known = {id(p) for parameters in named.values() for p in parameters}
     rest = [p for p in network.parameters() if p.requires_grad and id(p) not in known]
     return {name: parameters for name, parameters in {**named, "rest": rest}.items() if parameters}
+
+
+def freeze(network: nn.Module, names: Iterable[str]) -> None:
+    """Let groups of a network keep their weights.
+
+    Raises:
+        InputError: an unknown group, or nothing is left to train.
+    """
+    groups, names = named_groups(network), tuple(names)
+    _check_names(names, groups, "freeze")
+    for name in names:
+        for parameter in groups[name]:
+            parameter.requires_grad_(False)
+    if not any(parameter.requires_grad for parameter in network.parameters()):
+        raise InputError(f"optimizer: freeze: found {', '.join(names)}, expected something to be left to train")
+
+
+def learning(network: nn.Module) -> nn.Module:
+    """Put a network into training mode, but frozen layers of batch normalization: their running means are weights."""
+    network.train()
+    for module in network.modules():
+        own = list(module.parameters(recurse=False))
+        if isinstance(module, nn.modules.batchnorm._BatchNorm) and own and not any(p.requires_grad for p in own):
+            module.eval()
+    return network
+
+
+def layer_scales(network: nn.Module, decay: float | None) -> dict[nn.Parameter, float]:
+    """Factor of the learning rate of each parameter of the timm encoders within a network: decay^(layers after it).
+
+    Raises:
+        InputError: there is no such encoder.
+    """
+    if decay is None:
+        return {}
+    encoders: list[Any] = [module for module in network.modules() if hasattr(module, "group_matcher")]
+    if not encoders:
+        raise InputError(f"optimizer: layer_decay: found {decay:g}, but no encoder of timm in the network")
+    from timm.models._manipulate import group_with_matcher
+
+    scales: dict[nn.Parameter, float] = {}
+    for encoder in encoders:
+        named = dict(encoder.named_parameters())
+        layers = group_with_matcher(iter(named.items()), encoder.group_matcher(coarse=False), reverse=True)
+        last = max(layers.values())
+        scales |= {parameter: decay ** (last - layers[name]) for name, parameter in named.items()}
+    return scales
+
+
+def _check_names(names: Iterable[str], groups: Iterable[str], key: str) -> None:
+    for name in names:
+        if name not in groups:
+            hint = nearest(name, groups) or f", expected one of {', '.join(groups)}"
+            raise InputError(f"optimizer: {key}: found the unknown group {name}{hint}")
 
 
 class Schedule:
@@ -136,4 +188,8 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: dict[str, Tenso
         index, name = key.split(".", 1)
         state.setdefault(int(index), {})[name] = value
     groups = [{**group, "betas": tuple(group["betas"])} for group in settings]
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    for number, entry in state.items():  # in the parameter's memory order, as the optimizer's own are
+        like = parameters[number]
+        entry |= {n: torch.empty_like(like).copy_(t) for n, t in entry.items() if t.shape == like.shape and t.ndim}
     optimizer.load_state_dict({"state": state, "param_groups": groups})

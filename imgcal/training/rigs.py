@@ -27,13 +27,13 @@ Passes = tuple[Prediction, ...]
 
 
 class RigExperiment(Experiment, NetworkSpec):
-    """A network that says where a rig's cameras are: the blocks of `NetworkSpec`, and what it learns from."""
+    """A network that says what a whole rig is, from what its cameras see of the object."""
 
     model_config = ConfigDict(extra="forbid")
 
-    task: Literal["rig"] = "rig"
-    rig: str  # shipped name or path
-    object: str  # shipped name or path
+    task: Literal["rig"] = "rig"  # what the network says
+    rig: str  # factory rig: shipped name or path
+    object: str  # calibration object: shipped name or path
     corruption: Corruption = Corruption()  # what goes wrong in the views during training
     loss: LossConfig = LossConfig()
 

@@ -20,8 +20,18 @@ class Pending:
     """A step whose numbers nobody has looked at."""
 
     step: int  # steps taken, this one included
-    generator: Tensor  # state of the data's generator before it
-    numbers: Tensor  # (2,) loss, norm of its gradient
+    generators: list[Tensor]  # states of the data's generator before each part of its batch
+    numbers: Tensor  # losses of the parts, norm of the gradient
+
+
+@dataclass
+class Best:
+    """The weights that did best in validation, where `training.patience` asks for them."""
+
+    network: nn.Module
+    metrics: dict[str, Any]  # of the validation: step, errors by name
+    error: float  # that of the task's `judged`
+    since: int = 0  # validations that were no better
 
 
 @dataclass
@@ -38,7 +48,7 @@ class Run:
     average: nn.Module | None  # running mean of the weights
     generator: torch.Generator  # of this process's data
     dropout: tuple[torch.Generator, ...]  # what its layers draw from: one on the CPU, one on another device
-    batch_size: int  # of this process
+    batch_size: int  # of this process, at once
     step: int = 0
     elapsed: float = 0.0  # s, of all sessions until this one began
     began: float = field(default_factory=lambda: monotonic())
@@ -47,6 +57,7 @@ class Run:
     metrics: dict[str, Any] = field(default_factory=dict)  # the latest of each name that were due
     latest: dict[str, Any] = field(default_factory=dict)  # the latest of each name
     pending: list[Pending] = field(default_factory=list)
+    best: Best | None = None
 
     @property
     def seconds(self) -> float:
@@ -54,6 +65,11 @@ class Run:
         return self.elapsed + monotonic() - self.began
 
     @property
-    def best_weights(self) -> nn.Module:
-        """The network that is the result: the running mean where there is one."""
+    def candidate(self) -> nn.Module:
+        """The network as it is judged: the running mean where there is one."""
         return self.plain if self.average is None else self.average
+
+    @property
+    def best_weights(self) -> nn.Module:
+        """The network that is the result: the candidate, or the best one so far."""
+        return self.candidate if self.best is None else self.best.network

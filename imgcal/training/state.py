@@ -19,7 +19,8 @@ FORMAT = "imgcal-training/1"
 
 # What may differ between a run and its continuation: how long it takes and what it tells, not what it computes.
 FREE = {("name",), ("description",), ("paper",)} | {
-    ("training", name) for name in ("steps", "minutes", "log_every", "validate_every", "validation_rigs", "save_every")
+    ("training", name)
+    for name in ("steps", "minutes", "log_every", "validate_every", "validation_rigs", "patience", "save_every")
 }
 
 
@@ -27,8 +28,8 @@ FREE = {("name",), ("description",), ("paper",)} | {
 class TrainingState:
     """Everything that the rest of a run depends on."""
 
-    tensors: dict[str, dict[str, Tensor]]  # by part: network, average, optimizer, random, window
-    values: dict[str, Any]  # plain: step, elapsed, processes, settings of the optimizer, schedule, judged, metrics
+    tensors: dict[str, dict[str, Tensor]]  # by part: network, average, best, optimizer, random, window
+    values: dict[str, Any]  # plain: step, elapsed, processes, optimizer's settings, schedule, judged, metrics, best
     experiment: Experiment
 
 

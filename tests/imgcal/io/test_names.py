@@ -9,7 +9,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from imgcal.errors import InputError
-from imgcal.io.names import LONGEST_NAME, check_regular, find_file, is_file_name, natural_key, nearest, title_of
+from imgcal.io.names import (
+    LONGEST_NAME,
+    MODEL,
+    check_regular,
+    find_file,
+    is_file_name,
+    model_file,
+    model_name,
+    natural_key,
+    nearest,
+    title_of,
+)
 
 
 def test_numbers_in_names_count() -> None:
@@ -80,3 +91,17 @@ def test_what_is_nowhere_is_told_with_what_there_is(tmp_path: Path) -> None:
         find_file("O1O", "rigs", ".yaml")
     with pytest.raises(InputError, match="found a folder"):
         find_file(tmp_path, "rigs", ".yaml")
+
+
+def test_networks_are_files_folders_of_runs_or_shipped_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    run = tmp_path / "runs" / "one"
+    run.mkdir(parents=True)
+    with pytest.raises(InputError, match=f"one: found a folder without {MODEL}"):
+        model_file(run)
+    (run / MODEL).touch()
+    assert model_file(run) == model_file(run / MODEL) == run / MODEL
+    assert model_name(run / MODEL) == "one" and model_name(Path("a/b.safetensors")) == "b"
+    assert model_file("points-O10-cube8").is_file()
+    assert model_name(model_file("points-O10-cube8")) == "points-O10-cube8"
+    assert model_file("nothing") == Path("nothing")  # who reads it says what is wrong

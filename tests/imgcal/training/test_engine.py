@@ -1,5 +1,6 @@
 import copy
 import json
+import re
 import resource
 
 import pytest
@@ -147,6 +148,17 @@ def test_time_moves_the_schedule_and_ends_the_run(experiment, tmp_path, monkeypa
     rates = [row["lr"] for row in rows]
     assert rates[1] == max(rates) and rates[-1] < 0.01 * rates[1]
     assert finished(run, 61.0) and progress(run, 30.0) == 0.5
+
+
+def test_without_a_terminal_there_is_a_line_a_minute_and_one_at_the_end(line, tmp_path, monkeypatch, capsys):
+    clock = iter(range(0, 10**6, 7))
+    monkeypatch.setattr("imgcal.training.run.monotonic", lambda: float(next(clock)))
+    run = train(line("training.steps=null", "training.minutes=5", "training.log_every=3"), tmp_path)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[-1].startswith(f"step {run.step}  error ") and "left" not in lines[-1]
+    told = [line for line in lines if line.endswith("min left")]
+    assert 3 <= len(told) <= 4 and re.search(r"  2[0-3] %, 4 min left$", told[0])
+    assert len(lines) == len(told) + 2
 
 
 def test_a_resumed_clock_goes_on(experiment, tmp_path):

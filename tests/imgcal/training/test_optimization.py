@@ -2,6 +2,7 @@ import copy
 import math
 
 import pytest
+import timm
 import torch
 from torch import nn
 
@@ -10,6 +11,8 @@ from imgcal.training.experiment import OptimizerConfig, ScheduleConfig
 from imgcal.training.optimization import (
     Schedule,
     cosine,
+    freeze,
+    learning,
     make_average,
     make_optimizer,
     optimizer_settings,
@@ -54,6 +57,32 @@ def test_every_trainable_parameter_has_the_rate_of_its_group():
 def test_an_unknown_group_is_named():
     with pytest.raises(InputError, match="unknown group head, nearest: heads"):
         make_optimizer(Grouped(), OptimizerConfig(learning_rates={"head": 0.1}))
+
+
+def test_frozen_batch_normalization_keeps_its_means():
+    network = Grouped()
+    freeze(network, ["rest"])
+    assert learning(network).training and not network.norm.training and network.head.training
+    assert not network.norm.weight.requires_grad and network.head.weight.requires_grad
+    freeze(other := Grouped(), ["heads"])
+    assert learning(other).norm.training
+
+
+@pytest.mark.parametrize("name", ["vit_tiny_patch16_224", "resnet18"])
+def test_layers_near_the_images_learn_more_slowly(name):
+    small = {"embed_dim": 12, "depth": 2, "num_heads": 2} if name.startswith("vit") else {"layers": (1, 1, 1, 1)}
+    network = Grouped()
+    network.encoder = timm.create_model(name, num_classes=0, **small)
+    optimizer = make_optimizer(network, OptimizerConfig(lr=0.1, layer_decay=0.5, learning_rates={"encoder": 0.2}))
+    rates = {id(p): group["lr"] for group in optimizer.param_groups for p in group["params"]}
+    found = [rates[id(p)] for p in network.encoder.parameters()]
+    assert found == sorted(found) or name.startswith("vit")
+    assert min(found) < max(found) <= 0.2 and all(math.log2(0.2 / rate) % 1 == 0 for rate in found)
+    assert rates[id(next(network.encoder.parameters()))] == min(found)
+    assert rates[id(network.head.weight)] == 0.1
+    assert set(rates) == {id(p) for p in network.parameters()}
+    with pytest.raises(InputError, match=r"layer_decay: found 0\.5, but no encoder of timm"):
+        make_optimizer(Grouped(), OptimizerConfig(layer_decay=0.5))
 
 
 def test_cosine_with_warmup():

@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -60,28 +59,16 @@ def test_killed_and_resumed_is_bit_for_bit_uninterrupted(experiment, tmp_path):
     assert all(torch.equal(whole[name], killed[name]) for name in whole)
 
 
-def two_processes(tmp_path, *arguments):
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    processes = []
-    for rank in range(2):
-        ranks = {"RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": "2"}
-        where = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
-        command = [sys.executable, "-m", TOY, "train", str(tmp_path / "toy.yaml"), *arguments]
-        process = subprocess.Popen(command, env=environment(**ranks, **where), cwd=ROOT, stderr=subprocess.PIPE)
-        processes.append(process)
-    errors = [process.communicate(timeout=120)[1].decode() for process in processes]
-    assert [process.returncode for process in processes] == [0, 0], errors
-    return errors
-
-
-def test_two_processes_share_a_batch(tmp_path):
+def test_two_processes_of_torchrun_share_a_batch(tmp_path):
     (tmp_path / "toy.yaml").write_text(EXPERIMENT)
     out = tmp_path / "two"
-    errors = two_processes(tmp_path, "--out", str(out), "--set", "training.steps=60", "training.device=auto")
-    assert "2 x cpu" in errors[0]
-    assert errors[1] == ""  # only the main process speaks
+    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", TOY]
+    command = ["train", str(tmp_path / "toy.yaml"), "--out", str(out), "--set", "training.device=auto"]
+    run = subprocess.run(
+        [*launcher, *command], env=environment(), cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
+    assert run.returncode == 0, run.stderr
+    assert run.stderr.count("2 x cpu") == run.stderr.count("60 steps") == 1  # only the main process speaks
     rows = read_metrics(out / "metrics.jsonl")
     losses = [row["loss"] for row in rows if "loss" in row]
     assert len(losses) == 6 and losses[-1] < losses[0]

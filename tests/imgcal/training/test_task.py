@@ -1,89 +1,13 @@
-"""The engine knows nothing of rigs: a task of its own, a line through points, is trained, stopped and continued."""
-
-from dataclasses import dataclass
-from typing import Literal
+"""The engine knows nothing of rigs: a task of its own is trained, stopped and continued."""
 
 import pytest
 import torch
-from torch import nn
 
 from imgcal.cli.training_folder import RESULT, train_in
 from imgcal.errors import InputError
-from imgcal.io import read_metrics, read_tensors, write_tensors
-from imgcal.training import Loss, Task, experiment_file
-from imgcal.training.experiment import Experiment
-
-EXPERIMENT = """
-format: imgcal-experiment/1
-name: line
-task: line
-slope: 3.0
-optimizer: {lr: 0.1, ema: 0.9}
-training: {steps: 40, batch_size: 6, log_every: 10, validate_every: 20, save_every: 20, device: cpu}
-"""
-
-
-class LineExperiment(Experiment):
-    """Where a line is."""
-
-    task: Literal["line"]
-    slope: float
-
-    def make_task(self, device, batch_size, weights, fresh):
-        return LineTask(self)
-
-
-@dataclass
-class Points:
-    x: torch.Tensor
-    y: torch.Tensor
-
-    def tensors(self):
-        return vars(self)
-
-
-class LineTask(Task):
-    unit, judged, headline = "points", "validation_slope", {"error": "error {:.2g}"}
-
-    def __init__(self, experiment):
-        self.slope, self.network = experiment.slope, nn.Linear(1, 1)
-        nn.init.zeros_(self.network.weight)
-        nn.init.zeros_(self.network.bias)
-
-    def batch(self, count, generator):
-        x = torch.randn(count, 1, generator=generator)
-        return Points(x, self.slope * x + 1)
-
-    def predict(self, network, batch):
-        return network(batch.x)
-
-    def loss(self, answer, batch, step):
-        error = (answer - batch.y).abs().mean()
-        return Loss(error, {"error": error.detach()})
-
-    def validate(self, predict):
-        x = torch.tensor([[0.0], [1.0]])
-        y = predict(Points(x, x))
-        return {"validation_slope": abs(float(y[1] - y[0]) - self.slope)}
-
-    def result(self, network, metrics):
-        return Line(network, metrics)
-
-
-@dataclass
-class Line:
-    network: nn.Module
-    metrics: dict
-
-    def save(self, path):
-        write_tensors(path, self.network.state_dict(), "line/1", {})
-
-
-@pytest.fixture
-def line(tmp_path, monkeypatch):
-    monkeypatch.setitem(experiment_file.KINDS, "line", LineExperiment)
-    (tmp_path / "line.yaml").write_text(EXPERIMENT)
-    return lambda *changes: experiment_file.load_experiment(tmp_path / "line.yaml", changes)
+from imgcal.io import read_metrics, read_tensors
+from imgcal.training import experiment_file
+from tests.imgcal.training.line import EXPERIMENT
 
 
 def test_another_task_is_trained_and_continued(line, tmp_path, capsys):

@@ -1,0 +1,147 @@
+"""What the keys of `training` and `optimizer` do to a run; the task is a line, which costs nothing."""
+
+from functools import partialmethod
+
+import pytest
+import torch
+from torch import nn
+
+from imgcal.errors import InputError
+from imgcal.training import Callbacks, engine
+from tests.imgcal.training import line as of_line
+
+
+class Watching(Callbacks):
+    """Keeps the last state and result, and what was told of steps."""
+
+    def __init__(self):
+        self.steps, self.state, self.result, self.rows = [], None, None, []
+
+    def on_step(self, run, seconds):
+        self.steps.append(run.step)
+
+    def on_metrics(self, run, row, due):
+        self.rows.append(row)
+
+    def on_checkpoint(self, run, state, result):
+        tensors = {part: {name: t.clone() for name, t in named.items()} for part, named in state.tensors.items()}
+        self.state = type(state)(tensors, dict(state.values), state.experiment)
+        self.result = {name: tensor.clone() for name, tensor in result.network.state_dict().items()}
+        self.metrics = result.metrics
+
+
+def stopping_at(step):
+    asked = iter(range(1, 10**6))
+    return lambda: next(asked) == step
+
+
+def test_every_step_is_told(line):
+    told = Watching()
+    engine.train(line("training.steps=7"), told)
+    assert told.steps == list(range(1, 8))
+
+
+def test_parts_of_a_batch_have_the_gradient_of_their_mean(line):
+    setup = line("training.accumulate=3", "optimizer.ema=null", "optimizer.clip=null", "schedule.kind=constant")
+    run = engine.prepare(setup)
+    assert run.batch_size == 2
+    twin, random = of_line.LineTask(setup), torch.Generator().manual_seed(0)
+    random.set_state(run.generator.get_state())
+    batches = [twin.batch(2, random) for _ in range(3)]
+    losses = torch.stack([twin.loss(twin.network(batch.x), batch, 0).total for batch in batches])
+    losses.mean().backward()
+    engine.train_step(run)
+    for mine, other in zip(run.plain.parameters(), twin.network.parameters(), strict=True):
+        torch.testing.assert_close(mine.grad, other.grad)
+    torch.testing.assert_close(run.window[0]["loss"], losses.mean().detach())
+    with pytest.raises(InputError, match="found 6, expected a multiple of the 1 processes and 4 parts"):
+        engine.prepare(line("training.accumulate=4"))
+
+
+def test_a_run_in_parts_of_batches_continues_exactly(line):
+    setup, whole, parts, rest = line("training.accumulate=2"), Watching(), Watching(), Watching()
+    engine.train(setup, whole)
+    engine.train(setup, parts, should_stop=stopping_at(13))
+    engine.train(setup, rest, parts.state)
+    assert all(torch.equal(whole.result[name], rest.result[name]) for name in whole.result)
+
+
+def test_the_part_that_is_not_finite_is_named(line, monkeypatch):
+    batch = of_line.LineTask.batch
+
+    def broken(self, count, generator):
+        made = batch(self, count, generator)
+        made.y[made.y > 9] = torch.inf  # some batches, whenever they are made
+        return made
+
+    monkeypatch.setattr(of_line.LineTask, "batch", broken)
+    with pytest.raises(engine.DivergedError) as caught:
+        engine.train(line("training.accumulate=3", "training.steps=300", "training.log_every=1000"))
+    assert caught.value.batch.y.isinf().any() and 1 < caught.value.step < 300
+
+
+ENDLESS = ("training.steps=1000", "training.validate_every=5", "training.save_every=5", "schedule.kind=constant")
+
+
+def test_a_run_that_gets_no_better_ends_with_the_best_weights(line, monkeypatch):
+    """The rate is so high that the line overshoots for ever."""
+    setup = line(*ENDLESS, "training.patience=4", "optimizer={lr: 0.8, ema: null}")
+    told, parts, rest = Watching(), Watching(), Watching()
+    run = engine.train(setup, told)
+    errors = {row["step"]: row["validation_slope"] for row in told.rows if "validation_slope" in row}
+    best = min(errors, key=errors.get)
+    assert run.step == best + 20 < 1000 and engine.finished(run, run.seconds)
+    assert errors[run.step] > errors[best] == told.metrics["validation_slope"] and told.metrics["step"] == best
+    assert abs(float(told.result["weight"]) - 3.0) == pytest.approx(errors[best], abs=1e-5)
+    engine.train(setup, parts, should_stop=stopping_at(best + 7))
+    again = engine.train(setup, rest, parts.state)
+    assert again.step == run.step and rest.metrics["step"] == best
+    assert all(torch.equal(told.result[name], rest.result[name]) for name in told.result)
+    engine.train(setup, rest, rest.state)  # ended is ended
+    assert rest.steps[-1] == run.step
+    monkeypatch.setattr(of_line.LineTask, "validate", lambda self, predict: {})
+    with pytest.raises(InputError, match="patience: found no validation_slope to go by"):
+        engine.train(setup)
+
+
+def test_a_compiled_network_trains_as_a_plain_one_and_is_saved_alike(line, monkeypatch):
+    monkeypatch.setattr(nn.Module, "compile", partialmethod(nn.Module.compile, backend="eager"))
+    plain, compiled = Watching(), Watching()
+    engine.train(line("training.steps=3"), plain)
+    run = engine.train(line("training.steps=3", "training.compile=true"), compiled)
+    assert run.plain._compiled_call_impl is not None
+    assert plain.result.keys() == compiled.result.keys()
+    for name in plain.result:
+        torch.testing.assert_close(plain.result[name], compiled.result[name])
+
+
+def test_another_memory_order_is_kept_over_a_continuation(line, monkeypatch):
+    class Convolution(of_line.LineTask):
+        def __init__(self, experiment):
+            super().__init__(experiment)
+            torch.manual_seed(1)
+            self.network = nn.Sequential(nn.Unflatten(1, (1, 1, 1)), nn.Conv2d(1, 2, 2, padding=1), nn.Flatten())
+            self.network.append(nn.Linear(8, 1))
+
+    monkeypatch.setattr(of_line, "LineTask", Convolution)
+    setup = line("training.channels_last=true", "optimizer.kind=adam")
+    whole, parts, rest = Watching(), Watching(), Watching()
+    engine.train(setup, whole)
+    engine.train(setup, parts, should_stop=stopping_at(13))
+    run = engine.train(setup, rest, parts.state)
+    weight = run.plain[1].weight
+    assert weight.is_contiguous(memory_format=torch.channels_last)
+    assert run.optimizer.state[weight]["exp_avg"].stride() == weight.stride()
+    assert all(torch.equal(whole.result[name], rest.result[name]) for name in whole.result)
+
+
+def test_frozen_groups_stay(line, monkeypatch):
+    monkeypatch.setattr(
+        nn.Linear, "parameter_groups", lambda self: {"slope": [self.weight], "offset": [self.bias]}, False
+    )
+    told = Watching()
+    engine.train(line("optimizer.freeze=[offset]"), told)
+    assert told.result["bias"] == 0 and told.result["weight"] != 0
+    for frozen, message in (("[ofset]", "unknown group ofset, nearest: offset"), ("[offset, slope]", "to be left to")):
+        with pytest.raises(InputError, match=f"optimizer: freeze: found .*{message}"):
+            engine.prepare(line(f"optimizer.freeze={frozen}"))
