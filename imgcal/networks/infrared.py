@@ -27,11 +27,11 @@ GEOMETRY = 6
 class InfraredConfig(StrictModel):
     """Which query network."""
 
-    encoder: Literal["cnn", "vit"] = "cnn"
+    encoder: Literal["cnn", "vit"] = "cnn"  # family of the encoder
     crop: Annotated[int, Field(ge=48, le=384, multiple_of=48)] = 96  # pixels, each way
     channels: Annotated[int, Field(ge=1, le=128)] = 16  # of the feature map and of the windows
     window: Annotated[int, Field(ge=4, le=64, multiple_of=2)] = 22  # cells, each way
-    blocks: Annotated[int, Field(ge=1, le=16)] = 3
+    blocks: Annotated[int, Field(ge=1, le=16)] = 3  # of attention: within a query, among fiducials
     keys: Annotated[int, Field(ge=1, le=32)] = 4  # weighted means over the fiducials beside the plain one
 
 
