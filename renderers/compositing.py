@@ -35,7 +35,9 @@ class Canvas(NamedTuple):
         return cls(like.new_zeros(batch, channels, *image_size), like.new_ones(batch, *image_size))
 
 
-def composite_windows(canvas: Canvas, alpha: Tensor, colours: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+def composite_windows(
+    canvas: Canvas, alpha: Tensor, colours: Tensor, rows: Tensor, columns: Tensor, light: Tensor | None = None
+) -> Tensor:
     """Composite windows front to back: every window adds ``transmittance * alpha * colour``. Changes ``canvas``.
 
     Memory is that of the windows plus the images; the loop runs over fiducials, the batch is vectorized.
@@ -46,6 +48,7 @@ def composite_windows(canvas: Canvas, alpha: Tensor, colours: Tensor, rows: Tens
         colours: (B, N, K) colour of each fiducial.
         rows: (B, N) first image row of each window.
         columns: (B, N) first image column of each window.
+        light: (B, N, h, w) what shines where it is not what hides: `transmittance * light * colour` is added.
 
     Returns:
         (B, N) sum of each fiducial's opacity over the pixels, as far as nothing nearer hides it.
@@ -61,9 +64,11 @@ def composite_windows(canvas: Canvas, alpha: Tensor, colours: Tensor, rows: Tens
     for n in range(count):
         at = first_pixel + index[:, n]
         # Indexing and accumulation save indices only: autograd keeps windows, never a copy of the images.
-        visible = transmittance[at] * alpha[:, n].flatten(1)  # (B, h*w)
+        passed = transmittance[at]
+        visible = passed * alpha[:, n].flatten(1)  # (B, h*w)
+        shining = visible if light is None else passed * light[:, n].flatten(1)
         transmittance.index_put_((at,), -visible, accumulate=True)
         window = index[:, None, n].expand(-1, channels, -1)
-        images.scatter_add_(2, window, visible[:, None] * colours[:, n, :, None])
+        images.scatter_add_(2, window, shining[:, None] * colours[:, n, :, None])
         seen.append(visible.sum(-1))
     return torch.stack(seen, dim=-1) if seen else alpha.new_zeros(batch, 0)

@@ -6,6 +6,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from renderers.spots import Spots
+
 
 def splat_reference(
     uv: Tensor,
@@ -72,6 +74,61 @@ def ellipse_reference(
         inside = (kernel_v / norm) @ inside @ (kernel_u / norm)
     height, width = image_size
     return inside.view(height, samples, width, samples).mean(dim=(1, 3))
+
+
+def blob_reference(
+    spot: Spots, image_size: tuple[int, int], *, blur: float, samples: int = 8, moments: int = 32
+) -> Tensor:
+    """Draw one blob with its surface and its smear by brute force: many sharp pictures, averaged, blurred, binned.
+
+    Args:
+        spot: without batch axes, N = 1; visible, before an empty ground.
+        image_size: Height and width.
+        blur: Standard deviation of the lens blur in pixels.
+        samples: Samples a pixel along each axis.
+        moments: Pictures along the path; a quarter of the points on the disc of confusion.
+
+    Returns:
+        (H, W) light.
+    """
+    v, u = (((torch.arange(n * samples, dtype=spot.uv.dtype) + 0.5) / samples - 0.5) for n in image_size)
+    grid = torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1) - spot.uv[0]
+    shifts = spot.uv.new_zeros(1, 2)
+    if spot.smear is not None:
+        time = (torch.arange(moments, dtype=u.dtype) + 0.5) / moments - 0.5
+        point = torch.arange(2 * moments, dtype=u.dtype)
+        turn, away = point * math.pi * (3 - math.sqrt(5)), ((point + 0.5) / len(point)).sqrt()  # Vogel's spiral
+        disc = torch.stack([away * turn.cos(), away * turn.sin()], dim=-1) * spot.smear.defocus[0]
+        disc = torch.cat([disc, -disc])
+        way = time[:, None] * spot.smear.path[0]
+        parts = [part if bool(part.any()) else shifts for part in (way, disc)]
+        shifts = (parts[0][:, None] + parts[1]).reshape(-1, 2)
+    light = torch.zeros_like(grid[..., 0])
+    for shift in shifts:
+        light += _sharp(grid - shift, spot) / len(shifts)
+    kernel_v, kernel_u = (torch.exp(-0.5 * ((x[:, None] - x) / blur) ** 2) for x in (v, u))
+    norm = math.sqrt(2 * math.pi) * blur * samples
+    blurred = (kernel_v / norm) @ light @ (kernel_u / norm)
+    height, width = image_size
+    return spot.intensity[0] * blurred.view(height, samples, width, samples).mean(dim=(1, 3))
+
+
+def _sharp(offset: Tensor, spot: Spots) -> Tensor:
+    """Brightness of a blob's surface at offsets (H, W, 2) from its centre."""
+    (uu, uv), (_, vv) = spot.shape[0]
+    upper = torch.stack([torch.stack([(uu - uv**2 / vv).sqrt(), uv / vv.sqrt()]), torch.stack([0 * uv, vv.sqrt()])])
+    x, y = (offset @ torch.linalg.inv(upper).mT).unbind(-1)
+    light = (x**2 + y**2 <= 1).to(offset.dtype)
+    surface = spot.surface
+    if surface is None:
+        return light
+    if surface.limb is not None:
+        light = light * (1 - surface.limb[0] * (1 - (1 - x**2 - y**2).clamp(min=0).sqrt()))
+    for at_x, at_y, radius, gain in () if surface.bumps is None else surface.bumps[0]:
+        light = light * (1 + gain * torch.exp(-((x - at_x) ** 2 + (y - at_y) ** 2) / (2 * radius**2)))
+    for normal_u, normal_v, far in surface.cuts[0]:
+        light = light * (offset[..., 0] * normal_u + offset[..., 1] * normal_v <= far)
+    return light
 
 
 def _pixel_integral(offset: Tensor, sigma: Tensor) -> Tensor:

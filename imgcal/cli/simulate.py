@@ -25,19 +25,21 @@ from imgcal.io import (
 )
 from imgcal.messages import shortened
 from imgcal.synthesis import (
+    DIFFICULTIES,
     Drift,
     FrameModel,
     PhysicalDrift,
     PoseRange,
     RelativeDrift,
     Truth,
-    simulate_frames,
+    simulate_shots,
     simulate_truth,
     true_detections,
 )
 from imgcal.types import FIDUCIAL_RADIUS, CalibrationObject, CameraRig
 from renderers import ClutterModel, SensorModel
 
+Level = Literal["clean", "low-light", "motion-blur", "clutter", "defocus", "combined", "half-hidden", "uneven"]
 WRITTEN = ("capture.yaml", "rig.yaml", "object.csv", "truth", "frames")
 
 MOST_SNAPSHOTS = 100_000
@@ -48,7 +50,8 @@ class Simulate:
     """Make a capture: one rig that has drifted from its factory calibration, seen through realistic infrared frames.
 
     Writes OUT/frames/<camera>/<snapshot>.png, the factory rig and the object beside them, and OUT/truth/ with the
-    drifted rig, the exact image points (labelled) and the object's poses.
+    drifted rig, the exact image points (labelled), the object's poses and how much of each marker is seen (seen.csv).
+    --difficulty makes frames that are hard: dim, blurred by motion, out of focus, cluttered, with half-hidden markers.
     Example: imgcal simulate --rig O10 --object asymmetric8 --out my_capture --snapshots 20 --kappa 0.05
     """
 
@@ -65,6 +68,7 @@ class Simulate:
     alpha_deg: tuple[float, float] = (0.0, 360.0)  #: roll of the rig
     marker_radius: float = 6.0  #: mm, for objects whose file gives no radius
     clutter: bool = True  #: reflections, false blobs, partly hidden markers
+    difficulty: Level | None = None  #: a named level; its light and clutter replace those of the options below
     sensor: SensorModel = field(default_factory=SensorModel)
     clutter_model: ClutterModel = field(default_factory=ClutterModel)
 
@@ -100,13 +104,16 @@ class Simulate:
         save_rig(rig, out / "rig.yaml")
         save_object(obj, out / "object.csv")
         _write_truth(truth, out / "truth")
-        model = FrameModel(self.sensor, self.clutter_model if self.clutter else None, self.marker_radius)
+        level = None if self.difficulty is None else DIFFICULTIES[self.difficulty]
+        model = FrameModel(self.sensor, self.clutter_model if self.clutter else None, self.marker_radius, level)
         for camera in rig.camera_names:
             (out / "frames" / camera).mkdir(parents=True)
-        frames = simulate_frames(truth, obj, model, generator)
-        for snapshot, images in enumerate(progress(frames, self.snapshots, "rendering frames")):
-            for camera, image in images.items():
+        shots, rows = simulate_shots(truth, obj, model, generator), ["snapshot,camera,fiducial,seen"]
+        for snapshot, shot in enumerate(progress(shots, self.snapshots, "rendering frames")):
+            for (camera, image), shares in zip(shot.frames.items(), shot.seen.tolist(), strict=True):
                 write_frame(out / "frames" / camera / f"{snapshot:05d}.png", image)
+                rows += [f"{snapshot:05d},{camera},{n},{share:.3f}" for n, share in enumerate(shares)]
+        write_text(out / "truth" / "seen.csv", "\n".join([*rows, ""]))
 
     def _drift(self) -> Drift | None:
         kinds: dict[str, Drift | None] = {

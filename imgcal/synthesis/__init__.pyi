@@ -1,14 +1,17 @@
-from .captures import FrameModel, Truth, simulate_frames, simulate_truth, true_detections
+from .captures import FrameModel, Shot, Truth, simulate_frames, simulate_shots, simulate_truth, true_detections
 from .colour_coding import LEVELS, ImageOptions, render_views
 from .corruption import Corrupted, Corruption
 from .crops import CropTruth, Scenes, host_generator, render_crops, sample_scenes
+from .difficulty import DIFFICULTIES, Difficulty
 from .rigs import Drift, PhysicalDrift, PoseRange, RelativeDrift, Snapshots, synthesize
 
 __all__ = [
+    "DIFFICULTIES",
     "LEVELS",
     "Corrupted",
     "Corruption",
     "CropTruth",
+    "Difficulty",
     "Drift",
     "FrameModel",
     "ImageOptions",
@@ -16,6 +19,7 @@ __all__ = [
     "PoseRange",
     "RelativeDrift",
     "Scenes",
+    "Shot",
     "Snapshots",
     "Truth",
     "host_generator",
@@ -23,6 +27,7 @@ __all__ = [
     "render_views",
     "sample_scenes",
     "simulate_frames",
+    "simulate_shots",
     "simulate_truth",
     "synthesize",
     "true_detections",

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import numpy as np
 import torch
@@ -12,10 +13,13 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from imgcal.geometry import RigidTransform
+from imgcal.synthesis.difficulty import Difficulty, behind_drapes
 from imgcal.synthesis.rigs import Drift, PoseRange, Snapshots, synthesize
 from imgcal.synthesis.spheres import sphere_images
 from imgcal.types import BlobFlag, CalibrationObject, CameraRig, Detections
 from renderers import ClutterModel, SensorModel, Spots, infrared_frames, sample_clutter
+
+Frames = dict[str, NDArray[np.uint8] | NDArray[np.uint16]]
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,7 @@ class FrameModel:
     sensor: SensorModel = SensorModel()
     clutter: ClutterModel | None = None
     marker_radius: float = 6.0  # mm, where the object's fiducials have no radius of their own
+    difficulty: Difficulty | None = None  # disturbs the frames; its clutter and its light replace those above
 
 
 def simulate_truth(
@@ -102,11 +107,26 @@ def simulate_volume(
     return Truth(true_rig, poses, seen.uv, seen.visible)
 
 
+@dataclass(frozen=True)
+class Shot:
+    """One simulated snapshot, and what its frames show of the markers."""
+
+    frames: Frames  # camera name -> (H, W)
+    seen: Tensor  # (C, N) share of each marker's area that is inside the frame and not hidden
+
+
 def simulate_frames(
     truth: Truth, obj: CalibrationObject, model: FrameModel, generator: torch.Generator
-) -> Iterator[dict[str, NDArray[np.uint8] | NDArray[np.uint16]]]:
+) -> Iterator[Frames]:
     """Render the frames of one snapshot after another: camera name -> (H, W)."""
-    rig = truth.rig
+    return (shot.frames for shot in simulate_shots(truth, obj, model, generator))
+
+
+def simulate_shots(
+    truth: Truth, obj: CalibrationObject, model: FrameModel, generator: torch.Generator
+) -> Iterator[Shot]:
+    """Render one snapshot after another, with the truth about what is hidden."""
+    rig, difficulty = truth.rig, model.difficulty
     radius = torch.full_like(obj.points[:, 0], model.marker_radius) if obj.radius is None else obj.radius
     for pose in range(len(truth.uv)):
         points = truth.rig_from_object[pose].apply(obj.points)
@@ -118,7 +138,12 @@ def simulate_frames(
             visible=projection.visible,
             depth=projection.depth,
         )
-        yield _frames(markers, rig, model, generator)
+        sensor, clutter = model.sensor, model.clutter
+        if difficulty is not None:
+            smear = difficulty.smear(rig, truth.rig_from_object[pose], obj.points, obj.radius, generator)
+            markers = difficulty.disguise(replace(markers, smear=smear), generator)
+            sensor, clutter = difficulty.sensor(sensor, generator), difficulty.clutter
+        yield _shot(markers, rig, sensor, clutter, generator)
 
 
 def true_detections(truth: Truth) -> Detections:
@@ -147,24 +172,26 @@ def true_detections(truth: Truth) -> Detections:
     return exact if truth.visible is None else exact.select(truth.visible.reshape(-1).numpy())
 
 
-def _frames(
-    markers: Spots, rig: CameraRig, model: FrameModel, generator: torch.Generator
-) -> dict[str, NDArray[np.uint8] | NDArray[np.uint16]]:
+def _shot(
+    markers: Spots, rig: CameraRig, sensor: SensorModel, model: ClutterModel | None, generator: torch.Generator
+) -> Shot:
     """Render one snapshot: cameras with images of the same size together."""
-    frames: dict[str, NDArray[np.uint8] | NDArray[np.uint16]] = {}
+    frames: Frames = {}
+    seen = torch.zeros_like(markers.intensity)
     sizes = [tuple(size) for size in rig.image_size.tolist()]
     for width, height in sorted(set(sizes)):
         cameras = [camera for camera, size in enumerate(sizes) if size == (width, height)]
-        some = Spots(
-            markers.uv[cameras].float(),
-            markers.shape[cameras].float(),
-            markers.intensity[cameras].float(),
-            markers.visible[cameras],
-            markers.depth[cameras].float(),
-        )
+        some = markers.of_each(itemgetter(cameras)).of_each(_single)
         clutter = None
-        if model.clutter is not None:
-            clutter = sample_clutter(model.clutter, some, (height, width), generator=generator)
-        rendered = infrared_frames(some, (height, width), model.sensor, clutter=clutter, generator=generator)
+        if model is not None:
+            clutter = sample_clutter(model, some, (height, width), generator=generator)
+            some = behind_drapes(some, clutter.drapes)
+        rendered = infrared_frames(some, (height, width), sensor, clutter=clutter, generator=generator)
+        seen[cameras] = rendered.seen.to(seen)
         frames |= {rig.camera_names[c]: frame for c, frame in zip(cameras, rendered.frames.numpy(), strict=True)}
-    return {name: frames[name] for name in rig.camera_names}
+    return Shot({name: frames[name] for name in rig.camera_names}, seen)
+
+
+def _single(values: Tensor) -> Tensor:
+    """Render in single precision."""
+    return values.float() if values.is_floating_point() else values

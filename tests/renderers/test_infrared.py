@@ -8,12 +8,10 @@ import torch
 from torch import Tensor
 
 from renderers import (
-    BlobRange,
     ClutterModel,
     SensorModel,
     Spots,
     ellipse_reference,
-    expose,
     infrared_frames,
     render_blobs,
     sample_clutter,
@@ -130,53 +128,6 @@ def test_half_of_a_marker_on_the_border_is_seen() -> None:
     assert light[30, 0] > 0.7
 
 
-@pytest.mark.parametrize(("bit_depth", "dtype"), [(8, torch.uint8), (12, torch.uint16), (16, torch.uint16)])
-@pytest.mark.parametrize("polarity", ["bright", "dark"])
-def test_levels_and_noise(bit_depth: int, dtype: torch.dtype, polarity: str) -> None:
-    full = 2**bit_depth - 1
-    sensor = SensorModel(
-        bit_depth=bit_depth,  # type: ignore[arg-type]
-        polarity=polarity,  # type: ignore[arg-type]
-        background=0.2,
-        contrast=0.5,
-        gradient=(0.1, -0.06),
-        read_noise=3.0,
-        shot_noise=4.0,
-    )
-    light = torch.zeros(4, 100, 200)
-    light[2:] = 1.0
-    frames = expose(light, sensor, generator=torch.Generator().manual_seed(3))
-    assert frames.dtype == dtype
-    levels = torch.from_numpy(frames.numpy().astype("float64"))
-    assert levels.max() <= full
-    for part, level in ((levels[:2], 0.2), (levels[2:], 0.7)):
-        level, sign = (level, 1) if polarity == "bright" else (1 - level, -1)
-        assert part.mean().item() == pytest.approx(level * full, abs=0.1)
-        across_u = part[..., -20:].mean() - part[..., :20].mean()
-        across_v = part[:, -10:].mean() - part[:, :10].mean()
-        assert across_u.item() == pytest.approx(sign * 0.1 * 180 / 199 * full, abs=0.5)
-        assert across_v.item() == pytest.approx(-sign * 0.06 * 90 / 99 * full, abs=0.5)
-        noise = (part[0] - part[1]).std().item() / math.sqrt(2)
-        assert noise == pytest.approx(math.sqrt(9 + 16 * level + 1 / 12), rel=0.05)
-
-
-def test_exposure_saturates() -> None:
-    light = torch.tensor([[0.0, 0.3, 0.6, 1.0]])
-    quiet = SensorModel(read_noise=0.0, background=0.1, contrast=0.5)
-    assert expose(light, quiet).tolist() == [[26, 64, 102, 153]]
-    assert expose(light, dataclasses.replace(quiet, exposure=2.0)).tolist() == [[51, 128, 204, 255]]
-    assert expose(light, dataclasses.replace(quiet, exposure=2.0, saturation=0.6)).tolist() == [[51, 128, 153, 153]]
-
-
-def test_hot_pixels_belong_to_the_camera() -> None:
-    sensor = SensorModel(hot_pixels=0.01, read_noise=0.0, background=0.0)
-    frames = expose(torch.zeros(3, 2, 50, 60), sensor)
-    assert (frames == 255).sum(dim=(-1, -2)).float().mean().item() == pytest.approx(30, abs=2)
-    assert torch.equal(frames[0], frames[1])
-    assert not torch.equal(frames[0, 0], frames[0, 1])
-    assert not torch.equal(frames, expose(torch.zeros(3, 2, 50, 60), dataclasses.replace(sensor, hot_pixel_seed=1)))
-
-
 def test_the_generator_decides_everything() -> None:
     markers = blobs(torch.rand(2, 4, 2, generator=torch.Generator().manual_seed(0)) * 60, 3.0)
 
@@ -187,38 +138,6 @@ def test_the_generator_decides_everything() -> None:
 
     assert torch.equal(frames(5), frames(5))
     assert not torch.equal(frames(5), frames(6))
-
-
-def test_clutter_is_where_it_says() -> None:
-    none = BlobRange(0, (1, 1), (1, 1), (1, 1))
-    model = ClutterModel(reflections=BlobRange(1, (4.0, 9.0), (2.0, 3.0), (0.5, 1.0)), blobs=none, occluded=0.0)
-    markers = blobs(torch.full((20, 1, 2), math.nan), 3.0)
-    clutter = sample_clutter(model, markers, SIZE, generator=torch.Generator().manual_seed(4))
-    light, _ = render_blobs(markers, SIZE, 0.7, clutter=clutter)
-    assert clutter.false_blobs.uv.shape == (20, 1, 2)
-    axes = torch.linalg.eigvalsh(clutter.false_blobs.shape).sqrt()
-    assert axes[..., 1].min() >= 4
-    assert axes[..., 1].max() <= 9
-    assert (axes[..., 1] / axes[..., 0]).min() >= 2 - 1e-4
-    inside = ((clutter.false_blobs.uv > 12) & (clutter.false_blobs.uv < torch.tensor([67.0, 51.0]))).all(-1)[:, 0]
-    assert inside.sum() >= 5
-    for one, uv in zip(light[inside], clutter.false_blobs.uv[inside, 0], strict=True):
-        assert (centroid(one) - uv).abs().max() < 0.003
-
-
-def test_occluders_cover_the_promised_part_of_each_marker() -> None:
-    markers = blobs(torch.full((30, 1, 2), 30.0), tilted(6.0, 4.0, 0.3).expand(30, 1, 2, 2).float())
-    seen = {}
-    for share in (0.1, 0.4, 0.7):
-        model = ClutterModel(occluded=1.0, occluded_diameter=(share, share))
-        clutter = sample_clutter(model, markers, SIZE, generator=torch.Generator().manual_seed(4))
-        assert clutter.occluders.visible.all()
-        _, seen[share] = render_blobs(markers, SIZE, 0.7, clutter=clutter)
-        torch.testing.assert_close(seen[share], seen[share][:1].expand(30, 1), atol=0.03, rtol=0)
-    assert 1 > seen[0.1].mean() > 0.9 > seen[0.4].mean() > 0.5 > seen[0.7].mean() > 0.1
-
-    never = sample_clutter(ClutterModel(occluded=0.0), markers, SIZE, generator=torch.Generator().manual_seed(4))
-    assert not never.occluders.visible.any()
 
 
 def test_unusable_arguments_are_named() -> None:
