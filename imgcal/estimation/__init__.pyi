@@ -44,6 +44,8 @@ from .moves import find_moves
 from .object_shape import SNAPSHOTS_TO_BEND, FiducialOffset, ShapeEvidence, offsets
 from .pose_initialization import initial_pose
 from .pose_support import ON_A_LINE, UndeterminedPosesError, require_poses
+from .rig_error import displaced, error_between, step_by_error
+from .rig_filter import Absorbed, RigBelief, RigFilter, absorbed, aged
 from .rig_uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian
 from .robust_losses import squared
 from .variance_components import BENT, ObjectQuestion, Start, estimate_variance_components
@@ -57,6 +59,7 @@ __all__ = [
     "ON_A_LINE",
     "POSE_PARAMETERS",
     "SNAPSHOTS_TO_BEND",
+    "Absorbed",
     "BlockScatter",
     "Estimate",
     "EstimationOptions",
@@ -65,6 +68,8 @@ __all__ = [
     "ObjectQuestion",
     "PredictedError",
     "Problem",
+    "RigBelief",
+    "RigFilter",
     "RigUncertainty",
     "ShapeEvidence",
     "Solution",
@@ -72,13 +77,17 @@ __all__ = [
     "State",
     "UndeterminedPosesError",
     "WorkingVolume",
+    "absorbed",
+    "aged",
     "aligned",
     "attach_gradient",
     "block_scatter",
     "camera_covariance",
     "camera_std",
+    "displaced",
     "encoded",
     "equations_at",
+    "error_between",
     "estimate",
     "estimate_variance_components",
     "find_moves",
@@ -109,5 +118,6 @@ __all__ = [
     "retract",
     "rig_at",
     "squared",
+    "step_by_error",
     "whitened_covariance",
 ]

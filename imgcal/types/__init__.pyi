@@ -5,7 +5,7 @@ from .moved_camera import Kind, MovedCamera, MovedError
 from .observations import UNUSABLE, BlobFlag, Detections, Observations
 from .placement import CropPlacement
 from .prediction import Prediction, Views
-from .rig import PARAMETER_NAMES, PARAMETERS, CameraRig, RigPrior, pack21, unpack18, unpack21
+from .rig import PARAMETER_NAMES, PARAMETERS, CameraRig, DriftRate, RigPrior, pack21, unpack18, unpack21
 
 __all__ = [
     "BLOB_RADIUS",
@@ -20,6 +20,7 @@ __all__ = [
     "CameraRig",
     "CropPlacement",
     "Detections",
+    "DriftRate",
     "Kind",
     "MovedCamera",
     "MovedError",

@@ -69,6 +69,30 @@ class RigPrior:
 
 
 @dataclass(frozen=True)
+class DriftRate:
+    """How fast each value wanders while the rig is in use: one standard deviation of a random walk after an hour.
+
+    The defaults are for cameras on a rigid mount indoors: lenses and sensors follow the temperature by some hundredths
+    of a per cent, mounts creep. After four hours each is twice as large.
+
+    Examples:
+        >>> import imgcal
+        >>> DriftRate(rotation=1e-4).std(imgcal.load_rig("T4"))[0, :3]  # rad after an hour
+        tensor([1.0000e-04, 1.0000e-04, 1.0000e-04], dtype=torch.float64)
+    """
+
+    focal_length: float = 3e-4  # relative
+    principal_point: float = 0.3  # pixels
+    distortion: float = 1e-4  # absolute
+    rotation: float = 2e-4  # rad, each axis
+    position: float = 0.05  # mm, each axis
+
+    def std(self, rig: CameraRig) -> Tensor:
+        """Spread over the parameters of each camera after an hour: (*B, C, 15), in the order of `PARAMETER_NAMES`."""
+        return RigPrior(**vars(self)).std(rig)
+
+
+@dataclass(frozen=True)
 class CameraRig:
     """Cameras fixed to a common frame: whatever the factory says it is; only relations between cameras matter.
 

@@ -1,0 +1,389 @@
+"""What is known of a rig over time: `RigBelief`, what it becomes by what is seen (`absorbed`) and by time (`aged`).
+
+The state is every camera's parameters and, where the object has tolerances, the object's; the object's pose is
+eliminated from each snapshot. Information is kept as its Cholesky factor about errors in which a motion of the whole
+rig is the same direction everywhere (`rig_error.py`), so that it says nothing about what no image shows, however often
+the estimate has moved meanwhile. Several snapshots may be absorbed at once: they are then linearized where they lead
+together, which is what `RigFilter` does with its first ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve, cholesky, solve_triangular
+from torch import Tensor
+
+from imgcal.errors import RefusedError
+from imgcal.estimation.linearization import NormalEquations, Problem, State, pose_at, retract
+from imgcal.estimation.map_estimate import (
+    EstimationOptions,
+    equations_at,
+    initial_state,
+    make_loss,
+    make_problem,
+    object_prior_std,
+)
+from imgcal.estimation.rig_error import displaced, error_between, step_by_error
+from imgcal.geometry import RigidTransform
+from imgcal.types import PARAMETERS, CalibrationObject, CameraRig, DriftRate, Observations, RigPrior
+
+LEAST_STD = (1e-9,) * 3 + (1e-6,) * 3 + (1e-6,) * 4 + (1e-9,) * 5
+"""Standard deviation (rad, mm, pixels, 1) of a value that is fixed: small, and not zero."""
+MOST_DAMPING = 1e8
+SLACK = 0.01
+"""By how much the cost may rise in a step, relative: its derivative is approximate where the belief is far away."""
+DAMPED = 1e-3
+"""Damping below which a step that is as short as the tolerance shows that this is the minimum."""
+
+TOGETHER = (*range(2, 17), 20, 25, 32, 40, 50, 64, 80, 100, 128)
+"""Numbers of snapshots that are absorbed together once there are as many."""
+MEMORY = TOGETHER[-1]
+YOUNG_SECONDS = 60.0
+"""Time over which a rig may be taken to stand still; what it wanders by then is far below the noise of a snapshot."""
+LEAST_SECONDS = 1.0
+"""Time that is worth an inversion of the information."""
+
+Matrix = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RigBelief:
+    """The most probable rig, and how surely it is known."""
+
+    rig: CameraRig  # without batch axes, float64
+    obj: CalibrationObject  # with its tolerances, as it was given
+    object_offset: Tensor  # (M,) in units of its prior standard deviation: what is known of it; M = 0 where it is exact
+    factor: Matrix  # (D, D) lower Cholesky factor of the information; D = 15 C + M
+    unit: Tensor  # (C, 15) rad, mm, pixels, 1: of the cameras' errors
+
+    @classmethod
+    def of_prior(cls, rig: CameraRig, obj: CalibrationObject, prior_std: Tensor | None = None) -> RigBelief:
+        """What the factory says: `prior_std` (C, 15), None = as the rig file has it."""
+        rig = rig.to(torch.float64)
+        std = (rig.prior or RigPrior()).std(rig) if prior_std is None else prior_std
+        unit = std.double().clamp_min(torch.tensor(LEAST_STD, dtype=torch.float64))
+        step = _whitened(step_by_error(rig), unit)
+        own, wide = 0 if obj.exact else 3 * obj.num_fiducials + 1, rig.num_cameras * PARAMETERS
+        information = np.zeros((wide + own, wide + own))
+        _add_blocks(information, (step.mT @ step).numpy())
+        information[wide:, wide:] = np.eye(own)
+        return cls(rig, obj, rig.focal_length.new_zeros(own), cholesky(information, lower=True), unit)
+
+    @property
+    def information(self) -> Matrix:
+        """Inverse covariance (D, D) of the errors in their units."""
+        return self.factor @ self.factor.T
+
+    def covariance(self) -> Tensor:
+        """Joint covariance (15 C, 15 C) of the cameras in the units and order of `PARAMETER_NAMES`."""
+        wide = self.rig.num_cameras * PARAMETERS
+        covariance = torch.from_numpy(_inverse(self.factor)[:wide, :wide])
+        blocks = covariance.unflatten(0, (-1, PARAMETERS)).unflatten(-1, (-1, PARAMETERS))
+        step = step_by_error(self.rig) * self.unit[:, None, :]
+        return torch.einsum("cij,cjdk,dlk->cidl", step, blocks, step).reshape(wide, wide)
+
+    def std(self) -> Tensor:
+        """One standard deviation of every parameter: (C, 15)."""
+        return self.covariance().diagonal().clamp_min(0).sqrt().unflatten(0, (-1, PARAMETERS))
+
+    @property
+    def points_object(self) -> Tensor:
+        """The fiducials as they are known now: (N, 3) mm."""
+        if not len(self.object_offset):
+            return self.obj.points
+        offset = self.object_offset * object_prior_std(self.obj)
+        centroid = self.obj.points.mean(0)
+        return centroid + (self.obj.points - centroid) * (1 + offset[-1]) + offset[:-1].unflatten(0, (-1, 3))
+
+
+@dataclass(frozen=True)
+class Absorbed:
+    """What some snapshots have taught."""
+
+    belief: RigBelief
+    rig_from_object: RigidTransform  # (S,) the object's poses
+    residual: Tensor  # (S, C, N, 2) pixels, predicted minus observed; zero where not seen
+    chi2: float  # sum of squared whitened residuals (robust), and of the change in standard deviations of the belief
+    dof: int  # 2 observations - 6 snapshots: what chi2 is expected to be
+
+
+def absorbed(
+    belief: RigBelief,
+    observations: Observations,
+    rig_from_object: RigidTransform,
+    options: EstimationOptions = EstimationOptions(),
+) -> Absorbed:
+    """Learn from labelled snapshots of a rig that stood still while they were taken.
+
+    Args:
+        belief: what was known before.
+        observations: (S, C, N) of the object that the belief is about.
+        rig_from_object: (S,) first guess of the object's poses.
+        options: how to minimize.
+
+    Raises:
+        RefusedError: the observations do not determine the object's pose, or no minimum was found.
+    """
+    at = _Linearization.of(belief, observations, rig_from_object, options)
+    damping = 0.0
+    for _ in range(options.max_iterations):
+        step, gain, factor = at.step(damping)
+        trial = at.moved(step)
+        if trial.cost <= at.cost + SLACK * max(1.0, at.cost):
+            if gain <= options.tolerance and damping <= DAMPED:
+                return trial.absorbed(factor)
+            at, damping = trial, 0.0 if damping <= 1e-6 else damping / 8
+        else:
+            damping = max(8 * damping, 1e-4)
+            if damping > MOST_DAMPING:
+                break
+    raise RefusedError("estimation: found no minimum for these observations, expected one: labels may be wrong")
+
+
+def aged(belief: RigBelief, seconds: float, rate: DriftRate) -> RigBelief:
+    """Know less of a rig after some time, over which every value took a random walk on its own.
+
+    Args:
+        belief: what was known.
+        seconds: how long ago.
+        rate: of the walks.
+    """
+    variance = rate.std(belief.rig).square() * (max(seconds, 0.0) / 3600)
+    if not variance.any():
+        return belief
+    error_by_step = torch.linalg.inv(step_by_error(belief.rig)) / belief.unit[:, :, None]
+    covariance = _inverse(belief.factor)
+    _add_blocks(covariance, (error_by_step @ torch.diag_embed(variance) @ error_by_step.mT).numpy())
+    return replace(belief, factor=_cholesky(_inverse(_cholesky(covariance))))
+
+
+class RigFilter:
+    """Follows a rig, snapshot after snapshot, in constant memory.
+
+    The first snapshots are kept, and absorbed again together while their number grows: what was linearized far from the
+    truth is so no more.
+
+    Examples:
+        >>> import torch, imgcal
+        >>> from imgcal.synthesis import PhysicalDrift, simulate_truth
+        >>> factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+        >>> truth = simulate_truth(factory, obj, 5, torch.Generator().manual_seed(1), PhysicalDrift())
+        >>> follows, seen = RigFilter(factory, obj), torch.ones(1, 4, 8, dtype=torch.bool)
+        >>> for s in range(5):
+        ...     there = Observations(truth.uv[[s]], torch.full(seen.shape, 0.05), seen)
+        ...     result = follows.update(there, truth.rig_from_object[[s]], seconds=1 / 60)
+        >>> follows.belief.std()[0, 6] < 0.1 * 0.02 * factory.focal_length[0, 0]  # the factory knew it to 2 %
+        tensor(True)
+    """
+
+    def __init__(
+        self,
+        rig: CameraRig,
+        obj: CalibrationObject,
+        rate: DriftRate = DriftRate(),
+        options: EstimationOptions = EstimationOptions(),
+        prior_std: Tensor | None = None,
+    ) -> None:
+        """Begin with the factory calibration.
+
+        Args:
+            rig: the factory calibration, without batch axes.
+            obj: the calibration object.
+            rate: how fast the rig wanders.
+            options: how to minimize.
+            prior_std: (C, 15) how far the factory values may be off; None = as the rig says.
+        """
+        self.rate, self.options = rate, options
+        self.belief = RigBelief.of_prior(rig, obj, prior_std)
+        self.count = 0  # snapshots absorbed
+        self._first = self.belief
+        self._early: list[tuple[Observations, RigidTransform]] = []
+        self._span = self._waited = 0.0  # s, since the first snapshot; of it, what the belief has not aged by
+
+    def update(self, observations: Observations, rig_from_object: RigidTransform, seconds: float = 0.0) -> Absorbed:
+        """Learn from a snapshot; where it is refused, nothing is learnt, and its time counts for the next one.
+
+        Args:
+            observations: (1, C, N).
+            rig_from_object: (1,) first guess of the object's pose.
+            seconds: since the update before.
+
+        Raises:
+            RefusedError: see `absorbed`.
+        """
+        passed = max(seconds, 0.0) if self.count else 0.0
+        self._span, self._waited = self._span + passed, self._waited + passed
+        young = self.count == len(self._early) < MEMORY and self._span <= YOUNG_SECONDS
+        if young and self.count + 1 in TOGETHER:
+            result = self._together(observations, rig_from_object)
+            belief = aged(result.belief, self._span, self.rate)
+        else:
+            due = self._waited if self._waited >= LEAST_SECONDS else 0.0
+            result = absorbed(aged(self.belief, due, self.rate), observations, rig_from_object, self.options)
+            belief, self._waited = result.belief, self._waited - due
+        if young:
+            self._early.append((observations, result.rig_from_object[-1:]))
+        self.belief, self.count = belief, self.count + 1
+        return replace(result, belief=belief)
+
+    def _together(self, observations: Observations, rig_from_object: RigidTransform) -> Absorbed:
+        """Absorb all snapshots so far anew; the result is that of the last one."""
+        parts = [*(early for early, _ in self._early), observations]
+        values = (torch.cat([getattr(part, name) for part in parts]) for name in ("uv", "sigma", "seen"))
+        poses = RigidTransform.cat([*(pose for _, pose in self._early), rig_from_object])
+        result = absorbed(self._first, Observations(*values), poses, self.options)
+        self._waited = 0.0
+        return replace(result, rig_from_object=result.rig_from_object[-1:], residual=result.residual[-1:])
+
+
+@dataclass(frozen=True)
+class _Linearization:
+    """Snapshots at a rig, an object and poses, and what a belief says there."""
+
+    belief: RigBelief
+    problem: Problem  # one rig a snapshot, all the same; its factory is the rig, its prior's spread the belief's unit
+    state: State  # no offset: the rig is the problem's
+    options: EstimationOptions
+    equations: NormalEquations  # of each snapshot
+    distance: Matrix  # (D,) from the belief's rig and object, in units
+    cost: float
+
+    @classmethod
+    def of(
+        cls,
+        belief: RigBelief,
+        observations: Observations,
+        rig_from_object: RigidTransform,
+        options: EstimationOptions,
+    ) -> _Linearization:
+        """Begin at the belief."""
+        alone = Observations(*(x.unsqueeze(1) for x in (observations.uv, observations.sigma, observations.seen)))
+        count = len(observations.uv)
+        problem = make_problem(alone, belief.rig.expand(count), belief.obj, belief.unit)
+        state = initial_state(problem, rig_from_object.reshape(count, 1), None)
+        if state.object_offset is not None:
+            state = replace(state, object_offset=belief.object_offset.expand(count, -1))
+        return cls._at(belief, problem, state, options)
+
+    @classmethod
+    def _at(cls, belief: RigBelief, problem: Problem, state: State, options: EstimationOptions) -> _Linearization:
+        equations = equations_at(problem, state, make_loss(options))
+        own = state.object_offset
+        cameras = (error_between(problem.factory[0], belief.rig) / belief.unit).flatten()
+        change = cameras if own is None else torch.cat((cameras, own[0] - belief.object_offset))
+        prior = 0.5 * float(np.square(belief.factor.T @ change.numpy()).sum())
+        data = float(equations.cost.sum()) - (0.0 if own is None else 0.5 * float(own.square().sum()))
+        return cls(belief, problem, state, options, equations, change.numpy(), prior + data)
+
+    def step(self, damping: float) -> tuple[Matrix, float, Matrix]:
+        """Newton's step.
+
+        The derivative of the distance by the error is taken as the unit matrix. It is nearly so, and what it adds would
+        pull along motions of the whole rig, of which the belief knows nothing.
+
+        Returns:
+            The step (D,) of cameras and object, by how much it should lower the cost, and the factor (D, D) of the
+            information.
+        """
+        information, pull = self._information()
+        information = information + self.belief.information
+        pull = pull - self.belief.factor @ (self.belief.factor.T @ self.distance)
+        damped = factor = _cholesky(information)
+        if damping:
+            damped = _cholesky(information + damping * np.diag(information.diagonal()))
+        step = cho_solve((damped, True), pull, check_finite=False)
+        right = self.equations.pose_gradient[:, 0]
+        gain = 0.5 * float((right * _solved(self.equations.pose[:, 0], right)).sum())
+        return step, gain + 0.5 * float(step @ pull), factor
+
+    def moved(self, step: Matrix) -> _Linearization:
+        """Take a step of cameras and object; poses follow."""
+        problem, state, equations = self.problem, self.state, self.equations
+        wide = problem.prior_std.shape[1] * PARAMETERS
+        error = torch.from_numpy(step[:wide]).unflatten(0, (-1, PARAMETERS))
+        by_offset = torch.einsum("cij,cj->ci", self._basis(), error)
+        right = equations.pose_gradient[:, 0] + torch.einsum("scip,ci->sp", equations.coupling[:, 0], by_offset)
+        own = torch.from_numpy(step[wide:])
+        if equations.object is not None:
+            right = right + equations.object.pose[:, 0] @ own
+        pose = -_solved(equations.pose[:, 0], right)
+        own_step = None if equations.object is None else own.expand(len(pose), -1)
+        state = retract(problem, state, torch.zeros_like(state.offset), pose.unsqueeze(1), own_step)
+        rig = displaced(problem.factory[0], error * self.belief.unit)
+        problem = replace(problem, factory=rig.expand(len(pose)))
+        return self._at(self.belief, problem, state, self.options)
+
+    def absorbed(self, factor: Matrix) -> Absorbed:
+        """What is known now, its information being that of the last step, which was hardly any."""
+        own = self.state.object_offset
+        belief = replace(
+            self.belief,
+            rig=self.problem.factory[0],
+            object_offset=self.belief.object_offset if own is None else own[0],
+            factor=factor,
+        )
+        seen = (self.problem.root_weight > 0)[:, 0]
+        residual = torch.where(seen.unsqueeze(-2), self.equations.residual[:, 0], 0.0).mT
+        poses = pose_at(self.problem, self.state)
+        return Absorbed(belief, poses.reshape(len(seen)), residual, 2 * self.cost, 2 * int(seen.sum()) - 6 * len(seen))
+
+    def _basis(self) -> Tensor:
+        """Whitened offsets of the problem by errors in units: (C, 15, 15)."""
+        return _whitened(step_by_error(self.problem.factory[0]), self.belief.unit)
+
+    def _information(self) -> tuple[Matrix, Matrix]:
+        """What the snapshots say about cameras and object, poses eliminated: (D, D), and their pull (D,)."""
+        equations, own, offset = self.equations, self.equations.object, self.state.object_offset
+        basis = self._basis()
+        wide = len(basis) * PARAMETERS
+        camera = equations.camera - torch.eye(PARAMETERS, dtype=torch.float64)
+        pull = torch.einsum("cij,ci->cj", basis, equations.camera_gradient.sum(0)).flatten()
+        coupling = (basis.mT @ equations.coupling[:, 0]).flatten(1, 2)  # (S, 15 C, 6)
+        if own is not None and offset is not None:
+            coupling = torch.cat((coupling, own.pose[:, 0].mT), dim=1)
+            pull = torch.cat((pull, (own.gradient - offset).sum(0)))
+        factor, failed = torch.linalg.cholesky_ex(equations.pose[:, 0])
+        if bool(failed.any()):
+            raise RefusedError("estimation: the observations do not determine the object's pose in every snapshot")
+        carried = torch.linalg.solve_triangular(factor, coupling.mT, upper=False)  # (S, 6, D)
+        gradient = torch.linalg.solve_triangular(factor, equations.pose_gradient[:, 0, :, None], upper=False)
+        flat = carried.flatten(0, 1).numpy()
+        information = -(flat.T @ flat)
+        _add_blocks(information, (basis.mT @ camera.sum(0) @ basis).numpy())
+        if own is not None:
+            across = torch.einsum("cij,scim->cjm", basis, own.camera).flatten(0, 1).numpy()
+            information[:wide, wide:] += across
+            information[wide:, :wide] += across.T
+            information[wide:, wide:] += own.own.sum(0).numpy() - len(camera) * np.eye(len(across.T))
+        return information, ((carried.mT @ gradient).sum((0, 2)) - pull).numpy()
+
+
+def _cholesky(matrix: Matrix) -> Matrix:
+    return np.asarray(cholesky(matrix, lower=True, check_finite=False))
+
+
+def _inverse(factor: Matrix) -> Matrix:
+    """Invert a matrix by its Cholesky factor."""
+    half = solve_triangular(factor, np.eye(len(factor)), lower=True, check_finite=False)
+    return np.asarray(half.T @ half)
+
+
+def _solved(matrices: Tensor, vectors: Tensor) -> Tensor:
+    """Solve (S, 6, 6) systems for (S, 6)."""
+    return torch.linalg.solve(matrices, vectors[..., None])[..., 0]
+
+
+def _whitened(step: Tensor, unit: Tensor) -> Tensor:
+    """Whitened offsets by errors in units, of the derivative of a step by an error: (C, 15, 15)."""
+    return step * unit[:, None, :] / unit[:, :, None]
+
+
+def _add_blocks(matrix: Matrix, blocks: Matrix) -> None:
+    """Add (C, 15, 15) along the diagonal of the cameras' part."""
+    for camera, block in enumerate(blocks):
+        place = slice(camera * PARAMETERS, (camera + 1) * PARAMETERS)
+        matrix[place, place] += block
