@@ -28,6 +28,7 @@ from imgcal.cli.counts import blobs_by_camera, counts_by_camera, counts_by_snaps
 from imgcal.cli.describe import describe, describe_refusal
 from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError, RefusedError
+from imgcal.estimation import Gauge
 from imgcal.extras import advice, missing
 from imgcal.io import (
     RigCovariance,
@@ -82,7 +83,8 @@ class Calibrate:
     full_covariance: bool = False  #: write the whole covariance matrix to rig.yaml, too
     report: bool = True  #: write report.html
     reference: str | None = None
-    """camera that the uncertainty of positions and rotations refers to; default: the first"""
+    """camera that positions and rotations are relative to, in rig.yaml's uncertainty (default: the first) and in the
+    report (default: most cameras are taken to have stood still)"""
     detection: Annotated[DetectionOptions, tyro.conf.arg(name="")] = field(default_factory=DetectionOptions)
 
     def run(self) -> None:
@@ -127,7 +129,7 @@ class Calibrate:
                 if outcome.shape:
                     save_object(outcome.object, out / "object.csv")
                 result = summary(outcome, seconds)
-                content = describe(outcome, covariance.std, rig, frames, reference, seconds)
+                content = describe(outcome, self._gauge(outcome), rig, frames, seconds)
             if draws:
                 from imgcal.report import write_report  # brings plotly along, which is not in the core
 
@@ -177,6 +179,13 @@ class Calibrate:
         if self.reference not in rig.camera_names:
             raise InputError(f"--reference: found {self.reference}, expected one of {', '.join(rig.camera_names)}")
         return rig.camera_names.index(self.reference)
+
+    def _gauge(self, calibration: Calibration) -> Gauge:
+        """Say which cameras the report takes to have stood still."""
+        rig = calibration.rig
+        if self.reference is not None or rig.num_cameras == 1:
+            return Gauge.of_camera(self._reference(rig), rig.num_cameras)
+        return Gauge.of_most(rig, calibration.factory)
 
 
 def trusted_covariance(calibration: Calibration, reference: int) -> RigCovariance:

@@ -13,11 +13,12 @@ from torch import Tensor
 
 import imgcal
 from imgcal.association import matched_to_rig
+from imgcal.estimation import Gauge
 from imgcal.geometry import RigidTransform
 from imgcal.io import Frame
 from imgcal.pipeline import Calibration, rms_length
-from imgcal.report import ReportContent, SnapshotSummary, relative_prior_std
-from imgcal.types import CalibrationObject, CameraRig, Detections
+from imgcal.report import ReportContent, SnapshotSummary
+from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
 
 Pictures = Mapping[str, Frame | None]
 
@@ -55,13 +56,12 @@ def describe_refusal(
 
 def describe(
     calibration: Calibration,
-    std: Tensor,
+    gauge: Gauge,
     rig: CameraRig,
     pictures: Pictures,
-    reference: int,
     seconds: dict[str, float],
 ) -> ReportContent:
-    """Lay a calibration out blob by blob; `std` (C, 15) is that of the parameters, relative to the reference camera."""
+    """Lay a calibration out blob by blob, compared with the factory rig as a gauge says."""
     labelled, detections = calibration.labelled, calibration.labelled.detections
     before, sigma = _by_blob(calibration, calibration.before.residual)
     after, _ = _by_blob(calibration, calibration.residual)
@@ -85,9 +85,9 @@ def describe(
         predicted_before=before + detections.uv,
         predicted_after=after + detections.uv,
         sigma=sigma,
-        std=std.numpy(),
-        prior_std=relative_prior_std(rig, reference),
-        reference=reference,
+        std=gauge.std(calibration.estimate).numpy(),
+        prior_std=gauge.prior_std(rig.to(torch.float64), (rig.prior or RigPrior()).std(rig)).numpy(),
+        gauge=gauge,
         predicted=calibration.predicted_error,
         moves=tuple(map(str, calibration.moved)),
         unexplained=calibration.tally.unexplained.sum(0),

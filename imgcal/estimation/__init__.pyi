@@ -48,6 +48,7 @@ from .rig_error import displaced, error_between, step_by_error
 from .rig_filter import Absorbed, RigBelief, RigFilter, absorbed, aged
 from .rig_uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian
 from .robust_losses import squared
+from .steady_cameras import Gauge
 from .variance_components import BENT, ObjectQuestion, Start, estimate_variance_components
 
 __all__ = [
@@ -64,6 +65,7 @@ __all__ = [
     "Estimate",
     "EstimationOptions",
     "FiducialOffset",
+    "Gauge",
     "NormalEquations",
     "ObjectQuestion",
     "PredictedError",

@@ -1,10 +1,9 @@
-from .content import ReportContent, SnapshotSummary, relative_prior_std
+from .content import ReportContent, SnapshotSummary
 from .page import render, write_report
 
 __all__ = [
     "ReportContent",
     "SnapshotSummary",
-    "relative_prior_std",
     "render",
     "write_report",
 ]

@@ -10,11 +10,10 @@ from typing import Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from imgcal.estimation import PredictedError, relative_difference, relative_jacobian
+from imgcal.estimation import Gauge, PredictedError
 from imgcal.geometry import RigidTransform
-from imgcal.types import PARAMETERS, CameraRig, Detections, RigPrior
+from imgcal.types import PARAMETERS, CameraRig, Detections
 
 Array = NDArray[np.float64]
 
@@ -39,8 +38,8 @@ class SnapshotSummary:
 class ReportContent:
     """Everything on the page. A field that a refused run cannot fill keeps its default.
 
-    Convention: extrinsics in `std` and `prior_std` are relative to the reference camera, as in
-    `estimation.relative_covariance`; parameters in the order of `rig.PARAMETER_NAMES`.
+    Convention: extrinsics in `std` and `prior_std` are those of `gauge`; parameters in the order of
+    `rig.PARAMETER_NAMES`.
     """
 
     title: str
@@ -55,9 +54,9 @@ class ReportContent:
     predicted_before: Array | None = None  # (M, 2) pixels by the factory rig, pose refitted; nan where not used
     predicted_after: Array | None = None  # (M, 2) pixels by the recalibrated rig; nan where not used
     sigma: Array | None = None  # (M,) pixels, as weighted in the estimate; None = as detected
-    std: Array | None = None  # (C, 15) posterior standard deviation
-    prior_std: Array | None = None  # (C, 15) standard deviation before the data; see `relative_prior_std`
-    reference: int = 0  # index of the reference camera
+    std: Array | None = None  # (C, 15) posterior standard deviation of the change
+    prior_std: Array | None = None  # (C, 15) standard deviation before the data
+    gauge: Gauge | None = None  # which cameras are taken to have stood still; None = nothing is compared
     predicted: PredictedError | None = None  # over the working volume
     moves: tuple[str, ...] = ()  # cameras that moved during the capture, in words; earlier snapshots are rejected
     unexplained: NDArray[np.int64] | None = None  # (C,) blobs that may be fiducials in view, not where these should be
@@ -132,17 +131,29 @@ class ReportContent:
 
     @cached_property
     def change(self) -> Array | None:
-        """Recalibrated minus factory, extrinsics relative to the reference camera: (C, 15)."""
-        if self.recalibrated is None:
+        """Recalibrated minus factory, a motion of the whole rig taken out: (C, 15)."""
+        if self.laid is None:
             return None
-        factory, recalibrated = self.factory.to(torch.float64), self.recalibrated.to(torch.float64)
-        return relative_difference(recalibrated, factory, self.reference).detach().cpu().numpy()
+        return self.laid.local(self.factory.to(torch.float64)).detach().cpu().numpy()
+
+    @cached_property
+    def laid(self) -> CameraRig | None:
+        """The recalibrated rig, laid upon the factory's as `gauge` says."""
+        if self.recalibrated is None or self.gauge is None:
+            return None
+        return self.gauge.laid(self.recalibrated.to(torch.float64), self.factory.to(torch.float64))
+
+    @property
+    def reference(self) -> int | None:
+        """Index of the reference camera; None = the rig is laid upon what most cameras agree on."""
+        return None if self.gauge is None else self.gauge.reference
 
     @cached_property
     def fixed(self) -> NDArray[np.bool_]:
-        """Mark values that could not change, the extrinsics of the reference camera among them: (C, 15) bool."""
+        """Mark values that could not change, the extrinsics of a reference camera among them: (C, 15) bool."""
         fixed = np.zeros((len(self.cameras), PARAMETERS), dtype=bool) if self.std is None else self.std <= 0
-        fixed[self.reference, :6] = True
+        if self.reference is not None:
+            fixed[self.reference, :6] = True
         return fixed
 
     @cached_property
@@ -177,21 +188,3 @@ class ReportContent:
 
     def _residual(self, predicted: Array | None) -> Array:
         return np.full((len(self.detections), 2), np.nan) if predicted is None else predicted - self.detections.uv
-
-
-def relative_prior_std(factory: CameraRig, reference: int = 0, prior_std: Tensor | None = None) -> Array:
-    """Standard deviation of each factory value before the data, extrinsics relative to the reference camera.
-
-    Args:
-        factory: the factory rig, without batch axes.
-        reference: index of the reference camera.
-        prior_std: (C, 15) standard deviations in the rig's frame; None = the rig's own prior, or `RigPrior()`.
-
-    Returns:
-        (C, 15), comparable with the diagonal of `estimation.relative_covariance`.
-    """
-    factory = factory.to(torch.float64)
-    prior_std = (factory.prior or RigPrior()).std(factory) if prior_std is None else prior_std.to(torch.float64)
-    jacobian = relative_jacobian(factory, reference)
-    variance = jacobian.square() @ prior_std.flatten().square()
-    return variance.sqrt().unflatten(0, (factory.num_cameras, PARAMETERS)).cpu().numpy()

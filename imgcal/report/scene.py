@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from html import escape
 from typing import Any
 
@@ -23,7 +22,7 @@ LARGEST_CLOUD = 6000  # fiducials drawn, of all snapshots together
 def rig_figure(content: ReportContent) -> Figure:
     """Build the figure of the rig; `layout.meta` holds the recalibrated cameras for each exaggeration.
 
-    Convention: drawn in the factory's rig frame; the recalibrated rig lies so that the reference cameras coincide.
+    Convention: drawn in the factory's rig frame; the recalibrated rig is laid upon the factory's by `content.gauge`.
     """
     factory = content.factory.to(torch.float64)
     poses = _object_points(content, factory)
@@ -54,12 +53,12 @@ def drawn_fiducials(content: ReportContent) -> tuple[NDArray[np.int64], NDArray[
     if content.rig_from_object is None or content.object_points is None:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     good = np.flatnonzero(np.isfinite(content.rig_from_object.translation.cpu().numpy()).all(axis=1))
-    snapshots = good[_prior_std(len(good), 60)]
-    fiducials = _prior_std(len(content.object_points), max(LARGEST_CLOUD // max(len(snapshots), 1), 1))
+    snapshots = good[_evenly(len(good), 60)]
+    fiducials = _evenly(len(content.object_points), max(LARGEST_CLOUD // max(len(snapshots), 1), 1))
     return snapshots, fiducials
 
 
-def _prior_std(count: int, largest: int) -> NDArray[np.int64]:
+def _evenly(count: int, largest: int) -> NDArray[np.int64]:
     return np.linspace(0, max(count - 1, 0), min(count, largest)).round().astype(np.int64)
 
 
@@ -68,23 +67,19 @@ def _object_points(content: ReportContent, factory: CameraRig) -> Array | None:
     snapshots, fiducials = drawn_fiducials(content)
     if content.recalibrated is None or content.rig_from_object is None or not len(snapshots):
         return None
-    recalibrated = content.recalibrated.to(torch.float64)
-    r = content.reference
-    drawn_from_rig = factory.cam_from_rig[r].inverse() @ recalibrated.cam_from_rig[r]
+    recalibrated, laid = content.recalibrated.to(torch.float64), content.laid
+    drawn_from_rig = (recalibrated if laid is None else laid).cam_from_rig[0].inverse() @ recalibrated.cam_from_rig[0]
     points = torch.as_tensor(content.object_points)[fiducials].to(torch.float64)
     poses = content.rig_from_object.to(torch.float64)[torch.as_tensor(snapshots)]
     return drawn_from_rig.apply(poses.apply(points.to(poses.translation.device))).detach().cpu().numpy()
 
 
 def _exaggerated(content: ReportContent, factor: float) -> CameraRig:
-    """Factory cameras, moved by `factor` times their change relative to the reference camera."""
-    if content.recalibrated is None:
+    """Factory cameras, moved by `factor` times their change."""
+    if content.laid is None:
         return content.factory
-    factory, recalibrated = content.factory.to(torch.float64), content.recalibrated.to(torch.float64)
-    r = content.reference
-    rig_from_drawn = recalibrated.cam_from_rig[r].inverse() @ factory.cam_from_rig[r]
-    aligned = replace(recalibrated, cam_from_rig=recalibrated.cam_from_rig @ rig_from_drawn)
-    step = aligned.local(factory).detach()
+    factory = content.factory.to(torch.float64)
+    step = content.laid.local(factory).detach()
     step[..., :6] *= factor
     return factory.retract(step)
 

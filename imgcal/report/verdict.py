@@ -90,13 +90,14 @@ def _movement(content: ReportContent) -> tuple[str, ...]:
     angle = np.degrees(np.linalg.norm(content.change[:, :3], axis=1))
     shift = np.linalg.norm(content.change[:, 3:6], axis=1)
     moved = content.moved[:, :6].any(axis=1)
-    reference = content.cameras[content.reference]
+    reference = content.reference
+    others = "the others" if reference is None else content.cameras[reference]
     if not moved.any():
-        return (f"No camera moved measurably relative to {reference} (within {MOVED:g} standard deviations).",)
+        return (f"No camera moved measurably relative to {others} (within {MOVED:g} standard deviations).",)
     by_size = np.argsort(-np.where(moved, angle + shift / 10, -1))[: min(3, int(moved.sum()))]
     parts = [f"{content.cameras[i]} ({angle[i]:.2f}°, {shift[i]:.1f} mm)" for i in by_size]
-    others = len(content.cameras) - 1
-    words = f"{int(moved.sum())} of {others} cameras moved relative to {reference}"
+    count = len(content.cameras) - (reference is not None)
+    words = f"{int(moved.sum())} of {count} cameras moved relative to {others}"
     return (f"{words}, most of all {', '.join(parts)}.",)
 
 
@@ -152,7 +153,7 @@ def _undetermined_share(content: ReportContent) -> float:
 
 def _figures(content: ReportContent) -> tuple[KeyFigure, ...]:
     total, used = len(content.snapshots), sum(not s.reason for s in content.snapshots)
-    moved = int(content.moved[:, :6].any(axis=1).sum())
+    moved, count = int(content.moved[:, :6].any(axis=1).sum()), len(content.cameras) - (content.reference is not None)
     before = f"{pixels(content.rms_before)} → " if math.isfinite(content.rms_before) else ""
     note = "RMS, before → after" if before else "RMS"
     figures = [
@@ -166,7 +167,7 @@ def _figures(content: ReportContent) -> tuple[KeyFigure, ...]:
         note = f"predicted; 95 %: {length(predicted.p95_mm)}"
         figures.insert(1, KeyFigure(length(predicted.median_mm), "error in the volume", note))
     if len(content.cameras) > 1:
-        figures.append(KeyFigure(f"{moved} / {len(content.cameras) - 1}", "cameras moved", f"beyond {MOVED:g} std"))
+        figures.append(KeyFigure(f"{moved} / {count}", "cameras moved", f"beyond {MOVED:g} std"))
     if content.seconds and len(figures) < MOST_FIGURES:
         figures.append(KeyFigure(duration(sum(content.seconds.values())), "computing time"))
     return tuple(figures)

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.estimation import EstimationOptions, estimate, relative_covariance
+from imgcal.estimation import EstimationOptions, Gauge, estimate
 from imgcal.estimation.accuracy import predicted_error
 from imgcal.io import load_object, load_rig
 from imgcal.io.resources import data_path
-from imgcal.report import ReportContent, SnapshotSummary, relative_prior_std
+from imgcal.report import ReportContent, SnapshotSummary
 from imgcal.synthesis.rigs import PhysicalDrift, PoseRange, sample_rig_from_object, synthesize
 from imgcal.types.observations import Detections, Observations
-from imgcal.types.rig import PARAMETERS, CameraRig
+from imgcal.types.rig import PARAMETERS, CameraRig, RigPrior
 
 SIGMA = 0.05
 
@@ -88,7 +88,7 @@ def calibrated(
     fixed = torch.zeros(cameras, PARAMETERS, dtype=torch.float64)
     before = estimate(observations, factory, obj, prior_std=fixed, options=EstimationOptions(loss="squared"))
     detections, labels, cell = _detections(observations, factory, clutter, generator)
-    covariance = relative_covariance(after, 0)
+    gauge = Gauge.of_camera(0, 1) if cameras == 1 else Gauge.of_most(after.rig, factory)
     real = labels >= 0
 
     def predicted(residual: torch.Tensor) -> np.ndarray:
@@ -112,8 +112,9 @@ def calibrated(
         recalibrated=after.rig,
         predicted_before=predicted(before.residual),
         predicted_after=predicted(after.residual),
-        std=covariance.diagonal().clamp_min(0).sqrt().reshape(cameras, PARAMETERS).numpy(),
-        prior_std=relative_prior_std(factory),
+        std=gauge.std(after).numpy(),
+        prior_std=gauge.prior_std(factory, RigPrior().std(factory)).numpy(),
+        gauge=gauge,
         predicted=predicted_error(after),
         object_points=obj.points.numpy(),
         rig_from_object=after.rig_from_object,

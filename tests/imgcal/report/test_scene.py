@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from imgcal.estimation import Gauge
 from imgcal.report import ReportContent
 from imgcal.report.scene import Figure, drawn_fiducials, rig_figure
 
@@ -32,8 +33,8 @@ def test_drawn_fiducials_project_onto_their_images(content: ReportContent) -> No
     """Points and recalibrated cameras share a frame: what is drawn is what was seen."""
     assert content.recalibrated is not None
     points = _points(_named(rig_figure(content), "fiducials, by snapshot")).reshape(6, 8, 3)
-    reference = content.recalibrated.cam_from_rig[0].inverse() @ content.factory.cam_from_rig[0]
-    drawn = replace(content.recalibrated, cam_from_rig=content.recalibrated.cam_from_rig @ reference)
+    drawn = content.laid
+    assert drawn is not None
     uv = drawn.expand(6).project(torch.as_tensor(points)).uv.numpy()
     rows = np.flatnonzero(content.used)
     d = content.detections
@@ -44,7 +45,7 @@ def test_drawn_fiducials_project_onto_their_images(content: ReportContent) -> No
 
 
 def test_exaggeration_scales_the_shift_and_keeps_the_reference(content: ReportContent) -> None:
-    meta = rig_figure(content)["layout"]["meta"]
+    meta = rig_figure(replace(content, gauge=Gauge.of_camera(0, 10)))["layout"]["meta"]
     assert meta["factors"][:3] == [1, 2, 5]
     arrows = [np.array(step, dtype=float).T.reshape(10, 3, 3) for step in meta["moving"][1]["steps"]]
     shift = [a[:, 1] - a[:, 0] for a in arrows]

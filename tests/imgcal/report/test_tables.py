@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from imgcal.estimation import Gauge
 from imgcal.report import ReportContent
 from imgcal.report.tables import GROUPS, camera_rows, knowledge, signed
 from imgcal.types.rig import PARAMETERS
@@ -34,7 +35,8 @@ def test_rows_show_changes_in_their_units(content: ReportContent) -> None:
     step[3, 0], step[3, 4], step[3, 6], step[3, 10] = np.radians(1.5), 2.0, 8.0, 0.004
     std = np.full((10, PARAMETERS), 0.05)
     std[:, :3], std[:, 10:] = np.radians(0.1), 1e-3
-    changed = replace(content, recalibrated=content.factory.retract(step), std=std)
+    rig = content.factory.retract(step)
+    changed = replace(content, recalibrated=rig, std=std, gauge=Gauge.of_most(rig, content.factory))
     row = camera_rows(changed)[3]
     cells = {(g[0], c.name): c for g, group in zip(GROUPS, row.groups, strict=True) for c in group}
     assert (cells["rotation (deg)", "x"].change, cells["rotation (deg)", "x"].std) == ("+1.50", "0.10")
@@ -46,6 +48,8 @@ def test_rows_show_changes_in_their_units(content: ReportContent) -> None:
 
 
 def test_reference_has_no_extrinsics_of_its_own(content: ReportContent) -> None:
+    assert not any(row.reference for row in camera_rows(content))
+    content = replace(content, gauge=Gauge.of_camera(0, 10))
     first, *others = camera_rows(content)
     kinds = [{cell.kind for cell in group} for group in first.groups]
     assert first.reference
