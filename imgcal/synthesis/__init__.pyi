@@ -3,7 +3,16 @@ from .colour_coding import LEVELS, ImageOptions, render_views
 from .corruption import Corrupted, Corruption
 from .crops import CropTruth, Scenes, host_generator, render_crops, sample_scenes
 from .difficulty import DIFFICULTIES, Difficulty
-from .rigs import Drift, PhysicalDrift, PoseRange, RelativeDrift, Snapshots, synthesize
+from .rigs import (
+    Drift,
+    PhysicalDrift,
+    PoseRange,
+    RelativeDrift,
+    Snapshots,
+    share_of_good_rigs,
+    synthesize,
+    synthesize_at_once,
+)
 
 __all__ = [
     "DIFFICULTIES",
@@ -26,9 +35,11 @@ __all__ = [
     "render_crops",
     "render_views",
     "sample_scenes",
+    "share_of_good_rigs",
     "simulate_frames",
     "simulate_shots",
     "simulate_truth",
     "synthesize",
+    "synthesize_at_once",
     "true_detections",
 ]

@@ -250,6 +250,47 @@ def synthesize(
     )
 
 
+@torch.no_grad()
+def synthesize_at_once(
+    rig: CameraRig,
+    obj: CalibrationObject,
+    count: int,
+    trials: int,
+    generator: torch.Generator,
+    *,
+    drift: Drift | None = RelativeDrift(),
+    pose_range: PoseRange = PoseRange(),
+) -> Snapshots:
+    """Make `count` random rigs as `synthesize` does, but never wait for the device: the first good ones of `trials`.
+
+    Where fewer see every fiducial in every camera, those that do come again; where none does, rigs that miss some stay.
+
+    Args:
+        rig: the factory rig, without batch axes; device and dtype come from it.
+        obj: the calibration object.
+        count: number of rigs, B.
+        trials: how many are tried; see `share_of_good_rigs`.
+        generator: source of randomness, on the rig's device.
+        drift: how the parameters differ from the factory's; None = not at all.
+        pose_range: where the rig may be.
+    """
+    points, radius = obj.points.to(rig.focal_length), None if obj.radius is None else obj.radius.to(rig.focal_length)
+    trial = _sample(rig, points, radius, trials, generator, drift, pose_range)
+    good = trial.projection.visible.all(-1).all(-1)
+    first = torch.argsort((~good).byte(), stable=True)
+    return _take(trial, first[torch.arange(count, device=first.device) % good.sum().clamp_min(1)])
+
+
+@torch.no_grad()
+def share_of_good_rigs(
+    rig: CameraRig, obj: CalibrationObject, generator: torch.Generator, *, drift: Drift, pose_range: PoseRange
+) -> float:
+    """Estimate, from 1024, how many random rigs see every fiducial in every camera: 0 to 1."""
+    points, radius = obj.points.to(rig.focal_length), None if obj.radius is None else obj.radius.to(rig.focal_length)
+    trial = _sample(rig, points, radius, 1024, generator, drift, pose_range)
+    return float(trial.projection.visible.all(-1).all(-1).float().mean())
+
+
 def sample_rig_from_object(
     count: int, working_distance: float, centroid: Tensor, pose_range: PoseRange, generator: torch.Generator
 ) -> RigidTransform:

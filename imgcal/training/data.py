@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
-from imgcal.synthesis import Corruption, Drift, ImageOptions, PoseRange, Snapshots, render_views, synthesize
+from imgcal.synthesis import (
+    Corruption,
+    Drift,
+    ImageOptions,
+    PoseRange,
+    Snapshots,
+    render_views,
+    synthesize,
+    synthesize_at_once,
+)
 from imgcal.types import CalibrationObject, CameraRig, Prediction, Views
+
+SPARE = 1.25  # trials beyond those that are needed in the mean
 
 
 @dataclass(frozen=True)
@@ -46,10 +58,16 @@ class Source:
     pose_range: PoseRange
     corruption: Corruption = Corruption()
     images: ImageOptions | None = None  # None = the network takes points
+    good: float | None = None  # share of rigs that see everything; None = look, which waits for the device
     canvas: dict[int, Tensor] = field(default_factory=dict)  # images that are drawn over, by number of rigs: CPU only
 
     def sample(self, count: int, generator: torch.Generator) -> Snapshots:
         """Make `count` random rigs; the generator is on the training device."""
+        if self.good is not None:
+            trials = math.ceil(SPARE * count / self.good) + 32
+            return synthesize_at_once(
+                self.factory, self.obj, count, trials, generator, drift=self.drift, pose_range=self.pose_range
+            )
         return synthesize(self.factory, self.obj, count, generator, drift=self.drift, pose_range=self.pose_range)
 
     def show(self, made: Snapshots, generator: torch.Generator) -> RigBatch:

@@ -98,13 +98,17 @@ def prepare(experiment: Experiment, state: TrainingState | None = None) -> Run:
     seed = settings.seed * 4096 + accelerator.process_index
     optimizer = make_optimizer(task.network, experiment.optimizer)
     average = None if experiment.optimizer.ema is None else make_average(task.network)
+    judge = task.loss
     if settings.compile:
-        task.network.compile()
+        mode = "reduce-overhead" if settings.compile == "graphs" else None
+        task.network.compile(mode=mode)
+        judge = torch.compile(task.loss, mode=mode)
     run = Run(
         experiment=experiment,
         accelerator=accelerator,
         task=task,
         network=accelerator.prepare(task.network),
+        judge=judge,
         plain=task.network,
         optimizer=optimizer,
         schedule=Schedule(optimizer, experiment.schedule),
@@ -150,12 +154,16 @@ def train_step(run: Run) -> None:
 
 def _backward(run: Run, parts: int) -> dict[str, Tensor]:
     """Add the gradient of one part of a batch; returns its loss and other numbers by name, () each."""
+    if run.experiment.training.compile == "graphs":
+        torch.compiler.cudagraph_mark_step_begin()
     batch = run.task.batch(run.batch_size, run.generator)
     with drawing_from(*run.dropout), autocast(run):
         answer = run.task.predict(run.network, batch)
-    loss = run.task.loss(answer, batch, run.step)
+    loss = run.judge(answer, batch, run.step)
     run.accelerator.backward(loss.total / parts)
-    return {"loss": loss.total.detach(), **loss.means}
+    numbers = {"loss": loss.total.detach(), **loss.means}
+    # Copies: with CUDA graphs, the next step writes where these lie.
+    return dict(zip(numbers, torch.stack(list(numbers.values())).unbind(), strict=True))
 
 
 def autocast(run: Run) -> torch.autocast:

@@ -65,7 +65,7 @@ class TrainingConfig(StrictModel):
     precision: Literal["float32", "bf16"] = "float32"  # of the encoder and trunk; geometry is always float32
     device: Literal["auto", "cpu"] = "auto"  # auto: a GPU if there is one
     threads: Annotated[int, Field(ge=1, le=256)] | None = None  # of the CPU; null = as the environment says
-    compile: bool = False  # torch.compile of the network: a minute at the start, fewer launches on a GPU
+    compile: bool | Literal["graphs"] = False  # torch.compile of network and loss: fewer launches; graphs: CUDA's, too
     channels_last: bool = False  # memory order of convolutions' weights: faster on a GPU
     tf32: bool = False  # let a GPU round float32 matrix products to TF32
     init_from: str | None = None  # weights to start from: a file, the folder of a run, or the name of a shipped network

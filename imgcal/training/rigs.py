@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor, nn
 from imgcal.io import load_object, load_rig, validated
 from imgcal.networks import Checkpoint, Network, NetworkSpec, build_network, warm_start, without_pretrained
 from imgcal.nn import project_fiducials, reprojection_re
-from imgcal.synthesis import Corruption
+from imgcal.synthesis import Corruption, share_of_good_rigs
 from imgcal.training.data import RigBatch, Source, object_to
 from imgcal.training.end_to_end import refined_loss
 from imgcal.training.experiment import Experiment
@@ -22,6 +23,8 @@ from imgcal.types import CalibrationObject, CameraRig, Prediction
 
 # Seed of what must not depend on how long the training takes: validation rigs.
 VALIDATION_SEED = 20_000_003
+
+LEAST_GOOD = 0.01  # of random rigs must see everything
 
 Passes = tuple[Prediction, ...]
 
@@ -87,10 +90,20 @@ class RigTask(Task[RigBatch, Passes]):
             experiment.corruption,
             network.image_options,
         )
+        if device.type != "cpu":  # a batch must not wait for it; a CPU has no reason to draw more than it needs
+            self.source = replace(self.source, good=self._share_of_good(device))
         self.prior_std = experiment.drift.std(self.factory).to(device, torch.float32)  # (C, 15)
         fixed, count = torch.Generator(device).manual_seed(VALIDATION_SEED), experiment.training.validation_rigs
         starts = range(0, count, batch_size)
         self.validation = [self.source.sample(min(batch_size, count - start), fixed) for start in starts]
+
+    def _share_of_good(self, device: torch.device) -> float:
+        fixed = torch.Generator(device).manual_seed(VALIDATION_SEED)
+        rig, obj, drift, poses = self.source.factory, self.source.obj, self.source.drift, self.source.pose_range
+        found = share_of_good_rigs(rig, obj, fixed, drift=drift, pose_range=poses)
+        if found < LEAST_GOOD:
+            self.source.sample(1, fixed)  # says which camera misses the object
+        return max(found, LEAST_GOOD)
 
     def batch(self, count: int, generator: torch.Generator) -> RigBatch:
         """Make random rigs, and what their cameras see."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import monotonic
 from typing import Any
@@ -12,7 +13,7 @@ from torch import Tensor, nn
 
 from imgcal.training.experiment import Experiment
 from imgcal.training.optimization import Schedule
-from imgcal.training.task import Task
+from imgcal.training.task import Loss, Task
 
 
 @dataclass
@@ -42,6 +43,7 @@ class Run:
     accelerator: Accelerator
     task: Task[Any, Any]
     network: nn.Module  # as it is trained: wrapped when there are several processes
+    judge: Callable[[Any, Any, int], Loss]  # the task's loss, compiled where that was asked for
     plain: nn.Module  # the task's own, without the wrapping
     optimizer: torch.optim.Optimizer
     schedule: Schedule

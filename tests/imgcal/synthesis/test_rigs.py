@@ -16,7 +16,9 @@ from imgcal.synthesis.rigs import (
     RelativeDrift,
     Snapshots,
     sample_rig_from_object,
+    share_of_good_rigs,
     synthesize,
+    synthesize_at_once,
 )
 from imgcal.types.calibration_object import CalibrationObject
 from imgcal.types.rig import CameraRig
@@ -159,3 +161,24 @@ def test_bad_drift_is_refused() -> None:
         RelativeDrift(kappa_intrinsics=1.5)
     with pytest.raises(InputError, match="position"):
         PhysicalDrift(position=math.nan)
+
+
+def test_rigs_at_once_are_those_that_see_everything(o10, asymmetric8):
+    """Drift is so large that most rigs miss something; the distribution is that of rejection."""
+    kind = {"drift": RelativeDrift(0.3, 0.3)}
+    share = share_of_good_rigs(o10, asymmetric8, seeded(), **kind, pose_range=PoseRange())
+    assert 0.5 < share < 0.99
+    made = synthesize_at_once(o10, asymmetric8, 64, 64 * 20, seeded(), **kind)
+    assert made.projection.visible.all() and made.projection.uv.shape == (64, 10, 8, 2)
+    assert len(made.rig.focal_length.unique(dim=0)) == 64
+    again = synthesize_at_once(o10, asymmetric8, 64, 64 * 20, seeded(), **kind)
+    assert torch.equal(made.projection.uv, again.projection.uv)
+    many = synthesize_at_once(o10, asymmetric8, 2000, 40_000, seeded(1), **kind).rig.focal_length
+    slow = synthesize(o10, asymmetric8, 2000, seeded(2), **kind).rig.focal_length
+    scale = slow.std(0) / 2000**0.5
+    assert ((many.mean(0) - slow.mean(0)).abs() < 6 * scale).all()
+
+
+def test_too_few_trials_repeat_the_good_ones(o10, asymmetric8):
+    made = synthesize_at_once(o10, asymmetric8, 30, 10, seeded(), drift=RelativeDrift(0.01, 0.01))
+    assert made.projection.visible.all() and 1 <= len(made.rig.focal_length.unique(dim=0)) <= 10

@@ -1,7 +1,13 @@
+from dataclasses import replace
+
+import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from imgcal.networks import Checkpoint, NetworkSpec, load_checkpoint
+from imgcal.training import data
 from imgcal.training.rigs import RigTask, experiment_of
+from imgcal.types import CameraRig
 
 
 def task_of(experiment, **how):
@@ -55,3 +61,39 @@ def test_a_result_is_a_file_of_a_network(experiment, tmp_path):
     # A model from before there were tasks says nothing of them.
     older = {name: value for name, value in found.experiment.model_dump(mode="json").items() if name != "task"}
     assert experiment_of(NetworkSpec.model_validate(older)).task == "rig"
+
+
+class NoWaiting(TorchDispatchMode):
+    """Refuses what makes a GPU's host wait: values of tensors, and shapes that depend on them."""
+
+    def __torch_dispatch__(self, function, types, arguments=(), keywords=None):
+        assert function.__name__.split(".")[0] not in ("_local_scalar_dense", "nonzero", "masked_select", "equal")
+        return function(*arguments, **(keywords or {}))
+
+
+@pytest.mark.parametrize("preset", ["points", "paper-points", "paper-vit"])
+def test_a_step_on_a_gpu_waits_for_nothing(experiment, monkeypatch, preset):
+    """What a step does there: rigs that are made at once, projected and drawn by tensors, judged, differentiated."""
+    monkeypatch.undo()  # the real networks
+    small = {"points": "trunk: {width: 16, heads: 2, depth: 1, later_depth: 1}", "paper-points": "width: 16, depth: 1"}
+    vit = "backbone: vit_tiny_patch16_224, options: {img_size: 32, embed_dim: 12, depth: 1, num_heads: 2}"
+    made = experiment(
+        f"network={{preset: {preset}, change: {{{small.get(preset, vit)}}}}}",
+        f"loss={{kind: {'robust' if preset == 'points' else 'paper'}}}",
+        "training.validation_rigs=0",
+        "corruption={noise: 0.1, missing: 0.1, swapped: 0.1, false: 0.1}",
+    )
+    task = task_of(made)
+    task.source = replace(task.source, good=0.5)
+    monkeypatch.setattr(CameraRig, "project_values", lambda rig, points, radius=None: rig.project(points, radius))
+    monkeypatch.setattr(data, "render_views", drawn_by_tensors)
+    with NoWaiting():
+        batch = task.batch(3, torch.Generator().manual_seed(0))
+        task.loss(task.predict(task.network, batch), batch, 20_000).total.backward()
+    with pytest.raises(AssertionError), NoWaiting():
+        task.source = replace(task.source, good=None)
+        task.batch(3, torch.Generator().manual_seed(0))
+
+
+def drawn_by_tensors(uv, seen, size, obj, options, **_):
+    return torch.zeros(*uv.shape[:2], 3, options.size, options.size) + uv.mean() * seen.float().mean()

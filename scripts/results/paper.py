@@ -1,0 +1,157 @@
+"""Train the paper's own networks, row after row of its tables, in chunks: python -m scripts.results.paper [row ...].
+
+Trains what is not done yet, for at most the given minutes; the next call goes on exactly there. `scripts/results/gpu`
+is this at full size, `scripts/results/train --reduced` at a size and length for minutes of a CPU core. Runs are
+RUNS/<experiment>-seed<K>, of a reduced size RUNS/<experiment>-reduced-seed<K>.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from time import monotonic
+from typing import Annotated, Literal
+
+import torch
+import tyro
+
+from imgcal.cli.training_folder import STATE, train_in
+from imgcal.errors import InputError
+from imgcal.io import shipped_names
+from imgcal.training import RigExperiment, changed, finished, load_experiment
+from scripts.output import command
+
+Size = Literal["full", "reduced", "toy"]
+
+ROWS = tuple(
+    name
+    for name in shipped_names("experiments", ".yaml")
+    if name.startswith("ablation-row") or (name.startswith("table1-row") and name.endswith("-paper"))
+)
+
+# What is changed for a graphics processor: rounding, memory order, compilation; nothing of the method.
+FULL = {
+    "points": ("training.compile=true", "training.tf32=true"),
+    "images": ("training.compile=true", "training.tf32=true", "training.channels_last=true"),
+}
+EVERY = ("training.log_every=500", "training.validate_every=5000", "training.save_every=5000")
+
+# For minutes of a CPU core: an eighth of the width and fewer layers, float32, and a schedule for so few steps.
+SHORT = (
+    "optimizer.lr=0.003",
+    "schedule={kind: cosine, warmup: 0.05}",
+    "training.precision=float32",
+    "training.device=cpu",
+    "training.threads=1",
+    "training.validation_rigs=256",
+)
+SMALL_VIT = "{patch_size: 16, img_size: 112, embed_dim: 96, depth: 3, num_heads: 3}"
+SMALL_CNN = "{layers: [1, 1, 1, 1], channels: [16, 32, 64, 128], stem_width: 16}"
+REDUCED = {
+    "points": ("network.change.width=64", "network.change.depth=2", "network.change.head_widths=[128]"),
+    "vit": ("network.change.backbone=vit_tiny_patch16_224", f"network.change.options={SMALL_VIT}"),
+    "cnn": ("network.change.backbone=resnet10t", f"network.change.options={SMALL_CNN}"),
+}
+TOY = {
+    "points": ("network.change.width=16", "network.change.depth=1", "network.change.head_widths=[16]"),
+    "vit": (
+        "network.change.backbone=vit_tiny_patch16_224",
+        "network.change.options={patch_size: 16, img_size: 32, embed_dim: 12, depth: 1, num_heads: 2}",
+    ),
+    "cnn": (
+        "network.change.backbone=resnet10t",
+        "network.change.options={layers: [1, 1, 1, 1], channels: [8, 8, 8, 8], stem_width: 8}",
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Train the paper's own networks."""
+
+    rows: Annotated[tuple[str, ...], tyro.conf.Positional] = ()  #: experiments; none = all of the paper's rows
+    size: Size = "reduced"  #: of the networks, and how long they are trained
+    runs: Path = Path("out/runs")  #: folder of training runs
+    seeds: int = 1  #: trainings of each row, seeds 1 and up
+    steps: int | None = None  #: of every training, instead of what the size says
+    minutes: float | None = None  #: end after so long; None = when all is trained
+    device: Literal["auto", "cpu"] = "auto"  #: where networks run; "auto" = on a GPU if there is one
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Train, and say what is not done."""
+    options = tyro.cli(Options, args=arguments, description=__doc__)
+    for row in options.rows:
+        if row not in ROWS:
+            raise InputError(f"found {row}, expected some of {', '.join(ROWS)}")
+    for name in train(options):
+        print(f"not done: {name}", file=sys.stderr)
+
+
+def train(options: Options) -> list[str]:
+    """Go on with the trainings, seed by seed; returns the names of those that are not done."""
+    began = monotonic()
+
+    def out_of_time() -> bool:
+        return options.minutes is not None and monotonic() - began > 60 * options.minutes
+
+    left = []
+    for seed in range(1, options.seeds + 1):
+        for row in options.rows or ROWS:
+            experiment = sized(row, options, seed)
+            folder = folder_of(experiment, options.runs)
+            if (folder / "done").exists():
+                continue
+            if not out_of_time():
+                if experiment.training.tf32:
+                    torch.set_float32_matmul_precision("high")
+                if experiment.training.threads is not None:
+                    torch.set_num_threads(experiment.training.threads)
+                run = train_in(folder, experiment, (folder / STATE).exists(), out_of_time)
+                if finished(run, run.seconds):
+                    (folder / "done").touch()
+                    continue
+            left.append(folder.name)
+    return left
+
+
+def folder_of(experiment: RigExperiment, runs: Path) -> Path:
+    """Where a training run lies."""
+    return runs / f"{experiment.name}-seed{experiment.training.seed}"
+
+
+def name_of(row: str, size: Size) -> str:
+    """What the experiment of a row is called at a size."""
+    return row if size == "full" else f"{row}-{size}"
+
+
+def sized(row: str, options: Options, seed: int) -> RigExperiment:
+    """The experiment of a row at a size."""
+    experiment = load_experiment(row, kind=RigExperiment)
+    kind = {"paper-vit": "vit", "paper-cnn2d": "cnn"}.get(experiment.network.preset, "points")
+    images = kind != "points"
+    changes = [f"training.seed={seed}", f"name={name_of(row, options.size)}"]
+    if options.device == "cpu":
+        changes.append("training.device=cpu")
+    match options.size:
+        case "full":
+            changes += [*FULL["images" if images else "points"], *EVERY]
+            steps = options.steps or experiment.training.steps or 1
+        case "reduced":
+            steps = options.steps or (600 if images else 1500)
+            changes += [*SHORT, *REDUCED[kind], f"training.batch_size={8 if images else 64}"]
+            changes += ["training.save_every=200", "training.validate_every=300"]
+            changes += ["images={size: 112, dot: 1.0}"] if images else []
+        case "toy":
+            steps = options.steps or 4
+            changes += [*SHORT, *TOY[kind], "training.batch_size=4", "training.validation_rigs=4", "optimizer.lr=1e-3"]
+            changes += ["images={size: 32, dot: 1.0}"] if images else []
+    if options.size != "full" or options.steps is not None:
+        # The paper's second stage begins after 10,000 of its 300,000 steps.
+        changes.append(f"loss.paper.reprojection_from={steps // 3}")
+    return changed(experiment, *changes, f"training.steps={steps}")
+
+
+if __name__ == "__main__":
+    command(lambda: main(sys.argv[1:]))
