@@ -6,11 +6,14 @@ from .checkpoint import (
     save_checkpoint,
     warm_start,
 )
+from .claims import Claims, claim
 from .config import PRESETS, Images, NetworkConfig, NetworkSpec, PaperImages, PaperPoints, without_pretrained
+from .expectation import Expectation, cut_crops, cut_patches
 from .factory import build, build_network
 from .images import ImageNetwork, PaperImageNetwork
 from .infrared import Evidence, InfraredConfig, InfraredNetwork, Queries, normalized
-from .infrared_checkpoint import InfraredCheckpoint, load_infrared
+from .infrared_checkpoint import InfraredCheckpoint, MeasurerCheckpoint, load_infrared, load_measurer
+from .measurer import Measured, Measurer, MeasurerConfig
 from .network import Network
 from .parameterization import Parameterization
 from .points import PaperPointNetwork, PointNetwork
@@ -21,12 +24,18 @@ from .subject import check_object, check_rig
 __all__ = [
     "PRESETS",
     "Checkpoint",
+    "Claims",
     "Evidence",
+    "Expectation",
     "ImageNetwork",
     "Images",
     "InfraredCheckpoint",
     "InfraredConfig",
     "InfraredNetwork",
+    "Measured",
+    "Measurer",
+    "MeasurerCheckpoint",
+    "MeasurerConfig",
     "Network",
     "NetworkConfig",
     "NetworkSpec",
@@ -41,10 +50,14 @@ __all__ = [
     "build_network",
     "check_object",
     "check_rig",
+    "claim",
+    "cut_crops",
+    "cut_patches",
     "drawing_from",
     "find_soft_positions",
     "load_checkpoint",
     "load_infrared",
+    "load_measurer",
     "load_network",
     "normalized",
     "read_subject",

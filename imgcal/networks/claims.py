@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -11,8 +12,10 @@ from torch.nn import functional
 from imgcal.networks.infrared import Evidence
 from imgcal.networks.transport import partial_transport
 
-PEAKS = 3  # places that each fiducial puts forward
-SAME = 1.0  # crop pixels within which two places are one
+PEAKS = 3  # places that each fiducial puts forward at most ...
+LEAST_MASS = 0.02  # ... with this probability at least
+SAME = 1.5  # crop pixels within which two places are one
+TOLERANCE = 0.6  # crop pixels, one standard deviation between what two fiducials say of one place
 STRAY = -3.0  # log odds that a place belongs to no fiducial
 
 
@@ -42,7 +45,11 @@ def claim(evidence: Evidence, asked: Tensor) -> Claims:
     size = mass.shape[-1]
     inside = ((along > -0.5) & (along < size - 0.5)).all(-1)
     column, row = along.round().clamp(0, size - 1).long().unbind(-1)
-    said = mass.flatten(2).gather(2, row * size + column)
+    index = row * size + column
+    own = (evidence.cells + evidence.offset).flatten(2, 3).gather(2, index[..., None].expand(*index.shape, 2))
+    # Another's place counts as far as it is the one that this fiducial would have put forward itself.
+    beside = (own - place[:, None]).square().sum(-1) / (2 * TOLERANCE**2)
+    said = mass.flatten(2).gather(2, index) - beside
     present = functional.logsigmoid(evidence.present)[..., None]
     usable = inside & kept[:, None] & asked[..., None]
     scores = (said + present).masked_fill(~usable, -torch.inf)
@@ -67,7 +74,9 @@ def _local_mass(evidence: Evidence) -> Tensor:
 
 def _peaks(evidence: Evidence, mass: Tensor, asked: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The best local maxima of all windows, in one row: log odds (P, M), place (P, M, 2), log sigma (P, M)."""
-    highest = functional.max_pool2d(evidence.logits, 3, stride=1, padding=1) == evidence.logits
+    # So far apart that no two peaks share their neighbours' mass.
+    highest = functional.max_pool2d(evidence.logits, 5, stride=1, padding=2) == evidence.logits
+    highest &= mass > math.log(LEAST_MASS)
     value, index = mass.masked_fill(~highest, -torch.inf).flatten(2).topk(PEAKS, dim=-1)
     places = (evidence.cells + evidence.offset).flatten(2, 3)
     place = places.gather(2, index[..., None].expand(*index.shape, 2))

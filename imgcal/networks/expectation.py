@@ -13,6 +13,7 @@ from torch.nn import functional
 
 from imgcal.geometry import RigidTransform
 from imgcal.networks.infrared import Queries
+from imgcal.networks.measurer import PATCH, RADIUS
 from imgcal.types import CalibrationObject, CameraRig, CropPlacement
 
 MARGIN = 0.06
@@ -96,3 +97,37 @@ def cut_crops(frames: Frames, names: tuple[str, ...], placement: CropPlacement, 
             part = functional.pad(part, around, value=torch.nan)
         crops[camera] = functional.avg_pool2d(part[None], scale)[0]
     return -crops if inverted else crops
+
+
+def cut_patches(
+    frames: Frames, names: tuple[str, ...], uv: Tensor, radius: Tensor, *, inverted: bool = False
+) -> tuple[Tensor, CropPlacement]:
+    """Cut patches around places, for the measurer: reduced until the markers of a camera are small enough.
+
+    Args:
+        frames: by camera; None or absent = no frame.
+        names: of the cameras, C.
+        uv: (C, N, 2) pixels.
+        radius: (C, N) pixels, expected.
+        inverted: markers are dark on bright ground.
+
+    Returns:
+        (C, N, 24, 24) float32 grey levels, NaN outside of the image, and where they lie (C, N).
+    """
+    cameras, count = radius.shape
+    scale = (radius.median(-1).values / RADIUS).round().clamp(1, 64)[:, None].expand(-1, count)
+    corner = (uv + 0.5 - scale[..., None] * PATCH / 2).round().nan_to_num().clamp(-1e6, 1e6)
+    patches = torch.full((cameras, count, PATCH, PATCH), torch.nan)
+    for camera, name in enumerate(names):
+        frame = frames.get(name)
+        if frame is None:
+            continue
+        step = int(scale[camera, 0])
+        pixels = torch.arange(PATCH * step)
+        columns, rows = (corner[camera, :, axis, None].long() + pixels for axis in (0, 1))  # (N, 24 s)
+        height, width = frame.shape
+        inside = ((rows >= 0) & (rows < height))[:, :, None] & ((columns >= 0) & (columns < width))[:, None]
+        grey = frame[rows.clamp(0, height - 1).numpy()[:, :, None], columns.clamp(0, width - 1).numpy()[:, None]]
+        values = torch.from_numpy(grey.astype(np.float32)).masked_fill(~inside, torch.nan)
+        patches[camera] = functional.avg_pool2d(values, step)
+    return -patches if inverted else patches, CropPlacement(corner - 0.5, scale, PATCH)

@@ -8,6 +8,7 @@ one network serves any rig and any object.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -31,7 +32,8 @@ class InfraredConfig(StrictModel):
     crop: Annotated[int, Field(ge=48, le=384, multiple_of=48)] = 96  # pixels, each way
     channels: Annotated[int, Field(ge=1, le=128)] = 16  # of the feature map and of the windows
     window: Annotated[int, Field(ge=4, le=64, multiple_of=2)] = 22  # cells, each way
-    blocks: Annotated[int, Field(ge=1, le=16)] = 3  # of attention: within a query, among fiducials
+    close_window: Annotated[int, Field(ge=4, le=64, multiple_of=2)] = 12  # the same for a second look
+    blocks: Annotated[int, Field(ge=1, le=16)] = 3  # set blocks: windows of all fiducials compared
     keys: Annotated[int, Field(ge=1, le=32)] = 4  # weighted means over the fiducials beside the plain one
 
 
@@ -78,18 +80,19 @@ class InfraredNetwork(nn.Module):
         self.head = nn.Sequential(nn.Conv2d(width, 2 * width, 3, padding=1), nn.GELU(), nn.Conv2d(2 * width, 4, 1))
         self.presence = nn.Sequential(nn.Linear(2 * width + 2, 2 * width), nn.GELU(), nn.Linear(2 * width, 1))
 
-    def forward(self, crops: Tensor, queries: Queries) -> Evidence:
+    def forward(self, crops: Tensor, queries: Queries, window: int | None = None) -> Evidence:
         """Look for each fiducial.
 
         Args:
             crops: (P, S, S) grey, normalized by `normalized`.
             queries: (P, N) fiducials.
+            window: cells each way, where the places are known better than usual: `config.close_window`.
         """
-        return self.search(self.encoder(crops[:, None]), queries)
+        return self.search(self.encoder(crops[:, None]), queries, window)
 
-    def search(self, features: Tensor, queries: Queries) -> Evidence:
+    def search(self, features: Tensor, queries: Queries, window: int | None = None) -> Evidence:
         """Look for each fiducial in feature maps (P, channels, S / 2, S / 2): again and again for other poses."""
-        windows, cells = aligned_windows(features, queries.place, self.config.window)
+        windows, cells = aligned_windows(features, queries.place, window or self.config.window)
         geometry = queries.geometry(self.config.crop).to(windows.dtype)
         for block in self.blocks:
             windows = block(windows, geometry, queries.asked)
@@ -97,7 +100,9 @@ class InfraredNetwork(nn.Module):
         logits = said[:, :, 0]
         weights = logits.flatten(2).softmax(-1).to(windows.dtype)
         attended = torch.einsum("pnk,pndk->pnd", weights, windows.flatten(3))
-        sharpness = torch.stack((logits.flatten(2).amax(-1), logits.flatten(2).logsumexp(-1)), -1).to(windows.dtype)
+        highest, total = logits.flatten(2).amax(-1), logits.flatten(2).logsumexp(-1)
+        level = total - math.log(logits.shape[-1] ** 2)  # of an even window, whatever its size
+        sharpness = torch.stack((highest - total, level), -1).to(windows.dtype)
         summary = torch.cat((attended, windows.flatten(3).mean(-1), sharpness), -1)
         present = self.presence(summary).float()[..., 0]
         offset = STRIDE * said[:, :, 1:3].movedim(2, -1)

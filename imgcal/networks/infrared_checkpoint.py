@@ -1,4 +1,4 @@
-"""Query networks in files: weights and configuration alone, since they belong to no rig and no object."""
+"""Networks for captured frames in files: weights and configuration alone, since they belong to no rig and no object."""
 
 from __future__ import annotations
 
@@ -6,16 +6,20 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
+from torch import Tensor, nn
 
 from imgcal.errors import InputError
-from imgcal.io import read_json, read_tensors, validated, write_tensors
+from imgcal.io import StrictModel, read_json, read_tensors, validated, write_tensors
 from imgcal.networks.infrared import InfraredConfig, InfraredNetwork
+from imgcal.networks.measurer import Measurer, MeasurerConfig
 from imgcal.networks.randomness import drawing_from
 
-FORMAT = "imgcal-infrared/1"
+INFRARED, MEASURER = "imgcal-infrared/1", "imgcal-measurer/1"
+
+Config = TypeVar("Config", bound=StrictModel)
 
 
 @dataclass(frozen=True)
@@ -31,9 +35,19 @@ class InfraredCheckpoint:
         Raises:
             InputError: the file cannot be written.
         """
-        weights = {name: tensor.to(torch.bfloat16) for name, tensor in self.network.state_dict().items()}
-        config = json.dumps(self.network.config.model_dump(mode="json"))
-        write_tensors(path, weights, FORMAT, {"config": config, "metrics": json.dumps(dict(self.metrics))})
+        _write(path, INFRARED, self.network, self.network.config, self.metrics)
+
+
+@dataclass(frozen=True)
+class MeasurerCheckpoint:
+    """A measurer, and what it was found to be worth."""
+
+    network: Measurer
+    metrics: Mapping[str, Any]  # plain values
+
+    def save(self, path: str | Path) -> None:
+        """Write it in one step, in bfloat16; see `InfraredCheckpoint.save`."""
+        _write(path, MEASURER, self.network, self.network.config, self.metrics)
 
 
 def load_infrared(path: str | Path) -> InfraredCheckpoint:
@@ -42,19 +56,43 @@ def load_infrared(path: str | Path) -> InfraredCheckpoint:
     Raises:
         InputError: no such file, or something else in it.
     """
-    tensors, texts = read_tensors(path, FORMAT)
+    config, tensors, metrics = _read(path, INFRARED, InfraredConfig)
+    with drawing_from(torch.Generator()):
+        network = InfraredNetwork(config)
+    _fill(path, network, tensors)
+    return InfraredCheckpoint(network.eval(), metrics)
+
+
+def load_measurer(path: str | Path) -> MeasurerCheckpoint:
+    """Read a measurer; see `load_infrared`."""
+    config, tensors, metrics = _read(path, MEASURER, MeasurerConfig)
+    with drawing_from(torch.Generator()):
+        network = Measurer(config)
+    _fill(path, network, tensors)
+    return MeasurerCheckpoint(network.eval(), metrics)
+
+
+def _write(path: str | Path, tag: str, network: nn.Module, config: StrictModel, metrics: Mapping[str, Any]) -> None:
+    weights = {name: tensor.to(torch.bfloat16) for name, tensor in network.state_dict().items()}
+    texts = {"config": json.dumps(config.model_dump(mode="json")), "metrics": json.dumps(dict(metrics))}
+    write_tensors(path, weights, tag, texts)
+
+
+def _read(path: str | Path, tag: str, kind: type[Config]) -> tuple[Config, dict[str, Tensor], dict[str, Any]]:
+    tensors, texts = read_tensors(path, tag)
     try:
         content, metrics = read_json(texts["config"]), read_json(texts["metrics"])
         if not isinstance(content, dict) or not isinstance(metrics, dict):
             raise ValueError("no mapping")
     except (KeyError, ValueError) as error:
         raise InputError(f"{path}: found no readable configuration in it, expected one: the file is damaged") from error
-    with drawing_from(torch.Generator()):
-        network = InfraredNetwork(validated(content, InfraredConfig, f"{path}: config"))
+    return validated(content, kind, f"{path}: config"), tensors, metrics
+
+
+def _fill(path: str | Path, network: nn.Module, tensors: dict[str, Tensor]) -> None:
     own = network.state_dict()
     if own.keys() != tensors.keys() or any(own[name].shape != tensors[name].shape for name in own):
         raise InputError(f"{path}: found other weights than its network has: another version of imgcal")
     if not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
         raise InputError(f"{path}: found weights that are not finite, expected a trained network")
     network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
-    return InfraredCheckpoint(network.eval(), metrics)

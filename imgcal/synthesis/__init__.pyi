@@ -1,8 +1,10 @@
 from .captures import FrameModel, Shot, Truth, simulate_frames, simulate_shots, simulate_truth, true_detections
 from .colour_coding import LEVELS, ImageOptions, render_views
 from .corruption import Corrupted, Corruption
-from .crops import CropTruth, Scenes, host_generator, render_crops, sample_scenes
+from .crops import CropTruth, Scenes, render_crops, sample_scenes, second_look
 from .difficulty import DIFFICULTIES, Difficulty
+from .drawing import host_generator
+from .patches import Patches, sample_patches
 from .rigs import (
     Drift,
     PhysicalDrift,
@@ -24,6 +26,7 @@ __all__ = [
     "Drift",
     "FrameModel",
     "ImageOptions",
+    "Patches",
     "PhysicalDrift",
     "PoseRange",
     "RelativeDrift",
@@ -34,7 +37,9 @@ __all__ = [
     "host_generator",
     "render_crops",
     "render_views",
+    "sample_patches",
     "sample_scenes",
+    "second_look",
     "share_of_good_rigs",
     "simulate_frames",
     "simulate_shots",

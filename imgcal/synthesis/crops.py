@@ -8,14 +8,14 @@ motion blur along a segment is its exact integral. All of it is tensors on the d
 from __future__ import annotations
 
 import math
-import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from imgcal.geometry import RigidTransform, rotation_from_vector
+from imgcal.synthesis.drawing import Draw, host_generator
 from imgcal.synthesis.rigs import PhysicalDrift, RelativeDrift
 from imgcal.types import CameraRig, CropPlacement
 
@@ -58,7 +58,7 @@ def sample_scenes(rigs: int, cameras: int, fiducials: int, generator: torch.Gene
         fiducials: N, of each object.
         generator: source of randomness; its device is where all runs.
     """
-    draw = _Draw(generator)
+    draw = Draw(generator)
     points = _objects(rigs, fiducials, draw)
     size = points.square().sum(-1).amax(-1).sqrt()  # (B,)
     distance = size * draw.between(4.0, 12.0, rigs)
@@ -84,20 +84,9 @@ def sample_scenes(rigs: int, cameras: int, fiducials: int, generator: torch.Gene
     return Scenes(factory, rig, points, size * draw.between(0.02, 0.08, rigs), pose, expected)
 
 
-def host_generator(generator: torch.Generator) -> torch.Generator:
-    """Random numbers on the host that depend on where another generator stands: to ask a device would be to wait.
-
-    Examples:
-        >>> first, second = (host_generator(torch.Generator().manual_seed(3)) for _ in range(2))
-        >>> bool(torch.rand((), generator=first) == torch.rand((), generator=second))
-        True
-    """
-    return torch.Generator().manual_seed(zlib.crc32(generator.get_state().numpy().data))
-
-
 def render_crops(scenes: Scenes, generator: torch.Generator) -> CropTruth:
     """Look at the scenes through bad glass: every crop has its own mixture of everything that goes wrong."""
-    draw = _Draw(generator)
+    draw = Draw(generator)
     believed = scenes.factory.project(scenes.expected.apply(scenes.points))
     truth = scenes.rig.project(scenes.rig_from_object.apply(scenes.points))
     batch = believed.uv.shape[:2]
@@ -114,7 +103,17 @@ def render_crops(scenes: Scenes, generator: torch.Generator) -> CropTruth:
     return CropTruth(crops, placement, expected, expected_radius, depth, place, seen & inside & (truth.depth > 0))
 
 
-def _photograph(place: Tensor, radius: Tensor, draw: _Draw) -> tuple[Tensor, Tensor]:
+def second_look(truth: CropTruth, generator: torch.Generator) -> CropTruth:
+    """Expect the fiducials where a rig that was fitted to a first look has them: near, or all beside their places."""
+    draw = Draw(generator)
+    batch = truth.seen.shape[:2]
+    apart = truth.expected - truth.place
+    rest = (apart - apart.mean(2, keepdim=True)) * draw.between(0.0, 0.3, *batch, 1, 1)
+    lost = torch.where(draw.unit(*batch, 1, 1) < 0.15, 12.0, 0.8)
+    return replace(truth, expected=truth.place + rest + lost * draw.normal(*batch, 1, 2))
+
+
+def _photograph(place: Tensor, radius: Tensor, draw: Draw) -> tuple[Tensor, Tensor]:
     """Render markers (B, C, N, 2) of crop-pixel radii (B, C, N): crops (B, C, S, S), and which are to be seen."""
     batch, count = place.shape[:2], place.shape[2]
     hidden = draw.unit(*batch, count) < draw.often(0.5, 0.45, *batch)[..., None]
@@ -168,7 +167,7 @@ def _joined(*parts: _Spots) -> _Spots:
     return _Spots(*(torch.cat([getattr(part, name) for part in parts], dim=2) for name in _Spots.__dataclass_fields__))
 
 
-def _drawn(spots: _Spots, blur: Tensor, draw: _Draw) -> Tensor:
+def _drawn(spots: _Spots, blur: Tensor, draw: Draw) -> Tensor:
     """Add up spots, each in a window of its own: (B, C, S, S)."""
     batch, count = spots.radius.shape[:2], spots.radius.shape[2]
     corner = spots.place.detach().clamp(-PATCH, SIZE + PATCH).round() - PATCH // 2
@@ -201,7 +200,7 @@ def _drawn(spots: _Spots, blur: Tensor, draw: _Draw) -> Tensor:
     return image.scatter_add(2, index.flatten(2), (light * good).flatten(2)).unflatten(2, (SIZE, SIZE))
 
 
-def _background(batch: torch.Size, draw: _Draw) -> Tensor:
+def _background(batch: torch.Size, draw: Draw) -> Tensor:
     """Slow light, drapes (stripes), streaks and edges: (B, C, S, S)."""
     one = torch.ones(1, 1, 1, 1, device=draw.generator.device)
     slow = draw.normal(math.prod(batch), 1, 5, 5)
@@ -229,7 +228,7 @@ def _background(batch: torch.Size, draw: _Draw) -> Tensor:
     return ground + stripes + edge + (streaks * amount[..., None, None]).sum(2)
 
 
-def _objects(rigs: int, fiducials: int, draw: _Draw) -> Tensor:
+def _objects(rigs: int, fiducials: int, draw: Draw) -> Tensor:
     """Draw fiducials about their centroid, some 100 mm from it: balls, boxes, plates, subsets of lattices."""
     box = draw.between(-1, 1, rigs, fiducials, 3)
     ball = draw.direction(rigs, fiducials) * draw.unit(rigs, fiducials, 1) ** (1 / 3)
@@ -245,7 +244,7 @@ def _objects(rigs: int, fiducials: int, draw: _Draw) -> Tensor:
     return 100 * points / points.square().sum(-1).amax(-1).sqrt()[:, None, None]
 
 
-def _cameras(rigs: int, cameras: int, distance: Tensor, draw: _Draw) -> CameraRig:
+def _cameras(rigs: int, cameras: int, distance: Tensor, draw: Draw) -> CameraRig:
     """Cameras at about a distance from the rig's origin, looking near it, from anywhere."""
     turn = rotation_from_vector(draw.direction(rigs, cameras) * draw.between(0, math.pi, rigs, cameras, 1))
     size = torch.tensor((2048.0, 1088.0), device=distance.device)
@@ -261,29 +260,3 @@ def _cameras(rigs: int, cameras: int, distance: Tensor, draw: _Draw) -> CameraRi
         image_size=size.long().expand(cameras, 2),
         camera_names=tuple(f"cam{i + 1:02d}" for i in range(cameras)),
     )
-
-
-class _Draw:
-    """Random numbers of a generator, float32, on its device."""
-
-    def __init__(self, generator: torch.Generator) -> None:
-        self.generator = generator
-
-    def unit(self, *shape: int) -> Tensor:
-        return torch.rand(shape, generator=self.generator, device=self.generator.device)
-
-    def between(self, low: float, high: float, *shape: int) -> Tensor:
-        return low + (high - low) * self.unit(*shape)
-
-    def normal(self, *shape: int) -> Tensor:
-        return torch.randn(shape, generator=self.generator, device=self.generator.device)
-
-    def zeros(self, *shape: int) -> Tensor:
-        return torch.zeros(shape, device=self.generator.device)
-
-    def often(self, share: float, largest: float, *shape: int) -> Tensor:
-        """Nothing in most draws; in a share of them anything up to the largest."""
-        return torch.where(self.unit(*shape) < share, self.between(0, largest, *shape), 0.0)
-
-    def direction(self, *shape: int, of: int = 3) -> Tensor:
-        return functional.normalize(self.normal(*shape, of), dim=-1)

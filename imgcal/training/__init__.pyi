@@ -3,6 +3,7 @@ from .engine import Run, finished, prepare, progress, train, train_step
 from .experiment import Experiment
 from .experiment_file import KINDS, changed, load_experiment, save_experiment
 from .infrared_task import InfraredExperiment, InfraredTask
+from .measurer_task import MeasurerExperiment, MeasurerTask
 from .rigs import RigExperiment, RigTask, experiment_of
 from .state import TrainingState, load_state, save_state
 from .task import Loss, Result, Task
@@ -15,6 +16,8 @@ __all__ = [
     "InfraredExperiment",
     "InfraredTask",
     "Loss",
+    "MeasurerExperiment",
+    "MeasurerTask",
     "Result",
     "RigExperiment",
     "RigTask",

@@ -22,6 +22,7 @@ from imgcal.io import (
 from imgcal.messages import quoted
 from imgcal.training.experiment import Experiment
 from imgcal.training.infrared_task import InfraredExperiment
+from imgcal.training.measurer_task import MeasurerExperiment
 from imgcal.training.rigs import RigExperiment
 
 FORMAT = "imgcal-experiment/1"
@@ -30,6 +31,7 @@ FORMAT = "imgcal-experiment/1"
 KINDS: dict[str, type[Experiment]] = {
     "rig": RigExperiment,
     "infrared": InfraredExperiment,
+    "measurer": MeasurerExperiment,
 }
 
 # Keys as people write them: first what it is about.

@@ -11,6 +11,8 @@ from torch.nn import functional
 from imgcal.networks import Evidence, Queries
 from imgcal.synthesis import CropTruth
 
+NEIGHBOUR = 2.5  # crop pixels, each way: cells that must know the offset
+
 
 @dataclass(frozen=True)
 class QueryLosses:
@@ -19,12 +21,12 @@ class QueryLosses:
     cell: Tensor  # cross-entropy over the cells of a window, nats
     offset: Tensor  # crop pixels, absolute error of an axis
     likelihood: Tensor  # negative logarithm of the offset's likelihood, of an axis, by the predicted sigma
-    presence: Tensor  # binary cross-entropy of `present`
+    presence: Tensor  # binary cross-entropy of `present`: to be seen, and in its window
 
     @property
     def total(self) -> Tensor:
         """The weighted sum that is trained."""
-        return self.cell + 0.5 * self.offset + 0.1 * self.likelihood + 0.5 * self.presence
+        return self.cell + 0.5 * self.offset + 0.3 * self.likelihood + 0.5 * self.presence
 
 
 def queries_of(truth: CropTruth) -> Queries:
@@ -59,17 +61,18 @@ def query_losses(evidence: Evidence, asked: Tensor, place: Tensor, seen: Tensor)
         return (torch.where(good > 0, values, 0.0)).sum() / good.sum().clamp(min=1)
 
     cell = mean(-at(evidence.logits.flatten(2).log_softmax(-1)))
-    middle = torch.stack([at(evidence.cells[..., axis]) for axis in (0, 1)], -1)
-    offset = torch.stack([at(evidence.offset[..., axis]) for axis in (0, 1)], -1)
-    error = (middle + offset - place).abs()
-    log_sigma = at(evidence.log_sigma)
-    squared = error.detach().square().mean(-1)
-    likelihood = mean(squared / 2 * (-2 * log_sigma).exp() + log_sigma)
-    truly = asked & (~seen | inside)  # outside of the window nothing can be said
+    # A neighbour of the right cell must know where it is, too: it may be the one that is taken.
+    apart = place[:, :, None, None] - evidence.cells
+    near = ((apart.abs() < NEIGHBOUR).all(-1) & (good > 0)[..., None, None]).to(apart.dtype)
+    error = (evidence.offset - apart).abs()
+    count = near.sum().clamp(min=1)
+    offset = (error.mean(-1) * near).sum() / count
+    squared, log_sigma = error.detach().square().mean(-1), evidence.log_sigma
+    likelihood = ((squared / 2 * (-2 * log_sigma).exp() + log_sigma) * near).sum() / count
     target = (seen & inside).to(evidence.present.dtype)
     presence = functional.binary_cross_entropy_with_logits(evidence.present, target, reduction="none")
-    presence = (presence * truly).sum() / truly.sum().clamp(min=1)
-    return QueryLosses(cell, mean(error.clamp(max=8.0).mean(-1)), likelihood, presence)
+    presence = (presence * asked).sum() / asked.sum().clamp(min=1)
+    return QueryLosses(cell, offset, likelihood, presence)
 
 
 def evidence_at_best(evidence: Evidence) -> tuple[Tensor, Tensor, Tensor]:

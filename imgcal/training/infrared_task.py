@@ -19,11 +19,12 @@ from imgcal.networks import (
     load_infrared,
     normalized,
 )
-from imgcal.synthesis import host_generator, render_crops, sample_scenes
+from imgcal.synthesis import host_generator, render_crops, sample_scenes, second_look
 from imgcal.training.experiment import Experiment
 from imgcal.training.infrared import evidence_at_best, queries_of, query_losses
 from imgcal.training.task import Loss, Task
 
+SECOND_LOOKS = 0.5  # share of the batches, as after a rig was fitted to a first look
 VALIDATION_SEED = 20_000_003
 CAMERAS = 2  # crops a rig: more rigs and objects instead of more cameras
 FIDUCIALS = (5, 12)  # of the objects
@@ -49,6 +50,7 @@ class CropBatch:
     queries: Queries  # (P, N)
     place: Tensor  # (P, N, 2) crop pixels
     seen: Tensor  # (P, N) bool
+    window: int | None = None  # cells; None = the network's own
 
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name."""
@@ -90,14 +92,18 @@ class InfraredTask(Task[CropBatch, Evidence]):
     def batch(self, count: int, generator: torch.Generator) -> CropBatch:
         """Make crops of random rigs and objects; all objects of a batch have as many fiducials."""
         low, high = FIDUCIALS
-        fiducials = int(torch.randint(low, high + 1, (), generator=host_generator(generator)))
+        host = host_generator(generator)
+        fiducials = int(torch.randint(low, high + 1, (), generator=host))
+        second = float(torch.rand((), generator=host)) < SECOND_LOOKS
         truth = render_crops(sample_scenes(max(count // CAMERAS, 1), CAMERAS, fiducials, generator), generator)
+        truth = second_look(truth, generator) if second else truth
         crops, place, seen = (part.flatten(0, 1) for part in (truth.crops, truth.place, truth.seen))
-        return CropBatch(normalized(crops), queries_of(truth), place, seen)
+        window = self.network.config.close_window if second else None
+        return CropBatch(normalized(crops), queries_of(truth), place, seen, window)
 
     def predict(self, network: nn.Module, batch: CropBatch) -> Evidence:
         """Say where the fiducials are."""
-        return network(batch.crops, batch.queries)
+        return network(batch.crops, batch.queries, batch.window)
 
     def loss(self, answer: Evidence, batch: CropBatch, step: int) -> Loss:
         """Compare the evidence with the truth."""

@@ -3,7 +3,7 @@ import torch
 
 import imgcal
 from imgcal.geometry import RigidTransform
-from imgcal.networks.expectation import Expectation, cut_crops
+from imgcal.networks.expectation import Expectation, cut_crops, cut_patches
 from imgcal.types import CropPlacement
 
 
@@ -37,3 +37,19 @@ def test_crops_are_block_means() -> None:
     assert torch.equal(crops[1].isfinite(), inside)
     assert not bool(crops[2].isfinite().any())
     assert torch.equal(cut_crops({"a": frame}, ("a", "b", "c"), placement, inverted=True)[0], -crops[0])
+
+
+def test_patches_lie_around_their_places() -> None:
+    rng = np.random.default_rng(1)
+    frame = rng.integers(0, 255, (200, 160), dtype=np.uint8)
+    uv = torch.tensor([[[80.3, 99.6], [3.0, 100.0]]] * 2)
+    patches, placement = cut_patches({"a": frame}, ("a", "b"), uv, torch.tensor([[7.0, 7.2], [1.0, 1.0]]))
+    assert placement.scale.tolist() == [[2, 2], [1, 1]]
+    middle = placement.to_image(torch.full((2, 2, 1, 2), 11.5))[..., 0, :]
+    assert float((middle - uv).abs().max()) <= 1
+    left, top = (int(value) for value in placement.corner[0, 0] + 0.5)
+    expected = frame[top : top + 48, left : left + 48].reshape(24, 2, 24, 2).mean((1, 3))
+    torch.testing.assert_close(patches[0, 0], torch.from_numpy(expected).float())
+    assert bool(patches[0, 1].isnan().any())
+    assert bool(patches[0, 1, :, 12:].isfinite().all())
+    assert bool(patches[1].isnan().all())

@@ -7,7 +7,7 @@ import torch
 from imgcal.errors import InputError
 from imgcal.io import read_tensors, write_tensors
 from imgcal.networks import InfraredCheckpoint, InfraredConfig, InfraredNetwork, load_infrared
-from imgcal.networks.infrared_checkpoint import FORMAT
+from imgcal.networks.infrared_checkpoint import INFRARED
 
 SMALL = InfraredConfig(crop=48, channels=4, window=6, blocks=1)
 
@@ -32,7 +32,7 @@ def test_there_and_back(tmp_path: Path) -> None:
 
 def test_neither_rig_nor_object_is_in_it(tmp_path: Path) -> None:
     _, path = saved(tmp_path)
-    assert set(read_tensors(path, FORMAT)[1]) == {"config", "metrics", "format", "checksum"}
+    assert set(read_tensors(path, INFRARED)[1]) == {"config", "metrics", "format", "checksum"}
 
 
 @pytest.mark.parametrize(
@@ -46,9 +46,9 @@ def test_neither_rig_nor_object_is_in_it(tmp_path: Path) -> None:
 )
 def test_damaged_files_say_so(tmp_path: Path, damage, message: str) -> None:
     _, path = saved(tmp_path)
-    tensors, texts = read_tensors(path, FORMAT)
+    tensors, texts = read_tensors(path, INFRARED)
     kept = {name: text for name, text in texts.items() if name not in ("format", "checksum")}
     damage(tensors, kept)
-    write_tensors(path, tensors, FORMAT, kept)
+    write_tensors(path, tensors, INFRARED, kept)
     with pytest.raises(InputError, match=f"{re.escape(str(path))}.*{message}"):
         load_infrared(path)

@@ -1,0 +1,85 @@
+"""The measurer: the centre of a marker in a small patch at full scale, how well it is known, and whether it is one.
+
+It learns what a fitted ellipse cannot know: that half of a sphere may be hidden or dark, that motion has smeared it, or
+that two have merged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from imgcal.io import StrictModel
+from imgcal.networks.infrared_encoders import STRIDE, CnnEncoder, VitEncoder
+
+PATCH = 24  # pixels, each way
+RADIUS = 3.5  # patch pixels that a marker's radius is reduced to; smaller ones are taken as they are
+
+CNN_WIDTHS, VIT_WIDTH_AND_DEPTH = (8, 18, 54), (48, 2)  # as many weights and operations
+
+
+class MeasurerConfig(StrictModel):
+    """Which measurer."""
+
+    encoder: Literal["cnn", "vit"] = "cnn"  # family of the encoder
+    channels: Annotated[int, Field(ge=1, le=128)] = 24  # of the feature map
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What patches show, M of them."""
+
+    offset: Tensor  # (M, 2) patch pixels, from the middle of the patch to the marker's centre
+    log_sigma: Tensor  # (M,) of its error, patch pixels, one standard deviation of each axis
+    valid: Tensor  # (M,) logit that the marker is to be seen
+
+
+class Measurer(nn.Module):
+    """Patches in, centres out."""
+
+    def __init__(self, config: MeasurerConfig = MeasurerConfig()) -> None:
+        """Make an untrained network; weights come from torch's default generators (see `drawing_from`)."""
+        super().__init__()
+        self.config = config
+        channels = config.channels
+        self.encoder: nn.Module = (
+            CnnEncoder(channels, CNN_WIDTHS)
+            if config.encoder == "cnn"
+            else VitEncoder(channels, PATCH, *VIT_WIDTH_AND_DEPTH)
+        )
+        self.size = nn.Linear(2, channels)
+        self.head = nn.Sequential(
+            nn.GELU(), nn.Conv2d(channels, channels, 3, padding=1), nn.GELU(), nn.Conv2d(channels, 4, 1)
+        )
+        self.verdict = nn.Sequential(nn.Linear(channels + 1, channels), nn.GELU(), nn.Linear(channels, 2))
+
+    def forward(self, patches: Tensor, radius: Tensor) -> Measured:
+        """Measure one marker a patch, the one that is asked for in its middle.
+
+        Args:
+            patches: (M, 24, 24) grey, normalized by `normalized`.
+            radius: (M,) patch pixels, expected.
+        """
+        known = torch.stack((radius, radius.clamp(min=0.1).log()), -1)
+        features = self.encoder(patches[:, None]) + self.size(known)[..., None, None]
+        said = self.head(features).float()
+        weight = said[:, 0].flatten(1).softmax(-1)
+        steps = STRIDE * (torch.arange(said.shape[-1], device=said.device) - (said.shape[-1] - 1) / 2)
+        cells = torch.stack(torch.meshgrid(steps, steps, indexing="xy"))
+        votes = (cells + said[:, 1:3]).flatten(2)
+        offset = (votes * weight[:, None]).sum(-1)
+        # Cells that disagree are the first sign that a centre is not well known.
+        spread = ((votes - offset[..., None]).square().mean(1) * weight).sum(-1, keepdim=True).clamp(min=1e-4).log()
+        attended = (features.float().flatten(2) * weight[:, None]).sum(-1)
+        log_sigma, valid = self.verdict(torch.cat((attended, spread), -1)).float().unbind(-1)
+        return Measured(offset, log_sigma.clamp(-5, 3), valid)
+
+    def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:
+        """Parameters that may have their own learning rates."""
+        rest = [p for name, p in self.named_parameters() if not name.startswith("encoder.")]
+        return {"encoder": self.encoder.parameters(), "decoder": rest}

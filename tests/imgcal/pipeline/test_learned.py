@@ -1,0 +1,111 @@
+"""The proposer, around networks that know the truth: what it makes of their evidence."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import imgcal
+from imgcal.association import Snapshot
+from imgcal.geometry import RigidTransform, rotation_from_vector
+from imgcal.networks import Evidence, Expectation, InfraredNetwork, Measured, Measurer, Queries
+from imgcal.pipeline.learned import LearnedProposer
+from imgcal.synthesis import PhysicalDrift, Truth, simulate_truth
+from imgcal.types import Detections, RigPrior
+
+RIG, OBJ = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+
+
+class Knowing(InfraredNetwork):
+    """Sees the fiducials in their true places, if they are in their windows, and nothing elsewhere."""
+
+    def __init__(self, place: Tensor, seen: Tensor) -> None:
+        super().__init__()
+        self.place, self.seen = place, seen  # (C, N, 2) crop pixels, (C, N)
+
+    def search(self, features: Tensor, queries: Queries, window: int | None = None) -> Evidence:
+        size, count = window or self.config.window, len(queries.place) // len(self.place)
+        steps = 2.0 * torch.arange(size) - (size - 1)
+        cells = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1) + queries.place[:, :, None, None]
+        place, seen = self.place.repeat(count, 1, 1), self.seen.repeat(count, 1)
+        offset = place[:, :, None, None] - cells
+        near = (offset.abs() <= 1).all(-1) & seen[..., None, None]
+        present = 12.0 * (2 * near.flatten(2).any(-1).float() - 1)
+        return Evidence(15.0 * near, offset.clamp(-3, 3), torch.full(near.shape, -2.0), present, cells)
+
+
+class Blind(Measurer):
+    """Measures nothing: what is claimed stays."""
+
+    def forward(self, patches: Tensor, radius: Tensor) -> Measured:
+        return Measured(torch.zeros(len(patches), 2), torch.zeros(len(patches)), torch.full((len(patches),), -9.0))
+
+
+@dataclass(frozen=True)
+class Scene:
+    truth: Truth
+    snapshot: Snapshot
+    place: Tensor  # (C, N, 2) crop pixels, of the crops that the proposer cuts
+
+
+def scene(degrees: float = 1.0, seed: int = 0) -> Scene:
+    draw = torch.Generator().manual_seed(seed)
+    truth = simulate_truth(RIG, OBJ, 1, draw, PhysicalDrift())
+    axis = torch.nn.functional.normalize(torch.randn(3, generator=draw, dtype=torch.float64), dim=0)
+    turn, pose, centre = rotation_from_vector(axis * np.deg2rad(degrees)), truth.rig_from_object[0], OBJ.points.mean(0)
+    rotation = turn @ pose.rotation
+    candidate = RigidTransform(rotation, pose.rotation @ centre + pose.translation - rotation @ centre)
+    names = RIG.camera_names
+    frames = {name: np.zeros((1088, 2048), np.uint8) for name in names}
+    none, zeros = np.zeros(0, np.int64), np.zeros(0)
+    blobs = Detections(
+        np.zeros((0, 2)), zeros, none, none, none, zeros, zeros.astype(np.uint8), names, ("00000",)
+    )  # fmt: skip
+    snapshot = Snapshot(frames, blobs, RIG, OBJ, RigPrior().std(RIG), (candidate,))
+    poses = RigidTransform(candidate.rotation[None], candidate.translation[None])
+    placement = Expectation.of(RIG, OBJ, poses).placement(RIG, 96)
+    return Scene(truth, snapshot, placement.to_crop(truth.uv[0]).float())
+
+
+def proposer(place: Tensor, seen: Tensor) -> LearnedProposer:
+    torch.manual_seed(0)
+    return LearnedProposer(Knowing(place, seen), Blind())
+
+
+@pytest.mark.parametrize("degrees", [1.0, 12.0])
+def test_what_the_network_sees_is_proposed(degrees: float) -> None:
+    made = scene(degrees)
+    seen = torch.ones(made.place.shape[:-1], dtype=torch.bool)
+    seen[1, 2] = seen[3, :4] = False
+    proposal = proposer(made.place, seen).propose(made.snapshot)
+    assert not proposal.reason
+    rows = proposal.detections
+    expected = made.truth.uv[0].numpy()[rows.camera, rows.fiducial]
+    assert np.abs(rows.uv - expected).max() < 0.1
+    assert len(rows) == int(seen.sum())
+    assert proposal.margin > 20
+    assert proposal.rig_from_object is not None
+    turned = proposal.rig_from_object.rotation.mT @ made.truth.rig_from_object.rotation[0]
+    assert float(torch.rad2deg(torch.acos((turned.trace() - 1) / 2))) < 1.5
+
+
+def test_claims_that_fit_no_rig_are_dropped() -> None:
+    made = scene(seed=1)
+    place = made.place.clone()
+    place[0, 3] += 9.0  # some 60 pixels beside where rig and pose have it
+    seen = torch.ones(place.shape[:-1], dtype=torch.bool)
+    rows = proposer(place, seen).propose(made.snapshot).detections
+    assert not ((rows.camera == 0) & (rows.fiducial == 3)).any()
+    assert len(rows) == int(seen.sum()) - 1
+
+
+def test_it_declines_where_nothing_is_seen_and_where_nobody_knows_where_to_look() -> None:
+    made = scene()
+    nothing = torch.zeros(made.place.shape[:-1], dtype=torch.bool)
+    proposal = proposer(made.place, nothing).propose(made.snapshot)
+    assert proposal.reason
+    assert len(proposal.detections) == 0
+    lost = replace(made.snapshot, candidates=())
+    assert "no pose" in proposer(made.place, ~nothing).propose(lost).reason
