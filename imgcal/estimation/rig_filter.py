@@ -11,10 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from scipy.linalg import cho_solve, cholesky, solve_triangular
 from torch import Tensor
 
 from imgcal.errors import RefusedError
@@ -47,8 +44,6 @@ YOUNG_SECONDS = 60.0
 LEAST_SECONDS = 1.0
 """Time that is worth an inversion of the information."""
 
-Matrix = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class RigBelief:
@@ -57,7 +52,7 @@ class RigBelief:
     rig: CameraRig  # without batch axes, float64
     obj: CalibrationObject  # with its tolerances, as it was given
     object_offset: Tensor  # (M,) in units of its prior standard deviation: what is known of it; M = 0 where it is exact
-    factor: Matrix  # (D, D) lower Cholesky factor of the information; D = 15 C + M
+    factor: Tensor  # (D, D) lower Cholesky factor of the information; D = 15 C + M
     unit: Tensor  # (C, 15) rad, mm, pixels, 1: of the cameras' errors
 
     @classmethod
@@ -68,20 +63,19 @@ class RigBelief:
         unit = std.double().clamp_min(torch.tensor(LEAST_STD, dtype=torch.float64))
         step = _whitened(step_by_error(rig), unit)
         own, wide = 0 if obj.exact else 3 * obj.num_fiducials + 1, rig.num_cameras * PARAMETERS
-        information = np.zeros((wide + own, wide + own))
-        _add_blocks(information, (step.mT @ step).numpy())
-        information[wide:, wide:] = np.eye(own)
-        return cls(rig, obj, rig.focal_length.new_zeros(own), cholesky(information, lower=True), unit)
+        information = torch.eye(wide + own, dtype=torch.float64)
+        _add_blocks(information, step.mT @ step - torch.eye(PARAMETERS, dtype=torch.float64))
+        return cls(rig, obj, rig.focal_length.new_zeros(own), _cholesky(information), unit)
 
     @property
-    def information(self) -> Matrix:
+    def information(self) -> Tensor:
         """Inverse covariance (D, D) of the errors in their units."""
-        return self.factor @ self.factor.T
+        return self.factor @ self.factor.mT
 
     def covariance(self) -> Tensor:
         """Joint covariance (15 C, 15 C) of the cameras in the units and order of `PARAMETER_NAMES`."""
         wide = self.rig.num_cameras * PARAMETERS
-        covariance = torch.from_numpy(_inverse(self.factor)[:wide, :wide])
+        covariance = torch.cholesky_inverse(self.factor)[:wide, :wide]
         blocks = covariance.unflatten(0, (-1, PARAMETERS)).unflatten(-1, (-1, PARAMETERS))
         step = step_by_error(self.rig) * self.unit[:, None, :]
         return torch.einsum("cij,cjdk,dlk->cidl", step, blocks, step).reshape(wide, wide)
@@ -156,9 +150,9 @@ def aged(belief: RigBelief, seconds: float, rate: DriftRate) -> RigBelief:
     if not variance.any():
         return belief
     error_by_step = torch.linalg.inv(step_by_error(belief.rig)) / belief.unit[:, :, None]
-    covariance = _inverse(belief.factor)
-    _add_blocks(covariance, (error_by_step @ torch.diag_embed(variance) @ error_by_step.mT).numpy())
-    return replace(belief, factor=_cholesky(_inverse(_cholesky(covariance))))
+    covariance = torch.cholesky_inverse(belief.factor)
+    _add_blocks(covariance, error_by_step @ torch.diag_embed(variance) @ error_by_step.mT)
+    return replace(belief, factor=_cholesky(torch.cholesky_inverse(_cholesky(covariance))))
 
 
 class RigFilter:
@@ -249,7 +243,7 @@ class _Linearization:
     state: State  # no offset: the rig is the problem's
     options: EstimationOptions
     equations: NormalEquations  # of each snapshot
-    distance: Matrix  # (D,) from the belief's rig and object, in units
+    distance: Tensor  # (D,) from the belief's rig and object, in units
     cost: float
 
     @classmethod
@@ -275,11 +269,11 @@ class _Linearization:
         own = state.object_offset
         cameras = (error_between(problem.factory[0], belief.rig) / belief.unit).flatten()
         change = cameras if own is None else torch.cat((cameras, own[0] - belief.object_offset))
-        prior = 0.5 * float(np.square(belief.factor.T @ change.numpy()).sum())
+        prior = 0.5 * float((belief.factor.mT @ change).square().sum())
         data = float(equations.cost.sum()) - (0.0 if own is None else 0.5 * float(own.square().sum()))
-        return cls(belief, problem, state, options, equations, change.numpy(), prior + data)
+        return cls(belief, problem, state, options, equations, change, prior + data)
 
-    def step(self, damping: float) -> tuple[Matrix, float, Matrix]:
+    def step(self, damping: float) -> tuple[Tensor, float, Tensor]:
         """Newton's step.
 
         The derivative of the distance by the error is taken as the unit matrix. It is nearly so, and what it adds would
@@ -291,23 +285,23 @@ class _Linearization:
         """
         information, pull = self._information()
         information = information + self.belief.information
-        pull = pull - self.belief.factor @ (self.belief.factor.T @ self.distance)
+        pull = pull - self.belief.factor @ (self.belief.factor.mT @ self.distance)
         damped = factor = _cholesky(information)
         if damping:
-            damped = _cholesky(information + damping * np.diag(information.diagonal()))
-        step = cho_solve((damped, True), pull, check_finite=False)
+            damped = _cholesky(information + damping * information.diagonal().diag())
+        step = torch.cholesky_solve(pull[:, None], damped)[:, 0]
         right = self.equations.pose_gradient[:, 0]
         gain = 0.5 * float((right * _solved(self.equations.pose[:, 0], right)).sum())
         return step, gain + 0.5 * float(step @ pull), factor
 
-    def moved(self, step: Matrix) -> _Linearization:
+    def moved(self, step: Tensor) -> _Linearization:
         """Take a step of cameras and object; poses follow."""
         problem, state, equations = self.problem, self.state, self.equations
         wide = problem.prior_std.shape[1] * PARAMETERS
-        error = torch.from_numpy(step[:wide]).unflatten(0, (-1, PARAMETERS))
+        error = step[:wide].unflatten(0, (-1, PARAMETERS))
         by_offset = torch.einsum("cij,cj->ci", self._basis(), error)
         right = equations.pose_gradient[:, 0] + torch.einsum("scip,ci->sp", equations.coupling[:, 0], by_offset)
-        own = torch.from_numpy(step[wide:])
+        own = step[wide:]
         if equations.object is not None:
             right = right + equations.object.pose[:, 0] @ own
         pose = -_solved(equations.pose[:, 0], right)
@@ -317,7 +311,7 @@ class _Linearization:
         problem = replace(problem, factory=rig.expand(len(pose)))
         return self._at(self.belief, problem, state, self.options)
 
-    def absorbed(self, factor: Matrix) -> Absorbed:
+    def absorbed(self, factor: Tensor) -> Absorbed:
         """What is known now, its information being that of the last step, which was hardly any."""
         own = self.state.object_offset
         belief = replace(
@@ -335,7 +329,7 @@ class _Linearization:
         """Whitened offsets of the problem by errors in units: (C, 15, 15)."""
         return _whitened(step_by_error(self.problem.factory[0]), self.belief.unit)
 
-    def _information(self) -> tuple[Matrix, Matrix]:
+    def _information(self) -> tuple[Tensor, Tensor]:
         """What the snapshots say about cameras and object, poses eliminated: (D, D), and their pull (D,)."""
         equations, own, offset = self.equations, self.equations.object, self.state.object_offset
         basis = self._basis()
@@ -351,25 +345,29 @@ class _Linearization:
             raise RefusedError("estimation: the observations do not determine the object's pose in every snapshot")
         carried = torch.linalg.solve_triangular(factor, coupling.mT, upper=False)  # (S, 6, D)
         gradient = torch.linalg.solve_triangular(factor, equations.pose_gradient[:, 0, :, None], upper=False)
-        flat = carried.flatten(0, 1).numpy()
-        information = -(flat.T @ flat)
-        _add_blocks(information, (basis.mT @ camera.sum(0) @ basis).numpy())
+        flat = carried.flatten(0, 1)
+        information = -(flat.mT @ flat)
+        _add_blocks(information, basis.mT @ camera.sum(0) @ basis)
         if own is not None:
-            across = torch.einsum("cij,scim->cjm", basis, own.camera).flatten(0, 1).numpy()
+            across = torch.einsum("cij,scim->cjm", basis, own.camera).flatten(0, 1)
             information[:wide, wide:] += across
-            information[wide:, :wide] += across.T
-            information[wide:, wide:] += own.own.sum(0).numpy() - len(camera) * np.eye(len(across.T))
-        return information, ((carried.mT @ gradient).sum((0, 2)) - pull).numpy()
+            information[wide:, :wide] += across.mT
+            information[wide:, wide:] += own.own.sum(0) - len(camera) * torch.eye(
+                own.own.shape[-1], dtype=torch.float64
+            )
+        return information, (carried.mT @ gradient).sum((0, 2)) - pull
 
 
-def _cholesky(matrix: Matrix) -> Matrix:
-    return np.asarray(cholesky(matrix, lower=True, check_finite=False))
+def _cholesky(matrix: Tensor) -> Tensor:
+    """Factorize what is positive definite but for rounding.
 
-
-def _inverse(factor: Matrix) -> Matrix:
-    """Invert a matrix by its Cholesky factor."""
-    half = solve_triangular(factor, np.eye(len(factor)), lower=True, check_finite=False)
-    return np.asarray(half.T @ half)
+    Raises:
+        RefusedError: it is not.
+    """
+    factor, failed = torch.linalg.cholesky_ex(matrix)
+    if bool(failed):
+        raise RefusedError("estimation: these observations leave a rig that nothing is known of: labels may be wrong")
+    return factor
 
 
 def _solved(matrices: Tensor, vectors: Tensor) -> Tensor:
@@ -382,8 +380,9 @@ def _whitened(step: Tensor, unit: Tensor) -> Tensor:
     return step * unit[:, None, :] / unit[:, :, None]
 
 
-def _add_blocks(matrix: Matrix, blocks: Matrix) -> None:
+def _add_blocks(matrix: Tensor, blocks: Tensor) -> None:
     """Add (C, 15, 15) along the diagonal of the cameras' part."""
-    for camera, block in enumerate(blocks):
-        place = slice(camera * PARAMETERS, (camera + 1) * PARAMETERS)
-        matrix[place, place] += block
+    count = len(blocks)
+    wide = matrix[: count * PARAMETERS, : count * PARAMETERS]
+    square = wide.unflatten(0, (count, PARAMETERS)).unflatten(-1, (count, PARAMETERS))
+    square.diagonal(dim1=0, dim2=2).add_(blocks.movedim(0, -1))

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
@@ -97,10 +96,10 @@ def test_nothing_is_learnt_of_motions_of_the_whole_rig(made) -> None:
     prior = belief = RigBelief.of_prior(factory, obj)
     for s in range(24):  # each linearized elsewhere
         belief = absorbed(belief, *snapshots(made, s, s + 1), SQUARED).belief
-    whole = np.concatenate([np.vstack((np.eye(6), np.zeros((9, 6)))) for _ in range(4)])
-    whole = whole / np.repeat(belief.unit.numpy().reshape(-1, 1), 6, axis=1)
-    before, after = (whole.T @ b.information @ whole for b in (prior, belief))
-    np.testing.assert_allclose(after, before, rtol=1e-4, atol=1e-4 * before.max())
+    whole = torch.cat((torch.eye(6, dtype=torch.float64), torch.zeros(9, 6, dtype=torch.float64))).repeat(4, 1)
+    whole = whole / belief.unit.reshape(-1, 1)
+    before, after = (whole.mT @ b.information @ whole for b in (prior, belief))
+    torch.testing.assert_close(after, before, rtol=1e-4, atol=1e-4 * float(before.max()))
 
 
 def test_time_widens_what_is_known_and_moves_nothing(made) -> None:
