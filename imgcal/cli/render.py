@@ -17,7 +17,7 @@ from imgcal.cli.common import check_folder, progress, read_detections
 from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError
 from imgcal.io import load_object, load_rig, open_input, publishing, write_image
-from imgcal.synthesis import LEVELS, ImageOptions, render_views
+from imgcal.synthesis import GREY_LEVELS, ImageOptions, render_views
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Render:
             for row, snapshot in enumerate(progress(labelled.used, len(labelled.used), "rendering")):
                 name = labelled.snapshots[snapshot].name
                 images = render_views(observations.uv[row], observations.seen[row], rig.image_size, obj, options)
-                pixels = (images * LEVELS).round().to(torch.uint8).permute(0, 2, 3, 1).numpy()
+                pixels = (images * GREY_LEVELS).round().to(torch.uint8).permute(0, 2, 3, 1).numpy()
                 for camera, image in zip(rig.camera_names, pixels, strict=True):
                     write_image(out / camera / f"{name}.png", image)
         refused = len(labelled.snapshots) - len(labelled.used)

@@ -1,5 +1,5 @@
 from .encoder_check import LEAST_RISE, EncoderCheck, check_encoder
-from .methods import BASELINES, QUICK_BASELINES, Given, Method, network_method
+from .methods import BASELINES, QUICK_BASELINES, Given, Method, network_method, refined_by_sightings
 from .metrics import Errors, cramer_rao, errors, held_out_points, reprojection_error
 from .models import Model, load_models
 from .protocol import Conditions, Evaluation, Progress, Protocol, Row, Scores, evaluate
@@ -41,6 +41,7 @@ __all__ = [
     "load_models",
     "markdown",
     "network_method",
+    "refined_by_sightings",
     "reprojection_error",
     "sweep",
     "write",

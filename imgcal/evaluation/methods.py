@@ -14,18 +14,20 @@ from torch import Tensor
 
 from imgcal.estimation import EstimationOptions, estimate, initial_pose
 from imgcal.evaluation import classical
-from imgcal.networks import Network
+from imgcal.networks import ImageNetwork, Network, Sightings
 from imgcal.refinement import (
     ImageRefinementOptions,
     as_prediction,
     observed,
     refine_images,
+    refine_points,
     refine_robustly,
     robust_pose,
 )
 from imgcal.synthesis import ImageOptions, render_views
 from imgcal.types import CalibrationObject, CameraRig, Prediction, Views
 
+SIGHTED_SIGMA = 0.1  # pixels: what a position that an image network has found is off by at least
 DRIFTED_SIGMA = 10.0  # pixels: what the points of a factory rig are off by
 
 
@@ -181,14 +183,34 @@ def network_method(network: Network, batch: int | None = None) -> Method:
 
     if options is None:
         return Method(predict, refined_by_points, passes, batch=batch or 512)
-    return Method(predict, _refined_by_images(options), passes, batch=batch or 32, images=options)
+    return Method(predict, _refined_by_images(network, options), passes, batch=batch or 32, images=options)
 
 
-def _refined_by_images(options: ImageOptions) -> Refine:
+@torch.no_grad()
+def refined_by_sightings(
+    prediction: Prediction, sightings: Sightings, factory: CameraRig, obj: CalibrationObject, prior_std: Tensor
+) -> Prediction:
+    """Refine on the positions that an image network has found, each with the sigma that it predicts; Cauchy's loss."""
+    sigma = (sightings.sigma.square() + SIGHTED_SIGMA**2).sqrt().to("cpu", torch.float64)
+    views = Views(*(None if part is None else part.cpu() for part in (sightings.views.uv, sightings.views.seen)))
+    return as_prediction(refine_points(prediction, views, factory, obj, prior_std, sigma))
+
+
+def _refined_by_images(network: Network, options: ImageOptions) -> Refine:
+    """Render and compare; where images do not confirm the rig, the positions that the network has found decide."""
+
+    @torch.no_grad()
     def refine(prediction: Prediction, given: Given) -> Prediction:
         comparison = ImageRefinementOptions(image=options, position_noise=given.sigma)
         images = given.images(options)
         fit, _ = refine_images(prediction, images, given.factory, given.obj, given.prior_std, comparison)
-        return as_prediction(fit)
+        rows = (~fit.converged).nonzero().squeeze(-1)
+        if not isinstance(network, ImageNetwork) or not len(rows):
+            return as_prediction(fit)
+        device = next(network.parameters()).device
+        sightings = network.sight(images[rows].to(device))
+        mended = refined_by_sightings(prediction[rows], sightings, given.factory, given.obj, given.prior_std)
+        order = torch.arange(len(images)).index_copy(0, rows, len(images) + torch.arange(len(rows)))
+        return Prediction.cat([as_prediction(fit), mended])[order]
 
     return refine

@@ -7,16 +7,28 @@ from .checkpoint import (
     warm_start,
 )
 from .claims import Claims, claim
-from .config import PRESETS, Images, NetworkConfig, NetworkSpec, PaperImages, PaperPoints, without_pretrained
+from .config import (
+    PRESETS,
+    HueCentroids,
+    Images,
+    NetworkConfig,
+    NetworkSpec,
+    PaperImages,
+    PaperPoints,
+    PooledImages,
+    without_pretrained,
+)
 from .expectation import Expectation, cut_crops, cut_patches
 from .factory import build, build_network
-from .images import ImageNetwork, PaperImageNetwork
+from .images import HueCentroidNetwork, ImageNetwork, Sightings
 from .infrared import Evidence, InfraredConfig, InfraredNetwork, Queries, normalized
 from .infrared_checkpoint import InfraredCheckpoint, MeasurerCheckpoint, load_infrared, load_measurer
+from .locator import Located, PositionNetwork
 from .measurer import Measured, Measurer, MeasurerConfig
 from .network import Network
 from .parameterization import Parameterization
 from .points import PaperPointNetwork, PointNetwork
+from .pooled_images import PaperImageNetwork, PooledImageNetwork
 from .randomness import drawing_from
 from .soft_positions import find_soft_positions
 from .subject import check_object, check_rig
@@ -27,11 +39,14 @@ __all__ = [
     "Claims",
     "Evidence",
     "Expectation",
+    "HueCentroidNetwork",
+    "HueCentroids",
     "ImageNetwork",
     "Images",
     "InfraredCheckpoint",
     "InfraredConfig",
     "InfraredNetwork",
+    "Located",
     "Measured",
     "Measurer",
     "MeasurerCheckpoint",
@@ -45,7 +60,11 @@ __all__ = [
     "PaperPoints",
     "Parameterization",
     "PointNetwork",
+    "PooledImageNetwork",
+    "PooledImages",
+    "PositionNetwork",
     "Queries",
+    "Sightings",
     "build",
     "build_network",
     "check_object",

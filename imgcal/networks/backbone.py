@@ -1,4 +1,4 @@
-"""Any timm model as an encoder of images: a pooled feature, and a map of features over the image."""
+"""Any timm model as an encoder of images: a pooled feature; how such models are made."""
 
 from __future__ import annotations
 
@@ -8,43 +8,29 @@ from typing import Any, cast
 import timm
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from imgcal.errors import InputError
 from imgcal.io import nearest
 from imgcal.messages import quoted, shortened
 from imgcal.networks.backbone_options import MOST_WEIGHTS, check_options
+from imgcal.networks.encoders import resized
 
 SIZE = 224  # pixels, width and height of images for encoders that take any
 
 
 class Backbone(nn.Module):
-    """A timm model without its classifier: a pooled feature, and a map of features over the image."""
+    """A timm model without its classifier: a pooled feature an image."""
 
     def __init__(self, name: str, pretrained: bool, options: Mapping[str, Any]) -> None:
         super().__init__()
         self.model: Any = make_backbone(name, pretrained, options)
         self.size = input_size(self.model)
-        self.map_width = cast(int, self.model.num_features)
-        self.pooled_width = cast(int, getattr(self.model, "head_hidden_size", None) or self.map_width)
+        self.width = cast(int, getattr(self.model, "head_hidden_size", None) or self.model.num_features)
 
-    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Encode images (I, 3, H, W); other sizes than the encoder's are resized.
-
-        Returns:
-            The pooled feature (I, pooled_width) and the map (I, map_width, h, w).
-        """
-        if images.shape[-2:] != self.size:
-            images = functional.interpolate(images, self.size, mode="bilinear", antialias=True, align_corners=False)
-        features = self.model.forward_features(images)
-        pooled = self.model.forward_head(features, pre_logits=True)
-        if features.ndim == 3:  # tokens: those before the patches (class token) do not belong to the map
-            patches = features[:, int(getattr(self.model, "num_prefix_tokens", 0)) :]
-            side = round(patches.shape[1] ** 0.5)
-            features = patches.mT.unflatten(-1, (side, -1))
-        elif getattr(self.model, "output_fmt", "NCHW") == "NHWC":
-            features = features.movedim(-1, 1)
-        return pooled, features
+    def forward(self, images: Tensor) -> Tensor:
+        """Encode images (I, 3, H, W), of another size than the encoder's resized: (I, width)."""
+        features = self.model.forward_features(resized(images, self.size))
+        return self.model.forward_head(features, pre_logits=True)
 
 
 def make_backbone(name: str, pretrained: bool, options: Mapping[str, Any]) -> nn.Module:

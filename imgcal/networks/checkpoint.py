@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from imgcal.io import (
     write_tensors,
 )
 from imgcal.messages import shortened
-from imgcal.networks.config import NetworkSpec, without_pretrained
+from imgcal.networks.config import NetworkSpec, is_import_path, without_pretrained
 from imgcal.networks.factory import build_network
 from imgcal.networks.network import Network
 from imgcal.networks.refiner import IterativeRefiner
@@ -88,22 +88,32 @@ def load_network(path: str | Path, rig: CameraRig | None = None, obj: Calibratio
     return load_checkpoint(path, rig, obj).network
 
 
-def load_checkpoint(path: str | Path, rig: CameraRig | None = None, obj: CalibrationObject | None = None) -> Checkpoint:
+def load_checkpoint(
+    path: str | Path,
+    rig: CameraRig | None = None,
+    obj: CalibrationObject | None = None,
+    *,
+    trusted: Collection[str] = (),
+) -> Checkpoint:
     """Read a network and what it was trained for.
 
     Args:
         path: a file written by `save_checkpoint`.
         rig: the rig it is to be used with; None = whatever it was trained for.
         obj: the object it is to be used with; None = whatever it was trained for.
+        trusted: classes of yours, `package.module:Class`, that the file may name as its encoder: their modules are
+            imported, which runs their code.
 
     Returns:
         The checkpoint; the network is in evaluation mode, float32, on the CPU.
 
     Raises:
-        InputError: not such a file, damaged, another version, a pickle, or trained for another rig or object.
+        InputError: not such a file, damaged, another version, a pickle, trained for another rig or object, or with an
+            encoder of somebody's that is not trusted.
     """
     texts = read_texts(path, FORMAT)
     spec, metrics = _read_records(path, texts)
+    _check_code(path, spec, trusted)
     trained_rig, trained_obj = _from_texts(path, texts)
     if rig is not None:
         check_rig(path, trained_rig, rig)
@@ -124,19 +134,26 @@ def read_subject(path: str | Path) -> tuple[CameraRig, CalibrationObject]:
     return _from_texts(path, read_texts(path, FORMAT))
 
 
-def warm_start(path: str | Path, network: nn.Module) -> tuple[str, ...]:
-    """Take over the parameters of a checkpoint that fit by name and shape, whatever rig or drift it was trained for.
+def warm_start(start: str | Path | Sequence[str | Path], network: nn.Module) -> tuple[str, ...]:
+    """Take over the parameters of checkpoints that fit by name and shape, whatever rig or drift they were trained for.
 
     Args:
-        path: a file, the folder of a training run, or the name of a shipped network.
+        start: a file, the folder of a training run, or the name of a shipped network; or several: what a later one has
+            replaces what an earlier one had.
         network: takes them over.
 
     Returns:
-        Names of the network's parameters that were not in the checkpoint, or had another shape there.
+        Names of the network's parameters that were in no checkpoint, or had another shape there.
 
     Raises:
-        InputError: the file cannot be used, or nothing in it fits.
+        InputError: a file cannot be used, or nothing in it fits.
     """
+    missing = [set(_take_over(path, network)) for path in ([start] if isinstance(start, str | Path) else start)]
+    return tuple(name for name, _ in network.named_parameters() if all(name in names for names in missing))
+
+
+def _take_over(path: str | Path, network: nn.Module) -> tuple[str, ...]:
+    """Do the work of `warm_start` for one file."""
     path = model_file(path)
     tensors, texts = read_tensors(path, FORMAT)
     own = dict(network.named_parameters())
@@ -147,13 +164,32 @@ def warm_start(path: str | Path, network: nn.Module) -> tuple[str, ...]:
         for name in fitting:
             own[name].copy_(tensors[name])
     trunk = getattr(network, "trunk", None)
-    if isinstance(trunk, IterativeRefiner):
+    if isinstance(trunk, IterativeRefiner) and any(name.startswith("trunk.") for name in fitting):
         spec, _ = _read_records(path, texts)
         trunk.rescale(spec.drift.std(_from_texts(path, texts)[0]))
     return tuple(name for name in own if name not in fitting)
 
 
+def _check_code(path: str | Path, spec: NetworkSpec, trusted: Collection[str]) -> None:
+    """Refuse a file that would import somebody's module.
+
+    Raises:
+        InputError: its encoder is such a class, and not among the trusted ones.
+    """
+    backbone = getattr(spec.network.variant(), "backbone", "")
+    if is_import_path(backbone) and backbone not in trusted:
+        raise InputError(
+            f"{path}: found the encoder {shortened(backbone)}, whose code would run; expected one of ours or of timm, "
+            "or that it is named in load_checkpoint(..., trusted=(...,))"
+        )
+
+
 def _fill(path: str | Path, network: nn.Module, tensors: dict[str, Tensor]) -> None:
+    if "belief.weight" in tensors:
+        raise InputError(
+            f"{path}: found an image network that reads positions by hue, of an earlier version of imgcal; "
+            "expected one whose encoder finds them: train it anew"
+        )
     own = network.state_dict()
     wrong = sorted(own.keys() ^ tensors.keys()) or sorted(n for n in own if own[n].shape != tensors[n].shape)
     if wrong:

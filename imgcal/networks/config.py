@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -79,25 +80,51 @@ class Points(StrictModel):
     trunk: TrunkConfig = TrunkConfig()
 
 
+def is_import_path(backbone: str) -> bool:
+    """Tell whether a backbone is a class of the user's, `package.module:Class`, whose code would run."""
+    return re.fullmatch(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*", backbone) is not None
+
+
+class HueCentroids(StrictModel):
+    """No encoder: positions by hue, then our trunk. The baseline of the image variants."""
+
+    trunk: TrunkConfig = TrunkConfig()
+
+
 class Images(StrictModel):
-    """Our image variant: an encoder that also says where each fiducial is, then the same trunk."""
+    """Our image variant: an encoder's map says where each fiducial is, then our trunk."""
+
+    backbone: Annotated[str, Field(max_length=200)] = "vit"  # vit or cnn, ours; a timm model; or package.module:Class
+    pretrained: bool = False  # begin with published weights of timm
+    options: dict[str, Any] = Field(default={})  # of the encoder; of timm models: backbone_options
+    width: Width = 64  # features of the map
+    trunk: TrunkConfig = TrunkConfig()
+
+    @model_validator(mode="after")
+    def _harmless(self) -> Images:
+        if not is_import_path(self.backbone):
+            check_options(self.options)
+        return self
+
+
+class PooledImages(StrictModel):
+    """An image variant whose trunk is told one pooled feature an image, and no positions."""
 
     backbone: Annotated[str, Field(max_length=200)] = "vit_tiny_patch16_224"  # any model of timm, by name
     pretrained: bool = False  # begin with published weights of timm
     options: dict[str, Any] = Field(default={})  # further arguments of timm.create_model: backbone_options
     bottleneck: Width = 128  # of the pooled feature of an image
-    positions: bool = True  # hand the trunk each fiducial's position; otherwise the pooled feature alone
     trunk: TrunkConfig = TrunkConfig()
 
     @model_validator(mode="after")
-    def _harmless(self) -> Images:
+    def _harmless(self) -> PooledImages:
         check_options(self.options)
         return self
 
 
-Variant = PaperPoints | PaperImages | Points | Images
+Variant = PaperPoints | PaperImages | Points | HueCentroids | Images | PooledImages
 
-# Half a million parameters each, quick on a CPU: patches of 32 pixels, or a narrow ConvNeXt.
+# Half a million parameters each, quick on a CPU: patches of 32 pixels, or a narrow ConvNeXt; for pooled features.
 SMALL_VIT = {"patch_size": 32, "embed_dim": 96, "depth": 3, "num_heads": 3}
 SMALL_CNN = {"depths": [1, 1, 2, 1], "dims": [16, 32, 64, 128]}
 
@@ -109,10 +136,11 @@ PRESETS: dict[str, Variant] = {
     "points": Points(),
     "points-one-pass": Points(trunk=TrunkConfig(passes=1)),
     "points-cnn1d": Points(trunk=TrunkConfig(encoder="cnn1d")),
-    "vit": Images(backbone="vit_tiny_patch16_224", options=SMALL_VIT),
-    "cnn": Images(backbone="convnext_atto", options=SMALL_CNN),
-    "vit-pooled": Images(backbone="vit_tiny_patch16_224", options=SMALL_VIT, positions=False),
-    "cnn-pooled": Images(backbone="convnext_atto", options=SMALL_CNN, positions=False),
+    "hue-centroids": HueCentroids(),
+    "vit": Images(backbone="vit"),
+    "cnn": Images(backbone="cnn"),
+    "vit-pooled": PooledImages(backbone="vit_tiny_patch16_224", options=SMALL_VIT),
+    "cnn-pooled": PooledImages(backbone="convnext_atto", options=SMALL_CNN),
 }
 
 
@@ -142,7 +170,10 @@ class NetworkConfig(StrictModel):
             ValueError: a change that the preset does not know, or an impossible value (pydantic's ValidationError).
         """
         preset = PRESETS[self.preset]
-        return type(preset).model_validate(_merged(preset.model_dump(), self.change, self.preset), strict=False)
+        values = preset.model_dump()
+        if "backbone" in self.change and "options" in values:
+            values["options"] = {}  # those of the preset are of its own encoder
+        return type(preset).model_validate(_merged(values, self.change, self.preset), strict=False)
 
 
 class NetworkSpec(StrictModel):

@@ -6,7 +6,15 @@ import torch
 from torch import Tensor
 
 from imgcal.errors import InputError
-from imgcal.networks.config import Images, NetworkConfig, NetworkSpec, PaperImages, PaperPoints
+from imgcal.networks.config import (
+    HueCentroids,
+    Images,
+    NetworkConfig,
+    NetworkSpec,
+    PaperImages,
+    PaperPoints,
+    PooledImages,
+)
 from imgcal.networks.network import Network
 from imgcal.networks.parameterization import Parameterization
 from imgcal.networks.randomness import drawing_from
@@ -55,17 +63,23 @@ def build(
     from imgcal.networks.points import PaperPointNetwork, PointNetwork
 
     parameterization, variant = Parameterization(factory, obj, drift_std), config.variant()
-    if images is not None and not isinstance(variant, Images | PaperImages):
+    if isinstance(variant, PaperImages | PooledImages):
+        from imgcal.networks.pooled_images import PaperImageNetwork, PooledImageNetwork
+
+        with drawing_from(generator):
+            if isinstance(variant, PaperImages):
+                return PaperImageNetwork(variant, parameterization, images)
+            return PooledImageNetwork(variant, parameterization, images)
+    if isinstance(variant, HueCentroids | Images):
+        from imgcal.networks.images import HueCentroidNetwork, ImageNetwork
+
+        with drawing_from(generator):
+            if isinstance(variant, Images):
+                return ImageNetwork(variant, parameterization, images)
+            return HueCentroidNetwork(variant, parameterization, images)
+    if images is not None:
         raise InputError(f"images: found this block, but the network {config.preset} takes points")
     with drawing_from(generator):
-        if isinstance(variant, PaperImages):
-            from imgcal.networks.images import PaperImageNetwork
-
-            return PaperImageNetwork(variant, parameterization, images)
-        if isinstance(variant, Images):
-            from imgcal.networks.images import ImageNetwork
-
-            return ImageNetwork(variant, parameterization, images)
         if isinstance(variant, PaperPoints):
             return PaperPointNetwork(variant, parameterization)
         return PointNetwork(variant, parameterization)

@@ -1,111 +1,117 @@
-"""Image variants: one colour-coded image a camera in, a rig out. The paper's network and ours; any timm backbone."""
+"""Image variants: one colour-coded image a camera in, a rig out; and the baseline that needs no encoder."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from imgcal.geometry import resized_pixels
-from imgcal.networks.backbone import Backbone
-from imgcal.networks.config import Images, PaperImages
+from imgcal.networks.config import HueCentroids, Images
+from imgcal.networks.feature_maps import make_encoder
+from imgcal.networks.locator import Located, PositionNetwork
 from imgcal.networks.network import Network
 from imgcal.networks.parameterization import Parameterization
-from imgcal.networks.points import PaperHeads
 from imgcal.networks.refiner import IterativeRefiner
 from imgcal.networks.soft_positions import find_soft_positions
 from imgcal.synthesis import ImageOptions
 from imgcal.types import Prediction, Views
 
+TRUSTED = 3.0  # pixels of the sensor: a position of this error counts half
+DOUBTFUL, STEEP = 0.7, 20.0  # confidence at which a position counts half, and how fast it comes to count with it
+FOUND = 0.5  # confidence from which on a refinement is told of a position: it finds out itself which are wrong
 
-class PaperImageNetwork(Network):
-    """The paper's image variant: each image on its own through an encoder, bottleneck to 128, five heads.
 
-    Source: paper, supplementary section 1.2.
-    """
+@dataclass(frozen=True)
+class Sightings:
+    """Where a network sees fiducials, in pixels of the sensors."""
 
-    def __init__(
-        self, config: PaperImages, parameterization: Parameterization, images: ImageOptions | None = None
-    ) -> None:
-        """Make the layers; images are as large as the encoder takes them unless `images` says otherwise."""
-        backbone = Backbone(config.backbone, config.pretrained, config.options)
-        super().__init__(parameterization, images or ImageOptions(size=max(backbone.size)))
-        self.backbone = backbone
-        self.bottleneck = nn.Linear(self.backbone.pooled_width, config.bottleneck)
-        self.heads = PaperHeads(config.bottleneck, config.head_widths)
+    uv: Tensor  # (B, C, N, 2)
+    sigma: Tensor  # (B, C, N) one standard deviation of each axis, if the fiducial is there
+    confidence: Tensor  # (B, C, N) in [0, 1]: probability that it is there
 
     @property
-    def encoder(self) -> nn.Module:
-        """What turns images into features."""
-        return self.backbone
+    def weight(self) -> Tensor:
+        """How much each counts: (B, C, N) in [0, 1]."""
+        return (STEEP * (self.confidence - DOUBTFUL)).sigmoid() / (1 + (self.sigma / TRUSTED).square())
 
-    def forward(self, views: Views) -> tuple[Prediction, ...]:
-        """Predict the rig from `views.images`."""
-        images = images_of(views)
-        pooled, _ = self.backbone(images.flatten(0, 1))
-        numbers = self.heads(self.bottleneck(pooled).unflatten(0, images.shape[:2]))
-        with torch.autocast(images.device.type, enabled=False):
-            return (self.parameterization.absolute(numbers),)
-
-    def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:
-        """Parameters that may have their own learning rates."""
-        groups = {"encoder": self.backbone.parameters(), "bottleneck": self.bottleneck.parameters()}
-        return groups | self.heads.groups()
+    @property
+    def views(self) -> Views:
+        """The points that were found, for a refinement."""
+        return Views(uv=self.uv, seen=self.confidence > FOUND)
 
 
 class ImageNetwork(Network):
-    """Our image variant: an encoder weighs where each fiducial may be, positions go to the trunk in float32.
+    """Our image variant: an encoder's map says where each fiducial is and how sure that is; the trunk says which rig.
 
-    The encoder's map gives each fiducial heatmap logits, zero at first, that multiplies the likeness of
-    colours; its pooled feature goes to the trunk beside the positions, through the bottleneck. With
-    `positions: false` the pooled feature is all that the trunk is told, as in the paper.
+    The gradient goes the whole way, from the rig to the images.
     """
 
     def __init__(self, config: Images, parameterization: Parameterization, images: ImageOptions | None = None) -> None:
         """Make the layers; images are as large as the encoder takes them unless `images` says otherwise."""
-        backbone = Backbone(config.backbone, config.pretrained, config.options)
-        drawn = images or ImageOptions(size=max(backbone.size))
-        super().__init__(parameterization, drawn)
-        self.backbone, self.dot = backbone, drawn.dot
-        self.bottleneck = nn.Linear(self.backbone.pooled_width, config.bottleneck)
-        self.positions = config.positions
-        if config.positions:
-            # Keys of shipped weights: `belief` makes heatmap logits, `trunk` is the iterative refiner.
-            self.belief = nn.Conv2d(self.backbone.map_width, len(parameterization.colours), 1)
-            for parameter in self.belief.parameters():
-                nn.init.zeros_(parameter)
-        self.trunk = IterativeRefiner(parameterization, **config.trunk.model_dump(), features=config.bottleneck)
+        backbone, width, size = make_encoder(config, None if images is None else images.size)
+        super().__init__(parameterization, images or ImageOptions(size=size))
+        # Keys of shipped weights.
+        self.positions = PositionNetwork(backbone, width, len(parameterization.colours))
+        self.trunk = IterativeRefiner(parameterization, **config.trunk.model_dump())
 
     @property
     def encoder(self) -> nn.Module:
-        """What turns images into features."""
-        return self.backbone
+        """The image encoder: nothing else says where to look."""
+        return self.positions.backbone
+
+    def sight(self, images: Tensor) -> Sightings:
+        """Locate the fiducials in the images of rigs (B, C, 3, H, W), in pixels of the sensors."""
+        batch = images.shape[:2]
+        located: Located = self.positions(images.flatten(0, 1))
+        with torch.autocast(images.device.type, enabled=False):
+            scale = self.parameterization.image_size.to(located.uv) / images.shape[-1]  # (C, 2)
+            uv = resized_pixels(located.uv.unflatten(0, batch), scale[:, None])
+            # Of Laplace's distribution; one number for both axes, as the points of a sensor have.
+            sigma = 2**0.5 * located.log_scale.exp().unflatten(0, batch) * scale.prod(-1).sqrt()[:, None]
+            return Sightings(uv, sigma, located.confidence.unflatten(0, batch))
 
     def forward(self, views: Views) -> tuple[Prediction, ...]:
         """Predict the rig from `views.images`; one prediction a pass."""
-        images = images_of(views)
-        flat = images.flatten(0, 1)
-        pooled, features = self.backbone(flat)
-        bottleneck = functional.gelu(self.bottleneck(pooled)).float().unflatten(0, images.shape[:2])
+        found = self.sight(images_of(views))
+        return self.trunk(found.uv, found.weight)
+
+    def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:
+        """Parameters that may have their own learning rates, or be frozen."""
+        return {**self.positions.parameter_groups(), "trunk": self.trunk.parameters()}
+
+
+class HueCentroidNetwork(Network):
+    """No encoder: positions are the centres of all light of a fiducial's hue; then the same trunk. A baseline."""
+
+    def __init__(
+        self, config: HueCentroids, parameterization: Parameterization, images: ImageOptions | None = None
+    ) -> None:
+        """Make the trunk."""
+        super().__init__(parameterization, images or ImageOptions())
+        self.trunk = IterativeRefiner(parameterization, **config.trunk.model_dump())
+
+    def sight(self, images: Tensor) -> Sightings:
+        """Find the fiducials in the images of rigs (B, C, 3, H, W), in pixels of the sensors."""
+        assert self.image_options is not None
+        batch = images.shape[:2]
         with torch.autocast(images.device.type, enabled=False):
-            if not self.positions:
-                nothing = images.new_zeros((*images.shape[:2], len(self.parameterization.colours)), dtype=torch.float32)
-                return self.trunk(nothing[..., None].expand(*nothing.shape, 2), nothing, bottleneck)
-            heatmap_logits = self.belief(features.float())
-            in_image, confidence = find_soft_positions(
-                flat.float(), self.parameterization.colours, self.dot, heatmap_logits
-            )
-            in_image = in_image.unflatten(0, images.shape[:2])
-            scale = self.parameterization.image_size.to(in_image) / images.shape[-1]
-            uv = resized_pixels(in_image, scale[:, None])
-        return self.trunk(uv, confidence.unflatten(0, images.shape[:2]), bottleneck)
+            flat = images.flatten(0, 1).float()
+            uv, confidence = find_soft_positions(flat, self.parameterization.colours, self.image_options.dot)
+            scale = self.parameterization.image_size.to(uv) / images.shape[-1]
+            uv = resized_pixels(uv.unflatten(0, batch), scale[:, None])
+            return Sightings(uv, torch.zeros_like(uv[..., 0]), confidence.unflatten(0, batch))
+
+    def forward(self, views: Views) -> tuple[Prediction, ...]:
+        """Predict the rig from `views.images`; one prediction a pass."""
+        found = self.sight(images_of(views))
+        return self.trunk(found.uv, found.weight)
 
     def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:
         """Parameters that may have their own learning rates."""
-        heads = [*self.bottleneck.parameters(), *(self.belief.parameters() if self.positions else ())]
-        return {"encoder": self.backbone.parameters(), "heads": heads, "trunk": self.trunk.parameters()}
+        return {"trunk": self.trunk.parameters()}
 
 
 def images_of(views: Views) -> Tensor:

@@ -31,8 +31,6 @@ class UpdateBlock(nn.Module):
         super().__init__()
         self.embed = mlp((inputs, 2 * width, width))
         self.embed_features = nn.Linear(features, width, bias=False) if features else None
-        if self.embed_features is not None:  # a trunk that was trained on points is as good with features, at first
-            nn.init.zeros_(self.embed_features.weight)
         self.camera_identity = nn.Parameter(0.5 * torch.randn(cameras, width))
         self.rig_token = nn.Parameter(0.5 * torch.randn(width))
         self.encoder = transformer(width, depth, heads) if encoder == "transformer" else conv1d(width, depth)
@@ -132,10 +130,10 @@ class IterativeRefiner(nn.Module):
         for layer in [*told, *([] if self.trust_head is None else [self.trust_head[0]])]:
             next(layer.parameters())[:, -PARAMETERS:] /= ratio
 
-    @torch.no_grad()
     def _differences(self, state: RigState, prediction: Prediction, uv: Tensor, weight: Tensor) -> Tensor:
-        """What a later pass sees: (B, C, inputs), without gradient."""
-        projected = self.parameterization.project(prediction).uv
+        """What a later pass sees: (B, C, inputs); its gradient is that of the positions, not of the rig so far."""
+        with torch.no_grad():
+            projected = self.parameterization.project(prediction).uv
         residual = (projected - uv) * weight[..., None]
         scaled = [torch.tanh(residual / scale) for scale in RESIDUAL_SCALES]
         around = self.parameterization.normalized(projected)

@@ -15,7 +15,7 @@ from imgcal.refinement.graduated_non_convexity import refine_robustly
 from imgcal.refinement.label_swaps import colours_at, swapped_labels
 from imgcal.refinement.photometric import DotWindows, NearFit, ShiftPrior, blurred_step
 from imgcal.refinement.points import as_prediction
-from imgcal.synthesis import LEVELS, ImageOptions
+from imgcal.synthesis import GREY_LEVELS, ImageOptions
 from imgcal.types import CalibrationObject, CameraRig, Observations, Prediction, Views
 
 PRESENT = 0.5  # amplitude above which a dot counts as there
@@ -233,10 +233,10 @@ class ImageProblem:
             )
             for part in (fit.uv, fit.variance, fit.mean_square)
         )
-        noise = mean_square.clamp_min((options.noise / LEVELS) ** 2)
+        noise = mean_square.clamp_min((options.noise / GREY_LEVELS) ** 2)
         sigma = (variance * noise + (options.position_noise * self.unit) ** 2).sqrt()
         inside = ((uv > -0.5) & (uv < size - 0.5)).all(-1)
-        explained = mean_square < (options.most_residual / LEVELS) ** 2
+        explained = mean_square < (options.most_residual / GREY_LEVELS) ** 2
         return Dots(uv, sigma, present & inside & explained & sigma.isfinite(), light, colour)
 
     def _far(self, flat: Tensor, uv: Tensor, blurs: tuple[float, ...]) -> tuple[Tensor, Tensor, Tensor]:
@@ -249,7 +249,7 @@ class ImageProblem:
         for blur in blurs:
             step, amplitude = blurred_step(pooled, near, self.colours, dot, blur / pool, shift, options.trust)
             near = near + step
-        dark = (1 + options.noise) / LEVELS  # noise that cannot be negative adds up over a black image
+        dark = (1 + options.noise) / GREY_LEVELS  # noise that cannot be negative adds up over a black image
         light = torch.where(pooled > dark, pooled, 0.0).sum((1, 2, 3))
         return (near.to(uv) + 0.5) * pool - 0.5, amplitude, light / (2 * math.pi * dot**2)
 

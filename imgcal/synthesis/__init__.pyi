@@ -1,9 +1,10 @@
 from .captures import FrameModel, Shot, Truth, simulate_frames, simulate_shots, simulate_truth, true_detections
-from .colour_coding import LEVELS, ImageOptions, render_views
+from .colour_coding import GREY_LEVELS, ImageOptions, render_views
 from .corruption import Corrupted, Corruption
 from .crops import CropTruth, Scenes, render_crops, sample_scenes, second_look
 from .difficulty import DIFFICULTIES, Difficulty
 from .drawing import host_generator
+from .levels import LEVELS, Degradation
 from .patches import Patches, sample_patches
 from .rigs import (
     Drift,
@@ -18,10 +19,12 @@ from .rigs import (
 
 __all__ = [
     "DIFFICULTIES",
+    "GREY_LEVELS",
     "LEVELS",
     "Corrupted",
     "Corruption",
     "CropTruth",
+    "Degradation",
     "Difficulty",
     "Drift",
     "FrameModel",

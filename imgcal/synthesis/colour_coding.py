@@ -15,7 +15,7 @@ from imgcal.io import StrictRecord
 from imgcal.types import CalibrationObject
 from renderers import splat
 
-LEVELS = 255  # largest grey level of images as they are saved
+GREY_LEVELS = 255  # largest grey level of images as they are saved
 
 
 @dataclass(frozen=True)
@@ -80,15 +80,15 @@ def render_views(
     shape = (options.size, options.size)
     if torch.is_grad_enabled() and points.requires_grad:
         images = splat(points, colours, options.dot, shape, visible=seen, out=out).clamp(0, 1)
-        return images + (_rounded(images.detach().clone()) - images.detach()) if quantise else images
+        return images + (as_saved(images.detach().clone()) - images.detach()) if quantise else images
     # Rounded to 8 bit before anything coarser: a bfloat16 buffer would round first.
     direct = out is None or not quantise or out.dtype == points.dtype
     images = splat(points, colours, options.dot, shape, visible=seen, out=out if direct else None).clamp_(0, 1)
     if quantise:
-        images = _rounded(images)
+        images = as_saved(images)
     return images if direct or out is None else out.copy_(images)
 
 
-def _rounded(images: Tensor) -> Tensor:
-    """Round to grey levels, in place."""
-    return images.mul_(LEVELS).round_().div_(LEVELS)
+def as_saved(images: Tensor) -> Tensor:
+    """Round images in [0, 1] to grey levels, in place."""
+    return images.mul_(GREY_LEVELS).round_().div_(GREY_LEVELS)

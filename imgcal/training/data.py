@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from imgcal.synthesis import (
+    LEVELS,
     Corruption,
     Drift,
     ImageOptions,
@@ -21,6 +25,9 @@ from imgcal.synthesis import (
 from imgcal.types import CalibrationObject, CameraRig, Prediction, Views
 
 SPARE = 1.25  # trials beyond those that are needed in the mean
+
+# Numbers of `imgcal.synthesis.LEVELS`.
+Levels = Annotated[list[Annotated[int, Field(ge=0, lt=len(LEVELS))]], Field(max_length=64)]
 
 
 @dataclass(frozen=True)
@@ -58,6 +65,7 @@ class Source:
     pose_range: PoseRange
     corruption: Corruption = Corruption()
     images: ImageOptions | None = None  # None = the network takes points
+    levels: tuple[int, ...] = ()  # numbers of `LEVELS`: equal shares of a batch's images are degraded so
     good: float | None = None  # share of rigs that see everything; None = look, which waits for the device
     canvas: dict[int, Tensor] = field(default_factory=dict)  # images that are drawn over, by number of rigs: CPU only
 
@@ -74,6 +82,9 @@ class Source:
         """Make what the network sees of them. Images are valid until the next call."""
         truth = Prediction(made.rig, made.rig_from_object)
         views, size = Views(uv=made.projection.uv, seen=made.projection.visible), self.factory.image_size
+        if self.levels and self.images is not None:
+            images, _ = draw_levels(views, size, self.obj, self.images, self.levels, generator)
+            return RigBatch(Views(images=images), truth)
         if not self.corruption.nothing:
             views = self.corruption.apply(views, size, generator).views
         if self.images is None or views.uv is None or views.seen is None:
@@ -90,6 +101,32 @@ class Source:
         if count not in self.canvas:
             self.canvas[count] = uv.new_empty(count, self.factory.num_cameras, 3, size, size)
         return self.canvas[count]
+
+
+def draw_levels(
+    views: Views,
+    image_size: Tensor,
+    obj: CalibrationObject,
+    options: ImageOptions,
+    levels: Sequence[int],
+    generator: torch.Generator,
+) -> tuple[Tensor, Views]:
+    """Draw images of points, (B, C, N, 2), in equal shares of the batch by the numbers of `LEVELS`.
+
+    Returns:
+        Images (B, C, 3, size, size), and the views as they are drawn.
+    """
+    assert views.uv is not None and views.seen is not None
+    shares = zip(levels, views.uv.tensor_split(len(levels)), views.seen.tensor_split(len(levels)), strict=True)
+    parts = [
+        LEVELS[level].draw(Views(uv, seen), image_size, obj, options, generator)
+        for level, uv, seen in shares
+        if len(uv)
+    ]
+    drawn = [corrupted.views for _, corrupted in parts]
+    uv = torch.cat([one.uv for one in drawn if one.uv is not None])
+    seen = torch.cat([one.seen for one in drawn if one.seen is not None])
+    return torch.cat([images for images, _ in parts]), Views(uv, seen)
 
 
 def object_to(

@@ -39,7 +39,7 @@ class OptimizerConfig(StrictModel):
     clip: Positive | None = 1.0  # largest norm of the gradient
     ema: Annotated[float, Field(gt=0, lt=1)] | None = 0.999  # decay of the running mean of weights that is the result
     freeze: Names = Field(default=[])  # groups of the network that keep the weights they begin with
-    layer_decay: Annotated[float, Field(gt=0, le=1)] | None = None  # rate of a timm layer relative to the one after it
+    layer_decay: Annotated[float, Field(gt=0, le=1)] | None = None  # rate of an encoder's layer beside the one after it
 
 
 class ScheduleConfig(StrictModel):
@@ -68,7 +68,9 @@ class TrainingConfig(StrictModel):
     compile: bool | Literal["graphs"] = False  # torch.compile of network and loss: fewer launches; graphs: CUDA's, too
     channels_last: bool = False  # memory order of convolutions' weights: faster on a GPU
     tf32: bool = False  # let a GPU round float32 matrix products to TF32
-    init_from: str | None = None  # weights to start from: a file, the folder of a run, or the name of a shipped network
+    init_from: str | list[str] | None = (
+        None  # weights to start from: files, folders of runs, shipped names; the last wins
+    )
     log_every: Count = 50  # steps between two rows of metrics
     validate_every: Count = 500  # steps between two validations
     validation_rigs: Annotated[int, Field(ge=0, le=10**6)] = 512  # rigs (images, ...) to validate on; 0 = none

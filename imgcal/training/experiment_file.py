@@ -23,6 +23,7 @@ from imgcal.messages import quoted
 from imgcal.training.experiment import Experiment
 from imgcal.training.infrared_task import InfraredExperiment
 from imgcal.training.measurer_task import MeasurerExperiment
+from imgcal.training.positions import PositionsExperiment
 from imgcal.training.rigs import RigExperiment
 
 FORMAT = "imgcal-experiment/1"
@@ -32,6 +33,7 @@ KINDS: dict[str, type[Experiment]] = {
     "rig": RigExperiment,
     "infrared": InfraredExperiment,
     "measurer": MeasurerExperiment,
+    "positions": PositionsExperiment,
 }
 
 # Keys as people write them: first what it is about.

@@ -82,8 +82,9 @@ class InfraredTask(Task[CropBatch, Evidence]):
         start = experiment.training.init_from
         with drawing_from(weights):
             network = InfraredNetwork(experiment.network)
-        if fresh and start is not None:
-            network.load_state_dict(load_infrared(start).network.state_dict())
+        for path in [start] if isinstance(start, str) else start or []:
+            if fresh:
+                network.load_state_dict(load_infrared(path).network.state_dict())
         self.network = network.to(device)
         self.device = device
         count = experiment.training.validation_rigs

@@ -71,8 +71,9 @@ class MeasurerTask(Task[PatchBatch, Measured]):
         start = experiment.training.init_from
         with drawing_from(weights):
             network = Measurer(experiment.network)
-        if fresh and start is not None:
-            network.load_state_dict(load_measurer(start).network.state_dict())
+        for path in [start] if isinstance(start, str) else start or []:
+            if fresh:
+                network.load_state_dict(load_measurer(path).network.state_dict())
         self.network = network.to(device)
         self.device = device
         count = experiment.training.validation_rigs

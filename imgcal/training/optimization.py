@@ -80,7 +80,7 @@ def learning(network: nn.Module) -> nn.Module:
 
 
 def layer_scales(network: nn.Module, decay: float | None) -> dict[nn.Parameter, float]:
-    """Factor of the learning rate of each parameter of the timm encoders within a network: decay^(layers after it).
+    """Factor of the rate of each parameter of the encoders within a network, timm's or ours: decay^(layers after it).
 
     Raises:
         InputError: there is no such encoder.
@@ -89,7 +89,7 @@ def layer_scales(network: nn.Module, decay: float | None) -> dict[nn.Parameter, 
         return {}
     encoders: list[Any] = [module for module in network.modules() if hasattr(module, "group_matcher")]
     if not encoders:
-        raise InputError(f"optimizer: layer_decay: found {decay:g}, but no encoder of timm in the network")
+        raise InputError(f"optimizer: layer_decay: found {decay:g}, but no encoder of timm or ours in the network")
     from timm.models._manipulate import group_with_matcher
 
     scales: dict[nn.Parameter, float] = {}

@@ -7,14 +7,14 @@ from dataclasses import replace
 from typing import Any, ClassVar, Literal
 
 import torch
-from pydantic import ConfigDict
+from pydantic import ConfigDict, Field
 from torch import Tensor, nn
 
 from imgcal.io import load_object, load_rig, validated
 from imgcal.networks import Checkpoint, Network, NetworkSpec, build_network, warm_start, without_pretrained
 from imgcal.nn import project_fiducials, reprojection_re
 from imgcal.synthesis import Corruption, share_of_good_rigs
-from imgcal.training.data import RigBatch, Source, object_to
+from imgcal.training.data import Levels, RigBatch, Source, object_to
 from imgcal.training.end_to_end import refined_loss
 from imgcal.training.experiment import Experiment
 from imgcal.training.losses import LossConfig, compound
@@ -38,6 +38,9 @@ class RigExperiment(Experiment, NetworkSpec):
     rig: str  # factory rig: shipped name or path
     object: str  # calibration object: shipped name or path
     corruption: Corruption = Corruption()  # what goes wrong in the views during training
+    levels: Levels = Field(
+        default=[]
+    )  # of image variants: difficulty of the images, in equal shares, instead of `corruption`
     loss: LossConfig = LossConfig()
 
     def load_rig(self) -> CameraRig:
@@ -89,6 +92,7 @@ class RigTask(Task[RigBatch, Passes]):
             experiment.poses,
             experiment.corruption,
             network.image_options,
+            tuple(experiment.levels),
         )
         if device.type != "cpu":  # a batch must not wait for it; a CPU has no reason to draw more than it needs
             self.source = replace(self.source, good=self._share_of_good(device))

@@ -148,11 +148,12 @@ def training_of(model: Model, trained_on: str) -> dict[str, Any]:
     """What a training took."""
     metrics, experiment = model.checkpoint.metrics, experiment_of(model.checkpoint.experiment)
     start = experiment.training.init_from
+    starts = [start] if isinstance(start, str) else start or []
     return {
         "minutes": metrics.get("seconds", 0.0) / 60,
         "steps": metrics.get("step", 0),
         "batch_size": experiment.training.batch_size,
-        "started_from": None if start is None else _name_of_start(Path(start)),
+        "started_from": None if start is None else ", ".join(_name_of_start(Path(path)) for path in starts),
         "machine": trained_on,
     }
 

@@ -54,10 +54,14 @@ def portable(experiment: RigExperiment) -> RigExperiment:
     start = experiment.training.init_from
     if start is None:
         return experiment
-    return changed(
-        experiment,
-        f"training.init_from=out/runs/{experiment_of(load_checkpoint(start).experiment).name}/model.safetensors",
-    )
+    names = [_name(path) for path in ([start] if isinstance(start, str) else start)]
+    return changed(experiment, f"training.init_from=[{', '.join(f'out/runs/{name}' for name in names)}]")
+
+
+def _name(path: str) -> str:
+    """Folder of the run that made a file, or the file's own name."""
+    file = Path(path)
+    return file.parent.name if file.stem == "model" else file.stem
 
 
 @torch.no_grad()

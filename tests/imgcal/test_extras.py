@@ -56,11 +56,6 @@ def test_the_core_calibrates_all_but_the_report(tmp_path: Path) -> None:
     ("arguments", "needs"),
     [
         (["train", "table1-row01", "--out", "{out}"], 'train needs tensorboard: pip install "imgcal[train]"'),
-        ([*CALIBRATE, "{out}", "--first-guess", "vit"], 'calibrate needs timm: pip install "imgcal[train]"'),
-        (
-            ["compare", "data/models/vit-O10-cube8.safetensors", "data/models/cnn-O10-cube8.safetensors"],
-            'compare needs timm: pip install "imgcal[train]"',
-        ),
         (
             ["evaluate", "--rig", "O10", "--object", "cube8", "--out", "{out}"],
             '--out needs matplotlib: pip install "imgcal[report]"',
@@ -75,8 +70,9 @@ def test_what_needs_an_extra_says_so(arguments: list[str], needs: str, tmp_path:
     assert not out.exists()
 
 
-def test_points_need_no_extra_to_start_from(tmp_path: Path) -> None:
-    done = without_extras(*CALIBRATE, str(tmp_path / "out"), "--first-guess", "points", "--no-report")
+@pytest.mark.parametrize("guess", ["points", "cnn"])
+def test_networks_that_ship_need_no_extra_to_start_from(guess: str, tmp_path: Path) -> None:
+    done = without_extras(*CALIBRATE, str(tmp_path / "out"), "--first-guess", guess, "--no-report")
     assert done.returncode == 0, done.stderr
     assert not said(done)
     assert "network alone" in done.stdout

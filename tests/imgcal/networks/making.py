@@ -9,7 +9,7 @@ from imgcal.synthesis.rigs import RelativeDrift, synthesize
 from imgcal.types import Views
 
 DRIFT = RelativeDrift(0.02, 0.02)
-SMALL = ["points", "points-one-pass", "points-cnn1d", "vit", "cnn", "vit-pooled", "cnn-pooled"]
+SMALL = ["points", "points-one-pass", "points-cnn1d", "hue-centroids", "vit", "cnn", "vit-pooled", "cnn-pooled"]
 
 
 def make(preset, rig="T4", obj="asymmetric8", **change):

@@ -255,3 +255,38 @@ def test_warm_start_takes_what_fits(made, path, experiment):
     assert torch.equal(network.prior_std, prior_std)  # buffers belong to the new rig and drift
     with pytest.raises(InputError, match="no parameter that fits"):
         warm_start(path, torch.nn.Linear(3, 4))
+
+
+def test_a_model_file_imports_nothing_of_somebodys_unless_it_is_trusted(path, monkeypatch):
+    mine = "tests.imgcal.networks.test_feature_maps:Mine"
+    tensors, texts = read_tensors(path, FORMAT)
+    experiment = json.loads(texts["experiment"])
+    experiment["network"] = {"preset": "vit", "change": {"backbone": mine}}
+    path.write_bytes(save(tensors, {**texts, "experiment": json.dumps(experiment)}))
+    monkeypatch.undo()  # the real networks
+    with monkeypatch.context() as watched:
+        watched.setattr("importlib.import_module", None)
+        with pytest.raises(InputError, match="whose code would run; expected"):
+            load_checkpoint(path)
+    with pytest.raises(InputError, match="other weights than its network has"):  # it was imported, and is not the toy
+        load_checkpoint(path, trusted=(mine,))
+
+
+def test_image_networks_that_read_hues_are_refused_by_that_name(path):
+    tensors, texts = read_tensors(path, FORMAT)
+    write_tensors(path, {**tensors, "belief.weight": torch.zeros(1)}, FORMAT, texts)
+    with pytest.raises(InputError, match="reads positions by hue, of an earlier version"):
+        load_checkpoint(path)
+
+
+def test_of_several_starts_the_last_one_wins(made, tmp_path):
+    setup, network = made
+    files = []
+    for value in (1.0, 2.0):
+        with torch.no_grad():
+            for parameter in network.parameters():
+                parameter.fill_(value)
+        files.append(tmp_path / f"{value}.safetensors")
+        save_network(files[-1], network, setup, {})
+    other = built(setup)
+    assert warm_start([*files], other) == () and all(bool((p == 2.0).all()) for p in other.parameters())

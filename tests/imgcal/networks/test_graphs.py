@@ -19,10 +19,9 @@ POINTS = {
     "points": {"trunk": TRUNK | {"trust": True}},
     "paper-points": {"width": 16, "depth": 1, "head_widths": [16]},
 }
-SMALL = {"patch_size": 56, "embed_dim": 12, "depth": 1, "num_heads": 2}
 IMAGES = {
-    "vit": {"trunk": TRUNK, "options": SMALL, "bottleneck": 8},
-    "cnn": {"trunk": TRUNK, "options": {"depths": [1, 1, 1, 1], "dims": [4, 4, 8, 8]}, "bottleneck": 8},
+    "vit": {"trunk": TRUNK, "options": {"embed_dim": 8, "depth": 1, "num_heads": 2}, "width": 8},
+    "cnn": {"trunk": TRUNK, "options": {"depths": [1, 1, 1, 1], "dims": [4, 4, 8, 8]}, "width": 8},
 }
 
 

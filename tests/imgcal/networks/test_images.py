@@ -1,14 +1,33 @@
-"""Networks of images."""
+"""Image variants: the encoder carries the load, and the gradient goes the whole way."""
 
 import pytest
 import torch
 
 from imgcal.errors import InputError
 from imgcal.io import load_object, load_rig
-from imgcal.networks import NetworkConfig, build
-from imgcal.synthesis.colour_coding import ImageOptions
-from imgcal.types import Views
+from imgcal.networks import NetworkConfig, Sightings, build
+from imgcal.nn import MapEstimate, project_fiducials
+from imgcal.synthesis.colour_coding import ImageOptions, render_views
+from imgcal.types import Observations, Views
 from tests.imgcal.networks.making import DRIFT, make, snapshots, views
+
+TINY = {
+    "cnn": {"options": {"dims": [4, 4, 8, 8], "depths": [1, 1, 1, 1]}, "width": 8},
+    "vit": {"options": {"embed_dim": 16, "depth": 1, "num_heads": 2}, "width": 8},
+}
+TRUNK = {"width": 16, "heads": 2, "depth": 1, "later_depth": 1}
+
+
+def spoken(preset, size=64):
+    """A small network whose heads say something."""
+    factory, thing = load_rig("T4").to(torch.float32), load_object("asymmetric8")
+    config = NetworkConfig(preset=preset, change=TINY.get(preset, {}) | {"trunk": TRUNK})
+    weights = torch.Generator().manual_seed(0)
+    network = build(config, factory, thing, DRIFT.std(factory), weights, ImageOptions(size=size))
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter += 0.05 * torch.randn(parameter.shape, generator=weights)
+    return network
 
 
 def test_images_are_drawn_as_is_asked_for():
@@ -26,14 +45,90 @@ def test_images_are_what_is_asked_of_the_views():
         network(Views(uv=made.projection.uv, seen=made.projection.visible))
 
 
-def test_positions_alone_move_the_networks_that_are_told_them():
-    """A pooled variant sees the images through its encoder only: with a silent bottleneck all images are one."""
-    for preset, told in (("vit", True), ("vit-pooled", False)):
-        network = make(preset)
-        with torch.no_grad():
-            for parameter in network.trunk.parameters():
-                parameter += 0.02 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(3))
-            for parameter in network.bottleneck.parameters():
-                parameter.zero_()
-            found = network(views(network, snapshots(network)))[0].rig.focal_length
-        assert torch.equal(found[0], found[1]) != told
+def first_layer(network, preset):
+    return network.encoder.stem.weight if preset == "cnn" else network.encoder.patches.weight
+
+
+def drawn(network):
+    """Images of two rigs, and the positions that they are drawn at, as a leaf."""
+    made = snapshots(network, 2)
+    uv = made.projection.uv.clone().requires_grad_()
+    images = render_views(uv, made.projection.visible, network.factory.image_size, network.obj, network.image_options)
+    return made, uv, images
+
+
+@pytest.mark.parametrize("preset", ["vit", "cnn"])
+def test_the_gradient_goes_from_the_rig_to_the_renderer(preset):
+    """Renderer -> encoder -> trunk -> kornia's projection -> loss."""
+    network = spoken(preset)
+    made, uv, images = drawn(network)
+    found, truth = network(Views(images=images))[-1].cameras_from_object, made.rig.from_object(made.rig_from_object)
+    apart = project_fiducials(found, network.obj) - project_fiducials(truth, network.obj)
+    apart.square().mean().backward()
+    for gradient in (first_layer(network, preset).grad, uv.grad):
+        assert gradient is not None and torch.isfinite(gradient).all() and gradient.abs().max() > 0
+
+
+@pytest.mark.parametrize("preset", ["vit", "cnn"])
+def test_the_gradient_goes_through_the_map_estimate(preset):
+    """The most probable rig of what the encoder sees, weighed by how sure it is; near the truth, so that it exists."""
+    network = spoken(preset)
+    made, uv, images = drawn(network)
+    sighted = network.sight(images)
+    near = (uv.detach() + 1e-3 * (sighted.uv - uv.detach())).double()[:, None]
+    sigma = (0.1 * (1 + 1e-3 * sighted.sigma)).double()[:, None]
+    factory = network.factory.to(torch.float64)
+    solution = MapEstimate(factory, network.obj, DRIFT.std(factory))(
+        Observations(near, sigma, made.projection.visible[:, None]),
+        rig_from_object=made.rig_from_object[:, None].to(torch.float64),
+    )
+    solution.rig.focal_length.sub(made.rig.focal_length).square().mean().backward()
+    gradient = first_layer(network, preset).grad
+    assert gradient is not None and torch.isfinite(gradient).all() and gradient.abs().max() > 0
+
+
+def test_later_passes_look_at_positions_with_their_gradient():
+    network = spoken("cnn")
+    network.trunk.zero_grad()
+    uv = snapshots(network, 2).projection.uv.clone().requires_grad_()
+    passes = network.trunk(uv, torch.ones_like(uv[..., 0]))
+    # The state is detached between passes: what is left is the way by the positions.
+    (gradient,) = torch.autograd.grad(passes[-1].rig.focal_length.sum(), uv)
+    assert gradient.abs().max() > 0
+
+
+def test_another_encoders_output_is_another_rig():
+    network = spoken("cnn").eval()
+    given = views(network, snapshots(network))
+    with torch.no_grad():
+        before = network.sight(given.images)
+        hook = network.encoder.register_forward_hook(lambda module, inputs, output: output.roll(4, 0))
+        after = network.sight(given.images)
+        hook.remove()
+    assert not torch.allclose(before.uv, after.uv, atol=1.0)
+
+
+def test_positions_by_hue_need_no_encoder():
+    network = make("hue-centroids")
+    made = snapshots(network)
+    assert network.encoder is None
+    found = network.sight(views(network, made).images)
+    seen = made.projection.visible
+    apart = torch.where(seen[..., None], found.uv - made.projection.uv, 0.0).norm(dim=-1)
+    assert apart.median() < 0.3 and found.confidence[seen].median() > 0.9
+    assert torch.equal(found.views.seen, found.confidence > 0.5)
+
+
+def test_what_is_unsure_weighs_less():
+    uv, sigma = torch.zeros(1, 1, 3, 2), torch.tensor([[[0.0, 3.0, 30.0]]])
+    weight = Sightings(uv, sigma, torch.ones(1, 1, 3)).weight[0, 0]
+    torch.testing.assert_close(weight, torch.tensor([1.0, 0.5, 1 / 101]), rtol=0.01, atol=0)
+    doubtful = Sightings(uv, 0 * sigma, torch.tensor([[[0.3, 0.7, 0.95]]])).weight[0, 0]
+    assert doubtful[0] < 1e-3 and doubtful[1] == 0.5 and doubtful[2] > 0.99
+
+
+def test_groups_that_may_be_frozen_are_all_parameters():
+    network = make("cnn")
+    groups = {name: list(members) for name, members in network.parameter_groups().items()}
+    assert list(groups) == ["encoder", "heads", "trunk"]
+    assert sum(map(len, groups.values())) == len(list(network.parameters()))

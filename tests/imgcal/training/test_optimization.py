@@ -81,7 +81,7 @@ def test_layers_near_the_images_learn_more_slowly(name):
     assert rates[id(next(network.encoder.parameters()))] == min(found)
     assert rates[id(network.head.weight)] == 0.1
     assert set(rates) == {id(p) for p in network.parameters()}
-    with pytest.raises(InputError, match=r"layer_decay: found 0\.5, but no encoder of timm"):
+    with pytest.raises(InputError, match=r"layer_decay: found 0\.5, but no encoder of timm or ours"):
         make_optimizer(Grouped(), OptimizerConfig(layer_decay=0.5))
 
 

@@ -1,0 +1,99 @@
+"""Encoders by name: ours, any of timm, or a class of yours; each gives a map of features at a stride of 4 pixels."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+from imgcal.errors import InputError
+from imgcal.messages import quoted, shortened
+from imgcal.networks.backbone_options import MOST_WEIGHTS
+from imgcal.networks.config import Images, is_import_path
+from imgcal.networks.encoders import STRIDE, CnnEncoder, VitEncoder
+
+SIZE = 224  # pixels, width and height of images for encoders that take any
+
+
+def make_encoder(config: Images, size: int | None) -> tuple[nn.Module, int, int]:
+    """Make the encoder that an experiment names.
+
+    Args:
+        config: which, with its options. An import path runs the code of its module: whoever reads a configuration from
+            a file of unknown origin must refuse it before (`load_checkpoint` does).
+        size: pixels, width and height of the images; None = as the encoder takes them.
+
+    Returns:
+        The encoder, images (I, 3, H, W) -> (I, F, H / 4, W / 4); F; and the size of the images.
+
+    Raises:
+        InputError: nothing of that name, options that it does not take, or an encoder that is too large.
+    """
+    name, options = config.backbone, config.options
+    if name in ("cnn", "vit") or is_import_path(name):
+        if config.pretrained:
+            raise InputError(f"backbone {shortened(name)}: found pretrained: true, which only models of timm know")
+        drawn = size or SIZE
+        if name == "cnn":
+            return _counted(name, lambda: CnnEncoder(config.width, **options)), config.width, drawn
+        if name == "vit":
+            return _counted(name, lambda: VitEncoder(config.width, drawn, **options)), config.width, drawn
+        encoder = _counted(name, lambda: _imported(name)(**options))
+        return encoder, _checked_width(encoder, name, drawn), drawn
+    from imgcal.networks.timm_encoder import TimmEncoder  # timm takes seconds to import: only for those who need it
+
+    timms = TimmEncoder(name, config.pretrained, options, config.width)
+    return timms, config.width, size or max(timms.size)
+
+
+def _imported(path: str) -> Callable[..., nn.Module]:
+    """Find the class that `package.module:Class` names.
+
+    Raises:
+        InputError: no such module or class, or a class that is no `nn.Module`.
+    """
+    module, _, name = path.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise InputError(
+            f"backbone: found `{shortened(path)}`, which cannot be imported: {quoted(str(error))}"
+        ) from error
+    if not (isinstance(found, type) and issubclass(found, nn.Module)):
+        raise InputError(f"backbone: found `{shortened(path)}`, expected a subclass of torch.nn.Module")
+    return found
+
+
+def _counted(name: str, make: Callable[[], nn.Module]) -> nn.Module:
+    """Make an encoder whose weights were counted before they have memory."""
+    try:
+        with torch.device("meta"):
+            weights = sum(parameter.numel() for parameter in make().parameters())
+        if weights > MOST_WEIGHTS:
+            raise InputError(f"backbone {name}: found {weights:,} weights, expected at most {MOST_WEIGHTS:,}")
+        return make()
+    except (TypeError, ValueError, RuntimeError) as error:
+        first = quoted((str(error).splitlines() or [""])[0])
+        raise InputError(f"backbone {shortened(name)}: cannot be made of its options: {first}") from error
+
+
+@torch.no_grad()
+def _checked_width(encoder: nn.Module, name: str, size: int) -> int:
+    """Features of an encoder's map, found by looking at one image.
+
+    Raises:
+        InputError: it gives no map at a stride of 4.
+    """
+    was_training = encoder.training
+    features = encoder.eval()(torch.zeros(1, 3, size, size))
+    encoder.train(was_training)
+    cells = -(-size // STRIDE)
+    if not isinstance(features, Tensor) or features.ndim != 4 or features.shape[2:] != (cells, cells):
+        found = list(features.shape) if isinstance(features, Tensor) else type(features).__name__
+        raise InputError(
+            f"backbone {shortened(name)}: of an image of {size} x {size} pixels found {found}, "
+            f"expected features of shape (1, F, {cells}, {cells}): a stride of {STRIDE}"
+        )
+    return int(features.shape[1])

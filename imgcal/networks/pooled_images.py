@@ -1,0 +1,90 @@
+"""Image variants that know one pooled feature an image: the paper's network, and ours beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from imgcal.networks.backbone import Backbone
+from imgcal.networks.config import PaperImages, PooledImages
+from imgcal.networks.images import images_of
+from imgcal.networks.network import Network
+from imgcal.networks.parameterization import Parameterization
+from imgcal.networks.points import PaperHeads
+from imgcal.networks.refiner import IterativeRefiner
+from imgcal.synthesis import ImageOptions
+from imgcal.types import Prediction, Views
+
+
+class PaperImageNetwork(Network):
+    """The paper's image variant: each image on its own through an encoder, bottleneck to 128, five heads.
+
+    Source: paper, supplementary section 1.2.
+    """
+
+    def __init__(
+        self, config: PaperImages, parameterization: Parameterization, images: ImageOptions | None = None
+    ) -> None:
+        """Make the layers; images are as large as the encoder takes them unless `images` says otherwise."""
+        backbone = Backbone(config.backbone, config.pretrained, config.options)
+        super().__init__(parameterization, images or ImageOptions(size=max(backbone.size)))
+        self.backbone = backbone
+        self.bottleneck = nn.Linear(self.backbone.width, config.bottleneck)
+        self.heads = PaperHeads(config.bottleneck, config.head_widths)
+
+    @property
+    def encoder(self) -> nn.Module:
+        """The image encoder."""
+        return self.backbone
+
+    def forward(self, views: Views) -> tuple[Prediction, ...]:
+        """Predict the rig from `views.images`."""
+        images = images_of(views)
+        pooled = self.backbone(images.flatten(0, 1))
+        numbers = self.heads(self.bottleneck(pooled).unflatten(0, images.shape[:2]))
+        with torch.autocast(images.device.type, enabled=False):
+            return (self.parameterization.absolute(numbers),)
+
+    def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:
+        """Parameters that may have their own learning rates."""
+        groups = {"encoder": self.backbone.parameters(), "bottleneck": self.bottleneck.parameters()}
+        return groups | self.heads.groups()
+
+
+class PooledImageNetwork(Network):
+    """An image variant that knows one pooled feature an image, as the paper's does, and our trunk."""
+
+    def __init__(
+        self, config: PooledImages, parameterization: Parameterization, images: ImageOptions | None = None
+    ) -> None:
+        """Make the layers; images are as large as the encoder takes them unless `images` says otherwise."""
+        backbone = Backbone(config.backbone, config.pretrained, config.options)
+        super().__init__(parameterization, images or ImageOptions(size=max(backbone.size)))
+        self.backbone = backbone
+        self.bottleneck = nn.Linear(self.backbone.width, config.bottleneck)
+        self.trunk = IterativeRefiner(parameterization, **config.trunk.model_dump(), features=config.bottleneck)
+
+    @property
+    def encoder(self) -> nn.Module:
+        """The image encoder."""
+        return self.backbone
+
+    def forward(self, views: Views) -> tuple[Prediction, ...]:
+        """Predict the rig from `views.images`; one prediction a pass."""
+        images = images_of(views)
+        features = functional.gelu(self.bottleneck(self.backbone(images.flatten(0, 1))))
+        fiducials = len(self.parameterization.colours)
+        nothing = images.new_zeros((*images.shape[:2], fiducials), dtype=torch.float32)
+        uv = nothing[..., None].expand(*nothing.shape, 2)
+        return self.trunk(uv, nothing, features.float().unflatten(0, images.shape[:2]))
+
+    def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:
+        """Parameters that may have their own learning rates."""
+        return {
+            "encoder": self.backbone.parameters(),
+            "heads": self.bottleneck.parameters(),
+            "trunk": self.trunk.parameters(),
+        }

@@ -1,0 +1,184 @@
+"""The task of positions: one colour-coded image in, where each fiducial is out. What an encoder learns first.
+
+Dots lie anywhere: neither rig nor object is in the images, so that what is learnt serves all of them that have as many
+colours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal
+
+import torch
+from pydantic import ConfigDict, Field
+from torch import Tensor, nn
+
+from imgcal.errors import InputError
+from imgcal.io import load_object, load_rig
+from imgcal.networks import (
+    Checkpoint,
+    ImageNetwork,
+    Located,
+    NetworkSpec,
+    PositionNetwork,
+    build_network,
+    warm_start,
+    without_pretrained,
+)
+from imgcal.training.data import Levels, draw_levels, object_to
+from imgcal.training.experiment import Experiment
+from imgcal.training.task import Loss, Task
+from imgcal.types import Views
+
+VALIDATION_SEED = 20_000_004
+CENTRES = 0.09  # of the width of an image: standard deviation of the centre of its dots
+SPREADS = ((0.04, 0.15), (0.05, 0.2))  # of it, along u and v: smallest and largest standard deviation of the dots
+FINE = 0.3  # weight of the exact positions beside the rough ones
+NEAR = 4.5  # pixels, each axis: half of what the exact position is looked for in
+FOUND = 1.0  # pixels: a fiducial that is farther from its place is lost
+
+
+class PositionsExperiment(Experiment, NetworkSpec):
+    """The encoder and the locator of an image variant: the blocks of `NetworkSpec`, and how hard the images are."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    task: Literal["positions"]
+    rig: str  # shipped name or path: what the file's network is for; not in the images
+    object: str  # shipped name or path: the number of its fiducials and their colours count
+    levels: Annotated[Levels, Field(min_length=1)] = Field(
+        default=[0, 1, 2, 3, 4]
+    )  # difficulty levels of the images, in equal shares
+
+    def make_task(self, device: torch.device, batch_size: int, weights: torch.Generator, fresh: bool) -> PositionsTask:
+        """Build the network; see `Experiment.make_task`."""
+        return PositionsTask(self, device, batch_size, weights, fresh)
+
+
+@dataclass(frozen=True)
+class PositionBatch:
+    """Single images, and where their dots are."""
+
+    images: Tensor  # (I, 3, H, W)
+    uv: Tensor  # (I, N, 2) pixels of the image; any finite value where there is no dot
+    seen: Tensor  # (I, N) bool
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All tensors by name, to be saved."""
+        return vars(self)
+
+
+class PositionsTask(Task[PositionBatch, Located]):
+    """Random dots, and the two losses of a locator."""
+
+    unit = "images"
+    judged = "validation_lost"
+    headline: ClassVar = {"coarse": "cross-entropy {:.3g}", "validation_lost": "lost {:.2%}"}
+    network: PositionNetwork
+
+    def __init__(
+        self,
+        experiment: PositionsExperiment,
+        device: torch.device,
+        batch_size: int,
+        weights: torch.Generator,
+        fresh: bool,
+    ) -> None:
+        """Build it; see `Experiment.make_task`."""
+        self.experiment, self.batch_size = experiment, batch_size
+        self.rig, obj = load_rig(experiment.rig), load_object(experiment.object)
+        spec, start = experiment if fresh else without_pretrained(experiment), experiment.training.init_from
+        whole = build_network(spec, self.rig, obj, weights)
+        if not isinstance(whole, ImageNetwork):
+            raise InputError(f"task positions: found the network {spec.network.preset}, expected vit or cnn")
+        self.untrained = warm_start(start, whole) if fresh and start is not None else ()
+        self.whole, self.network = whole, whole.positions.to(device)
+        self.obj, self.true_obj = object_to(obj, device), obj
+        assert whole.image_options is not None
+        self.options, self.device = whole.image_options, device
+        self.image_size = torch.full((1, 2), self.options.size, device=device)
+
+    def batch(self, count: int, generator: torch.Generator) -> PositionBatch:
+        """Draw dots that lie anywhere."""
+        return self._draw(count, self.experiment.levels, generator)
+
+    def predict(self, network: nn.Module, batch: PositionBatch) -> Located:
+        """Say where they are."""
+        return network(batch.images)
+
+    def loss(self, answer: Located, batch: PositionBatch, step: int) -> Loss:
+        """Cross-entropy of the cells, and Laplace's likelihood of the exact position where it is looked for."""
+        coarse, fine = coarse_loss(answer, batch), fine_loss(answer, batch)
+        return Loss(coarse + FINE * fine, {"coarse": coarse.detach(), "fine": fine.detach()})
+
+    def validate(self, predict: Callable[[PositionBatch], Located]) -> dict[str, float]:
+        """By level and for all: median error (px of the image), and the share of dots that is not found."""
+        count = -(-self.experiment.training.validation_rigs // len(self.experiment.levels))
+        if not count:
+            return {}
+        medians, lost = {}, {}
+        for level in self.experiment.levels:
+            generator = torch.Generator(self.device).manual_seed(VALIDATION_SEED)
+            batch = self._draw(count, (level,), generator)
+            parts = (tensor.split(self.batch_size) for tensor in (batch.images, batch.uv, batch.seen))
+            found = torch.cat([predict(PositionBatch(*part)).uv for part in zip(*parts, strict=True)])
+            error = (found - batch.uv).norm(dim=-1)[batch.seen]
+            medians[f"validation_level{level}_px"] = float(error.median())
+            lost[f"validation_level{level}_lost"] = float((error > FOUND).float().mean())
+        means = {"validation_px": sum(medians.values()), "validation_lost": sum(lost.values())}
+        return medians | lost | {name: value / len(lost) for name, value in means.items()}
+
+    def result(self, network: nn.Module, metrics: Mapping[str, Any]) -> Checkpoint:
+        """The whole image network, whose trunk is untrained: `training.init_from` of others takes what it needs."""
+        whole = build_network(
+            without_pretrained(self.experiment), self.rig, self.true_obj, torch.Generator().manual_seed(0)
+        )
+        assert isinstance(whole, ImageNetwork)
+        whole.positions.load_state_dict(network.state_dict())
+        return Checkpoint(whole, self.rig, self.true_obj, self.experiment, metrics)
+
+    def _draw(self, count: int, levels: Sequence[int], generator: torch.Generator) -> PositionBatch:
+        cloud = random_dots(count, self.obj.num_fiducials, self.options.size, generator)
+        images, drawn = draw_levels(cloud, self.image_size, self.obj, self.options, levels, generator)
+        assert drawn.uv is not None and drawn.seen is not None
+        return PositionBatch(images[:, 0], drawn.uv[:, 0], drawn.seen[:, 0])
+
+
+def random_dots(count: int, fiducials: int, size: int, generator: torch.Generator) -> Views:
+    """Scatter dots over images of `size` pixels: (count, 1, fiducials, 2), those that fall outside are not seen."""
+    device = generator.device
+    centre = torch.randn(count, 1, 1, 2, generator=generator, device=device)
+    share = torch.rand(count, 1, 1, 2, generator=generator, device=device)
+    dots = torch.randn(count, 1, fiducials, 2, generator=generator, device=device)
+    least, most = torch.tensor(SPREADS, device=device).unbind(-1)
+    uv = size * (0.5 + CENTRES * centre + (least + (most - least) * share) * dots) - 0.5
+    seen = ((uv > 0) & (uv < size - 1)).all(-1)
+    return Views(torch.where(seen[..., None], uv, 0.0), seen)
+
+
+def coarse_loss(found: Located, batch: PositionBatch) -> Tensor:
+    """Cross-entropy of each fiducial's cells, and of being nowhere; a dot between cells belongs to the four around it.
+
+    The share of each is bilinear, so that the centre of mass is the dot.
+    """
+    height, width = found.logits.shape[-2:]
+    cells, pixels = batch.uv.new_tensor((width, height)), batch.uv.new_tensor(batch.images.shape[:-3:-1])
+    place = ((batch.uv + 0.5) * cells / pixels - 0.5).clamp_min(0).minimum(cells - 1)
+    first = place.floor().minimum(cells - 2)
+    share = torch.stack((1 - (place - first), place - first), dim=-1)  # (I, N, axis, lower or upper)
+    corner = (first[..., 1] * width + first[..., 0]).long()[..., None, None]
+    step = torch.arange(2, device=corner.device)
+    index = (corner + step[:, None] * width + step).flatten(-2)  # (I, N, 4), row by row
+    weight = (share[..., 1, :, None] * share[..., 0, None, :]).flatten(-2)
+    flat = found.logits.flatten(2)
+    target = torch.where(batch.seen, (flat.gather(-1, index) * weight).sum(-1), found.nowhere)
+    return (torch.logaddexp(flat.logsumexp(-1), found.nowhere) - target).mean()
+
+
+def fine_loss(found: Located, batch: PositionBatch) -> Tensor:
+    """Mean negative log likelihood, by Laplace's distribution, of exact positions of dots near where is looked."""
+    near = batch.seen & ((batch.uv - found.near).abs() <= NEAR).all(-1)
+    error = torch.where(near[..., None], found.uv - batch.uv, 0.0).abs().sum(-1)
+    each = error * (-found.log_scale).exp() + 2 * found.log_scale
+    return torch.where(near, each, 0.0).sum() / near.sum().clamp_min(1)
