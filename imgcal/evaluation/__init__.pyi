@@ -2,11 +2,11 @@ from .encoder_check import LEAST_RISE, EncoderCheck, check_encoder
 from .methods import BASELINES, QUICK_BASELINES, Given, Method, network_method, refined_by_sightings
 from .metrics import Errors, cramer_rao, errors, held_out_points, reprojection_error
 from .models import Model, load_models
-from .protocol import Conditions, Evaluation, Progress, Protocol, Row, Scores, evaluate
+from .protocol import REFERENCE, Conditions, Evaluation, Progress, Protocol, Row, Scores, evaluate
 from .summary import Facts, Summary
 from .sweeps import AXES, Sweep, sweep
 from .tables import PLOTS, RESULT, TABLES, as_tables, describe, markdown, write
-from .timing import latency
+from .timing import Latency, latency
 
 __all__ = [
     "AXES",
@@ -14,6 +14,7 @@ __all__ = [
     "LEAST_RISE",
     "PLOTS",
     "QUICK_BASELINES",
+    "REFERENCE",
     "RESULT",
     "TABLES",
     "Conditions",
@@ -22,6 +23,7 @@ __all__ = [
     "Evaluation",
     "Facts",
     "Given",
+    "Latency",
     "Method",
     "Model",
     "Progress",

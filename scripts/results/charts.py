@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from scripts.output import BLUE, GREEN, RED, figure
-from scripts.results.measuring import NETWORK, WITHOUT
+from scripts.results.measuring import NETWORK, ONE_PASS, WITHOUT
 
 LEAST_RE = 1e-4  # pixels: exact points are refined to rounding errors, which say nothing
 
@@ -31,7 +31,8 @@ def over_time(results: Mapping[str, dict[str, Any]], path: Path) -> None:
 def sweeps(result: dict[str, Any], path: Path) -> None:
     """Draw RE against perturbation and against the angle of view."""
     lines: dict[str, tuple[str, dict[str, Any]]] = {
-        NETWORK: ("network alone", {"color": RED}),
+        ONE_PASS: ("network, one pass", {"color": RED, "linestyle": ":"}),
+        NETWORK: ("network, all passes", {"color": RED}),
         f"{NETWORK} + refinement": ("network + refinement", {"color": BLUE, "linewidth": 4.0}),
         WITHOUT: ("MAP without network", {"color": GREEN, "linestyle": "--"}),
     }
@@ -39,6 +40,8 @@ def sweeps(result: dict[str, Any], path: Path) -> None:
         for axes, axis, factor in zip(panels, ("kappa", "phi"), (100.0, 1.0), strict=True):
             values = [factor * value for value in result[axis]["values"]]
             for name, (text, style) in lines.items():
+                if any(name not in row for row in result[axis]["rows"]):
+                    continue  # a network of one pass
                 means = [row[name]["mean"] for row in result[axis]["rows"]]
                 errors = [math.nan if mean is None else max(mean, LEAST_RE) for mean in means]
                 axes.plot(values, errors, marker="o", markersize=3, label=text, **style)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic
@@ -14,12 +14,15 @@ from typing import Any
 from imgcal.errors import InputError
 from imgcal.evaluation import (
     BASELINES,
+    QUICK_BASELINES,
+    REFERENCE,
     Conditions,
     Evaluation,
     Method,
     Model,
     Protocol,
     Scores,
+    check_encoder,
     evaluate,
     latency,
     load_models,
@@ -28,13 +31,14 @@ from imgcal.evaluation import (
 from imgcal.io import read_metrics, read_texts
 from imgcal.networks.checkpoint import FORMAT
 from imgcal.synthesis import Corruption, RelativeDrift
-from imgcal.training import experiment_of
+from imgcal.training import RigExperiment, experiment_of
 from scripts.output import surroundings
 
 NOISE = Corruption(noise=0.1)
 ROBUSTNESS = Corruption(noise=0.1, missing=0.2, swapped=0.1)
 FACTORY, WITHOUT, ROBUST = "factory, pose fitted", "MAP from PnP", "PnP + robust bundle adjustment"
 NETWORK = "network"
+ONE_PASS = f"{NETWORK}, one pass"
 HISTORY = 60  # points of the curve over training time
 
 
@@ -58,6 +62,7 @@ class Source:
 
     path: Path
     experiment: str
+    seed: int
     sha256: str
     shipped: bool
     log: Path  # folder of the training run
@@ -67,17 +72,21 @@ def find(runs: Path, models: Path) -> list[Source]:
     """Look for checkpoints: of training runs, and shipped ones, which replace the runs that they come from.
 
     Raises:
-        InputError: a file that cannot be used, or two of the same experiment.
+        InputError: a file that cannot be used, or two of the same experiment and seed.
     """
-    found: dict[str, Source] = {}
+    found: dict[tuple[str, int], Source] = {}
     files = [(path, False) for path in sorted(runs.glob("*/model.safetensors"))]
     files += [(path, True) for path in sorted(models.glob("*.safetensors"))]
     for path, shipped in files:
-        name, digest = _experiment_name(path), hashlib.sha256(path.read_bytes()).hexdigest()
-        before = found.get(name)
+        known, digest = _experiment_and_seed(path), hashlib.sha256(path.read_bytes()).hexdigest()
+        if known is None:
+            continue
+        name, seed = known
+        before = found.get((name, seed))
         if before is not None and before.shipped == shipped:
-            raise InputError(f"{path}: found another run of {name} in {before.path}, expected one")
-        found[name] = Source(path, name, digest, shipped, path.parent if before is None else before.log)
+            raise InputError(f"{path}: found another run of {name} with seed {seed} in {before.path}, expected one")
+        log = path.parent if before is None else before.log
+        found[name, seed] = Source(path, name, seed, digest, shipped, log)
     return list(found.values())
 
 
@@ -95,13 +104,14 @@ def measure(source: Source, effort: Effort, device: str, trained_on: str) -> dic
     count = min(effort.count, effort.image_count) if images else effort.count
     exact = Protocol(count, effort.trials)
     few = Protocol(min(effort.extra, count), effort.trials)
-    methods = {
-        NETWORK: model.method,
-        FACTORY: replace(BASELINES[FACTORY], most=few.count),
-        WITHOUT: replace(BASELINES[WITHOUT], most=few.count),
-    }
+    methods = {NETWORK: model.method}
+    methods |= {name: replace(method, most=few.count) for name, method in QUICK_BASELINES.items()}
+    check = check_encoder(model.checkpoint.network, model.conditions)
     result = {
         "experiment": name,
+        "label": label(experiment_of(model.checkpoint.experiment)),
+        "seed": source.seed,
+        "encoder": None if check is None else vars(check) | {"rise": check.rise, "used": check.used},
         "sha256": source.sha256,
         "shipped": source.shipped,
         "bytes": model.size,
@@ -110,19 +120,28 @@ def measure(source: Source, effort: Effort, device: str, trained_on: str) -> dic
         "surroundings": surroundings(device),
         "images": images,
         "rigs": effort.rigs(images),
-        "exact": _columns(_evaluated(methods, model.conditions, exact, f"{name}, exact"), methods),
-        "noise": _columns(
-            _evaluated({NETWORK: model.method}, replace(model.conditions, corruption=NOISE), few, f"{name}, noise"),
+        "exact": columns(evaluated(methods, model.conditions, exact, f"{name}, exact"), methods),
+        "noise": columns(
+            evaluated({NETWORK: model.method}, replace(model.conditions, corruption=NOISE), few, f"{name}, noise"),
             {NETWORK: model.method},
         ),
         "latency_ms": vars(latency(model.method, model.conditions)),
         "history": history_of(read_metrics(source.log / "metrics.jsonl")),
     }
     if name.startswith("shipped"):
-        all_methods = {NETWORK: model.method} | {key: BASELINES[key] for key in (FACTORY, WITHOUT, ROBUST)}
+        all_methods = {NETWORK: model.method} | QUICK_BASELINES | {ROBUST: BASELINES[ROBUST]}
         conditions = replace(model.conditions, corruption=ROBUSTNESS)
-        result["robustness"] = _columns(_evaluated(all_methods, conditions, few, f"{name}, outliers"), all_methods)
+        result["robustness"] = columns(evaluated(all_methods, conditions, few, f"{name}, outliers"), all_methods)
     return result
+
+
+def without_network(experiment: RigExperiment, count: int) -> dict[str, Any]:
+    """Evaluate what needs no network, on exact points from what an experiment draws."""
+    rig, obj = experiment.load_rig(), experiment.load_object()
+    conditions = Conditions(rig, obj, experiment.poses, experiment.drift)
+    return columns(
+        evaluated(QUICK_BASELINES, conditions, Protocol(count, 3), f"{experiment.name}, no network"), QUICK_BASELINES
+    )
 
 
 def swept(source: Source, count: int, device: str) -> dict[str, Any]:
@@ -139,9 +158,23 @@ def swept(source: Source, count: int, device: str) -> dict[str, Any]:
     }
     for axis in ("kappa", "phi"):
         found = sweep(methods, model.conditions, axis, Protocol(count, 1))
-        rows = [_columns(evaluation, methods) for evaluation in found.evaluations]
+        rows = [columns(evaluation, methods) for evaluation in found.evaluations]
         result[axis] = {"values": list(found.values), "rows": rows}
     return result
+
+
+def label(experiment: RigExperiment) -> str:
+    """Say in a few words what an experiment is about."""
+    drift, poses = experiment.drift, experiment.poses
+    where = "overhead" if poses.phi_deg == (0.0, 0.0) else "hemisphere"
+    kappas = "physical drift"
+    if isinstance(drift, RelativeDrift):
+        kappas = f"kappa {100 * drift.kappa_intrinsics:g} / {100 * drift.kappa_extrinsics:g} %"
+    changes = ", ".join(f"{key} {value}" for key, value in experiment.network.change.items())
+    if experiment.loss.kind == "paper" and experiment.loss.paper.lambda_scale == 1:
+        changes = ", ".join(filter(None, (changes, "no value scaling")))
+    network = experiment.network.preset + (f" ({changes})" if changes else "")
+    return f"{network}, {where}, {experiment.rig} {experiment.object}, {kappas}"
 
 
 def training_of(model: Model, trained_on: str) -> dict[str, Any]:
@@ -169,32 +202,42 @@ def _name_of_start(path: Path) -> str:
     return path.parent.name if path.stem == "model" else path.stem
 
 
-def _experiment_name(path: Path) -> str:
+def _experiment_and_seed(path: Path) -> tuple[str, int] | None:
+    """Of a checkpoint; None where it was trained for another task than rigs."""
     try:
-        return str(json.loads(read_texts(path, FORMAT)["experiment"])["name"])
+        experiment = json.loads(read_texts(path, FORMAT)["experiment"])
+        if experiment.get("task", "rig") != "rig":
+            return None
+        return str(experiment["name"]), int(experiment.get("training", {}).get("seed", 0))
     except (KeyError, ValueError) as error:
         raise InputError(f"{path}: found no readable experiment in it: the file is damaged") from error
 
 
-def _columns(evaluation: Evaluation, methods: dict[str, Method]) -> dict[str, Any]:
-    columns: dict[str, Any] = {"MAP, true inliers": _scores(evaluation.reference)}
+def columns(evaluation: Evaluation, methods: Mapping[str, Method]) -> dict[str, Any]:
+    """Every stage of every method in plain values, and MAP from the true inliers."""
+    found: dict[str, Any] = {REFERENCE: _scores(evaluation.reference)}
     for name in methods:
         row = evaluation.rows[name]
-        columns[name] = _scores(row.alone)
+        if row.one_pass is not None:
+            found[f"{name}, one pass"] = _scores(row.one_pass) | {"passes": 1}
+        found[name] = _scores(row.alone) | {"passes": row.passes}
         if row.refined is not None:
-            columns[f"{name} + refinement"] = _scores(row.refined)
-    return columns
+            found[f"{name} + refinement"] = _scores(row.refined)
+    return found
 
 
 def _scores(scores: Scores) -> dict[str, Any]:
     found: dict[str, Any] = dict(scores.statistics()) | {"parameters": scores.parameters()}
-    found.pop("trial_means")
+    found["held_out"] = dict(scores.statistics("held_out"))
+    for told in (found, found["held_out"]):
+        told.pop("trial_means")
     if scores.bounds:
         found["times_cramer_rao"] = scores.cramer_rao_ratios()
     return found
 
 
-def _evaluated(methods: dict[str, Method], conditions: Conditions, protocol: Protocol, what: str) -> Evaluation:
+def evaluated(methods: Mapping[str, Method], conditions: Conditions, protocol: Protocol, what: str) -> Evaluation:
+    """Evaluate, and say on standard error how far it is and how long it took."""
     began = monotonic()
     found = evaluate(methods, conditions, protocol, _progress(what, protocol, len(methods)))
     print(f"\r{what}: {protocol.trials} x {protocol.count} rigs, {monotonic() - began:.0f} s", file=sys.stderr)

@@ -1,154 +1,148 @@
-"""Turns results into the tables of docs/results.md, between its markers."""
+"""Turns results into the tables of docs/results.md, between its markers.
+
+One line is one experiment: all its training seeds together, mean and spread over them, or the words "one seed".
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from statistics import fmean, stdev
 from typing import Any
 
 from imgcal.networks import Images, PaperImages
-from imgcal.synthesis import RelativeDrift
 from imgcal.training import RigExperiment
 from scripts.output import markdown
-from scripts.results.measuring import FACTORY, NETWORK, ROBUST, WITHOUT
+from scripts.results.measuring import FACTORY, NETWORK, ONE_PASS, ROBUST, WITHOUT, label
 
-Results = Mapping[str, dict[str, Any]]
+Runs = Sequence[Mapping[str, Any]]
+"""Results of one experiment, a training seed each."""
+Results = Mapping[str, Runs]
 
 MISSING = "not trained yet"
-TRAINING = ("minutes", "steps x rigs", "started from", "machine")
+TRAINING = ("minutes", "steps x rigs", "started from", "trained")
 REFINED = f"{NETWORK} + refinement"
-
-# RE in pixels that was aimed at, by row of table 1: network alone, and refined on exact points or 8-bit images.
-GOALS = {1: 2.0, 2: 3.0, 3: 5.0, 4: 3.0, 5: 3.0, 6: 2.0, 7: 0.2, 8: 1.0, 9: 3.0, 10: 1.5, 11: 1.5, 12: 2.5, 13: 4.0}
-REFINED_GOALS = {"points": 0.02, "images": 0.1}
+STEPS = ("1 LM step from the factory", "2 LM steps from the factory", "3 LM steps from the factory")
+PARAMETERS = {
+    "rotation_deg": "rotation (deg)",
+    "principal_point": "principal point (px)",
+    "focal_length": "focal length (px)",
+    "position": "position (mm)",
+}
 
 
 def accuracy_table(experiments: Sequence[RigExperiment], results: Results) -> str:
-    """Table 1, our networks: both columns beside the paper's."""
-    head = (
-        "row",
-        "what",
-        "paper's RE",
-        "goal, network alone",
-        "network alone",
-        "goal, refined",
-        "network + refinement",
-        "p99",
-        "share <= 0.5 px",
-    )
-    rows = []
-    for experiment in experiments:
-        row, kind = row_of(experiment), variant(experiment)
-        cells = [str(row), label(experiment), _paper(experiment), _px(GOALS.get(row))]
-        result = results.get(experiment.name)
-        if result is None:
-            cells += [MISSING, _px(REFINED_GOALS[kind]), "", "", ""]
-        else:
-            alone, refined = result["exact"][NETWORK], result["exact"][REFINED]
-            cells += [
-                f"**{mean(alone)}**",
-                _px(REFINED_GOALS[kind]),
-                f"**{mean(refined)}**",
-                _px(refined["p99"]),
-                _percent(refined["share_under_half_px"]),
-            ]
-        rows.append(cells)
-    return markdown(head, rows)
+    """Table 1, our networks: what is comparable with the paper first, and steps from the factory beside it."""
+    stages = {ONE_PASS: "one pass", NETWORK: "all passes", REFINED: "refined", FACTORY: FACTORY}
+    stages |= {name: name.replace(" from the factory", "") for name in STEPS}
+    head = ("row", "what", "paper's RE", *stages.values(), "RE < 1 px, one pass / all", "encoder", "seeds")
+
+    def cells(experiment: RigExperiment, runs: Runs) -> list[str]:
+        row = [str(row_of(experiment)), _what(experiment, runs), _paper(experiment)]
+        row += [f"**{cell}**" if cell and name == ONE_PASS else cell for name in stages for cell in [mean(runs, name)]]
+        return [*row, _shares(runs, (ONE_PASS, NETWORK), "share_under_one_px"), encoder(runs), seeds(runs)]
+
+    return _of_trained(head, experiments, results, cells)
+
+
+def parameters_table(experiments: Sequence[RigExperiment], results: Results) -> str:
+    """Table 1, what RE does not show: factory / one pass / all passes / MAP."""
+    stages = (FACTORY, ONE_PASS, NETWORK, WITHOUT)
+    head = ("row", "what", *PARAMETERS.values(), "RE on held-out points, median (px)")
+
+    def cells(experiment: RigExperiment, runs: Runs) -> list[str]:
+        row = [str(row_of(experiment)), _what(experiment, runs)]
+        for kind in PARAMETERS:
+            row.append(" / ".join(_px(_mean(runs, name, "parameters", kind)) or "?" for name in stages))
+        return [*row, " / ".join(_px(_mean(runs, name, "held_out", "median")) or "?" for name in stages)]
+
+    return _of_trained(head, experiments, results, cells)
 
 
 def background_table(experiments: Sequence[RigExperiment], results: Results) -> str:
-    """Table 1, second half: noise, what other methods get there, and what each training took."""
-    head = (
-        "row",
-        "what",
-        "factory rig, pose fitted",
-        "MAP without network",
-        "0.1 px noise: alone",
-        "refined",
-        "refined / Cramer-Rao bound",
-        "rigs",
-        *TRAINING,
-    )
+    """Table 1, last part: noise, and what each training took."""
+    head = ("row", "what", "0.1 px noise: alone", "refined", "refined / Cramer-Rao bound", "rigs", *TRAINING)
 
-    def cells(experiment: RigExperiment, result: dict[str, Any]) -> list[str]:
-        exact, noise = result["exact"], result["noise"]
-        row = [str(row_of(experiment)), label(experiment), _px(exact[FACTORY]["mean"]), _px(exact[WITHOUT]["mean"])]
-        row += [_px(noise[NETWORK]["mean"]), _px(noise[REFINED]["mean"]), _bound(noise[REFINED])]
-        return [*row, f"{result['rigs']:,}", *training_cells(result)]
+    def cells(experiment: RigExperiment, runs: Runs) -> list[str]:
+        row = [str(row_of(experiment)), _what(experiment, runs)]
+        row += [_px(_mean(runs, name, "mean", part="noise")) for name in (NETWORK, REFINED)]
+        bound = _mean(runs, REFINED, "times_cramer_rao", "re", part="noise")
+        return [*row, "" if bound is None else f"{bound:.2f}", f"{runs[0]['rigs']:,}", *training_cells(runs)]
 
     return _of_trained(head, experiments, results, cells)
 
 
 def paper_table(experiments: Sequence[RigExperiment], results: Results) -> str:
     """Trained networks of the paper's own design."""
-    head = ("row", "what", "paper's RE", "network alone", REFINED, "parameters", *TRAINING)
+    head = (
+        "row",
+        "what",
+        "paper's RE",
+        "network alone",
+        REFINED,
+        *STEPS[:2],
+        "encoder",
+        "seeds",
+        "parameters",
+        *TRAINING,
+    )
 
-    def cells(experiment: RigExperiment, result: dict[str, Any]) -> list[str]:
-        exact = result["exact"]
-        row = [str(row_of(experiment)), label(experiment), _paper(experiment)]
-        return [
-            *row,
-            mean(exact[NETWORK]),
-            mean(exact[REFINED]),
-            _millions(result["parameters"]),
-            *training_cells(result),
-        ]
+    def cells(experiment: RigExperiment, runs: Runs) -> list[str]:
+        row = [str(row_of(experiment)), _what(experiment, runs), _paper(experiment)]
+        row += [mean(runs, name) for name in (NETWORK, REFINED, *STEPS[:2])]
+        return [*row, encoder(runs), seeds(runs), _millions(runs[0]["parameters"]), *training_cells(runs)]
 
     return _of_trained(head, experiments, results, cells)
 
 
 def comparison_table(experiments: Sequence[RigExperiment], results: Results) -> str:
     """What single decisions are worth, in equal minutes from nothing."""
-    head = ("what", "network alone", "median", "parameters", *TRAINING)
+    head = ("what", "network alone", "median", "seeds", "parameters", *TRAINING)
 
-    def cells(experiment: RigExperiment, result: dict[str, Any]) -> list[str]:
-        alone = result["exact"][NETWORK]
-        row = [experiment.description.partition(":")[0], mean(alone), _px(alone["median"])]
-        return [*row, _millions(result["parameters"]), *training_cells(result)]
+    def cells(experiment: RigExperiment, runs: Runs) -> list[str]:
+        row = [experiment.description.partition(":")[0], mean(runs, NETWORK), _px(_mean(runs, NETWORK, "median"))]
+        return [*row, seeds(runs), _millions(runs[0]["parameters"]), *training_cells(runs)]
 
     return _of_trained(head, experiments, results, cells)
 
 
 def shipped_table(experiments: Sequence[RigExperiment], results: Results) -> str:
-    """Size, speed and accuracy of the models that ship."""
+    """Accuracy, speed and size of the models that ship."""
     head = (
-        "model",
-        "parameters",
-        "file, MB",
-        "network alone",
-        REFINED,
-        "p99",
-        "share <= 0.5 px",
-        "alone, ms p50 / p99",
-        "refined, ms p50 / p99",
-        *TRAINING,
-    )
-    rows = []
-    for experiment in experiments:
-        result = results.get(experiment.name)
-        if result is None:
-            rows.append([experiment.name, MISSING])
-            continue
-        exact, took = result["exact"], result["latency_ms"]
-        name = experiment.name if result["shipped"] else f"{experiment.name} (float32 run)"
-        cells = [name, _millions(result["parameters"]), f"{result['bytes'] / 1e6:.1f}"]
-        cells += [mean(exact[NETWORK]), mean(exact[REFINED]), _px(exact[REFINED]["p99"])]
-        cells += [_percent(exact[REFINED]["share_under_half_px"])]
-        cells += [f"{took['alone_p50']:.1f} / {took['alone_p99']:.1f}"]
-        cells += [f"{took['refined_p50']:.1f} / {took['refined_p99']:.1f}", *training_cells(result)]
-        rows.append(cells)
-    return markdown(head, rows)
+        "model", "one pass", "all passes", REFINED, *STEPS[:2], "RE < 1 px, one pass / all / refined", "encoder",
+        "rises by", "seeds", "alone, ms p50 / p99", "refined, ms p50 / p99", "parameters", "file, MB", *TRAINING,
+    )  # fmt: skip
+    stages = (ONE_PASS, NETWORK, REFINED)
+
+    def cells(experiment: RigExperiment, runs: Runs) -> list[str]:
+        shown = next((run for run in runs if run["shipped"]), runs[0])
+        took, check = shown["latency_ms"], shown.get("encoder")
+        name = experiment.name if shown["shipped"] else f"{experiment.name} (float32 run)"
+        row = [name, *(mean(runs, stage) for stage in (*stages, *STEPS[:2]))]
+        row += [_shares(runs, stages, "share_under_one_px"), encoder(runs)]
+        row += ["" if check is None else f"{check['rise']:.3g} x", seeds(runs)]
+        row += [
+            f"{took['alone_p50']:.1f} / {took['alone_p99']:.1f}",
+            f"{took['refined_p50']:.1f} / {took['refined_p99']:.1f}",
+        ]
+        return [*row, _millions(shown["parameters"]), f"{shown['bytes'] / 1e6:.1f}", *training_cells(runs)]
+
+    return _of_trained(head, experiments, results, cells)
 
 
 def robustness_table(experiments: Sequence[RigExperiment], results: Results) -> str:
-    """Median RE with outliers, everybody on the same rigs."""
-    columns = ("MAP, true inliers", NETWORK, REFINED, ROBUST, WITHOUT, FACTORY)
+    """With outliers, everybody on the same rigs: how often it succeeds, and the median."""
+    columns = ("MAP, true inliers", NETWORK, REFINED, ROBUST, WITHOUT, "5 LM steps from the factory", FACTORY)
 
-    def cells(experiment: RigExperiment, result: dict[str, Any]) -> list[str]:
-        medians = {name: result["robustness"][name]["median"] for name in columns}
-        return [experiment.name, *map(_px, medians.values()), f"{medians[REFINED] / medians[columns[0]]:.2f}"]
+    def cells(experiment: RigExperiment, runs: Runs) -> list[str]:
+        def cell(name: str) -> str:
+            share = _mean(runs, name, "share_under_one_px", part="robustness")
+            median = _px(_mean(runs, name, "median", part="robustness"))
+            return median if share is None else f"{100 * share:.1f} % / {median}"
 
-    tried = {name: result for name, result in results.items() if result.get("robustness") is not None}
-    return _of_trained(("model", *columns, "network + refinement / true inliers"), experiments, tried, cells)
+        return [experiment.name, *map(cell, columns), seeds(runs)]
+
+    tried = {name: runs for name, runs in results.items() if runs[0].get("robustness") is not None}
+    return _of_trained(("model", *columns, "seeds"), experiments, tried, cells)
 
 
 def variant(experiment: RigExperiment) -> str:
@@ -156,31 +150,38 @@ def variant(experiment: RigExperiment) -> str:
     return "images" if isinstance(experiment.network.variant(), Images | PaperImages) else "points"
 
 
-def label(experiment: RigExperiment) -> str:
-    """Say in a few words what an experiment is about."""
-    drift, poses = experiment.drift, experiment.poses
-    where = "overhead" if poses.phi_deg == (0.0, 0.0) else "hemisphere"
-    kappas = "physical drift"
-    if isinstance(drift, RelativeDrift):
-        kappas = f"kappa {100 * drift.kappa_intrinsics:g} / {100 * drift.kappa_extrinsics:g} %"
-    changes = ", ".join(f"{key} {value}" for key, value in experiment.network.change.items())
-    if experiment.loss.kind == "paper" and experiment.loss.paper.lambda_scale == 1:
-        changes = ", ".join(filter(None, (changes, "no value scaling")))
-    network = experiment.network.preset + (f" ({changes})" if changes else "")
-    return f"{network}, {where}, {experiment.rig} {experiment.object}, {kappas}"
-
-
-def mean(column: Mapping[str, Any]) -> str:
-    """Mean RE, and the spread of that mean over trials."""
-    if column["mean"] is None:
+def mean(runs: Runs, stage: str) -> str:
+    """Mean RE, and its spread over training seeds, or of one seed over trials; empty where it was not measured."""
+    found = [run["exact"][stage] for run in runs if stage in run["exact"]]
+    if not found:
+        return ""
+    means = [column["mean"] for column in found]
+    if None in means:
         return "not finite"
-    deviation = column["spread"]
-    return _px(column["mean"]) + ("" if deviation is None else f" ± {deviation:.1g}")
+    spread = stdev(means) if len(means) > 1 else found[0]["spread"]
+    return _px(fmean(means)) + ("" if spread is None else f" ± {spread:.1g}")
 
 
-def training_cells(result: Mapping[str, Any]) -> list[str]:
-    """What a training took: minutes, steps, start, machine."""
-    training = result["training"]
+def seeds(runs: Runs) -> str:
+    """How many trainings a line stands for, and whether what was measured is still there to be measured again."""
+    count = "one seed" if len(runs) == 1 else f"{len(runs)} seeds"
+    if any(run["shipped"] for run in runs):
+        return f"{count}, shipped"
+    return count if "seed" in runs[0] else f"{count}, measured earlier, model not kept"
+
+
+def encoder(runs: Runs) -> str:
+    """Whether the network needs its encoder, of every seed; empty where it has none."""
+    checks = [run.get("encoder") for run in runs]
+    used = [check["used"] for check in checks if check is not None]
+    if not used:
+        return ""
+    return "used" if all(used) else "**not used**" if not any(used) else f"used by {sum(used)} of {len(used)}"
+
+
+def training_cells(runs: Runs) -> list[str]:
+    """What a training took: minutes, steps, start, machine; of the first seed."""
+    training = runs[0]["training"]
     steps = f"{training['steps']:,} x {training['batch_size']}"
     return [f"{training['minutes']:.0f}", steps, training["started_from"] or "", training["machine"]]
 
@@ -190,36 +191,55 @@ def row_of(experiment: RigExperiment) -> int:
     return experiment.paper.row if experiment.paper else 0
 
 
+def _what(experiment: RigExperiment, runs: Runs) -> str:
+    """What it is about: as it was trained, which may be at a reduced size."""
+    return str(runs[0].get("label") or label(experiment))
+
+
 def _paper(experiment: RigExperiment) -> str:
     return f"{experiment.paper.re_px:g}" if experiment.paper and experiment.paper.re_px else ""
+
+
+def _mean(runs: Runs, stage: str, *keys: str, part: str = "exact") -> float | None:
+    """Mean over seeds of a number of a stage; None where one lacks it."""
+    found = []
+    for run in runs:
+        value: Any = run.get(part, {}).get(stage)
+        for key in keys:
+            value = None if value is None else value.get(key)
+        found.append(value)
+    return None if None in found else fmean(found)
+
+
+def _shares(runs: Runs, stages: Iterable[str], key: str) -> str:
+    shares = [_mean(runs, stage, key) for stage in stages]
+    return " / ".join("?" if share is None else _percent(share) for share in shares)
 
 
 def _of_trained(
     head: Iterable[str],
     experiments: Sequence[RigExperiment],
     results: Results,
-    cells: Callable[[RigExperiment, dict[str, Any]], list[str]],
+    cells: Callable[[RigExperiment, Runs], list[str]],
 ) -> str:
     """A table of the experiments that have results, and the names of those that have none."""
     rows = [cells(experiment, results[experiment.name]) for experiment in experiments if experiment.name in results]
     missing = [experiment.name for experiment in experiments if experiment.name not in results]
-    return markdown(head, rows) + (f"\n\nNot trained yet: {', '.join(missing)}." if missing else "")
+    note = f"{MISSING.capitalize()}: {', '.join(missing)}." if missing else ""
+    return "\n\n".join(filter(None, (markdown(head, rows) if rows else "", note)))
 
 
 def _px(value: float | None) -> str:
     if value is None:
         return ""
+    if value < 1e-9:  # rounding
+        return "0"
     return f"{value:.0f}" if 100 <= value < 1e5 else f"{value:.3g}"
 
 
 def _percent(share: float) -> str:
-    return "100 %" if share == 1 else f"{100 * share:.2f} %"
+    return "100 %" if share == 1 else f"{100 * share:.1f} %"
 
 
 def _millions(count: int) -> str:
     return f"{count / 1e6:.2f} M"
-
-
-def _bound(column: Mapping[str, Any]) -> str:
-    ratio = column.get("times_cramer_rao", {}).get("re")
-    return "" if ratio is None else f"{ratio:.2f}"

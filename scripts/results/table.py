@@ -1,7 +1,8 @@
 """Evaluate trained networks and rewrite docs/results.md: ``python -m scripts.results.table out/runs``.
 
-Reads out/runs/<experiment>/model.safetensors, as `imgcal train` writes them, and data/models. The figures of a network
-are kept in docs/results/<experiment>.json under the hash of its file: another call evaluates only what is new.
+Reads out/runs/*/model.safetensors, as `imgcal train` writes them, and data/models. The figures of a network are kept in
+docs/results/<experiment>-seed<K>.json under the hash of its file: another call evaluates only what is new. All seeds of
+an experiment make one line.
 """
 
 from __future__ import annotations
@@ -19,16 +20,23 @@ from imgcal.io import shipped_names, write_text
 from imgcal.training import RigExperiment, load_experiment
 from scripts.output import RESULTS, ROOT, command, read_json, replaced, write_json
 from scripts.results.charts import over_time, sweeps
-from scripts.results.measuring import Effort, Source, find, measure, swept
+from scripts.results.headline import headline_tables, measure_headline
+from scripts.results.measuring import Effort, Source, find, measure, swept, without_network
 from scripts.results.pages import (
+    STEPS,
     accuracy_table,
     background_table,
     comparison_table,
     paper_table,
+    parameters_table,
     robustness_table,
     row_of,
     shipped_table,
 )
+
+REDUCED = "-reduced"
+"""Ending of the names of experiments that were trained at another size than their file's."""
+HEADLINE, BASELINES = "headline.json", "baselines.json"
 
 
 @dataclass(frozen=True)
@@ -41,7 +49,8 @@ class Options:
     results: Path = RESULTS  #: folder of JSON results and plots
     effort: Annotated[Effort, tyro.conf.arg(name="")] = field(default_factory=Effort)
     only: tuple[str, ...] = ()  #: evaluate these experiments only; the page gets all known ones
-    sweep: str = "table1-row01"  #: experiment whose error is drawn against perturbation and angle
+    headline: str = "points-O10-cube8"  #: shipped network that stands beside Levenberg-Marquardt steps at every drift
+    sweep: str = "shipped-points-cube8"  #: experiment whose error is drawn against perturbation and angle
     sweep_count: int = 1000  #: rigs at each point of those curves
     machine: str = "2 CPU cores shared, 1 thread a training"  #: what new runs were trained on
     device: str = "cpu"  #: where networks run; refinement is always on the CPU
@@ -56,32 +65,39 @@ def main(arguments: list[str] | None = None) -> None:
     sources = find(options.runs, options.models)
     _check_names(options.only, sources)
     for source in sources:
-        if source.experiment not in experiments:
+        if source.experiment.removesuffix(REDUCED) not in experiments:
             print(f"{source.path}: {source.experiment} is not in data/experiments: left out", file=sys.stderr)
             continue
         if options.only and source.experiment not in options.only:
             continue
-        place = options.results / f"{source.experiment}.json"
+        place = options.results / f"{source.experiment}-seed{source.seed}.json"
         if not _known(place, source, options.effort):
             write_json(place, measure(source, options.effort, options.device, options.machine))
         if source.experiment == options.sweep:
             _sweep(options, source)
-    places = {name: options.results / f"{name}.json" for name in experiments}
-    results = {name: read_json(place) for name, place in places.items() if place.is_file()}
-    over_time(results, options.results / "training.png")
+        if source.path.stem == options.headline:
+            _headline(options, source)
+    results = {name: _runs(options.results, name) for one in experiments for name in (one, f"{one}{REDUCED}")}
+    results = {name: runs for name, runs in results.items() if runs}
+    _complete(results, experiments, options)
+    over_time({name: runs[0] for name, runs in results.items()}, options.results / "training.png")
     texts = sections(list(experiments.values()), results) | pictures(options.results)
+    texts["headline"] = _headline_text(options.results)
     write_text(options.page, replaced(page, texts, options.page))
 
 
-def sections(experiments: list[RigExperiment], results: dict[str, dict[str, Any]]) -> dict[str, str]:
+def sections(experiments: list[RigExperiment], results: dict[str, list[dict[str, Any]]]) -> dict[str, str]:
     """Make all tables, by the name of their markers."""
+    reduced = [one.model_copy(update={"name": f"{one.name}{REDUCED}"}) for one in experiments]
+    experiments = [*experiments, *(one for one in reduced if one.name in results)]
     table1 = [e for e in experiments if e.paper is not None and e.paper.table == "1"]
-    ours = sorted((e for e in table1 if not e.name.endswith("-paper")), key=_order)
-    theirs = sorted((e for e in table1 if e.name.endswith("-paper")), key=_order)
+    ours = sorted((e for e in table1 if "-paper" not in e.name), key=_order)
+    theirs = sorted((e for e in table1 if "-paper" in e.name), key=_order)
     ablation = sorted((e for e in experiments if e.paper is not None and e.paper.table == "ablation"), key=_order)
     shipped = [e for e in experiments if e.name.startswith("shipped-")]
     return {
         "table 1": accuracy_table(ours, results),
+        "table 1 parameters": parameters_table(ours, results),
         "table 1 background": background_table(ours, results),
         "paper's networks": paper_table(theirs, results),
         "ablation": paper_table(ablation, results),
@@ -108,6 +124,40 @@ def _known(place: Path, source: Source, effort: Effort) -> bool:
         return False
     found = read_json(place)
     return bool(found["sha256"] == source.sha256 and found["rigs"] >= effort.rigs(found["images"]))
+
+
+def _runs(folder: Path, name: str) -> list[dict[str, Any]]:
+    """Results of an experiment, seed by seed; where there are none, what was measured before seeds were told apart."""
+    places = sorted(folder.glob(f"{name}-seed*.json")) or [folder / f"{name}.json"]
+    return [read_json(place) for place in places if place.is_file()]
+
+
+def _complete(
+    results: dict[str, list[dict[str, Any]]], experiments: dict[str, RigExperiment], options: Options
+) -> None:
+    """Put steps from the factory beside networks that were measured before there were any, and are gone."""
+    place = options.results / BASELINES
+    known = read_json(place) if place.is_file() else {}
+    for name, runs in results.items():
+        for run in runs:
+            if name.startswith("table1") and STEPS[0] not in run["exact"]:
+                if name not in known:
+                    known[name] = without_network(experiments[name], options.effort.extra)
+                run["exact"] = known[name] | run["exact"]
+    if known:
+        write_json(place, known)
+
+
+def _headline(options: Options, source: Source) -> None:
+    place = options.results / HEADLINE
+    known = read_json(place) if place.is_file() else {}
+    if known.get("sha256") != source.sha256 or known["rigs"] < 3 * options.effort.count:
+        write_json(place, measure_headline(source, options.effort.count, options.device))
+
+
+def _headline_text(folder: Path) -> str:
+    place = folder / HEADLINE
+    return headline_tables(read_json(place)) if place.is_file() else "Not made yet."
 
 
 def _sweep(options: Options, source: Source) -> None:

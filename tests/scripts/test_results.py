@@ -28,11 +28,11 @@ def script(name):
 def trained(tmp_path):
     """Pretend that an experiment was trained; returns its file."""
 
-    def make(name, *changes):
+    def make(name, *changes, folder=None):
         experiment = changed(load_experiment(name), *changes)
         rig, obj = experiment.load_rig(), experiment.load_object()
         torch.manual_seed(1)
-        run = tmp_path / "runs" / name
+        run = tmp_path / "runs" / (folder or name)
         run.mkdir(parents=True)
         rows = [{"step": step, "re_px": 90.0 / step, "seconds": 60.0 * step} for step in range(1, 131)]
         (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
@@ -56,17 +56,20 @@ def test_table_evaluates_what_is_new_and_keeps_the_rest(trained, tmp_path, monke
     table = script("table")
     trained("table1-row08", SMALL, LEVEL)
     table.main(table_arguments(tmp_path, "--sweep", "table1-row08"))
-    result = json.loads((tmp_path / "results" / "table1-row08.json").read_text())
+    result = json.loads((tmp_path / "results" / "table1-row08-seed1.json").read_text())
     exact = result["exact"]
+    assert exact["network, one pass"]["rigs"] == exact["network"]["rigs"]
+    assert exact["2 LM steps from the factory"]["mean"] < exact["1 LM step from the factory"]["mean"] < 1
     assert exact["network"]["rigs"] == 2 * 5
     assert exact["network + refinement"]["mean"] < 0.05 < exact["network"]["mean"]
     assert result["noise"]["network + refinement"]["times_cramer_rao"]["re"] < 3
     assert len(result["history"]) <= 60
     assert result["history"][-1] == pytest.approx([130.0, 90.0 / 130], rel=1e-4)
     page = (tmp_path / "results.md").read_text()
-    [row] = [line for line in page.splitlines() if line.startswith("| 8 | points, overhead, O6")][:1]
-    assert f"{exact['network']['mean']:.3g}" in row and "3.08" in row and " 1 " in row
-    assert "| 7 | points, overhead, O6 cube8, kappa 0 / 0 % | 1.12 | 0.2 | not trained yet" in page
+    rows = [line for line in page.splitlines() if line.startswith("| 8 | points (trunk")]
+    assert f"| 3.08 | **{exact['network, one pass']['mean']:.3g}" in rows[0] and "| one seed |" in rows[0]
+    assert f"{exact['network']['mean']:.3g} ±" in rows[0]
+    assert "Not trained yet: table1-row01, " in page
     for name in ("training.png", "sweep.png"):
         assert 1000 < (tmp_path / "results" / name).stat().st_size < 60_000
 
@@ -85,14 +88,51 @@ def test_table_of_a_shipped_model(trained, tmp_path):
     shipped = tmp_path / "models" / "points-O10-asymmetric8.safetensors"
     file.rename(shipped)
     script("table").main(table_arguments(tmp_path))
-    result = json.loads((tmp_path / "results" / "shipped-points-asymmetric8.json").read_text())
+    result = json.loads((tmp_path / "results" / "shipped-points-asymmetric8-seed1.json").read_text())
+    assert result["encoder"] is None and result["seed"] == 1
     assert result["shipped"] and result["bytes"] == shipped.stat().st_size
     robust = result["robustness"]
     assert robust["network + refinement"]["median"] < robust["factory, pose fitted"]["median"]
     assert result["latency_ms"]["alone_p50"] > 0
     page = (tmp_path / "results.md").read_text()
-    assert "| shipped-points-asymmetric8 | 0.0" in page  # parameters, in millions
-    assert "| shipped-cnn-cube8 | not trained yet" in page
+    assert "| shipped-points-asymmetric8 | " in page and f" | {result['parameters'] / 1e6:.2f} M | " in page
+    assert "Not trained yet: shipped-cnn-asymmetric8, shipped-cnn-cube8" in page and "one seed, shipped" in page
+
+
+def test_seeds_of_one_experiment_make_one_line(trained, tmp_path):
+    table, pages = script("table"), script("pages")
+    trained("table1-row08", SMALL, LEVEL)
+    again = trained("table1-row08", SMALL, LEVEL, "training.seed=7", folder="table1-row08-seed7")
+    table.main(table_arguments(tmp_path, "--sweep", "none"))
+    results = [json.loads((tmp_path / "results" / f"table1-row08-seed{seed}.json").read_text()) for seed in (1, 7)]
+    assert "| 2 seeds |" in (tmp_path / "results.md").read_text()
+    for result, mean in zip(results, (1.0, 3.0), strict=True):
+        result["exact"]["network"]["mean"] = mean
+    assert pages.mean(results, "network") == "2 ± 1"
+    assert pages.seeds(results) == "2 seeds" and pages.seeds(results[:1]) == "one seed"
+    earlier = {key: value for key, value in results[0].items() if key != "seed"}
+    assert pages.seeds([earlier]) == "one seed, measured earlier, model not kept"
+    used = [result | {"encoder": {"used": result["seed"] == 7, "rise": 4.0}} for result in results]
+    assert pages.encoder(used) == "used by 1 of 2" and pages.encoder(used[:1]) == "**not used**"
+    again.unlink()
+
+
+def test_headline_is_made_of_a_shipped_model(trained, tmp_path, monkeypatch):
+    places = script("headline").PLACES
+    assert [place.paper for place in places[:3]] == [9.93, 11.53, 14.21]
+    monkeypatch.setattr(script("headline"), "PLACES", places[:2])
+    file = trained("shipped-points-cube8", SMALL, LEVEL)
+    (tmp_path / "models").mkdir()
+    file.rename(tmp_path / "models" / "points-O10-cube8.safetensors")
+    script("table").main(table_arguments(tmp_path, "--sweep", "none"))
+    result = json.loads((tmp_path / "results" / "headline.json").read_text())
+    assert len(result["places"]) == 2 and result["rigs"] == 3 * 5
+    for place in result["places"]:
+        columns = place["columns"]
+        assert columns["3 LM steps from the factory"]["mean"] < 0.1 < columns["factory, pose by PnP"]["mean"]
+    page = (tmp_path / "results.md").read_text()
+    assert "| paper's network | 9.93 | 11.53 |" in page and "| network, one pass | " in page
+    assert "| rotation, RMS error (deg) | " in page
 
 
 def test_two_runs_of_one_experiment_are_refused(trained, tmp_path):
