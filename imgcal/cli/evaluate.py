@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from imgcal.cli.common import check_folder
+from imgcal.cli.common import check_folder, counted
+from imgcal.cli.compare_captures import Captures, compare_captures
 from imgcal.errors import InputError
 from imgcal.extras import advice, missing
 from imgcal.io import load_object, load_rig, publishing
 
 if TYPE_CHECKING:
     from imgcal.evaluation import Conditions, Facts, Method, Model, Protocol, Summary
-    from imgcal.evaluation import Progress as Advance
 
 Axis = Literal["kappa", "phi", "noise", "missing", "swapped", "false"]
 
@@ -82,16 +80,27 @@ class Compare:
     shuffled, zeroed and replaced by noise: where that does not hurt, the network does not use it. With
     --out: evaluation.json, evaluation.md and plots (latency against accuracy, training curves).
     Example: imgcal compare out/vit out/cnn --out comparison --count 2000
+
+    With --captures, detectors instead: each calibrates the same simulated captures from their frames, at every
+    difficulty; the table says how many it calibrates, refuses, and gets wrong (more than 1 px over the working volume,
+    and more than 5 times what it claims). Writes captures.json and captures.md.
+    Example: imgcal compare classical matched --captures 20 --difficulty low-light clutter
     """
 
     models: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """two trained networks or more: *.safetensors, or folders of training runs"""
+    """two trained networks or more: *.safetensors, or folders of training runs; with --captures one detector or more:
+    what `imgcal calibrate --detector` takes"""
     out: Path | None = None  #: folder to write; default: nothing is written
     setting: Annotated[Setting, tyro.conf.arg(name="")] = field(default_factory=Setting)
     baselines: bool = False  #: the slow classical methods in the same table, too
+    captured: Annotated[Captures, tyro.conf.arg(name="")] = field(default_factory=Captures)
 
     def run(self) -> None:
         """Compare, print and write."""
+        if self.captured.captures:
+            rig, obj = self.setting.rig or "O10", self.setting.object or "asymmetric8"
+            compare_captures(self.models, self.captured, rig, obj, self.setting.seed, self.out)
+            return
         if len(self.models) < 2:
             raise InputError(f"compare: found {len(self.models)} models, expected two or more")
         _run(self.models, self.setting, self.baselines, self.out)
@@ -165,7 +174,7 @@ def _measure(methods: Mapping[str, Method], conditions: Conditions, protocol: Pr
     points = sum(len(AXES[axis].values) for axis in setting.sweep)
     shares = [min(method.most or protocol.count, protocol.count) for method in methods.values()]
     total = protocol.trials * (protocol.count + sum(shares)) + points * along.count * (1 + len(fast))
-    with _bar(total) as advance:
+    with counted("evaluating", total) as advance:
         evaluation = evaluate(methods, conditions, protocol, advance)
         sweeps = tuple(sweep(fast, conditions, axis, along, progress=advance) for axis in setting.sweep)
     repeats = {name: 50 if method.most is None else 10 for name, method in methods.items()}
@@ -181,19 +190,6 @@ def _checked(model: Model, conditions: Conditions, setting: Setting) -> Facts:
     clean = replace(conditions, corruption=Corruption())
     check = check_encoder(model.checkpoint.network, clean, CHECKED_RIGS, setting.seed)
     return replace(model.facts, encoder=check)
-
-
-@contextmanager
-def _bar(total: int) -> Iterator[Advance]:
-    """Show a progress bar on standard error, if that is a terminal."""
-    console = Console(file=sys.stderr)
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-    if not console.is_terminal:  # some versions of rich write a line even where it is disabled
-        yield lambda rigs: None
-        return
-    with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task("evaluating", total=total)
-        yield lambda rigs: bar.advance(task, rigs)
 
 
 def _print(summary: Summary) -> None:

@@ -105,12 +105,12 @@ def _errors(seeds: Sequence[Scores]) -> tuple[str, ...]:
     means = [one["mean"] for one in found]
     spread = stdev(means) if len(means) > 1 else found[0]["spread"]
     return (
-        _number(fmean(means)) + ("" if spread is None else f" ± {_number(spread)}"),
-        _number(fmean(one["median"] for one in found)),
-        _number(fmean(one["p99"] for one in found)),
+        number(fmean(means)) + ("" if spread is None else f" ± {number(spread)}"),
+        number(fmean(one["median"] for one in found)),
+        number(fmean(one["p99"] for one in found)),
         f"{100 * fmean(one['share_under_one_px'] for one in found):.1f} %",
         f"{100 * fmean(one['share_under_half_px'] for one in found):.1f} %",
-        _number(fmean(held_out)),
+        number(fmean(held_out)),
         f"{found[0]['rigs']}",
     )
 
@@ -151,7 +151,7 @@ def _encoder_table(facts: Mapping[str, Facts]) -> Table:
         if (check := known.encoder) is not None:
             errors = (check.untouched, check.shuffled, check.zeroed, check.noise)
             verdict = "used" if check.used else "NOT USED"
-            rows.append((name, *map(_number, errors), f"{_number(check.rise)} x", verdict))
+            rows.append((name, *map(number, errors), f"{number(check.rise)} x", verdict))
     return Table(f"Encoder's output spoilt: used if RE (px, alone) rises {LEAST_RISE:g} x", header, tuple(rows))
 
 
@@ -178,8 +178,8 @@ def _parameters_table(summary: Summary) -> Table:
     for line in _lines(summary):
         errors = [scores.parameters() for scores in line.scores]
         bounds = [scores.cramer_rao_ratios() for scores in line.scores]
-        cells = [_number(fmean(one[kind] for one in errors)) for kind in kinds]
-        rows.append((line.label, *cells, *(_number(_mean([one[kind] for one in bounds])) for kind in ratios)))
+        cells = [number(fmean(one[kind] for one in errors)) for kind in kinds]
+        rows.append((line.label, *cells, *(number(_mean([one[kind] for one in bounds])) for kind in ratios)))
     title = "Parameters, RMS error" + (", and ratio to the Cramer-Rao bound" if bounded else "")
     return Table(title, header, tuple(rows))
 
@@ -191,7 +191,7 @@ def _cost_table(summary: Summary) -> Table:
         known = summary.facts.get(name)
         size = (MISSING, MISSING) if known is None else (f"{known.parameters:,}", f"{known.size / 1e6:.1f}")
         times = (took.alone_p50, took.alone_p99, took.refined_p50, took.refined_p99)
-        rows.append((name, *map(_number, times), *size))
+        rows.append((name, *map(number, times), *size))
     return Table("One rig at a time, and size", header, tuple(rows))
 
 
@@ -200,7 +200,8 @@ def _mean(values: Sequence[float | None]) -> float | None:
     return fmean(there) if there else None
 
 
-def _number(value: float | None) -> str:
+def number(value: float | None) -> str:
+    """A number as tables show it."""
     if value is None or math.isnan(value):
         return MISSING
     if value >= HUGE:

@@ -59,7 +59,7 @@ class Options:
 def main(arguments: list[str] | None = None) -> None:
     """Evaluate what is new, then write the page and the plots."""
     options = tyro.cli(Options, args=arguments, description=__doc__)
-    page = _read(options.page)
+    _read(options.page)  # one that cannot be read is refused now, not when all is measured
     shipped = {name: load_experiment(name) for name in shipped_names("experiments", ".yaml")}
     experiments = {name: one for name, one in shipped.items() if isinstance(one, RigExperiment)}
     sources = find(options.runs, options.models)
@@ -83,7 +83,7 @@ def main(arguments: list[str] | None = None) -> None:
     over_time({name: runs[0] for name, runs in results.items()}, options.results / "training.png")
     texts = sections(list(experiments.values()), results) | pictures(options.results)
     texts["headline"] = _headline_text(options.results)
-    write_text(options.page, replaced(page, texts, options.page))
+    write_text(options.page, replaced(_read(options.page), texts, options.page))
 
 
 def sections(experiments: list[RigExperiment], results: dict[str, list[dict[str, Any]]]) -> dict[str, str]:

@@ -1,0 +1,48 @@
+"""`imgcal compare --captures`: detectors on simulated captures."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from imgcal.cli.compare_captures import contender
+from imgcal.cli.main import main
+
+
+def test_detectors_are_compared_on_captures(tmp_path, capsys):
+    out = tmp_path / "result"
+    scene = ["--rig", "T4", "--difficulty", "clean", "--snapshots", "2", "--seed", "3"]
+    assert main(["compare", "classical", "--captures", "1", *scene, "--out", str(out)]) == 0
+    values = json.loads((out / "captures.json").read_text())
+    [outcome] = values["outcomes"]
+    assert (values["rig"], values["object"], values["seed"]) == ("T4", "asymmetric8", 3)
+    assert (outcome["difficulty"], outcome["capture"], outcome["frames"]) == ("clean", 300_000, 8)
+    assert outcome["status"] == "calibrated" and outcome["held_out_px"] < 0.5
+    printed = capsys.readouterr().out
+    assert "| classical |     – | 100 / 0 / 0 |" in printed and (out / "captures.md").read_text() == printed
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--captures", "1", "--difficulty", "cleen"], "--difficulty: found 'cleen', expected some of clean, "),
+        (["--captures", "-1"], "--captures: found -1, expected 1 to 100000"),
+        (["--captures", "1", "--processes", "0"], "--processes: found 0"),
+        (["--captures", "1", "--rig", "none.yaml"], "none.yaml"),
+    ],
+)
+def test_what_cannot_be_done_is_said_in_one_line(arguments, expected, capsys):
+    assert main(["compare", "classical", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert expected in error and len(error.splitlines()) == 1
+
+
+def test_runs_that_differ_in_the_seed_have_one_name(tmp_path):
+    assert contender(Path("matched")).name == contender(Path("matched")).detector == "matched"
+    for run in ("ir-cnn-seed0", "ir-cnn-seed12"):
+        (tmp_path / run).mkdir()
+        (tmp_path / run / "model.safetensors").touch()
+    first, second = (contender(tmp_path / run) for run in ("ir-cnn-seed0", "ir-cnn-seed12"))
+    assert (first.name, first.seed, second.name, second.seed) == ("ir-cnn", 0, "ir-cnn", 12)
+    file = contender(tmp_path / "ir-cnn-seed0" / "model.safetensors")
+    assert (file.name, file.seed) == ("ir-cnn", 0)
