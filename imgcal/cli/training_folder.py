@@ -106,7 +106,7 @@ class TrainingFolder(Callbacks):
     def on_step(self, run: Run, seconds: float) -> None:
         """Move the bar; without a terminal, say a line every minute."""
         done = progress(run, seconds)
-        self.bar.update(self.shown, completed=done)
+        self.bar.update(self.shown, completed=done, description=_summary(run))
         if not self.console.is_terminal and seconds - self.said >= EVERY and not finished(run, seconds):
             self.said = seconds
             left = seconds * (1 - done) / max(done, 1e-9) / 60

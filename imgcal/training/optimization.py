@@ -87,18 +87,26 @@ def layer_scales(network: nn.Module, decay: float | None) -> dict[nn.Parameter, 
     """
     if decay is None:
         return {}
-    encoders: list[Any] = [module for module in network.modules() if hasattr(module, "group_matcher")]
-    if not encoders:
-        raise InputError(f"optimizer: layer_decay: found {decay:g}, but no encoder of timm or ours in the network")
-    from timm.models._manipulate import group_with_matcher
-
     scales: dict[nn.Parameter, float] = {}
-    for encoder in encoders:
-        named = dict(encoder.named_parameters())
-        layers = group_with_matcher(iter(named.items()), encoder.group_matcher(coarse=False), reverse=True)
-        last = max(layers.values())
-        scales |= {parameter: decay ** (last - layers[name]) for name, parameter in named.items()}
+    for encoder in network.modules():
+        layers = _layers(encoder)
+        scales |= {parameter: decay ** (len(layers) - 1 - n) for n, layer in enumerate(layers) for parameter in layer}
+    if not scales:
+        raise InputError(f"optimizer: layer_decay: found {decay:g}, but no encoder of timm or ours in the network")
     return scales
+
+
+def _layers(encoder: Any) -> list[list[nn.Parameter]]:
+    """Parameters of a timm model, layer by layer; nothing for any other module."""
+    if hasattr(encoder, "group_matcher"):
+        from timm.models._manipulate import group_with_matcher
+
+        named = dict(encoder.named_parameters())
+        numbers = group_with_matcher(iter(named.items()), encoder.group_matcher(coarse=False), reverse=True)
+        return [[named[name] for name in numbers if numbers[name] == layer] for layer in sorted({*numbers.values()})]
+    if hasattr(encoder, "feature_info") and isinstance(encoder, nn.ModuleDict):  # a model that gives its stages' maps
+        return [parameters for stage in encoder.children() if (parameters := list(stage.parameters()))]
+    return []
 
 
 def _check_names(names: Iterable[str], groups: Iterable[str], key: str) -> None:

@@ -47,11 +47,19 @@ SHORT = (
     "training.validation_rigs=256",
 )
 SMALL_VIT = "{patch_size: 16, img_size: 112, embed_dim: 96, depth: 3, num_heads: 3}"
-SMALL_CNN = "{layers: [1, 1, 1, 1], channels: [16, 32, 64, 128], stem_width: 16}"
+SMALL_CNN = "{layers: [1, 1, 1, 1], channels: [8, 16, 32, 128], stem_width: 8}"
 REDUCED = {
     "points": ("network.change.width=64", "network.change.depth=2", "network.change.head_widths=[128]"),
-    "vit": ("network.change.backbone=vit_tiny_patch16_224", f"network.change.options={SMALL_VIT}"),
-    "cnn": ("network.change.backbone=resnet10t", f"network.change.options={SMALL_CNN}"),
+    "vit": (
+        "network.change.backbone=vit_tiny_patch16_224",
+        f"network.change.options={SMALL_VIT}",
+        "images={size: 112, dot: 1.0}",
+    ),
+    "cnn": (
+        "network.change.backbone=resnet10t",
+        f"network.change.options={SMALL_CNN}",
+        "training.channels_last=true",
+    ),
 }
 TOY = {
     "points": ("network.change.width=16", "network.change.depth=1", "network.change.head_widths=[16]"),
@@ -142,7 +150,6 @@ def sized(row: str, options: Options, seed: int) -> RigExperiment:
             steps = options.steps or (600 if images else 1500)
             changes += [*SHORT, *REDUCED[kind], f"training.batch_size={8 if images else 64}"]
             changes += ["training.save_every=200", "training.validate_every=300"]
-            changes += ["images={size: 112, dot: 1.0}"] if images else []
         case "toy":
             steps = options.steps or 4
             changes += [*SHORT, *TOY[kind], "training.batch_size=4", "training.validation_rigs=4", "optimizer.lr=1e-3"]

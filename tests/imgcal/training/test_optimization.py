@@ -68,11 +68,20 @@ def test_frozen_batch_normalization_keeps_its_means():
     assert learning(other).norm.training
 
 
-@pytest.mark.parametrize("name", ["vit_tiny_patch16_224", "resnet18"])
-def test_layers_near_the_images_learn_more_slowly(name):
-    small = {"embed_dim": 12, "depth": 2, "num_heads": 2} if name.startswith("vit") else {"layers": (1, 1, 1, 1)}
+SMALL = {"embed_dim": 12, "depth": 2, "num_heads": 2}
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("vit_tiny_patch16_224", {"num_classes": 0, **SMALL}),
+        ("resnet18", {"num_classes": 0, "layers": (1, 1, 1, 1)}),
+        ("convnext_atto", {"features_only": True, "depths": (1, 1, 1, 1), "dims": (4, 4, 8, 8)}),
+    ],
+)
+def test_layers_near_the_images_learn_more_slowly(name, options):
     network = Grouped()
-    network.encoder = timm.create_model(name, num_classes=0, **small)
+    network.encoder = timm.create_model(name, **options)
     optimizer = make_optimizer(network, OptimizerConfig(lr=0.1, layer_decay=0.5, learning_rates={"encoder": 0.2}))
     rates = {id(p): group["lr"] for group in optimizer.param_groups for p in group["params"]}
     found = [rates[id(p)] for p in network.encoder.parameters()]
