@@ -58,8 +58,42 @@ def test_a_chunk_that_ends_goes_on_in_the_next(tmp_path, monkeypatch):
     assert steps[-1] == 4
 
 
-@pytest.mark.parametrize("name", ["gpu", "train"])
-def test_the_commands_are_bash_that_can_be_read(name):
-    path = SCRIPTS / name
-    assert os.access(path, os.X_OK)
-    assert subprocess.run(["bash", "-n", str(path)], capture_output=True).returncode == 0
+@pytest.fixture
+def told(tmp_path):
+    """Run a script whose Python only says what it is asked, and makes folders of runs; returns what it said."""
+    (tmp_path / "bin").mkdir()
+    python = tmp_path / "bin" / "python"
+    python.write_text('#!/bin/bash\necho "$@"\n[[ $* =~ --out\\ ([^ ]*) ]] && mkdir -p "${BASH_REMATCH[1]}" || true\n')
+    python.chmod(0o755)
+    environment = {**os.environ, "IMGCAL_VENV": str(tmp_path), "IMGCAL_EXTRAS": "none"}
+    stamp = subprocess.run(["sha256sum", "pyproject.toml"], cwd=SCRIPTS.parents[1], capture_output=True, check=True)
+    (tmp_path / "imgcal-none.sha256").write_bytes(stamp.stdout)
+
+    def run(name, *arguments):
+        made = subprocess.run([SCRIPTS / name, *arguments], env=environment, capture_output=True, text=True)
+        assert made.returncode in (0, 2), made.stderr
+        return made.stdout.splitlines() if made.returncode == 0 else made.stderr
+
+    return run
+
+
+def test_what_is_named_is_trained_after_all_that_it_starts_from(told, tmp_path):
+    runs = str(tmp_path / "runs")
+    lines = told("train", "--seeds", "2", runs, "shipped-vit-cube8", "comparison-vit")
+    names = [line.split()[3] for line in lines]
+    chain = ["table1-row03", "table1-row02", "shipped-points-cube8", "shipped-trunk-cube8", "positions-vit"]
+    assert names == [name for name in [*chain, "shipped-vit-cube8", "comparison-vit"] for _ in range(2)]
+    vit = lines[11]
+    assert f"--out {runs}/shipped-vit-cube8-seed2 --set" in vit and "training.seed=2" in vit
+    starts = [f"{runs}/{name}-seed2" for name in ("positions-vit", "shipped-trunk-cube8")]
+    assert f"training.init_from=[{','.join(starts)},]" in vit
+    assert told("train", "--seeds", "2", runs, "comparison-vit") == []  # done
+    assert "found nothing, expected some of" in told("train", runs, "nothing")
+
+
+def test_scripts_for_small_and_large(told):
+    assert told("train", "--reduced", "--minutes", "3") == [
+        "-m scripts.results.paper --size reduced --seeds 3 --minutes 3"
+    ]
+    assert told("gpu", "ablation-row1") == ["-m scripts.results.paper --size full --minutes 8 ablation-row1"]
+    assert told("gpu", "--evaluate", "out/runs")[-1].startswith("-m scripts.results.table out/runs --device ")
