@@ -21,10 +21,11 @@ SIZE = 224  # pixels, width and height of images for encoders that take any
 class Backbone(nn.Module):
     """A timm model without its classifier: a pooled feature an image."""
 
-    def __init__(self, name: str, pretrained: bool, options: Mapping[str, Any]) -> None:
+    def __init__(self, name: str, pretrained: bool, options: Mapping[str, Any], size: int | None = None) -> None:
+        """Make it; `size` (pixels) is that of the images, for models that take any."""
         super().__init__()
         self.model: Any = make_backbone(name, pretrained, options)
-        self.size = input_size(self.model)
+        self.size = input_size(self.model, size or SIZE)
         self.width = cast(int, getattr(self.model, "head_hidden_size", None) or self.model.num_features)
 
     def forward(self, images: Tensor) -> Tensor:
@@ -69,13 +70,13 @@ def make_backbone(name: str, pretrained: bool, options: Mapping[str, Any]) -> nn
         raise InputError(f"backbone {name}: cannot be made of {quoted(repr(dict(options)))}: {found}") from error
 
 
-def input_size(model: Any) -> tuple[int, int]:
-    """Height and width (pixels) of the images that a timm model takes; `SIZE` where it takes any."""
+def input_size(model: Any, otherwise: int = SIZE) -> tuple[int, int]:
+    """Height and width (pixels) of the images that a timm model takes; `otherwise` where it takes any."""
     of_patches = getattr(getattr(model, "patch_embed", None), "img_size", None)
     config = model.pretrained_cfg
     if of_patches is None and config.get("fixed_input_size"):
         of_patches = config["input_size"][-2:]
-    height, width = of_patches or (SIZE, SIZE)
+    height, width = of_patches or (otherwise, otherwise)
     return int(height), int(width)
 
 

@@ -29,7 +29,8 @@ class PaperImageNetwork(Network):
         self, config: PaperImages, parameterization: Parameterization, images: ImageOptions | None = None
     ) -> None:
         """Make the layers; images are as large as the encoder takes them unless `images` says otherwise."""
-        backbone = Backbone(config.backbone, config.pretrained, config.options)
+        size = None if images is None else images.size
+        backbone = Backbone(config.backbone, config.pretrained, config.options, size)
         super().__init__(parameterization, images or ImageOptions(size=max(backbone.size)))
         self.backbone = backbone
         self.bottleneck = nn.Linear(self.backbone.width, config.bottleneck)
@@ -61,7 +62,8 @@ class PooledImageNetwork(Network):
         self, config: PooledImages, parameterization: Parameterization, images: ImageOptions | None = None
     ) -> None:
         """Make the layers; images are as large as the encoder takes them unless `images` says otherwise."""
-        backbone = Backbone(config.backbone, config.pretrained, config.options)
+        size = None if images is None else images.size
+        backbone = Backbone(config.backbone, config.pretrained, config.options, size)
         super().__init__(parameterization, images or ImageOptions(size=max(backbone.size)))
         self.backbone = backbone
         self.bottleneck = nn.Linear(self.backbone.width, config.bottleneck)

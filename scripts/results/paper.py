@@ -47,7 +47,7 @@ SHORT = (
     "training.validation_rigs=256",
 )
 SMALL_VIT = "{patch_size: 16, img_size: 112, embed_dim: 96, depth: 3, num_heads: 3}"
-SMALL_CNN = "{layers: [1, 1, 1, 1], channels: [8, 16, 32, 128], stem_width: 8}"
+SMALL_CNN = "{layers: [1, 1, 1, 1], channels: [12, 24, 48, 160], stem_width: 12}"
 REDUCED = {
     "points": ("network.change.width=64", "network.change.depth=2", "network.change.head_widths=[128]"),
     "vit": (
@@ -59,6 +59,7 @@ REDUCED = {
         "network.change.backbone=resnet10t",
         f"network.change.options={SMALL_CNN}",
         "training.channels_last=true",
+        "images={size: 112, dot: 1.0}",
     ),
 }
 TOY = {
@@ -147,7 +148,7 @@ def sized(row: str, options: Options, seed: int) -> RigExperiment:
             changes += [*FULL["images" if images else "points"], *EVERY]
             steps = options.steps or experiment.training.steps or 1
         case "reduced":
-            steps = options.steps or (600 if images else 1500)
+            steps = options.steps or (400 if images else 1000)
             changes += [*SHORT, *REDUCED[kind], f"training.batch_size={8 if images else 64}"]
             changes += ["training.save_every=200", "training.validate_every=300"]
         case "toy":

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from imgcal.errors import InputError
+from imgcal.networks.backbone import Backbone
 from tests.imgcal.networks.making import make, snapshots, views
 
 
@@ -31,8 +32,19 @@ def test_any_backbone_fits(backbone, options):
     ],
 )
 def test_a_backbone_knows_the_size_of_its_images(backbone, options, size):
+    assert Backbone(backbone, False, options, size=96).size == (size, size)
     network = make("vit-pooled", backbone=backbone, options=options)
     assert network.encoder.size == (size, size) and network.image_options.size == size
+
+
+def test_convolutions_see_images_of_any_size_as_they_are():
+    options = {"layers": [1, 1, 1, 1], "channels": [8, 8, 8, 8]}
+    assert Backbone("resnet18", False, options).size == (224, 224)
+    small = Backbone("resnet18", False, options, size=64).eval()
+    images = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        expected = small.model.forward_head(small.model.forward_features(images), pre_logits=True)
+        assert torch.equal(small(images), expected)
 
 
 @pytest.mark.parametrize(
