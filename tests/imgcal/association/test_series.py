@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association import associate, identify, matched_to_rig, series, to_observations
+from imgcal.association import associate, identify, matched_to_rig, series, to_observations, tracker
 from imgcal.errors import InputError, RefusedError
 from imgcal.synthesis.captures import simulate_truth, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
@@ -109,7 +109,7 @@ def test_a_wrong_object_is_refused_with_an_effort_that_does_not_grow_with_the_ca
         return spent[-1]
 
     monkeypatch.setattr(series, "MOST_IN_VAIN", 250_000)
-    monkeypatch.setattr(series, "identify", counted)
+    monkeypatch.setattr(tracker, "identify", counted)
     rows = np.concatenate([np.flatnonzero(seen.snapshot == s % 4) for s in range(count)])
     names = tuple(map(str, range(count)))
     long = replace(seen.select(rows), snapshot=np.repeat(np.arange(count), len(seen) // 4), snapshot_names=names)
