@@ -1,5 +1,6 @@
-from .ambiguities import lattice_shifts
+from .ambiguities import lattice_shifts, near_turns
 from .assignment import distances_to_nearest, mutual_nearest
+from .blobs import pattern_prior
 from .identification import identify, relocalize, track
 from .options import PipelineOptions
 from .orientation import oriented
@@ -35,8 +36,10 @@ __all__ = [
     "lattice_shifts",
     "matched_to_rig",
     "mutual_nearest",
+    "near_turns",
     "observations_of",
     "oriented",
+    "pattern_prior",
     "relocalize",
     "rows_of",
     "to_observations",

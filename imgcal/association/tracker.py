@@ -34,6 +34,7 @@ class SnapshotIdentity:
     reason: str
     alternatives: int
     rig_from_object: RigidTransform | None
+    found_by: str = "classical"  # blobs, or the name of the proposer
 
 
 class Tracker:
@@ -77,7 +78,8 @@ class Tracker:
         error = float(np.hypot(self.options.identity_error, self._tolerance_px(blobs)))
         identity, found = judge(proposal, snapshot, self.options.identity, error=error, pose_known=near)
         self.looks_in_vain = max(0, self.looks_in_vain + (-1 if identity.accepted else 1))
-        return *self._concluded(self._taken_over(identity), found, name), found
+        concluded, labels = self._concluded(self._taken_over(identity), found, name)
+        return replace(concluded, found_by=sight.proposer.name), labels, found
 
     def _concluded(
         self, identity: Identity, blobs: Detections, name: str

@@ -14,11 +14,13 @@ from typing import Annotated, Any
 import torch
 import tyro
 
-from imgcal.association import PipelineOptions
+from imgcal.association import PipelineOptions, Sight
 from imgcal.cli.common import (
     StartPose,
     check_folder,
+    masks_of,
     only_cameras,
+    parse_range,
     progress,
     read_detections,
     start_pose,
@@ -31,6 +33,7 @@ from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import Gauge
 from imgcal.extras import advice, missing
 from imgcal.io import (
+    Capture,
     RigCovariance,
     load_object,
     load_rig,
@@ -41,7 +44,15 @@ from imgcal.io import (
     save_rig,
     write_text,
 )
-from imgcal.pipeline import Calibration, calibrate, load_initializer, rms_length
+from imgcal.pipeline import (
+    Calibration,
+    Detector,
+    DetectorName,
+    calibrate,
+    load_initializer,
+    proposer_of,
+    rms_length,
+)
 from imgcal.types import PARAMETER_NAMES, CalibrationObject, CameraRig, Detections, MovedError, limits
 
 WRITTEN = ("report.html", "rig.yaml", "object.csv", "result.json")
@@ -66,6 +77,9 @@ class Calibrate:
     object: str  #: object: file, or the name of a shipped one
     out: Path  #: folder to write
     snapshots: str | None = None  #: A:B, numbers in file order from 0, B excluded
+    detector: DetectorName = "classical"
+    """who finds the fiducials in frames: classical (blobs), matched (the whole pattern at once, for frames too dim,
+    blurred or cluttered for blobs; slower), or auto (blobs, and the pattern where these decide nothing)"""
     first_guess: str = "none"  #: where to start: none (factory rig), points, vit, cnn (shipped), a file or run
     without: tuple[str, ...] = ()  #: cameras to leave out
     blind_cameras: bool = False  #: accept cameras that see nothing; they keep their factory values
@@ -102,6 +116,7 @@ class Calibrate:
             start_pose=start_pose(self.start_pose),
         )
         source = open_input(self.input, complete, obj.num_fiducials)
+        detector = self._detector(source)
         initializer = None if self.first_guess == "none" else load_initializer(self.first_guess, rig, obj)
         loaded = time.perf_counter()
         detections, frames = read_detections(source, self.snapshots, self.detection)
@@ -113,7 +128,7 @@ class Calibrate:
 
         outcome: Calibration | RefusedError
         try:
-            outcome = calibrate(detections, rig, obj, options, initializer=initializer, progress=bar)
+            outcome = calibrate(detections, rig, obj, options, initializer=initializer, progress=bar, detector=detector)
             covariance = trusted_covariance(outcome, reference)
             seconds |= {name: value for name, value in outcome.seconds.items() if name != "detection"}
         except RefusedError as error:
@@ -173,6 +188,16 @@ class Calibrate:
             tolerance = torch.full_like(obj.points[:, 0], self.object_tolerance)
         return replace(obj, tolerance=tolerance, scale_tolerance=self.object_scale_tolerance)
 
+    def _detector(self, source: Capture | Detections) -> Detector:
+        """Who finds the fiducials, with the frames of the chosen snapshots."""
+        if self.detector == "classical":
+            return self.detector
+        if isinstance(source, Detections):
+            raise InputError(f"--detector {self.detector}: found blobs in {self.input}, expected a capture with frames")
+        proposer, where_blobs_fail = proposer_of(self.detector)
+        first, masks = parse_range(self.snapshots)[0], masks_of(source)
+        return Sight(proposer, lambda s: source.frames_of(first + s), where_blobs_fail, self.detection, masks)
+
     def _reference(self, rig: CameraRig) -> int:
         if self.reference is None:
             return 0
@@ -226,6 +251,7 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         "reason": "",
         "identity": calibration.identity,
         "identity_alternatives": alternatives,
+        "detector": dict(calibration.detectors),
         "rms_px_before": rms_length(calibration.before.residual, seen),
         "rms_px_after": rms_length(calibration.residual, seen),
         "first_guess": _guess_summary(calibration),
@@ -276,6 +302,7 @@ def refused_summary(
         "reason": refusal.for_command,
         "identity": None,
         "identity_alternatives": None,
+        "detector": {},
         "rms_px_before": None,
         "rms_px_after": None,
         "first_guess": None,

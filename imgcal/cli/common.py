@@ -15,6 +15,7 @@ from typing import TypeVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -67,7 +68,7 @@ def _detect_capture(
     capture: Capture, first: int, last: int | None, options: DetectionOptions
 ) -> tuple[Detections, dict[str, Frame | None]]:
     names = capture.snapshot_names[first:last]
-    masks = {camera: mask for camera in capture.camera_names if (mask := capture.mask(camera)) is not None}
+    masks = masks_of(capture)
     found: list[Blobs] = []
     shown: dict[str, Frame | None] = {}
     with ThreadPoolExecutor() as pool:
@@ -75,6 +76,11 @@ def _detect_capture(
             shown = shown or dict(frames)
             found.append(detect_snapshot(frames, options, masks=masks, pool=pool, whole_capture=True))
     return to_detections(without_dim(found, options), capture.camera_names, names), shown
+
+
+def masks_of(capture: Capture) -> dict[str, NDArray[np.bool_]]:
+    """Read the masks of the cameras that have one: True where the image is to be ignored."""
+    return {camera: mask for camera in capture.camera_names if (mask := capture.mask(camera)) is not None}
 
 
 def progress(items: Iterable[Item], total: int, label: str) -> Iterator[Item]:

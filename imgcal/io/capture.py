@@ -80,6 +80,10 @@ class Capture:
                     frames[camera] = frame
                 yield snapshot, frames
 
+    def frames_of(self, number: int) -> dict[str, Frame | None]:
+        """Read the frames of one snapshot by its number: camera name -> frame; errors as in `snapshots`."""
+        return next(self.snapshots(number, number + 1))[1]
+
     def mask(self, camera: str) -> NDArray[np.bool_] | None:
         """Read the mask of a camera.
 

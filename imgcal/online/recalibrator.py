@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imgcal.association import PipelineOptions, SnapshotIdentity, Tracker, lattice_shifts
+from imgcal.association import PipelineOptions, Proposer, Sight, SnapshotIdentity, Tracker, lattice_shifts
 from imgcal.detection import DetectionOptions, Frame, detect_snapshot, to_detections
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import aligned, flat_std
@@ -34,7 +34,7 @@ from imgcal.online.following import (
 from imgcal.online.motion import measured_move
 from imgcal.online.resection import resected
 from imgcal.online.window import RELEARNT, SIGNIFICANT, Kept, Usual, Window, WindowFit
-from imgcal.pipeline import Calibration, checked_detections, checked_frames
+from imgcal.pipeline import Calibration, DetectorName, checked_detections, checked_frames, proposer_of
 from imgcal.types import CalibrationObject, CameraRig, Detections, MovedCamera, RigPrior
 
 MOST_FOLLOWED = 64
@@ -100,6 +100,7 @@ class Recalibrator:
         *,
         detection: DetectionOptions = DetectionOptions(),
         window: int = 1,
+        detector: DetectorName | Proposer = "classical",
     ) -> None:
         """Start from a factory calibration.
 
@@ -110,6 +111,7 @@ class Recalibrator:
             detection: how blobs are found.
             window: number of latest snapshots that a calibration is made from; more know the rig better and follow it
                 more slowly. Of a camera that moves, those before the move are left out.
+            detector: who finds the fiducials in frames, as for `calibrate`; blobs found elsewhere decide alone.
         """
         if window < 1:
             raise InputError(f"window: found {window}, expected at least 1 snapshot")
@@ -129,6 +131,10 @@ class Recalibrator:
         self._tests: deque[float] = deque(maxlen=200)
         self._additive_noises: deque[float] = deque(maxlen=10)
         self._count = self._refused = 0
+        self._proposer: Proposer | None = None
+        self._where_blobs_fail = True
+        if detector != "classical":
+            self._proposer, self._where_blobs_fail = proposer_of(detector)
         self._slips = obj.num_fiducials > MOST_FOLLOWED and bool(lattice_shifts(obj))
         self._pool = ThreadPoolExecutor(min(rig.num_cameras, os.cpu_count() or 1))
 
@@ -165,7 +171,8 @@ class Recalibrator:
         if followed is not None:
             return followed
         self._follows = False
-        return self._concluded(*self._decided(usable, name, coded))
+        frames = None if isinstance(source, Detections) or coded is not None else source
+        return self._concluded(*self._decided(usable, name, coded, frames))
 
     def _blobs(self, source: Mapping[str, Frame | None] | Detections, name: str) -> Detections:
         if isinstance(source, Detections):
@@ -206,14 +213,22 @@ class Recalibrator:
             return None
 
     def _decided(
-        self, usable: Detections, name: str, coded: NDArray[np.int64] | None
+        self,
+        usable: Detections,
+        name: str,
+        coded: NDArray[np.int64] | None,
+        frames: Mapping[str, Frame | None] | None,
     ) -> tuple[Detections, SnapshotIdentity]:
         """Label a snapshot by itself, with what is known of the rig."""
         prior, tracker = (self.rig.prior or RigPrior()).std(self.rig), self._tracker
         tracker.rig, tracker.prior_std = self.rig, prior
         if self._latest is not None:
             tracker.rig, tracker.prior_std = self._latest.rig, torch.minimum(2 * flat_std(self._latest.estimate), prior)
+        if self._proposer is not None and frames is not None and not self._where_blobs_fail:
+            return self._looked(self._proposer, usable, name, frames)
         snapshot, labels = tracker.decide(usable, name) if coded is None else tracker.accept(name, coded)
+        if snapshot.status == "refused" and self._proposer is not None and frames is not None:
+            return self._looked(self._proposer, usable, name, frames)
         again = self._latest is not None and self._refused & (self._refused - 1) == 0
         if snapshot.status == "refused" and coded is None and again:
             # What was known may hold no more. Another try is dear: after 1, 2, 4, 8, ... refusals in a row.
@@ -224,6 +239,18 @@ class Recalibrator:
             raise RefusedError(f"identity: {snapshot.reason}")
         self._refused = 0
         return replace(usable, fiducial=labels), snapshot
+
+    def _looked(
+        self, proposer: Proposer, blobs: Detections, name: str, frames: Mapping[str, Frame | None]
+    ) -> tuple[Detections, SnapshotIdentity]:
+        """Label a snapshot by what a proposer sees in its frames."""
+        sight = Sight(proposer, lambda _: frames, self._where_blobs_fail, self.detection)
+        snapshot, labels, found = self._tracker.look(sight, 0, blobs, name)
+        if snapshot.status == "refused":
+            self._refused += 1
+            raise RefusedError(f"identity: {snapshot.reason}")
+        self._refused = 0
+        return replace(found, fiducial=labels), snapshot
 
     def _usual(self) -> Usual:
         """What earlier fits looked like."""

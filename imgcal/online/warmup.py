@@ -78,8 +78,9 @@ def _from_frames(
     """Blobs are found, told apart and followed."""
     shots = list(simulate_frames(truth, obj, FrameModel(sensor), generator))
     stacks = {name: [shot[name] for shot in shots] for name in rig.camera_names}
-    with _whatever_comes():
-        calibrate(stacks, rig, obj)
+    for detector in ("classical", "matched"):
+        with _whatever_comes():
+            calibrate(stacks, rig, obj, detector=detector)
     with Recalibrator(rig, obj, window=2) as recalibrator:
         for shot in (shots[0], *shots):
             with _whatever_comes():

@@ -1,7 +1,7 @@
 from .calibration import Calibration, calibrate, fit_labelled
 from .initialization import load_initializer
 from .scoring import RigScore, rms_length, score
-from .sources import Detector, DetectorName, checked_detections, checked_frames, sight_of
+from .sources import Detector, DetectorName, checked_detections, checked_frames, proposer_of
 from .tally import DOUBTFUL, Tally
 
 __all__ = [
@@ -16,7 +16,7 @@ __all__ = [
     "checked_frames",
     "fit_labelled",
     "load_initializer",
+    "proposer_of",
     "rms_length",
     "score",
-    "sight_of",
 ]

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -47,7 +48,7 @@ from imgcal.pipeline.checks import (
 )
 from imgcal.pipeline.initialization import Initialization, Initializer, residual_of
 from imgcal.pipeline.object_checks import displaced, lost_fiducials, object_offsets
-from imgcal.pipeline.sources import Detector, Frames, FramesOf, blobs_of, sight_of
+from imgcal.pipeline.sources import Detector, Frames, blobs_of, sight_of
 from imgcal.pipeline.steadiness import steady_part
 from imgcal.pipeline.tally import Tally, tally
 from imgcal.types import (
@@ -179,6 +180,11 @@ class Calibration:
         return predicted_error(self.estimate)
 
     @property
+    def detectors(self) -> Mapping[str, int]:
+        """Who found the fiducials, with the number of snapshots used: `classical` (blobs), or a proposer's name."""
+        return Counter(self.labelled.snapshots[s].found_by for s in self.labelled.used)
+
+    @property
     def identity(self) -> str:
         """coded | unique | by_prior | by_tracking | ambiguous."""
         return self.labelled.identity
@@ -194,7 +200,6 @@ def calibrate(
     initializer: Initializer | None = None,
     progress: Progress | None = None,
     detector: Detector = "classical",
-    frames: FramesOf | None = None,
 ) -> Calibration:
     """Recalibrate a rig from what its cameras saw.
 
@@ -206,9 +211,9 @@ def calibrate(
         detection: how blobs are found in frames.
         initializer: network whose first guess the estimate starts from (`load_initializer`).
         progress: wraps the loop over snapshots, for a progress bar.
-        detector: who finds the fiducials in frames: `classical` (blobs), or a `Proposer`. Whatever that one proposes,
-            blobs that contradict count, and identity and all checks decide as ever.
-        frames: those of a snapshot by its number, where the source is blobs that were found in them.
+        detector: who finds the fiducials in frames: `classical` (blobs), `matched` (a matched filter for frames in
+            which blobs fail), `auto` (the filter where blobs decide nothing), or a `Proposer`; a `Sight` brings frames
+            that are not in memory. Blobs that contradict count, and identity and all checks decide as ever.
 
     Raises:
         RefusedError: the data cannot decide; the message says why.
@@ -226,7 +231,7 @@ def calibrate(
     started, rig = time.perf_counter(), rig.to(torch.float64)
     detections = blobs_of(source, rig, obj, detection)
     found = time.perf_counter()
-    sight = sight_of(detector, source, frames, detection)
+    sight = sight_of(detector, source, detection)
     labelled = associate(detections, rig, obj, options, progress, sight)
     identified = time.perf_counter()
     arranged = arrange(labelled, rig, obj)

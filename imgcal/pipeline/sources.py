@@ -15,13 +15,14 @@ from imgcal.association import Proposer, Sight, matched_to_rig
 from imgcal.detection import DetectionOptions, Frame, detect
 from imgcal.errors import InputError
 from imgcal.io import MARGIN
+from imgcal.matching import MatchedFilter
 from imgcal.types import BLOB_RADIUS, SIGMA, CalibrationObject, CameraRig, Detections
 
 Frames = Mapping[str, Frame | Sequence[Frame | None] | None]
-FramesOf = Callable[[int], Mapping[str, Frame | None]]  # number of a snapshot -> camera name -> frame
-DetectorName = Literal["classical"]
-Detector = DetectorName | Proposer
-"""Who finds the fiducials in frames: blobs (classical), or something that proposes labels itself."""
+DetectorName = Literal["classical", "matched", "auto"]
+Detector = DetectorName | Proposer | Sight
+"""Who finds the fiducials in frames: blobs (classical), a matched filter, or the filter where blobs decide nothing
+(auto); something else that proposes labels; or one of them with frames that are not in memory."""
 ROWS = tuple(field.name for field in fields(Detections) if not field.name.endswith("_names"))
 
 
@@ -41,29 +42,34 @@ def blobs_of(
     return matched_to_rig(detect(frames, options), rig)
 
 
-def sight_of(
-    detector: Detector, source: Detections | Frames, frames: FramesOf | None, detection: DetectionOptions
-) -> Sight | None:
-    """Say who looks at the frames, and at which; None = blobs alone decide.
+def sight_of(detector: Detector, source: Detections | Frames, detection: DetectionOptions) -> Sight | None:
+    """Say who looks at frames in memory, and at which; None = blobs alone decide.
 
     Raises:
         InputError: no such detector, or no frames to look at.
     """
-    if detector == "classical":
-        return None
-    proposer = detector if not isinstance(detector, str) else _named(detector)
-    if frames is None:
-        if isinstance(source, Detections):
-            raise InputError(f"detector {proposer.name}: found blobs without frames, expected frames to look at")
-        frames = _in_memory(source)
-    return Sight(proposer, frames, detector == "auto", detection)
+    if isinstance(detector, Sight) or detector == "classical":
+        return None if isinstance(detector, str) else detector
+    proposer, where_blobs_fail = proposer_of(detector)
+    if isinstance(source, Detections):
+        raise InputError(f"detector {proposer.name}: found blobs without frames, expected frames to look at")
+    return Sight(proposer, _in_memory(source), where_blobs_fail, detection)
 
 
-def _named(detector: str) -> Proposer:
+def proposer_of(detector: DetectorName | Proposer) -> tuple[Proposer, bool]:
+    """Give who looks, and whether only where blobs decide nothing.
+
+    Raises:
+        InputError: no such detector.
+    """
+    if not isinstance(detector, str):
+        return detector, False
+    if detector in ("matched", "auto"):
+        return MatchedFilter(), detector == "auto"
     raise InputError(f"detector: found {detector!r:.80}, expected one of {', '.join(get_args(DetectorName))}")
 
 
-def _in_memory(source: Frames) -> FramesOf:
+def _in_memory(source: Frames) -> Callable[[int], Mapping[str, Frame | None]]:
     """Frames of one snapshot after another, of cameras that have one frame or many."""
     series = {name: entry if isinstance(entry, Sequence) else (entry,) for name, entry in source.items()}
     return lambda number: {name: frames[number] if number < len(frames) else None for name, frames in series.items()}

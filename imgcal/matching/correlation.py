@@ -1,0 +1,105 @@
+"""A pattern of points laid on the maps of all cameras, each map shifted until it fits best."""
+
+# Compiled functions take their types from their arguments.
+# ruff: noqa: ANN001, ANN202
+# mypy: allow-untyped-defs
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imgcal.geometry import RigidTransform
+from imgcal.matching.maps import Maps
+from imgcal.types import CalibrationObject, CameraRig
+from renderers.compiling import njit
+
+HIDDEN = 0.3
+"""Probability that a fiducial in view does not show."""
+EVEN = 0.25
+"""Exponent of the distribution of ranks at markers: 1 would be that of the rest of the frame."""
+BLIND = 0.1
+"""Probability that a camera shows nothing of the object."""
+
+
+@dataclass(frozen=True)
+class Scores:
+    """How well poses agree with the maps."""
+
+    log_odds: NDArray[np.float64]  # (K, C) against nothing being there
+    shift: NDArray[np.float64]  # (K, C, 2) pixels, map minus prediction
+
+    @property
+    def total(self) -> NDArray[np.float64]:
+        """All cameras together: (K,)."""
+        return self.log_odds.sum(1)
+
+    def select(self, rows: NDArray[np.int64]) -> Scores:
+        """Keep the given poses."""
+        return Scores(self.log_odds[rows], self.shift[rows])
+
+    def __add__(self, other: Scores) -> Scores:
+        return Scores(np.concatenate((self.log_odds, other.log_odds)), np.concatenate((self.shift, other.shift)))
+
+
+def gains(maps: Maps) -> NDArray[np.float32]:
+    """Log odds of each cell: that a marker gives as much surprise, against the rest of the frame: (C, H, W)."""
+    # Ranks of the frame are even in [0, 1], those at markers have the density EVEN * rank^(EVEN - 1).
+    log_odds = np.log(HIDDEN + (1 - HIDDEN) * EVEN * np.exp((1 - EVEN) * maps.surprise))
+    return log_odds.astype(np.float32)
+
+
+def correlate(
+    maps: Maps,
+    gain: NDArray[np.float32],
+    rig: CameraRig,
+    obj: CalibrationObject,
+    poses: RigidTransform,
+    reach: NDArray[np.float64],
+) -> Scores:
+    """Score poses (K,), each camera's map shifted as far as `reach` (C,) pixels."""
+    points = poses.apply(obj.points.to(rig.focal_length))
+    projection = rig.expand(len(points)).project_values(points, obj.radius)
+    # Far outside of the image nothing is said; at its edge the shift decides.
+    cells = np.nan_to_num((projection.uv.numpy() + 0.5) / maps.factor, nan=-1e6).clip(-1e6, 1e6)
+    cells, front = np.ascontiguousarray(cells), np.ascontiguousarray(projection.depth.numpy() > 1)
+    score, shift = np.zeros(cells.shape[:2]), np.zeros((*cells.shape[:2], 2))
+    steps = np.ceil(reach / maps.factor).astype(np.int64)
+    most = int(steps.max(initial=0))
+    window = np.zeros((2 * most + 1, 2 * most + 1), np.float32)
+    _correlate(cells, front, gain, maps.size, steps, window, score, shift)
+    return Scores(np.log(BLIND + (1 - BLIND) * np.exp(score)), shift * maps.factor)
+
+
+@njit(cache=True)
+def _correlate(cells, front, gain, size, steps, window, score, shift):
+    for k in range(len(cells)):
+        for c in range(cells.shape[1]):
+            step, width, height = steps[c], size[c, 0], size[c, 1]
+            side = 2 * step + 1
+            for i in range(side):
+                for j in range(side):
+                    window[i, j] = 0
+            for n in range(cells.shape[2]):
+                if not front[k, c, n]:
+                    continue
+                left, top = int(np.floor(cells[k, c, n, 0])) - step, int(np.floor(cells[k, c, n, 1])) - step
+                first, last = max(0, -left), min(side, width - left)
+                for i in range(max(0, -top), min(side, height - top)):
+                    row = gain[c, top + i]
+                    for j in range(first, last):
+                        window[i, j] += row[left + j]
+            most, at_i, at_j, total = window[0, 0], 0, 0, 0.0
+            for i in range(side):
+                for j in range(side):
+                    if window[i, j] > most:
+                        most, at_i, at_j = window[i, j], i, j
+            for i in range(side):
+                for j in range(side):
+                    if window[i, j] > most - 12:
+                        total += np.exp(window[i, j] - most)
+            # The shift is not known beforehand: the mean over all of them counts.
+            score[k, c] = most + np.log(total / (side * side))
+            shift[k, c, 0], shift[k, c, 1] = at_j - step, at_i - step

@@ -1,0 +1,132 @@
+"""Frames as maps of surprise: how unusual it is, in this very frame, to look so much like a marker.
+
+A frame is reduced and filtered for spots of several sizes. What the filters say is replaced by its rank: minus the
+logarithm of the share of the frame in which they say as much. Without markers that is a standard exponential variable,
+whatever noise, contrast, background and clutter are; the more clutter a frame has, the less a bright spot is worth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from imgcal.detection import Frame
+
+SIZES = (0.0, 1.2, 2.4)  # cells, standard deviations of the spots that are looked for; 0 = as reduced
+SURROUND = 2.0  # of the ring around a spot, in parts of the spot's
+LEAST_SURROUND = 1.6  # cells
+BINS = 4096
+MOST = 9.0
+"""Surprise beyond which nothing counts more: a reflection is no better a marker for being bright."""
+
+
+@dataclass(frozen=True)
+class Maps:
+    """Surprise of all cameras at one scale."""
+
+    surprise: NDArray[np.float32]  # (C, H, W), 0 where a camera has no image
+    factor: int  # pixels to a cell
+    size: NDArray[np.int64]  # (C, 2) width and height in cells
+
+    def pooled(self, factor: int) -> Maps:
+        """Make larger cells, each as surprising as the most surprising one within it or next to it."""
+        step = factor // self.factor
+        if step <= 1:
+            return self
+        count, height, width = self.surprise.shape
+        padded = np.zeros((count, -(-height // step) * step, -(-width // step) * step), np.float32)
+        padded[:, :height, :width] = self.surprise
+        most = padded.reshape(count, padded.shape[1] // step, step, -1, step).max((2, 4))
+        size = -(-self.size // step)
+        return Maps(_ranked(most, size), self.factor * step, size)
+
+    def dilated(self) -> Maps:
+        """Let every cell be as surprising as its most surprising neighbour."""
+        kernel = np.ones((3, 3), np.uint8)
+        most = np.stack([cv2.dilate(one, kernel) for one in self.surprise])
+        return Maps(_ranked(most, self.size), self.factor, self.size)
+
+
+def surprise_maps(
+    frames: list[Frame | None], factor: int, dark: bool, masks: list[NDArray[np.bool_] | None]
+) -> tuple[Maps, NDArray[np.float32]]:
+    """Filter the frames of all cameras.
+
+    Args:
+        frames: (H, W) of each camera, None = it has none.
+        factor: pixels to a cell.
+        dark: markers are darker than their surroundings.
+        masks: (H, W) of each camera, True where not to look.
+
+    Returns:
+        Maps, and the response to each size of spots in standard deviations of the noise: (C, sizes, H, W).
+    """
+    size = np.array([(0, 0) if frame is None else _cells(frame, factor) for frame in frames], dtype=np.int64)
+    shape = (len(frames), int(max(size[:, 1].max(), 1)), int(max(size[:, 0].max(), 1)))
+    surprise = np.zeros(shape, np.float32)
+    response = np.zeros((shape[0], len(SIZES), *shape[1:]), np.float32)
+    for camera, (frame, mask) in enumerate(zip(frames, masks, strict=True)):
+        if frame is None:
+            continue
+        width, height = size[camera]
+        values = _spots(_reduced(frame, factor, dark))
+        if mask is not None:
+            covered = cv2.resize(mask.astype(np.uint8), (int(width), int(height)), interpolation=cv2.INTER_AREA) > 0
+            values[:, covered] = 0.0
+        ranks = np.stack([rank(value) for value in values]) - np.float32(np.log(len(values)))
+        surprise[camera, :height, :width] = np.clip(ranks.max(0), 0, MOST)
+        response[camera, :, :height, :width] = values
+    return Maps(surprise, factor, size), response
+
+
+def rank(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Minus the logarithm of the share of the values that are as large, for each of them."""
+    low, high = float(values.min()), float(values.max())
+    if not high > low:
+        return np.zeros_like(values)
+    # The interesting ones are few and large: bins are narrow at zero and wide far out.
+    squeezed = np.arcsinh(values)
+    low, high = float(np.arcsinh(low)), float(np.arcsinh(high))
+    place = ((squeezed - np.float32(low)) * np.float32((BINS - 1) / (high - low))).astype(np.int32)
+    count = np.bincount(place.ravel(), minlength=BINS)
+    above = np.cumsum(count[::-1])[::-1] - 0.5 * count
+    table = -np.log(np.maximum(above, 0.5) / values.size).astype(np.float32)
+    return table[place]
+
+
+def _ranked(values: NDArray[Any], size: NDArray[np.int64]) -> NDArray[np.float32]:
+    ranked = np.zeros(values.shape, np.float32)
+    for camera, (width, height) in enumerate(size.tolist()):
+        if width:
+            part = rank(values[camera, :height, :width])
+            ranked[camera, :height, :width] = np.clip(part, 0, MOST)
+    return ranked
+
+
+def _cells(frame: Frame, factor: int) -> tuple[int, int]:
+    return frame.shape[1] // factor, frame.shape[0] // factor
+
+
+def _reduced(frame: Frame, factor: int, dark: bool) -> NDArray[np.float32]:
+    """Mean of each cell; what is left over at the right and at the bottom is not seen."""
+    width, height = _cells(frame, factor)
+    values = np.ascontiguousarray(frame[: height * factor, : width * factor]).astype(np.float32)
+    if factor > 1:
+        values = np.asarray(cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA))
+    return -values if dark else values
+
+
+def _spots(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Respond to spots of each size, in standard deviations of the noise: (sizes, H, W)."""
+    found = np.empty((len(SIZES), *image.shape), np.float32)
+    for number, sigma in enumerate(SIZES):
+        around = max(LEAST_SURROUND, SURROUND * sigma)
+        spot = cv2.GaussianBlur(image, (0, 0), sigma) if sigma else image
+        difference = spot - cv2.GaussianBlur(image, (0, 0), around)
+        noise = 1.4826 * float(np.median(np.abs(difference[::3, ::3])))
+        found[number] = difference / max(noise, 1e-3)
+    return found

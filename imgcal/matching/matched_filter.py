@@ -1,0 +1,164 @@
+"""The proposer that lays the object on the frames: where blobs fail, the whole pattern in all cameras still shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from imgcal.association import Proposal, Snapshot, lattice_shifts, near_turns, rows_of
+from imgcal.geometry import RigidTransform
+from imgcal.matching.maps import Maps, surprise_maps
+from imgcal.matching.poses import Matcher, Ranked, Scene, anywhere, around, distinct_turns
+from imgcal.matching.refinement import Fitted, fitted
+from imgcal.types import CalibrationObject
+
+FINEST = 4  # px to a cell
+CELLS_A_GAP = 5.0  # cells of the search between neighbouring fiducials, at least
+TURNS = 4608  # of all rotations: 15 degrees apart
+KEPT = 200  # poses of each camera's search
+CLIMBING = 8
+SAME = 0.6  # share of the fiducials that two poses must see in the same places to be one
+SURE_CAMERA = 2.0  # log odds from which a camera has a say in that
+CLEAR = 40.0  # log odds between the best pose and the best distinct one at which the search ends
+FINE_CLIMBS = (0.03, 0.012)
+"""Radians: steps on the finest maps."""
+MOST_RIVALS = 2  # that are fitted, too, where the best pose does not stand out by far
+PARALLAX = 60.0  # px: what a pose from one camera may be off in the others
+
+
+@dataclass(frozen=True)
+class MatchedFilter:
+    """Finds the object by its whole pattern, in all cameras together; see `Proposer`."""
+
+    name: str = "matched"
+
+    def propose(self, snapshot: Snapshot) -> Proposal:
+        """Look at one snapshot: near the known poses first, then anywhere."""
+        names = snapshot.rig.camera_names
+        frames = [snapshot.frames.get(name) for name in names]
+        dark = snapshot.detection.polarity == "dark"
+        scene = Scene(snapshot.rig, snapshot.obj, snapshot.prior_std, _distance(snapshot))
+        gap = _gap(snapshot.obj) * scene.pixels_per_mm
+        fine, response = surprise_maps(frames, FINEST, dark, [snapshot.masks.get(name) for name in names])
+        coarse = fine.pooled(max(FINEST, 2 ** int(np.log2(max(gap / CELLS_A_GAP, 1)))))
+        close = Matcher.on(scene, fine.dilated(), 4 * scene.drift + PARALLAX / 3)
+        found = self._known(close, coarse, snapshot)
+        if found is None:
+            found = self._searched(close, coarse)
+        margin, rivals = margin_of(found, close)
+
+        def fit(pose: Ranked) -> Fitted | None:
+            return fitted(scene, pose, fine, response, frames, dark)
+
+        result = fit(found.best(1)) if margin > 0 else None
+        if result is None:
+            return Proposal.declined(snapshot, "no pose of the object stands out in the images", margin)
+        if margin < CLEAR:
+            # With rig and pose fitted, places are compared to a cell, for the best and for its rivals.
+            fits = [fit(rivals.select(np.array([k]))) for k in range(min(MOST_RIVALS, len(rivals.scores.total)))]
+            against = [0.0, *rivals.scores.total, *(f.log_odds(scene, fine) for f in fits if f is not None)]
+            margin = max(margin, result.log_odds(scene, fine) - max(against))
+        return _proposal(result, snapshot, margin)
+
+    def _known(self, close: Matcher, coarse: Maps, snapshot: Snapshot) -> Ranked | None:
+        """Look around the known poses, or the origin; None = the object is not there."""
+        known = list(snapshot.candidates) or [RigidTransform.identity(dtype=torch.float64)]
+        scene, found = close.scene, None
+        matcher = Matcher.on(scene, coarse, close.reach)
+        for pose in known:
+            if not bool(scene.rig.expand(1).project_values(pose.apply(scene.obj.points)[None]).visible.any()):
+                continue
+            near = matcher.climb(matcher.rank(around(pose, scene.obj)).best(CLIMBING))
+            near = close.climb(close.rank(near.poses), FINE_CLIMBS)
+            found = near if found is None else found + near
+        return found if found is not None and margin_of(found, close)[0] > CLEAR else None
+
+    def _searched(self, close: Matcher, coarse: Maps) -> Ranked:
+        """Look anywhere: from the image of one camera after the other, until a pose stands out."""
+        scene = close.scene
+        turns = distinct_turns(scene.obj, TURNS)
+        reach = 4 * 2**0.5 * scene.drift + PARALLAX
+        alone = Matcher.on(scene, coarse.pooled(2 * coarse.factor), reach)
+        matcher = Matcher.on(scene, coarse, reach)
+        found: Ranked | None = None
+        for camera in np.argsort(-_promise(coarse)).tolist():
+            poses = anywhere(alone, camera, turns, min(KEPT, len(turns)))
+            fresh = matcher.climb(matcher.rank(poses).best(CLIMBING))
+            fresh = close.climb(close.rank(fresh.poses), FINE_CLIMBS)
+            found = fresh if found is None else (found + fresh).best(2 * CLIMBING)
+            if margin_of(found, close)[0] > CLEAR:
+                break
+        assert found is not None
+        return found
+
+
+def margin_of(found: Ranked, matcher: Matcher) -> tuple[float, Ranked]:
+    """Compare the best pose with the best distinct ones, be they found or made by moving the object onto itself.
+
+    Returns:
+        Log odds against the best of these, and these, the best first.
+    """
+    obj, best = matcher.scene.obj, found.best(1)
+    motions = lattice_shifts(obj) + near_turns(obj, 0.1 * obj.size)
+    if motions:
+        rotation = torch.from_numpy(np.stack([motion.rotation for motion in motions]))
+        translation = torch.from_numpy(np.stack([motion.translation for motion in motions]))
+        found = found + matcher.rank(best.poses[0] @ RigidTransform(rotation, translation))
+    rivals = found.select(np.flatnonzero(distinct(found, best, matcher.scene)))
+    rivals = rivals.best(len(rivals.scores.total))
+    return float(best.scores.total[0] - max([0.0, *rivals.scores.total])), rivals
+
+
+def distinct(found: Ranked, best: Ranked, scene: Scene) -> NDArray[np.bool_]:
+    """Tell which poses (K,) see other fiducials than the best one does in the same places, but for symmetric turns."""
+    there, here = _places(found, scene), _places(best, scene)[0]  # (K, C, N, 2), (C, N, 2)
+    gaps = np.linalg.norm(here[:, :, None] - here[:, None], axis=-1)
+    gaps[:, np.arange(here.shape[1]), np.arange(here.shape[1])] = np.inf
+    gap = gaps.min(-1)
+    sure = best.scores.log_odds[0] > SURE_CAMERA
+    same = np.zeros(len(there))
+    for motion in scene.obj.symmetries:
+        turned = motion.permutation
+        one = np.linalg.norm(there - here[:, turned], axis=-1) < 0.5 * gap[:, turned]
+        same = np.maximum(same, one[:, sure].mean((1, 2)) if sure.any() else 0.0)
+    return same < SAME
+
+
+def _places(found: Ranked, scene: Scene) -> NDArray[np.float64]:
+    """Where poses see all fiducials, with the shifts of the cameras: (K, C, N, 2) pixels."""
+    points = found.poses.apply(scene.obj.points.to(scene.rig.focal_length))
+    uv = scene.rig.expand(len(points)).project_values(points, scene.obj.radius).uv.numpy()
+    return uv + found.scores.shift[:, :, None]
+
+
+def _proposal(result: Fitted, snapshot: Snapshot, margin: float) -> Proposal:
+    rows = rows_of(result.uv, result.sigma, result.seen, result.radius, snapshot.blobs)
+    return Proposal(rows, result.rig_from_object, margin)
+
+
+def _promise(maps: Maps) -> NDArray[np.float64]:
+    """How much stands out in each camera: (C,)."""
+    flat = maps.surprise.reshape(len(maps.surprise), -1)
+    return np.sort(flat, axis=1)[:, -64:].sum(1)
+
+
+def _gap(obj: CalibrationObject) -> float:
+    """Usual distance (mm) from a fiducial to the nearest other one."""
+    gaps = torch.cdist(obj.points, obj.points)
+    gaps.fill_diagonal_(torch.inf)
+    return float(gaps.min(1).values.median())
+
+
+def _distance(snapshot: Snapshot) -> float:
+    """How far from the cameras the object is, roughly, mm."""
+    rig, obj = snapshot.rig, snapshot.obj
+    if snapshot.candidates:
+        centre = snapshot.candidates[0].apply(obj.points.mean(0, keepdim=True))[0]
+        return float((rig.positions - centre).norm(dim=-1).median())
+    if rig.working_distance is not None:
+        return rig.working_distance
+    # As large as a fifth of the image.
+    return float((rig.focal_length.mean(-1) * obj.size / (0.2 * rig.image_size[:, 0])).median())

@@ -1,0 +1,213 @@
+"""Poses that the maps suggest: around one that is known, or anywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from imgcal.association import pattern_prior
+from imgcal.geometry import RigidTransform, rotation_from_vector
+from imgcal.matching.correlation import Scores, correlate, gains
+from imgcal.matching.maps import Maps
+from imgcal.types import CalibrationObject, CameraRig
+
+NEAR = 0.31  # rad: how far a known pose may be turned
+STEP = 0.105  # rad: between the turns that are tried around it
+CLIMBS = (0.07, 0.035, 0.017)
+"""Radians: steps of the search for the best turn."""
+OFF = 60.0  # mm: standard deviation of the place of a pose that the maps suggest
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is given."""
+
+    rig: CameraRig
+    obj: CalibrationObject
+    std: Tensor  # (C, 15)
+    distance: float  # mm, from the cameras to the object, roughly
+
+    @property
+    def drift(self) -> NDArray[np.float64]:
+        """One standard deviation of how far drift moves the object's image: (C,) pixels."""
+        return pattern_prior(self.std, self.rig, self.distance).shift
+
+    @property
+    def pixels_per_mm(self) -> float:
+        """Scale of the images at the object."""
+        return float(self.rig.focal_length.mean()) / self.distance
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """Poses, the best first."""
+
+    poses: RigidTransform  # (K,)
+    scores: Scores  # (K, C)
+
+    def select(self, rows: NDArray[np.int64]) -> Ranked:
+        """Keep the given ones, in this order."""
+        return Ranked(self.poses[torch.from_numpy(rows)], self.scores.select(rows))
+
+    def best(self, count: int) -> Ranked:
+        """Keep the best ones, in order."""
+        return self.select(np.argsort(-self.scores.total, kind="stable")[:count])
+
+    def __add__(self, other: Ranked) -> Ranked:
+        return Ranked(RigidTransform.cat([self.poses, other.poses]), self.scores + other.scores)
+
+
+@dataclass(frozen=True)
+class Matcher:
+    """Lays the object on maps of one scale."""
+
+    scene: Scene
+    maps: Maps
+    gain: NDArray[np.float32]  # (C, H, W)
+    reach: NDArray[np.float64]  # (C,) pixels that images may be shifted
+
+    @classmethod
+    def on(cls, scene: Scene, maps: Maps, reach: NDArray[np.float64]) -> Matcher:
+        """Prepare maps."""
+        return cls(scene, maps, gains(maps), reach)
+
+    def rank(self, poses: RigidTransform) -> Ranked:
+        """Score poses (K,), in their order."""
+        return Ranked(poses, correlate(self.maps, self.gain, self.scene.rig, self.scene.obj, poses, self.reach))
+
+    def climb(self, found: Ranked, steps: Sequence[float] = CLIMBS) -> Ranked:
+        """Turn and move each pose to where it fits best: (K,) in their order."""
+        turns = _axes(found.poses.rotation)
+        for step in steps:
+            found = self.better(found, moved(found, self.scene))
+            tried = RigidTransform.stack([turned(found.poses, step * axis, self.scene.obj) for axis in turns])
+            count = len(found.poses.rotation)
+            scored = self.rank(RigidTransform(tried.rotation.flatten(0, 1), tried.translation.flatten(0, 1)))
+            best = scored.scores.total.reshape(len(turns), count).argmax(0)
+            found = self.better(found, scored.select(best * count + np.arange(count)).poses)
+        return self.better(found, moved(found, self.scene))
+
+    def better(self, found: Ranked, poses: RigidTransform) -> Ranked:
+        """Of two sets of poses (K,), the better one of each pair."""
+        other = self.rank(poses)
+        both, count = found + other, len(found.poses.rotation)
+        take = np.where(other.scores.total > found.scores.total, count, 0)
+        return both.select(take + np.arange(count))
+
+
+def around(pose: RigidTransform, obj: CalibrationObject) -> RigidTransform:
+    """Turn a pose about the object's centre in all directions, the smallest turns first: (K,)."""
+    steps = np.arange(-NEAR, NEAR + 1e-9, STEP)
+    vectors = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
+    size = np.linalg.norm(vectors, axis=1)
+    vectors = vectors[np.argsort(size, kind="stable")][: int((size <= NEAR).sum())]
+    vectors = np.concatenate((np.zeros((1, 3)), vectors))
+    return turned(pose, torch.from_numpy(vectors).to(pose.rotation), obj)
+
+
+def turned(poses: RigidTransform, vectors: Tensor, obj: CalibrationObject) -> RigidTransform:
+    """Turn the object in poses (K,) about its centre by rotation vectors (K, 3) or (3,), in the object's axes."""
+    rotation = poses.rotation @ rotation_from_vector(vectors)
+    centre = obj.points.mean(0).to(rotation)
+    place = poses.rotation @ centre + poses.translation
+    return RigidTransform(rotation, place - rotation @ centre)
+
+
+def moved(found: Ranked, scene: Scene) -> RigidTransform:
+    """Move the object to where most cameras see it, as far as drift does not explain the shifts of their images."""
+    rotation = found.poses.rotation
+    centre = scene.obj.points.mean(0).to(rotation)
+    places = rotation @ centre + found.poses.translation  # (K, 3)
+    offsets = torch.cat((torch.zeros(1, 3), torch.eye(3))).to(rotation)
+    count = len(places)
+    uv = scene.rig.expand(count).project_values(places[:, None] + offsets).uv  # (K, C, 4, 2)
+    slope = (uv[:, :, 1:] - uv[:, :, :1]).mT.nan_to_num()  # (K, C, 2, 3) pixels per mm
+    sure = torch.from_numpy(found.scores.log_odds > 3.0)
+    weight = torch.where(sure, 1 / torch.from_numpy(scene.drift).square(), 0.0)[..., None, None]
+    normal = (slope.mT @ slope * weight).sum(1) + torch.eye(3).to(slope) / OFF**2
+    right = (slope.mT @ torch.from_numpy(found.scores.shift)[..., None] * weight).sum(1)
+    step = torch.linalg.solve(normal, right)[..., 0]
+    return RigidTransform(rotation, places + step - rotation @ centre)
+
+
+@lru_cache(maxsize=8)
+def all_turns(count: int) -> NDArray[np.float64]:
+    """Spread rotations evenly: (count, 3, 3).
+
+    Source: Alexa 2022, "Super-Fibonacci Spirals: Fast, Low-Discrepancy Sampling of SO(3)".
+    """
+    s = np.arange(count) + 0.5
+    phi, psi = np.sqrt(2.0), 1.533751168755204288118041
+    r, big = np.sqrt(s / count), np.sqrt(1 - s / count)
+    alpha, beta = 2 * np.pi * s / phi, 2 * np.pi * s / psi
+    quaternions = np.stack((r * np.sin(alpha), r * np.cos(alpha), big * np.sin(beta), big * np.cos(beta)), axis=1)
+    return Rotation.from_quat(quaternions).as_matrix()
+
+
+def distinct_turns(obj: CalibrationObject, count: int) -> NDArray[np.float64]:
+    """Spread rotations evenly, of those that look alike one only: about (count / order, 3, 3)."""
+    turns = all_turns(count)
+    if len(obj.symmetries) == 1:
+        return turns
+    alike = np.stack([motion.rotation for motion in obj.symmetries])
+    # Of rotations that look alike, that with the smallest angle, which is that of the largest trace.
+    traces = np.einsum("kij,gji->gk", turns, alike)
+    return turns[traces[0] >= traces.max(0) - 1e-9] if len(alike) else turns
+
+
+def anywhere(matcher: Matcher, camera: int, turns: NDArray[np.float64], count: int) -> RigidTransform:
+    """Look for the object in the whole image of one camera, at the usual distance: the best poses (count,).
+
+    Args:
+        matcher: on coarse maps.
+        camera: which one.
+        turns: (K, 3, 3) of the object against that camera.
+        count: how many to give.
+    """
+    scene = matcher.scene
+    alone = Matcher(
+        Scene(scene.rig.select([camera]), scene.obj, scene.std[[camera]], scene.distance),
+        Maps(matcher.maps.surprise[[camera]], matcher.maps.factor, matcher.maps.size[[camera]]),
+        matcher.gain[[camera]],
+        np.full(1, matcher.maps.factor * matcher.maps.size[camera].max() / 2),
+    )
+    cam_from_rig = scene.rig.cam_from_rig[camera]
+    # In the middle of the image, at the usual distance; the shift says where it is instead.
+    lens = scene.rig.select([camera])
+    middle = (lens.image_size[0].to(lens.focal_length) / 2 - lens.principal_point[0]) / lens.focal_length[0]
+    ray = torch.cat((middle, middle.new_ones(1)))
+    place = ray * (scene.distance / ray.norm())
+    centre = scene.obj.points.mean(0).to(place)
+    rotation = torch.from_numpy(turns).to(place)
+    cam_from_object = RigidTransform(rotation, place - rotation @ centre)
+    inverse = cam_from_rig.inverse()
+    found = alone.rank(inverse @ cam_from_object)
+    best = np.argsort(-found.scores.total, kind="stable")[:count]
+    shift = torch.from_numpy(found.scores.shift[best, 0])
+    ray = torch.cat((middle + shift / lens.focal_length[0], middle.new_ones(count, 1)), dim=1)
+    place = ray * (scene.distance / ray.norm(dim=1, keepdim=True))
+    # What is seen away from the middle is seen from another side.
+    straight = torch.cat((middle, middle.new_ones(1))).expand(count, 3)
+    rotation = _between(straight, ray) @ rotation[torch.from_numpy(best)]
+    return inverse @ RigidTransform(rotation, place - rotation @ centre)
+
+
+def _between(first: Tensor, second: Tensor) -> Tensor:
+    """Smallest rotations that take directions (K, 3) to others: (K, 3, 3)."""
+    a, b = (x / x.norm(dim=-1, keepdim=True) for x in (first, second))
+    axis = torch.linalg.cross(a, b)
+    sine = axis.norm(dim=-1, keepdim=True)
+    angle = torch.atan2(sine, (a * b).sum(-1, keepdim=True))
+    return rotation_from_vector(axis / sine.clamp_min(1e-12) * angle)
+
+
+def _axes(like: Tensor) -> Tensor:
+    """Both directions of the three axes: (6, 3)."""
+    return torch.cat((torch.eye(3), -torch.eye(3))).to(like)

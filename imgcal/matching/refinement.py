@@ -1,0 +1,202 @@
+"""From a pose that agrees with the maps to measured fiducials: rig and pose are fitted, markers measured, in turns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from imgcal.detection import Frame
+from imgcal.estimation import Estimate, EstimationOptions, estimate
+from imgcal.geometry import RigidTransform
+from imgcal.matching.correlation import BLIND, gains
+from imgcal.matching.maps import SIZES, Maps
+from imgcal.matching.photometry import Measured, measure_markers
+from imgcal.matching.poses import Ranked, Scene
+from imgcal.types import CameraRig, Observations
+
+ROBUST = EstimationOptions(loss="cauchy", threshold=2.0, max_iterations=30, tolerance=1e-2)
+SURE = 6.0  # log odds from which a camera surely shows the object where the maps say
+SURPRISED = 4.0  # surprise from which a cell may be a marker
+LEAST_IN_CAMERA = 3  # fiducials that fit, below which a camera says nothing
+OUTLIER = 5.0  # standard deviations from which a measured marker is something else
+SHAPE_ERROR = 0.3  # px: what a measured place may be off beyond its own sigma
+LEAST_FITTED = 6  # fiducials of all cameras
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """Rig and pose, with what was measured of each fiducial."""
+
+    rig: CameraRig
+    rig_from_object: RigidTransform
+    uv: NDArray[np.float64]  # (C, N, 2) pixels
+    sigma: NDArray[np.float64]  # (C, N) pixels
+    radius: NDArray[np.float64]  # (C, N) pixels
+    seen: NDArray[np.bool_]  # (C, N)
+    predicted: NDArray[np.float64]  # (C, N, 2) pixels, where rig and pose put the fiducials
+
+    def log_odds(self, scene: Scene, maps: Maps) -> float:
+        """How much more is where the fiducials are put than elsewhere: log odds against nothing being there.
+
+        No image is shifted any more; what the fit of each has cost is that its place was known by the prior only.
+        """
+        cells = np.rint(np.nan_to_num((self.predicted + 0.5) / maps.factor - 0.5, nan=-1.0).clip(-1, 1e6)).astype(int)
+        inside = ((cells >= 0) & (cells < maps.size[:, None])).all(-1)
+        cells = np.where(inside[..., None], cells, 0)
+        gain = gains(maps)[np.arange(len(cells))[:, None], cells[..., 1], cells[..., 0]]
+        cost = np.log(np.maximum(2 * np.pi * (scene.drift / maps.factor) ** 2, 1.0))
+        return float(np.log(BLIND + (1 - BLIND) * np.exp(np.where(inside, gain, 0).sum(1) - cost)).sum())
+
+
+def fitted(
+    scene: Scene,
+    found: Ranked,
+    maps: Maps,
+    response: NDArray[np.float32],
+    frames: Sequence[Frame | None],
+    dark: bool,
+) -> Fitted | None:
+    """Fit and measure, finer each time; None = too little is left.
+
+    Args:
+        scene: what is given.
+        found: one pose.
+        maps: fine ones.
+        response: (C, sizes, H, W) from `surprise_maps`.
+        frames: of each camera.
+        dark: markers are darker than their surroundings.
+    """
+    pose = found.poses[0]
+    predicted = predictions(scene.rig, scene, pose) + found.scores.shift[0][:, None]
+    sure = (found.scores.log_odds[0] > SURE)[:, None]
+    reach = max(2, round(0.15 * spacing(predicted) / maps.factor))
+    fit = _fit_peaks(scene, pose, maps, predicted, (reach, 2), sure)
+    for gate in (2.0 * maps.factor, 2.5):
+        if fit is None:
+            return None
+        pose, predicted = fit.rig_from_object[0], predictions(fit.rig, scene, fit.rig_from_object[0])
+        markers = _measured(scene, fit, predicted, response, maps.factor, frames, dark)
+        uv, sigma = np.stack([m.uv for m in markers]), np.stack([m.sigma for m in markers])
+        off = np.linalg.norm(np.nan_to_num(uv) - predicted, axis=-1)
+        near = off < np.hypot(gate, OUTLIER * np.minimum(sigma, 3.0))
+        seen = _enough(np.stack([m.seen for m in markers]) & near)
+        fit = _fit(scene, pose, uv, np.hypot(sigma, SHAPE_ERROR), seen)
+    if fit is None:
+        return None
+    pose, predicted = fit.rig_from_object[0], predictions(fit.rig, scene, fit.rig_from_object[0])
+    radius = np.stack([np.full(len(m.sigma), m.radius) for m in markers])
+    off = np.linalg.norm(np.nan_to_num(uv) - predicted, axis=-1)
+    seen = _enough(seen & (off < OUTLIER * np.hypot(sigma, SHAPE_ERROR)))
+    return Fitted(fit.rig, pose, uv, sigma, radius, seen, predicted)
+
+
+def predictions(rig: CameraRig, scene: Scene, pose: RigidTransform) -> NDArray[np.float64]:
+    """Pixels of all fiducials: (C, N, 2)."""
+    points = pose.apply(scene.obj.points.to(rig.focal_length))
+    return rig.expand(1).project_values(points[None], scene.obj.radius).uv[0].numpy()
+
+
+def spacing(uv: NDArray[np.float64]) -> float:
+    """Median distance (px) from a fiducial's image (C, N, 2) to the nearest other one."""
+    gaps = np.linalg.norm(uv[:, :, None] - uv[:, None], axis=-1)
+    gaps[:, np.arange(uv.shape[1]), np.arange(uv.shape[1])] = np.inf
+    return float(np.median(gaps.min(-1)))
+
+
+def _enough(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Leave out cameras in which hardly anything (C, N) fits: it may do so by chance."""
+    return seen & (seen.sum(1, keepdims=True) >= LEAST_IN_CAMERA)
+
+
+def _peaks(maps: Maps, predicted: NDArray[np.float64], cells: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Find the most surprising place within so many cells of each prediction (C, N, 2), to a part of a cell."""
+    count, height, width = maps.surprise.shape
+    at = np.nan_to_num((predicted + 0.5) / maps.factor - 0.5, nan=-1e6).clip(-1e6, 1e6)
+    middle = np.rint(at).astype(np.int64)
+    inside = ((middle >= 0) & (middle < maps.size[:, None])).all(-1)
+    steps = np.arange(-cells, cells + 1)
+    dv, du = (x.ravel() for x in np.meshgrid(steps, steps, indexing="ij"))
+    near = np.hypot(du, dv) <= cells + 0.5
+    du, dv = du[near], dv[near]
+    columns = np.clip(middle[..., 0, None] + du, 0, width - 1)
+    rows = np.clip(middle[..., 1, None] + dv, 0, height - 1)
+    values = maps.surprise[np.arange(count)[:, None, None], rows, columns]  # (C, N, K)
+    # Capped maps have plateaus: their middle counts, the nearer to the prediction the more.
+    peak = values.max(-1, keepdims=True)
+    weight = np.exp(4 * (values - peak)) * np.exp(-(du**2 + dv**2) / (2 * cells**2))
+    place = np.stack(((weight * columns).sum(-1), (weight * rows).sum(-1)), -1) / weight.sum(-1, keepdims=True)
+    return (place + 0.5) * maps.factor - 0.5, inside & (peak[..., 0] > SURPRISED)
+
+
+def _fit_peaks(
+    scene: Scene,
+    pose: RigidTransform,
+    maps: Maps,
+    predicted: NDArray[np.float64],
+    reaches: Sequence[int],
+    sure: NDArray[np.bool_],
+) -> Estimate | None:
+    """Fit to the most surprising places near predictions (C, N, 2), closer each time, `sure` (C, 1) cameras first."""
+    fit: Estimate | None = None
+    for cells in reaches:
+        uv, seen = _peaks(maps, predicted, cells)
+        fit = _fit(scene, pose, uv, np.full(seen.shape, 0.4 * maps.factor * cells), seen & sure)
+        if fit is None:
+            break
+        pose, predicted = fit.rig_from_object[0], predictions(fit.rig, scene, fit.rig_from_object[0])
+        sure = np.ones_like(sure)
+    return fit
+
+
+def _fit(
+    scene: Scene, pose: RigidTransform, uv: NDArray[np.float64], sigma: NDArray[np.float64], seen: NDArray[np.bool_]
+) -> Estimate | None:
+    """Fit rig and pose to places (C, N, 2); None = there are too few."""
+    if seen.sum() < LEAST_FITTED:
+        return None
+    observations = Observations(
+        torch.from_numpy(np.where(seen[..., None], uv, 0.0))[None],
+        torch.from_numpy(np.where(seen, sigma, 1.0))[None],
+        torch.from_numpy(seen)[None],
+    )
+    fit = estimate(observations, scene.rig, scene.obj.taken_as_exact(), pose[None], prior_std=scene.std, options=ROBUST)
+    return fit if bool(fit.rig_from_object.translation.isfinite().all()) else None
+
+
+def _measured(
+    scene: Scene,
+    fit: Estimate,
+    predicted: NDArray[np.float64],
+    response: NDArray[np.float32],
+    factor: int,
+    frames: Sequence[Frame | None],
+    dark: bool,
+) -> list[Measured]:
+    """Measure the markers of all cameras near their predictions (C, N, 2)."""
+    points = fit.rig_from_object.apply(scene.obj.points.to(scene.rig.focal_length))  # (1, N, 3)
+    depth = fit.rig.expand(1).project_values(points).depth[0].numpy()
+    focal = scene.rig.focal_length.mean(-1).numpy()[:, None]
+    per_mm = focal / np.maximum(depth, 1.0)
+    given = scene.obj.radius
+    cells = np.rint((predicted + 0.5) / factor - 0.5)
+    high = np.array(response.shape[-1:-3:-1]) - 1
+    cells = np.nan_to_num(cells, nan=-1).clip(0, high).astype(np.int64)
+    found = []
+    for camera, frame in enumerate(frames):
+        radius = per_mm[camera] * (1.0 if given is None else given.numpy())
+        # As the images show them: blurred, they are larger than they are.
+        seen = response[camera][:, cells[camera, :, 1], cells[camera, :, 0]]
+        size = max(0.5, 1.6 * SIZES[int(np.median(seen, axis=1).argmax())]) * factor
+        if given is None or size > np.median(radius):
+            radius = radius * (size / np.median(radius))
+        if frame is None:
+            none = np.zeros(len(radius))
+            found.append(Measured(np.full((len(radius), 2), np.nan), none + np.inf, none, none, 1.0))
+            continue
+        sure = np.ones(len(radius), dtype=bool)
+        found.append(measure_markers(frame, predicted[camera], radius, dark, sure))
+    return found

@@ -1,0 +1,85 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from imgcal import InputError, Recalibrator, RefusedError, calibrate
+from imgcal.association import Snapshot
+from imgcal.detection import DetectionOptions, detect_snapshot, to_detections
+from imgcal.geometry import geodesic_angle
+from imgcal.io import load_object
+from imgcal.matching import MatchedFilter
+from imgcal.matching.correlation import Scores
+from imgcal.matching.matched_filter import distinct
+from imgcal.matching.poses import Ranked, Scene, turned
+from renderers import SensorModel
+
+from .scenes import DIM, dim_frames
+
+
+def snapshot_of(frames, rig, obj, candidates=()):
+    blobs = to_detections([detect_snapshot(frames, DetectionOptions())], rig.camera_names, ("0",))
+    return Snapshot(frames, blobs, rig, obj, rig.prior.std(rig), tuple(candidates))
+
+
+def errors(rows, truth, snapshot=0):
+    return np.linalg.norm(rows.uv - truth.uv[snapshot].numpy()[rows.camera, rows.fiducial], axis=1)
+
+
+def test_twelve_degrees_off_and_too_dim_for_blobs():
+    rig, obj, truth, (frames,) = dim_frames()
+    axis = torch.tensor([0.5, 1.0, -1.0], dtype=torch.float64)
+    start = turned(truth.rig_from_object[0], np.radians(12) * axis / axis.norm(), obj)
+    proposal = MatchedFilter().propose(snapshot_of(frames, rig, obj, [start]))
+    assert proposal.reason == "" and proposal.margin > 20
+    assert float(geodesic_angle(proposal.rig_from_object.rotation, truth.rig_from_object.rotation[0])) < 0.02
+    assert len(proposal.detections) > 22 and np.median(errors(proposal.detections, truth)) < 0.6
+
+
+def test_another_object_and_an_empty_frame_are_declined():
+    rig, _, _, (frames,) = dim_frames()
+    other = load_object("cube8")
+    empty = {name: np.full_like(frame, 20) for name, frame in frames.items()}
+    for shown in (frames, empty):
+        proposal = MatchedFilter().propose(snapshot_of(shown, rig, other))
+        assert proposal.reason or proposal.margin < 20
+
+
+def test_calibrates_where_blobs_are_refused_and_says_who_did_it():
+    rig, obj, truth, shots = dim_frames(snapshots=2, seed=2)
+    stacks = {name: [shot[name] for shot in shots] for name in rig.camera_names}
+    with pytest.raises(RefusedError):
+        calibrate(stacks, rig, obj)
+    result = calibrate(stacks, rig, obj, detector="auto")
+    assert dict(result.detectors) == {"matched": 2} and result.identity == "unique"
+    labelled = result.labelled_detections
+    rows = labelled.select(labelled.fiducial >= 0)
+    off = np.linalg.norm(rows.uv - truth.uv.numpy()[rows.snapshot, rows.camera, rows.fiducial], axis=1)
+    assert len(rows) > 50 and (off < 3).all()
+
+
+def test_blobs_come_first_where_they_decide():
+    rig, obj, _, (frames,) = dim_frames(model=replace(DIM, sensor=SensorModel()))
+    assert dict(calibrate(frames, rig, obj, detector="auto").detectors) == {"classical": 1}
+
+
+def test_a_running_rig_looks_too():
+    rig, obj, _, shots = dim_frames(snapshots=2, seed=2)
+    with Recalibrator(rig, obj, window=2, detector="auto") as live:
+        for shot in shots:
+            result = live.update(shot)
+    assert dict(result.detectors) == {"matched": 2}
+    with pytest.raises(InputError, match="detector"):
+        Recalibrator(rig, obj, detector="eye")
+
+
+def test_of_a_cube_every_turn_is_the_same_pose():
+    rig, obj, truth, (frames,) = dim_frames(obj="cube8", seed=3)
+    scene, pose = Scene(rig, obj, rig.prior.std(rig), 850.0), truth.rig_from_object
+    turns = torch.tensor([[0.0, 0.0, np.pi / 2], [0.0, 0.0, 0.05], [0.0, 0.0, np.pi / 4]], dtype=torch.float64)
+    scores = Scores(np.full((1, 4), 9.0), np.zeros((1, 4, 2)))
+    others = Ranked(turned(pose, turns, obj), Scores(np.full((3, 4), 9.0), np.zeros((3, 4, 2))))
+    assert distinct(others, Ranked(pose, scores), scene).tolist() == [False, False, True]
+    result = calibrate(frames, rig, obj, detector="matched")
+    assert result.identity == "ambiguous" and result.labelled.snapshots[0].alternatives == 24
