@@ -34,6 +34,7 @@ from imgcal.types import Views
 VALIDATION_SEED = 20_000_004
 CENTRES = 0.09  # of the width of an image: standard deviation of the centre of its dots
 SPREADS = ((0.04, 0.15), (0.05, 0.2))  # of it, along u and v: smallest and largest standard deviation of the dots
+PAIRED, APART = 0.25, 0.012  # share of dots that lie beside another one; how far, in widths of the image, each axis
 FINE = 0.3  # weight of the exact positions beside the rough ones
 NEAR = 4.5  # pixels, each axis: half of what the exact position is looked for in
 FOUND = 1.0  # pixels: a fiducial that is farther from its place is lost
@@ -146,13 +147,19 @@ class PositionsTask(Task[PositionBatch, Located]):
 
 
 def random_dots(count: int, fiducials: int, size: int, generator: torch.Generator) -> Views:
-    """Scatter dots over images of `size` pixels: (count, 1, fiducials, 2), those that fall outside are not seen."""
+    """Scatter dots over images of `size` pixels: (count, 1, fiducials, 2), those that fall outside are not seen.
+
+    Some lie beside others, as dots of two faces of an object do that is seen from above.
+    """
     device = generator.device
     centre = torch.randn(count, 1, 1, 2, generator=generator, device=device)
     share = torch.rand(count, 1, 1, 2, generator=generator, device=device)
     dots = torch.randn(count, 1, fiducials, 2, generator=generator, device=device)
     least, most = torch.tensor(SPREADS, device=device).unbind(-1)
     uv = size * (0.5 + CENTRES * centre + (least + (most - least) * share) * dots) - 0.5
+    paired = torch.rand(count, 1, fiducials, 1, generator=generator, device=device) < PAIRED
+    beside = uv.roll(1, -2) + APART * size * torch.randn(uv.shape, generator=generator, device=device)
+    uv = torch.where(paired, beside, uv)
     seen = ((uv > 0) & (uv < size - 1)).all(-1)
     return Views(torch.where(seen[..., None], uv, 0.0), seen)
 

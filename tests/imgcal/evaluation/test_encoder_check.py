@@ -11,8 +11,8 @@ from imgcal.evaluation.encoder_check import EncoderCheck, check_encoder
 from imgcal.evaluation.protocol import Conditions
 from imgcal.geometry.projection import resized_pixels
 from imgcal.io import data_path
-from imgcal.networks import ImageNetwork, Network, PaperPointNetwork, load_checkpoint
-from imgcal.networks.config import Images, PaperPoints
+from imgcal.networks import Network, PaperPointNetwork, PooledImageNetwork, load_checkpoint
+from imgcal.networks.config import PaperPoints, PooledImages
 from imgcal.networks.soft_positions import find_soft_positions
 from imgcal.synthesis.colour_coding import ImageOptions
 from imgcal.types.prediction import Views
@@ -92,8 +92,8 @@ def test_the_network_is_left_as_it_was(trained, known):
 
 def test_networks_say_which_part_is_their_encoder(trained, known):
     size = {"img_size": 32, "embed_dim": 16, "depth": 1, "num_heads": 1}
-    images = ImageNetwork(
-        Images(backbone="vit_tiny_patch16_224", options=size, positions=False), trained.network.parameterization
+    images = PooledImageNetwork(
+        PooledImages(backbone="vit_tiny_patch16_224", options=size), trained.network.parameterization
     )
     assert isinstance(images.encoder, nn.Module)
     found = check_encoder(images, known, count=2)  # hands over nothing, untrained: the factory rig, whatever it sees
@@ -106,3 +106,12 @@ def test_networks_say_which_part_is_their_encoder(trained, known):
 def test_one_rig_cannot_be_shuffled(trained, known):
     with pytest.raises(InputError, match="encoder check: found 1 rigs"):
         check_encoder(Toy(trained.network, bypass=False), replace(known), count=1)
+
+
+@pytest.mark.parametrize("kind", ["vit", "cnn"])
+@pytest.mark.parametrize("thing", ["cube8", "asymmetric8"])
+def test_image_networks_that_ship_live_on_their_encoder(kind, thing):
+    shipped = load_checkpoint(data_path("models", f"{kind}-O10-{thing}.safetensors"))
+    conditions = Conditions(shipped.rig, shipped.obj, shipped.experiment.poses, shipped.experiment.drift)
+    check = check_encoder(shipped.network, conditions, count=8)
+    assert check is not None and check.rise > 10
