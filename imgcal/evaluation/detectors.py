@@ -59,6 +59,7 @@ class Contender:
     seed: int | None = None  # of its training; None = nothing is trained
     detection: Mapping[str, DetectionOptions] = field(default_factory=dict)  # by difficulty; others: the default
     pipeline: PipelineOptions = PipelineOptions()
+    only: tuple[str, ...] = ()  # difficulties in which it takes part; empty = all
 
 
 @dataclass(frozen=True)
@@ -138,7 +139,8 @@ def draw_capture(scene: Scene, difficulty: str, seed: int) -> tuple[Truth, dict[
 def _of_capture(contenders: Sequence[Contender], scene: Scene, case: tuple[str, int]) -> list[Outcome]:
     difficulty, seed = case
     truth, frames = draw_capture(scene, difficulty, seed)
-    return [_of_contender(contender, scene, truth, frames, case) for contender in contenders]
+    ours = [contender for contender in contenders if not contender.only or difficulty in contender.only]
+    return [_of_contender(contender, scene, truth, frames, case) for contender in ours]
 
 
 def _of_contender(

@@ -196,6 +196,35 @@ def test_plain_bundle_adjustment_starts_at_the_projection_of_the_rig():
     )
 
 
+def test_first_guess(tmp_path, monkeypatch):
+    module = script("first_guess")
+    for name, values in (("KAPPAS", (0.05,)), ("EXCHANGED", (0.0,)), ("SNAPSHOTS", (4,))):
+        monkeypatch.setattr(module, name, values)
+    module.main(["--captures", "1", "--out", str(tmp_path / "first_guess.json")])
+    [row] = json.loads((tmp_path / "first_guess.json").read_text())["rows"]
+    assert row["none"]["calibrated"] == row["guess"]["calibrated"] == row["used"] == row["alike"] == 1
+    assert row["guess"]["px"] == pytest.approx(row["none"]["px"], rel=0.01)
+
+
+def test_detectors_are_tuned_on_other_captures_than_they_are_compared_on(tmp_path, monkeypatch):
+    module = script("detectors")
+    tried = {"blind to all": (module.DetectionOptions(threshold=60_000), module.BLIND)}
+    monkeypatch.setattr(module, "VARIANTS", tried | {"default": module.VARIANTS["default"]})
+    few = ["--captures", "1", "--snapshots", "2", "--difficulty", "clean", "--rig", "T4", "--processes", "1"]
+    for step in ("tune", "compare"):
+        module.main([step, *few, "--results", str(tmp_path)])
+    assert json.loads((tmp_path / "detectors-tuning.json").read_text())["chosen"]["clean"]["variant"] == "default"
+    place = tmp_path / "detectors.json"
+    result = json.loads(place.read_text())
+    assert [row["contender"] for row in result["outcomes"]] == ["classical", "classical, tuned"]
+    assert {row["status"] for row in result["outcomes"]} == {"calibrated"} and module.TEST != module.VALIDATION
+    result["outcomes"][0]["contender"] = "measured before"
+    place.write_text(json.dumps(result))
+    module.main(["compare", *few, "--results", str(tmp_path)])
+    names = [row["contender"] for row in json.loads(place.read_text())["outcomes"]]
+    assert names == ["measured before", "classical", "classical, tuned"]
+
+
 def test_losses(tmp_path):
     network = "network={preset: paper-points, change: {width: 16, depth: 1, head_widths: [8]}}"
     sets = ["--set", network, "training.batch_size=8", "optimizer={lr: 1.0e-3, ema: null}"]

@@ -1,0 +1,170 @@
+"""Detectors on simulated captures, the classical one tuned to each difficulty: ``python -m scripts.results.detectors``.
+
+`tune` tries settings of the classical detector and of identity on validation captures and keeps the best for every
+difficulty; `compare` then calibrates test captures, of other seeds, with each detector, and writes the tables of
+docs/results.md. What was measured before stays in the JSON: another call adds detectors, or replaces theirs.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from statistics import median
+from typing import Annotated, Any
+
+import torch
+import tyro
+
+from imgcal import load_object, load_rig
+from imgcal.association import PipelineOptions
+from imgcal.cli.compare_captures import contender
+from imgcal.detection import DetectionOptions
+from imgcal.evaluation import Contender, Outcome, Scene, compare_detectors, detector_tables
+from imgcal.io import write_text
+from imgcal.synthesis import DIFFICULTIES, FrameModel
+from scripts.output import RESULTS, ROOT, command, read_json, replaced, surroundings, write_json
+
+TUNING, COMPARISON = "detectors-tuning.json", "detectors.json"
+PAGE = ROOT / "docs" / "results.md"
+TEST, VALIDATION = 0, 1  # seeds: captures that are reported, and captures on which settings are chosen
+TUNED = "classical, tuned"
+
+# What is tried: each setting for what a difficulty may need. "blind": cameras that saw nothing keep factory values.
+BLIND = PipelineOptions(blind_cameras=True)
+VARIANTS: dict[str, tuple[DetectionOptions, PipelineOptions]] = {
+    "default": (DetectionOptions(), PipelineOptions()),
+    "blind": (DetectionOptions(), BLIND),
+    "blind, dim blobs": (DetectionOptions(dim_blobs=True), BLIND),
+    "blind, threshold 5": (DetectionOptions(threshold=5.0), BLIND),
+    "blind, threshold 40": (DetectionOptions(threshold=40.0), BLIND),
+    "blind, long and large": (DetectionOptions(max_elongation=12.0, max_radius=40.0), BLIND),
+    "blind, loose": (DetectionOptions(), replace(BLIND, identity_error=1.0)),
+    "blind, loose, dim blobs": (DetectionOptions(dim_blobs=True), replace(BLIND, identity_error=1.0)),
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Compare detectors on simulated captures."""
+
+    step: Annotated[str, tyro.conf.Positional]  #: tune | compare | page
+    detectors: tuple[
+        Path, ...
+    ] = ()  #: beside the classical one: what `imgcal calibrate --detector` takes, or run folders
+    captures: int = 8  #: of each difficulty
+    snapshots: int = 2  #: of each capture
+    difficulty: tuple[str, ...] = tuple(DIFFICULTIES)
+    rig: str = "O10"
+    object: str = "asymmetric8"
+    processes: int = 2
+    classical: bool = True  #: measure the classical ones, too
+    results: Path = RESULTS
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Do one step."""
+    options = tyro.cli(Options, args=arguments, description=__doc__)
+    torch.set_num_threads(1)
+    models = {name: FrameModel(difficulty=DIFFICULTIES[name]) for name in options.difficulty}
+    scene = Scene(load_rig(options.rig), load_object(options.object), models, options.snapshots)
+    if options.step == "tune":
+        tune(scene, options)
+    elif options.step == "compare":
+        compare(scene, options)
+    write_page(options.results)
+
+
+def tune(scene: Scene, options: Options) -> None:
+    """Try all variants on validation captures."""
+    variants = [
+        Contender(name, detection=dict.fromkeys(scene.models, detection), pipeline=pipeline)
+        for name, (detection, pipeline) in VARIANTS.items()
+    ]
+    outcomes = _measured(variants, scene, options, VALIDATION)
+    chosen = {}
+    for difficulty in scene.models:
+        scores = {name: _score([one for one in outcomes if (one.contender, one.difficulty) == (name, difficulty)])
+                  for name in VARIANTS}  # fmt: skip
+        chosen[difficulty] = {"variant": max(scores, key=lambda name: scores[name]), "scores": scores}
+    write_json(options.results / TUNING, surroundings() | {"captures": options.captures, "snapshots": scene.snapshots}
+               | {"chosen": chosen})  # fmt: skip
+
+
+def _score(outcomes: Sequence[Outcome]) -> tuple[float, float]:
+    """Right minus wrong, and on equal terms the smaller error."""
+    share = sum({"calibrated": 1.0, "wrong": -1.0}.get(one.status, 0.0) for one in outcomes) / len(outcomes)
+    px = [one.held_out_px for one in outcomes if one.held_out_px is not None and one.status == "calibrated"]
+    return share, -round(median(px), 3) if px else -1e3
+
+
+def compare(scene: Scene, options: Options) -> None:
+    """Calibrate test captures, and put the outcomes beside those that are known."""
+    contenders = [contender(path) for path in options.detectors]
+    contenders = [replace(one, pipeline=BLIND) for one in contenders]
+    if options.classical:
+        contenders += [Contender("classical"), *tuned(options.results, scene)]
+    began, before = time.monotonic(), surroundings()
+    outcomes = _measured(contenders, scene, options, TEST)
+    place = options.results / COMPARISON
+    known = read_json(place) if place.is_file() else {}
+    same = known.get("captures") == options.captures and known.get("snapshots") == scene.snapshots
+    fresh = {(one.contender, one.training_seed, one.difficulty) for one in outcomes}
+    kept = [
+        row
+        for row in (known.get("outcomes", []) if same else [])
+        if (row["contender"], row["training_seed"], row["difficulty"]) not in fresh
+    ]
+    result = {"rig": scene.rig.name, "object": scene.obj.name, "captures": options.captures}
+    result |= {"snapshots": scene.snapshots, "drift": vars(scene.drift), "seconds": round(time.monotonic() - began)}
+    write_json(place, before | result | {"outcomes": kept + [asdict(one) for one in outcomes]})
+
+
+def tuned(results: Path, scene: Scene) -> list[Contender]:
+    """The classical detector with the settings that were best on validation captures, difficulty by difficulty."""
+    place = results / TUNING
+    if not place.is_file():
+        return []
+    chosen: Mapping[str, Any] = read_json(place)["chosen"]
+    return [
+        Contender(
+            TUNED, detection={difficulty: VARIANTS[variant][0]}, pipeline=VARIANTS[variant][1], only=(difficulty,)
+        )
+        for difficulty in scene.models
+        for variant in [chosen[difficulty]["variant"]]
+    ]
+
+
+def _measured(contenders: Sequence[Contender], scene: Scene, options: Options, seed: int) -> tuple[Outcome, ...]:
+    total, done, began = options.captures * len(scene.models), [0], time.monotonic()
+
+    def show(count: int) -> None:
+        done[0] += count
+        print(f"{done[0]} of {total} captures, {time.monotonic() - began:.0f} s", file=sys.stderr, flush=True)
+
+    return compare_detectors(contenders, scene, options.captures, seed, options.processes, show)
+
+
+def write_page(results: Path) -> None:
+    """Put the tables on the page, if results lie where those of the page do."""
+    place = results / COMPARISON
+    if results != RESULTS or not place.is_file():
+        return
+    known = read_json(place)
+    outcomes = [Outcome(**row) for row in known["outcomes"]]
+    text = (
+        f"Rig {known['rig']}, object {known['object']}, {known['captures']} captures a difficulty of "
+        f"{known['snapshots']} snapshots, drift of all 15 values of each camera."
+    )
+    texts = [text, *(f"{table.markdown()}".strip() for table in detector_tables(outcomes))]
+    if (results / TUNING).is_file():
+        chosen = read_json(results / TUNING)["chosen"]
+        variants = ", ".join(f"{difficulty}: {one['variant']}" for difficulty, one in chosen.items())
+        texts.append(f"Settings of the tuned classical detector: {variants}.")
+    write_text(PAGE, replaced(PAGE.read_text("utf-8"), {"detectors": "\n\n".join(texts)}, PAGE))
+
+
+if __name__ == "__main__":
+    command(lambda: main(sys.argv[1:]))
