@@ -39,6 +39,9 @@ class Setting:
     missing: float = 0.0  #: share of fiducials that are not seen
     swapped: float = 0.0  #: share of labels exchanged within a camera
     false: float = 0.0  #: share of fiducials found somewhere else in the image
+    level: int | None = (
+        None  #: instead of these, points and images as hard as a level of `imgcal.synthesis.LEVELS`: 0-4
+    )
     count: int = 20_000  #: rigs a trial
     trials: int = 3  #: each with other rigs
     seed: int = 0  #: same seed, same rigs
@@ -144,7 +147,7 @@ def _load(paths: tuple[Path, ...], setting: Setting) -> list[Model]:
 def _conditions(models: list[Model], setting: Setting) -> Conditions:
     """What is asked for, and for the rest what the first model was trained for."""
     from imgcal.evaluation import Conditions
-    from imgcal.synthesis import Corruption, PoseRange, RelativeDrift
+    from imgcal.synthesis import LEVELS, Corruption, PoseRange, RelativeDrift
 
     if models:
         known = models[0].conditions
@@ -158,12 +161,16 @@ def _conditions(models: list[Model], setting: Setting) -> Conditions:
         if not 0 <= low <= high <= 180:
             raise InputError(f"--phi: found {low:g} {high:g}, expected two angles from 0 to 180, the smaller first")
         poses = replace(poses, phi_deg=(low, high))
-    return replace(
-        known,
-        pose_range=poses,
-        drift=known.drift if setting.kappa is None else RelativeDrift(setting.kappa, setting.kappa),
-        corruption=Corruption(setting.noise, setting.missing, setting.swapped, setting.false),
-    )
+    drift = known.drift if setting.kappa is None else RelativeDrift(setting.kappa, setting.kappa)
+    corruption = Corruption(setting.noise, setting.missing, setting.swapped, setting.false)
+    known = replace(known, pose_range=poses, drift=drift, corruption=corruption)
+    if setting.level is None:
+        return known
+    if not 0 <= setting.level < len(LEVELS):
+        raise InputError(f"--level: found {setting.level}, expected 0 to {len(LEVELS) - 1}")
+    if not corruption.nothing:
+        raise InputError("--level: found --noise, --missing, --swapped or --false beside it, expected one of the two")
+    return known.at_level(setting.level)
 
 
 def _measure(methods: Mapping[str, Method], conditions: Conditions, protocol: Protocol, setting: Setting) -> Summary:
@@ -185,9 +192,9 @@ def _measure(methods: Mapping[str, Method], conditions: Conditions, protocol: Pr
 def _checked(model: Model, conditions: Conditions, setting: Setting) -> Facts:
     """What is known of a network, with a check of its encoder on views without corruption."""
     from imgcal.evaluation import check_encoder
-    from imgcal.synthesis import Corruption
+    from imgcal.synthesis import Corruption, Degradation
 
-    clean = replace(conditions, corruption=Corruption())
+    clean = replace(conditions, corruption=Corruption(), degradation=Degradation())
     check = check_encoder(model.checkpoint.network, clean, CHECKED_RIGS, setting.seed)
     return replace(model.facts, encoder=check)
 

@@ -24,7 +24,7 @@ from imgcal.refinement import (
     refine_robustly,
     robust_pose,
 )
-from imgcal.synthesis import ImageOptions, render_views
+from imgcal.synthesis import Degradation, ImageOptions, render_views
 from imgcal.types import CalibrationObject, CameraRig, Prediction, Views
 
 SIGHTED_SIGMA = 0.1  # pixels: what a position that an image network has found is off by at least
@@ -40,6 +40,8 @@ class Given:
     obj: CalibrationObject
     prior_std: Tensor  # (C, 15) standard deviation of each factory value
     sigma: float  # pixels, noise of the points
+    degradation: Degradation = Degradation()  # what happens to images, beside what has happened to the points
+    seed: int = 0  # of that
     drawn: dict[ImageOptions, Tensor] = field(default_factory=dict)  # images, as far as somebody has asked for them
 
     @property
@@ -59,8 +61,13 @@ class Given:
     def images(self, options: ImageOptions) -> Tensor:
         """Colour-coded images of the points, 8 bit a channel: (B, C, 3, size, size) float32; drawn once."""
         if options not in self.drawn:
-            uv = self.uv.to(torch.float32)
-            self.drawn[options] = render_views(uv, self.seen, self.factory.image_size, self.obj, options, quantise=True)
+            uv, size = self.uv.to(torch.float32), self.factory.image_size
+            if self.degradation == Degradation():
+                self.drawn[options] = render_views(uv, self.seen, size, self.obj, options, quantise=True)
+            else:
+                generator = torch.Generator().manual_seed(self.seed)
+                views = Views(uv=uv, seen=self.seen)
+                self.drawn[options], _ = self.degradation.draw(views, size, self.obj, options, generator)
         return self.drawn[options]
 
 

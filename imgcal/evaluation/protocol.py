@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, TypedDict
 
 import torch
@@ -16,7 +16,7 @@ from imgcal.evaluation.methods import Given, Method
 from imgcal.evaluation.metrics import KINDS, Errors, concatenate, cramer_rao, errors
 from imgcal.messages import shortened
 from imgcal.refinement import SQUARED, as_prediction, refine_points
-from imgcal.synthesis import Corrupted, Corruption, Drift, PoseRange, RelativeDrift, synthesize
+from imgcal.synthesis import LEVELS, Corrupted, Corruption, Degradation, Drift, PoseRange, RelativeDrift, synthesize
 from imgcal.types import CalibrationObject, CameraRig, Prediction, Views
 
 REFERENCE = "MAP, true inliers"
@@ -36,6 +36,12 @@ class Conditions:
     pose_range: PoseRange = PoseRange()
     drift: Drift = RelativeDrift()
     corruption: Corruption = Corruption()
+    degradation: Degradation = Degradation()  # of images, beside what happens to the points that are drawn
+
+    def at_level(self, level: int) -> Conditions:
+        """Return these conditions with points and images as hard as one of `imgcal.synthesis.LEVELS`."""
+        hard = LEVELS[level]
+        return replace(self, corruption=hard.points, degradation=replace(hard, points=Corruption()))
 
     @property
     def sigma(self) -> float:
@@ -210,6 +216,7 @@ class Sample:
     truth: Prediction  # (B,)
     corrupted: Corrupted  # (B,)
     conditions: Conditions
+    seed: int = 0  # of what happens to images
 
     def __len__(self) -> int:
         return len(self.corrupted.views)
@@ -219,7 +226,9 @@ class Sample:
         views, known = self.corrupted.views, self.conditions
         assert views.uv is not None and views.seen is not None  # points are what is corrupted
         some = Views(uv=views.uv[rows], seen=views.seen[rows])
-        return Given(some, known.rig, known.obj, known.drift.std(known.rig), known.sigma)
+        # Methods that look at rigs in parts of the same size are given the same images.
+        seed = self.seed + (rows.start or 0)
+        return Given(some, known.rig, known.obj, known.drift.std(known.rig), known.sigma, known.degradation, seed)
 
     def reference(self) -> Estimate:
         """MAP estimate of the true inliers from the truth, squared loss."""
@@ -235,7 +244,10 @@ def draw(conditions: Conditions, count: int, generator: torch.Generator) -> Samp
     )
     views = Views(uv=made.projection.uv, seen=made.projection.visible)
     corrupted = conditions.corruption.apply(views, conditions.rig.image_size, generator)
-    return Sample(Prediction(made.rig, made.rig_from_object), corrupted, conditions)
+    seed = 0
+    if conditions.degradation != Degradation():
+        seed = int(torch.randint(2**40, (), generator=generator))
+    return Sample(Prediction(made.rig, made.rig_from_object), corrupted, conditions, seed)
 
 
 def _batches(conditions: Conditions, protocol: Protocol, trial: int) -> Iterator[tuple[int, Sample]]:

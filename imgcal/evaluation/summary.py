@@ -95,6 +95,7 @@ def _conditions(conditions: Conditions) -> dict[str, Any]:
         "poses_deg": {name.removesuffix("_deg"): list(limits) for name, limits in vars(poses).items()},
         "drift": {"kind": "relative" if isinstance(drift, RelativeDrift) else "physical"} | vars(drift),
         "corruption": dict(vars(conditions.corruption)),
+        "images": {name: value for name, value in vars(conditions.degradation).items() if name != "points"},
         "sigma_px": conditions.sigma,
     }
 

@@ -76,6 +76,9 @@ def describe(evaluation: Evaluation) -> str:
     phi = " to ".join(f"{angle:g}" for angle in known.pose_range.phi_deg)
     drift = ", ".join(f"{name} {value:g}" for name, value in vars(known.drift).items())
     wrong = ", ".join(f"{name} {value:g}" for name, value in vars(known.corruption).items() if value)
+    images = {name: value for name, value in vars(known.degradation).items() if name != "points" and value}
+    if images:
+        wrong += "; images: " + ", ".join(f"{name} {value:g}" for name, value in images.items())
     return (
         f"Rig {known.rig.name}, object {known.obj.name}, phi {phi} deg, {drift}; {wrong or 'exact points'}; "
         f"{protocol.count} rigs a trial, {protocol.trials} trials, seed {protocol.seed}."

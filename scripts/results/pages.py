@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from statistics import fmean, stdev
 from typing import Any
 
-from imgcal.networks import Images, PaperImages
 from imgcal.training import RigExperiment
 from scripts.output import markdown
 from scripts.results.measuring import FACTORY, NETWORK, ONE_PASS, ROBUST, WITHOUT, label
@@ -143,11 +142,6 @@ def robustness_table(experiments: Sequence[RigExperiment], results: Results) -> 
 
     tried = {name: runs for name, runs in results.items() if runs[0].get("robustness") is not None}
     return _of_trained(("model", *columns, "seeds"), experiments, tried, cells)
-
-
-def variant(experiment: RigExperiment) -> str:
-    """Tell what the network of an experiment takes: points or images."""
-    return "images" if isinstance(experiment.network.variant(), Images | PaperImages) else "points"
 
 
 def mean(runs: Runs, stage: str) -> str:

@@ -116,6 +116,8 @@ def test_compare_puts_networks_side_by_side(models, tmp_path, capsys):
         (["--missing", "1"], "missing: found 1, expected a smaller share"),
         (["--count", "0"], "count"),
         (["--phi", "20", "10"], "--phi"),
+        (["--level", "5"], "--level: found 5, expected 0 to 4"),
+        (["--level", "1", "--noise", "0.2"], "--level: found --noise"),
     ],
 )
 def test_what_cannot_be_evaluated_is_refused_in_one_line(models, tmp_path, capsys, arguments, expected):

@@ -7,7 +7,8 @@ from imgcal.errors import InputError, RefusedError
 from imgcal.evaluation import BASELINES, Conditions, Method, Protocol, evaluate, network_method
 from imgcal.evaluation.methods import factory_alone
 from imgcal.evaluation.metrics import KINDS, Errors
-from imgcal.evaluation.protocol import LEAST_SIGMA, Scores
+from imgcal.evaluation.protocol import LEAST_SIGMA, Scores, draw
+from imgcal.synthesis import LEVELS, Degradation, ImageOptions
 from tests.imgcal.evaluation.conftest import Fake, straight_down
 
 FACTORY = {"factory": Method(factory_alone)}
@@ -100,6 +101,20 @@ def test_bounds_exist_where_there_is_noise(conditions):
     few = Protocol(count=3, trials=1)
     assert evaluate(FACTORY, conditions(), few).reference.cramer_rao_ratios()["re"] is None
     assert evaluate(FACTORY, conditions(noise=0.1), few).reference.cramer_rao_ratios()["re"] is not None
+
+
+def test_levels_degrade_points_and_images_alike_for_everybody(conditions):
+    level = conditions().at_level(3)
+    assert level.corruption == LEVELS[3].points and level.degradation.points.nothing
+    options = ImageOptions(size=64)
+    first, again = (draw(level, 3, torch.Generator().manual_seed(1)).given(slice(0, 2)) for _ in range(2))
+    assert torch.equal(first.images(options), again.images(options))
+    plain = replace(first, degradation=Degradation(), drawn={})
+    assert (first.images(options) - plain.images(options)).abs().mean() > 0.01  # background, blur, noise
+    other = replace(first, seed=first.seed + 1, drawn={})
+    assert not torch.equal(first.images(options), other.images(options))
+    exact = conditions().at_level(0)
+    assert exact.corruption.nothing and exact.degradation == Degradation()
 
 
 def test_methods_are_told_the_noise(conditions):
