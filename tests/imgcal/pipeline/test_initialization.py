@@ -10,7 +10,7 @@ from torch import nn
 from imgcal.errors import InputError
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
-from imgcal.io import load_object, load_rig
+from imgcal.io import data_path, load_object, load_rig
 from imgcal.pipeline import calibrate, rms_length
 from imgcal.pipeline.initialization import KINDS, Initializer, load_initializer
 from imgcal.synthesis.captures import simulate_truth, true_detections
@@ -76,6 +76,15 @@ def test_a_shipped_network_does_not_mind_a_radius(case):
     factory, obj, *_ = case
     spheres = replace(obj, radius=torch.full((obj.num_fiducials,), 6.0, dtype=torch.float64))
     assert load_initializer("points", factory, spheres).name == "points-O10-asymmetric8"
+
+
+def test_the_folder_of_a_run_is_its_network(tmp_path):
+    o10, cube = load_rig("O10"), load_object("cube8")
+    with pytest.raises(InputError, match=r"found a folder without model\.safetensors"):
+        load_initializer(str(tmp_path), o10, cube)
+    (tmp_path / "my-rig").mkdir()
+    (tmp_path / "my-rig" / "model.safetensors").symlink_to(data_path("models", "points-O10-cube8.safetensors"))
+    assert load_initializer(str(tmp_path / "my-rig"), o10, cube).name == "my-rig"
 
 
 @pytest.mark.parametrize(

@@ -63,7 +63,8 @@ def test_two_processes_of_torchrun_share_a_batch(tmp_path):
     (tmp_path / "toy.yaml").write_text(EXPERIMENT)
     out = tmp_path / "two"
     launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", TOY]
-    command = ["train", str(tmp_path / "toy.yaml"), "--out", str(out), "--set", "training.device=auto"]
+    changes = ["training.device=auto", "training.accumulate=2", "training.patience=9"]
+    command = ["train", str(tmp_path / "toy.yaml"), "--out", str(out), "--set", *changes]
     run = subprocess.run(
         [*launcher, *command], env=environment(), cwd=ROOT, capture_output=True, text=True, timeout=120
     )
