@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from imgcal.evaluation import QUICK_BASELINES, Conditions, Latency, Protocol, latency, load_models
+from imgcal.evaluation import QUICK_BASELINES, REFERENCE, Conditions, Latency, Protocol, latency, load_models
 from imgcal.synthesis import Drift, PhysicalDrift, PoseRange, RelativeDrift
 from scripts.output import markdown, surroundings
 from scripts.results.measuring import NETWORK, ONE_PASS, Source, columns, evaluated
@@ -47,27 +47,32 @@ def measure_headline(source: Source, count: int, device: str) -> dict[str, Any]:
         conditions = Conditions(model.conditions.rig, model.conditions.obj, place.poses, place.drift)
         what = f"{source.path.stem}, {place.name}"
         found.append(columns(evaluated(methods, conditions, Protocol(count, 3), what), methods))
-    took = {name: latency(method, model.conditions, min(200, 2 * count)) for name, method in methods.items()}
     return {
         "model": source.path.name,
         "sha256": source.sha256,
         "rigs": 3 * count,
         "surroundings": surroundings(device),
         "places": [{"name": place.name, "columns": one} for place, one in zip(PLACES, found, strict=True)],
-        "latency_ms": {name: vars(one) for name, one in took.items()},
+        "latency_ms": time_headline(source, min(200, 2 * count), device),
     }
+
+
+def time_headline(source: Source, repeats: int, device: str) -> dict[str, Any]:
+    """Milliseconds of one rig, of the network and of every number of steps."""
+    [model] = load_models([source.path], device=device)
+    methods = {NETWORK: model.method} | QUICK_BASELINES
+    return {name: vars(latency(method, model.conditions, repeats)) for name, method in methods.items()}
 
 
 def headline_tables(result: Mapping[str, Any]) -> str:
     """One table of RE, and one each of what RE does not show."""
     places = [place["columns"] for place in result["places"]]
-    names = [name for name in (ONE_PASS, *places[0]) if name in places[0]]
-    names = sorted(dict.fromkeys(names), key=_order)
+    names = sorted((name for name in places[0] if name != REFERENCE), key=_order)
     took = {name: Latency(**one) for name, one in result["latency_ms"].items()}
     head = ("RE mean (px)", *(place.name for place in PLACES), "ms, p50")
     paper = ["paper's network", *("" if place.paper is None else f"{place.paper:g}" for place in PLACES), ""]
-    rows = [paper, *([name, *(_px(one[name]["mean"]) for one in places), _time(name, took)] for name in names)]
-    texts = [markdown(head, rows)]
+    rows = [paper, *([_shown(name), *(_px(one[name]["mean"]) for one in places), _time(name, took)] for name in names)]
+    texts = [f"`{result['model']}`, one seed, exact points, {result['rigs']:,} rigs a column.", markdown(head, rows)]
     for title, cell in (
         ("RE < 1 px / < 0.5 px, % of rigs", _success),
         ("RE on held-out points, median (px)", lambda one: _px(one["held_out"]["median"])),
@@ -76,7 +81,7 @@ def headline_tables(result: Mapping[str, Any]) -> str:
         ("focal length, RMS error (px)", lambda one: _px(one["parameters"]["focal_length"])),
         ("position, RMS error (mm)", lambda one: _px(one["parameters"]["position"])),
     ):
-        lines = [[name, *(cell(one[name]) for one in places)] for name in names if name in TOLD]
+        lines = [[_shown(name), *(cell(one[name]) for one in places)] for name in names if name in TOLD]
         texts.append(markdown((title, *(place.name for place in PLACES)), lines))
     return "\n\n".join(texts)
 
@@ -91,6 +96,10 @@ TOLD = (
     "MAP from PnP",
 )
 """Lines of the tables behind the first: what comes after two steps is MAP to the digits shown."""
+
+
+def _shown(name: str) -> str:
+    return f"{name}, all passes" if name == NETWORK else name
 
 
 def _order(name: str) -> int:

@@ -135,6 +135,12 @@ def measure(source: Source, effort: Effort, device: str, trained_on: str) -> dic
     return result
 
 
+def latency_of(source: Source, device: str) -> dict[str, Any]:
+    """Milliseconds of one rig."""
+    [model] = load_models([source.path], device=device)
+    return vars(latency(model.method, model.conditions))
+
+
 def without_network(experiment: RigExperiment, count: int) -> dict[str, Any]:
     """Evaluate what needs no network, on exact points from what an experiment draws."""
     rig, obj = experiment.load_rig(), experiment.load_object()

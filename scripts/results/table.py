@@ -20,8 +20,8 @@ from imgcal.io import shipped_names, write_text
 from imgcal.training import RigExperiment, load_experiment
 from scripts.output import RESULTS, ROOT, command, read_json, replaced, write_json
 from scripts.results.charts import over_time, sweeps
-from scripts.results.headline import headline_tables, measure_headline
-from scripts.results.measuring import Effort, Source, find, measure, swept, without_network
+from scripts.results.headline import headline_tables, measure_headline, time_headline
+from scripts.results.measuring import Effort, Source, find, latency_of, measure, swept, without_network
 from scripts.results.pages import (
     STEPS,
     accuracy_table,
@@ -51,6 +51,7 @@ class Options:
     only: tuple[str, ...] = ()  #: evaluate these experiments only; the page gets all known ones
     headline: str = "points-O10-cube8"  #: shipped network that stands beside Levenberg-Marquardt steps at every drift
     sweep: str = "shipped-points-cube8"  #: experiment whose error is drawn against perturbation and angle
+    times: bool = False  #: measure how long everything takes anew, and nothing else: for a machine that is idle at last
     sweep_count: int = 1000  #: rigs at each point of those curves
     machine: str = "2 CPU cores shared, 1 thread a training"  #: what new runs were trained on
     device: str = "cpu"  #: where networks run; refinement is always on the CPU
@@ -71,11 +72,13 @@ def main(arguments: list[str] | None = None) -> None:
         if options.only and source.experiment not in options.only:
             continue
         place = options.results / f"{source.experiment}-seed{source.seed}.json"
-        if not _known(place, source, options.effort):
+        if options.times:
+            _time_anew(options, source, place)
+        elif not _known(place, source, options.effort):
             write_json(place, measure(source, options.effort, options.device, options.machine))
         if source.experiment == options.sweep:
             _sweep(options, source)
-        if source.path.stem == options.headline:
+        if source.path.stem == options.headline and not options.times:
             _headline(options, source)
     results = {name: _runs(options.results, name) for one in experiments for name in (one, f"{one}{REDUCED}")}
     results = {name: runs for name, runs in results.items() if runs}
@@ -94,7 +97,7 @@ def sections(experiments: list[RigExperiment], results: dict[str, list[dict[str,
     ours = sorted((e for e in table1 if "-paper" not in e.name), key=_order)
     theirs = sorted((e for e in table1 if "-paper" in e.name), key=_order)
     ablation = sorted((e for e in experiments if e.paper is not None and e.paper.table == "ablation"), key=_order)
-    shipped = [e for e in experiments if e.name.startswith("shipped-")]
+    shipped = [e for e in experiments if e.name.startswith("shipped-") and "-trunk-" not in e.name]
     return {
         "table 1": accuracy_table(ours, results),
         "table 1 parameters": parameters_table(ours, results),
@@ -146,6 +149,15 @@ def _complete(
                 run["exact"] = known[name] | run["exact"]
     if known:
         write_json(place, known)
+
+
+def _time_anew(options: Options, source: Source, place: Path) -> None:
+    """Replace the times of a network that has been evaluated, and of the steps beside it."""
+    if place.is_file() and (known := read_json(place))["sha256"] == source.sha256:
+        write_json(place, known | {"latency_ms": latency_of(source, options.device)})
+    place = options.results / HEADLINE
+    if source.path.stem == options.headline and place.is_file():
+        write_json(place, read_json(place) | {"latency_ms": time_headline(source, 200, options.device)})
 
 
 def _headline(options: Options, source: Source) -> None:
