@@ -79,7 +79,9 @@ class Calibrate:
     snapshots: str | None = None  #: A:B, numbers in file order from 0, B excluded
     detector: DetectorName = "classical"
     """who finds the fiducials in frames: classical (blobs), matched (the whole pattern at once, for frames too dim,
-    blurred or cluttered for blobs; slower), or auto (blobs, and the pattern where these decide nothing)"""
+    blurred or cluttered for blobs; slower), auto (blobs, and the pattern where these decide nothing), learned (a
+    network for any rig and object), both (blobs, and the network where these decide nothing), or the network's file or
+    run"""
     first_guess: str = "none"  #: where to start: none (factory rig), points, vit, cnn (shipped), a file or run
     without: tuple[str, ...] = ()  #: cameras to leave out
     blind_cameras: bool = False  #: accept cameras that see nothing; they keep their factory values

@@ -1,5 +1,6 @@
 from .calibration import Calibration, calibrate, fit_labelled
 from .initialization import load_initializer
+from .learned import LearnedProposer, load_proposer
 from .scoring import RigScore, rms_length, score
 from .sources import Detector, DetectorName, checked_detections, checked_frames, proposer_of
 from .tally import DOUBTFUL, Tally
@@ -9,6 +10,7 @@ __all__ = [
     "Calibration",
     "Detector",
     "DetectorName",
+    "LearnedProposer",
     "RigScore",
     "Tally",
     "calibrate",
@@ -16,6 +18,7 @@ __all__ = [
     "checked_frames",
     "fit_labelled",
     "load_initializer",
+    "load_proposer",
     "proposer_of",
     "rms_length",
     "score",

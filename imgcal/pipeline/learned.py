@@ -10,18 +10,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from imgcal.association import Proposal, Snapshot, rows_of
+from imgcal.association import Proposal, Proposer, Snapshot, rows_of
 from imgcal.detection import Frame
 from imgcal.estimation import EstimationOptions, estimate
 from imgcal.geometry import RigidTransform, rotation_from_vector
+from imgcal.io import model_file
+from imgcal.matching import measure_markers
 from imgcal.networks import (
     Claims,
     Evidence,
@@ -31,6 +34,8 @@ from imgcal.networks import (
     claim,
     cut_crops,
     cut_patches,
+    load_infrared,
+    load_measurer,
     normalized,
 )
 from imgcal.types import CalibrationObject, CameraRig, CropPlacement, Observations
@@ -41,9 +46,13 @@ LEAST_CLAIMS = 6  # in all cameras together, to fit a pose to
 TURNS_DEG = (7.0, 13.0)  # of the candidate about each axis, where it shows too little
 LOOKS = 3  # first the candidate, then what its claims make of it
 LEAST_MEASURED = 0.01  # patch pixels: what the measurer cannot know better
-FARTHEST = 3.0  # standard deviations of a claim, beyond its radius, that its marker may be measured off
+LEAST_PRESENT = 0.1  # probability by the network that a fiducial shows, below which it is not measured
+GATES = (8.0, 2.5)  # px that a measured place may be off the fitted rig, once and again
+LARGEST_REACH = 3.0  # px: larger sigmas give no right to be farther off
+LEAST_IN_CAMERA = 3  # fiducials that fit, below which a camera says nothing
 LEAST_SIGMA = 0.1  # crop pixels: what the network cannot know better
-ROBUST = EstimationOptions(loss="geman_mcclure", threshold=4.0, max_iterations=30)
+ROBUST = EstimationOptions(loss="cauchy", threshold=2.0, max_iterations=30, tolerance=1e-2)
+MODEL_ERROR = 0.3  # px: what a measured place may be off beyond its own sigma
 OUTLIER = 5.0  # standard deviations of a claim from the fitted rig, at which it is dropped
 LARGEST_SIGMA = 20.0  # px: where a claim is too vague to be one
 CHANCE = 0.05  # probability that a window is not what the network takes it for
@@ -85,14 +94,18 @@ class LearnedProposer:
     """Proposes what a query network sees."""
 
     network: InfraredNetwork
-    measurer: Measurer
+    measurer: Measurer | None = None  # None = markers are fitted: all of a camera share one shape
+    finder: Proposer | None = None  # asked for a pose where none is known
     name: str = "learned"
 
     @torch.no_grad()
     def propose(self, snapshot: Snapshot) -> Proposal:
         """Look at one snapshot."""
         if not snapshot.candidates:
-            return Proposal.declined(snapshot, "found no pose to look around")
+            found = None if self.finder is None else self.finder.propose(snapshot).rig_from_object
+            if found is None:
+                return Proposal.declined(snapshot, "found no pose to look around")
+            snapshot = replace(snapshot, candidates=(found,))
         view = _View.of(self.network, self.measurer, snapshot)
         looks = view.best(snapshot.rig, RigidTransform.stack(snapshot.candidates))
         if float(looks.found[0]) < LEAST_SEEN * float(looks.asked[0].sum()):
@@ -107,19 +120,36 @@ class LearnedProposer:
         return view.proposal(looks)
 
 
+def load_proposer(
+    network: str | Path = "ir-cnn", measurer: str | Path | None = None, finder: Proposer | None = None
+) -> LearnedProposer:
+    """Read networks for the frames of any rig and any object.
+
+    Args:
+        network: name of a shipped query network, its file, or the folder of the run that trained it.
+        measurer: the same of a measurer; None = markers are fitted.
+        finder: asked for a pose where none is known.
+
+    Raises:
+        InputError: no such file, or something else in it.
+    """
+    reader = None if measurer is None else load_measurer(model_file(measurer)).network
+    return LearnedProposer(load_infrared(model_file(network)).network, reader, finder)
+
+
 @dataclass(frozen=True)
 class _View:
     """Crops of all cameras of a snapshot, encoded once."""
 
     network: InfraredNetwork
-    measurer: Measurer
+    measurer: Measurer | None
     snapshot: Snapshot
     frames: Mapping[str, Frame | None]  # without what is masked
     placement: CropPlacement  # (C,)
     features: Tensor  # (C, D, G, G)
 
     @classmethod
-    def of(cls, network: InfraredNetwork, measurer: Measurer, snapshot: Snapshot) -> _View:
+    def of(cls, network: InfraredNetwork, measurer: Measurer | None, snapshot: Snapshot) -> _View:
         rig, size = snapshot.rig, network.config.crop
         poses = RigidTransform.stack(snapshot.candidates)
         placement = Expectation.of(rig, snapshot.obj, poses).placement(rig, size)
@@ -148,49 +178,84 @@ class _View:
         seen = (claims.probability > LEAST_PROBABILITY) & (sigma < LARGEST_SIGMA)
         return Observations(uv[None], sigma[None], seen[None])
 
-    def measured(self, observations: Observations, expected: Expectation) -> Observations:
-        """Measure what is claimed (1, C, N) at full scale; what cannot be measured stays as it is."""
-        inverted = self.snapshot.detection.polarity == "dark"
-        uv, radius = observations.uv[0], expected.radius[0]
-        patches, placement = cut_patches(self.frames, self.snapshot.rig.camera_names, uv, radius, inverted=inverted)
-        size = radius / placement.scale
-        said = self.measurer(normalized(patches.flatten(0, 1)), size.flatten().float())
-        shape = size.shape
-        middle = (placement.size - 1) / 2
-        place = placement.to_image((said.offset.to(uv) + middle).view(*shape, 1, 2))[..., 0, :]
+    def measured(self, looks: Sighting, expected: Expectation, gate: float) -> Observations:
+        """Measure all fiducials where a fitted rig has them (1, C, N), at full scale, as far as the network sees them.
+
+        Args:
+            looks: what was claimed: it stands where nothing can be measured.
+            expected: by rig and pose.
+            gate: pixels that a place may be off, beyond what its sigma explains.
+        """
+        claimed = self.observations(looks)
+        shown = looks.asked[0] & (looks.evidence.present.sigmoid() > LEAST_PRESENT)
+        look = self._fitted if self.measurer is None else self._by_network
+        place, sigma, good = look(expected.uv[0], expected.radius[0], claimed.seen[0] & shown)
+        good &= shown
+        uv = torch.where(good[..., None], place, claimed.uv[0])
+        sigma = torch.where(good, sigma, claimed.sigma[0])
+        reach = torch.hypot(OUTLIER * sigma.clamp(max=LARGEST_REACH), sigma.new_tensor(gate))
+        seen = (good | claimed.seen[0]) & ((expected.uv[0] - uv).norm(dim=-1) < reach)
+        # What fits in hardly any place of a camera may do so by chance.
+        seen &= seen.sum(-1, keepdim=True) >= LEAST_IN_CAMERA
+        return Observations(uv[None], sigma[None], seen[None])
+
+    def _by_network(self, uv: Tensor, radius: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Ask the measurer: places (C, N, 2), sigmas and whether they are any good (C, N)."""
+        assert self.measurer is not None
+        names, shape = self.snapshot.rig.camera_names, radius.shape
+        patches, placement = cut_patches(self.frames, names, uv, radius, inverted=self._dark)
+        size = (radius / placement.scale).flatten().float()
+        said = self.measurer(normalized(patches.flatten(0, 1)), size)
+        offset = (said.offset.to(uv) + (placement.size - 1) / 2).view(*shape, 1, 2)
         sigma = (said.log_sigma.exp().to(uv).view(shape).square() + LEAST_MEASURED**2).sqrt() * placement.scale
-        moved = (place - uv).norm(dim=-1)
-        good = (said.valid > 0).view(shape) & (moved < FARTHEST * observations.sigma[0] + radius)
-        good &= sigma < observations.sigma[0]
-        uv = torch.where(good[..., None], place, uv)
-        return Observations(uv[None], torch.where(good, sigma, observations.sigma[0])[None], observations.seen)
+        return placement.to_image(offset)[..., 0, :], sigma, (said.valid > 0).view(shape)
+
+    def _fitted(self, uv: Tensor, radius: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Fit the markers of each camera together; the same."""
+        place, sigma, good = uv.clone(), torch.full_like(radius, torch.inf), torch.zeros_like(seen)
+        for camera, name in enumerate(self.snapshot.rig.camera_names):
+            frame = self.frames.get(name)
+            if frame is None or not bool(seen[camera].any()):
+                continue
+            sizes, sure = radius[camera].numpy(), seen[camera].numpy()
+            found = measure_markers(frame, uv[camera].numpy(), sizes, self._dark, sure)
+            place[camera] = torch.from_numpy(np.nan_to_num(found.uv))
+            sigma[camera], good[camera] = torch.from_numpy(found.sigma), torch.from_numpy(found.seen)
+        return place, sigma, good
+
+    @property
+    def _dark(self) -> bool:
+        return self.snapshot.detection.polarity == "dark"
 
     def fit(self, looks: Sighting, observations: Observations) -> tuple[CameraRig, RigidTransform] | None:
         """The most probable rig and pose (1,) that observations (1, C, N) speak for; None = they are too few."""
         if int(observations.seen.sum()) < LEAST_CLAIMS:
             return None
         snapshot = self.snapshot
+        widened = replace(observations, sigma=(observations.sigma.square() + MODEL_ERROR**2).sqrt())
         fitted = estimate(
-            observations, snapshot.rig, snapshot.obj.taken_as_exact(), looks.poses, prior_std=snapshot.prior_std,
-            options=ROBUST,
+            widened, snapshot.rig, snapshot.obj.taken_as_exact(), looks.poses, prior_std=snapshot.prior_std,
+            initial_rig=looks.rig, options=ROBUST,
         )  # fmt: skip
         if not bool(fitted.rig.focal_length.isfinite().all() & fitted.rig_from_object.translation.isfinite().all()):
             return None
         return fitted.rig, fitted.rig_from_object
 
     def proposal(self, looks: Sighting) -> Proposal:
-        """Claims that agree with one rig and pose, as labelled blobs."""
-        snapshot, expected = self.snapshot, Expectation.of(looks.rig, self.snapshot.obj, looks.poses)
-        observations = self.measured(self.observations(looks), expected)
+        """Measure what agrees with one rig and pose: labelled blobs."""
+        snapshot, observations = self.snapshot, self.observations(looks)
+        for gate in GATES:
+            fitted = self.fit(looks, observations)
+            if fitted is None:
+                break
+            observations = self.measured(looks, Expectation.of(fitted[0], snapshot.obj, fitted[1]), gate)
         fitted = self.fit(looks, observations)
         if fitted is None:
-            return Proposal.declined(snapshot, "found hardly any fiducial in the frames", looks.margin)
+            return Proposal.declined(snapshot, "found hardly any fiducials that agree with one pose", looks.margin)
         rig, poses = fitted
         expected = Expectation.of(rig, snapshot.obj, poses)
-        off = (expected.uv - observations.uv).norm(dim=-1) / observations.sigma
+        off = (expected.uv - observations.uv).norm(dim=-1) / (observations.sigma.square() + MODEL_ERROR**2).sqrt()
         seen = (observations.seen & (off < OUTLIER))[0]
-        if int(seen.sum()) < LEAST_CLAIMS:
-            return Proposal.declined(snapshot, "found no fiducials that agree with one pose", looks.margin)
         uv, sigma, radius = (values[0].numpy() for values in (observations.uv, observations.sigma, expected.radius))
         rows = rows_of(uv, sigma, seen.numpy(), radius, snapshot.blobs)
         return Proposal(rows, poses[0], looks.margin)

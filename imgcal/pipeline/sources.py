@@ -7,22 +7,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
-from typing import Literal, get_args
 
 import numpy as np
 
 from imgcal.association import Proposer, Sight, matched_to_rig
 from imgcal.detection import DetectionOptions, Frame, detect
 from imgcal.errors import InputError
-from imgcal.io import MARGIN
+from imgcal.io import MARGIN, model_file, nearest
 from imgcal.matching import MatchedFilter
+from imgcal.pipeline.learned import load_proposer
 from imgcal.types import BLOB_RADIUS, SIGMA, CalibrationObject, CameraRig, Detections
 
 Frames = Mapping[str, Frame | Sequence[Frame | None] | None]
-DetectorName = Literal["classical", "matched", "auto"]
+DETECTORS = ("classical", "matched", "auto", "learned", "both")
+DetectorName = str
+"""One of `DETECTORS`, or a query network: its file, the folder of the run that trained it, a shipped one's name."""
 Detector = DetectorName | Proposer | Sight
 """Who finds the fiducials in frames: blobs (classical), a matched filter, or the filter where blobs decide nothing
-(auto); something else that proposes labels; or one of them with frames that are not in memory."""
+(auto); a network, or the network where blobs decide nothing (both); something else that proposes labels; or one of them
+with frames that are not in memory."""
 ROWS = tuple(field.name for field in fields(Detections) if not field.name.endswith("_names"))
 
 
@@ -66,7 +69,12 @@ def proposer_of(detector: DetectorName | Proposer) -> tuple[Proposer, bool]:
         return detector, False
     if detector in ("matched", "auto"):
         return MatchedFilter(), detector == "auto"
-    raise InputError(f"detector: found {detector!r:.80}, expected one of {', '.join(get_args(DetectorName))}")
+    if detector in ("learned", "both"):
+        return load_proposer(finder=MatchedFilter()), detector == "both"
+    if not model_file(detector).is_file():
+        expected = f"{', '.join(DETECTORS)}, or a network for frames: a file or the folder of a run"
+        raise InputError(f"detector: found {detector!r:.80}{nearest(detector, DETECTORS)}, expected {expected}")
+    return load_proposer(detector, finder=MatchedFilter()), False
 
 
 def _in_memory(source: Frames) -> Callable[[int], Mapping[str, Frame | None]]:

@@ -28,7 +28,8 @@ Calls = dict[str, Callable[[], object]]
 def measure(effort: Effort) -> dict[str, Any]:
     """Time all networks in turn, one thread, one rig."""
     torch.set_num_threads(1)
-    paths = sorted(data_path("models").glob("*.safetensors"))
+    # Names that end in rig and object: the others are parts of a detector, which belong to neither.
+    paths = sorted(data_path("models").glob("*-*-*.safetensors"))
     if effort.smoke:
         paths = [path for path in paths if path.stem.startswith("points")]
     trained = {path.stem: load_checkpoint(path) for path in paths}

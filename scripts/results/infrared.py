@@ -1,0 +1,261 @@
+"""Which fiducial is where in single snapshots of captured frames: networks beside blobs, level by level.
+
+`python -m scripts.results.infrared --models ir-cnn=out/ir-cnn/model.safetensors --measurer ...` rewrites
+`docs/results/infrared.json` and the tables of `docs/infrared.md`. All methods look at the same frames.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import tyro
+from numpy.typing import NDArray
+from torch import Tensor
+
+import imgcal
+from imgcal.association import Proposer, Snapshot, matched_to_rig, track
+from imgcal.detection import detect_snapshot, to_detections
+from imgcal.geometry import RigidTransform, rotation_from_vector
+from imgcal.matching import MatchedFilter
+from imgcal.networks import InfraredNetwork, Measurer, Queries, load_infrared, load_measurer
+from imgcal.pipeline.learned import LearnedProposer
+from imgcal.synthesis import DIFFICULTIES, FrameModel, PhysicalDrift, simulate_shots, simulate_truth
+from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
+from scripts.output import RESULTS, ROOT, command, markdown, read_json, replaced, surroundings, write_json
+
+JSON, PAGE = RESULTS / "infrared.json", ROOT / "docs" / "infrared.md"
+NEAR = 5.0  # px within which a place is right: less than the radius of a marker
+VISIBLE = 0.25  # share of a marker that must be seen for it to count
+ASIDE = 8.0  # mm, one standard deviation of each coordinate of the believed pose
+DEGREES = (1.0, 6.0, 12.0)  # that the believed pose is turned
+OTHERS = (("T4", "cube8"), ("U7", "cube27"), ("O6", "wand4"))  # rigs and objects
+OTHER_LEVELS = ("clean", "combined")
+
+
+@dataclass(frozen=True)
+class Case:
+    """One snapshot, with the truth about it."""
+
+    snapshot: Snapshot
+    uv: NDArray[np.float64]  # (C, N, 2) px
+    visible: NDArray[np.bool_]  # (C, N)
+    pose: RigidTransform  # (), the true one
+
+    def believed(self, degrees: float, seed: int) -> Snapshot:
+        """The snapshot with a pose that is turned by so much, and moved."""
+        draw, obj = torch.Generator().manual_seed(seed), self.snapshot.obj
+        axis = torch.nn.functional.normalize(torch.randn(3, generator=draw, dtype=torch.float64), dim=0)
+        aside = ASIDE * torch.randn(3, generator=draw, dtype=torch.float64)
+        rotation = rotation_from_vector(axis * np.deg2rad(degrees)) @ self.pose.rotation
+        centre = obj.points.mean(0)
+        place = self.pose.rotation @ centre + self.pose.translation + aside
+        return replace(self.snapshot, candidates=(RigidTransform(rotation, place - rotation @ centre),))
+
+
+@dataclass
+class Tally:
+    """What a method said of some snapshots."""
+
+    visible: int = 0
+    claimed: int = 0
+    right: int = 0
+    squared: float = 0.0  # px^2, of the right ones
+    whitened: float = 0.0  # the same over sigma^2
+    declined: int = 0  # snapshots
+    seconds: float = 0.0
+
+    def add(self, case: Case, said: Detections, seconds: float) -> None:
+        """Count one snapshot."""
+        off = np.square(said.uv - case.uv[said.camera, said.fiducial]).sum(1)
+        right = (off < NEAR**2) & case.visible[said.camera, said.fiducial]
+        self.visible += int(case.visible.sum())
+        # What hardly shows is no fault to find, and none to miss.
+        self.claimed += int((right | (off >= NEAR**2)).sum())
+        self.right += int(right.sum())
+        self.squared += float(off[right].sum()) / 2
+        self.whitened += float((off[right] / np.square(said.sigma[right])).sum()) / 2
+        self.declined += len(said) == 0
+        self.seconds += seconds
+
+    def result(self) -> dict[str, Any]:
+        """Plain values."""
+        return {
+            "right_percent": 100 * self.right / max(self.visible, 1),
+            "wrong_percent": 100 * (self.claimed - self.right) / max(self.claimed, 1),
+            "rms_px": (self.squared / max(self.right, 1)) ** 0.5,
+            "nees": self.whitened / max(self.right, 1),
+            "visible": self.visible,
+            "claimed": self.claimed,
+            "declined_snapshots": self.declined,
+        }
+
+
+class Shuffled(InfraredNetwork):
+    """A network that gets the encoder's output of other cameras."""
+
+    def search(self, features: Tensor, queries: Queries, window: int | None = None) -> Any:
+        """Look at the next camera's features."""
+        return super().search(features.roll(1, 0), queries, window)
+
+
+class Zeroed(InfraredNetwork):
+    """A network whose encoder says nothing."""
+
+    def search(self, features: Tensor, queries: Queries, window: int | None = None) -> Any:
+        """Look at nothing."""
+        return super().search(torch.zeros_like(features), queries, window)
+
+
+@dataclass(frozen=True)
+class Blobs:
+    """The detector, then a vote of all cameras near the believed pose."""
+
+    name: str = "blobs"
+
+    def labelled(self, snapshot: Snapshot) -> Detections:
+        """Label the blobs that identity accepts."""
+        wide = replace(snapshot.blobs, sigma=np.hypot(snapshot.blobs.sigma, 0.3))
+        found = track(wide, snapshot.rig, snapshot.obj, snapshot.prior_std, snapshot.candidates[0])
+        labels = found.labels if found.accepted else np.full(len(wide), -1)
+        return replace(snapshot.blobs, fiducial=labels).select(labels >= 0)
+
+
+def cases(rig: CameraRig, obj: CalibrationObject, level: str, count: int) -> Iterator[Case]:
+    """Make snapshots of rigs that have drifted, each of its own."""
+    draw = torch.Generator().manual_seed(20_260)
+    for _ in range(count):
+        truth = simulate_truth(rig, obj, 1, draw, PhysicalDrift())
+        shot = next(iter(simulate_shots(truth, obj, FrameModel(difficulty=DIFFICULTIES[level]), draw)))
+        blobs = matched_to_rig(
+            to_detections([detect_snapshot(shot.frames, imgcal.DetectionOptions())], rig.camera_names, ("0",)), rig
+        )
+        snapshot = Snapshot(shot.frames, blobs, rig, obj, (rig.prior or RigPrior()).std(rig))
+        visible = (shot.seen > VISIBLE).numpy()
+        yield Case(snapshot, truth.uv[0].numpy(), visible, truth.rig_from_object[0])
+
+
+Method = Callable[[Snapshot], Detections]
+
+
+def methods_of(models: dict[str, Path], measurer: Measurer | None) -> dict[str, Method]:
+    """All methods by name, broken ones last."""
+
+    def proposed(proposer: Proposer) -> Method:
+        return lambda snapshot: proposer.propose(snapshot).detections
+
+    made: dict[str, Method] = {"blobs + vote": Blobs().labelled, "matched filter": proposed(MatchedFilter())}
+    networks = {name: load_infrared(path).network for name, path in models.items()}
+    made |= {name: proposed(LearnedProposer(network, measurer)) for name, network in networks.items()}
+    for name, network in networks.items():
+        for kind, word in ((Shuffled, "shuffled"), (Zeroed, "zeroed")):
+            broken = kind(network.config).eval()
+            broken.load_state_dict(network.state_dict())
+            made[f"{name}, encoder {word}"] = proposed(LearnedProposer(broken, measurer))
+    return made
+
+
+def measure(methods: dict[str, Method], count: int) -> dict[str, Any]:
+    """Ask everybody about everything."""
+    levels: dict[str, Any] = {}
+    obj, rig = imgcal.load_object("asymmetric8"), imgcal.load_rig("O10")
+    for level in DIFFICULTIES:
+        tallies = {(name, degrees): Tally() for name in methods for degrees in DEGREES}
+        for number, case in enumerate(cases(rig, obj, level, count)):
+            for (name, degrees), tally in tallies.items():
+                if "encoder" not in name or degrees == DEGREES[0]:
+                    ask(methods[name], case, degrees, number, tally)
+        levels[level] = _by_name(tallies)
+        print(level, {name: round(said["1"]["right_percent"], 1) for name, said in levels[level].items()}, flush=True)
+    others: dict[str, Any] = {}
+    for rig_name, object_name in OTHERS:
+        for level in OTHER_LEVELS:
+            tallies = {(name, DEGREES[0]): Tally() for name in methods if "encoder" not in name}
+            other = imgcal.load_rig(rig_name), imgcal.load_object(object_name)
+            for number, case in enumerate(cases(*other, level, max(count // 2, 1))):
+                for (name, degrees), tally in tallies.items():
+                    ask(methods[name], case, degrees, number, tally)
+            others[f"{rig_name}, {object_name}, {level}"] = _by_name(tallies)
+    return {"snapshots": count, "levels": levels, "others": others}
+
+
+def ask(method: Method, case: Case, degrees: float, seed: int, tally: Tally) -> None:
+    """Let a method look at a case whose pose is believed to be turned."""
+    snapshot = case.believed(degrees, seed)
+    started = time.process_time()
+    said = method(snapshot)
+    tally.add(case, said, time.process_time() - started)
+
+
+def _by_name(tallies: dict[tuple[str, float], Tally]) -> dict[str, Any]:
+    made: dict[str, Any] = {}
+    for (name, degrees), tally in tallies.items():
+        if tally.visible:
+            made.setdefault(name, {})[f"{degrees:g}"] = tally.result()
+    return made
+
+
+def tables(result: dict[str, Any]) -> dict[str, str]:
+    """What the page shows."""
+
+    def cell(said: dict[str, Any] | None) -> str:
+        return "" if said is None else f"{said['right_percent']:.1f} / {said['wrong_percent']:.1f}"
+
+    def by_level(degrees: str) -> str:
+        levels = result["levels"]
+        names = [name for name, said in next(iter(levels.values())).items() if degrees in said]
+        rows = [[name, *(cell(levels[level].get(name, {}).get(degrees)) for level in levels)] for name in names]
+        return markdown(["right % of visible / wrong % of claimed", *levels], rows)
+
+    def accuracy() -> str:
+        levels = result["levels"]
+        names = [name for name in next(iter(levels.values())) if "encoder" not in name]
+        rows = [
+            [name, *(f"{said[name]['1']['rms_px']:.2f} / {said[name]['1']['nees']:.2f}" for said in levels.values())]
+            for name in names
+        ]
+        return markdown(["RMS px of the right ones / NEES", *levels], rows)
+
+    others = result["others"]
+    names = list(next(iter(others.values())))
+    rows = [[name, *(cell(said[name]["1"]) for said in others.values())] for name in names]
+    return {
+        "infrared levels": by_level("1"),
+        "infrared 6 degrees": by_level("6"),
+        "infrared 12 degrees": by_level("12"),
+        "infrared accuracy": accuracy(),
+        "infrared others": markdown(["right % / wrong %", *others], rows),
+    }
+
+
+def main(
+    models: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ("ir-cnn=data/models/ir-cnn.safetensors",),
+    measurer: Path | None = None,
+    count: int = 6,
+    tables_only: bool = False,
+) -> None:
+    """Measure, write the JSON, and rewrite the tables.
+
+    Args:
+        models: NAME=FILE of query networks.
+        measurer: file of a measurer; markers are fitted without one.
+        count: snapshots a level.
+        tables_only: from the JSON that is there.
+    """
+    if not tables_only:
+        torch.set_num_threads(1)
+        paths = {name: Path(path) for name, _, path in (model.partition("=") for model in models)}
+        reader = None if measurer is None else load_measurer(measurer).network
+        found = measure(methods_of(paths, reader), count)
+        write_json(JSON, {**surroundings(), **found})
+    page = PAGE.read_text()
+    PAGE.write_text(replaced(page, tables(read_json(JSON)), PAGE))
+
+
+if __name__ == "__main__":
+    command(lambda: tyro.cli(main))
