@@ -44,8 +44,10 @@ from .moves import find_moves
 from .object_shape import SNAPSHOTS_TO_BEND, FiducialOffset, ShapeEvidence, offsets
 from .pose_initialization import initial_pose
 from .pose_support import ON_A_LINE, UndeterminedPosesError, require_poses
+from .rig_changes import CHANGES, change_scores, jump
 from .rig_error import displaced, error_between, step_by_error
-from .rig_filter import Absorbed, RigBelief, RigFilter, absorbed, aged
+from .rig_filter import Absorbed, RigBelief, RigFilter, absorbed, aged, widened
+from .rig_monitor import Change, RigMonitor
 from .rig_uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian
 from .robust_losses import squared
 from .steady_cameras import Gauge
@@ -53,6 +55,7 @@ from .variance_components import BENT, ObjectQuestion, Start, estimate_variance_
 
 __all__ = [
     "BENT",
+    "CHANGES",
     "CLIP",
     "LEAST_SNAPSHOTS",
     "MAP_DEPTHS",
@@ -62,6 +65,7 @@ __all__ = [
     "SNAPSHOTS_TO_BEND",
     "Absorbed",
     "BlockScatter",
+    "Change",
     "Estimate",
     "EstimationOptions",
     "FiducialOffset",
@@ -72,6 +76,7 @@ __all__ = [
     "Problem",
     "RigBelief",
     "RigFilter",
+    "RigMonitor",
     "RigUncertainty",
     "ShapeEvidence",
     "Solution",
@@ -86,6 +91,7 @@ __all__ = [
     "block_scatter",
     "camera_covariance",
     "camera_std",
+    "change_scores",
     "displaced",
     "encoded",
     "equations_at",
@@ -97,6 +103,7 @@ __all__ = [
     "initial_pose",
     "initial_state",
     "inverse_or_zero",
+    "jump",
     "linearize",
     "lm_cpu",
     "make_estimate",
@@ -122,4 +129,5 @@ __all__ = [
     "squared",
     "step_by_error",
     "whitened_covariance",
+    "widened",
 ]

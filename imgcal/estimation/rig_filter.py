@@ -9,6 +9,7 @@ together, which is what `RigFilter` does with its first ones.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -103,6 +104,7 @@ class Absorbed:
     residual: Tensor  # (S, C, N, 2) pixels, predicted minus observed; zero where not seen
     chi2: float  # sum of squared whitened residuals (robust), and of the change in standard deviations of the belief
     dof: int  # 2 observations - 6 snapshots: what chi2 is expected to be
+    evidence: float  # log probability of what was seen, up to what is the same for every belief before it (Laplace)
 
 
 def absorbed(
@@ -147,8 +149,11 @@ def aged(belief: RigBelief, seconds: float, rate: DriftRate) -> RigBelief:
         rate: of the walks.
     """
     variance = rate.std(belief.rig).square() * (max(seconds, 0.0) / 3600)
-    if not variance.any():
-        return belief
+    return widened(belief, variance) if variance.any() else belief
+
+
+def widened(belief: RigBelief, variance: Tensor) -> RigBelief:
+    """Know less of some parameters: add variances (C, 15), in the units and order of `PARAMETER_NAMES`."""
     error_by_step = torch.linalg.inv(step_by_error(belief.rig)) / belief.unit[:, :, None]
     covariance = torch.cholesky_inverse(belief.factor)
     _add_blocks(covariance, error_by_step @ torch.diag_embed(variance) @ error_by_step.mT)
@@ -194,6 +199,7 @@ class RigFilter:
         self.rate, self.options = rate, options
         self.belief = RigBelief.of_prior(rig, obj, prior_std)
         self.count = 0  # snapshots absorbed
+        self._young = True  # the first snapshots are still kept
         self._first = self.belief
         self._early: list[tuple[Observations, RigidTransform]] = []
         self._span = self._waited = 0.0  # s, since the first snapshot; of it, what the belief has not aged by
@@ -209,29 +215,56 @@ class RigFilter:
         Raises:
             RefusedError: see `absorbed`.
         """
+        result = self.follow(observations, rig_from_object, seconds)
+        return self.relinearize() if self.due else result
+
+    def follow(self, observations: Observations, rig_from_object: RigidTransform, seconds: float = 0.0) -> Absorbed:
+        """Do the work of `update`, and leave it to the caller to `relinearize` where that is `due`."""
         passed = max(seconds, 0.0) if self.count else 0.0
         self._span, self._waited = self._span + passed, self._waited + passed
-        young = self.count == len(self._early) < MEMORY and self._span <= YOUNG_SECONDS
-        if young and self.count + 1 in TOGETHER:
-            result = self._together(observations, rig_from_object)
-            belief = aged(result.belief, self._span, self.rate)
+        due = self._waited if self._waited >= LEAST_SECONDS else 0.0
+        result = absorbed(aged(self.belief, due, self.rate), observations, rig_from_object, self.options)
+        self.belief, self._waited, self.count = result.belief, self._waited - due, self.count + 1
+        self._young = self._young and len(self._early) < MEMORY and self._span <= YOUNG_SECONDS
+        if self._young:
+            self._early.append((observations, result.rig_from_object))
         else:
-            due = self._waited if self._waited >= LEAST_SECONDS else 0.0
-            result = absorbed(aged(self.belief, due, self.rate), observations, rig_from_object, self.options)
-            belief, self._waited = result.belief, self._waited - due
-        if young:
-            self._early.append((observations, result.rig_from_object[-1:]))
-        self.belief, self.count = belief, self.count + 1
-        return replace(result, belief=belief)
+            self._early.clear()
+        return result
 
-    def _together(self, observations: Observations, rig_from_object: RigidTransform) -> Absorbed:
-        """Absorb all snapshots so far anew; the result is that of the last one."""
-        parts = [*(early for early, _ in self._early), observations]
-        values = (torch.cat([getattr(part, name) for part in parts]) for name in ("uv", "sigma", "seen"))
-        poses = RigidTransform.cat([*(pose for _, pose in self._early), rig_from_object])
-        result = absorbed(self._first, Observations(*values), poses, self.options)
-        self._waited = 0.0
-        return replace(result, rig_from_object=result.rig_from_object[-1:], residual=result.residual[-1:])
+    @property
+    def due(self) -> bool:
+        """Tell whether the first snapshots are to be absorbed together now."""
+        return len(self._early) in TOGETHER
+
+    def relinearize(self) -> Absorbed:
+        """Absorb the first snapshots anew, all together; the result is that of the last one."""
+        result = absorbed(self._first, *joined(self._early), self.options)
+        self.belief, self._waited = aged(result.belief, self._span, self.rate), 0.0
+        last = replace(result, rig_from_object=result.rig_from_object[-1:], residual=result.residual[-1:])
+        return replace(last, belief=self.belief)
+
+    def restart(self, first: RigBelief, snapshots: Sequence[tuple[Observations, RigidTransform]]) -> Absorbed:
+        """Begin anew: with what was believed before some snapshots, and these.
+
+        Args:
+            first: what was believed before them.
+            snapshots: observations (1, C, N) and the object's pose (1,) of each.
+
+        Raises:
+            RefusedError: see `absorbed`; the filter stays as it was.
+        """
+        result = absorbed(first, *joined(snapshots), self.options)
+        self.belief, self._first, self._early = result.belief, first, list(snapshots)
+        self._young, self._span, self._waited = True, 0.0, 0.0
+        return result
+
+
+def joined(snapshots: Sequence[tuple[Observations, RigidTransform]]) -> tuple[Observations, RigidTransform]:
+    """Put snapshots together: (S, C, N) and (S,)."""
+    observations, poses = zip(*snapshots, strict=True)
+    values = (torch.cat([getattr(part, name) for part in observations]) for name in ("uv", "sigma", "seen"))
+    return Observations(*values), RigidTransform.cat(poses)
 
 
 @dataclass(frozen=True)
@@ -323,7 +356,9 @@ class _Linearization:
         seen = (self.problem.root_weight > 0)[:, 0]
         residual = torch.where(seen.unsqueeze(-2), self.equations.residual[:, 0], 0.0).mT
         poses = pose_at(self.problem, self.state)
-        return Absorbed(belief, poses.reshape(len(seen)), residual, 2 * self.cost, 2 * int(seen.sum()) - 6 * len(seen))
+        dof = 2 * int(seen.sum()) - 6 * len(seen)
+        known = self.belief.factor.diagonal().log().sum() - factor.diagonal().log().sum()
+        return Absorbed(belief, poses.reshape(len(seen)), residual, 2 * self.cost, dof, float(known) - self.cost)
 
     def _basis(self) -> Tensor:
         """Whitened offsets of the problem by errors in units: (C, 15, 15)."""

@@ -1,0 +1,85 @@
+"""A camera is bumped while the rig is in use: which, when, how, how far; and the others stay known."""
+
+import math
+
+import pytest
+import torch
+
+import imgcal
+from imgcal.estimation import CHANGES, Change, RigFilter, RigMonitor
+from imgcal.geometry import RigidTransform
+from imgcal.synthesis import PhysicalDrift, simulate_truth
+from imgcal.types import CameraRig, Observations
+
+NOISE = 0.1
+SIZES = {"rotation": math.radians(0.1), "position": 1.0, "focal_length": 3.0, "principal_point": 1.0}
+
+
+def followed(bumps: dict[int, dict[int, str]], count: int, seed: int) -> tuple[RigMonitor, CameraRig, list[Change]]:
+    """Follow a rig of which cameras are bumped before some snapshots: {snapshot: {camera: kind}}."""
+    factory, obj, generator = (
+        imgcal.load_rig("T4"),
+        imgcal.load_object("asymmetric8"),
+        torch.Generator().manual_seed(seed),
+    )
+    truth = simulate_truth(factory, obj, count, generator, PhysicalDrift())
+    monitor, rig, told = RigMonitor(RigFilter(factory, obj)), truth.rig, []
+    for s in range(count):
+        for camera, kind in bumps.get(s, {}).items():
+            part, step = CHANGES[kind], torch.zeros(4, 15, dtype=torch.float64)
+            direction = torch.randn(part.stop - part.start, generator=generator, dtype=torch.float64)
+            step[camera, part] = SIZES[kind] * direction / direction.norm()
+            rig = rig.retract(step)
+        pose = truth.rig_from_object[s : s + 1]
+        shift = torch.tensor([100.0, 60.0, 80.0]) * torch.randn(3, generator=generator, dtype=torch.float64)
+        pose = RigidTransform(pose.rotation, pose.translation + shift)
+        image = rig.expand(1).project(pose.apply(obj.points))
+        uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
+        seen = image.visible & (torch.rand(image.visible.shape, generator=generator) > 0.1)
+        observations = Observations(uv, torch.full(seen.shape, NOISE, dtype=torch.float64), seen)
+        _, changes = monitor.update(observations, pose, seconds=1 / 60)
+        told += changes
+    return monitor, rig, told
+
+
+def normalized_error(monitor: RigMonitor, rig: CameraRig) -> float:
+    """Squared error of the filter per degree of freedom."""
+    belief = monitor.filter.belief
+    error = belief.rig.local(rig).flatten()
+    return float(error @ torch.linalg.solve(belief.covariance(), error)) / len(error)
+
+
+def test_a_steady_rig_gives_no_alarm() -> None:
+    monitor, rig, told = followed({}, 70, seed=4)
+    assert told == []
+    assert 0.6 < normalized_error(monitor, rig) < 1.5
+
+
+@pytest.mark.parametrize(
+    ("kind", "camera"), [("rotation", 0), ("position", 1), ("focal_length", 2), ("principal_point", 3)]
+)
+def test_a_bump_is_told_with_camera_kind_and_size(camera: int, kind: str) -> None:
+    monitor, rig, told = followed({30: {camera: kind}}, 50, seed=10 + camera)
+    alarm, change = told
+    assert (alarm.camera, alarm.kind) == (camera, "unknown")
+    assert abs(alarm.since - 30) <= 3
+    assert (change.camera, change.kind) == (camera, kind)
+    assert abs(change.size - SIZES[kind]) < 4 * change.sigma < 0.5 * SIZES[kind]
+    assert 0.5 < normalized_error(monitor, rig) < 1.8
+    assert monitor.open == {}
+
+
+def test_two_cameras_at_once() -> None:
+    _, _, told = followed({30: {1: "rotation", 3: "principal_point"}}, 60, seed=21)
+    assert {change.camera for change in told} == {1, 3}
+    assert {change.camera: change.kind for change in told} == {1: "rotation", 3: "principal_point"}
+
+
+def test_the_others_stay_known() -> None:
+    before, _, _ = followed({}, 30, seed=12)
+    after, _, told = followed({30: {2: "focal_length"}}, 33, seed=12)
+    assert told[0].camera == 2
+    known, now = before.filter.belief.std(), after.filter.belief.std()
+    others = [0, 1, 3]
+    assert (now[others, 6:10] < 1.15 * known[others, 6:10]).all()
+    assert (now[2, 6:8] > 1.5 * known[2, 6:8]).all()
