@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from imgcal.io import StrictModel
 from imgcal.networks.infrared_encoders import STRIDE, CnnEncoder, VitEncoder
+from imgcal.types import BlobKind
 
 PATCH = 24  # pixels, each way
 RADIUS = 3.5  # patch pixels that a marker's radius is reduced to; smaller ones are taken as they are
@@ -36,7 +37,12 @@ class Measured:
 
     offset: Tensor  # (M, 2) patch pixels, from the middle of the patch to the marker's centre
     log_sigma: Tensor  # (M,) of its error, patch pixels, one standard deviation of each axis
-    valid: Tensor  # (M,) logit that the marker is to be seen
+    kind: Tensor  # (M, 4) logits of BlobKind
+
+    @property
+    def valid(self) -> Tensor:
+        """Logit that the marker is to be seen: (M,)."""
+        return self.kind[:, : BlobKind.FALSE].logsumexp(-1) - self.kind[:, BlobKind.FALSE]
 
 
 class Measurer(nn.Module):
@@ -56,7 +62,9 @@ class Measurer(nn.Module):
         self.head = nn.Sequential(
             nn.GELU(), nn.Conv2d(channels, channels, 3, padding=1), nn.GELU(), nn.Conv2d(channels, 4, 1)
         )
-        self.verdict = nn.Sequential(nn.Linear(channels + 1, channels), nn.GELU(), nn.Linear(channels, 2))
+        self.verdict = nn.Sequential(
+            nn.Linear(channels + 1, channels), nn.GELU(), nn.Linear(channels, 1 + len(BlobKind))
+        )
 
     def forward(self, patches: Tensor, radius: Tensor) -> Measured:
         """Measure one marker a patch, the one that is asked for in its middle.
@@ -76,8 +84,8 @@ class Measurer(nn.Module):
         # Cells that disagree are the first sign that a centre is not well known.
         spread = ((votes - offset[..., None]).square().mean(1) * weight).sum(-1, keepdim=True).clamp(min=1e-4).log()
         attended = (features.float().flatten(2) * weight[:, None]).sum(-1)
-        log_sigma, valid = self.verdict(torch.cat((attended, spread), -1)).float().unbind(-1)
-        return Measured(offset, log_sigma.clamp(-5, 3), valid)
+        verdict = self.verdict(torch.cat((attended, spread), -1)).float()
+        return Measured(offset, verdict[:, 0].clamp(-5, 3), verdict[:, 1:])
 
     def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:
         """Parameters that may have their own learning rates."""

@@ -1,6 +1,7 @@
 from .calibration import Calibration, calibrate, fit_labelled
 from .initialization import load_initializer
 from .learned import LearnedProposer, load_proposer
+from .measuring import LearnedMeasurer
 from .scoring import RigScore, rms_length, score
 from .sources import Detector, DetectorName, checked_detections, checked_frames, proposer_of
 from .tally import DOUBTFUL, Tally
@@ -11,6 +12,7 @@ __all__ = [
     "Detector",
     "DetectorName",
     "LearnedProposer",
+    "LearnedMeasurer",
     "RigScore",
     "Tally",
     "calibrate",

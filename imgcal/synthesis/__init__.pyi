@@ -5,7 +5,7 @@ from .crops import CropTruth, Scenes, render_crops, sample_scenes, second_look
 from .difficulty import DIFFICULTIES, Difficulty
 from .drawing import host_generator
 from .levels import LEVELS, Degradation
-from .patches import Patches, sample_patches
+from .patches import Patches, expose_patches, render_patches
 from .rigs import (
     Drift,
     PhysicalDrift,
@@ -37,10 +37,11 @@ __all__ = [
     "Shot",
     "Snapshots",
     "Truth",
+    "expose_patches",
     "host_generator",
     "render_crops",
+    "render_patches",
     "render_views",
-    "sample_patches",
     "sample_scenes",
     "second_look",
     "share_of_good_rigs",

@@ -113,6 +113,8 @@ class Shot:
 
     frames: Frames  # camera name -> (H, W)
     seen: Tensor  # (C, N) share of each marker's area that is inside the frame and not hidden
+    markers: Spots  # (C, N) as they were drawn, before drapes cut them
+    sensor: SensorModel  # and the light
 
 
 def simulate_frames(
@@ -189,7 +191,7 @@ def _shot(
         rendered = infrared_frames(some, (height, width), sensor, clutter=clutter, generator=generator)
         seen[cameras] = rendered.seen.to(seen)
         frames |= {rig.camera_names[c]: frame for c, frame in zip(cameras, rendered.frames.numpy(), strict=True)}
-    return Shot({name: frames[name] for name in rig.camera_names}, seen)
+    return Shot({name: frames[name] for name in rig.camera_names}, seen, markers, sensor)
 
 
 def _single(values: Tensor) -> Tensor:

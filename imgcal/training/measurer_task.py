@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from functools import lru_cache
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -19,18 +21,20 @@ from imgcal.networks import (
     load_measurer,
     normalized,
 )
-from imgcal.synthesis import sample_patches
+from imgcal.synthesis import Patches, expose_patches, render_patches
 from imgcal.training.experiment import Experiment
 from imgcal.training.task import Loss, Task
+from imgcal.types import BlobKind
 
-VALIDATION_SEED = 20_000_003
+POOL_SEED, VALIDATION_SEED = 20_000_001, 20_000_003
 
 
 class MeasurerExperiment(Experiment):
     """A network that measures markers in patches."""
 
-    task: Literal["measurer"] = "measurer"
-    network: MeasurerConfig = MeasurerConfig()
+    task: Literal["measurer"] = "measurer"  # what the network is trained for
+    network: MeasurerConfig = MeasurerConfig()  # family and size
+    pool: Annotated[int, Field(ge=1, le=10**7)] = 16_000  # patches rendered at the start; turned, lit and noised anew
 
     def make_task(self, device: torch.device, batch_size: int, weights: torch.Generator, fresh: bool) -> MeasurerTask:
         """Build the network and its source of patches; see `Experiment.make_task`."""
@@ -44,7 +48,12 @@ class PatchBatch:
     patches: Tensor  # (M, 24, 24), normalized
     radius: Tensor  # (M,) patch pixels, expected
     offset: Tensor  # (M, 2) patch pixels, the truth
-    seen: Tensor  # (M,) bool
+    kind: Tensor  # (M,) BlobKind
+
+    @property
+    def seen(self) -> Tensor:
+        """Whether there is a marker: (M,) bool."""
+        return self.kind != BlobKind.FALSE
 
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name."""
@@ -78,18 +87,20 @@ class MeasurerTask(Task[PatchBatch, Measured]):
         self.device = device
         count = experiment.training.validation_rigs
         self.sizes = [min(batch_size, count - first) for first in range(0, count, batch_size)]
+        self.pool = _pool(experiment.pool, POOL_SEED, device)
+        self.held_out = _pool(max(count, 1), VALIDATION_SEED, device)
 
     def batch(self, count: int, generator: torch.Generator) -> PatchBatch:
-        """Make random patches."""
-        made = sample_patches(count, generator)
-        return PatchBatch(normalized(made.images), made.radius, made.offset, made.seen)
+        """Take patches of the pool, and give them light and noise."""
+        rows = torch.randint(len(self.pool.kind), (count,), generator=generator, device=self.device)
+        return _exposed(self.pool.take(rows), generator)
 
     def predict(self, network: nn.Module, batch: PatchBatch) -> Measured:
         """Measure."""
         return network(batch.patches, batch.radius)
 
     def loss(self, answer: Measured, batch: PatchBatch, step: int) -> Loss:
-        """Error of the centres, their likelihood under the predicted sigma, and whether there is a marker."""
+        """Error of the centres, their likelihood under the predicted sigma, and what the blobs show."""
         seen = batch.seen.to(answer.offset.dtype)
         count = seen.sum().clamp(min=1)
         error = answer.offset - batch.offset
@@ -99,29 +110,43 @@ class MeasurerTask(Task[PatchBatch, Measured]):
         ).sum()
         squared = error.detach().square().mean(-1)
         likelihood = (squared / 2 * (-2 * answer.log_sigma).exp() + answer.log_sigma) * seen
-        verdict = functional.binary_cross_entropy_with_logits(answer.valid, seen)
+        verdict = functional.cross_entropy(answer.kind, batch.kind)
         total = (off + 0.2 * likelihood.sum()) / count + 0.3 * verdict
         rms = ((squared * seen).sum() / count).sqrt()
         return Loss(total, {"error_px": rms.detach(), "verdict": verdict.detach()})
 
     def validate(self, predict: Callable[[PatchBatch], Measured]) -> dict[str, float]:
-        """Mean absolute error of an axis, NEES, and wrong verdicts, on patches that are always the same."""
+        """Mean absolute error of an axis and NEES of markers that stand alone, and wrong verdicts; always the same."""
         if not self.sizes:
             return {}
         generator = torch.Generator(self.device).manual_seed(VALIDATION_SEED)
-        batches = [self.batch(size, generator) for size in self.sizes]
+        rows = torch.arange(sum(self.sizes), device=self.device).split(self.sizes)
+        batches = [_exposed(self.held_out.take(some), generator) for some in rows]
         answers = [predict(batch) for batch in batches]
         error = torch.cat([answer.offset - batch.offset for answer, batch in zip(answers, batches, strict=True)])
         sigma = torch.cat([answer.log_sigma for answer in answers]).exp()
-        valid, seen = (torch.cat(parts) for parts in ([a.valid for a in answers], [b.seen for b in batches]))
+        said, kind = torch.cat([a.kind for a in answers]).argmax(-1), torch.cat([b.kind for b in batches])
+        seen = (kind == BlobKind.WHOLE) | (kind == BlobKind.PARTIAL)
         return {
             "validation_error_px": float(error[seen].abs().mean()),
             "validation_median_px": float(error[seen].norm(dim=-1).median()),
             "validation_nees": float((error.square().mean(-1) / sigma.square())[seen].mean()),
-            "validation_wrong_verdicts": float(((valid > 0) != seen).double().mean()),
+            "validation_wrong_verdicts": float((said != kind).double().mean()),
         }
 
     def result(self, network: nn.Module, metrics: Mapping[str, Any]) -> MeasurerCheckpoint:
         """Weights and configuration."""
         assert isinstance(network, Measurer)  # `self.network`, or the mean of what it was
         return MeasurerCheckpoint(network, metrics)
+
+
+@lru_cache(maxsize=4)
+def _pool(count: int, seed: int, device: torch.device) -> Patches:
+    """Render patches, always the same: once for all trainings of a process."""
+    with torch.no_grad():
+        return render_patches(count, torch.Generator(device).manual_seed(seed))
+
+
+def _exposed(patches: Patches, generator: torch.Generator) -> PatchBatch:
+    grey, radius, offset = expose_patches(patches, generator)
+    return PatchBatch(normalized(grey), radius, offset, patches.kind)

@@ -2,7 +2,7 @@ from . import limits
 from .calibration_object import CalibrationObject, Symmetry
 from .limits import BLOB_RADIUS, FIDUCIAL_RADIUS, MOST_PIXELS, SIGMA, Range, check_object, check_observations, check_rig
 from .moved_camera import Kind, MovedCamera, MovedError
-from .observations import UNUSABLE, BlobFlag, Detections, Observations
+from .observations import UNUSABLE, BlobFlag, BlobKind, Detections, Observations
 from .placement import CropPlacement
 from .prediction import Prediction, Views
 from .rig import PARAMETER_NAMES, PARAMETERS, CameraRig, DriftRate, RigPrior, pack21, unpack18, unpack21
@@ -16,6 +16,7 @@ __all__ = [
     "SIGMA",
     "UNUSABLE",
     "BlobFlag",
+    "BlobKind",
     "CalibrationObject",
     "CameraRig",
     "CropPlacement",

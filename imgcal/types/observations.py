@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from enum import IntFlag
+from enum import IntEnum, IntFlag
 
 import numpy as np
 import torch
@@ -20,9 +20,19 @@ class BlobFlag(IntFlag):
     SATURATED = 4  # clipped grey values; the centre is less certain, its sigma says by how much
     MASKED = 8  # inside a mask of known reflections
     OUTLIER = 16  # labelled, and not where the calibrated rig has this fiducial
+    REFLECTION = 32  # no marker, a learned measurer says
 
 
-UNUSABLE = BlobFlag.BORDER | BlobFlag.MERGED | BlobFlag.MASKED
+UNUSABLE = BlobFlag.BORDER | BlobFlag.MERGED | BlobFlag.MASKED | BlobFlag.REFLECTION
+
+
+class BlobKind(IntEnum):
+    """What a blob shows, as a learned measurer tells them apart."""
+
+    WHOLE = 0  # a marker, all of it and evenly bright
+    PARTIAL = 1  # a marker that is half hidden, or unevenly bright
+    MERGED = 2  # a marker and something else that touches it
+    FALSE = 3  # no marker
 
 
 @dataclass(frozen=True)

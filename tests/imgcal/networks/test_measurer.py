@@ -15,6 +15,8 @@ def test_patches_are_measured_one_by_one(encoder: str) -> None:
     assert together.offset.shape == (3, 2)
     torch.testing.assert_close(together.offset[1:2], alone.offset, atol=1e-5, rtol=1e-4)
     torch.testing.assert_close(together.valid[1:2], alone.valid, atol=1e-5, rtol=1e-4)
+    odds = together.kind.softmax(-1)[:, 3]
+    torch.testing.assert_close(together.valid.sigmoid(), 1 - odds, atol=1e-5, rtol=1e-4)
 
 
 def test_families_are_alike_in_size() -> None:

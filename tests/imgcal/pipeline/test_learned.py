@@ -40,7 +40,8 @@ class Blind(Measurer):
     """Measures nothing: what is claimed stays."""
 
     def forward(self, patches: Tensor, radius: Tensor) -> Measured:
-        return Measured(torch.zeros(len(patches), 2), torch.zeros(len(patches)), torch.full((len(patches),), -9.0))
+        kind = torch.tensor([0.0, 0.0, 0.0, 9.0]).expand(len(patches), 4)
+        return Measured(torch.zeros(len(patches), 2), torch.zeros(len(patches)), kind)
 
 
 @dataclass(frozen=True)

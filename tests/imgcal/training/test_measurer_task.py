@@ -8,20 +8,21 @@ from imgcal.training.measurer_task import PatchBatch
 
 
 def task() -> MeasurerTask:
-    experiment = load_experiment("measurer-cnn", ["training.validation_rigs=40"], kind=MeasurerExperiment)
+    experiment = load_experiment("measurer-cnn", ["training.validation_rigs=130", "pool=130"], kind=MeasurerExperiment)
     return experiment.make_task(torch.device("cpu"), 20, torch.Generator().manual_seed(0), True)
 
 
 def knows(batch: PatchBatch, sigma: float) -> Measured:
-    return Measured(batch.offset, torch.full_like(batch.radius, math.log(sigma)), 20.0 * (2 * batch.seen.float() - 1))
+    kinds = 20.0 * torch.nn.functional.one_hot(batch.kind, 4).float()
+    return Measured(batch.offset, torch.full_like(batch.radius, math.log(sigma)), kinds)
 
 
 def test_loss_is_least_for_the_truth() -> None:
     made, generator = task(), torch.Generator().manual_seed(1)
     batch = made.batch(16, generator)
     truth = made.loss(knows(batch, 0.05), batch, 0)
-    off = made.loss(Measured(batch.offset + 0.3, torch.full_like(batch.radius, -3.0), knows(batch, 1).valid), batch, 0)
-    wrong = made.loss(Measured(batch.offset, torch.full_like(batch.radius, -3.0), -knows(batch, 1).valid), batch, 0)
+    off = made.loss(Measured(batch.offset + 0.3, torch.full_like(batch.radius, -3.0), knows(batch, 1).kind), batch, 0)
+    wrong = made.loss(Measured(batch.offset, torch.full_like(batch.radius, -3.0), -knows(batch, 1).kind), batch, 0)
     assert float(truth.total) < min(float(off.total), float(wrong.total))
     assert float(truth.means["error_px"]) == 0
 
@@ -29,11 +30,11 @@ def test_loss_is_least_for_the_truth() -> None:
 def test_validation_counts_errors_in_sigmas() -> None:
     made = task()
     said = made.validate(
-        lambda batch: Measured(batch.offset + 0.2, torch.full_like(batch.radius, math.log(0.1)), batch.radius)
+        lambda batch: Measured(batch.offset + 0.2, torch.full_like(batch.radius, math.log(0.1)), knows(batch, 1).kind)
     )
     assert abs(said["validation_error_px"] - 0.2) < 1e-5
     assert abs(said["validation_nees"] - 4) < 1e-3
-    assert 0 < said["validation_wrong_verdicts"] < 0.4  # all are called markers
+    assert said["validation_wrong_verdicts"] == 0
 
 
 def test_it_learns_and_its_file_is_read(tmp_path) -> None:

@@ -1,0 +1,114 @@
+"""Blobs measured again by a network: half-hidden and unevenly lit markers, where a fitted ellipse is off."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from imgcal.detection import Blobs, DetectionOptions, Frame
+from imgcal.networks import Measurer, cut_patches, load_measurer, normalized
+from imgcal.types import BlobFlag, BlobKind, Detections
+
+REDUCED = 3.5  # patch pixels that radii are reduced to, as `cut_patches` does
+LEAST_SIGMA = 0.02  # patch pixels: what the network cannot know better
+FARTHEST = 1.0  # radii that a centre may be moved by
+SURE = 0.8  # probability of a kind that is acted upon
+
+
+Columns = TypeVar("Columns", Blobs, Detections)
+
+
+@dataclass(frozen=True)
+class Remeasured:
+    """What a network says of K blobs."""
+
+    uv: NDArray[np.float64]  # (K, 2) pixels
+    sigma: NDArray[np.float64]  # (K,) pixels
+    kind: NDArray[np.float64]  # (K, 4) probabilities of BlobKind
+
+
+@dataclass(frozen=True)
+class LearnedMeasurer:
+    """Measures blobs again, and says which of them are whole markers, parts of markers, merged, or none.
+
+    A fitted ellipse is as exact as the noise allows where a marker is whole and even: those keep their centres. Partial
+    ones get the network's, with its sigma; merged ones and what is no marker are flagged.
+    """
+
+    network: Measurer
+    name: str = "measurer"
+
+    @classmethod
+    def load(cls, path: str) -> LearnedMeasurer:
+        """Read one: a file, the folder of a run, or the name of a shipped one.
+
+        Raises:
+            InputError: no such file, or something else in it.
+        """
+        return cls(load_measurer(path).network, path)
+
+    def __call__(self, frames: Mapping[str, Frame | None], blobs: Columns, options: DetectionOptions) -> Columns:
+        """Measure the blobs of one snapshot again.
+
+        Args:
+            frames: camera name -> frame (H, W), in the order that `blobs.camera` counts.
+            blobs: what was found in them.
+            options: how they were found.
+        """
+        if not len(blobs.uv):
+            return blobs
+        said = self.measured(frames, blobs, options)
+        sure = said.kind.max(1) > SURE
+        kind = said.kind.argmax(1)
+        moved = np.linalg.norm(said.uv - blobs.uv, axis=1)
+        taken = (kind == BlobKind.PARTIAL) & sure & (moved < FARTHEST * _radii(blobs))
+        flags = blobs.flags.copy()
+        flags[sure & (kind == BlobKind.MERGED)] |= np.uint8(BlobFlag.MERGED)
+        flags[sure & (kind == BlobKind.FALSE)] |= np.uint8(BlobFlag.REFLECTION)
+        uv = np.where(taken[:, None], said.uv, blobs.uv)
+        sigma = np.where(taken, said.sigma, blobs.sigma)
+        return replace(blobs, uv=uv, sigma=sigma, flags=flags)
+
+    @torch.no_grad()
+    def measured(
+        self, frames: Mapping[str, Frame | None], blobs: Blobs | Detections, options: DetectionOptions
+    ) -> Remeasured:
+        """Ask the network about blobs; see `__call__`."""
+        radius, names = _radii(blobs), list(frames)
+        scale = np.clip(np.round(radius / REDUCED), 1, 64).astype(np.int64)
+        # Blobs of one camera and one scale are cut out together: each row of `cut_patches` is such a group.
+        groups, group = np.unique(np.stack([blobs.camera, scale], axis=1), axis=0, return_inverse=True)
+        group = group.reshape(-1)
+        place = _places(group)
+        shape = (len(groups), int(place.max()) + 1)
+        uv, size = np.zeros((*shape, 2)), np.repeat(REDUCED * groups[:, 1:], shape[1], axis=1)
+        uv[group, place], size[group, place] = blobs.uv, REDUCED * scale
+        of_camera = tuple(names[camera] for camera in groups[:, 0])
+        patches, placement = cut_patches(
+            frames, of_camera, torch.from_numpy(uv), torch.from_numpy(size), inverted=options.polarity == "dark"
+        )
+        rows, columns = torch.from_numpy(group), torch.from_numpy(place)
+        reduced = torch.from_numpy(radius / scale).float()
+        said = self.network(normalized(patches[rows, columns]), reduced)
+        corner, by = placement.corner[rows, columns], placement.scale[rows, columns]
+        sigma = (said.log_sigma.double().exp().square() + LEAST_SIGMA**2).sqrt() * by
+        uv = corner + by[:, None] * (said.offset.double() + placement.size / 2)
+        return Remeasured(uv.numpy(), sigma.numpy(), said.kind.softmax(-1).double().numpy())
+
+
+def _radii(blobs: Blobs | Detections) -> NDArray[np.float64]:
+    return np.nan_to_num(blobs.radius, nan=REDUCED).clip(1.0)
+
+
+def _places(group: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Number the members of each group: (K,)."""
+    order = np.argsort(group, kind="stable")
+    counts = np.bincount(group)
+    place = np.empty_like(group)
+    place[order] = np.arange(len(group)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return place

@@ -1,0 +1,254 @@
+"""The learned measurer against the fitted ellipse: errors by level of difficulty, on frames it was not trained on.
+
+    python -m scripts.results.measurer out/runs --snapshots 6
+
+Trained networks are folders: `imgcal train measurer-cnn --set training.seed=K --out out/runs/measurer-cnn-seedK`.
+Writes docs/results/measurer.json and the tables of docs/measurer.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.utils.flop_counter import FlopCounterMode
+
+from imgcal.detection import Blobs, DetectionOptions, Frame, detect_snapshot
+from imgcal.io import load_object, load_rig
+from imgcal.networks import Measurer, load_measurer
+from imgcal.networks.measurer import PATCH
+from imgcal.pipeline import LearnedMeasurer
+from imgcal.synthesis import DIFFICULTIES, FrameModel, PhysicalDrift, Shot, simulate_shots, simulate_truth
+from imgcal.types import UNUSABLE, BlobKind
+from renderers import Spots, render_crops
+from scripts.output import markdown, surroundings
+
+RESULT, PAGE = Path("docs/results/measurer.json"), Path("docs/measurer.md")
+SEED = 77
+LEAST_SEEN = 0.25  # share of a marker that there must be to measure
+NEAR = 1.0  # marker radii within which a blob belongs to a marker
+WINDOW = 96  # px, each way, that a bound is computed on
+STEP = 0.02  # px, of its derivatives
+LEVELS = tuple(DIFFICULTIES)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Blobs of one snapshot that show a marker, and that marker: K of them; and all blobs."""
+
+    frames: dict[str, Frame]
+    blobs: Blobs
+    row: NDArray[np.int64]  # (K,) of the blobs
+    uv: NDArray[np.float64]  # (K, 2) true centre
+    share: NDArray[np.float64]  # (K,) of the marker that is seen
+    bound: NDArray[np.float64]  # (K,) px, Cramer-Rao, one axis; nan where it is not defined
+    markers: int  # that there were to find
+
+
+def snapshots(level: str, count: int) -> Iterator[Seen]:
+    """Simulate captures of O10, detect blobs, and say which marker each one shows."""
+    rig, obj = load_rig("O10"), load_object("asymmetric8")
+    generator = torch.Generator().manual_seed(SEED)
+    truth = simulate_truth(rig, obj, count, generator, PhysicalDrift())
+    shots = simulate_shots(truth, obj, FrameModel(difficulty=DIFFICULTIES[level]), generator)
+    for uv, shot in zip(truth.uv.numpy(), shots, strict=True):
+        blobs = detect_snapshot(shot.frames, DetectionOptions())
+        radius = torch.linalg.det(shot.markers.shape).sqrt().sqrt().numpy()
+        bounds = cramer_rao(shot)
+        found = []
+        for camera, marker in np.argwhere((shot.seen > LEAST_SEEN).numpy()):
+            away = np.linalg.norm(blobs.uv - uv[camera, marker], axis=1) + 1e9 * (blobs.camera != camera)
+            row = int(away.argmin()) if len(away) else 0
+            if len(away) and away[row] < NEAR * radius[camera, marker]:
+                found.append((row, *uv[camera, marker], float(shot.seen[camera, marker]), bounds[camera, marker]))
+        table = np.array(found).reshape(-1, 5)
+        yield Seen(
+            shot.frames, blobs, table[:, 0].astype(np.int64), table[:, 1:3], table[:, 3], table[:, 4],
+            int((shot.seen > LEAST_SEEN).sum()),
+        )  # fmt: skip
+
+
+def cramer_rao(shot: Shot) -> NDArray[np.float64]:
+    """Least error (C, N) of one axis that noise allows who knows all but centre, brightness and ground: px.
+
+    Not defined for markers that are cut or partly hidden: what is unknown of the edge is not in it.
+    """
+    flat = shot.markers.of_each(
+        lambda values: (values.float() if values.is_floating_point() else values).flatten(0, 1)[:, None]
+    )
+    middle = shot.markers.uv.reshape(-1, 2)
+
+    def light(du: float, dv: float) -> torch.Tensor:
+        spots: Spots = replace(flat, uv=flat.uv + flat.uv.new_tensor([du, dv]))
+        return render_crops(spots, middle.round() + 0.5, 1.0, (WINDOW, WINDOW), shot.sensor.blur)[0]
+
+    here = light(0, 0)
+    along = [(light(*step) - light(-step[0], -step[1])) / (2 * STEP) for step in ((STEP, 0.0), (0.0, STEP))]
+    sensor, contrast = shot.sensor, shot.sensor.contrast * shot.sensor.full_scale
+    level = (sensor.background + sensor.contrast * here) * sensor.full_scale
+    variance = level * sensor.shot_noise**2 / sensor.full_scale + sensor.read_noise**2 + 1 / 12
+    rows = torch.stack([contrast * along[0], contrast * along[1], here, torch.ones_like(here)], dim=1).flatten(2)
+    information = (rows / variance.flatten(1)[:, None]) @ rows.mT
+    information = information + 1e-9 * torch.eye(4, dtype=here.dtype)  # of what is not seen nothing is known
+    variances = torch.diagonal(torch.linalg.inv(information), dim1=1, dim2=2)[:, :2]
+    bound = variances.mean(1).sqrt().view(shot.seen.shape)
+    whole = (shot.seen > 0.98) & shot.markers.visible
+    return torch.where(whole, bound, torch.nan).numpy()
+
+
+def shuffled(network: Measurer) -> Measurer:
+    """Exchange what the network says of one patch with what it says of another one."""
+    generator = torch.Generator().manual_seed(0)
+
+    def exchange(module: torch.nn.Module, arguments: Any, features: torch.Tensor) -> torch.Tensor:
+        return features[torch.randperm(len(features), generator=generator)]
+
+    network.encoder.register_forward_hook(exchange)
+    return network
+
+
+def score(error: NDArray[np.float64], sigma: NDArray[np.float64]) -> dict[str, float]:
+    """Errors (K, 2) and their standard deviations (K,): plain numbers."""
+    if not len(error):
+        return {"count": 0}
+    squared = (error**2).sum(1)
+    nees = squared / (2 * sigma**2)
+    return {
+        "count": len(error),
+        "rms_px": float(np.sqrt(squared.mean() / 2)),
+        "median_px": float(np.median(np.sqrt(squared))),
+        "p90_px": float(np.quantile(np.sqrt(squared), 0.9)),
+        "nees": float(nees.mean()),
+        "nees_median": float(np.median(nees) / np.log(2)),  # 1 for a Gaussian of the stated sigma
+    }
+
+
+def judged(views: list[Seen], measurer: LearnedMeasurer | None, alone: bool) -> dict[str, Any]:
+    """Errors of all blobs that show markers; kinds of all blobs.
+
+    Args:
+        views: snapshots of one level.
+        measurer: None = the fitted ellipse.
+        alone: centres of the network for every blob, not only for partial markers.
+    """
+    errors, sigmas, flagged, false, kinds = [], [], [], [], []
+    for view in views:
+        blobs = view.blobs
+        if measurer is not None and len(blobs.uv):
+            said = measurer.measured(view.frames, blobs, DetectionOptions())
+            kinds.append(said.kind.argmax(1)[view.row])
+            blobs = measurer(view.frames, blobs, DetectionOptions())
+            if alone:
+                blobs = replace(blobs, uv=said.uv, sigma=said.sigma)
+        unusable = (blobs.flags & int(UNUSABLE)) != 0
+        # The same blobs for all: those that the detector calls usable.
+        counted = view.row[(view.blobs.flags[view.row] & int(UNUSABLE)) == 0]
+        truth = view.uv[(view.blobs.flags[view.row] & int(UNUSABLE)) == 0]
+        errors.append(blobs.uv[counted] - truth)
+        sigmas.append(blobs.sigma[counted])
+        flagged.append(unusable[counted])
+        other = np.setdiff1d(np.arange(len(blobs.uv)), view.row)
+        false.append(unusable[other])
+    error, sigma, out = np.concatenate(errors), np.concatenate(sigmas), np.concatenate(flagged)
+    result: dict[str, Any] = score(error, sigma) | {"flagged_markers": float(out.mean()) if len(out) else 0.0}
+    result["flagged_false"] = float(np.concatenate(false).mean()) if sum(map(len, false)) else 0.0
+    result["kept"] = score(error[~out], sigma[~out])
+    if kinds:
+        count = np.bincount(np.concatenate(kinds), minlength=len(BlobKind))
+        result["kinds"] = {kind.name.lower(): int(count[kind]) for kind in BlobKind}
+    return result
+
+
+def measured(folder: Path, count: int) -> dict[str, Any]:
+    """All methods on all levels."""
+    runs = sorted(path.parent for path in folder.glob("measurer-*-seed*/model.safetensors"))
+    networks = {run.name: load_measurer(run / "model.safetensors").network for run in runs}
+    result: dict[str, Any] = {
+        "surroundings": surroundings(),
+        "snapshots": count,
+        "seed": SEED,
+        "sizes": sizes(networks),
+    }
+    result["levels"] = {}
+    for level in LEVELS:
+        views = list(snapshots(level, count))
+        bound = np.concatenate([view.bound for view in views])
+        row: dict[str, Any] = {
+            "markers": sum(view.markers for view in views),
+            "found": sum(len(view.row) for view in views),
+            "bound_px": float(np.sqrt(np.nanmean(bound**2))) if np.isfinite(bound).any() else None,
+            "ellipse": judged(views, None, False),
+        }
+        for name, network in networks.items():
+            row[name] = judged(views, LearnedMeasurer(network), False)
+            row[f"{name} alone"] = judged(views, LearnedMeasurer(network), True)
+        for name in {name.rpartition("-")[0]: name for name in networks}.values():
+            mixed = shuffled(load_measurer(folder / name / "model.safetensors").network)
+            row[f"{name} shuffled"] = judged(views, LearnedMeasurer(mixed), False)
+        result["levels"][level] = row
+        print(
+            level,
+            json.dumps({key: value.get("rms_px") for key, value in row.items() if isinstance(value, dict)}),
+            flush=True,
+        )
+    return result
+
+
+def sizes(networks: dict[str, Measurer]) -> dict[str, dict[str, int]]:
+    """Weights and operations of each family: of the whole network, for one patch."""
+    families = {}
+    for name, network in networks.items():
+        with FlopCounterMode(display=False) as counter:
+            network(torch.zeros(1, PATCH, PATCH), torch.ones(1))
+        weights = sum(parameter.numel() for parameter in network.parameters())
+        families[name.rpartition("-")[0]] = {"parameters": weights, "flops": counter.get_total_flops()}
+    return families
+
+
+def tables(result: dict[str, Any]) -> str:
+    """The tables of the page, as Markdown."""
+    families = sorted(result["sizes"])
+
+    def of_seeds(row: dict[str, Any], family: str, key: str, suffix: str = "") -> str:
+        values = [
+            value[key] for name, value in row.items()
+            if name.startswith(f"{family}-seed") and name.endswith(suffix or name[-1]) and (" " in name) == bool(suffix)
+            and key in value
+        ]  # fmt: skip
+        return "-" if not values else f"{np.mean(values):.3g} ({min(values):.3g} to {max(values):.3g})"
+
+    head = ("level", "bound", "ellipse", *(f"{f}" for f in families), *(f"{f} alone" for f in families), "shuffled")
+    lines = []
+    for level, row in result["levels"].items():
+        bound = "-" if row["bound_px"] is None else f"{row['bound_px']:.3g}"
+        mixed = next((f"{v['rms_px']:.3g}" for k, v in row.items() if k.endswith(" shuffled") and "rms_px" in v), "-")
+        lines.append(
+            [level, bound, f"{row['ellipse'].get('rms_px', float('nan')):.3g}"]
+            + [of_seeds(row, f, "rms_px") for f in families]
+            + [of_seeds(row, f, "rms_px", " alone") for f in families]
+            + [mixed]
+        )
+    return markdown(head, lines)
+
+
+def main() -> None:
+    """Measure, and write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("runs", type=Path)
+    parser.add_argument("--snapshots", type=int, default=6)
+    parser.add_argument("--out", type=Path, default=RESULT)
+    arguments = parser.parse_args()
+    result = measured(arguments.runs, arguments.snapshots)
+    arguments.out.write_text(json.dumps(result, indent=1) + "\n")
+    print(tables(result))
+
+
+if __name__ == "__main__":
+    main()

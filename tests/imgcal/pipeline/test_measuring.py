@@ -1,0 +1,98 @@
+"""Blobs measured again: by a network that knows, which one is told what to say."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from imgcal.detection import DetectionOptions, detect_frame
+from imgcal.networks import Measured, Measurer
+from imgcal.pipeline import LearnedMeasurer
+from imgcal.types import BlobFlag, BlobKind
+from renderers import SensorModel, Spots, Surface, infrared_frames
+
+PLACES = np.array([[40.3, 50.6], [120.8, 52.1], [60.2, 130.4], [150.5, 140.9]])
+RADII = np.array([3.0, 7.0, 11.0, 6.0])
+
+
+class Told(Measurer):
+    """Says the same of all patches, and notes them."""
+
+    def __init__(self, offset: tuple[float, float], sigma: float, kind: BlobKind, sure: float = 9.0) -> None:
+        super().__init__()
+        self.offset, self.sigma, self.kind, self.sure = offset, sigma, kind, sure
+
+    def forward(self, patches: torch.Tensor, radius: torch.Tensor) -> Measured:
+        self.patches, self.radius = patches, radius
+        count = len(patches)
+        kind = torch.zeros(count, 4)
+        kind[:, self.kind] = self.sure
+        offset = torch.tensor(self.offset).expand(count, 2)
+        return Measured(offset, torch.full((count,), self.sigma).log(), kind)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    one = torch.ones(1, 4)
+    shape = torch.from_numpy(RADII**2).float()[:, None, None] * torch.eye(2)
+    cut = torch.tensor([1.0, 0.0, torch.inf]).repeat(1, 4, 1, 1)
+    cut[0, 2, 0, 2] = 0.0  # the third one is hidden to the right of its middle
+    uv = torch.from_numpy(PLACES).float()[None]
+    spots = Spots(uv, shape[None], one, one > 0, one, Surface(cut))
+    frame = infrared_frames(spots, (180, 200), SensorModel(), generator=torch.Generator().manual_seed(0)).frames[0]
+    return frame.numpy(), detect_frame(frame.numpy(), DetectionOptions())
+
+
+def test_patches_hold_the_blobs_in_their_middle(scene):
+    frame, blobs = scene
+    network = Told((0.0, 0.0), 0.1, BlobKind.WHOLE)
+    said = LearnedMeasurer(network).measured({"frame": frame}, blobs, DetectionOptions())
+    # An offset of zero is the middle of the patch: within a pixel of the blob, at the patch's scale.
+    scale = np.maximum(np.round(blobs.radius / 3.5), 1)
+    assert (np.abs(said.uv - blobs.uv) <= 0.51 * scale[:, None]).all()
+    np.testing.assert_allclose(network.radius.numpy(), blobs.radius / scale, rtol=1e-6)
+    middle = network.patches[:, 11:13, 11:13].mean((1, 2))
+    assert (middle > network.patches[:, :2].mean((1, 2)) + 0.5).all()
+
+
+def test_offsets_are_in_pixels_of_the_frame(scene):
+    frame, blobs = scene
+    here = LearnedMeasurer(Told((0.0, 0.0), 0.1, BlobKind.PARTIAL)).measured({"a": frame}, blobs, DetectionOptions())
+    there = LearnedMeasurer(Told((0.5, -0.2), 0.1, BlobKind.PARTIAL)).measured({"a": frame}, blobs, DetectionOptions())
+    scale = np.maximum(np.round(blobs.radius / 3.5), 1)
+    np.testing.assert_allclose(there.uv - here.uv, scale[:, None] * [0.5, -0.2], atol=1e-5)
+    np.testing.assert_allclose(there.sigma, scale * np.hypot(0.1, 0.02), rtol=1e-5)
+
+
+def test_whole_markers_keep_their_ellipse_and_partial_ones_do_not(scene):
+    frame, blobs = scene
+    whole = LearnedMeasurer(Told((0.3, 0.0), 0.1, BlobKind.WHOLE))({"a": frame}, blobs, DetectionOptions())
+    assert np.array_equal(whole.uv, blobs.uv) and np.array_equal(whole.flags, blobs.flags)
+    partial = LearnedMeasurer(Told((0.3, 0.0), 0.1, BlobKind.PARTIAL))({"a": frame}, blobs, DetectionOptions())
+    assert (partial.uv != blobs.uv).any(axis=1).all()
+    assert (partial.sigma > 0.1).all()
+    unsure = LearnedMeasurer(Told((0.3, 0.0), 0.1, BlobKind.PARTIAL, 1.0))({"a": frame}, blobs, DetectionOptions())
+    assert np.array_equal(unsure.uv, blobs.uv)
+
+
+@pytest.mark.parametrize(("kind", "flag"), [(BlobKind.MERGED, BlobFlag.MERGED), (BlobKind.FALSE, BlobFlag.REFLECTION)])
+def test_what_is_no_marker_alone_is_flagged(scene, kind, flag):
+    frame, blobs = scene
+    flagged = LearnedMeasurer(Told((0.0, 0.0), 0.1, kind))({"a": frame}, blobs, DetectionOptions())
+    assert (flagged.flags & int(flag) != 0).all()
+    assert np.array_equal(flagged.uv, blobs.uv)
+
+
+def test_no_blobs_no_question(scene):
+    frame, blobs = scene
+    none = blobs.select(np.zeros(len(blobs.uv), bool))
+    assert len(LearnedMeasurer(Told((0.0, 0.0), 0.1, BlobKind.WHOLE))({"a": frame}, none, DetectionOptions()).uv) == 0
+
+
+def test_dark_markers_are_shown_as_bright_ones(scene):
+    frame, blobs = scene
+    bright, dark = (Told((0.0, 0.0), 0.1, BlobKind.WHOLE) for _ in range(2))
+    LearnedMeasurer(bright).measured({"a": frame}, blobs, DetectionOptions())
+    LearnedMeasurer(dark).measured({"a": 255 - frame}, blobs, replace(DetectionOptions(), polarity="dark"))
+    torch.testing.assert_close(dark.patches, bright.patches)
