@@ -48,6 +48,7 @@ from imgcal.pipeline import (
     Calibration,
     Detector,
     DetectorName,
+    LearnedMeasurer,
     calibrate,
     load_initializer,
     proposer_of,
@@ -82,6 +83,7 @@ class Calibrate:
     blurred or cluttered for blobs; slower), auto (blobs, and the pattern where these decide nothing), learned (a
     network for any rig and object), both (blobs, and the network where these decide nothing), or the network's file or
     run"""
+    measurer: str | None = None  #: network that measures blobs again: a file, the folder of a run, or a shipped name
     first_guess: str = "none"  #: where to start: none (factory rig), points, vit, cnn (shipped), a file or run
     without: tuple[str, ...] = ()  #: cameras to leave out
     blind_cameras: bool = False  #: accept cameras that see nothing; they keep their factory values
@@ -121,7 +123,8 @@ class Calibrate:
         detector = self._detector(source)
         initializer = None if self.first_guess == "none" else load_initializer(self.first_guess, rig, obj)
         loaded = time.perf_counter()
-        detections, frames = read_detections(source, self.snapshots, self.detection)
+        measurer = None if self.measurer is None else LearnedMeasurer.load(self.measurer)
+        detections, frames = read_detections(source, self.snapshots, self.detection, measurer)
         detections = only_cameras(detections, rig)
         seconds = {"loading": loaded - started, "reading and detection": time.perf_counter() - loaded}
 

@@ -24,6 +24,7 @@ from imgcal.errors import InputError
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import Capture, Frame
 from imgcal.messages import listed, shortened
+from imgcal.pipeline import LearnedMeasurer
 from imgcal.types import CameraRig, Detections
 
 Item = TypeVar("Item")
@@ -45,27 +46,38 @@ def parse_range(text: str | None) -> tuple[int, int | None]:
 
 
 def read_detections(
-    source: Capture | Detections, snapshots: str | None, options: DetectionOptions
+    source: Capture | Detections,
+    snapshots: str | None,
+    options: DetectionOptions,
+    measurer: LearnedMeasurer | None = None,
 ) -> tuple[Detections, dict[str, Frame | None]]:
     """Take detections from a file as they are, or find blobs in the frames of a capture.
+
+    Args:
+        source: what was opened.
+        snapshots: A:B, or None for all.
+        options: what counts as a blob.
+        measurer: measures the blobs of frames again.
 
     Returns:
         The detections of the chosen snapshots, and the frames of the first one, for pictures (empty without frames).
 
     Raises:
-        InputError: the range of snapshots is empty.
+        InputError: the range of snapshots is empty, or a measurer has no frames.
     """
     first, last = parse_range(snapshots)
     count = len(source.snapshot_names)
     if first >= count:
         raise InputError(f"--snapshots: found {snapshots}, expected a range within the {count} snapshots of the input")
     if isinstance(source, Detections):
+        if measurer is not None:
+            raise InputError(f"--measurer {measurer.name}: found blobs without frames, expected a capture with frames")
         return source.of_snapshots(first, count if last is None else min(last, count)), {}
-    return _detect_capture(source, first, last, options)
+    return _detect_capture(source, first, last, options, measurer)
 
 
 def _detect_capture(
-    capture: Capture, first: int, last: int | None, options: DetectionOptions
+    capture: Capture, first: int, last: int | None, options: DetectionOptions, measurer: LearnedMeasurer | None
 ) -> tuple[Detections, dict[str, Frame | None]]:
     names = capture.snapshot_names[first:last]
     masks = masks_of(capture)
@@ -74,7 +86,8 @@ def _detect_capture(
     with ThreadPoolExecutor() as pool:
         for _, frames in progress(capture.snapshots(first, last), len(names), "detecting blobs"):
             shown = shown or dict(frames)
-            found.append(detect_snapshot(frames, options, masks=masks, pool=pool, whole_capture=True))
+            blobs = detect_snapshot(frames, options, masks=masks, pool=pool, whole_capture=True)
+            found.append(blobs if measurer is None else measurer(frames, blobs, options))
     return to_detections(without_dim(found, options), capture.camera_names, names), shown
 
 

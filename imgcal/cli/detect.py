@@ -12,6 +12,7 @@ import tyro
 from imgcal.cli.common import read_detections
 from imgcal.detection import DetectionOptions
 from imgcal.io import load_rig, open_capture, save_detections
+from imgcal.pipeline import LearnedMeasurer
 
 
 @dataclass(frozen=True)
@@ -19,19 +20,21 @@ class Detect:
     """Find blobs in captured frames and measure their centres.
 
     Writes one row a blob: snapshot, camera, u, v, sigma (pixels), radius, flags (1 touches the border, 2 merged,
-    4 saturated, 8 masked). Example: imgcal detect my_capture --out detections.csv
+    4 saturated, 8 masked, 32 no marker, as --measurer says). Example: imgcal detect my_capture --out detections.csv
     """
 
     capture: Annotated[Path, tyro.conf.Positional]  #: folder with frames/<camera>/<snapshot>.png
     out: Path  #: CSV or CSV.gz to write
     rig: str | None = None  #: rig file or name, to check camera names and image sizes against
     snapshots: str | None = None  #: A:B, numbers in file order from 0, B excluded
+    measurer: str | None = None  #: network that measures blobs again: a file, the folder of a run, or a shipped name
     detection: Annotated[DetectionOptions, tyro.conf.arg(name="")] = field(default_factory=DetectionOptions)
 
     def run(self) -> None:
         """Detect and write."""
         capture = open_capture(self.capture, None if self.rig is None else load_rig(self.rig))
-        detections, _ = read_detections(capture, self.snapshots, self.detection)
+        measurer = None if self.measurer is None else LearnedMeasurer.load(self.measurer)
+        detections, _ = read_detections(capture, self.snapshots, self.detection, measurer)
         save_detections(detections, self.out)
         print(
             f"{len(detections)} blobs in {len(detections.snapshot_names)} snapshots of "

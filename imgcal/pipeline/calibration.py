@@ -47,6 +47,7 @@ from imgcal.pipeline.checks import (
     require_views,
 )
 from imgcal.pipeline.initialization import Initialization, Initializer, residual_of
+from imgcal.pipeline.measuring import LearnedMeasurer
 from imgcal.pipeline.object_checks import displaced, lost_fiducials, object_offsets
 from imgcal.pipeline.sources import Detector, Frames, blobs_of, sight_of
 from imgcal.pipeline.steadiness import steady_part
@@ -200,6 +201,7 @@ def calibrate(
     initializer: Initializer | None = None,
     progress: Progress | None = None,
     detector: Detector = "classical",
+    measurer: LearnedMeasurer | None = None,
 ) -> Calibration:
     """Recalibrate a rig from what its cameras saw.
 
@@ -214,6 +216,7 @@ def calibrate(
         detector: who finds the fiducials in frames: `classical` (blobs), `matched` (a matched filter for frames in
             which blobs fail), `auto` (the filter where blobs decide nothing), or a `Proposer`; a `Sight` brings frames
             that are not in memory. Blobs that contradict count, and identity and all checks decide as ever.
+        measurer: measures the blobs of frames again (`LearnedMeasurer.load`): half-hidden and unevenly lit markers.
 
     Raises:
         RefusedError: the data cannot decide; the message says why.
@@ -229,7 +232,7 @@ def calibrate(
         ('coded', True)
     """
     started, rig = time.perf_counter(), rig.to(torch.float64)
-    detections = blobs_of(source, rig, obj, detection)
+    detections = blobs_of(source, rig, obj, detection, measurer)
     found = time.perf_counter()
     sight = sight_of(detector, source, detection)
     labelled = associate(detections, rig, obj, options, progress, sight)

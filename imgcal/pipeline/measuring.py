@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -72,6 +72,24 @@ class LearnedMeasurer:
         flags[sure & (kind == BlobKind.FALSE)] |= np.uint8(BlobFlag.REFLECTION)
         uv = np.where(taken[:, None], said.uv, blobs.uv)
         sigma = np.where(taken, said.sigma, blobs.sigma)
+        return replace(blobs, uv=uv, sigma=sigma, flags=flags)
+
+    def of_snapshots(
+        self, frames: Callable[[int], Mapping[str, Frame | None]], blobs: Detections, options: DetectionOptions
+    ) -> Detections:
+        """Measure the blobs of several snapshots again.
+
+        Args:
+            frames: those of a snapshot by its number: camera name -> frame.
+            blobs: what was found in them.
+            options: how they were found.
+        """
+        uv, sigma, flags = blobs.uv.copy(), blobs.sigma.copy(), blobs.flags.copy()
+        for snapshot in np.unique(blobs.snapshot).tolist():
+            rows = np.flatnonzero(blobs.snapshot == snapshot)
+            shown = frames(snapshot)
+            part = self({name: shown.get(name) for name in blobs.camera_names}, blobs.select(rows), options)
+            uv[rows], sigma[rows], flags[rows] = part.uv, part.sigma, part.flags
         return replace(blobs, uv=uv, sigma=sigma, flags=flags)
 
     @torch.no_grad()

@@ -16,6 +16,7 @@ from imgcal.errors import InputError
 from imgcal.io import MARGIN, model_file, nearest
 from imgcal.matching import MatchedFilter
 from imgcal.pipeline.learned import load_proposer
+from imgcal.pipeline.measuring import LearnedMeasurer
 from imgcal.types import BLOB_RADIUS, SIGMA, CalibrationObject, CameraRig, Detections
 
 Frames = Mapping[str, Frame | Sequence[Frame | None] | None]
@@ -30,19 +31,28 @@ ROWS = tuple(field.name for field in fields(Detections) if not field.name.endswi
 
 
 def blobs_of(
-    source: Detections | Frames, rig: CameraRig, obj: CalibrationObject, options: DetectionOptions
+    source: Detections | Frames,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    options: DetectionOptions,
+    measurer: LearnedMeasurer | None = None,
 ) -> Detections:
-    """Take blobs as they are, or find them in frames; cameras are numbered as in the rig.
+    """Take blobs as they are, or find them in frames, and measure these again; cameras are numbered as in the rig.
 
     Raises:
         InputError: neither blobs nor frames, or they are not of this rig and object.
     """
     if isinstance(source, Detections):
+        if measurer is not None:
+            raise InputError(f"measurer {measurer.name}: found blobs without frames, expected frames to look at")
         return checked_detections(source, rig, obj)
     frames = checked_frames(source, rig)
     if not frames:
         raise InputError(f"frames: found no camera, expected frames of the cameras of rig {rig.name}")
-    return matched_to_rig(detect(frames, options), rig)
+    blobs = detect(frames, options)
+    if measurer is not None:
+        blobs = measurer.of_snapshots(_in_memory(frames), blobs, options)
+    return matched_to_rig(blobs, rig)
 
 
 def sight_of(detector: Detector, source: Detections | Frames, detection: DetectionOptions) -> Sight | None:

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.detection import DetectionOptions, detect_frame
+from imgcal.detection import DetectionOptions, detect, detect_frame
+from imgcal.errors import InputError
+from imgcal.io import load_object, load_rig
 from imgcal.networks import Measured, Measurer
-from imgcal.pipeline import LearnedMeasurer
+from imgcal.pipeline import LearnedMeasurer, calibrate
 from imgcal.types import BlobFlag, BlobKind
 from renderers import SensorModel, Spots, Surface, infrared_frames
 
@@ -96,3 +98,19 @@ def test_dark_markers_are_shown_as_bright_ones(scene):
     LearnedMeasurer(bright).measured({"a": frame}, blobs, DetectionOptions())
     LearnedMeasurer(dark).measured({"a": 255 - frame}, blobs, replace(DetectionOptions(), polarity="dark"))
     torch.testing.assert_close(dark.patches, bright.patches)
+
+
+def test_calibration_takes_it(scene):
+    frame, blobs = scene
+    network = Told((0.3, 0.0), 0.1, BlobKind.PARTIAL)
+    shots = {"a": [frame, None, frame], "b": [None, frame, None]}
+    found = detect(shots, DetectionOptions())
+    again = LearnedMeasurer(network).of_snapshots(
+        lambda number: {name: frames[number] for name, frames in shots.items()}, found, DetectionOptions()
+    )
+    one = LearnedMeasurer(network)({"a": frame}, blobs, DetectionOptions())
+    for snapshot in range(3):
+        np.testing.assert_allclose(again.uv[again.snapshot == snapshot], one.uv)
+    rig, obj = load_rig("T4"), load_object("asymmetric8")
+    with pytest.raises(InputError, match="measurer measurer: found blobs without frames"):
+        calibrate(found, rig, obj, measurer=LearnedMeasurer(network))
