@@ -183,7 +183,7 @@ class RigFilter:
         self,
         rig: CameraRig,
         obj: CalibrationObject,
-        rate: DriftRate = DriftRate(),
+        rate: DriftRate | None = None,
         options: EstimationOptions = EstimationOptions(),
         prior_std: Tensor | None = None,
     ) -> None:
@@ -192,11 +192,11 @@ class RigFilter:
         Args:
             rig: the factory calibration, without batch axes.
             obj: the calibration object.
-            rate: how fast the rig wanders.
+            rate: how fast the rig wanders; None = as the rig says.
             options: how to minimize.
             prior_std: (C, 15) how far the factory values may be off; None = as the rig says.
         """
-        self.rate, self.options = rate, options
+        self.rate, self.options = rate or rig.drift_rate or DriftRate(), options
         self.belief = RigBelief.of_prior(rig, obj, prior_std)
         self.count = 0  # snapshots absorbed
         self._young = True  # the first snapshots are still kept

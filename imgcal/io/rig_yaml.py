@@ -19,7 +19,7 @@ from imgcal.io.names import LONGEST_NAME, find_file, is_file_name, title_of
 from imgcal.io.validation import StrictModel, validated
 from imgcal.io.yaml_file import Flow, FlowMap, read_yaml, record_from_yaml, yaml_text
 from imgcal.messages import listed, quoted
-from imgcal.types import PARAMETER_NAMES, PARAMETERS, CameraRig, RigPrior, limits
+from imgcal.types import PARAMETER_NAMES, PARAMETERS, CameraRig, DriftRate, RigPrior, limits
 
 FORMAT = "imgcal-rig/1"
 ENTRY_NAMES = {"cameras": "camera"}
@@ -117,6 +117,16 @@ class _Prior(StrictModel):
     position: Annotated[float, _within(limits.PRIOR_POSITION)] = RigPrior.position
 
 
+class _DriftRate(StrictModel):
+    """Zero is allowed: a value that does not wander."""
+
+    focal_length: Annotated[float, Field(ge=0, le=limits.PRIOR_FOCAL_LENGTH.high)] = DriftRate.focal_length
+    principal_point: Annotated[float, Field(ge=0, le=limits.PRIOR_PRINCIPAL_POINT.high)] = DriftRate.principal_point
+    distortion: Annotated[float, Field(ge=0, le=limits.PRIOR_DISTORTION.high)] = DriftRate.distortion
+    rotation: Annotated[float, Field(ge=0, le=limits.PRIOR_ROTATION.high)] = DriftRate.rotation
+    position: Annotated[float, Field(ge=0, le=limits.PRIOR_POSITION.high)] = DriftRate.position
+
+
 class _Covariance(StrictModel):
     reference_camera: Name | None = None
     parameters: Annotated[list[Name], Field(max_length=PARAMETERS)]
@@ -132,6 +142,7 @@ class _RigFile(StrictModel):
     working_distance: Annotated[float, _within(limits.DISTANCE)] | None = None
     cameras: Annotated[list[_Camera], Field(min_length=1, max_length=limits.MOST_CAMERAS)]
     prior: _Prior | None = None
+    drift_rate: _DriftRate | None = None
     covariance: _Covariance | None = None
 
     @model_validator(mode="after")
@@ -237,6 +248,8 @@ def rig_text(
     content["cameras"] = [_camera_entry(rig, camera, covariance) for camera in range(rig.num_cameras)]
     if rig.prior is not None:
         content["prior"] = {key: float(value) for key, value in vars(rig.prior).items()}
+    if rig.drift_rate is not None:
+        content["drift_rate"] = {key: float(value) for key, value in vars(rig.drift_rate).items()}
     if covariance is not None:
         content["covariance"] = _covariance_entry(covariance, full, where)
     validated(content, _RigFile, f"{where}: not written", ENTRY_NAMES)
@@ -268,6 +281,7 @@ def _rig_of(content: _RigFile, name: str) -> CameraRig:
         name=content.name if content.name is not None else name,
         working_distance=content.working_distance,
         prior=None if content.prior is None else RigPrior(**content.prior.model_dump()),
+        drift_rate=None if content.drift_rate is None else DriftRate(**content.drift_rate.model_dump()),
     )
 
 

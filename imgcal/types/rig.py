@@ -117,6 +117,7 @@ class CameraRig:
     name: str = "rig"
     working_distance: float | None = None  # mm, from the rig's origin to the object
     prior: RigPrior | None = None
+    drift_rate: DriftRate | None = None  # None = the defaults
 
     @property
     def batch_shape(self) -> torch.Size:

@@ -12,7 +12,7 @@ from imgcal.errors import InputError
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.io.rig_yaml import RigCovariance, load_rig, load_rig_covariance, save_rig
-from imgcal.types.rig import CameraRig, RigPrior
+from imgcal.types.rig import CameraRig, DriftRate, RigPrior
 
 TEXT = """\
 format: imgcal-rig/1
@@ -50,6 +50,7 @@ def make_rig(numbers: torch.Tensor, names: tuple[str, ...] = ("a", "b", "c")) ->
         name="made",
         working_distance=850.5,
         prior=RigPrior(rotation=0.123),
+        drift_rate=DriftRate(position=0.0),
     )
 
 
@@ -105,8 +106,8 @@ def test_round_trip_is_exact(tmp_path_factory: pytest.TempPathFactory, numbers: 
         assert torch.equal(getattr(loaded, name), getattr(rig, name))
     assert torch.equal(loaded.cam_from_rig.translation, rig.cam_from_rig.translation)
     torch.testing.assert_close(loaded.cam_from_rig.rotation, rig.cam_from_rig.rotation, rtol=0, atol=4e-15)
-    assert (loaded.camera_names, loaded.name, loaded.working_distance, loaded.prior) == (
-        rig.camera_names, rig.name, rig.working_distance, rig.prior,
+    assert (loaded.camera_names, loaded.name, loaded.working_distance, loaded.prior, loaded.drift_rate) == (
+        rig.camera_names, rig.name, rig.working_distance, rig.prior, rig.drift_rate,
     )  # fmt: skip
 
 
@@ -184,6 +185,8 @@ def test_covariance_round_trip(tmp_path: Path) -> None:
          r"cameras: found more than 256"),
         (TEXT[TEXT.index("cameras") :], "\n".join(f"k{i}: 0" for i in range(5000)), r"found 5,001 values"),
         ("prior:\n", "prior:\n  rotation: 0\n", r"prior: rotation: found 0"),
+        ("prior:\n", "drift_rate: {rotation: -1}\nprior:\n", r"drift_rate: rotation: found -1"),
+        ("prior:\n", "drift_rate: {focal: 1}\nprior:\n", r"drift_rate: unknown key `focal`"),
         ("prior:\n", "covariance: {parameters: [fx]}\nprior:\n", r"found only one of `std`|`std`.*`covariance`"),
     ],
 )  # fmt: skip
