@@ -25,6 +25,8 @@ from imgcal.types import BlobFlag, CalibrationObject, CameraRig, Detections
 SAME_BLOB = 1.5
 """Pixels within which a blob of the detector and a proposed fiducial are one, beyond three standard deviations."""
 FARTHEST = 6.0  # px: the same at most, so that no proposal hides blobs that contradict it
+DOUBTED = 1.0
+"""Pixels: a proposed sigma as large says that part of the marker may be hidden, which a blob of the rest cannot know."""
 LEAST_AGREEMENT = 0.8
 """Share of the labels that identity gives near the proposed pose which the proposer must have given, too."""
 
@@ -140,7 +142,7 @@ def together(proposed: Detections, blobs: Detections) -> tuple[Detections, NDArr
         rows = theirs[nearest]
         reach = SAME_BLOB + 3 * np.hypot(proposed.sigma[ours], blobs.sigma[rows])
         one = distance < np.minimum(reach, FARTHEST)
-        better = (blobs.sigma[rows] <= proposed.sigma[ours]) & blobs.usable[rows]
+        better = (blobs.sigma[rows] <= proposed.sigma[ours]) & blobs.usable[rows] & (proposed.sigma[ours] < DOUBTED)
         # A merged blob near two fiducials is neither of them.
         alone = np.bincount(rows[one], minlength=len(blobs))[rows] == 1
         taken = one & better & alone

@@ -98,19 +98,24 @@ def fit_markers(windows, real, corner, scale, close, shape, uv, found):
     count = side * side
     values, weight, residual = np.empty(count), np.empty(count), np.empty(count)
     shapes = np.empty((count, 3))
+    members = np.empty(len(windows), np.int64)
     normal, right, row = np.empty((4, 4)), np.empty(4), np.empty(4)
     for iteration in range(len(MISFIT)):
         for n in range(len(windows)):
-            inside = 0
+            inside, neighbours = 0, 0
+            for m in range(len(windows)):
+                if close[n, m] and found[m, 0] > 0:
+                    members[neighbours] = m
+                    neighbours += 1
             for i in range(side):
                 for j in range(side):
                     k = i * side + j
                     u, v = float(corner[n, 0] + j), float(corner[n, 1] + i)
                     value = windows[n, i, j]
-                    for m in range(len(windows)):
-                        if close[n, m] and found[m, 0] > 0:
-                            other, _, _ = _shape(u - uv[m, 0], v - uv[m, 1], scale[m], whitening, profile)
-                            value -= found[m, 0] * other
+                    for near in range(neighbours):
+                        m = members[near]
+                        other, _, _ = _shape(u - uv[m, 0], v - uv[m, 1], scale[m], whitening, profile)
+                        value -= found[m, 0] * other
                     values[k] = value
                     weight[k] = 1.0 if real[n, i, j] else 0.0
                     inside += 1 if real[n, i, j] else 0

@@ -17,7 +17,8 @@ from imgcal.types import CalibrationObject
 
 FINEST = 4  # px to a cell
 CELLS_A_GAP = 5.0  # cells of the search between neighbouring fiducials, at least
-TURNS = 4608  # of all rotations: 15 degrees apart
+TURNS = 4608  # of all rotations,
+TURN_APART = 0.26  # rad from each other
 KEPT = 200  # poses of each camera's search
 CLIMBING = 8
 SAME = 0.6  # share of the fiducials that two poses must see in the same places to be one
@@ -46,6 +47,8 @@ class MatchedFilter:
         coarse = fine.pooled(max(FINEST, 2 ** int(np.log2(max(gap / CELLS_A_GAP, 1)))))
         close = Matcher.on(scene, fine.dilated(), 4 * scene.drift + PARALLAX / 3)
         found = self._known(close, coarse, snapshot)
+        if found is None and not _searchable(scene.obj):
+            return Proposal.declined(snapshot, "its fiducials are too many and too close to search for it anywhere")
         if found is None:
             found = self._searched(close, coarse)
         margin, rivals = margin_of(found, close)
@@ -64,17 +67,21 @@ class MatchedFilter:
         return _proposal(result, snapshot, margin)
 
     def _known(self, close: Matcher, coarse: Maps, snapshot: Snapshot) -> Ranked | None:
-        """Look around the known poses, or the origin; None = the object is not there."""
-        known = list(snapshot.candidates) or [RigidTransform.identity(dtype=torch.float64)]
+        """Look at the known poses, or the origin, and around them; None = the object is not there for sure."""
         scene, found = close.scene, None
         matcher = Matcher.on(scene, coarse, close.reach)
-        for pose in known:
-            if not bool(scene.rig.expand(1).project_values(pose.apply(scene.obj.points)[None]).visible.any()):
-                continue
-            near = matcher.climb(matcher.rank(around(pose, scene.obj)).best(CLIMBING))
-            near = close.climb(close.rank(near.poses), FINE_CLIMBS)
-            found = near if found is None else found + near
-        return found if found is not None and margin_of(found, close)[0] > CLEAR else None
+        known = [pose for pose in _known_poses(snapshot) if _in_view(pose, snapshot)]
+        for turns_too in (False, True):
+            for pose in known:
+                if turns_too and not _searchable(scene.obj):
+                    continue
+                start = around(pose, scene.obj) if turns_too else pose[None]
+                near = matcher.climb(matcher.rank(start).best(CLIMBING))
+                near = close.climb(close.rank(near.poses), FINE_CLIMBS)
+                found = near if found is None else found + near
+                if margin_of(found, close)[0] > CLEAR:
+                    return found
+        return None if _searchable(scene.obj) else found
 
     def _searched(self, close: Matcher, coarse: Maps) -> Ranked:
         """Look anywhere: from the image of one camera after the other, until a pose stands out."""
@@ -152,13 +159,30 @@ def _gap(obj: CalibrationObject) -> float:
     return float(gaps.min(1).values.median())
 
 
+def _searchable(obj: CalibrationObject) -> bool:
+    """Tell whether turns as far apart as those of the search still show most fiducials near their places."""
+    return TURN_APART / 2 * obj.size < 0.6 * _gap(obj)
+
+
+def _known_poses(snapshot: Snapshot) -> list[RigidTransform]:
+    """Poses worth a look: those given, or the origin, where many captures have the object."""
+    return list(snapshot.candidates) or [RigidTransform.identity(dtype=torch.float64)]
+
+
+def _in_view(pose: RigidTransform, snapshot: Snapshot) -> bool:
+    """Tell whether some camera would see the object there."""
+    points = pose.apply(snapshot.obj.points.to(snapshot.rig.focal_length))
+    return bool(snapshot.rig.expand(1).project_values(points[None]).visible.any())
+
+
 def _distance(snapshot: Snapshot) -> float:
     """How far from the cameras the object is, roughly, mm."""
     rig, obj = snapshot.rig, snapshot.obj
-    if snapshot.candidates:
-        centre = snapshot.candidates[0].apply(obj.points.mean(0, keepdim=True))[0]
-        return float((rig.positions - centre).norm(dim=-1).median())
-    if rig.working_distance is not None:
+    if not snapshot.candidates and rig.working_distance is not None:
         return rig.working_distance
+    for pose in _known_poses(snapshot):
+        if _in_view(pose, snapshot):
+            centre = pose.apply(obj.points.mean(0, keepdim=True))[0]
+            return float((rig.positions - centre).norm(dim=-1).median())
     # As large as a fifth of the image.
     return float((rig.focal_length.mean(-1) * obj.size / (0.2 * rig.image_size[:, 0])).median())

@@ -18,6 +18,10 @@ DOUBTFUL = 0.25
 """Share of what a camera sees of the object that is not where it should be, from which on it is said: partly hidden
 markers and false blobs beside them leave a tenth in good captures."""
 
+LEAST_FOUND, LEAST_SHARE = 4, 0.4
+"""Labels of one camera that fit, and their share of the fiducials in view, from which on the pattern was found: so
+many do not fit a rig and each other by chance, whatever else the frame shows."""
+
 Counts = NDArray[np.int64]
 
 
@@ -30,6 +34,7 @@ class Tally:
     labelled: Counts  # (S, C) blobs with a fiducial
     kept: Counts  # (S, C) labels that fit
     expected: Counts  # (S, C) fiducials in view of the factory camera, given where the rest of the rig sees the object
+    found: NDArray[np.bool_]  # (S, C) the pattern was looked for in the frame itself, and is there
 
     @property
     def outliers(self) -> Counts:
@@ -41,9 +46,10 @@ class Tally:
         """Blobs that may be fiducials in view, and are not where these should be: (S, C).
 
         False blobs beside fiducials that were all found are no witness against a camera, nor are fiducials in view that
-        are hidden: each counts as far as there is something of the other.
+        are hidden: each counts as far as there is something of the other. Where the pattern was found in the frame
+        itself, fiducials are missing because they are hidden: false blobs elsewhere are not what they would be.
         """
-        return np.maximum(np.minimum(self.expected, self.usable) - self.kept, 0)
+        return np.where(self.found, 0, np.maximum(np.minimum(self.expected, self.usable) - self.kept, 0))
 
 
 def tally(
@@ -72,10 +78,12 @@ def tally(
     inside = ((uv > MARGIN * size) & (uv < (1 - MARGIN) * size)).all(-1) & projection.visible.numpy()
     fitting, expected = np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=np.int64)
     fitting[used], expected[used] = kept.sum(-1), inside.sum(-1)
+    looked = np.array([snapshot.found_by != "classical" for snapshot in labelled.snapshots], dtype=bool)
     return Tally(
         blobs=count(np.ones(len(detections), dtype=bool)),
         usable=count(detections.usable),
         labelled=count(detections.fiducial >= 0),
         kept=fitting,
         expected=expected,
+        found=looked[:, None] & (fitting >= np.maximum(LEAST_FOUND, LEAST_SHARE * expected)),
     )

@@ -88,8 +88,10 @@ def test_where_both_see_one_thing_the_better_measured_stays(truth, o10, asymmetr
     proposed = Oracle(truth).propose(snapshot).detections
     sharp, labels = together(replace(proposed, sigma=proposed.sigma / 10), blobs)
     assert len(sharp) == 80 and np.allclose(sharp.sigma, 0.01) and (labels == proposed.fiducial).all()
-    dull, labels = together(replace(proposed, sigma=proposed.sigma * 10), blobs)
+    dull, labels = together(replace(proposed, sigma=proposed.sigma * 5), blobs)
     assert len(dull) == 80 and np.allclose(dull.sigma, 0.1) and (np.sort(labels) == np.sort(proposed.fiducial)).all()
+    doubted, _ = together(replace(proposed, sigma=proposed.sigma * 20), blobs)  # half hidden, says who looked
+    assert len(doubted) == 80 and np.allclose(doubted.sigma, 2.0)
     apart = replace(proposed, uv=proposed.uv + 12, sigma=np.full(80, 30.0))
     assert len(together(apart, blobs)[0]) > 150  # a large sigma hides no blobs that contradict
 

@@ -5,7 +5,7 @@ import pytest
 
 from imgcal.association.options import PipelineOptions
 from imgcal.errors import RefusedError
-from imgcal.pipeline.calibration import calibrate
+from imgcal.pipeline import Tally, calibrate
 from scripts.benchmarks import camera_faults as damage
 
 CAMERA = 3
@@ -81,3 +81,9 @@ def test_a_covered_camera_with_one_reflection_counts_as_blind():
     with pytest.raises(RefusedError, match="found no fiducial in any snapshot"):
         calibrate(table, rig, obj)
     assert calibrate(table, rig, obj, BLIND).tally.kept[:, CAMERA].sum() == 0
+
+
+def test_where_the_pattern_was_found_in_the_frame_false_blobs_are_no_witness():
+    counts = {name: np.full((1, 2), number) for name, number in (("blobs", 30), ("usable", 30), ("labelled", 5))}
+    seen = Tally(**counts, kept=np.full((1, 2), 4), expected=np.full((1, 2), 8), found=np.array([[True, False]]))
+    assert seen.unexplained.tolist() == [[0, 4]]
