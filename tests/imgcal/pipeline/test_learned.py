@@ -8,11 +8,13 @@ import torch
 from torch import Tensor
 
 import imgcal
-from imgcal.association import Snapshot
+from imgcal.association import PipelineOptions, Proposal, Snapshot
+from imgcal.errors import InputError
 from imgcal.geometry import RigidTransform, rotation_from_vector
+from imgcal.io import data_path
 from imgcal.networks import Evidence, Expectation, InfraredNetwork, Measured, Measurer, Queries
-from imgcal.pipeline.learned import LearnedProposer
-from imgcal.synthesis import PhysicalDrift, Truth, simulate_truth
+from imgcal.pipeline.learned import LearnedProposer, load_proposer
+from imgcal.synthesis import DIFFICULTIES, FrameModel, PhysicalDrift, Truth, simulate_frames, simulate_truth
 from imgcal.types import Detections, RigPrior
 
 RIG, OBJ = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
@@ -110,3 +112,44 @@ def test_it_declines_where_nothing_is_seen_and_where_nobody_knows_where_to_look(
     assert len(proposal.detections) == 0
     lost = replace(made.snapshot, candidates=())
     assert "no pose" in proposer(made.place, ~nothing).propose(lost).reason
+
+
+@pytest.fixture(scope="module")
+def dim() -> tuple[Truth, Snapshot]:
+    """A snapshot in low light, of a rig whose pose is believed to be turned by eight degrees."""
+    made, draw = scene(8.0, seed=2), torch.Generator().manual_seed(5)
+    frames = next(iter(simulate_frames(made.truth, OBJ, FrameModel(difficulty=DIFFICULTIES["low-light"]), draw)))
+    return made.truth, replace(made.snapshot, frames=frames)
+
+
+def right_share(proposal: Proposal, truth: Truth) -> float:
+    rows = proposal.detections
+    off = np.linalg.norm(rows.uv - truth.uv[0].numpy()[rows.camera, rows.fiducial], axis=1)
+    return float((off < 8).sum()) / truth.uv[0][..., 0].numel()
+
+
+def test_the_shipped_network_finds_fiducials_and_lives_on_its_encoder(dim: tuple[Truth, Snapshot]) -> None:
+    truth, snapshot = dim
+    whole = load_proposer()
+    found = whole.propose(snapshot)
+    assert right_share(found, truth) > 0.9
+    assert len(found.detections) * 0.95 <= right_share(found, truth) * truth.uv[0][..., 0].numel()
+    encoder = whole.network.encoder
+    handle = encoder.register_forward_hook(lambda module, given, features: features.roll(1, 0))
+    assert right_share(whole.propose(snapshot), truth) < 0.2
+    handle.remove()
+    encoder.register_forward_hook(lambda module, given, features: torch.zeros_like(features))
+    assert right_share(whole.propose(snapshot), truth) < 0.2
+
+
+def test_calibrate_takes_it_by_name_and_by_file(dim: tuple[Truth, Snapshot]) -> None:
+    truth, snapshot = dim
+    options = PipelineOptions(start_pose=snapshot.candidates[0])
+    by_name = imgcal.calibrate(snapshot.frames, RIG, OBJ, options, detector="learned")
+    path = str(data_path("models", "ir-cnn.safetensors"))
+    by_file = imgcal.calibrate(snapshot.frames, RIG, OBJ, options, detector=path)
+    assert torch.equal(by_name.rig.focal_length, by_file.rig.focal_length)
+    uv = by_name.rig.expand(1).project(by_name.rig_from_object.apply(OBJ.points)).uv
+    assert float((uv - truth.uv).square().mean().sqrt()) < 1.0
+    with pytest.raises(InputError, match=r"lerned.*nearest: learned"):
+        imgcal.calibrate(snapshot.frames, RIG, OBJ, options, detector="lerned")
