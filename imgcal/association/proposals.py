@@ -26,7 +26,7 @@ SAME_BLOB = 1.5
 """Pixels within which a blob of the detector and a proposed fiducial are one, beyond three standard deviations."""
 FARTHEST = 6.0  # px: the same at most, so that no proposal hides blobs that contradict it
 DOUBTED = 1.0
-"""Pixels: a proposed sigma as large says that part of the marker may be hidden, which a blob of the rest cannot know."""
+"""Pixels: as large a proposed sigma says that part of the marker may be hidden, which a blob of the rest cannot say."""
 LEAST_AGREEMENT = 0.8
 """Share of the labels that identity gives near the proposed pose which the proposer must have given, too."""
 

@@ -7,6 +7,8 @@ whatever noise, contrast, background and clutter are; the more clutter a frame h
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -69,9 +71,11 @@ def surprise_maps(
     shape = (len(frames), int(max(size[:, 1].max(), 1)), int(max(size[:, 0].max(), 1)))
     surprise = np.zeros(shape, np.float32)
     response = np.zeros((shape[0], len(SIZES), *shape[1:]), np.float32)
-    for camera, (frame, mask) in enumerate(zip(frames, masks, strict=True)):
+
+    def fill(camera: int) -> None:
+        frame, mask = frames[camera], masks[camera]
         if frame is None:
-            continue
+            return
         width, height = size[camera]
         values = _spots(_reduced(frame, factor, dark))
         if mask is not None:
@@ -80,6 +84,9 @@ def surprise_maps(
         ranks = np.stack([rank(value) for value in values]) - np.float32(np.log(len(values)))
         surprise[camera, :height, :width] = np.clip(ranks.max(0), 0, MOST)
         response[camera, :, :height, :width] = values
+
+    with ThreadPoolExecutor(max(1, min(len(frames), os.cpu_count() or 1))) as pool:
+        list(pool.map(fill, range(len(frames))))
     return Maps(surprise, factor, size), response
 
 

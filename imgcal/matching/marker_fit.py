@@ -78,7 +78,7 @@ def _linear(values, shapes, weight, count):
     return (s11 * sv - s1 * s1v) / determinant, (ss * s1v - s1 * sv) / determinant
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def fit_markers(windows, real, corner, scale, close, shape, uv, found):
     """Fit markers (N) in their windows, place by place.
 

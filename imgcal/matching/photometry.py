@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import gaussian_filter
 
 from imgcal.detection import Frame
 from imgcal.matching.marker_fit import RINGS, fit_markers
@@ -28,6 +29,7 @@ class Measured:
     amplitude: NDArray[np.float64]  # (N,) grey levels
     significance: NDArray[np.float64]  # (N,) amplitude over its standard deviation
     radius: float  # px, of the disc as large as the marker's image
+    misfit: NDArray[np.float64]  # (N,) RMS difference from the common shape beyond noise, in parts of the amplitude
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -51,6 +53,7 @@ def measure_markers(
     radius: NDArray[np.float64],
     dark: bool,
     sure: NDArray[np.bool_],
+    passes: int = 3,
 ) -> Measured:
     """Fit the markers of one camera near their expected places.
 
@@ -60,6 +63,7 @@ def measure_markers(
         radius: (N,) px, how large they are: roughly, but for their ratios.
         dark: markers are darker than their surroundings.
         sure: (N,) those from which the common shape is taken.
+        passes: how often shape and places are found, each from the other.
     """
     height, width = frame.shape
     usual = float(np.median(radius))
@@ -68,7 +72,7 @@ def measure_markers(
     inside = np.asarray(((expected > -0.5) & (expected < (width - 0.5, height - 0.5))).all(1))
     uv = np.where(inside[:, None], expected, 0.0)
     shape = None
-    for _ in range(3):
+    for _ in range(passes):
         chosen = sure & inside if (sure & inside).any() else inside
         if not chosen.any():
             return _nothing(len(expected), usual)
@@ -76,26 +80,30 @@ def measure_markers(
         if shape is None:
             return _nothing(len(expected), usual)
         fit = _fitted(frame, uv, inside, shape, scale)
+        # Those that look like most others say better what a whole marker looks like.
+        sure = sure & (fit.misfit <= max(USUAL_MISFIT, float(np.median(fit.misfit[chosen]))))
         uv = np.where((np.linalg.norm(fit.uv - expected, axis=1) < half)[:, None], fit.uv, uv)
     return fit
 
 
 def _nothing(count: int, radius: float) -> Measured:
     none = np.zeros(count)
-    return Measured(np.full((count, 2), np.nan), np.full(count, np.inf), none, none, radius)
+    return Measured(np.full((count, 2), np.nan), np.full(count, np.inf), none, none, radius, none)
 
 
 def _patches(
     frame: Frame, uv: NDArray[np.float64], scale: NDArray[np.float64], half: int, dark: bool
 ) -> NDArray[np.float64]:
     """Cut windows about places (N, 2), resampled so that these are in the middle: (N, 2 half + 1, 2 half + 1)."""
-    v, u = np.mgrid[-half : half + 1, -half : half + 1].astype(float)
-    rows = v[None] * scale[:, None, None] + uv[:, 1, None, None]
-    columns = u[None] * scale[:, None, None] + uv[:, 0, None, None]
+    steps = np.arange(-half, half + 1, dtype=np.float32)
+    rows = steps[None, :, None] * scale[:, None, None] + uv[:, 1, None, None]
+    columns = steps[None, None, :] * scale[:, None, None] + uv[:, 0, None, None]
     top, left = int(max(rows.min() - 1, 0)), int(max(columns.min() - 1, 0))
-    bottom, right = int(rows.max() + 3), int(columns.max() + 3)
-    part = frame[top:bottom, left:right].astype(np.float32)
-    values = map_coordinates(part, [rows - top, columns - left], order=1, mode="nearest")
+    part = frame[top : int(rows.max() + 3), left : int(columns.max() + 3)].astype(np.float32)
+    shape, side = (len(uv), 2 * half + 1, 2 * half + 1), 2 * half + 1
+    maps = [np.broadcast_to(x, shape).reshape(-1, side).astype(np.float32) for x in (columns - left, rows - top)]
+    values = cv2.remap(part, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    values = np.asarray(values, dtype=np.float64).reshape(shape)
     return -values if dark else values
 
 
@@ -167,7 +175,7 @@ def _fitted(
     doubt = HALF_HIDDEN * np.maximum(misfit - USUAL_MISFIT, 0) * reach_of(shape) * scale
     sigma = np.sqrt(place + LEAST_SIGMA**2 + doubt**2)
     significance = np.where(inside & (amplitude > 0), amplitude / np.sqrt(np.maximum(spread, 1e-12)), 0.0)
-    return Measured(uv, sigma, amplitude, significance, reach_of(shape))
+    return Measured(uv, sigma, amplitude, significance, reach_of(shape), misfit)
 
 
 def reach_of(shape: Shape) -> float:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -185,18 +187,19 @@ def _measured(
     cells = np.rint((predicted + 0.5) / factor - 0.5)
     high = np.array(response.shape[-1:-3:-1]) - 1
     cells = np.nan_to_num(cells, nan=-1).clip(0, high).astype(np.int64)
-    found = []
-    for camera, frame in enumerate(frames):
-        radius = per_mm[camera] * (1.0 if given is None else given.numpy())
+
+    def measured(camera: int) -> Measured:
+        frame, radius = frames[camera], per_mm[camera] * (1.0 if given is None else given.numpy())
+        if frame is None:
+            none = np.zeros(len(radius))
+            return Measured(np.full((len(radius), 2), np.nan), none + np.inf, none, none, 1.0, none)
         # As the images show them: blurred, they are larger than they are.
         seen = response[camera][:, cells[camera, :, 1], cells[camera, :, 0]]
         size = max(0.5, 1.6 * SIZES[int(np.median(seen, axis=1).argmax())]) * factor
         if given is None or size > np.median(radius):
             radius = radius * (size / np.median(radius))
-        if frame is None:
-            none = np.zeros(len(radius))
-            found.append(Measured(np.full((len(radius), 2), np.nan), none + np.inf, none, none, 1.0))
-            continue
         sure = np.ones(len(radius), dtype=bool)
-        found.append(measure_markers(frame, predicted[camera], radius, dark, sure))
-    return found
+        return measure_markers(frame, predicted[camera], radius, dark, sure)
+
+    with ThreadPoolExecutor(max(1, min(len(frames), os.cpu_count() or 1))) as pool:
+        return list(pool.map(measured, range(len(frames))))
