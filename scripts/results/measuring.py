@@ -6,10 +6,13 @@ import hashlib
 import json
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic
 from typing import Any
+
+from safetensors import SafetensorError, safe_open
 
 from imgcal.errors import InputError
 from imgcal.evaluation import (
@@ -210,6 +213,10 @@ def _name_of_start(path: Path) -> str:
 
 def _experiment_and_seed(path: Path) -> tuple[str, int] | None:
     """Of a checkpoint; None where it was trained for another task than rigs."""
+    with suppress(OSError, SafetensorError), safe_open(path, framework="pt") as file:
+        kind = (file.metadata() or {}).get("format", "")
+        if kind.startswith("imgcal-") and kind != FORMAT:
+            return None
     try:
         experiment = json.loads(read_texts(path, FORMAT)["experiment"])
         if experiment.get("task", "rig") != "rig":

@@ -258,3 +258,17 @@ def test_scripts_say_what_is_wrong_in_one_line(tmp_path, capsys, monkeypatch):
     (tmp_path / "broken.json").write_text("{")
     with pytest.raises(InputError, match="no readable JSON"):
         output.read_json(tmp_path / "broken.json")
+
+
+def test_networks_for_other_tasks_are_left_out(trained, tmp_path):
+    from imgcal.io import data_path
+
+    trained("table1-row08", SMALL, LEVEL)
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models" / "ir-cnn.safetensors").write_bytes(data_path("models", "ir-cnn.safetensors").read_bytes())
+    (tmp_path / "models" / "broken.safetensors").write_text("nothing")
+    measuring = script("measuring")
+    with pytest.raises(InputError, match=r"broken.safetensors"):
+        measuring.find(tmp_path / "runs", tmp_path / "models")
+    (tmp_path / "models" / "broken.safetensors").unlink()
+    assert [source.experiment for source in measuring.find(tmp_path / "runs", tmp_path / "models")] == ["table1-row08"]
