@@ -148,9 +148,9 @@ def sized(row: str, options: Options, seed: int) -> RigExperiment:
             changes += [*FULL["images" if images else "points"], *EVERY]
             steps = options.steps or experiment.training.steps or 1
         case "reduced":
-            steps = options.steps or (400 if images else 1000)
+            steps = options.steps or (400 if images else 500)
             changes += [*SHORT, *REDUCED[kind], f"training.batch_size={8 if images else 64}"]
-            changes += ["training.save_every=200", "training.validate_every=300"]
+            changes += ["training.save_every=250", "training.validate_every=250"]
         case "toy":
             steps = options.steps or 4
             changes += [*SHORT, *TOY[kind], "training.batch_size=4", "training.validation_rigs=4", "optimizer.lr=1e-3"]
