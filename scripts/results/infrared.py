@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.matching import MatchedFilter
 from imgcal.networks import InfraredNetwork, Measurer, Queries, load_infrared, load_measurer
 from imgcal.pipeline.learned import LearnedProposer
-from imgcal.synthesis import DIFFICULTIES, FrameModel, PhysicalDrift, simulate_shots, simulate_truth
+from imgcal.synthesis import DIFFICULTIES, Difficulty, FrameModel, PhysicalDrift, simulate_shots, simulate_truth
 from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
 from scripts.output import RESULTS, ROOT, command, markdown, read_json, replaced, surroundings, write_json
 
@@ -36,6 +36,12 @@ VISIBLE = 0.25  # share of a marker that must be seen for it to count
 ASIDE = 8.0  # mm, one standard deviation of each coordinate of the believed pose
 NEARLY = 1.0  # degrees that the believed pose is turned, if nothing else is said
 LOST = (45.0, 120.0)  # the same where it is no help at all
+HARDER = {  # than any named level
+    "low light, peak SNR 0.5 to 0.7": replace(DIFFICULTIES["low-light"], peak_snr=(0.5, 0.7)),
+    "low light, peak SNR 0.3 to 0.4": replace(DIFFICULTIES["low-light"], peak_snr=(0.3, 0.4)),
+    "combined, peak SNR 0.8 to 1.2": replace(DIFFICULTIES["combined"], peak_snr=(0.8, 1.2)),
+    "clutter, 60 % hidden": replace(DIFFICULTIES["clutter"], hidden=0.6),
+}
 OTHERS = (("T4", "cube8"), ("U7", "cube27"), ("O6", "asymmetric8"))  # rigs and objects
 OTHER_LEVELS = ("clean", "combined")
 
@@ -128,12 +134,12 @@ class Blobs:
         return replace(snapshot.blobs, fiducial=labels).select(labels >= 0)
 
 
-def cases(rig: CameraRig, obj: CalibrationObject, level: str, count: int) -> Iterator[Case]:
+def cases(rig: CameraRig, obj: CalibrationObject, difficulty: Difficulty, count: int) -> Iterator[Case]:
     """Make snapshots of rigs that have drifted, each of its own."""
     draw = torch.Generator().manual_seed(20_260)
     for _ in range(count):
         truth = simulate_truth(rig, obj, 1, draw, PhysicalDrift())
-        shot = next(iter(simulate_shots(truth, obj, FrameModel(difficulty=DIFFICULTIES[level]), draw)))
+        shot = next(iter(simulate_shots(truth, obj, FrameModel(difficulty=difficulty), draw)))
         blobs = matched_to_rig(
             to_detections([detect_snapshot(shot.frames, imgcal.DetectionOptions())], rig.camera_names, ("0",)), rig
         )
@@ -167,9 +173,9 @@ def measure(methods: dict[str, Method], judged: Mapping[str, Proposer], count: i
     levels: dict[str, Any] = {}
     lost = {name: {"accepted": 0, "wrong labels": 0, "refused": 0} for name in judged}
     obj, rig = imgcal.load_object("asymmetric8"), imgcal.load_rig("O10")
-    for level in DIFFICULTIES:
+    for level, difficulty in DIFFICULTIES.items():
         tallies = {(name, degrees): Tally() for name in methods for degrees in (NEARLY, turned)}
-        for number, case in enumerate(cases(rig, obj, level, count)):
+        for number, case in enumerate(cases(rig, obj, difficulty, count)):
             for (name, degrees), tally in tallies.items():
                 if "encoder" not in name or degrees == NEARLY:
                     ask(methods[name], case, degrees, number, tally)
@@ -182,11 +188,25 @@ def measure(methods: dict[str, Method], judged: Mapping[str, Proposer], count: i
         for level in OTHER_LEVELS:
             tallies = {(name, NEARLY): Tally() for name in methods if "encoder" not in name}
             other = imgcal.load_rig(rig_name), imgcal.load_object(object_name)
-            for number, case in enumerate(cases(*other, level, max(count // 3, 1))):
+            for number, case in enumerate(cases(*other, DIFFICULTIES[level], max(count // 3, 1))):
                 for (name, degrees), tally in tallies.items():
                     ask(methods[name], case, degrees, number, tally)
             others[f"{rig_name}, {object_name}, {level}"] = _by_name(tallies)
     return {"snapshots": count, "turned_deg": turned, "levels": levels, "others": others, "lost": lost}
+
+
+def measure_harder(methods: dict[str, Method], count: int, turned: float) -> dict[str, Any]:
+    """Ask where the named levels are too easy to tell methods apart."""
+    rig, obj = imgcal.load_rig("O10"), imgcal.load_object("asymmetric8")
+    made: dict[str, Any] = {}
+    for level, difficulty in HARDER.items():
+        tallies = {(name, d): Tally() for name in methods if "encoder" not in name for d in (NEARLY, turned)}
+        for number, case in enumerate(cases(rig, obj, difficulty, count)):
+            for (name, degrees), tally in tallies.items():
+                ask(methods[name], case, degrees, number, tally)
+        made[level] = _by_name(tallies)
+        print(level, {name: round(said["1"]["right_percent"], 1) for name, said in made[level].items()}, flush=True)
+    return {"snapshots_harder": count, "harder": made}
 
 
 def count_lost(proposer: Proposer, case: Case, number: int, counted: dict[str, int]) -> None:
@@ -237,6 +257,8 @@ def tables(result: dict[str, Any]) -> dict[str, str]:
         ]
         return markdown(["RMS px of the right ones / NEES", *levels], rows)
 
+    harder = result["harder"]
+    beyond = next(iter(harder.values()))
     others = result["others"]
     names = list(next(iter(others.values())))
     rows = [[name, *(cell(said[name]["1"]) for said in others.values())] for name in names]
@@ -245,6 +267,10 @@ def tables(result: dict[str, Any]) -> dict[str, str]:
         "infrared turned": f"{result['turned_deg']:g} degrees:\n\n" + by_level(f"{result['turned_deg']:g}"),
         "infrared accuracy": accuracy(),
         "infrared others": markdown(["right % / wrong %", *others], rows),
+        "infrared harder": markdown(
+            ["right % / wrong %", *(f"{name}, {d} degrees off" for name in beyond for d in beyond[name])],
+            [[level, *(cell(row) for said in by.values() for row in said.values())] for level, by in harder.items()],
+        ),
         "infrared lost": markdown(
             ["snapshots", "refused", "accepted", "labels more than 20 px off in these"],
             [
@@ -260,7 +286,7 @@ def main(
     measurer: Path | None = None,
     count: int = 6,
     turned: float = 12.0,
-    tables_only: bool = False,
+    part: Literal["all", "harder", "tables"] = "all",
 ) -> None:
     """Measure, write the JSON, and rewrite the tables.
 
@@ -269,15 +295,18 @@ def main(
         measurer: file of a measurer; markers are fitted without one.
         count: snapshots a level.
         turned: degrees that the believed pose is off the second time.
-        tables_only: from the JSON that is there.
+        part: what to do; the rest stays as the JSON has it.
     """
-    if not tables_only:
+    if part != "tables":
         torch.set_num_threads(1)
         paths = {name: Path(path) for name, _, path in (model.partition("=") for model in models)}
         reader = None if measurer is None else load_measurer(measurer).network
-        proposers = {name: LearnedProposer(load_infrared(path).network, reader) for name, path in paths.items()}
-        found = measure(methods_of(paths, reader), proposers, count, turned)
-        write_json(JSON, {**surroundings(), **found})
+        methods = methods_of(paths, reader)
+        found = read_json(JSON) if part == "harder" else {}
+        if part == "all":
+            proposers = {name: LearnedProposer(load_infrared(path).network, reader) for name, path in paths.items()}
+            found = measure(methods, proposers, count, turned)
+        write_json(JSON, {**found, **surroundings(), **measure_harder(methods, count, turned)})
     page = PAGE.read_text()
     PAGE.write_text(replaced(page, tables(read_json(JSON)), PAGE))
 

@@ -51,9 +51,10 @@ def test_tables_show_every_method_where_it_was_asked() -> None:
     levels = {"clean": {"blobs": {"1": said, "12": said}, "net, encoder zeroed": {"1": said}}}
     lost = {"net": {"accepted": 1, "refused": 2, "wrong labels": 0}}
     others = {"T4, cube8, clean": {"blobs": {"1": said}}}
-    made = tables({"levels": levels, "others": others, "lost": lost, "turned_deg": 12.0})
+    made = tables({"levels": levels, "others": others, "lost": lost, "turned_deg": 12.0, "harder": levels})
     assert "net, encoder zeroed | 90.0 / 1.0" in made["infrared levels"]
     assert "zeroed" not in made["infrared turned"]
+    assert "blobs, 12 degrees off" in made["infrared harder"]
     assert "| net | 2 | 1 | 0 |" in made["infrared lost"]
     assert "0.20 / 1.10" in made["infrared accuracy"]
     assert "T4, cube8, clean" in made["infrared others"]
