@@ -60,10 +60,13 @@ class MatchedFilter:
         if result is None:
             return Proposal.declined(snapshot, "no pose of the object stands out in the images", margin)
         if margin < CLEAR:
-            # With rig and pose fitted, places are compared to a cell, for the best and for its rivals.
-            fits = [fit(rivals.select(np.array([k]))) for k in range(min(MOST_RIVALS, len(rivals.scores.total)))]
-            against = [0.0, *rivals.scores.total, *(f.log_odds(scene, fine) for f in fits if f is not None)]
-            margin = max(margin, result.log_odds(scene, fine) - max(against))
+            # With rig and pose fitted, places are compared to a cell: chance agreements gain nothing from that.
+            against = rivals.scores.total.tolist()
+            for k in range(min(MOST_RIVALS, len(against))):
+                rival = fit(rivals.select(np.array([k])))
+                if rival is not None and differs(rival.predicted[None], result.predicted, scene.obj)[0]:
+                    against[k] = max(against[k], rival.log_odds(scene, fine))
+            margin = max(margin, result.log_odds(scene, fine) - max([0.0, *against]))
         return _proposal(result, snapshot, margin)
 
     def _known(self, close: Matcher, coarse: Maps, snapshot: Snapshot) -> Ranked | None:
@@ -121,16 +124,20 @@ def margin_of(found: Ranked, matcher: Matcher) -> tuple[float, Ranked]:
 
 def distinct(found: Ranked, best: Ranked, scene: Scene) -> NDArray[np.bool_]:
     """Tell which poses (K,) see other fiducials than the best one does in the same places, but for symmetric turns."""
-    there, here = _places(found, scene), _places(best, scene)[0]  # (K, C, N, 2), (C, N, 2)
+    sure = best.scores.log_odds[0] > SURE_CAMERA
+    return differs(_places(found, scene)[:, sure], _places(best, scene)[0, sure], scene.obj)
+
+
+def differs(there: NDArray[np.float64], here: NDArray[np.float64], obj: CalibrationObject) -> NDArray[np.bool_]:
+    """Tell which of K sets of places (K, C, N, 2) have other fiducials where those of one (C, N, 2) are: (K,)."""
     gaps = np.linalg.norm(here[:, :, None] - here[:, None], axis=-1)
     gaps[:, np.arange(here.shape[1]), np.arange(here.shape[1])] = np.inf
     gap = gaps.min(-1)
-    sure = best.scores.log_odds[0] > SURE_CAMERA
     same = np.zeros(len(there))
-    for motion in scene.obj.symmetries:
+    for motion in obj.symmetries if len(here) else []:
         turned = motion.permutation
         one = np.linalg.norm(there - here[:, turned], axis=-1) < 0.5 * gap[:, turned]
-        same = np.maximum(same, one[:, sure].mean((1, 2)) if sure.any() else 0.0)
+        same = np.maximum(same, one.mean((1, 2)))
     return same < SAME
 
 

@@ -15,7 +15,7 @@ from imgcal.matching.marker_fit import RINGS, fit_markers
 LEAST_SIGMA = 0.02  # px: what no fit is better than
 LEAST_SIGNIFICANCE = 5.0  # amplitude over its standard deviation
 FAINT = 0.25  # of the peak: where the shape is measured from
-USUAL_MISFIT = 0.1  # RMS of the amplitude: what markers differ by in their shapes
+USUAL_MISFIT = 0.1  # RMS of the amplitude: what whole markers differ by in their shapes, at least
 HALF_HIDDEN = 0.7  # of the radius: how far the centre may be off per misfit
 LARGEST = 40  # px, half of a window
 
@@ -172,7 +172,8 @@ def _fitted(
     amplitude, spread, place, middle, noise = found.T
     # Where the middle of a marker does not look like the common shape, part of it may be hidden.
     misfit = np.sqrt(np.maximum(middle - 1.5 * noise, 0)) / np.maximum(amplitude, 1e-9)
-    doubt = HALF_HIDDEN * np.maximum(misfit - USUAL_MISFIT, 0) * reach_of(shape) * scale
+    usual = max(USUAL_MISFIT, 2 * float(np.quantile(misfit[inside], 0.25))) if inside.any() else USUAL_MISFIT
+    doubt = HALF_HIDDEN * np.maximum(misfit - usual, 0) * reach_of(shape) * scale
     sigma = np.sqrt(place + LEAST_SIGMA**2 + doubt**2)
     significance = np.where(inside & (amplitude > 0), amplitude / np.sqrt(np.maximum(spread, 1e-12)), 0.0)
     return Measured(uv, sigma, amplitude, significance, reach_of(shape), misfit)
