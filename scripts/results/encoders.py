@@ -50,6 +50,7 @@ MARKER = "encoders"
 SUCCESS = 1.0  # px of RE below which a refined rig counts as found
 NEAR = 3.0  # px of the sensor below which a position counts as right
 BATCH = 10  # rigs at once
+RENDERED = 20  # rigs of a level for which rendering and comparing is tried: it is slow where it fails
 SIGMAS = (0.1, 0.5, 2.0)  # px: methods that predict no sigma get the one that suits a level best,
 # and the better of two robust refinements: graduated non-convexity, and Cauchy's loss.
 
@@ -144,7 +145,8 @@ def of_network(network: ImageNetwork, shown: Shown, model: Checkpoint) -> dict[s
     result["last_pass_px"] = median(last, shown, model)
     found = refined_by_sightings(last, sightings, model.rig, model.obj, model.drift_std)
     result |= refined("points", found, shown, model)
-    result |= refined("images", by_images(last, shown, model), shown, model)
+    few = slice(0, RENDERED)
+    result |= refined("images", by_images(last[few], shown[few], model), shown[few], model)
     cameras = model.rig.num_cameras  # rolled by so many images, each rig has the map of another one
     handle = network.encoder.register_forward_hook(lambda module, inputs, output: output.roll(cameras, 0))
     spoilt, _ = looked(network, shown)
@@ -165,7 +167,9 @@ def of_hue(network: HueCentroidNetwork, shown: Shown, model: Checkpoint) -> dict
                 rigs = refine(guess, sightings.views, model.rig, model.obj, model.drift_std, sigma=sigma)
                 found = refined(name, rigs, shown, model)
                 best[name] = max(best.get(name, found), found, key=lambda one: one[f"{name}_success"])
-    return result | best["points"] | best["pnp"] | refined("images", by_images(passes[-1], shown, model), shown, model)
+    few = slice(0, RENDERED)
+    images = refined("images", by_images(passes[-1][few], shown[few], model), shown[few], model)
+    return result | best["points"] | best["pnp"] | images
 
 
 def looked(network: ImageNetwork | HueCentroidNetwork, shown: Shown) -> tuple[list[Prediction], Sightings]:

@@ -11,9 +11,11 @@ from imgcal.evaluation.methods import (
     map_from_pnp,
     network_method,
     pnp,
+    refined_by_sightings,
     steps_from_factory,
 )
 from imgcal.evaluation.metrics import errors
+from imgcal.networks import Sightings
 from imgcal.synthesis.colour_coding import ImageOptions
 from imgcal.types.prediction import Prediction
 from tests.imgcal.evaluation.conftest import Fake, disturbed
@@ -136,3 +138,33 @@ def test_images_are_refined_by_render_and_compare(sample):
     guess = disturbed(some.truth, some.given().prior_std, 0.05)
     assert (re(method.refine(guess, some.given()), some) < 0.2).all()
     assert (re(guess, some) > 0.2).all()
+
+
+def test_sightings_are_refined_with_their_own_sigma(sample):
+    """A wrong position counts little where a network says that it is unsure, and is outvoted where it says nothing."""
+    some = sample(4)
+    given = some.given()
+    uv, sigma = given.uv.clone(), torch.full_like(given.uv[..., 0], 0.05)
+    uv[:, 1, 3] += 40.0  # a stray
+    uv[:, 2, 5] += 3.0
+    sigma[:, 2, 5] = 5.0
+    sightings = Sightings(uv, sigma, given.seen.double())
+    start = disturbed(some.truth, given.prior_std)
+    found = refined_by_sightings(start, sightings, given.factory, given.obj, given.prior_std)
+    assert (re(found, some) < 0.1).all()
+
+
+def test_where_images_confirm_no_rig_positions_of_the_network_decide(sample, monkeypatch):
+    some = sample(3)
+    given = some.given()
+
+    class Sees(Fake):
+        image_options = ImageOptions(size=32, dot=1.0)
+
+        def sight(self, images):
+            return Sightings(given.uv[: len(images)], torch.full_like(given.uv[..., 0], 0.05), given.seen.double())
+
+    monkeypatch.setattr("imgcal.evaluation.methods.ImageNetwork", Sees)
+    given.drawn[ImageOptions(size=32, dot=1.0)] = torch.zeros(3, 4, 3, 32, 32)  # nothing to be seen
+    refined = network_method(Sees(some.conditions)).refine(disturbed(some.truth, given.prior_std), given)
+    assert (re(refined, some) < 0.05).all()
