@@ -3,7 +3,8 @@
 Usage: python -m scripts.results.encoders out/runs/shipped-vit-cube8-seed{0,1,2} out/runs/shipped-cnn-cube8-seed{0,1,2}
 
 Every method sees the same images of the same rigs, at each of `imgcal.synthesis.LEVELS`. Runs of one preset are seeds
-of one family. Writes docs/results/encoders.json, and the table between the markers `encoders` of docs/results.md.
+of one family. Runs are added to what docs/results/encoders.json says of others on the same rigs; the table goes between
+the markers `encoders` of docs/results.md.
 """
 
 from __future__ import annotations
@@ -101,19 +102,28 @@ def measured(options: Options) -> dict[str, Any]:
     models = {str(run): load_checkpoint(file) for run, file in zip(options.runs, files, strict=True)}
     first = next(iter(models.values()))
     hue = hue_network(first)
-    result: dict[str, Any] = surroundings() | {"rigs": options.rigs, "models": {}, "levels": []}
+    subject = {"rigs": options.rigs, "seed": options.seed, "rig": first.rig.name, "object": first.obj.name}
+    before = _before(options.out / "encoders.json", subject)
+    levels: list[dict[str, Any]] = before.get("levels", [{} for _ in LEVELS])
+    result: dict[str, Any] = surroundings() | subject | {"models": before.get("models", {}), "levels": levels}
     for run, one in models.items():
         result["models"][Path(run).name] = facts(one)
     for number in range(len(LEVELS)):
-        shown = draw(first, number, options.rigs, options.seed)
-        level: dict[str, Any] = {"hue-centroids": of_hue(hue, shown, first)}
+        shown, level = draw(first, number, options.rigs, options.seed), levels[number]
+        if "hue-centroids" not in level:
+            level["hue-centroids"] = of_hue(hue, shown, first)
         for run, one in models.items():
             assert isinstance(one.network, ImageNetwork)
             level[Path(run).name] = of_network(one.network, shown, one)
             print(f"level {number}, {Path(run).name}: {level[Path(run).name]}", flush=True)
         print(f"level {number}, hue: {level['hue-centroids']}", flush=True)
-        result["levels"].append(level)
     return result
+
+
+def _before(path: Path, subject: dict[str, Any]) -> dict[str, Any]:
+    """What was measured before on the same rigs, which other runs are added to."""
+    found = read_json(path) if path.is_file() else {}
+    return found if subject.items() <= found.items() else {}
 
 
 def hue_network(like: Checkpoint) -> HueCentroidNetwork:
