@@ -13,6 +13,7 @@ from typing import Annotated, Literal
 import torch
 from pydantic import Field
 from torch import Tensor, nn
+from torch.nn import functional
 
 from imgcal.io import StrictModel
 from imgcal.networks.infrared_encoders import STRIDE, CnnEncoder, VitEncoder
@@ -63,7 +64,7 @@ class Measurer(nn.Module):
             nn.GELU(), nn.Conv2d(channels, channels, 3, padding=1), nn.GELU(), nn.Conv2d(channels, 4, 1)
         )
         self.verdict = nn.Sequential(
-            nn.Linear(channels + 1, channels), nn.GELU(), nn.Linear(channels, 1 + len(BlobKind))
+            nn.Linear(2 * channels + 1, 2 * channels), nn.GELU(), nn.Linear(2 * channels, 1 + len(BlobKind))
         )
 
     def forward(self, patches: Tensor, radius: Tensor) -> Measured:
@@ -84,7 +85,9 @@ class Measurer(nn.Module):
         # Cells that disagree are the first sign that a centre is not well known.
         spread = ((votes - offset[..., None]).square().mean(1) * weight).sum(-1, keepdim=True).clamp(min=1e-4).log()
         attended = (features.float().flatten(2) * weight[:, None]).sum(-1)
-        verdict = self.verdict(torch.cat((attended, spread), -1)).float()
+        # What a blob shows is to be seen around its centre, too.
+        around = functional.gelu(features.float()).mean((2, 3))
+        verdict = self.verdict(torch.cat((attended, around, spread), -1)).float()
         return Measured(offset, verdict[:, 0].clamp(-5, 3), verdict[:, 1:])
 
     def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:

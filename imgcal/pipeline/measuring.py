@@ -11,13 +11,16 @@ import torch
 from numpy.typing import NDArray
 
 from imgcal.detection import Blobs, DetectionOptions, Frame
+from imgcal.io import model_file
 from imgcal.networks import Measurer, cut_patches, load_measurer, normalized
-from imgcal.types import BlobFlag, BlobKind, Detections
+from imgcal.types import UNUSABLE, BlobFlag, BlobKind, Detections
 
 REDUCED = 3.5  # patch pixels that radii are reduced to, as `cut_patches` does
 LEAST_SIGMA = 0.02  # patch pixels: what the network cannot know better
-FARTHEST = 1.0  # radii that a centre may be moved by
-SURE = 0.8  # probability of a kind that is acted upon
+FARTHEST = 1.5  # radii that a centre may be moved by
+LIKELY, SURE = 0.5, 0.8  # probability of a kind: to learn a size from whole ones, and to flag others
+SMALLEST = 0.5  # share of the markers' radius that a part of a marker may measure
+SEVERAL = 4  # whole markers that tell how large a camera sees them
 
 
 Columns = TypeVar("Columns", Blobs, Detections)
@@ -30,6 +33,7 @@ class Remeasured:
     uv: NDArray[np.float64]  # (K, 2) pixels
     sigma: NDArray[np.float64]  # (K,) pixels
     kind: NDArray[np.float64]  # (K, 4) probabilities of BlobKind
+    radius: NDArray[np.float64]  # (K,) pixels, that the markers were expected to have
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,7 @@ class LearnedMeasurer:
         Raises:
             InputError: no such file, or something else in it.
         """
-        return cls(load_measurer(path).network, path)
+        return cls(load_measurer(model_file(path)).network, path)
 
     def __call__(self, frames: Mapping[str, Frame | None], blobs: Columns, options: DetectionOptions) -> Columns:
         """Measure the blobs of one snapshot again.
@@ -63,13 +67,11 @@ class LearnedMeasurer:
         if not len(blobs.uv):
             return blobs
         said = self.measured(frames, blobs, options)
-        sure = said.kind.max(1) > SURE
-        kind = said.kind.argmax(1)
         moved = np.linalg.norm(said.uv - blobs.uv, axis=1)
-        taken = (kind == BlobKind.PARTIAL) & sure & (moved < FARTHEST * _radii(blobs))
+        taken = (said.kind.argmax(1) == BlobKind.PARTIAL) & (moved < FARTHEST * said.radius)
         flags = blobs.flags.copy()
-        flags[sure & (kind == BlobKind.MERGED)] |= np.uint8(BlobFlag.MERGED)
-        flags[sure & (kind == BlobKind.FALSE)] |= np.uint8(BlobFlag.REFLECTION)
+        flags[said.kind[:, BlobKind.MERGED] > SURE] |= np.uint8(BlobFlag.MERGED)
+        flags[said.kind[:, BlobKind.FALSE] > SURE] |= np.uint8(BlobFlag.REFLECTION)
         uv = np.where(taken[:, None], said.uv, blobs.uv)
         sigma = np.where(taken, said.sigma, blobs.sigma)
         return replace(blobs, uv=uv, sigma=sigma, flags=flags)
@@ -96,8 +98,23 @@ class LearnedMeasurer:
     def measured(
         self, frames: Mapping[str, Frame | None], blobs: Blobs | Detections, options: DetectionOptions
     ) -> Remeasured:
-        """Ask the network about blobs; see `__call__`."""
-        radius, names = _radii(blobs), list(frames)
+        """Ask the network about blobs, twice: parts of markers are as large as the whole ones; see `__call__`."""
+        radius = np.nan_to_num(blobs.radius, nan=REDUCED).clip(1.0)
+        first = self._asked(frames, blobs, radius, options)
+        whole = (first.kind[:, BlobKind.WHOLE] > LIKELY) & ((blobs.flags & int(UNUSABLE)) == 0)
+        usual = _usual(radius, whole, blobs.camera)
+        larger = (radius > SMALLEST * usual) & (radius < usual) & ~whole
+        return self._asked(frames, blobs, np.where(larger, usual, radius), options) if larger.any() else first
+
+    def _asked(
+        self,
+        frames: Mapping[str, Frame | None],
+        blobs: Blobs | Detections,
+        radius: NDArray[np.float64],
+        options: DetectionOptions,
+    ) -> Remeasured:
+        """Ask the network about blobs whose markers have these radii (K,)."""
+        names = list(frames)
         scale = np.clip(np.round(radius / REDUCED), 1, 64).astype(np.int64)
         # Blobs of one camera and one scale are cut out together: each row of `cut_patches` is such a group.
         groups, group = np.unique(np.stack([blobs.camera, scale], axis=1), axis=0, return_inverse=True)
@@ -116,11 +133,17 @@ class LearnedMeasurer:
         corner, by = placement.corner[rows, columns], placement.scale[rows, columns]
         sigma = (said.log_sigma.double().exp().square() + LEAST_SIGMA**2).sqrt() * by
         uv = corner + by[:, None] * (said.offset.double() + placement.size / 2)
-        return Remeasured(uv.numpy(), sigma.numpy(), said.kind.softmax(-1).double().numpy())
+        return Remeasured(uv.numpy(), sigma.numpy(), said.kind.softmax(-1).double().numpy(), radius)
 
 
-def _radii(blobs: Blobs | Detections) -> NDArray[np.float64]:
-    return np.nan_to_num(blobs.radius, nan=REDUCED).clip(1.0)
+def _usual(radius: NDArray[np.float64], whole: NDArray[np.bool_], camera: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Radius (K,) that whole markers have in each blob's camera, or in all together where it shows few; nan = none."""
+    usual = np.full(len(radius), np.median(radius[whole]) if whole.any() else np.nan)
+    for one in np.unique(camera[whole]):
+        here = whole & (camera == one)
+        if here.sum() >= SEVERAL:
+            usual[camera == one] = np.median(radius[here])
+    return usual
 
 
 def _places(group: NDArray[np.int64]) -> NDArray[np.int64]:

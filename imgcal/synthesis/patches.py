@@ -20,7 +20,7 @@ SIZE = 24  # pixels, each way
 CHUNK = 64  # patches of one size, one lens blur and one kind of trouble
 RADIUS, USUAL = (1.0, 2.6, 5.0), 0.75  # patch pixels; share of the patches beyond the middle one
 BLUR = (0.15, 0.9)  # patch pixels, of the lens
-MERGED, FALSE, COMPANY, CUT, UNEVEN, SMEARED = 0.15, 0.15, 0.2, 0.35, 0.3, 0.4  # shares of the chunks
+MERGED, FALSE, COMPANY, CUT, UNEVEN, SMEARED = 0.12, 0.12, 0.2, 0.5, 0.3, 0.25  # shares of the chunks
 LEAST_CUT, MOST_CUT = 0.1, 0.75  # shares of the diameter: what counts as partial, and what is still to be measured
 PATH, DEFOCUS = 3.0, 1.2  # marker radii, most
 FACTORS = (0.25, 2.5)  # size of what is no marker, beside the expected size
@@ -76,7 +76,7 @@ def expose_patches(patches: Patches, generator: torch.Generator) -> tuple[Tensor
     grey = light + _ground(count, draw)
     full = torch.where(draw.unit(count) < 0.15, draw.between(0.4, 1.0, count), torch.inf)
     grey = grey.minimum(full[:, None, None])
-    noise = draw.between(math.log(0.004), math.log(0.5), count).exp()[:, None, None]
+    noise = draw.between(math.log(0.004), math.log(0.3), count).exp()[:, None, None]
     shot = draw.often(0.5, 1.0, count)[:, None, None] * grey.clamp(min=0)
     grey = grey + noise * (1 + shot).sqrt() * draw.normal(*grey.shape)
     # Who asks knows the radius from the rig, or only from the other blobs of the frame.

@@ -1,12 +1,15 @@
 import signal
 import subprocess
 import sys
+from typing import get_args
 
 import numpy as np
 import pytest
 
 from imgcal.cli.main import main
+from imgcal.cli.simulate import Level
 from imgcal.io import load_detections, load_rig, read_frame
+from imgcal.synthesis import DIFFICULTIES
 
 
 def simulate(out, *more):
@@ -88,6 +91,7 @@ KILLED = """
 import os, signal, sys
 from imgcal.cli import simulate
 from imgcal.cli.main import main
+from imgcal.cli.simulate import Level
 
 written = []
 
@@ -124,3 +128,14 @@ def test_an_interrupted_simulation_leaves_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr("imgcal.cli.simulate.write_frame", interrupted)
     assert simulate(tmp_path / "a") == 130
     assert not (tmp_path / "a").exists()
+
+
+def test_a_named_difficulty(tmp_path):
+    """The levels of the command are those of the library; what is hidden is written beside the truth."""
+    assert get_args(Level) == tuple(DIFFICULTIES)
+    assert simulate(tmp_path / "a", "--difficulty", "clutter") == 0
+    lines = (tmp_path / "a" / "truth" / "seen.csv").read_text().splitlines()
+    assert lines[0] == "snapshot,camera,fiducial,seen"
+    assert len(lines) == 1 + 4 * 8
+    shares = [float(line.rpartition(",")[2]) for line in lines[1:]]
+    assert 0 <= min(shares) < 0.1 and max(shares) > 0.9

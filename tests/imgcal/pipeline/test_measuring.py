@@ -114,3 +114,37 @@ def test_calibration_takes_it(scene):
     rig, obj = load_rig("T4"), load_object("asymmetric8")
     with pytest.raises(InputError, match="measurer measurer: found blobs without frames"):
         calibrate(found, rig, obj, measurer=LearnedMeasurer(network))
+
+
+def half_hidden(count: int):
+    """A frame of markers of which a quarter to a half is hidden, and their true centres."""
+    generator = torch.Generator().manual_seed(3)
+    steps = 40.0 * torch.arange(1, count + 1)
+    uv = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), dim=-1).reshape(1, -1, 2)
+    uv = uv + torch.rand(uv.shape, generator=generator)
+    one, angle = torch.ones(1, count**2), 2 * torch.pi * torch.rand(1, count**2, generator=generator)
+    kept = 10 * (0.6 * torch.rand(1, count**2, generator=generator) - 0.1)
+    cuts = torch.stack([angle.cos(), angle.sin(), kept], dim=-1)[..., None, :]
+    cuts[:, ::2, :, 2] = torch.inf  # every other one is whole
+    spots = Spots(uv, 100.0 * torch.eye(2).expand(*uv.shape, 2), one, one > 0, one, Surface(cuts))
+    side = 40 * (count + 1)
+    return infrared_frames(spots, (side, side), SensorModel(), generator=generator).frames[0].numpy(), uv[0].numpy()
+
+
+def test_the_shipped_one_halves_the_error_and_lives_on_its_encoder():
+    frame, truth = half_hidden(9)
+    blobs = detect_frame(frame, DetectionOptions())
+
+    def error(uv: np.ndarray) -> float:
+        away = np.linalg.norm(uv[:, None] - truth, axis=-1).min(1)
+        return float(np.sqrt((away**2).mean()))
+
+    measurer = LearnedMeasurer.load("measurer-cnn")
+    again = measurer({"a": frame}, blobs, DetectionOptions())
+    assert error(again.uv) < 0.5 * error(blobs.uv)
+    moved = np.linalg.norm(again.uv - blobs.uv, axis=1) > 0
+    assert 0.3 < moved.mean() < 0.7  # whole ones keep their ellipse
+    turn = torch.Generator().manual_seed(0)
+    measurer.network.encoder.register_forward_hook(lambda _, __, f: f[torch.randperm(len(f), generator=turn)])
+    shuffled = measurer({"a": frame}, blobs, DetectionOptions())
+    assert error(shuffled.uv) > 2 * error(again.uv)
