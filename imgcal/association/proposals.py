@@ -27,6 +27,9 @@ SAME_BLOB = 1.5
 FARTHEST = 6.0  # px: the same at most, so that no proposal hides blobs that contradict it
 DOUBTED = 1.0
 """Pixels: as large a proposed sigma says that part of the marker may be hidden, which a blob of the rest cannot say."""
+LEAST_SHARE = 0.3
+"""Explained part of what could be seen: less than of blobs alone, since false blobs stand for those that are hidden,
+and the proposal's margin has told the object from chance already."""
 LEAST_AGREEMENT = 0.8
 """Share of the labels that identity gives near the proposed pose which the proposer must have given, too."""
 
@@ -110,6 +113,7 @@ def judge(
     if proposal.margin < options.least_margin:
         reason = f"the images tell the object from others by a margin of {proposal.margin:.1f} only, expected "
         return replace(refused, reason=f"{reason}{options.least_margin:.0f}"), blobs
+    options = replace(options, least_share=min(options.least_share, LEAST_SHARE))
     widened = replace(blobs, sigma=np.hypot(blobs.sigma, error), fiducial=nothing)
     found = track(
         widened, snapshot.rig, snapshot.obj, snapshot.prior_std, proposal.rig_from_object, options,

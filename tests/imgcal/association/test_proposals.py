@@ -107,3 +107,18 @@ def test_what_was_looked_at_is_in_the_table(truth, o10, asymmetric8, where_blobs
     assert len(table) == 160 and (table.fiducial >= 0).mean() > 0.95 and (np.diff(table.snapshot) >= 0).all()
     error = table.uv - truth.uv.double().numpy()[table.snapshot, table.camera, table.fiducial]
     assert np.abs(error[table.fiducial >= 0]).max() < 0.6
+
+
+def test_hidden_fiducials_among_false_blobs_are_no_objection(truth, o10, asymmetric8):
+    """Four of ten markers show, in every camera among as many false blobs as make up for the others."""
+    shown = np.random.default_rng(2).permuted(np.arange(80).reshape(10, 8) % 8 < 4, axis=1)
+    false = replace(blobs_of(truth, share=1.0), uv=np.random.default_rng(1).uniform((0, 0), (2000, 1000), (80, 2)))
+    snapshot = Snapshot(frames(0), false, o10, asymmetric8, o10.prior.std(o10))
+    proposal = Oracle(truth).propose(snapshot)
+    rows = proposal.detections
+    some = replace(proposal, detections=rows.select(shown[rows.camera, rows.fiducial]))
+    found, blobs = judge(some, snapshot, IdentityOptions(), error=0.3, pose_known=False)
+    labelled = found.labels >= 0
+    assert found.accepted and labelled.sum() > 30
+    error = blobs.uv[labelled] - truth.uv[0].numpy()[blobs.camera[labelled], found.labels[labelled]]
+    assert np.abs(error).max() < 1

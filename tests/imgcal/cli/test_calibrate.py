@@ -367,3 +367,15 @@ def test_blobs_that_say_next_to_nothing_are_refused(workplace, tmp_path, capsys)
     assert "say next to nothing" in one_line(capsys)
     assert json.loads((tmp_path / "out" / "result.json").read_text())["status"] == "refused"
     assert not (tmp_path / "out" / "rig.yaml").exists()
+
+
+def test_a_matched_filter_looks_at_the_frames_and_needs_them(workplace, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert calibrate(workplace, workplace.capture, out, "--detector", "matched", "--snapshots", "1:3") == 0
+    result = json.loads((out / "result.json").read_text())
+    assert result["detector"] == {"matched": 2} and result["rms_px_after"] < 0.5 < result["rms_px_before"]
+    blobs = tmp_path / "blobs.csv"
+    assert main(["detect", str(workplace.capture), "--out", str(blobs)]) == 0
+    capsys.readouterr()
+    assert calibrate(workplace, blobs, tmp_path / "other", "--detector", "matched") == 2
+    assert "expected a capture with frames" in one_line(capsys)
