@@ -42,6 +42,7 @@ from imgcal.types import CalibrationObject, CameraRig, CropPlacement, Observatio
 
 LEAST_PROBABILITY = 0.5  # of a claim
 LEAST_SEEN = 0.5  # share of what is asked for, below which other poses are tried
+CONVINCING = 0.35  # share of what is in view: a wrong pose shows less of its object by chance
 LEAST_CLAIMS = 6  # in all cameras together, to fit a pose to
 TURNS_DEG = (7.0, 13.0)  # of the candidate about each axis, where it shows too little
 LOOKS = 3  # first the candidate, then what its claims make of it
@@ -95,17 +96,30 @@ class LearnedProposer:
 
     network: InfraredNetwork
     measurer: Measurer | None = None  # None = markers are fitted: all of a camera share one shape
-    finder: Proposer | None = None  # asked for a pose where none is known
+    finder: Proposer | None = None  # asked for a pose where none is known, or the known ones show too little
     name: str = "learned"
 
     @torch.no_grad()
     def propose(self, snapshot: Snapshot) -> Proposal:
-        """Look at one snapshot."""
-        if not snapshot.candidates:
-            found = None if self.finder is None else self.finder.propose(snapshot).rig_from_object
-            if found is None:
-                return Proposal.declined(snapshot, "found no pose to look around")
-            snapshot = replace(snapshot, candidates=(found,))
+        """Look at one snapshot: around known poses, and if they show too little, where the finder sees the object."""
+        near = self._around(snapshot) if snapshot.candidates else None
+        if self.finder is None or (near is not None and self._convinces(near, snapshot)):
+            return near or Proposal.declined(snapshot, "found no pose to look around")
+        elsewhere = self.finder.propose(snapshot).rig_from_object
+        if elsewhere is None:
+            return near or Proposal.declined(snapshot, "found no pose to look around")
+        there = self._around(replace(snapshot, candidates=(elsewhere,)))
+        return there if near is None or len(there.detections) > len(near.detections) else near
+
+    def _convinces(self, proposal: Proposal, snapshot: Snapshot) -> bool:
+        """Tell whether so much is seen that the object cannot well be elsewhere."""
+        if proposal.rig_from_object is None:
+            return False
+        points = proposal.rig_from_object.apply(snapshot.obj.points)
+        in_view = int(snapshot.rig.project(points).visible.sum())
+        return len(proposal.detections) > CONVINCING * in_view
+
+    def _around(self, snapshot: Snapshot) -> Proposal:
         view = _View.of(self.network, self.measurer, snapshot)
         looks = view.best(snapshot.rig, RigidTransform.stack(snapshot.candidates))
         if float(looks.found[0]) < LEAST_SEEN * float(looks.asked[0].sum()):

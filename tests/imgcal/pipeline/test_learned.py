@@ -114,6 +114,32 @@ def test_it_declines_where_nothing_is_seen_and_where_nobody_knows_where_to_look(
     assert "no pose" in proposer(made.place, ~nothing).propose(lost).reason
 
 
+@dataclass(frozen=True)
+class Finder:
+    """Knows a pose."""
+
+    pose: RigidTransform
+    name: str = "finder"
+
+    def propose(self, snapshot: Snapshot) -> Proposal:
+        return replace(Proposal.declined(snapshot, "says where, not what"), rig_from_object=self.pose)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_finder_is_asked_where_the_known_pose_shows_nothing(known: bool) -> None:
+    made = scene(2.0)
+    (near,) = made.snapshot.candidates
+    turn = rotation_from_vector(torch.tensor([1.2, -1.5, 0.6], dtype=torch.float64))
+    away = RigidTransform(turn @ near.rotation, near.translation)
+    snapshot = replace(made.snapshot, candidates=(away,) if known else ())
+    alone = proposer(made.place, torch.ones(made.place.shape[:-1], dtype=torch.bool))
+    assert len(alone.propose(snapshot).detections) < 11
+    found = replace(alone, finder=Finder(near)).propose(snapshot)
+    expected = made.truth.uv[0].numpy()[found.detections.camera, found.detections.fiducial]
+    assert len(found.detections) == 32
+    assert np.abs(found.detections.uv - expected).max() < 0.1
+
+
 @pytest.fixture(scope="module")
 def dim() -> tuple[Truth, Snapshot]:
     """A snapshot in low light, of a rig whose pose is believed to be turned by eight degrees."""
