@@ -74,7 +74,7 @@ def test_whole_markers_keep_their_ellipse_and_partial_ones_do_not(scene):
     partial = LearnedMeasurer(Told((0.3, 0.0), 0.1, BlobKind.PARTIAL))({"a": frame}, blobs, DetectionOptions())
     assert (partial.uv != blobs.uv).any(axis=1).all()
     assert (partial.sigma > 0.1).all()
-    unsure = LearnedMeasurer(Told((0.3, 0.0), 0.1, BlobKind.PARTIAL, 1.0))({"a": frame}, blobs, DetectionOptions())
+    unsure = LearnedMeasurer(Told((0.3, 0.0), 0.1, BlobKind.PARTIAL, -1.0))({"a": frame}, blobs, DetectionOptions())
     assert np.array_equal(unsure.uv, blobs.uv)
 
 
