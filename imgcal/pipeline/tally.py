@@ -35,6 +35,7 @@ class Tally:
     kept: Counts  # (S, C) labels that fit
     expected: Counts  # (S, C) fiducials in view of the factory camera, given where the rest of the rig sees the object
     found: NDArray[np.bool_]  # (S, C) the pattern was looked for in the frame itself, and is there
+    crowd: Counts  # (S, 1) false blobs that frames have which were looked at: as many are no witness; else 0
 
     @property
     def outliers(self) -> Counts:
@@ -47,9 +48,11 @@ class Tally:
 
         False blobs beside fiducials that were all found are no witness against a camera, nor are fiducials in view that
         are hidden: each counts as far as there is something of the other. Where the pattern was found in the frame
-        itself, fiducials are missing because they are hidden: false blobs elsewhere are not what they would be.
+        itself, fiducials are missing because they are hidden: false blobs elsewhere are not what they would be. Where
+        it was looked for in vain, only blobs beyond the usual number of false ones may be the object.
         """
-        return np.where(self.found, 0, np.maximum(np.minimum(self.expected, self.usable) - self.kept, 0))
+        spare = np.maximum(self.usable - self.crowd, 0)
+        return np.where(self.found, 0, np.maximum(np.minimum(self.expected, spare) - self.kept, 0))
 
 
 def tally(
@@ -78,12 +81,20 @@ def tally(
     inside = ((uv > MARGIN * size) & (uv < (1 - MARGIN) * size)).all(-1) & projection.visible.numpy()
     fitting, expected = np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=np.int64)
     fitting[used], expected[used] = kept.sum(-1), inside.sum(-1)
+    usable = count(detections.usable)
     looked = np.array([snapshot.found_by != "classical" for snapshot in labelled.snapshots], dtype=bool)
     return Tally(
         blobs=count(np.ones(len(detections), dtype=bool)),
-        usable=count(detections.usable),
+        usable=usable,
         labelled=count(detections.fiducial >= 0),
         kept=fitting,
         expected=expected,
         found=looked[:, None] & (fitting >= np.maximum(LEAST_FOUND, LEAST_SHARE * expected)),
+        crowd=np.where(looked[:, None], _crowd(usable - fitting), 0),
     )
+
+
+def _crowd(false: Counts) -> Counts:
+    """How many false blobs (S, C) a frame of a snapshot may well have: (S, 1)."""
+    usual = np.median(np.maximum(false, 0), axis=1, keepdims=True)
+    return np.floor(usual + 2 * np.sqrt(usual)).astype(np.int64)

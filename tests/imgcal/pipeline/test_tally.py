@@ -83,7 +83,12 @@ def test_a_covered_camera_with_one_reflection_counts_as_blind():
     assert calibrate(table, rig, obj, BLIND).tally.kept[:, CAMERA].sum() == 0
 
 
-def test_where_the_pattern_was_found_in_the_frame_false_blobs_are_no_witness():
-    counts = {name: np.full((1, 2), number) for name, number in (("blobs", 30), ("usable", 30), ("labelled", 5))}
-    seen = Tally(**counts, kept=np.full((1, 2), 4), expected=np.full((1, 2), 8), found=np.array([[True, False]]))
-    assert seen.unexplained.tolist() == [[0, 4]]
+def test_where_a_frame_was_looked_at_false_blobs_as_usual_are_no_witness():
+    def seen(usable, kept, found, crowd):
+        row = {"blobs": usable, "usable": usable, "labelled": kept, "kept": kept, "expected": 8, "crowd": crowd}
+        return Tally(found=np.array([[found]]), **{name: np.full((1, 1), number) for name, number in row.items()})
+
+    assert seen(30, 4, True, 0).unexplained == 0  # the pattern was found: what is missing is hidden
+    assert seen(30, 4, False, 0).unexplained == 4
+    assert seen(24, 0, False, 25).unexplained == 0  # as many false blobs as other frames have
+    assert seen(10, 0, False, 3).unexplained == 7  # more than that: the object may be elsewhere
