@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 RESULT, TABLES = "captures.json", "captures.md"
 LIMITS = {"captures": 100_000, "snapshots": 1000, "processes": 256}
+SHIPPED_NETWORKS = ("learned", "both")
+"""Detectors by name that are one training of a network."""
 SEED = re.compile(r"(.+)-seed(\d+)")
 
 
@@ -87,7 +89,7 @@ def contender(path: Path) -> Contender:
     from imgcal.evaluation import Contender
 
     if not path.exists():
-        return Contender(str(path), str(path))
+        return Contender(str(path), str(path), 0 if str(path) in SHIPPED_NETWORKS else None)
     name = path.parent.name if path.stem == "model" else path.stem
     if of_seed := SEED.fullmatch(name):
         return Contender(of_seed[1], str(path), int(of_seed[2]))

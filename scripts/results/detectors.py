@@ -151,13 +151,18 @@ def _measured(contenders: Sequence[Contender], scene: Scene, options: Options, s
     return compare_detectors(contenders, scene, options.captures, seed, options.processes, show)
 
 
+def _order(outcome: Outcome) -> tuple[int, int]:
+    """As difficulties stand in their table, the classical detector first."""
+    return list(DIFFICULTIES).index(outcome.difficulty), -outcome.contender.startswith("classical")
+
+
 def write_page(results: Path) -> None:
     """Put the tables on the page, if results lie where those of the page do."""
     place = results / COMPARISON
     if results != RESULTS or not place.is_file():
         return
     known = read_json(place)
-    outcomes = [Outcome(**row) for row in known["outcomes"]]
+    outcomes = sorted((Outcome(**row) for row in known["outcomes"]), key=_order)
     text = (
         f"Rig {known['rig']}, object {known['object']}, {known['captures']} captures a difficulty of "
         f"{known['snapshots']} snapshots, drift of all 15 values of each camera."

@@ -39,6 +39,7 @@ def test_what_cannot_be_done_is_said_in_one_line(arguments, expected, capsys):
 
 def test_runs_that_differ_in_the_seed_have_one_name(tmp_path):
     assert contender(Path("matched")).name == contender(Path("matched")).detector == "matched"
+    assert contender(Path("matched")).seed is None and contender(Path("learned")).seed == 0  # the shipped one: one seed
     for run in ("ir-cnn-seed0", "ir-cnn-seed12"):
         (tmp_path / run).mkdir()
         (tmp_path / run / "model.safetensors").touch()
