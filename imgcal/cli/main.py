@@ -45,7 +45,7 @@ COMMANDS = {
         "imgcal.cli.render",
         "Redraw captured frames as colour-coded images: every fiducial a soft dot in its own colour, nothing else.",
     ),
-    "describe": ("imgcal.cli.experiment_keys", "List every key of an experiment file, with its meaning."),
+    "describe": ("imgcal.cli.experiment_keys", "List every key of an experiment file: type, default and meaning."),
     "train": ("imgcal.cli.train", "Train a network as an experiment file says."),
     "evaluate": (
         "imgcal.cli.evaluate",

@@ -77,8 +77,8 @@ class DriftRate:
 
     Examples:
         >>> import imgcal
-        >>> DriftRate(rotation=1e-4).std(imgcal.load_rig("T4"))[0, :3]  # rad after an hour
-        tensor([1.0000e-04, 1.0000e-04, 1.0000e-04], dtype=torch.float64)
+        >>> DriftRate(position=0.5).std(imgcal.load_rig("T4"))[0, 3:6]  # mm after an hour
+        tensor([0.5000, 0.5000, 0.5000], dtype=torch.float64)
     """
 
     focal_length: float = 3e-4  # relative
