@@ -19,7 +19,26 @@ from imgcal.synthesis import ImageOptions
 from imgcal.types import Prediction, Views
 
 
-class PaperImageNetwork(Network):
+class _PooledNetwork(Network):
+    """An encoder whose pooled feature of each image goes through a bottleneck."""
+
+    def __init__(
+        self, config: PaperImages | PooledImages, parameterization: Parameterization, images: ImageOptions | None = None
+    ) -> None:
+        """Make the layers; images are as large as the encoder takes them unless `images` says otherwise."""
+        size = None if images is None else images.size
+        backbone = Backbone(config.backbone, config.pretrained, config.options, size)
+        super().__init__(parameterization, images or ImageOptions(size=max(backbone.size)))
+        self.backbone = backbone
+        self.bottleneck = nn.Linear(self.backbone.width, config.bottleneck)
+
+    @property
+    def encoder(self) -> nn.Module:
+        """The image encoder."""
+        return self.backbone
+
+
+class PaperImageNetwork(_PooledNetwork):
     """The paper's image variant: each image on its own through an encoder, bottleneck to 128, five heads.
 
     Source: paper, supplementary section 1.2.
@@ -28,18 +47,9 @@ class PaperImageNetwork(Network):
     def __init__(
         self, config: PaperImages, parameterization: Parameterization, images: ImageOptions | None = None
     ) -> None:
-        """Make the layers; images are as large as the encoder takes them unless `images` says otherwise."""
-        size = None if images is None else images.size
-        backbone = Backbone(config.backbone, config.pretrained, config.options, size)
-        super().__init__(parameterization, images or ImageOptions(size=max(backbone.size)))
-        self.backbone = backbone
-        self.bottleneck = nn.Linear(self.backbone.width, config.bottleneck)
+        """Make the layers; see `_PooledNetwork`."""
+        super().__init__(config, parameterization, images)
         self.heads = PaperHeads(config.bottleneck, config.head_widths)
-
-    @property
-    def encoder(self) -> nn.Module:
-        """The image encoder."""
-        return self.backbone
 
     def forward(self, views: Views) -> tuple[Prediction, ...]:
         """Predict the rig from `views.images`."""
@@ -55,24 +65,15 @@ class PaperImageNetwork(Network):
         return groups | self.heads.groups()
 
 
-class PooledImageNetwork(Network):
+class PooledImageNetwork(_PooledNetwork):
     """An image variant that knows one pooled feature an image, as the paper's does, and our trunk."""
 
     def __init__(
         self, config: PooledImages, parameterization: Parameterization, images: ImageOptions | None = None
     ) -> None:
-        """Make the layers; images are as large as the encoder takes them unless `images` says otherwise."""
-        size = None if images is None else images.size
-        backbone = Backbone(config.backbone, config.pretrained, config.options, size)
-        super().__init__(parameterization, images or ImageOptions(size=max(backbone.size)))
-        self.backbone = backbone
-        self.bottleneck = nn.Linear(self.backbone.width, config.bottleneck)
+        """Make the layers; see `_PooledNetwork`."""
+        super().__init__(config, parameterization, images)
         self.trunk = IterativeRefiner(parameterization, **config.trunk.model_dump(), features=config.bottleneck)
-
-    @property
-    def encoder(self) -> nn.Module:
-        """The image encoder."""
-        return self.backbone
 
     def forward(self, views: Views) -> tuple[Prediction, ...]:
         """Predict the rig from `views.images`; one prediction a pass."""

@@ -83,6 +83,16 @@ class TrainingConfig(StrictModel):
             raise ValueError("found neither `steps` nor `minutes`, expected one of them")
         return self
 
+    @property
+    def starts(self) -> tuple[str, ...]:
+        """The networks of `init_from`, none or several."""
+        return (self.init_from,) if isinstance(self.init_from, str) else tuple(self.init_from or ())
+
+    def validation_sizes(self, batch_size: int) -> list[int]:
+        """Split what is validated into batches of at most `batch_size`."""
+        count = self.validation_rigs
+        return [min(batch_size, count - first) for first in range(0, count, batch_size)]
+
 
 class Experiment(StrictModel, ABC):
     """What every experiment file holds; a subclass for each task says what is trained, and on what."""

@@ -79,16 +79,13 @@ class InfraredTask(Task[CropBatch, Evidence]):
         fresh: bool,
     ) -> None:
         """Build it; see `Experiment.make_task`."""
-        start = experiment.training.init_from
         with drawing_from(weights):
             network = InfraredNetwork(experiment.network)
-        for path in [start] if isinstance(start, str) else start or []:
-            if fresh:
-                network.load_state_dict(load_infrared(path).network.state_dict())
+        for path in experiment.training.starts if fresh else ():
+            network.load_state_dict(load_infrared(path).network.state_dict())
         self.network = network.to(device)
         self.device = device
-        count = experiment.training.validation_rigs
-        self.sizes = [min(batch_size, count - first) for first in range(0, count, batch_size)]
+        self.sizes = experiment.training.validation_sizes(batch_size)
 
     def batch(self, count: int, generator: torch.Generator) -> CropBatch:
         """Make crops of random rigs and objects; all objects of a batch have as many fiducials."""

@@ -77,18 +77,15 @@ class MeasurerTask(Task[PatchBatch, Measured]):
         fresh: bool,
     ) -> None:
         """Build it; see `Experiment.make_task`."""
-        start = experiment.training.init_from
         with drawing_from(weights):
             network = Measurer(experiment.network)
-        for path in [start] if isinstance(start, str) else start or []:
-            if fresh:
-                network.load_state_dict(load_measurer(path).network.state_dict())
+        for path in experiment.training.starts if fresh else ():
+            network.load_state_dict(load_measurer(path).network.state_dict())
         self.network = network.to(device)
         self.device = device
-        count = experiment.training.validation_rigs
-        self.sizes = [min(batch_size, count - first) for first in range(0, count, batch_size)]
+        self.sizes = experiment.training.validation_sizes(batch_size)
         self.pool = _pool(experiment.pool, POOL_SEED, device)
-        self.held_out = _pool(max(count, 1), VALIDATION_SEED, device)
+        self.held_out = _pool(max(sum(self.sizes), 1), VALIDATION_SEED, device)
 
     def batch(self, count: int, generator: torch.Generator) -> PatchBatch:
         """Take patches of the pool, and give them light and noise."""

@@ -89,11 +89,11 @@ class PositionsTask(Task[PositionBatch, Located]):
         """Build it; see `Experiment.make_task`."""
         self.experiment, self.batch_size = experiment, batch_size
         self.rig, obj = load_rig(experiment.rig), load_object(experiment.object)
-        spec, start = experiment if fresh else without_pretrained(experiment), experiment.training.init_from
+        spec, starts = experiment if fresh else without_pretrained(experiment), experiment.training.starts
         whole = build_network(spec, self.rig, obj, weights)
         if not isinstance(whole, ImageNetwork):
             raise InputError(f"task positions: found the network {spec.network.preset}, expected vit or cnn")
-        self.untrained = warm_start(start, whole) if fresh and start is not None else ()
+        self.untrained = warm_start(starts, whole) if fresh and starts else ()
         self.whole, self.network = whole, whole.positions.to(device)
         self.obj, self.true_obj = object_to(obj, device), obj
         assert whole.image_options is not None

@@ -82,8 +82,8 @@ class RigTask(Task[RigBatch, Passes]):
         self.experiment = experiment
         self.factory, self.obj = experiment.load_rig(), experiment.load_object()  # float64
         spec = experiment if fresh else without_pretrained(experiment)
-        network, start = build_network(spec, self.factory, self.obj, weights), experiment.training.init_from
-        self.untrained = warm_start(start, network) if fresh and start is not None else ()
+        network, starts = build_network(spec, self.factory, self.obj, weights), experiment.training.starts
+        self.untrained = warm_start(starts, network) if fresh and starts else ()
         self.network = network.to(device)
         self.source = Source(
             self.factory.to(torch.float32, device),
@@ -97,9 +97,9 @@ class RigTask(Task[RigBatch, Passes]):
         if device.type != "cpu":  # a batch must not wait for it; a CPU has no reason to draw more than it needs
             self.source = replace(self.source, good=self._share_of_good(device))
         self.prior_std = experiment.drift.std(self.factory).to(device, torch.float32)  # (C, 15)
-        fixed, count = torch.Generator(device).manual_seed(VALIDATION_SEED), experiment.training.validation_rigs
-        starts = range(0, count, batch_size)
-        self.validation = [self.source.sample(min(batch_size, count - start), fixed) for start in starts]
+        fixed = torch.Generator(device).manual_seed(VALIDATION_SEED)
+        sizes = experiment.training.validation_sizes(batch_size)
+        self.validation = [self.source.sample(size, fixed) for size in sizes]
 
     def _share_of_good(self, device: torch.device) -> float:
         fixed = torch.Generator(device).manual_seed(VALIDATION_SEED)
