@@ -1,13 +1,17 @@
-from . import kernels
-from .projection import (
-    NEAREST_DEPTH,
-    Projection,
+from . import kernels, lens_kernels
+from .lens_model import LensModel
+from .lenses import (
+    LENS_MODELS,
+    ModelNames,
+    distort_by_coefficients,
     distort_with_jacobian,
-    project_components,
-    project_kornia,
-    resized_pixels,
+    lens_codes,
+    lens_names,
+    lens_width,
+    named_lenses,
     undistort,
 )
+from .projection import NEAREST_DEPTH, Projection, project_components, project_kornia, resized_pixels
 from .projection_cpu import project_cpu, undistort_cpu
 from .rotations import (
     cross_matrix,
@@ -23,16 +27,25 @@ from .rotations import (
 from .transforms import Join, RigidTransform, rotate
 
 __all__ = [
+    "LENS_MODELS",
     "NEAREST_DEPTH",
     "Join",
+    "LensModel",
+    "ModelNames",
     "Projection",
     "RigidTransform",
     "cross_matrix",
+    "distort_by_coefficients",
     "distort_with_jacobian",
     "euler_from_rotation",
     "geodesic_angle",
     "kernels",
     "left_jacobian",
+    "lens_codes",
+    "lens_kernels",
+    "lens_names",
+    "lens_width",
+    "named_lenses",
     "project_components",
     "project_cpu",
     "project_kornia",

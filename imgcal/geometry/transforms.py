@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from imgcal.messages import brief_repr
+
 Join = Callable[[list[Tensor]], Tensor]
 """Puts tensors together: `torch.cat`, `torch.stack`, or a choice between them."""
 
@@ -28,6 +30,8 @@ class RigidTransform:
 
     rotation: Tensor  # (*B, 3, 3)
     translation: Tensor  # (*B, 3) mm
+
+    __repr__ = brief_repr
 
     @classmethod
     def identity(

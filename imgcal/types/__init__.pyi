@@ -5,7 +5,18 @@ from .moved_camera import Kind, MovedCamera, MovedError
 from .observations import UNUSABLE, BlobFlag, BlobKind, Detections, Observations
 from .placement import CropPlacement
 from .prediction import Prediction, Views
-from .rig import PARAMETER_NAMES, PARAMETERS, CameraRig, DriftRate, RigPrior, pack21, unpack18, unpack21
+from .rig import (
+    PARAMETER_NAMES,
+    PARAMETERS,
+    CameraRig,
+    DriftRate,
+    RigPrior,
+    pack21,
+    parameter_names,
+    unpack18,
+    unpack21,
+)
+from .volume import Volume
 
 __all__ = [
     "BLOB_RADIUS",
@@ -31,11 +42,13 @@ __all__ = [
     "RigPrior",
     "Symmetry",
     "Views",
+    "Volume",
     "check_object",
     "check_observations",
     "check_rig",
     "limits",
     "pack21",
+    "parameter_names",
     "unpack18",
     "unpack21",
 ]

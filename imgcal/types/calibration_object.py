@@ -46,6 +46,11 @@ class CalibrationObject:
     tolerance: Tensor | None = None  # (N,) mm, one standard deviation of each coordinate; None = exact
     scale_tolerance: float = 0.0  # relative, one standard deviation of all distances together
 
+    def __repr__(self) -> str:
+        """Say what it is: `CalibrationObject('cube8': 8 fiducials)`; points, radii and tolerances are attributes."""
+        exact = "" if self.tolerance is None else ", with tolerances"
+        return f"CalibrationObject({self.name!r}: {len(self.points)} fiducials{exact})"
+
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3 or len(self.points) < 4:
             raise InputError(

@@ -12,6 +12,7 @@ from typing import NoReturn
 from torch import Tensor
 
 from imgcal.errors import InputError
+from imgcal.geometry import LENS_MODELS, lens_width
 from imgcal.messages import shortened
 from imgcal.types.calibration_object import CalibrationObject
 from imgcal.types.observations import Observations
@@ -60,6 +61,14 @@ PRIOR_POSITION = Range(1e-9, 1e7, "mm")
 
 def check_rig(rig: CameraRig) -> None:
     """Raise `InputError` where a rig holds values that no rig has; files are checked when they are read."""
+    unknown = [name for name in rig.lens_models if name not in LENS_MODELS]
+    if unknown or len(rig.lens_models) != rig.num_cameras:
+        found = f"the lens model {unknown[0]}" if unknown else f"{len(rig.lens_models)} lens models"
+        raise InputError(f"rig {rig.name}: found {found}, expected {', '.join(LENS_MODELS)} for all cameras or each")
+    width = lens_width(rig.lens_model)
+    if rig.distortion.shape[-1] < width:
+        found = f"distortion of width {rig.distortion.shape[-1]}"
+        raise InputError(f"rig {rig.name}: found {found}, expected {width} for {rig.lens_model}")
     values = {
         "focal_length": (rig.focal_length, FOCAL_LENGTH),
         "principal_point": (rig.principal_point, PIXEL),

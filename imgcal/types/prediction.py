@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from imgcal.geometry import Join, RigidTransform, rotation_from_6d, sixd_from_rotation
+from imgcal.messages import brief_repr
 from imgcal.types.rig import CameraRig
 
 
@@ -40,6 +41,8 @@ class Prediction:
     rig: CameraRig  # (B,)
     rig_from_object: RigidTransform  # (B,)
     log_sigma: Tensor | None = None  # (B, C, N) log of the factor on each fiducial's sigma in a refinement; None = 1
+
+    __repr__ = brief_repr
 
     def __getitem__(self, rows: Tensor | slice) -> Prediction:
         """Keep some rigs of the batch."""

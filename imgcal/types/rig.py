@@ -4,14 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 
 import torch
 from torch import Tensor
 
 from imgcal.geometry import (
+    LENS_MODELS,
     Join,
+    ModelNames,
     Projection,
     RigidTransform,
+    lens_names,
+    lens_width,
+    named_lenses,
     project_components,
     project_cpu,
     resized_pixels,
@@ -21,16 +27,33 @@ from imgcal.geometry import (
     sixd_from_rotation,
     vector_from_rotation,
 )
+from imgcal.types.volume import Volume
 from renderers import is_traced
 
-PARAMETERS = 15
-"""Free parameters of a camera, in this order: rotation (3, rad), position (3, mm), focal length (2, pixels), principal
-point (2, pixels), distortion (5). Rotation: cam_from_rig = exp(w) cam_from_rig0. Position: of the camera in the rig."""
-
-PARAMETER_NAMES = (
-    "rotation_x", "rotation_y", "rotation_z", "position_x", "position_y", "position_z",
-    "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3",
+PINHOLE = (
+    "rotation_x", "rotation_y", "rotation_z", "position_x", "position_y", "position_z", "fx", "fy", "cx", "cy",
 )  # fmt: skip
+"""Free parameters of a camera before its lens: rotation (3, rad), position (3, mm), focal length (2, pixels), principal
+point (2, pixels). The K parameters of a rig's cameras are these and the D coefficients of `distortion`. Rotation:
+cam_from_rig = exp(w) cam_from_rig0. Position: of the camera in the rig."""
+
+
+def parameter_names(lens_models: Sequence[str], width: int | None = None) -> tuple[str, ...]:
+    """Name the parameters of cameras with these lenses; see `CameraRig.parameter_names`.
+
+    Args:
+        lens_models: names of `LENS_MODELS`.
+        width: D of their distortion; None = what they need.
+    """
+    names = dict.fromkeys(lens_models)
+    fill = [""] * (lens_width(tuple(names)) if width is None else width)
+    columns = zip_longest(*(LENS_MODELS[name].coefficients for name in names), fill, fillvalue="")
+    return (*PINHOLE, *("/".join(dict.fromkeys(filter(None, column))) or "-" for column in columns))
+
+
+PARAMETER_NAMES = parameter_names(["brown_conrady"])
+"""Of a camera with a Brown-Conrady lens, which is what networks know."""
+PARAMETERS = len(PARAMETER_NAMES)
 
 
 @dataclass(frozen=True)
@@ -41,7 +64,7 @@ class RigPrior:
         >>> import imgcal
         >>> rig = imgcal.load_rig("T4")
         >>> prior = RigPrior(focal_length=0.01, position=2.0)
-        >>> prior.std(rig).shape  # four cameras, 15 parameters
+        >>> prior.std(rig).shape  # four cameras, 10 parameters and 5 coefficients
         torch.Size([4, 15])
         >>> prior.std(rig)[0, 3:6]  # mm
         tensor([2., 2., 2.], dtype=torch.float64)
@@ -54,9 +77,12 @@ class RigPrior:
     position: float = 10.0  # mm, each axis
 
     def std(self, rig: CameraRig) -> Tensor:
-        """Spread over the parameters of each camera: (*B, C, 15), in the order of `PARAMETER_NAMES`."""
+        """Spread over the parameters of each camera: (*B, C, K), in the order of `CameraRig.parameter_names`.
+
+        Zero for coefficients that a camera's lens does not have.
+        """
         ones = torch.ones_like(rig.distortion)
-        return torch.cat(
+        std = torch.cat(
             (
                 ones[..., :3] * self.rotation,
                 ones[..., :3] * self.position,
@@ -66,6 +92,7 @@ class RigPrior:
             ),
             dim=-1,
         )
+        return rig.only_existing(std)
 
 
 @dataclass(frozen=True)
@@ -88,7 +115,7 @@ class DriftRate:
     position: float = 0.05  # mm, each axis
 
     def std(self, rig: CameraRig) -> Tensor:
-        """Spread over the parameters of each camera after an hour: (*B, C, 15), in the order of `PARAMETER_NAMES`."""
+        """Spread over the parameters of each camera after an hour: (*B, C, K); see `CameraRig.parameter_names`."""
         return RigPrior(**vars(self)).std(rig)
 
 
@@ -110,7 +137,7 @@ class CameraRig:
 
     focal_length: Tensor  # (*B, C, 2) pixels: fx, fy
     principal_point: Tensor  # (*B, C, 2) pixels: cx, cy
-    distortion: Tensor  # (*B, C, 5): k1, k2, p1, p2, k3
+    distortion: Tensor  # (*B, C, D): coefficients in the order of each camera's lens model, zeros behind them
     cam_from_rig: RigidTransform  # (*B, C)
     image_size: Tensor  # (C, 2) pixels: width, height
     camera_names: tuple[str, ...]  # C
@@ -118,6 +145,32 @@ class CameraRig:
     working_distance: float | None = None  # mm, from the rig's origin to the object
     prior: RigPrior | None = None
     drift_rate: DriftRate | None = None  # None = the defaults
+    volume: Volume | None = None  # where it is used, in the rig frame
+    lens_model: ModelNames = "brown_conrady"  # a name of `geometry.LENS_MODELS` for all cameras, or one for each
+
+    def __repr__(self) -> str:
+        """Say what it is: `CameraRig('O10': 10 cameras, cam01 to cam10)`; `print` shows the values of each camera."""
+        batch = f" x {tuple(self.batch_shape)}" if self.batch_shape else ""
+        first, last = self.camera_names[0], self.camera_names[-1]
+        cameras = f"camera {first}" if first == last else f"{self.num_cameras} cameras, {first} to {last}"
+        return f"CameraRig({self.name!r}{batch}: {cameras})"
+
+    def __str__(self) -> str:
+        """List the cameras, with the unit of each value; a rig with batch axes is only named."""
+        if self.batch_shape:
+            return repr(self)
+        width, names = max(6, *(len(name) for name in self.camera_names)), ", ".join(self.parameter_names[10:])
+        head = f"{'camera':<{width}}  image (px)   fx, fy (px)         cx, cy (px)         "
+        rows = [repr(self), f"{head}{names:<43}   position in the rig (mm)"]
+        values = (self.focal_length, self.principal_point, self.distortion, self.positions.round(decimals=2) + 0.0)
+        columns = zip(self.camera_names, self.image_size.tolist(), *(value.tolist() for value in values), strict=True)
+        for name, (w, h), focal, centre, lens, position in columns:
+            pixels = "".join(f"{a:9.2f} {b:9.2f} " for a, b in (focal, centre))
+            coefficients = " ".join(f"{value:8.5f}" for value in lens)
+            rows.append(
+                f"{name:<{width}}  {w:>4} x {h:<4} {pixels} {coefficients} " + " ".join(f"{x:9.2f}" for x in position)
+            )
+        return "\n".join(rows)
 
     @property
     def batch_shape(self) -> torch.Size:
@@ -128,6 +181,40 @@ class CameraRig:
     def num_cameras(self) -> int:
         """Number of cameras, C."""
         return len(self.camera_names)
+
+    @property
+    def lens_models(self) -> tuple[str, ...]:
+        """Name of each camera's lens model: C."""
+        return lens_names(self.lens_model, self.num_cameras)
+
+    @property
+    def num_parameters(self) -> int:
+        """Number of parameters of a camera, K: ten, and the width D of the distortion."""
+        return len(PINHOLE) + self.distortion.shape[-1]
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the K parameters; of what is a coefficient of this lens and that lens, both: "p1/k3".
+
+        Examples:
+            >>> import imgcal
+            >>> imgcal.load_rig("T4").parameter_names[6:]
+            ('fx', 'fy', 'cx', 'cy', 'k1', 'k2', 'p1', 'p2', 'k3')
+        """
+        return parameter_names(self.lens_models, self.distortion.shape[-1])
+
+    @property
+    def has_coefficient(self) -> Tensor:
+        """Tell which of the distortion's entries are coefficients of the camera's lens: (C, D) bool."""
+        count = torch.tensor([len(LENS_MODELS[name].coefficients) for name in self.lens_models])
+        return (torch.arange(self.distortion.shape[-1]) < count[:, None]).to(self.distortion.device)
+
+    def only_existing(self, std: Tensor) -> Tensor:
+        """Let standard deviations (*B, C, K) be zero where a camera's lens has no such coefficient."""
+        names = (self.lens_model,) if isinstance(self.lens_model, str) else self.lens_model
+        if all(len(LENS_MODELS[name].coefficients) == self.distortion.shape[-1] for name in names):
+            return std
+        return torch.cat((std[..., : len(PINHOLE)], std[..., len(PINHOLE) :] * self.has_coefficient), dim=-1)
 
     @property
     def positions(self) -> Tensor:
@@ -153,9 +240,8 @@ class CameraRig:
         for row, shift in zip(rows, shifts, strict=True):
             by_x, by_y, by_z = row.unbind(-1)  # (*B, C, 1)
             points_cam.append(torch.addcmul(torch.addcmul(torch.addcmul(shift, x, by_x), y, by_y), z, by_z))
-        return project_components(
-            tuple(points_cam), self.focal_length, self.principal_point, self.distortion, self.image_size, radius
-        )
+        lens = (self.focal_length, self.principal_point, self.distortion)
+        return project_components(tuple(points_cam), *lens, self.image_size, radius, self.lens_model)
 
     def project_values(self, points_rig: Tensor, radius: Tensor | None = None) -> Projection:
         """Do the work of `project` without gradients: several times faster on the CPU.
@@ -168,7 +254,7 @@ class CameraRig:
             with torch.no_grad():
                 return self.project(points_rig, radius)
         lens = (self.focal_length, self.principal_point, self.distortion)
-        return project_cpu(points_rig, self.cam_from_rig, *lens, self.image_size, radius)
+        return project_cpu(points_rig, self.cam_from_rig, *lens, self.image_size, radius, self.lens_model)
 
     def from_object(self, rig_from_object: RigidTransform) -> CameraRig:
         """Express the rig in the frame of an object: `cam_from_rig` of the result is `cam_from_object`.
@@ -191,19 +277,19 @@ class CameraRig:
         )
 
     def retract(self, step: Tensor) -> CameraRig:
-        """Add a step to the parameters: (*B, C, 15), in the order of `PARAMETER_NAMES`."""
+        """Add a step to the parameters: (*B, C, K), in the order of `parameter_names`."""
         rotation = rotation_from_vector(step[..., 0:3]) @ self.cam_from_rig.rotation
         positions = self.positions + step[..., 3:6]
         return replace(
             self,
             focal_length=self.focal_length + step[..., 6:8],
             principal_point=self.principal_point + step[..., 8:10],
-            distortion=self.distortion + step[..., 10:15],
+            distortion=self.distortion + step[..., 10:],
             cam_from_rig=RigidTransform(rotation, -rotate(rotation, positions)),
         )
 
     def local(self, reference: CameraRig) -> Tensor:
-        """Invert `retract`: the step (*B, C, 15) that takes `reference` to this rig."""
+        """Invert `retract`: the step (*B, C, K) that takes `reference` to this rig."""
         rotation = self.cam_from_rig.rotation @ reference.cam_from_rig.rotation.mT
         parts = (
             vector_from_rotation(rotation),
@@ -243,6 +329,7 @@ class CameraRig:
             ),
             image_size=self.image_size[index],
             camera_names=tuple(self.camera_names[i] for i in index),
+            lens_model=named_lenses([self.lens_models[i] for i in index]),
         )
 
     @classmethod
@@ -309,7 +396,8 @@ def pack21(rig: CameraRig) -> Tensor:
         rig: a rig in the object's frame (`CameraRig.from_object`).
 
     Returns:
-        (*B, C, 21). Convention: distortion in our order k1, k2, p1, p2, k3; the paper lists k1, k2, k3, p1, p2.
+        (*B, C, 21), for five coefficients. Convention: distortion in our order k1, k2, p1, p2, k3; the paper lists k1,
+        k2, k3, p1, p2.
 
     Examples:
         >>> import imgcal
@@ -346,7 +434,7 @@ def _pack_rest(rig: CameraRig) -> Tensor:
 
 
 def _unpack(rotation: Tensor, rest: Tensor, like: CameraRig) -> CameraRig:
-    translation, focal_length, principal_point, distortion = rest.split((3, 2, 2, 5), dim=-1)
+    translation, focal_length, principal_point, distortion = rest.split((3, 2, 2, like.distortion.shape[-1]), dim=-1)
     return replace(
         like,
         focal_length=focal_length,

@@ -6,23 +6,20 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from kornia.geometry.calibration import distort_points, undistort_points
 from kornia.geometry.camera.perspective import project_points
 from kornia.geometry.liegroup import Se3
 from kornia.geometry.quaternion import Quaternion
 from torch import Tensor
 
+from imgcal.geometry.lenses import undistort
 from imgcal.geometry.projection import (
     NEAREST_DEPTH,
     Projection,
     apparent_centre_scale,
-    is_before_fold,
     is_inside,
     project,
     project_kornia,
-    undistort,
 )
 from imgcal.geometry.projection_cpu import undistort_cpu
 from imgcal.synthesis.rigs import RelativeDrift, synthesize
@@ -131,51 +128,6 @@ def test_image_borders() -> None:
     v = torch.tensor([[0.0, 0.0, 0.0, 0.0, -0.51, 1087.5, 1087.51, 5.0]], dtype=torch.float64)
     inside = is_inside(u, v, torch.tensor([[2048, 1088]]))
     assert inside.tolist() == [[True, False, True, False, False, True, False, False]]
-
-
-def distortion_of_slope(a: float, b: float, c: float) -> Tensor:
-    """Distortion whose radial slope is 1 + a s + b s^2 + c s^3."""
-    return torch.tensor([[a / 3, b / 5, 0.0, 0.0, c / 7]], dtype=torch.float64)
-
-
-@pytest.mark.parametrize(
-    ("roots", "complex_root"),
-    [
-        ((0.4,), None),  # k1 < 0 alone: folds at 1 / (3 |k1|)
-        ((0.4, 0.9), None),
-        ((0.4, 0.9, 2.0), None),  # the slope recovers and folds again
-        ((0.4, -0.7), None),
-        ((0.4, -0.7, -2.0), None),
-        ((0.4, 1.5, -0.2), None),
-        ((0.4,), 0.6 + 0.3j),
-        ((0.4,), -0.6 + 0.3j),
-    ],
-)
-def test_fold_at_constructed_radius(roots: tuple[float, ...], complex_root: complex | None) -> None:
-    everything = list(roots) + ([complex_root, complex_root.conjugate()] if complex_root else [])
-    coefficients = np.real(np.poly(1 / np.array(everything)))  # product of (1 - s / root), in powers of s
-    a, b, c = np.pad(coefficients[1:], (0, 4 - len(coefficients)))
-    fold = min(root for root in roots if root > 0)
-    rr = fold * torch.tensor([[0.0, 0.5, 1 - 1e-9, 1 + 1e-9, 1.2, 3.0, 300.0]], dtype=torch.float64)
-    before = is_before_fold(rr, distortion_of_slope(a, b, c))
-    assert before.tolist() == [[True, True, True, False, False, False, False]]
-
-
-@pytest.mark.parametrize("slope", [(0.0, 0.0, 0.0), (0.3, 0.1, 0.05), (-0.3, 0.1, 0.0), (1.0, -2.0, 1.5)])
-def test_no_fold_where_the_slope_stays_positive(slope: tuple[float, float, float]) -> None:
-    assert is_before_fold(torch.linspace(0, 50, 200, dtype=torch.float64)[None], distortion_of_slope(*slope)).all()
-
-
-@given(st.tuples(*[st.floats(-2, 2).filter(lambda x: x == 0 or abs(x) > 1e-6)] * 3))
-@settings(max_examples=100, deadline=None)
-def test_fold_is_monotone_in_radius_and_agrees_with_sampling(slope: tuple[float, float, float]) -> None:
-    a, b, c = slope
-    rr = torch.linspace(0, 4, 4001, dtype=torch.float64)
-    before = is_before_fold(rr[None], distortion_of_slope(*slope))[0]
-    assert not (before[1:] & ~before[:-1]).any()
-    lowest = torch.cummin(1 + rr * (a + rr * (b + rr * c)), 0).values
-    clear = lowest.abs() > 1e-3  # sampling cannot tell a touch from a dip
-    assert torch.equal(before[clear], (lowest > 0)[clear])
 
 
 def test_fold_makes_points_inside_the_image_invisible() -> None:

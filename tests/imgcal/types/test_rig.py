@@ -159,3 +159,12 @@ def test_prior_standard_deviations(o10: CameraRig) -> None:
 def test_drifted_rigs_differ(o10: CameraRig, asymmetric8: CalibrationObject) -> None:
     snapshots = synthesize(o10, asymmetric8, 2, torch.Generator().manual_seed(0))
     assert (snapshots.rig[0].local(snapshots.rig[1]).abs().amax(0) > 0).sum() >= 12
+
+
+def test_a_rig_is_named_on_one_line_and_printed_as_a_table(o10: CameraRig) -> None:
+    assert repr(o10) == "CameraRig('O10': 10 cameras, cam01 to cam10)"
+    assert repr(o10.select([2])) == "CameraRig('O10': camera cam03)"
+    assert str(o10.expand(4, 3)) == repr(o10.expand(4, 3)) == "CameraRig('O10' x (4, 3): 10 cameras, cam01 to cam10)"
+    rows = str(o10).splitlines()
+    assert len(rows) == 12 and len({len(row) for row in rows[2:]}) == 1
+    assert rows[2].split()[:6] == ["cam01", "2048", "x", "1088", "1620.00", "1621.00"]

@@ -1,0 +1,52 @@
+"""Functions that the formulas of lenses need, of tensors and, in compiled code, of numbers: one text serves both."""
+
+# Numba takes types from arguments, and compares the signatures.
+# ruff: noqa: ANN001, ANN202
+# mypy: allow-untyped-defs
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numba.extending import overload
+from torch import Tensor
+
+
+def sqrt(x: Tensor) -> Tensor:
+    """Square root."""
+    return torch.sqrt(x)
+
+
+def arctan(x: Tensor) -> Tensor:
+    """Angle of a slope, rad."""
+    return torch.arctan(x)
+
+
+def tan(x: Tensor) -> Tensor:
+    """Slope of an angle."""
+    return torch.tan(x)
+
+
+def minimum(x: Tensor, limit: float) -> Tensor:
+    """The smaller of both."""
+    return x.clamp_max(limit)
+
+
+@overload(sqrt)
+def _sqrt(x):
+    return lambda x: np.sqrt(x)
+
+
+@overload(arctan)
+def _arctan(x):
+    return lambda x: np.arctan(x)
+
+
+@overload(tan)
+def _tan(x):
+    return lambda x: np.tan(x)
+
+
+@overload(minimum)
+def _minimum(x, limit):
+    return lambda x, limit: min(x, limit)

@@ -1,0 +1,41 @@
+"""What a lens model is: a radial profile, and the decentering that models share."""
+
+# The same functions work on tensors and, compiled, on numbers.
+# mypy: allow-untyped-defs
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+Formula = Callable[..., Any]
+
+
+@dataclass(frozen=True)
+class LensModel:
+    """A lens: a point (x, y) of the z = 1 plane comes to (x, y) g(x^2 + y^2), plus the decentering by p1 and p2.
+
+    The formulas are plain arithmetic (and `elementary`'s functions), which serves tensors and, compiled, numbers. Each
+    is given `one`, which is 1 in the type of the arithmetic (a literal would make double precision of single), a
+    squared radius s, and k, the coefficients in the order of `coefficients`.
+    """
+
+    name: str  # in rig files
+    coefficients: tuple[str, ...]  # those named p1 and p2 are Brown's decentering
+    radial: Formula  # (one, s, k) -> g
+    growth: Formula  # (one, s, k) -> 2 dg/ds
+    by_coefficients: Formula  # (one, s, k) -> dg/dk of each coefficient, anything for p1 and p2
+    kornia: Callable[[Tensor, Tensor], Tensor]  # (B, N, 2), (B, coefficients) -> (B, N, 2), through kornia's function
+    inverse: Formula | None = None  # (one, squared distorted radius, k) -> 1 / g; None = by iteration
+    # (s, k) -> whether the distorted radius grows up to s, of tensors, and compiled (k) -> squared radius from which
+    # the slope there says no more; None = from samples.
+    is_before_fold: Callable[[Tensor, tuple[Tensor, ...]], Tensor] | None = None
+    blind_from: Formula | None = None
+
+    @property
+    def decentering(self) -> tuple[int, int] | None:
+        """Where p1 and p2 stand among the coefficients; None = a lens without."""
+        return (self.coefficients.index("p1"), self.coefficients.index("p2")) if "p1" in self.coefficients else None

@@ -1,0 +1,83 @@
+"""`Volume`: where a rig is used."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imgcal.errors import InputError
+
+Corner = tuple[float, float, float]
+FLAT = 1e-6
+"""Parts of a volume's length that it must be thick."""
+
+
+@dataclass(frozen=True)
+class Volume:
+    """Where objects are used: the smallest convex body that holds some points of the rig frame, a box for example.
+
+    Examples:
+        >>> room = Volume.box((-1000, -1000, 0), (1000, 1000, 2000))
+        >>> len(room.points), room.low, room.high
+        (8, (-1000.0, -1000.0, 0.0), (1000.0, 1000.0, 2000.0))
+        >>> room.contains(np.array([[0.0, 0.0, 500.0], [0.0, 0.0, 2500.0]]))
+        array([ True, False])
+    """
+
+    points: tuple[Corner, ...]  # mm in the rig frame, 4 or more, not all in one plane
+
+    def __post_init__(self) -> None:
+        """Refuse what encloses nothing.
+
+        Raises:
+            InputError: fewer than four points, or all in one plane.
+        """
+        points = tuple(tuple(float(value) for value in point) for point in self.points)
+        object.__setattr__(self, "points", points)
+        if len(points) < 4:
+            raise InputError(f"volume: found {len(points)} points, expected 4 or more that enclose a volume")
+        corners = np.array(points)
+        spread = np.linalg.svd(corners - corners.mean(0), compute_uv=False)
+        if not spread[2] > FLAT * spread[0]:
+            raise InputError("volume: found points that all lie in one plane, expected ones that enclose a volume")
+
+    @classmethod
+    def box(cls, low: Corner, high: Corner) -> Volume:
+        """Enclose a box between two opposite corners, mm."""
+        if any(not a < b for a, b in zip(low, high, strict=True)):
+            raise InputError(f"volume: found low {list(low)} and high {list(high)}, expected each low below its high")
+        (x, y, z), (u, v, w) = low, high
+        return cls(tuple((a, b, c) for a in (x, u) for b in (y, v) for c in (z, w)))
+
+    @property
+    def low(self) -> Corner:
+        """Least x, y and z, mm."""
+        x, y, z = np.array(self.points).min(0).tolist()
+        return x, y, z
+
+    @property
+    def high(self) -> Corner:
+        """Largest x, y and z, mm."""
+        x, y, z = np.array(self.points).max(0).tolist()
+        return x, y, z
+
+    @property
+    def is_box(self) -> bool:
+        """Tell whether the volume is the box between `low` and `high`."""
+        return len(self.points) == 8 and set(self.points) == set(Volume.box(self.low, self.high).points)
+
+    @cached_property
+    def _planes(self) -> NDArray[np.float64]:
+        """Outward normals and offsets of the faces: (F, 4)."""
+        from scipy.spatial import ConvexHull  # slow to import, and few ask
+
+        return np.asarray(ConvexHull(np.array(self.points)).equations)
+
+    def contains(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Tell which points (M, 3) mm are inside, a hair's breadth of rounding included: (M,)."""
+        slack = FLAT * float(np.ptp(np.array(self.points), axis=0).max())
+        inside = np.all(points @ self._planes[:, :3].T + self._planes[:, 3] <= slack, axis=1)
+        return np.asarray(inside)
