@@ -1,22 +1,26 @@
 from .atomic import replacing, write_bytes, write_text
-from .capture import Capture, open_capture, open_input, save_capture_settings
-from .detections_csv import MARGIN, load_detections, save_detections
-from .frames import Frame, read_frame, write_frame, write_image
+from .cameras_yaml import is_cameras_file, load_cameras, save_cameras, unplaced
+from .capture import Capture, check_times, open_capture, open_input, save_capture_settings
+from .detections_csv import DEFAULT_SIGMA, MARGIN, load_detections, save_detections
+from .frames import IMAGE_SUFFIXES, VIDEO_SUFFIXES, Frame, Video, grey_frame, read_frame, write_frame, write_image
 from .json_text import read_json
 from .key_table import Key, keys_of
 from .metrics import read_metrics
-from .names import MODEL, find_file, model_file, model_name, nearest, title_of
+from .names import MODEL, find_file, is_file_name, model_file, model_name, natural_key, nearest, title_of
 from .object_csv import load_object, object_from_text, object_text, save_object
 from .publication import publishing
 from .resources import data_path, shipped_names
 from .rig_yaml import RigCovariance, load_rig, load_rig_covariance, rig_from_text, rig_text, save_rig
 from .safetensors_file import read_tensors, read_texts, write_tensors
 from .validation import StrictModel, StrictRecord, validated
-from .yaml_file import Flow, parse_yaml, read_yaml, read_yaml_mapping, yaml_text
+from .yaml_file import Flow, parse_foreign_yaml, parse_yaml, read_yaml, read_yaml_mapping, yaml_text
 
 __all__ = [
+    "DEFAULT_SIGMA",
+    "IMAGE_SUFFIXES",
     "MARGIN",
     "MODEL",
+    "VIDEO_SUFFIXES",
     "Capture",
     "Flow",
     "Frame",
@@ -24,20 +28,28 @@ __all__ = [
     "RigCovariance",
     "StrictModel",
     "StrictRecord",
+    "Video",
+    "check_times",
     "data_path",
     "find_file",
+    "grey_frame",
+    "is_cameras_file",
+    "is_file_name",
     "keys_of",
+    "load_cameras",
     "load_detections",
     "load_object",
     "load_rig",
     "load_rig_covariance",
     "model_file",
     "model_name",
+    "natural_key",
     "nearest",
     "object_from_text",
     "object_text",
     "open_capture",
     "open_input",
+    "parse_foreign_yaml",
     "parse_yaml",
     "publishing",
     "read_frame",
@@ -50,12 +62,14 @@ __all__ = [
     "replacing",
     "rig_from_text",
     "rig_text",
+    "save_cameras",
     "save_capture_settings",
     "save_detections",
     "save_object",
     "save_rig",
     "shipped_names",
     "title_of",
+    "unplaced",
     "validated",
     "write_bytes",
     "write_frame",

@@ -7,7 +7,7 @@ Optional beside `frames/`: `capture.yaml` (format, bit_depth, note) and `masks/<
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -27,6 +27,7 @@ from imgcal.messages import listed
 from imgcal.types import CameraRig, Detections
 
 FORMAT = "imgcal-capture/1"
+DIFFER = "--videos-differ (in Python videos_differ=True) takes them by number all the same"
 
 
 class _Settings(StrictModel):
@@ -45,6 +46,7 @@ class Capture:
     files: Mapping[str, Mapping[str, tuple[Path, int]]]  # camera -> snapshot -> file, page or frame in it
     image_size: Mapping[str, tuple[int, int]]  # camera -> width, height in pixels; empty when opened without a rig
     bit_depth: int | None = None  # 8, 12 or 16 as stated in capture.yaml; None = not stated
+    videos_differ: bool = False  # time stamps of the videos need not agree
 
     def snapshots(self, first: int = 0, last: int | None = None) -> Iterator[tuple[str, dict[str, Frame | None]]]:
         """Read frames one snapshot at a time, so that memory does not grow with the length of the capture.
@@ -57,7 +59,8 @@ class Capture:
             Name of the snapshot and, for every camera, its frame (H, W), or None where there is none.
 
         Raises:
-            InputError: a frame is unreadable, or of another size or bit depth than expected.
+            InputError: a frame is unreadable, or of another size or bit depth than expected; or the videos' time stamps
+                say that frames of one number are of different moments.
         """
         before: dict[str, tuple[int, int, int]] = {}
         with contextlib.ExitStack() as stack:
@@ -78,7 +81,17 @@ class Capture:
                         frame = videos[path].read(index)
                     self._check(frame, camera, path, before)
                     frames[camera] = frame
+                if not self.videos_differ:
+                    check_times(tuple(videos.values()), snapshot)
                 yield snapshot, frames
+
+    def frames(self, first: int = 0, last: int | None = None) -> dict[str, list[Frame | None]]:
+        """Read frames of several snapshots at once, as `imgcal.calibrate` takes them: camera name -> frames (H, W).
+
+        Arguments and errors as in `snapshots`.
+        """
+        read = [frames for _, frames in self.snapshots(first, last)]
+        return {name: [frames[name] for frames in read] for name in self.camera_names}
 
     def frames_of(self, number: int) -> dict[str, Frame | None]:
         """Read the frames of one snapshot by its number: camera name -> frame; errors as in `snapshots`."""
@@ -112,12 +125,14 @@ class Capture:
             raise InputError(f"{path}: found the value {frame.max()}, expected at most 4095 (12 bit in the low bits)")
 
 
-def open_capture(folder: str | Path, rig: CameraRig | None = None) -> Capture:
+def open_capture(folder: str | Path, rig: CameraRig | None = None, videos_differ: bool = False) -> Capture:
     """Find the frames of a capture.
 
     Args:
         folder: the folder that holds `frames/`.
         rig: gives the cameras, their order and image sizes; a camera without files is allowed. None = what is there.
+        videos_differ: accept videos (and TIFFs of several pages) whose numbers of frames or time stamps differ; their
+            frames go together by number.
 
     Raises:
         InputError: one line with the file or folder, what was found and what was expected.
@@ -147,6 +162,8 @@ def open_capture(folder: str | Path, rig: CameraRig | None = None) -> Capture:
         _check_cameras(frames, files, rig)
     if not any(files.values()):
         raise InputError(f"{frames}: found no frames, expected images or videos of the cameras")
+    if not videos_differ:
+        _check_counts(frames, files)
     names = tuple(files) if rig is None else rig.camera_names
     masks = folder / "masks"
     for path in _listing(masks) if masks.exists() else ():
@@ -160,14 +177,17 @@ def open_capture(folder: str | Path, rig: CameraRig | None = None) -> Capture:
         files={name: files.get(name, {}) for name in names},
         image_size={} if rig is None else _sizes(rig),
         bit_depth=read_yaml(settings, _Settings, FORMAT).bit_depth if settings.exists() else None,
+        videos_differ=videos_differ,
     )
 
 
-def open_input(path: str | Path, rig: CameraRig | None = None, fiducials: int | None = None) -> Capture | Detections:
+def open_input(
+    path: str | Path, rig: CameraRig | None = None, fiducials: int | None = None, videos_differ: bool = False
+) -> Capture | Detections:
     """Open what a user gives to a command: a capture folder or a detections file; arguments as for their functions."""
     path = Path(path)
     if path.is_dir():
-        return open_capture(path, rig)
+        return open_capture(path, rig, videos_differ)
     if not path.is_file():
         found = "found a device or pipe" if path.exists() else "no such file or folder"
         raise InputError(f"{path}: {found}, expected a capture folder or a detections file (.csv, .csv.gz)")
@@ -216,6 +236,33 @@ def _file_snapshots(path: Path) -> dict[str, tuple[Path, int]]:
         expected = ", ".join(sorted(IMAGE_SUFFIXES | VIDEO_SUFFIXES))
         raise InputError(f"{path}: expected a folder, an image or a video of one camera ({expected})")
     return {str(index): (path, index) for index in range(count_frames(path))}
+
+
+def check_times(videos: Sequence[Video], snapshot: str) -> None:
+    """Raise `InputError` where the frames that were read last are further apart than half a frame."""
+    if len(videos) < 2:
+        return
+    first, last = min(videos, key=lambda video: video.seconds), max(videos, key=lambda video: video.seconds)
+    if last.seconds - first.seconds > 0.5 / max(first.rate, last.rate):
+        raise InputError(
+            f"{last.path}: found frame {snapshot} at {last.seconds:.3f} s, in {first.path.name} at {first.seconds:.3f} "
+            f"s, expected the same moment; {DIFFER}"
+        )
+
+
+def _check_counts(frames: Path, files: Mapping[str, Mapping[str, tuple[Path, int]]]) -> None:
+    """Compare the lengths of the files that hold several snapshots: one frame less, and all after it are of others."""
+    counts: dict[Path, int] = {}
+    for found in files.values():
+        path, _ = next(iter(found.values()), (frames, 0))
+        if path.parent == frames and (len(found) > 1 or path.suffix.lower() in VIDEO_SUFFIXES):
+            counts[path] = len(found)
+    if len(set(counts.values())) > 1:
+        shortest, longest = min(counts, key=lambda path: counts[path]), max(counts, key=lambda path: counts[path])
+        raise InputError(
+            f"{shortest}: found {counts[shortest]} frames, and {counts[longest]} in {longest.name}, expected as many "
+            f"in each: after a missing one the others are of different moments; {DIFFER}"
+        )
 
 
 def _read_image(path: Path, page: int, alone: bool, size: tuple[int, int] | None) -> Frame:

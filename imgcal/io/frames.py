@@ -23,7 +23,7 @@ Frame = NDArray[np.uint8] | NDArray[np.uint16]  # (H, W) grey
 TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
 IMAGE_SUFFIXES = frozenset({".png", ".bmp", ".pgm", ".jpg", ".jpeg"}) | TIFF_SUFFIXES
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov"})
-VIDEO_PROPERTIES = (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
+VIDEO_PROPERTIES = (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
 
 JPEG_SUFFIXES = frozenset({".jpg", ".jpeg"})
 JPEG_END, END_OF_JPEG = b"\xff\xd9", 2**16  # some cameras write a few bytes behind it
@@ -32,6 +32,7 @@ LOSSY_TOLERANCE = 4  # grey levels by which lossy compression may tear the chann
 
 LARGEST_IMAGE_FILE = 2**30  # bytes
 LEAST_OF_A_FRAME = 4  # bytes that a frame takes in a video, at least
+USUAL_RATE = 30.0  # frames a second of a video that does not say
 
 
 def count_frames(path: Path) -> int:
@@ -129,6 +130,9 @@ def write_image(path: str | Path, image: NDArray[np.uint8]) -> None:
 class Video:
     """A grey video that is read forwards; a context manager.
 
+    `count` frames, `rate` of them a second; `seconds` is when the frame that was read last was taken, by the time
+    stamps of the file, which some formats (AVI) make of the number of the frame.
+
     Raises:
         InputError: on opening, when the file is no video; on reading, when it ends before its announced length.
     """
@@ -145,7 +149,7 @@ class Video:
             raise InputError(f"{path}: found a damaged or empty file, expected a video")
         with silenced():
             self._capture = cv2.VideoCapture(str(path))
-            announced, *size = (self._capture.get(name) for name in VIDEO_PROPERTIES)
+            announced, rate, *size = (self._capture.get(name) for name in VIDEO_PROPERTIES)
         try:
             self.count = int(announced) if self._capture.isOpened() and math.isfinite(announced) else 0
             if self.count <= 0:
@@ -157,6 +161,8 @@ class Video:
         except InputError:
             self._capture.release()
             raise
+        self.rate = rate if math.isfinite(rate) and rate > 0 else USUAL_RATE
+        self.seconds = 0.0
         self._next = 0
 
     def __enter__(self) -> Video:
@@ -179,22 +185,47 @@ class Video:
                 self._next += 1
         if not good or image is None:
             raise InputError(f"{self.path}: found {self._next - 1} readable frames, expected {self.count} (truncated)")
+        self.seconds = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
         return _grey(image, self.path)
+
+
+def grey_frame(image: NDArray[Any], where: str, tolerance: float = LOSSY_TOLERANCE) -> Frame:
+    """Take the one channel that a grey image has; what is in true colours is none.
+
+    Args:
+        image: (H, W), (H, W, 1), (H, W, 3) or, where it is opaque, (H, W, 4); uint8 or uint16.
+        where: what a message begins with: the file or the camera.
+        tolerance: grey levels by which channels may differ: lossy compression tears them apart.
+
+    Raises:
+        InputError: true colours, transparency, another type or shape.
+
+    Examples:
+        >>> grey = np.arange(12, dtype=np.uint8).reshape(3, 4)
+        >>> bool((grey_frame(np.stack([grey] * 3, axis=-1), "camera left") == grey).all())
+        True
+    """
+    if image.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"{where}: found pixels of type {image.dtype}, expected 8 or 16 bit whole numbers")
+    if image.ndim == 2:
+        return np.asarray(image)
+    if image.ndim != 3 or image.shape[2] not in (1, 3, 4):
+        raise InputError(f"{where}: found a frame of shape {image.shape}, expected grey (H, W)")
+    if image.shape[2] == 1:
+        return np.asarray(image[..., 0])
+    if image.shape[2] == 4 and (image[..., 3] != np.iinfo(image.dtype).max).any():
+        raise InputError(f"{where}: found a transparent image, expected grey")
+    channels: Any = cv2.split(image[..., :3])
+    first, green, third = channels
+    apart = max(float(cv2.norm(green, other, cv2.NORM_INF)) for other in (first, third))
+    if apart > tolerance:
+        raise InputError(f"{where}: found a colour image (channels differ by up to {apart:.0f}), expected grey")
+    return np.asarray(green)
 
 
 def _grey(image: Any, path: Path) -> Frame:
     """Check the type of a decoded image and take the one channel that a grey image has."""
-    if image.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"{path}: found pixels of type {image.dtype}, expected 8 or 16 bit whole numbers")
-    if image.ndim == 2:
-        return np.asarray(image)
-    if image.shape[2] == 4 and (image[..., 3] != np.iinfo(image.dtype).max).any():
-        raise InputError(f"{path}: found a transparent image, expected grey")
-    blue, green, red = cv2.split(image[..., :3])
-    apart = max(float(cv2.norm(green, other, cv2.NORM_INF)) for other in (blue, red))
-    if apart > (LOSSY_TOLERANCE if path.suffix.lower() in LOSSY_SUFFIXES else 0):
-        raise InputError(f"{path}: found a colour image (channels differ by up to {apart:.0f}), expected grey")
-    return np.asarray(green)
+    return grey_frame(image, str(path), LOSSY_TOLERANCE if path.suffix.lower() in LOSSY_SUFFIXES else 0)
 
 
 def _content(path: Path) -> bytes:

@@ -13,19 +13,31 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from imgcal.errors import InputError
-from imgcal.geometry import RigidTransform, rotation_from_vector, vector_from_rotation
+from imgcal.geometry import (
+    LENS_MODELS,
+    LensModel,
+    RigidTransform,
+    lens_width,
+    named_lenses,
+    rotation_from_vector,
+    vector_from_rotation,
+)
 from imgcal.io.atomic import write_text
 from imgcal.io.names import LONGEST_NAME, find_file, is_file_name, title_of
 from imgcal.io.validation import StrictModel, validated
 from imgcal.io.yaml_file import Flow, FlowMap, read_yaml, record_from_yaml, yaml_text
 from imgcal.messages import listed, quoted
-from imgcal.types import PARAMETER_NAMES, PARAMETERS, CameraRig, DriftRate, RigPrior, limits
+from imgcal.types import CameraRig, DriftRate, RigPrior, Volume, limits, parameter_names
 
 FORMAT = "imgcal-rig/1"
 ENTRY_NAMES = {"cameras": "camera"}
 
 # How far the distortion may move a point at half the image diagonal, in units of its distance from the centre.
 LARGEST_DISTORTION = 10.0
+MOST_POINTS = 1000  # of a volume
+WIDEST = math.radians(85)  # of a fisheye, where its distortion is looked at
+MOST_COEFFICIENTS = max(len(model.coefficients) for model in LENS_MODELS.values())
+MOST_PARAMETERS = len(parameter_names(list(LENS_MODELS)))
 
 
 def _within(plausible: limits.Range) -> Any:
@@ -49,16 +61,16 @@ Name = Annotated[str, Field(max_length=LONGEST_NAME)]
 
 @dataclass(frozen=True)
 class RigCovariance:
-    """Uncertainty of a rig, in the order of `imgcal.types.rig.PARAMETER_NAMES` for each camera."""
+    """Uncertainty of a rig, in the order of `CameraRig.parameter_names` for each camera."""
 
-    std: Tensor  # (C, 15) one standard deviation: rad, mm, pixels, pixels, 1
-    matrix: Tensor | None = None  # (15 C, 15 C); None = not kept
+    std: Tensor  # (C, K) one standard deviation: rad, mm, pixels, pixels, 1
+    matrix: Tensor | None = None  # (K C, K C); None = not kept
     reference_camera: str | None = None  # rotations and positions are relative to this camera; None = to the rig frame
 
     @classmethod
-    def from_matrix(cls, matrix: Tensor, reference_camera: str | None = None) -> RigCovariance:
-        """Take the standard deviations from the diagonal of a (15 C, 15 C) covariance."""
-        std = matrix.diagonal().clamp_min(0).sqrt().unflatten(0, (-1, PARAMETERS))
+    def from_matrix(cls, matrix: Tensor, cameras: int, reference_camera: str | None = None) -> RigCovariance:
+        """Take the standard deviations from the diagonal of the (K C, K C) covariance of C cameras."""
+        std = matrix.diagonal().clamp_min(0).sqrt().unflatten(0, (cameras, -1))
         return cls(std, matrix, reference_camera)
 
 
@@ -79,7 +91,7 @@ class _Std(StrictModel):
     position: Annotated[list[Spread], _exactly(3)]
     focal_length: Annotated[list[Spread], _exactly(2)]
     principal_point: Annotated[list[Spread], _exactly(2)]
-    distortion: Annotated[list[Spread], _exactly(5)]
+    distortion: Annotated[list[Spread], Field(max_length=MOST_COEFFICIENTS)]
 
 
 class _Camera(StrictModel):
@@ -87,7 +99,8 @@ class _Camera(StrictModel):
     image_size: Annotated[list[Side], _exactly(2)]
     focal_length: Annotated[list[Focal], _exactly(2)]
     principal_point: Annotated[list[Pixel], _exactly(2)]
-    distortion: Annotated[list[Coefficient], _exactly(5)]
+    model: Name = "brown_conrady"
+    distortion: Annotated[list[Coefficient], Field(max_length=MOST_COEFFICIENTS)]
     cam_from_rig: _Transform
     std: _Std | None = None
 
@@ -98,15 +111,34 @@ class _Camera(StrictModel):
             raise ValueError(f"found the camera name {quoted(self.name)!r}, expected a name that can be a file name")
         if math.prod(self.image_size) > limits.MOST_PIXELS:
             raise ValueError(f"image_size: found {self.image_size}, expected at most {limits.MOST_PIXELS:,} pixels")
+        self._check_lens()
+        return self
+
+    def _check_lens(self) -> None:
+        if self.model not in LENS_MODELS:
+            raise ValueError(f"model: found {quoted(self.model)!r}, expected one of {listed(LENS_MODELS)}")
+        model = LENS_MODELS[self.model]
+        names, count = ", ".join(model.coefficients), len(model.coefficients)
+        for key, values in (("distortion", self.distortion), ("std", self.std.distortion if self.std else None)):
+            if values is not None and len(values) != count:
+                raise ValueError(f"{key}: found {len(values)} coefficients, expected {count} of {self.model}: {names}")
         radius = math.hypot(*self.image_size) / 2 / min(self.focal_length)
-        k1, k2, p1, p2, k3 = (abs(k) for k in self.distortion)
-        shift = k1 * radius**2 + k2 * radius**4 + k3 * radius**6 + 3 * (p1 + p2) * radius
-        if shift > LARGEST_DISTORTION:
+        shift = _shift(model, self.distortion, radius)
+        if not shift <= LARGEST_DISTORTION:
             raise ValueError(
                 f"distortion: found {self.distortion}, which moves the image corners by {shift:.0f} times their "
-                "distance from the centre; expected k1, k2, p1, p2, k3 on the z = 1 plane"
+                f"distance from the centre; expected {names} on the z = 1 plane"
             )
-        return self
+
+
+def _shift(model: LensModel, coefficients: list[float], radius: float) -> float:
+    """How far a lens moves points within a radius of the image, in units of their distance from its centre."""
+    if model.inverse is not None:
+        radius = math.tan(min(radius, WIDEST))
+    s = (radius * torch.linspace(0.125, 1.0, 8, dtype=torch.float64)).square()
+    k = torch.tensor(coefficients, dtype=torch.float64)
+    along = (model.radial(1.0, s, k) - model.radial(1.0, 0 * s, k)).abs().max()
+    return float(along) + (3 * radius * sum(abs(coefficients[i]) for i in model.decentering or ()))
 
 
 class _Prior(StrictModel):
@@ -127,9 +159,36 @@ class _DriftRate(StrictModel):
     position: Annotated[float, Field(ge=0, le=limits.PRIOR_POSITION.high)] = DriftRate.position
 
 
+class _Volume(StrictModel):
+    """A box between two corners, or what some points enclose."""
+
+    low: Annotated[list[Shift], _exactly(3)] | None = None
+    high: Annotated[list[Shift], _exactly(3)] | None = None
+    points: Annotated[list[Annotated[list[Shift], _exactly(3)]], Field(min_length=4, max_length=MOST_POINTS)] | None = (
+        None
+    )
+
+    @model_validator(mode="after")
+    def _sound(self) -> _Volume:
+        if (self.low is None, self.high is None) != (self.points is not None,) * 2:
+            raise ValueError("expected `low` and `high` of a box, or `points` that enclose a volume")
+        try:
+            self.value()
+        except InputError as error:
+            raise ValueError(str(error).removeprefix("volume: ")) from error
+        return self
+
+    def value(self) -> Volume:
+        if self.points is not None:
+            return Volume(tuple((x, y, z) for x, y, z in self.points))
+        assert self.low is not None and self.high is not None
+        (x, y, z), (u, v, w) = self.low, self.high
+        return Volume.box((x, y, z), (u, v, w))
+
+
 class _Covariance(StrictModel):
     reference_camera: Name | None = None
-    parameters: Annotated[list[Name], Field(max_length=PARAMETERS)]
+    parameters: Annotated[list[Name], Field(max_length=MOST_PARAMETERS)]
     # One wrong value of millions is enough to know.
     matrix: (
         Annotated[list[Annotated[list[Covariance], Field(fail_fast=True)]], Field(min_length=1, fail_fast=True)] | None
@@ -143,6 +202,7 @@ class _RigFile(StrictModel):
     cameras: Annotated[list[_Camera], Field(min_length=1, max_length=limits.MOST_CAMERAS)]
     prior: _Prior | None = None
     drift_rate: _DriftRate | None = None
+    volume: _Volume | None = None
     covariance: _Covariance | None = None
 
     @model_validator(mode="after")
@@ -150,9 +210,7 @@ class _RigFile(StrictModel):
         if self.name is not None and not self.name.isprintable():
             raise ValueError(f"name: found {self.name!r}, expected text that can be shown")
         names = [camera.name for camera in self.cameras]
-        twice, times = Counter(names).most_common(1)[0]
-        if times > 1:
-            raise ValueError(f"found the camera name {twice} more than once, expected different names")
+        check_names(names)
         given = [camera.name for camera in self.cameras if camera.std is not None]
         if given and len(given) < len(names):
             raise ValueError(f"found `std` for {listed(given)} only, expected it for all cameras or none")
@@ -161,8 +219,15 @@ class _RigFile(StrictModel):
                 "expected `std` of the cameras and the block `covariance` together, found only one of them"
             )
         if self.covariance is not None:
-            _check_covariance(self.covariance, names, _std_tensor(self))
+            _check_covariance(self.covariance, self.cameras, _std_tensor(self))
         return self
+
+
+def check_names(names: list[str]) -> None:
+    """Raise `ValueError` where two cameras have one name."""
+    twice, times = Counter(names).most_common(1)[0]
+    if times > 1:
+        raise ValueError(f"found the camera name {twice} more than once, expected different names")
 
 
 def load_rig(path: str | Path) -> CameraRig:
@@ -206,7 +271,7 @@ def load_rig_covariance(path: str | Path) -> RigCovariance | None:
     if content.covariance.matrix is None:
         return RigCovariance(_std_tensor(content), None, reference_camera)
     matrix = torch.tensor(content.covariance.matrix, dtype=torch.float64)
-    return RigCovariance.from_matrix(matrix, reference_camera)
+    return RigCovariance.from_matrix(matrix, len(content.cameras), reference_camera)
 
 
 def save_rig(rig: CameraRig, path: str | Path, covariance: RigCovariance | None = None, full: bool = False) -> None:
@@ -242,6 +307,8 @@ def rig_text(
     """
     if rig.batch_shape:
         raise InputError(f"{where}: found a batch of rigs of shape {tuple(rig.batch_shape)}, expected one rig")
+    if covariance is not None:
+        covariance = _narrowed(covariance, rig)
     content: dict[str, Any] = {"format": FORMAT, "name": rig.name}
     if rig.working_distance is not None:
         content["working_distance"] = rig.working_distance
@@ -250,8 +317,10 @@ def rig_text(
         content["prior"] = {key: float(value) for key, value in vars(rig.prior).items()}
     if rig.drift_rate is not None:
         content["drift_rate"] = {key: float(value) for key, value in vars(rig.drift_rate).items()}
+    if rig.volume is not None:
+        content["volume"] = _volume_entry(rig.volume)
     if covariance is not None:
-        content["covariance"] = _covariance_entry(covariance, full, where)
+        content["covariance"] = _covariance_entry(covariance, rig, full, where)
     validated(content, _RigFile, f"{where}: not written", ENTRY_NAMES)
     return yaml_text(content)
 
@@ -264,6 +333,8 @@ def _read(path: str | Path) -> tuple[_RigFile, Path]:
 def _rig_of(content: _RigFile, name: str) -> CameraRig:
     """The rig of a file; `name` is for one without."""
     cameras = content.cameras
+    models = named_lenses([camera.model for camera in cameras])
+    width = lens_width(models)
 
     def column(values: list[list[float]]) -> Tensor:
         return torch.tensor(values, dtype=torch.float64)
@@ -271,7 +342,7 @@ def _rig_of(content: _RigFile, name: str) -> CameraRig:
     return CameraRig(
         focal_length=column([camera.focal_length for camera in cameras]),
         principal_point=column([camera.principal_point for camera in cameras]),
-        distortion=column([camera.distortion for camera in cameras]),
+        distortion=column([[*camera.distortion, *[0.0] * (width - len(camera.distortion))] for camera in cameras]),
         cam_from_rig=RigidTransform(
             rotation_from_vector(column([camera.cam_from_rig.rotation_vector for camera in cameras])),
             column([camera.cam_from_rig.translation for camera in cameras]),
@@ -282,17 +353,22 @@ def _rig_of(content: _RigFile, name: str) -> CameraRig:
         working_distance=content.working_distance,
         prior=None if content.prior is None else RigPrior(**content.prior.model_dump()),
         drift_rate=None if content.drift_rate is None else DriftRate(**content.drift_rate.model_dump()),
+        volume=None if content.volume is None else content.volume.value(),
+        lens_model=models,
     )
 
 
 def _camera_entry(rig: CameraRig, camera: int, covariance: RigCovariance | None) -> dict[str, Any]:
     rotation = rig.cam_from_rig.rotation[camera].double()
+    model = LENS_MODELS[rig.lens_models[camera]]
+    count = len(model.coefficients)
     entry: dict[str, Any] = {
         "name": rig.camera_names[camera],
         "image_size": Flow(rig.image_size[camera].tolist()),
         "focal_length": _flow(rig.focal_length[camera]),
         "principal_point": _flow(rig.principal_point[camera]),
-        "distortion": _flow(rig.distortion[camera]),
+        **({"model": model.name} if model.name != _Camera.model_fields["model"].default else {}),
+        "distortion": _flow(rig.distortion[camera, :count]),
         "cam_from_rig": FlowMap(
             rotation_vector=_flow(vector_from_rotation(rotation)),
             translation=_flow(rig.cam_from_rig.translation[camera]),
@@ -301,16 +377,33 @@ def _camera_entry(rig: CameraRig, camera: int, covariance: RigCovariance | None)
     if covariance is not None:
         # Six digits are plenty for a spread; the exact values are those of the matrix.
         rounded = [float(f"{value:.6g}") for value in covariance.std[camera].tolist()]
-        parts = torch.tensor(rounded, dtype=torch.float64).split((3, 3, 2, 2, 5))
+        *pinhole, lens = torch.tensor(rounded, dtype=torch.float64).tensor_split((3, 6, 8, 10))
+        parts = (*pinhole, lens[:count])
         entry["std"] = FlowMap(zip(_Std.model_fields, map(_flow, parts), strict=True))
     return entry
 
 
-def _covariance_entry(covariance: RigCovariance, full: bool, where: str | Path) -> dict[str, Any]:
+def _volume_entry(volume: Volume) -> dict[str, Any]:
+    if volume.is_box:
+        return FlowMap(low=Flow(volume.low), high=Flow(volume.high))
+    return {"points": [Flow(point) for point in volume.points]}
+
+
+def _narrowed(covariance: RigCovariance, rig: CameraRig) -> RigCovariance:
+    """Leave out coefficients that no camera has: some of a wider rig."""
+    cameras, kept = rig.num_cameras, len(parameter_names(rig.lens_models))
+    matrix = covariance.matrix
+    if matrix is not None and kept < covariance.std.shape[1]:
+        blocks = matrix.unflatten(0, (cameras, -1)).unflatten(-1, (cameras, -1))
+        matrix = blocks[:, :kept, :, :kept].flatten(2).flatten(0, 1)
+    return RigCovariance(covariance.std[:, :kept], matrix, covariance.reference_camera)
+
+
+def _covariance_entry(covariance: RigCovariance, rig: CameraRig, full: bool, where: str | Path) -> dict[str, Any]:
     entry: dict[str, Any] = {}
     if covariance.reference_camera is not None:
         entry["reference_camera"] = covariance.reference_camera
-    entry["parameters"] = Flow(PARAMETER_NAMES)
+    entry["parameters"] = Flow(parameter_names(rig.lens_models))
     if full:
         if covariance.matrix is None:
             raise InputError(f"{where}: not written: found no covariance matrix, expected one with full=True")
@@ -319,20 +412,22 @@ def _covariance_entry(covariance: RigCovariance, full: bool, where: str | Path) 
 
 
 def _std_tensor(content: _RigFile) -> Tensor:
-    """Collect the standard deviations of all cameras: (C, 15)."""
+    """Collect the standard deviations of all cameras: (C, K)."""
     rows = [[v for part in camera.std.model_dump().values() for v in part] for camera in content.cameras if camera.std]
-    return torch.tensor(rows, dtype=torch.float64)
+    width = len(parameter_names([camera.model for camera in content.cameras]))
+    return torch.tensor([[*row, *[0.0] * (width - len(row))] for row in rows], dtype=torch.float64)
 
 
-def _check_covariance(covariance: _Covariance, names: list[str], std: Tensor) -> None:
+def _check_covariance(covariance: _Covariance, cameras: list[_Camera], std: Tensor) -> None:
+    names, expected = [camera.name for camera in cameras], parameter_names([camera.model for camera in cameras])
     if covariance.reference_camera is not None and covariance.reference_camera not in names:
         found = covariance.reference_camera
         raise ValueError(f"covariance: found reference_camera {found}, expected one of {listed(names)}")
-    if tuple(covariance.parameters) != PARAMETER_NAMES:
-        raise ValueError(f"covariance: found other parameters than {', '.join(PARAMETER_NAMES)}, or another order")
+    if tuple(covariance.parameters) != expected:
+        raise ValueError(f"covariance: found other parameters than {', '.join(expected)}, or another order")
     if covariance.matrix is None:
         return
-    size = len(names) * PARAMETERS
+    size = std.numel()
     lengths = {len(row) for row in covariance.matrix}
     if len(covariance.matrix) != size or lengths != {size}:
         raise ValueError(

@@ -76,6 +76,17 @@ def parse_yaml(text: str, where: str) -> Any:
         raise InputError(f"{where}: found {reprlib.repr(text)}, expected a value in YAML") from error
 
 
+def parse_foreign_yaml(content: bytes, where: str, mapping_tags: frozenset[str] = frozenset()) -> Any:
+    """Read the plain values of a YAML file of another tool, within the same bounds; errors begin with `where`.
+
+    Args:
+        content: encoded text. A first line `%YAML:1.0` (OpenCV's) or `%YAML 1.2` is passed over.
+        where: what errors begin with.
+        mapping_tags: tags that its mappings may have, as `tag:yaml.org,2002:opencv-matrix`.
+    """
+    return _parse(re.sub(rb"\A(\xef\xbb\xbf)?%YAML[^\n]*\n", b"", content), where, mapping_tags)
+
+
 def yaml_text(content: dict[str, Any]) -> str:
     """Write plain values as YAML in the given order; floats in their shortest exact form."""
     return yaml.dump(
@@ -105,11 +116,11 @@ def _content(path: Path) -> bytes:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
-def _parse(content: bytes, where: str) -> Any:
+def _parse(content: bytes, where: str, mapping_tags: frozenset[str] = frozenset()) -> Any:
     if len(content) > MOST_BYTES:
         raise InputError(f"{where}: found {len(content):,} bytes, expected at most {MOST_BYTES:,}")
     try:
-        return read_values(content)
+        return read_values(content, mapping_tags)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = f" in line {mark.line + 1}" if mark is not None else ""

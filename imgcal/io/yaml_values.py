@@ -27,13 +27,14 @@ MERGE = object()  # stands for the key `<<`
 Mark = Any  # of PyYAML: where in the text
 
 
-def read_values(content: bytes) -> Any:
+def read_values(content: bytes, mapping_tags: frozenset[str] = frozenset()) -> Any:
     """Read one YAML document.
 
     Keys stay text whatever they look like (`false: 0.1`, `1: 2`), and so do dates.
 
     Args:
         content: encoded text.
+        mapping_tags: tags beyond those of JSON that a mapping may have; nothing is made of them.
 
     Returns:
         dict, list, str, int, float, bool or None.
@@ -43,7 +44,7 @@ def read_values(content: bytes) -> Any:
     """
     loader = _Loader(content)
     try:
-        return _Builder(loader).document()
+        return _Builder(loader, MAPPING | mapping_tags).document()
     finally:
         loader.dispose()
 
@@ -62,8 +63,9 @@ class _Open:
 class _Builder:
     """Turns events into values."""
 
-    def __init__(self, loader: Any) -> None:
+    def __init__(self, loader: Any, mapping_tags: frozenset[str]) -> None:
         self.loader = loader
+        self.mapping_tags = mapping_tags
         self.open: list[_Open] = []
         self.anchors: dict[str, tuple[Any, int]] = {}  # value and how many values it holds
         self.count = 0
@@ -110,7 +112,7 @@ class _Builder:
 
     def _begin(self, event: Any) -> None:
         value: list[Any] | dict[str, Any] = {} if isinstance(event, yaml.MappingStartEvent) else []
-        _check_tag(event, MAPPING if isinstance(value, dict) else LIST)
+        _check_tag(event, self.mapping_tags if isinstance(value, dict) else LIST)
         self._check_not_a_key(event.start_mark)
         if len(self.open) == MOST_DEPTH:
             _fail(f"found more than {MOST_DEPTH} levels, one within the other", event.start_mark)

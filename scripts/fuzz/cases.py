@@ -26,6 +26,7 @@ from imgcal.io import (
 )
 from imgcal.networks import Checkpoint, build_network, save_checkpoint
 from imgcal.training import RigExperiment, load_experiment
+from scripts.fuzz.foreign import prepare_foreign
 from scripts.fuzz.mutations import NAMES, VALUES, mutated
 
 SIZE = (256, 136)  # pixels: small frames are quick
@@ -44,6 +45,7 @@ OPTIONS = {
     ),
     "score": ("--snapshots", "--rig", "--object", "--threshold", "--bit-depth"),
     "render": ("--size", "--dot", "--snapshots", "--rig", "--object", "--out"),
+    "convert": ("--unit", "--out-unit", "--image-size", "--distance", "--cameras", "--from", "--to", "--fit-limit"),
     "detect": ("--rig", "--snapshots", "--threshold", "--bit-depth", "--max-radius", "--out"),
     "evaluate": ("--rig", "--object", "--kappa", "--phi", "--noise", "--missing", "--swapped", "--false", "--seed"),
 }  # fmt: skip
@@ -74,6 +76,7 @@ def prepare(folder: Path) -> None:
         raise RuntimeError("no blobs are found in the sound capture")
     _other_frames(folder)
     _network(folder)
+    prepare_foreign(folder / "foreign", load_rig(folder / "rig.yaml"))
 
 
 def case(sound: Path, folder: Path, seed: int, number: int) -> Case:
@@ -153,6 +156,21 @@ def _rig(folder: Path, random: Random) -> tuple[list[str], str]:
     return _on(folder, random.choice(("labelled.csv", "blobs.csv")), random), _damage(folder / "rig.yaml", random)
 
 
+def _foreign(folder: Path, random: Random) -> tuple[list[str], str]:
+    """Another tool's calibration, converted or used as a rig."""
+    place = random.choice(sorted((folder / "foreign").iterdir()))
+    path = random.choice(sorted(place.iterdir()))
+    damage = f"{place.name}/{_damage(path, random)}"
+    given = str(random.choice((place, path)))
+    if random.random() < 0.2:
+        return ["score", str(folder / "labelled.csv"), "--rig", given, "--object", str(folder / "object.csv")], damage
+    to = random.choice(("imgcal", "imgcal", "kalibr", "colmap", "mrcal", "anipose", "ros", "opencv-stereo"))
+    arguments = ["convert", given, "--to", to, "--out", str(folder / "out")]
+    if random.random() < 0.8:
+        arguments += ["--unit", random.choice(("m", "mm", "inch"))]
+    return arguments, damage
+
+
 def _object(folder: Path, random: Random) -> tuple[list[str], str]:
     return _on(folder, random.choice(("labelled.csv", "blobs.csv")), random), _damage(folder / "object.csv", random)
 
@@ -216,6 +234,7 @@ def _option(folder: Path, random: Random) -> tuple[list[str], str]:
     sound = {
         "simulate": ["simulate", *_subject(folder), "--out", str(folder / "out"), "--snapshots", "1"],
         "evaluate": ["evaluate", *_subject(folder), "--count", "2", "--trials", "1"],
+        "convert": ["convert", str(folder / "foreign" / "colmap"), "--out", str(folder / "out" / "rig.yaml")],
         "detect": ["detect", str(folder / "capture"), "--out", str(folder / "out.csv")],
         "calibrate": ["calibrate", str(folder / "capture"), *_subject(folder), "--out", str(folder / "out")],
         "render": ["render", str(folder / "capture"), *_subject(folder), "--out", str(folder / "out"), "--size", "32"],
@@ -229,6 +248,7 @@ def _option(folder: Path, random: Random) -> tuple[list[str], str]:
 
 KINDS: dict[str, Callable[[Path, Random], tuple[list[str], str]]] = {
     "rig": _rig,
+    "foreign": _foreign,
     "object": _object,
     "table": _table,
     "frames": _frames,

@@ -140,6 +140,26 @@ def structure(content: bytes, random: Random) -> bytes:
     return b"\n".join(rows)
 
 
+def markup(content: bytes, random: Random) -> bytes:
+    """Put what only a parser of XML minds into a text: in UTF-16 where the text is."""
+    nasty = random.choice(
+        (
+            "<!DOCTYPE a [<!ENTITY l 'lol'><!ENTITY m '&l;&l;&l;&l;&l;&l;&l;&l;'>]>",
+            "<!DOCTYPE a [<!ENTITY e SYSTEM 'file:///etc/passwd'>]>",
+            "<a>" * 5000,
+            "&l;",
+            "</Cameras>",
+            "<Camera/>" * 400,
+            "<![CDATA[",
+        )
+    )
+    wide = content.startswith((b"\xff\xfe", b"\xfe\xff"))
+    new = nasty.encode("utf-16-le" if wide else "utf-8")
+    ends = [match.end() for match in re.finditer(rb">\0" if wide else rb">", content)]
+    place = random.choice([2 if wide else 0, *ends])
+    return content[:place] + new + content[place:]
+
+
 def png_chunks(content: bytes, random: Random) -> bytes:
     """Damage a chunk of a PNG and make its checksum right again."""
     position, chunks = 8, []
@@ -203,7 +223,12 @@ def deep(content: bytes, random: Random) -> bytes:
 
 BYTES: tuple[Mutation, ...] = (flip, cut, replace_range, numbers_in_binary)
 CSV: tuple[Mutation, ...] = (other_value, other_value, other_name, lines, columns, flip, cut, replace_range)
+TEXT: tuple[Mutation, ...] = (other_value, other_value, other_value, other_name, lines, flip, cut, replace_range, deep)
+XML: tuple[Mutation, ...] = (other_value, other_value, other_name, lines, markup, flip, cut, replace_range)
 MUTATIONS: dict[str, tuple[Mutation, ...]] = {
+    **dict.fromkeys((".toml", ".json", ".txt", ".cameramodel"), TEXT),
+    **dict.fromkeys((".xml", ".mcal", ".xcp"), XML),
+    ".yml": (other_value, other_value, other_value, other_name, lines, structure, flip, cut, replace_range),
     ".yaml": (other_value, other_value, other_value, other_name, lines, structure, flip, cut, replace_range),
     ".csv": CSV,
     ".gz": (compressed, compressed, compressed, *BYTES),

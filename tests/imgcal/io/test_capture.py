@@ -11,6 +11,7 @@ from imgcal.errors import InputError
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.io.capture import Capture, open_capture, open_input, save_capture_settings
 from imgcal.io.frames import Frame, write_frame
+from imgcal.io.resources import data_path
 from imgcal.types.observations import Detections
 from imgcal.types.rig import CameraRig
 
@@ -60,6 +61,14 @@ def test_folders_with_missing_frames_and_a_missing_camera(tmp_path: Path) -> Non
     assert open_capture(tmp_path).camera_names == ("left", "right")
 
 
+def test_frames_by_camera_are_those_of_the_snapshots(tmp_path: Path) -> None:
+    capture = open_capture(data_path("samples", "O10"))
+    frames = capture.frames(1, 3)
+    assert list(frames) == list(capture.camera_names) and {len(series) for series in frames.values()} == {2}
+    for number, (_, snapshot) in enumerate(capture.snapshots(1, 3)):
+        assert all(np.array_equal(frames[name][number], frame) for name, frame in snapshot.items())
+
+
 def test_one_file_a_camera(tmp_path: Path) -> None:
     (tmp_path / "frames").mkdir()
     cv2.imwritemulti(str(tmp_path / "frames" / "a.tif"), [grey(i, np.uint16) for i in range(12)])
@@ -68,13 +77,40 @@ def test_one_file_a_camera(tmp_path: Path) -> None:
         writer.write(grey(20 + i))
     writer.release()
     put(tmp_path, "frames/c.png", grey(99))
-    capture = open_capture(tmp_path, make_rig("a", "b", "c"))
+    with pytest.raises(InputError, match=r"b\.avi: found 11 frames, and 12 in a\.tif, expected as many"):
+        open_capture(tmp_path, make_rig("a", "b", "c"))
+    capture = open_capture(tmp_path, make_rig("a", "b", "c"), videos_differ=True)
     assert capture.snapshot_names == tuple(str(i) for i in range(12))
     seen = levels(capture)
     assert seen["0"] == [0, 20, 99]
     assert seen["10"] == [10, 30, None]
     assert seen["11"] == [11, None, None]
     assert [int(f["b"][0, 0]) for _, f in capture.snapshots(3, 5) if f["b"] is not None] == [23, 24]
+
+
+def write_video(path: Path, levels: list[int], rate: float = 10.0, codec: str = "FFV1") -> None:
+    path.parent.mkdir(exist_ok=True)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), rate, (32, 24), False)
+    for level in levels:
+        writer.write(grey(level))
+    writer.release()
+
+
+def test_a_video_that_lacks_a_frame_is_an_error_unless_told_otherwise(tmp_path: Path) -> None:
+    write_video(tmp_path / "frames" / "a.avi", [0, 1, 2, 3])
+    write_video(tmp_path / "frames" / "b.avi", [0, 2, 3])
+    with pytest.raises(InputError, match=r"b\.avi: found 3 frames, and 4 in a\.avi.*--videos-differ"):
+        open_input(tmp_path)
+    capture = open_input(tmp_path, videos_differ=True)
+    assert isinstance(capture, Capture) and levels(capture)["2"] == [2, 3]
+
+
+def test_videos_whose_time_stamps_differ_are_an_error_unless_told_otherwise(tmp_path: Path) -> None:
+    write_video(tmp_path / "frames" / "a.mkv", list(range(8)), 10.0)
+    write_video(tmp_path / "frames" / "b.mkv", list(range(8)), 11.0)
+    with pytest.raises(InputError, match=r"a\.mkv: found frame 6 at 0\.600 s, in b\.mkv at 0\.545 s"):
+        list(open_capture(tmp_path).snapshots())
+    assert levels(open_capture(tmp_path, videos_differ=True))["7"] == [7, 7]
 
 
 @pytest.mark.parametrize("name", [b"frames/a/\xff.png", b"frames/\xff/0.png", b"frames/a/0\x1b[31m.png"])

@@ -1,3 +1,4 @@
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.io.rig_yaml import RigCovariance, load_rig, load_rig_covariance, save_rig
 from imgcal.types.rig import CameraRig, DriftRate, RigPrior
+from imgcal.types.volume import Volume
 
 TEXT = """\
 format: imgcal-rig/1
@@ -58,7 +60,7 @@ def covariance_of(cameras: int) -> RigCovariance:
     generator = torch.Generator().manual_seed(0)
     root = torch.randn(15 * cameras, 15 * cameras, generator=generator, dtype=torch.float64)
     root[:6] = 0  # the reference camera's place is exact
-    return RigCovariance.from_matrix(root @ root.mT / 100, "a")
+    return RigCovariance.from_matrix(root @ root.mT / 100, cameras, "a")
 
 
 def test_reads_the_documented_example(tmp_path: Path) -> None:
@@ -116,6 +118,61 @@ def test_names_that_look_like_something_else_survive(name: str, tmp_path: Path) 
     rig = make_rig(torch.zeros(1, 15, dtype=torch.float64), (name,))
     save_rig(rig, tmp_path / "r.yaml")
     assert load_rig(tmp_path / "r.yaml").camera_names == (name,)
+
+
+@pytest.mark.parametrize(
+    "volume", [Volume.box((-1, -2, 3), (1, 2, 4.5)), Volume(((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 7.25)))]
+)
+def test_a_volume_survives(volume: Volume, tmp_path: Path) -> None:
+    save_rig(replace(make_rig(torch.zeros(3, 15, dtype=torch.float64)), volume=volume), tmp_path / "r.yaml")
+    assert load_rig(tmp_path / "r.yaml").volume == volume
+    assert ("low" in (tmp_path / "r.yaml").read_text()) == volume.is_box
+
+
+def test_lens_models_round_trip(tmp_path: Path) -> None:
+    models = ("equidistant", "brown_conrady", "rational")
+    rig = make_rig(torch.zeros(3, 15, dtype=torch.float64))
+    lenses = torch.zeros(3, 8, dtype=torch.float64)
+    lenses[0, :4], lenses[1, :5], lenses[2] = 0.01, 0.02, torch.linspace(0.01, 0.08, 8)
+    rig = replace(rig, distortion=lenses, lens_model=models)
+    root = torch.randn(54, 54, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    root.view(3, 18, 54)[0, 14:] = root.view(3, 18, 54)[1, 15:] = 0
+    path = tmp_path / "r.yaml"
+    covariance = RigCovariance.from_matrix(root @ root.mT / 100, 3)
+    save_rig(rig, path, covariance, full=True)
+    back, known = load_rig(path), load_rig_covariance(path)
+    assert back.lens_model == models and torch.equal(back.distortion, lenses)
+    assert known is not None and known.matrix is not None and torch.equal(known.matrix, covariance.matrix)
+    assert "distortion: [0.01, 0.01, 0.01, 0.01]" in path.read_text()
+    one = rig.select([0])  # as wide as the rig that it is of; the file is not
+    save_rig(one, path, RigCovariance.from_matrix(covariance.matrix[:18, :18], 1), full=True)
+    narrow = load_rig(path)
+    assert narrow.lens_model == "equidistant" and narrow.distortion.shape == (1, 5)
+    points = torch.tensor([[50.0, -20.0, 900.0]], dtype=torch.float64)
+    torch.testing.assert_close(narrow.project(points).uv, one.project(points).uv, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("model", "lens", "message"),
+    [
+        ("fisheye", [0.0] * 4, "model: found 'fisheye', expected one of brown_conrady, rational"),
+        (
+            "rational",
+            [0.0] * 5,
+            "distortion: found 5 coefficients, expected 8 of rational: k1, k2, p1",
+        ),
+        ("equidistant", [0.0] * 5, "distortion: found 5 coefficients, expected 4 of equidistant"),
+        ("equidistant", [900.0, 0.0, 0.0, 0.0], "which moves the image corners"),
+    ],
+)
+def test_lenses_that_cannot_be(model: str, lens: list[float], message: str, tmp_path: Path) -> None:
+    path = tmp_path / "r.yaml"
+    save_rig(make_rig(torch.zeros(1, 15, dtype=torch.float64), ("a",)), path)
+    lines = [line for line in path.read_text().splitlines() if not line.lstrip().startswith("distortion: [")]
+    at = next(i for i, line in enumerate(lines) if "principal_point: [" in line)
+    path.write_text("\n".join([*lines[:at], f"  model: {model}", f"  distortion: {lens}", *lines[at:]]) + "\n")
+    with pytest.raises(InputError, match=re.escape(message)):
+        load_rig(path)
 
 
 def test_covariance_round_trip(tmp_path: Path) -> None:
@@ -186,6 +243,10 @@ def test_covariance_round_trip(tmp_path: Path) -> None:
         (TEXT[TEXT.index("cameras") :], "\n".join(f"k{i}: 0" for i in range(5000)), r"found 5,001 values"),
         ("prior:\n", "prior:\n  rotation: 0\n", r"prior: rotation: found 0"),
         ("prior:\n", "drift_rate: {rotation: -1}\nprior:\n", r"drift_rate: rotation: found -1"),
+        ("prior:\n", "volume: {low: [0, 0, 0]}\nprior:\n", r"volume: expected `low` and `high` of a box, or `points`"),
+        ("prior:\n", "volume: {low: [0, 0, 0], high: [1, 0, 1]}\nprior:\n", r"expected each low below its high"),
+        ("prior:\n", "volume: {points: [[0, 0, 0], [1, 0, 0]]}\nprior:\n", r"volume: points: found 2 values"),
+        ("prior:\n", "volume: {points: [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]}\nprior:\n", "in one plane"),
         ("prior:\n", "drift_rate: {focal: 1}\nprior:\n", r"drift_rate: unknown key `focal`"),
         ("prior:\n", "covariance: {parameters: [fx]}\nprior:\n", r"found only one of `std`|`std`.*`covariance`"),
     ],

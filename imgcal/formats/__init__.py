@@ -1,0 +1,5 @@
+"""Calibrations of other tools: read, written and verified; one file a format."""
+
+import lazy_loader as lazy
+
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

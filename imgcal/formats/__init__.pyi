@@ -1,0 +1,39 @@
+from .conversion import LIMIT, Held, describe_lens, from_camera_rig, held_by, to_camera_rig, with_image_sizes
+from .fitting import Fit, Holds
+from .foreign_rig import ForeignCamera, ForeignRig
+from .format import Format
+from .lens import Lens
+from .loading import load_rig
+from .registry import FORMATS, format_named, is_foreign, read_foreign_rig
+from .units import in_millimetres, millimetres
+from .verification import known_points, worst_difference
+from .writing import OURS, Written, converted, selected
+
+__all__ = [
+    "FORMATS",
+    "LIMIT",
+    "OURS",
+    "Fit",
+    "ForeignCamera",
+    "ForeignRig",
+    "Format",
+    "Held",
+    "Holds",
+    "Lens",
+    "Written",
+    "converted",
+    "describe_lens",
+    "format_named",
+    "from_camera_rig",
+    "held_by",
+    "in_millimetres",
+    "is_foreign",
+    "known_points",
+    "load_rig",
+    "millimetres",
+    "read_foreign_rig",
+    "selected",
+    "to_camera_rig",
+    "with_image_sizes",
+    "worst_difference",
+]

@@ -1,0 +1,48 @@
+"""Anipose / aniposelib `calibration.toml`: [cam_N] in the unit of the board's squares, which the file does not say."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from imgcal.formats.fitting import Holds
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig
+from imgcal.formats.format import Files, Format
+from imgcal.formats.source import Source
+from imgcal.formats.toml_cameras import cameras_of, tables_of, toml_text
+from imgcal.formats.values import vector_of_rotation
+
+TITLE = "anipose calibration.toml"
+
+
+def _recognizes(source: Source) -> bool:
+    return tables_of(source) is not None
+
+
+def _read(source: Source) -> ForeignRig:
+    tables = tables_of(source)
+    assert tables is not None
+    notes: list[str] = []
+    cameras = cameras_of(tables.cameras, notes)
+    return ForeignRig(FORMAT.name, cameras, None, "the file's world (anipose: near the first camera)", tuple(notes))
+
+
+def camera_table(camera: ForeignCamera, coefficients: int = 5) -> dict[str, Any]:
+    """One camera as anipose and its kin write it."""
+    fisheye = camera.lens.model == "fisheye"
+    return {
+        "name": camera.name,
+        "size": list(camera.image_size or ()),
+        "matrix": camera.lens.matrix.tolist(),
+        "distortions": camera.lens.padded(4 if fisheye else coefficients),
+        "rotation": vector_of_rotation(camera.rotation).tolist(),
+        "translation": camera.translation.tolist(),
+        "fisheye": fisheye,
+    }
+
+
+def _write(rig: ForeignRig) -> Files:
+    tables = {f"cam_{number}": camera_table(camera) for number, camera in enumerate(rig.cameras)}
+    return {"": toml_text({**tables, "metadata": {"adjusted": False, "error": 0.0}})}
+
+
+FORMAT = Format("anipose", TITLE, _recognizes, _read, _write, Holds((5,), fisheye=True), unit="mm")

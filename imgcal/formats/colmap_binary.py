@@ -1,0 +1,159 @@
+"""COLMAP's binary files: little endian, every count compared with what is left of the file."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any
+
+from imgcal.formats.chains import IDENTITY, Pose
+from imgcal.formats.colmap_model import (
+    COUNTS,
+    MODELS,
+    ColmapCamera,
+    ColmapImage,
+    ColmapRig,
+    model_of_rig,
+    pose_of,
+    rig_of_model,
+    seven,
+)
+from imgcal.formats.documents import read_bytes
+from imgcal.formats.fitting import Holds
+from imgcal.formats.foreign_rig import ForeignRig, FormatError
+from imgcal.formats.format import Files, Format
+from imgcal.formats.source import Source
+from imgcal.formats.values import number
+
+TITLE = "COLMAP model (binary)"
+CAMERA = 0  # the type of a sensor
+MOST_BYTES = 2**30
+LONGEST_NAME = 4096
+POINT = struct.calcsize("<ddQ")
+
+
+class _Reader:
+    """Values one after another; a file that ends too early is an error of one line."""
+
+    def __init__(self, path: Path) -> None:
+        self.name, self.content, self.place = path.name, read_bytes(path, MOST_BYTES), 0
+
+    def take(self, layout: str) -> tuple[Any, ...]:
+        size = struct.calcsize("<" + layout)
+        self.need(size)
+        values = struct.unpack_from("<" + layout, self.content, self.place)
+        self.place += size
+        return values
+
+    def count(self, smallest: int) -> int:
+        """A number of records of at least so many bytes each."""
+        (count,) = self.take("Q")
+        self.need(count * smallest)
+        return int(count)
+
+    def need(self, size: int) -> None:
+        if size > len(self.content) - self.place:
+            raise FormatError(f"{self.name}: ends after {len(self.content):,} bytes, in the middle of a record")
+
+    def name_of_image(self) -> str:
+        end = self.content.find(b"\0", self.place, self.place + LONGEST_NAME)
+        if end < 0:
+            raise FormatError(f"{self.name}: found an image name without an end")
+        text = self.content[self.place : end].decode(errors="replace")
+        self.place = end + 1
+        return text
+
+    def pose(self) -> Pose:
+        return pose_of([number(value, self.name) for value in self.take("7d")], self.name)
+
+
+def _recognizes(source: Source) -> bool:
+    return source.named("cameras.bin") is not None
+
+
+def _read(source: Source) -> ForeignRig:
+    path = source.named("cameras.bin")
+    assert path is not None
+    cameras = _cameras(_Reader(path))
+    rigs_path, images_path = source.named("rigs.bin"), source.named("images.bin")
+    rigs = _rigs(_Reader(rigs_path)) if rigs_path else []
+    if images_path is None and not any(len(rig.sensors) > 1 for rig in rigs):
+        raise FormatError("intrinsics alone: expected images.bin or rigs.bin beside cameras.bin")
+    return rig_of_model(FORMAT.name, cameras, _images(_Reader(images_path)) if images_path else [], rigs)
+
+
+def _cameras(reader: _Reader) -> list[ColmapCamera]:
+    found = []
+    for _ in range(reader.count(24)):
+        camera, model, width, height = reader.take("IiQQ")
+        if not 0 <= model < len(MODELS):
+            raise FormatError(
+                f"{reader.name}: camera {camera}: found the model number {model}, which is none of COLMAP's"
+            )
+        name = MODELS[model]
+        parameters = tuple(number(value, reader.name) for value in reader.take(f"{COUNTS[name]}d"))
+        found.append(ColmapCamera(camera, name, (width, height), parameters))
+    return found
+
+
+def _rigs(reader: _Reader) -> list[ColmapRig]:
+    found = []
+    for _ in range(reader.count(8)):
+        rig, sensors = reader.take("II")
+        reader.need(9 * max(sensors - 1, 0))
+        poses: dict[int, Pose | None] = {}
+        for place in range(sensors):
+            kind, sensor = reader.take("iI")
+            pose: Pose | None = IDENTITY
+            if place:
+                (posed,) = reader.take("B")
+                pose = reader.pose() if posed else None
+            if kind == CAMERA:
+                poses[sensor] = pose
+        found.append(ColmapRig(rig, poses))
+    return found
+
+
+def _images(reader: _Reader) -> list[ColmapImage]:
+    found = []
+    for _ in range(reader.count(73)):
+        (image,) = reader.take("I")
+        pose = reader.pose()
+        (camera,) = reader.take("I")
+        name = reader.name_of_image()
+        points = reader.count(POINT)
+        reader.place += points * POINT
+        found.append(ColmapImage(image, pose, camera, name))
+    return found
+
+
+def _write(rig: ForeignRig) -> Files:
+    cameras, images, colmap_rig, rig_from_world = model_of_rig(rig)
+    count = struct.pack("<Q", len(cameras))
+    camera_rows = [
+        struct.pack(f"<IiQQ{len(c.parameters)}d", c.id, MODELS.index(c.model), *(c.image_size or (0, 0)), *c.parameters)
+        for c in cameras
+    ]
+    image_rows = [
+        struct.pack("<I7dI", i.id, *seven(i.pose), i.camera) + i.name.encode() + b"\0" + struct.pack("<Q", 0)
+        for i in images
+    ]
+    sensors = [struct.pack("<iI", CAMERA, 1)]
+    for sensor, pose in colmap_rig.sensors.items():
+        if sensor != 1 and pose is not None:
+            sensors.append(struct.pack("<iIB7d", CAMERA, sensor, 1, *seven(pose)))
+    data = [struct.pack("<iIQ", CAMERA, image.camera, image.id) for image in images]
+    frame = struct.pack("<II7dI", 1, 1, *seven(rig_from_world), len(images))
+    one = struct.pack("<Q", 1)
+    return {
+        "cameras.bin": count + b"".join(camera_rows),
+        "images.bin": count + b"".join(image_rows),
+        "rigs.bin": one + struct.pack("<II", 1, len(cameras)) + b"".join(sensors),
+        "frames.bin": one + frame + b"".join(data),
+        "points3D.bin": struct.pack("<Q", 0),
+    }
+
+
+FORMAT = Format(
+    "colmap-binary", TITLE, _recognizes, _read, _write, Holds((4, 8), fisheye=True), unit="m", cameras=(2, 256)
+)

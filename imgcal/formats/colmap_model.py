@@ -1,0 +1,217 @@
+"""COLMAP's model: cameras, images, rigs and frames, whether they come as text or as binary.
+
+Pixel (0.5, 0.5) is the centre of the top-left pixel there: principal points move by half a pixel. The unit is arbitrary
+unless the model has been given a scale.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+
+import numpy as np
+
+from imgcal.formats.chains import IDENTITY, Pose, compose, inverse
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
+from imgcal.formats.lens import Array, Lens
+from imgcal.formats.values import named, quaternion_of_rotation, rotation_of_quaternion
+
+HALF = 0.5
+MODELS = (
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
+    "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE",
+)  # fmt: skip
+"""In the order of their numbers in binary files."""
+
+COUNTS = dict(zip(MODELS, (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16), strict=True))
+STEADY_PX = 0.5  # how far images of cameras that are fixed to each other may disagree about it
+ROTATION_STEADY, PLACE_STEADY = 1e-3, 1e-2  # rad; of the cameras' distances to each other
+
+
+@dataclass(frozen=True)
+class ColmapCamera:
+    """A row of cameras.txt."""
+
+    id: int
+    model: str
+    image_size: tuple[int, int] | None
+    parameters: tuple[float, ...]
+
+    def lens(self) -> Lens:
+        """The lens with OpenCV's pixels."""
+        if self.model not in COUNTS or self.model in ("FOV", *MODELS[10:]):
+            raise FormatError(f"camera {self.id}: the model {self.model} has no counterpart in other tools")
+        if len(self.parameters) != COUNTS[self.model]:
+            raise FormatError(
+                f"camera {self.id}: found {len(self.parameters)} parameters, {self.model} has {COUNTS[self.model]}"
+            )
+        p = self.parameters
+        if self.model.startswith("SIMPLE") or self.model.startswith("RADIAL"):
+            focal, centre, ks = (p[0], p[0]), (p[1], p[2]), p[3:]
+        else:
+            focal, centre, ks = (p[0], p[1]), (p[2], p[3]), p[4:]
+        if min(focal) <= 0:
+            raise FormatError(f"camera {self.id}: found the focal length {min(focal):g}")
+        model = "fisheye" if self.model.endswith("FISHEYE") else "opencv"
+        return Lens(
+            focal, (centre[0] - HALF, centre[1] - HALF), tuple(ks), "fisheye" if model == "fisheye" else "opencv"
+        )
+
+
+@dataclass(frozen=True)
+class ColmapImage:
+    """A row of images.txt: cam_from_world."""
+
+    id: int
+    pose: Pose
+    camera: int
+    name: str
+
+
+@dataclass(frozen=True)
+class ColmapRig:
+    """A row of rigs.txt: sensor_from_rig of each camera; None where the file has no pose."""
+
+    id: int
+    sensors: dict[int, Pose | None]
+
+
+def pose_of(row: Sequence[float], what: str) -> Pose:
+    """A quaternion w, x, y, z (Hamilton) and a translation."""
+    return rotation_of_quaternion(list(row[:4]), what), np.array(row[4:7], dtype=np.float64)
+
+
+def rig_of_model(
+    name: str, cameras: Sequence[ColmapCamera], images: Sequence[ColmapImage], rigs: Sequence[ColmapRig]
+) -> ForeignRig:
+    """Make a rig: of a rig that the model has, else of the images that were taken together.
+
+    Raises:
+        FormatError: neither is there, or the cameras were not fixed to each other.
+    """
+    known = {camera.id: camera for camera in cameras}
+    notes = ["COLMAP's pixels begin half a pixel earlier: cx and cy are 0.5 less here"]
+    together = [rig for rig in rigs if len(rig.sensors) > 1]
+    if len(together) > 1:
+        raise FormatError(f"found {len(together)} rigs of several cameras, expected one")
+    if together:
+        return _of_rig(name, together[0], known, images, notes)
+    return _of_images(name, known, images, notes)
+
+
+def _names(rig: ColmapRig, images: Sequence[ColmapImage]) -> dict[int, str]:
+    """Cameras are called as the folders of their images, where each has one of its own, else by their numbers."""
+    folders: dict[int, set[str]] = {sensor: set() for sensor in rig.sensors}
+    for image in images:
+        if image.camera in folders:
+            folders[image.camera].add(str(PurePosixPath(image.name).parent))
+    one_each = [next(iter(found)) for found in folders.values() if len(found) == 1]
+    names = [folder.rpartition("/")[2] for folder in one_each]
+    if len(set(names)) == len(folders) and "." not in names:
+        return dict(zip(folders, names, strict=True))
+    return {sensor: str(sensor) for sensor in rig.sensors}
+
+
+def _of_rig(
+    name: str, rig: ColmapRig, known: dict[int, ColmapCamera], images: Sequence[ColmapImage], notes: list[str]
+) -> ForeignRig:
+    names = _names(rig, images)
+    lost = [names[sensor] for sensor, pose in rig.sensors.items() if pose is None]
+    if lost:
+        notes.append(f"{named(lost)}: left out, without a pose in the rig")
+    found = []
+    for sensor, pose in rig.sensors.items():
+        if pose is None:
+            continue
+        if sensor not in known:
+            raise FormatError(f"rig {rig.id}: camera {sensor} is not among the cameras")
+        found.append(ForeignCamera(names[sensor], known[sensor].lens(), known[sensor].image_size, *pose))
+    if len(found) < 2:
+        raise FormatError(f"rig {rig.id}: {named(lost)} without a pose in it, so that there is no rig")
+    return ForeignRig(name, tuple(found), None, f"rig {rig.id} (its reference camera)", tuple(notes))
+
+
+def _of_images(
+    name: str, known: dict[int, ColmapCamera], images: Sequence[ColmapImage], notes: list[str]
+) -> ForeignRig:
+    if len(images) < 2:
+        raise FormatError(
+            f"found no rig and {len(images)} images, expected rigs.txt or images that were taken together"
+        )
+    frames: dict[str, dict[str, ColmapImage]] = {}
+    folders = {str(PurePosixPath(image.name).parent) for image in images}
+    for image in images:
+        path = PurePosixPath(image.name)
+        frame, camera = (path.stem, str(path.parent)) if len(folders) > 1 else ("", path.stem)
+        if camera in frames.setdefault(frame, {}):
+            raise FormatError(f"found two images of {camera} in one frame: {image.name}")
+        frames[frame][camera] = image
+    if len(folders) == 1 and len({image.camera for image in images}) == 1 and len(images) > 2:
+        notes.append(
+            f"found no rigs.txt, and {len(images)} images with one set of intrinsics: taken for as many cameras of one "
+            "moment; if it is one camera that moved, there is no rig"
+        )
+    first = max(frames.values(), key=len)
+    frame = next(key for key, value in frames.items() if value is first)
+    if len(frames) > 1:
+        _check_steady(frames, first)
+        notes.append(f"found no rigs.txt: the cameras' poses are those of the images {frame!r} of each folder")
+    cameras = []
+    for camera, image in first.items():
+        if image.camera not in known:
+            raise FormatError(f"image {image.name}: camera {image.camera} is not among the cameras")
+        row = known[image.camera]
+        cameras.append(ForeignCamera(camera, row.lens(), row.image_size, *image.pose))
+    return ForeignRig(name, tuple(cameras), None, "COLMAP's world" + (f" at {frame!r}" if frame else ""), tuple(notes))
+
+
+def _check_steady(frames: dict[str, dict[str, ColmapImage]], first: dict[str, ColmapImage]) -> None:
+    """The cameras must stand to each other in every frame as they do in the first."""
+    root = next(iter(first))
+    size = max(float(np.linalg.norm(compose(image.pose, inverse(first[root].pose))[1])) for image in first.values())
+    for frame, images in frames.items():
+        if root not in images:
+            continue
+        for camera, image in images.items():
+            if camera not in first:
+                continue
+            now = compose(image.pose, inverse(images[root].pose))
+            then = compose(first[camera].pose, inverse(first[root].pose))
+            turned = float(np.abs(now[0] - then[0]).max())
+            moved = float(np.linalg.norm(now[1] - then[1]))
+            if turned > ROTATION_STEADY or moved > PLACE_STEADY * size:
+                raise FormatError(
+                    f"found no rigs.txt, and camera {camera} stands otherwise to {root} in {frame!r}: the cameras are "
+                    "not fixed to each other, or the model was made without a rig (see COLMAP's rig_configurator)"
+                )
+
+
+def model_of_rig(rig: ForeignRig) -> tuple[list[ColmapCamera], list[ColmapImage], ColmapRig, Pose]:
+    """Take a rig apart for writing: cameras, an image each, the rig (first camera = reference), and rig_from_world."""
+    first = (rig.cameras[0].rotation, rig.cameras[0].translation)
+    cameras, images, sensors = [], [], dict[int, Pose | None]()
+    for number, camera in enumerate(rig.cameras, start=1):
+        pose = (camera.rotation, camera.translation)
+        cameras.append(_row(number, camera))
+        images.append(ColmapImage(number, pose, number, f"{camera.name}/0.png"))
+        sensors[number] = IDENTITY if number == 1 else compose(pose, inverse(first))
+    return cameras, images, ColmapRig(1, sensors), first
+
+
+def _row(number: int, camera: ForeignCamera) -> ColmapCamera:
+    lens = camera.lens
+    (fx, fy), (cx, cy) = lens.focal_length, lens.principal_point
+    start = (fx, fy, cx + HALF, cy + HALF)
+    if lens.model == "fisheye":
+        return ColmapCamera(number, "OPENCV_FISHEYE", camera.image_size, (*start, *lens.padded(4)))
+    if lens.length == 0:
+        return ColmapCamera(number, "PINHOLE", camera.image_size, start)
+    if lens.length <= 4:
+        return ColmapCamera(number, "OPENCV", camera.image_size, (*start, *lens.padded(4)))
+    return ColmapCamera(number, "FULL_OPENCV", camera.image_size, (*start, *lens.padded(8)))
+
+
+def seven(pose: Pose) -> Array:
+    """A pose as COLMAP writes it: quaternion w, x, y, z and translation."""
+    return np.concatenate((quaternion_of_rotation(pose[0]), pose[1]))

@@ -1,0 +1,187 @@
+"""COLMAP's text files, also the comma-separated ones of kapture, and rig_config.json."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from imgcal.errors import InputError
+from imgcal.formats.chains import IDENTITY, Pose
+from imgcal.formats.colmap_model import (
+    ColmapCamera,
+    ColmapImage,
+    ColmapRig,
+    model_of_rig,
+    pose_of,
+    rig_of_model,
+    seven,
+)
+from imgcal.formats.fitting import Holds
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
+from imgcal.formats.format import Files, Format
+from imgcal.formats.source import Source
+from imgcal.formats.values import array, mapping, number, numbers, rotation_of_quaternion, text
+
+TITLE = "COLMAP model (text)"
+CONFIG_TITLE = "COLMAP rig_config.json"
+MOST_BYTES = 2**30
+MOST_ROW = 2**26  # characters: the points of an image stand in one row
+
+
+def _recognizes(source: Source) -> bool:
+    return source.named("cameras.txt") is not None
+
+
+def _read(source: Source) -> ForeignRig:
+    path = source.named("cameras.txt")
+    assert path is not None
+    cameras = [_camera(row, line) for line, row in _rows(path)]
+    rigs_path, images_path = source.named("rigs.txt"), source.named("images.txt")
+    rigs = [_rig(row, line) for line, row in _rows(rigs_path)] if rigs_path else []
+    if images_path is None and not any(len(rig.sensors) > 1 for rig in rigs):
+        raise FormatError("intrinsics alone: expected images.txt or rigs.txt beside cameras.txt")
+    return rig_of_model(FORMAT.name, cameras, list(_images(images_path)) if images_path else [], rigs)
+
+
+def _camera(row: list[str], line: str) -> ColmapCamera:
+    if len(row) < 5:
+        raise FormatError(f"cameras.txt: {line}: found {len(row)} values, expected ID MODEL WIDTH HEIGHT PARAMETERS")
+    place = f"cameras.txt: {line}"
+    width, height = int(number(row[2], place)), int(number(row[3], place))
+    return ColmapCamera(int(number(row[0], place)), row[1], (width, height), tuple(number(v, place) for v in row[4:]))
+
+
+def _rig(row: list[str], line: str) -> ColmapRig:
+    place = f"rigs.txt: {line}"
+    rest = row[2:]
+    sensors: dict[int, Pose | None] = {}
+    while rest:
+        if len(rest) < 2:
+            raise FormatError(f"{place}: ends in the middle of a sensor")
+        kind, sensor, pose, taken = rest[0], int(number(rest[1], place)), IDENTITY, 2
+        posed = True
+        if len(rest) < len(row) - 2:  # not the reference
+            if len(rest) < 3:
+                raise FormatError(f"{place}: ends in the middle of a sensor")
+            posed, taken = rest[2] == "1", 3
+            if posed:
+                pose, taken = (
+                    pose_of([number(v, place) for v in rest[3:10]], place) if len(rest) >= 10 else _short(place),
+                    10,
+                )
+        if kind == "CAMERA":
+            sensors[sensor] = pose if posed else None
+        rest = rest[taken:]
+    return ColmapRig(int(number(row[0], place)), sensors)
+
+
+def _short(place: str) -> Pose:
+    raise FormatError(f"{place}: ends in the middle of a pose")
+
+
+def _images(path: Path) -> Iterator[ColmapImage]:
+    """Every second row is an image; those between hold its points, and may be empty."""
+    expects_points = False
+    for line, row in _rows(path, keep_empty=True):
+        if expects_points:
+            expects_points = False
+            continue
+        if not row:
+            continue
+        place = f"images.txt: {line}"
+        if len(row) < 10:
+            raise FormatError(f"{place}: found {len(row)} values, expected ID QW QX QY QZ TX TY TZ CAMERA NAME")
+        pose = pose_of([number(value, place) for value in row[1:8]], place)
+        yield ColmapImage(int(number(row[0], place)), pose, int(number(row[8], place)), " ".join(row[9:]))
+        expects_points = True
+
+
+def _rows(path: Path, keep_empty: bool = False) -> Iterator[tuple[str, list[str]]]:
+    """The rows of a text file without its remarks, split at spaces or commas; a long one (points) is cut."""
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise InputError(f"{path}: found {path.stat().st_size:,} bytes, expected at most {MOST_BYTES:,}")
+        with open(path, encoding="utf-8", errors="replace") as file:
+            for count in range(1, MOST_BYTES):
+                row = file.readline(MOST_ROW)
+                if not row:
+                    return
+                if len(row) >= MOST_ROW:
+                    raise InputError(f"{path}: found a row of more than {MOST_ROW:,} characters")
+                if row.lstrip().startswith("#") or (not row.strip() and not keep_empty):
+                    continue
+                yield f"line {count}", row[:20_000].replace(",", " ").split()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+def _write(rig: ForeignRig) -> Files:
+    cameras, images, colmap_rig, rig_from_world = model_of_rig(rig)
+
+    def row(*values: Any) -> str:
+        return " ".join(v if isinstance(v, str) else repr(float(v)) if isinstance(v, float) else str(v) for v in values)
+
+    camera_rows = [row(c.id, c.model, *(c.image_size or (0, 0)), *map(float, c.parameters)) for c in cameras]
+    image_rows = [row(i.id, *seven(i.pose).tolist(), i.camera, i.name.replace(" ", "_")) + "\n" for i in images]
+    others = [
+        part for sensor, pose in colmap_rig.sensors.items() if sensor != 1 and pose is not None
+        for part in ("CAMERA", sensor, 1, *seven(pose).tolist())
+    ]  # fmt: skip
+    rig_row = row(1, len(cameras), "CAMERA", 1, *others)
+    data = [part for image in images for part in ("CAMERA", image.camera, image.id)]
+    frame_row = row(1, 1, *seven(rig_from_world).tolist(), len(images), *data)
+    made = "# made by imgcal convert\n"
+    return {
+        "cameras.txt": (made + "\n".join(camera_rows) + "\n").encode(),
+        "images.txt": (made + "\n".join(image_rows) + "\n").encode(),
+        "rigs.txt": (made + rig_row + "\n").encode(),
+        "frames.txt": (made + frame_row + "\n").encode(),
+        "points3D.txt": made.encode(),
+    }
+
+
+def _configs(source: Source) -> list[dict[str, Any]]:
+    """The rigs of a rig_config.json."""
+    for document in source.documents:
+        rigs = document.value
+        if document.kind == "json" and isinstance(rigs, list) and rigs and all(isinstance(rig, dict) for rig in rigs):
+            found = [rig for rig in rigs if isinstance(rig.get("cameras"), list)]
+            if found and any(isinstance(c, dict) and "image_prefix" in c for c in found[0]["cameras"]):
+                return found
+    return []
+
+
+def _read_config(source: Source) -> ForeignRig:
+    rigs = _configs(source)
+    if len(rigs) > 1:
+        raise FormatError(f"found {len(rigs)} rigs, expected one")
+    cameras, without = [], []
+    for place, value in enumerate(rigs[0]["cameras"], start=1):
+        entry = mapping(value, f"camera {place}")
+        prefix = text(entry.get("image_prefix", str(place)), f"camera {place}")
+        name = prefix.rstrip("/").rpartition("/")[2] or str(place)
+        if "camera_model_name" not in entry or "camera_params" not in entry:
+            raise FormatError(f"camera {name}: no intrinsics (camera_model_name, camera_params are optional there, and "
+                              "COLMAP estimates them): give the folder of the model instead")  # fmt: skip
+        parameters = tuple(numbers(entry["camera_params"], f"camera {name}: camera_params"))
+        lens = ColmapCamera(place, text(entry["camera_model_name"], name), None, parameters).lens()
+        turn, shift = entry.get("cam_from_rig_rotation"), entry.get("cam_from_rig_translation")
+        if entry.get("ref_sensor") is True:
+            pose = IDENTITY
+        elif turn is None or shift is None:
+            without.append(name)
+            continue
+        else:
+            pose = rotation_of_quaternion(turn, name), array(shift, (3,), name)
+        cameras.append(ForeignCamera(name, lens, None, *pose))
+    notes = ["COLMAP's pixels begin half a pixel earlier: cx and cy are 0.5 less here"]
+    if without:
+        notes.append(f"{', '.join(without)}: left out, without a pose in the rig")
+    if len(cameras) < 2:
+        raise FormatError("fewer than two cameras have a pose: COLMAP estimates them later")
+    return ForeignRig(CONFIG.name, tuple(cameras), None, "the rig's reference camera", tuple(notes))
+
+
+FORMAT = Format("colmap", TITLE, _recognizes, _read, _write, Holds((4, 8), fisheye=True), unit="m", cameras=(2, 256))
+CONFIG = Format("colmap-rig-config", CONFIG_TITLE, lambda source: bool(_configs(source)), _read_config)

@@ -1,0 +1,155 @@
+"""From another tool's rig to a `CameraRig`, and back; lenses are exact where the other side can say them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from imgcal.errors import InputError, RefusedError
+from imgcal.formats.fitting import Fit, Holds, fitted
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig
+from imgcal.formats.lens import Lens
+from imgcal.formats.values import named
+from imgcal.geometry import LENS_MODELS, RigidTransform, lens_width, named_lenses
+from imgcal.io import RigCovariance
+from imgcal.types import CameraRig, check_rig
+
+LIMIT = 0.05  # px, anywhere in the image, that another lens model may be off
+BROWN, RATIONAL, FISHEYE = "brown_conrady", "rational", "equidistant"
+NATIVE = Holds(tuple(len(LENS_MODELS[name].coefficients) for name in (BROWN, RATIONAL)), fisheye=True)
+"""Lenses of a `CameraRig`."""
+
+
+@dataclass(frozen=True)
+class Held:
+    """A rig whose lenses are such as a target can say."""
+
+    rig: ForeignRig
+    fits: tuple[Fit, ...]  # one a camera
+
+    @property
+    def worst(self) -> float:
+        """The largest residual of a lens in pixels; 0 where all are exact."""
+        return max(fit.worst for fit in self.fits)
+
+
+def with_image_sizes(rig: ForeignRig, where: str, sizes: Mapping[str, tuple[int, int]]) -> ForeignRig:
+    """Fill in the image sizes that a file does not have.
+
+    Args:
+        rig: as it was read.
+        where: what errors begin with.
+        sizes: by camera; "" stands for all.
+
+    Raises:
+        InputError: a size is still missing, or it is another than the file says.
+    """
+    unknown = [name for name in sizes if name and name not in rig.names]
+    if unknown:
+        raise InputError(f"--image-size: found {named(unknown)}, expected cameras of {where}: {named(rig.names)}")
+    cameras, missing = [], []
+    for camera in rig.cameras:
+        given = sizes.get(camera.name, sizes.get(""))
+        if camera.image_size is None and given is None:
+            missing.append(camera.name)
+        elif camera.image_size is not None and given is not None and camera.image_size != given:
+            (width, height), (w, h) = given, camera.image_size
+            raise InputError(f"{where}: camera {camera.name}: found {w}x{h} pixels, --image-size says {width}x{height}")
+        cameras.append(replace(camera, image_size=camera.image_size or given))
+    if missing:
+        raise InputError(
+            f"{where}: {named(missing)}: the size of the images is not said in the file: state it with --image-size "
+            f"1280x720 for all, or --image-size {missing[0]}=1280x720; in Python load_rig(..., image_size=(1280, 720))"
+        )
+    return replace(rig, cameras=tuple(cameras))
+
+
+def held_by(rig: ForeignRig, holds: Holds, title: str, limit: float = LIMIT) -> Held:
+    """Say every lens in a model of the target.
+
+    Raises:
+        RefusedError: the target's models are farther than `limit` pixels from a lens, somewhere in its image.
+    """
+    fits = []
+    for camera in rig.cameras:
+        assert camera.image_size is not None
+        fit = fitted(camera.lens, camera.image_size, holds)
+        if not fit.worst <= limit:
+            off = f"by {fit.worst:.3g} px" if np.isfinite(fit.worst) else "by any amount in a part of the image"
+            raise RefusedError(
+                f"camera {camera.name}: {title} cannot say its lens ({describe_lens(camera.lens)}): the nearest that "
+                f"it can is off {off}, more than the limit of {limit:g} px",
+                command="--fit-limit allows more",
+                python="`fit_limit` allows more",
+            )
+        fits.append(fit)
+    cameras = tuple(replace(camera, lens=fit.lens) for camera, fit in zip(rig.cameras, fits, strict=True))
+    return Held(replace(rig, cameras=cameras), tuple(fits))
+
+
+def describe_lens(lens: Lens) -> str:
+    """Say in a few words what a lens is."""
+    kinds = {"opencv": "OpenCV", "fisheye": "fisheye, equidistant", "to_ideal": "image to ideal"}
+    skew = ", skewed" if lens.skew else ""
+    return f"{kinds[lens.model]}, {lens.length} coefficient{'s' if lens.length != 1 else ''}{skew}"
+
+
+def to_camera_rig(rig: ForeignRig, name: str) -> CameraRig:
+    """Make a `CameraRig` of a rig in millimetres whose lenses it can say (`held_by`); `name` is for one without.
+
+    Raises:
+        InputError: a value that no rig has.
+    """
+
+    def column(values: list[Any]) -> torch.Tensor:
+        return torch.tensor(np.array(values), dtype=torch.float64)
+
+    models = [_model_of(camera.lens) for camera in rig.cameras]
+    width = lens_width(named_lenses(models))
+    values: dict[str, Any] = {
+        "focal_length": column([camera.lens.focal_length for camera in rig.cameras]),
+        "principal_point": column([camera.lens.principal_point for camera in rig.cameras]),
+        "distortion": column([camera.lens.padded(width) for camera in rig.cameras]),
+        "lens_model": named_lenses(models),
+        "cam_from_rig": RigidTransform(
+            column([camera.rotation for camera in rig.cameras]), column([camera.translation for camera in rig.cameras])
+        ),
+        "image_size": torch.tensor([camera.image_size for camera in rig.cameras]),
+        "camera_names": tuple(rig.names),
+    }
+    made = CameraRig(**values, name=name) if rig.own is None else replace(rig.own, **values)
+    check_rig(made)
+    return made
+
+
+def _model_of(lens: Lens) -> str:
+    """The name that a lens has in a rig file: the plainest model that says it."""
+    if lens.model == "fisheye":
+        return FISHEYE
+    return BROWN if lens.length <= NATIVE.opencv[0] else RATIONAL
+
+
+def from_camera_rig(rig: CameraRig, covariance: RigCovariance | None = None) -> ForeignRig:
+    """Take a rig of our own for one of another tool: millimetres, in its own frame."""
+    cameras = []
+    for number, name in enumerate(rig.camera_names):
+        fx, fy = rig.focal_length[number].tolist()
+        cx, cy = rig.principal_point[number].tolist()
+        model = rig.lens_models[number]
+        coefficients = rig.distortion[number, : len(LENS_MODELS[model].coefficients)].tolist()
+        lens = Lens((fx, fy), (cx, cy), tuple(coefficients), "fisheye" if model == FISHEYE else "opencv")
+        width, height = (int(side) for side in rig.image_size[number].tolist())
+        cameras.append(
+            ForeignCamera(
+                name,
+                lens,
+                (width, height),
+                rig.cam_from_rig.rotation[number].double().numpy(),
+                rig.cam_from_rig.translation[number].double().numpy(),
+            )
+        )
+    return ForeignRig("imgcal", tuple(cameras), "mm", "the rig file's", covariance=covariance, own=rig)

@@ -1,0 +1,94 @@
+"""EasyMocap `intri.yml` and `extri.yml`: OpenCV FileStorages with K_<n>, dist_<n> and Rot_<n>, R_<n>, T_<n>; metres."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from imgcal.formats.file_storage import merged, storage_text
+from imgcal.formats.fitting import Holds
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
+from imgcal.formats.format import Files, Format
+from imgcal.formats.lens import Lens
+from imgcal.formats.source import Source
+from imgcal.formats.values import (
+    array,
+    camera_matrix,
+    coefficients,
+    image_size,
+    named,
+    number,
+    rotation,
+    text,
+    vector_of_rotation,
+)
+
+TITLE = "EasyMocap intri.yml and extri.yml"
+
+
+def _recognizes(source: Source) -> bool:
+    values = merged(source)
+    inside, outside = set(_named_by(values, "K_")), set(_named_by(values, "Rot_", "R_"))
+    return bool(inside & outside or ((inside or outside) and isinstance(values.get("names"), list)))
+
+
+def _named_by(values: dict[str, Any], *prefixes: str) -> list[str]:
+    """The cameras of keys with a prefix."""
+    found = [key[len(p) :] for p in prefixes for key in values if key.startswith(p) and isinstance(values[key], dict)]
+    return list(dict.fromkeys(found))
+
+
+def _read(source: Source) -> ForeignRig:
+    values = merged(source)
+    inside, outside = _named_by(values, "K_"), [n for n in _named_by(values, "Rot_", "R_") if f"T_{n}" in values]
+    if not outside:
+        raise FormatError("intri.yml alone: give extri.yml, too, or the folder of both")
+    if not inside:
+        raise FormatError("extri.yml alone: give intri.yml, too, or the folder of both")
+    names = values.get("names")
+    listed = [text(name, "names") for name in names] if isinstance(names, list) else []
+    order = sorted(set(inside) & set(outside), key=lambda name: listed.index(name) if name in listed else len(listed))
+    notes = ["metres, as EasyMocap has them"]
+    if lost := sorted(set(inside) ^ set(outside)):
+        notes.append(f"{named(lost)}: left out, not in both files")
+    if not order:
+        raise FormatError(f"no camera is in both files: intrinsics of {named(inside)}, poses of {named(outside)}")
+    cameras = []
+    for name in order:
+        focal, centre, skew = camera_matrix(values[f"K_{name}"], f"K_{name}")
+        ks = values.get(f"dist_{name}", values.get(f"D_{name}"))
+        lens = Lens(focal, centre, coefficients(ks, f"dist_{name}"), "opencv", skew)
+        size = None
+        if f"H_{name}" in values and f"W_{name}" in values:
+            pair = [number(_only(values[f"{side}_{name}"]), f"{side}_{name}") for side in "WH"]
+            size = image_size(pair, f"W_{name}, H_{name}")
+        turn = values.get(f"Rot_{name}", values.get(f"R_{name}"))
+        cameras.append(
+            ForeignCamera(
+                name, lens, size, rotation(turn, f"Rot_{name}"), array(values[f"T_{name}"], (3,), f"T_{name}")
+            )
+        )
+    return ForeignRig(FORMAT.name, tuple(cameras), "m", "the file's world", tuple(notes))
+
+
+def _only(value: Any) -> Any:
+    """A number, also where it was written as a matrix of one."""
+    data = value.get("data") if isinstance(value, dict) else value
+    return data[0] if isinstance(data, list) and len(data) == 1 else data
+
+
+def _write(rig: ForeignRig) -> Files:
+    intri: dict[str, Any] = {"names": rig.names}
+    extri: dict[str, Any] = {"names": rig.names}
+    for camera in rig.cameras:
+        name = camera.name
+        intri[f"K_{name}"] = camera.lens.matrix
+        intri[f"dist_{name}"] = array(camera.lens.padded(5), (1, 5), "dist")
+        if camera.image_size:
+            intri[f"H_{name}"], intri[f"W_{name}"] = camera.image_size[1], camera.image_size[0]
+        extri[f"R_{name}"] = vector_of_rotation(camera.rotation)[:, None]
+        extri[f"Rot_{name}"] = camera.rotation
+        extri[f"T_{name}"] = camera.translation[:, None]
+    return {"intri.yml": storage_text(intri), "extri.yml": storage_text(extri)}
+
+
+FORMAT = Format("easymocap", TITLE, _recognizes, _read, _write, Holds((5,)), states_unit=True)

@@ -1,0 +1,141 @@
+"""A lens in the words of another model: exactly where that can say it, else by a fit over the image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imgcal.formats.lens import Array, Lens, distorted
+
+GRID = 33  # pixels along each side of the image, border included
+
+
+@dataclass(frozen=True)
+class Holds:
+    """Which lenses a format can say: how many of OpenCV's coefficients, and whether a fisheye."""
+
+    opencv: tuple[int, ...] = (5,)  # counts that a file may have, ascending
+    fisheye: bool = False
+
+    def exactly(self, lens: Lens) -> bool:
+        """Tell whether the lens can be said as it is."""
+        if lens.skew or lens.model == "to_ideal":
+            return lens.length == 0 and not lens.skew
+        return self.fisheye if lens.model == "fisheye" else lens.length <= self.opencv[-1]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A lens of another model, and how well it takes the first one's place over the image."""
+
+    lens: Lens
+    worst: float  # pixels, anywhere in the image; infinite where the other model has no answer
+    rms: float  # pixels
+    exact: bool
+
+
+def fitted(lens: Lens, image_size: tuple[int, int], holds: Holds) -> Fit:
+    """Say a lens in another model.
+
+    Args:
+        lens: what a file states.
+        image_size: pixels: width, height, over which the two are to agree.
+        holds: what may be said.
+
+    Returns:
+        The lens itself where it can be said, else that of the model that comes nearest.
+    """
+    if holds.exactly(lens):
+        return Fit(replace(lens, model="opencv") if lens.model == "to_ideal" else lens, 0.0, 0.0, True)
+    uv = pixels_of(image_size, GRID)
+    rays = lens.rays(uv)
+    if not np.isfinite(rays).all():
+        return Fit(lens, np.inf, np.inf, False)
+    tried = [_opencv(lens, uv, rays, holds.opencv[-1])] if holds.opencv else []
+    if holds.fisheye:
+        tried.append(_fisheye(lens, uv, rays))
+    fits = [_judged(lens, candidate, image_size) for candidate in tried]
+    return min(fits, key=lambda fit: fit.worst)
+
+
+def pixels_of(image_size: tuple[int, int], count: int) -> Array:
+    """A grid of pixels over an image, its border included: (count^2, 2)."""
+    sides = [np.linspace(-0.5, side - 0.5, count) for side in image_size]
+    return np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
+
+
+def _judged(lens: Lens, candidate: Lens, image_size: tuple[int, int]) -> Fit:
+    """Compare on a finer grid than the fit's, with its own points between."""
+    uv = pixels_of(image_size, 2 * GRID)
+    away = np.linalg.norm(candidate.project(lens.rays(uv)) - uv, axis=-1)
+    back = candidate.rays(pixels_of(image_size, 9))  # its fold must lie outside
+    if not np.isfinite(away).all() or not np.isfinite(back).all():
+        return Fit(candidate, np.inf, np.inf, False)
+    return Fit(candidate, float(away.max()), float(np.sqrt((away**2).mean())), False)
+
+
+def _opencv(lens: Lens, uv: Array, rays: Array, count: int) -> Lens:
+    """Fit focal lengths, principal point and `count` coefficients."""
+    count = min(count, 8)  # thin prisms and tilts are small, and hard to tell from the rest
+    start = lens.padded(8) if lens.model == "opencv" else [0.0] * 8
+    start = [*start[: min(count, 5)], *[0.0] * (count - min(count, 5))]
+    x, y = rays[:, 0], rays[:, 1]
+
+    def predicted(values: Array) -> Array:
+        fx, fy, cx, cy, *coefficients = values
+        u, v = distorted(x, y, [*coefficients, *[0.0] * (14 - count)])
+        return np.stack((fx * u + cx, fy * v + cy), axis=-1)
+
+    values = _least_squares(predicted, uv, [*lens.focal_length, *lens.principal_point, *start])
+    return Lens((values[0], values[1]), (values[2], values[3]), tuple(values[4:]))
+
+
+def _fisheye(lens: Lens, uv: Array, rays: Array) -> Lens:
+    x, y = rays[:, 0], rays[:, 1]
+    radius = np.maximum(np.hypot(x, y), 1e-30)
+    angle = np.arctan(radius)
+
+    def predicted(values: Array) -> Array:
+        fx, fy, cx, cy, *ks = values
+        square = angle * angle
+        bent = angle * (1 + square * (ks[0] + square * (ks[1] + square * (ks[2] + square * ks[3])))) / radius
+        return np.stack((fx * x * bent + cx, fy * y * bent + cy), axis=-1)
+
+    start = lens.padded(4) if lens.model == "fisheye" else [0.3, 0.1, 0.0, 0.0]
+    values = _least_squares(predicted, uv, [*lens.focal_length, *lens.principal_point, *start])
+    return Lens((values[0], values[1]), (values[2], values[3]), tuple(values[4:]), "fisheye")
+
+
+def _least_squares(predicted: object, uv: Array, start: list[float]) -> list[float]:
+    """Levenberg-Marquardt with derivatives by complex steps, which are exact."""
+    assert callable(predicted)
+    tiny = 1e-200
+    values = np.array(start, dtype=np.float64)
+    scale = np.maximum(np.abs(values), 1.0)
+    damping = 1e-3
+    with np.errstate(all="ignore"):
+        residual = (predicted(values) - uv).ravel()
+        for _ in range(100):
+            columns = []
+            for number in range(len(values)):
+                moved = values.astype(complex)
+                moved[number] += 1j * tiny
+                columns.append(predicted(moved).imag.ravel() / tiny * scale[number])
+            jacobian = np.stack(columns, axis=-1)
+            normal, gradient = jacobian.T @ jacobian, jacobian.T @ residual
+            if not np.isfinite(normal).all():
+                break
+            step = -np.linalg.lstsq(normal + damping * np.diag(np.diag(normal) + 1e-12), gradient, rcond=None)[0]
+            tried = values + step * scale
+            new = (predicted(tried) - uv).ravel()
+            if np.isfinite(new).all() and new @ new < residual @ residual:
+                done = residual @ residual - new @ new < 1e-14 * (residual @ residual)
+                values, residual, damping = tried, new, damping / 10
+                if done:
+                    break
+            else:
+                damping *= 10
+                if damping > 1e8:
+                    break
+    return [float(value) for value in values]

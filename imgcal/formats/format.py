@@ -1,0 +1,30 @@
+"""What a format is to the rest of the room."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from imgcal.formats.fitting import Holds
+from imgcal.formats.foreign_rig import ForeignRig
+from imgcal.formats.source import Source
+
+Files = dict[str, bytes]
+"""What a writer makes: names of files in a folder and what they hold; "" names the one file of a format without."""
+
+
+@dataclass(frozen=True)
+class Format:
+    """A way of another tool to write a rig down."""
+
+    name: str  # as in `--from` and `--to`
+    title: str  # as people call it
+    recognizes: Callable[[Source], bool]
+    read: Callable[[Source], ForeignRig]
+    write: Callable[[ForeignRig], Files] | None = None  # in `unit`; None = read only
+    holds: Holds = Holds()  # which lenses it can say
+    accepts: Callable[[Source], bool] | None = None  # who may be one when the user says so; None = who is recognized
+    unit: str = "m"  # of what is written
+    states_unit: bool = False  # the file, or the tool's custom, says what its unit is
+    from_first: bool = False  # its rig frame is its first camera's
+    cameras: tuple[int, int] = (1, 256)  # how many it can hold

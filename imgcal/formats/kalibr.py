@@ -1,0 +1,132 @@
+"""Kalibr camchain: T_cn_cnm1 takes points of the camera before to this one, in metres, so that poses are chains."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+
+from imgcal.formats.chains import Link, Pose, from_root, inverse, pose_of_matrix
+from imgcal.formats.fitting import Holds
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
+from imgcal.formats.format import Files, Format
+from imgcal.formats.lens import Lens
+from imgcal.formats.source import Source
+from imgcal.formats.values import array, coefficients, focal_length, image_size, mapping, numbers, text
+from imgcal.io import Flow, yaml_text
+
+TITLE = "Kalibr camchain"
+CAMERA = re.compile(r"cam(\d+)")
+BETWEEN = re.compile(r"T_(cam\d+|imu\d*)_(cam\d+|imu\d*)")
+NO_LENS = {
+    "omni": "an omnidirectional model (omni)", "ds": "a double sphere (ds)", "eucm": "an extended unified model (eucm)",
+}  # fmt: skip
+DISTORTIONS = {
+    "radtan": ("opencv", (4, 5)), "plumb_bob": ("opencv", (4, 5)), "rational_polynomial": ("opencv", (8,)),
+    "equidistant": ("fisheye", (4,)), "equi": ("fisheye", (4,)), "none": ("opencv", (0, 4)), "": ("opencv", (0, 4)),
+}  # fmt: skip
+
+
+def _recognizes(source: Source) -> bool:
+    return any(
+        CAMERA.fullmatch(key) and isinstance(value, dict) and "intrinsics" in value
+        for key, value in source.merged().items()
+    )
+
+
+def _read(source: Source) -> ForeignRig:
+    values = source.merged()
+    entries = {key: mapping(values[key], key) for key in values if CAMERA.fullmatch(key)}
+    names = sorted(entries, key=lambda name: int(name[3:]))
+    lenses = {name: _lens(name, entries[name]) for name in names}
+    links = _links(values, entries, names)
+    root = names[0]
+    notes = ["T_cn_cnm1 takes points from the camera before to this one; metres, as Kalibr's targets are"]
+    direct = [link for link in links if "imu" not in (link.destination, link.source)]
+    try:
+        poses = from_root(root, names, direct)
+    except FormatError:
+        poses = from_root(root, names, links)
+        notes.append("some cameras are linked by the IMU only (T_cam_imu)")
+    cameras = tuple(
+        ForeignCamera(name, lenses[name], image_size(entries[name].get("resolution"), name), *poses[name])
+        for name in names
+    )
+    return ForeignRig(FORMAT.name, cameras, "m", f"camera {root}", tuple(notes))
+
+
+def _lens(name: str, entry: dict[str, Any]) -> Lens:
+    model = text(entry.get("camera_model", "pinhole"), f"{name}: camera_model").lower()
+    kind = text(entry.get("distortion_model", "none"), f"{name}: distortion_model").lower()
+    if model in NO_LENS:
+        raise FormatError(
+            f"{name}: {NO_LENS[model]}, which no other tool here can say; calibrate with pinhole-radtan or pinhole-equi"
+        )
+    if model == "fov" or kind == "fov":
+        raise FormatError(f"{name}: the FOV distortion is not supported; calibrate with radtan or equidistant")
+    if model != "pinhole" or kind not in DISTORTIONS:
+        raise FormatError(f"{name}: found the model {model}-{kind}, expected pinhole with radtan or equidistant")
+    fx, fy, cx, cy = array(entry.get("intrinsics"), (4,), f"{name}: intrinsics").tolist()
+    family, counts = DISTORTIONS[kind]
+    ks = coefficients(entry.get("distortion_coeffs"), f"{name}: distortion_coeffs", counts)
+    if kind in ("none", "") and any(ks):
+        raise FormatError(f"{name}: found distortion_coeffs without a distortion_model")
+    focal = focal_length(fx, fy, f"{name}: intrinsics")
+    return Lens(focal, (cx, cy), ks, "fisheye" if family == "fisheye" else "opencv")
+
+
+def _links(values: dict[str, Any], entries: dict[str, dict[str, Any]], names: list[str]) -> list[Link]:
+    """Whatever says where one camera is relative to another, or to the IMU; what is nearest to Kalibr's own first."""
+    links = []
+    for number, name in enumerate(names):
+        if number and "T_cn_cnm1" in entries[name]:
+            links.append(Link(name, names[number - 1], _pose(entries[name]["T_cn_cnm1"], f"{name}: T_cn_cnm1")))
+    for place, group in (("", values), *((f"{name}: ", entry) for name, entry in entries.items())):
+        for key, value in group.items():
+            if (between := BETWEEN.fullmatch(key)) and value is not None:
+                links.append(Link(_node(between[1]), _node(between[2]), _pose(value, place + key)))
+    for name, entry in entries.items():
+        if "T_cam_imu" in entry:
+            links.append(Link(name, "imu", _pose(entry["T_cam_imu"], f"{name}: T_cam_imu")))
+        elif "T_imu_cam" in entry:  # OpenVINS
+            links.append(Link(name, "imu", inverse(_pose(entry["T_imu_cam"], f"{name}: T_imu_cam"))))
+    return links
+
+
+def _node(name: str) -> str:
+    return "imu" if name.startswith("imu") else name
+
+
+def _pose(value: Any, what: str) -> Pose:
+    rows = len(numbers(value, what)) // 4
+    return pose_of_matrix(array(value, (4 if rows == 4 else 3, 4), what), what)
+
+
+def _write(rig: ForeignRig) -> Files:
+    content: dict[str, Any] = {}
+    for number, camera in enumerate(rig.cameras):
+        entry: dict[str, Any] = {}
+        if number:
+            before = rig.cameras[number - 1]
+            turned = camera.rotation @ before.rotation.T
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = turned, camera.translation - turned @ before.translation
+            entry["T_cn_cnm1"] = [Flow(row) for row in pose.tolist()]
+        fisheye = camera.lens.model == "fisheye"
+        entry |= {
+            "cam_overlaps": Flow(other for other in range(len(rig.cameras)) if other != number),
+            "camera_model": "pinhole",
+            "distortion_coeffs": Flow(camera.lens.padded(4)),
+            "distortion_model": "equidistant" if fisheye else "radtan",
+            "intrinsics": Flow([*camera.lens.focal_length, *camera.lens.principal_point]),
+            "resolution": Flow(camera.image_size or ()),
+            "rostopic": f"/{camera.name}/image_raw",
+        }
+        content[f"cam{number}"] = entry
+    return {"": yaml_text(content).encode()}
+
+
+FORMAT = Format(
+    "kalibr", TITLE, _recognizes, _read, _write, Holds((4,), fisheye=True), states_unit=True, from_first=True
+)

@@ -1,0 +1,61 @@
+"""`load_rig`: of our own files, of shipped rigs, and of every format of another tool."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from imgcal import io
+from imgcal.errors import InputError
+from imgcal.formats.conversion import LIMIT, NATIVE, held_by, to_camera_rig, with_image_sizes
+from imgcal.formats.registry import is_foreign, read_foreign_rig
+from imgcal.formats.units import in_millimetres
+from imgcal.types import CameraRig
+
+Size = tuple[int, int]
+
+
+def load_rig(
+    path: str | Path,
+    *,
+    unit: str | None = None,
+    image_size: Size | Mapping[str, Size] | None = None,
+    format: str | None = None,
+    fit_limit: float = LIMIT,
+) -> CameraRig:
+    """Read a rig: a YAML file of our own, the bare name of a shipped rig, or a calibration of another tool.
+
+    What kind a file is, its content says: OpenCV, Kalibr, ROS, anipose, caliscope, FreeMoCap, Pose2Sim, COLMAP,
+    multical, mrcal, EasyMocap, PyMVG, Qualisys, Motive and Vicon are known (docs/formats.md).
+
+    Args:
+        path: a file, a folder of files that are one calibration, or a name such as "O10" when there is no such file.
+        unit: of another tool's file, where it does not say: "mm", "m", ..., or the length of one unit, "417.2mm".
+        image_size: width and height of another tool's cameras, or by camera, where the file does not say.
+        format: of another tool, by name; None = by what stands in the file.
+        fit_limit: pixels that a lens may be off, anywhere in its image, where a fit of another model takes its place.
+
+    Returns:
+        The rig in float64 and millimetres, without batch axes.
+
+    Raises:
+        InputError: one line with the file, what was found and what was expected.
+        RefusedError: no lens model of ours comes within `fit_limit`.
+
+    Examples:
+        >>> import imgcal
+        >>> rig = imgcal.load_rig("O10")
+        >>> rig.name, rig.num_cameras, rig.working_distance
+        ('O10', 10, 850.14)
+    """
+    path = Path(path)
+    stated = unit is not None or image_size is not None or format is not None
+    if not stated and not (path.exists() and is_foreign(path)):
+        return io.load_rig(path)
+    if path.exists() and not is_foreign(path):
+        raise InputError(f"{path}: a rig file of our own says its unit, image sizes and format itself")
+    where = str(path)
+    rig = in_millimetres(read_foreign_rig(path, format), where, unit)
+    sizes = image_size if isinstance(image_size, Mapping) else {} if image_size is None else {"": image_size}
+    held = held_by(with_image_sizes(rig, where, sizes), NATIVE, "a rig of ours", fit_limit)
+    return to_camera_rig(held.rig, io.title_of(path if path.is_file() else path.resolve()))

@@ -1,0 +1,70 @@
+"""OptiTrack Motive `.mcal` (Motive 3.2 and newer): XML, metres, y up; camera axes x right, y up, looking along -z.
+
+The direction of its distortion polynomial is not documented. Public readers take it as OpenCV's (ideal to distorted),
+and so does this one; the signs of real files hint at the other. The two differ by tens of pixels in the corners.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from imgcal.formats.documents import Element
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
+from imgcal.formats.format import Format
+from imgcal.formats.lens import Lens
+from imgcal.formats.source import Source
+from imgcal.formats.values import focal_length, image_size, named, nearest_rotation, number
+
+TITLE = "OptiTrack Motive calibration (.mcal)"
+UPWARD = np.diag([1.0, -1.0, -1.0])
+
+
+def _recognizes(source: Source) -> bool:
+    return any(root.all("IntrinsicStandardCameraModel") or root.all("Extrinsic") for root in source.roots())
+
+
+def _read(source: Source) -> ForeignRig:
+    root = next(root for root in source.roots() if root.all("Extrinsic") or root.all("Camera"))
+    cameras: list[ForeignCamera] = []
+    lost: list[str] = []
+    for element in root.all("Camera"):
+        name = element.attributes.get("Serial", str(len(cameras) + len(lost) + 1))
+        pose, lens = element.find("Extrinsic"), element.find("IntrinsicStandardCameraModel")
+        if pose is None or lens is None:
+            lost.append(name)
+            continue
+        cameras.append(_camera(name, element, pose, lens))
+    if not cameras:
+        raise FormatError("no camera has Extrinsic and IntrinsicStandardCameraModel")
+    notes = [
+        "metres, y up",
+        "UNCONFIRMED: Motive does not document the direction of its distortion; read as OpenCV's. If the corners of "
+        "images disagree by tens of pixels, it is the other one: the poses hold, the distortion does not",
+        "whether pixel centres lie at 0 or 0.5 is not documented: up to half a pixel is open",
+    ]
+    if lost:
+        notes.append(f"{named(lost)}: left out, not calibrated")
+    return ForeignRig(FORMAT.name, tuple(cameras), "m", "Motive's world (y up)", tuple(notes))
+
+
+def _camera(name: str, element: Element, pose: Element, model: Element) -> ForeignCamera:
+    def get(of: Element, key: str) -> float:
+        if key not in of.attributes:
+            raise FormatError(f"{name}: no {key}")
+        return number(of.attributes[key], f"{name}: {key}")
+
+    focal = focal_length(get(model, "HorizontalFocalLength"), get(model, "VerticalFocalLength"), name)
+    ks = [get(model, key) for key in ("k1", "k2", "TangentialX", "TangentialY", "k3")]
+    lens = Lens(focal, (get(model, "LensCenterX"), get(model, "LensCenterY")), tuple(ks))
+    axes = np.array([get(pose, f"OrientMatrix{n}") for n in range(9)]).reshape(3, 3)
+    world_from_camera = nearest_rotation(axes, f"{name}: OrientMatrix")
+    rotation = UPWARD @ world_from_camera.T
+    centre = np.array([get(pose, axis) for axis in "XYZ"])
+    attributes = element.find("Attributes")
+    size = None
+    if attributes is not None:
+        size = image_size([get(attributes, "ImagerPixelWidth"), get(attributes, "ImagerPixelHeight")], name)
+    return ForeignCamera(name, lens, size, rotation, -rotation @ centre)
+
+
+FORMAT = Format("motive", TITLE, _recognizes, _read, states_unit=True)

@@ -1,0 +1,95 @@
+"""Qualisys QTM calibration (XML in .qca.txt, .xml): mm, intrinsics in 1/64 pixel, camera axes x right, y up, -z ahead.
+
+Distortion is dimensionless, in OpenCV's order and direction. Whether centre / 64 counts from a pixel's centre or corner
+is not documented: up to half a pixel is open. Theia3D writes the same elements with plain pixels and X_cam = r X + p.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from imgcal.formats.documents import Element
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
+from imgcal.formats.format import Format
+from imgcal.formats.lens import Array, Lens
+from imgcal.formats.source import Source
+from imgcal.formats.values import focal_length, named, nearest_rotation, number
+
+TITLE = "Qualisys calibration"
+FRACTION = 64.0
+FEWEST = 250  # pixels across of any of their cameras: a smaller span is one of plain pixels
+UPWARD = np.diag([1.0, -1.0, -1.0])  # OpenCV's camera from one that has y up and looks along -z
+
+
+def _recognizes(source: Source) -> bool:
+    return any(root.find("cameras") is not None and root.all("transform") for root in source.roots("calibration"))
+
+
+def _read(source: Source) -> ForeignRig:
+    root = source.roots("calibration")[0]
+    cameras: list[ForeignCamera] = []
+    lost: list[str] = []
+    turned: list[str] = []
+    theia = False
+    for element in root.all("camera"):
+        name = element.attributes.get("serial") or f"camera {len(cameras) + len(lost) + 1}"
+        transform, intrinsic = element.find("transform"), element.find("intrinsic")
+        if transform is None or intrinsic is None or element.attributes.get("active") == "0":
+            lost.append(name)
+            continue
+        if element.attributes.get("viewrotation", "0") not in ("0", ""):
+            turned.append(name)
+        camera, plain = _camera(name, element, transform, intrinsic)
+        theia |= plain
+        cameras.append(camera)
+    if not cameras:
+        raise FormatError("no active camera has a transform and intrinsics")
+    notes = ["millimetres, z up"]
+    if theia:
+        notes.append("plain pixels: read as Theia3D's variant (X_cam = r X + p)")
+    else:
+        notes.append("QTM does not document whether its pixel centres lie at 0 or 0.5: up to half a pixel is open")
+    if lost:
+        notes.append(f"{named(lost)}: left out, not active or not calibrated")
+    if turned:
+        notes.append(
+            f"{named(turned)}: mounted turned (viewrotation): the numbers are those of the sensor's own image, before "
+            "a video is turned upright"
+        )
+    return ForeignRig(FORMAT.name, tuple(cameras), "mm", "QTM's world (z up)", tuple(notes))
+
+
+def _camera(name: str, element: Element, transform: Element, intrinsic: Element) -> tuple[ForeignCamera, bool]:
+    def get(key: str, of: Element = intrinsic) -> float:
+        if key not in of.attributes:
+            raise FormatError(f"{name}: no {key}")
+        return number(of.attributes[key], f"{name}: {key}")
+
+    view = element.find("fov_video") or element.find("fov_marker") or element.find("fov_video_max")
+    span = get("sensorMaxU") - get("sensorMinU"), get("sensorMaxV") - get("sensorMinV")
+    plain = abs(span[0]) < FRACTION * FEWEST
+    fraction = 1.0 if plain else FRACTION
+    if view is None:
+        left, top, width, height = 0.0, 0.0, span[0] / fraction + 1, span[1] / fraction + 1
+    else:
+        left, top = get("left", view), get("top", view)
+        width, height = get("right", view) - left + 1, get("bottom", view) - top + 1
+    if not 1 <= width <= 2**16 or not 1 <= height <= 2**16:
+        raise FormatError(f"{name}: found an image of {width:g} x {height:g} pixels")
+    focal = focal_length(get("focalLengthU") / fraction, get("focalLengthV") / fraction, name)
+    centre = get("centerPointU") / fraction - left, get("centerPointV") / fraction - top
+    tangential = [
+        get(next((key for key in (f"{word}Distortion{n}" for word in ("tangental", "tangential"))
+                  if key in intrinsic.attributes), f"tangentalDistortion{n}"))
+        for n in (1, 2)
+    ]  # fmt: skip
+    radial = [get(f"radialDistortion{n}") for n in (1, 2, 3)]
+    lens = Lens(focal, centre, (*radial[:2], *tangential, radial[2]), "opencv", get("skew") / fraction)
+    place = np.array([get(axis, transform) for axis in "xyz"])
+    axes: Array = np.array([[get(f"r{row}{column}", transform) for column in (1, 2, 3)] for row in (1, 2, 3)])
+    axes = nearest_rotation(axes, f"{name}: transform")
+    rotation, translation = (axes, place) if plain else (UPWARD @ axes, -UPWARD @ axes @ place)
+    return ForeignCamera(name, lens, (round(width), round(height)), rotation, translation), plain
+
+
+FORMAT = Format("qualisys", TITLE, _recognizes, _read, states_unit=True)

@@ -1,0 +1,178 @@
+"""All formats, and which one a file is."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from imgcal.errors import InputError
+from imgcal.formats import (
+    anipose,
+    caliscope,
+    colmap_binary,
+    colmap_text,
+    easymocap,
+    freemocap,
+    kalibr,
+    motive,
+    mrcal,
+    multical,
+    opencv_multiview,
+    opencv_stereo,
+    pose2sim,
+    pymvg,
+    qualisys,
+    ros_camera_info,
+    vicon,
+)
+from imgcal.formats.file_storage import is_matrix, merged
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
+from imgcal.formats.format import Format
+from imgcal.formats.source import Source
+from imgcal.io import is_file_name
+from imgcal.types import limits
+
+FORMATS = (  # asked in this order: who knows a file by more comes before who knows it by less
+    colmap_text.FORMAT,
+    colmap_binary.FORMAT,
+    opencv_multiview.FORMAT,
+    easymocap.FORMAT,
+    opencv_stereo.FORMAT,
+    kalibr.FORMAT,
+    ros_camera_info.FORMAT,
+    pymvg.FORMAT,
+    multical.FORMAT,
+    mrcal.FORMAT,
+    colmap_text.CONFIG,
+    freemocap.FORMAT,
+    caliscope.FORMAT,
+    caliscope.OLD_FORMAT,
+    pose2sim.FORMAT,
+    anipose.FORMAT,
+    qualisys.FORMAT,
+    motive.FORMAT,
+    vicon.FORMAT,
+)
+BY_NAME = {one.name: one for one in FORMATS}
+NATIVE = re.compile(rb"(?m)^[\"']?format[\"']?[ \t]*:")
+
+
+def read_foreign_rig(paths: str | Path | Sequence[str | Path], name: str | None = None) -> ForeignRig:
+    """Read a calibration of another tool.
+
+    Args:
+        paths: a file, a folder, or the files that are one calibration together.
+        name: of the format, as in `FORMATS`; None = by what stands in the files.
+
+    Raises:
+        InputError: one line with the file, what it is and what it lacks.
+    """
+    source = Source([Path(one) for one in ([paths] if isinstance(paths, str | Path) else paths)])
+    return _read(source, format_of(source) if name is None else _asked_for(source, format_named(name)))
+
+
+def format_named(name: str) -> Format:
+    """Find a format by its name.
+
+    Raises:
+        InputError: there is none of that name.
+    """
+    if name not in BY_NAME:
+        raise InputError(f"found the format {name!r}, expected one of imgcal, {', '.join(sorted(BY_NAME))}")
+    return BY_NAME[name]
+
+
+def format_of(source: Source) -> Format:
+    """Recognize a format by content.
+
+    Raises:
+        InputError: nothing here is a calibration; the line says what it is instead, where that is known.
+    """
+    for one in FORMATS:
+        try:
+            if one.recognizes(source):
+                return one
+        except FormatError as error:
+            raise InputError(f"{source.where}: {error}") from error
+    if source.alone and source.unreadable:
+        raise source.unreadable[0]
+    raise InputError(f"{source.where}: {_instead(source)}")
+
+
+def _asked_for(source: Source, one: Format) -> Format:
+    """A format that the user names instead of the content: the file must be able to be one."""
+    try:
+        if (one.accepts or one.recognizes)(source):
+            return one
+    except FormatError as error:
+        raise InputError(f"{source.where}: {error}") from error
+    raise InputError(f"{source.where}: this is no {one.title}: {_instead(source)}")
+
+
+def is_foreign(path: Path) -> bool:
+    """Tell whether a path that exists is not a rig file of our own: a folder, or a file without the key `format`."""
+    if path.is_dir():
+        return True
+    try:
+        with open(path, "rb") as file:
+            return path.is_file() and not NATIVE.search(file.read(2**16))
+    except OSError:
+        return False
+
+
+def _instead(source: Source) -> str:
+    """What a source without a rig is, as far as can be told."""
+    values = merged(source)
+    if is_matrix(values.get("camera_matrix")) or is_matrix(values.get("cameraMatrix")) or is_matrix(values.get("K")):
+        return (
+            "this is an OpenCV calibration of one camera: extrinsics in it are those of its boards; a rig needs where "
+            "its cameras stand to each other"
+        )
+    if {"R", "T"} <= values.keys() and is_matrix(values["R"]):
+        return (
+            "this is an OpenCV file of extrinsics alone: give the file with M1, D1, M2, D2, too, or the folder of both"
+        )
+    if isinstance(values.get("frames"), list) and ("transform_matrix" in str(values["frames"][:1])):
+        return "this is a transforms.json of nerfstudio: convert its COLMAP model instead"
+    if any(path.suffix == ".cal" for path in source.files):
+        return "this looks like a Motive .cal, which is binary and not documented: export .mcal (Motive 3.2 or newer)"
+    titles = "; ".join(dict.fromkeys(one.title for one in FORMATS))
+    found = f"found {source.shown()}" if not source.alone else f"found none of the keys of a calibration{_keys(values)}"
+    return f"{found}, expected `format: imgcal-rig/1` or one of: {titles}"
+
+
+def _keys(values: dict[str, object]) -> str:
+    return f" (its keys: {', '.join(key[:20] for key in list(values)[:6])})" if values else ""
+
+
+def _read(source: Source, one: Format) -> ForeignRig:
+    try:
+        rig = one.read(source)
+    except FormatError as error:
+        raise InputError(f"{source.where}: this is a {one.title}: {error}") from error
+    if len(rig.cameras) > limits.MOST_CAMERAS:
+        raise InputError(f"{source.where}: found {len(rig.cameras)} cameras, expected at most {limits.MOST_CAMERAS}")
+    return _with_sound_names(replace(rig, format=one.name))
+
+
+def _with_sound_names(rig: ForeignRig) -> ForeignRig:
+    """Names are files of a capture, too: without slashes, each once."""
+    cameras: list[ForeignCamera] = []
+    renamed, frame = [], rig.frame
+    for number, camera in enumerate(rig.cameras, start=1):
+        name = (
+            camera.name
+            if is_file_name(camera.name)
+            else re.sub(r"[/\\]+", "_", camera.name.strip().strip("/\\.")).strip()
+        )
+        name = name if is_file_name(name) else f"camera{number}"
+        taken = {one.name for one in cameras}
+        name = name if name not in taken else next(f"{name}_{n}" for n in range(2, 1000) if f"{name}_{n}" not in taken)
+        if name != camera.name:
+            renamed.append(f"{camera.name[:40]} -> {name}")
+            frame = frame.replace(f"camera {camera.name}", f"camera {name}")
+        cameras.append(replace(camera, name=name))
+    notes = (f"cameras renamed: {', '.join(renamed[:8])}",) if renamed else ()
+    return replace(rig, cameras=tuple(cameras), frame=frame, notes=rig.notes + notes)

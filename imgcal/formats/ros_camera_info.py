@@ -1,0 +1,190 @@
+"""ROS camera_info: one file a camera; where two cameras stand is in P and R of a stereo pair, and nowhere else.
+
+P[0, 3] = Tx = -fx' B in metres, R turns a camera into the common rectified frame:
+X_right = R_r^T (R_l X_left + (Tx / fx', Ty / fy', 0)).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from imgcal.formats.documents import Document
+from imgcal.formats.fitting import Holds
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
+from imgcal.formats.format import Files, Format
+from imgcal.formats.lens import Array, Lens
+from imgcal.formats.source import Source
+from imgcal.formats.values import array, camera_matrix, coefficients, image_size, nearest_rotation, numbers, text
+from imgcal.io import Flow, yaml_text
+
+TITLE = "ROS camera_info file"
+KEYS = {
+    "width": ("image_width", "width"), "height": ("image_height", "height"), "k": ("camera_matrix", "K", "k"),
+    "d": ("distortion_coefficients", "D", "d"), "r": ("rectification_matrix", "R", "r"),
+    "p": ("projection_matrix", "P", "p"), "model": ("distortion_model",), "name": ("camera_name",),
+}  # fmt: skip
+MODELS = {
+    "plumb_bob": ("opencv", (0, 4, 5)), "radtan": ("opencv", (0, 4, 5)), "": ("opencv", (0, 4, 5, 8, 12, 14)),
+    "rational_polynomial": ("opencv", (8, 12, 14)), "equidistant": ("fisheye", (4,)), "fisheye": ("fisheye", (4,)),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Info:
+    name: str
+    lens: Lens
+    image_size: tuple[int, int] | None
+    rectified: Array  # (3, 3): rectified_from_camera
+    projection: Array  # (3, 4)
+
+    @property
+    def shift(self) -> Array:
+        """Of the rectified camera relative to the one without Tx and Ty: (3,) m."""
+        p = self.projection
+        return np.array([p[0, 3] / p[0, 0], p[1, 3] / p[1, 1], 0.0])
+
+
+def _recognizes(source: Source) -> bool:
+    return any(_is_info(values) for _, values in source.mappings)
+
+
+def _is_info(values: dict[str, Any]) -> bool:
+    has = {key for key, names in KEYS.items() if any(name in values for name in names)}
+    return {"k", "d", "model"} <= has or ({"k", "p"} <= has and bool({"r", "name"} & has))
+
+
+def _read(source: Source) -> ForeignRig:
+    infos = [_info(values, document) for document, values in source.mappings if _is_info(values)]
+    if len(infos) > 2:
+        raise FormatError(f"{len(infos)} files: ROS says in them where two cameras are, no more; the poses of more are "
+                          "in /tf and in no file")  # fmt: skip
+    if len(infos) == 1:
+        return _single(infos[0])
+    infos.sort(key=lambda info: float(np.abs(info.shift).sum()))  # the left one has no Tx
+    left, right = infos
+    if not right.shift.any():
+        raise FormatError(
+            "two files without Tx in P: these are two single cameras, and where they are to each other is not said"
+        )
+    notes = ["a stereo pair: X_right = R_r^T (R_l X_left + (Tx / fx', 0, 0)), metres; the rig's frame is the left "
+             "camera's, unrectified"]  # fmt: skip
+    if left.shift.any():
+        notes.append("both files have Tx or Ty in P: their difference counts")
+    if right.shift[0] > left.shift[0]:
+        notes.append("Tx > 0: the cameras are called the other way round than they stand; taken as it is")
+    turned = nearest_rotation(right.rectified.T @ left.rectified, "R of the pair")
+    translation = right.rectified.T @ (right.shift - left.shift)
+    cameras = (
+        ForeignCamera(left.name, left.lens, left.image_size, np.eye(3), np.zeros(3)),
+        ForeignCamera(right.name, right.lens, right.image_size, turned, translation),
+    )
+    return ForeignRig(FORMAT.name, cameras, "m", f"camera {left.name}", tuple(notes))
+
+
+def _single(info: _Info) -> ForeignRig:
+    pair = bool(info.shift.any()) or np.abs(info.rectified - np.eye(3)).max() > 1e-9
+    note = "one camera: its own frame is the rig's" + (
+        "; R and P are those of a stereo pair: give both files, or their folder, for the pair" if pair else ""
+    )
+    camera = ForeignCamera(info.name, info.lens, info.image_size, np.eye(3), np.zeros(3))
+    return ForeignRig(FORMAT.name, (camera,), "m", f"camera {info.name}", (note,))
+
+
+def _info(values: dict[str, Any], document: Document) -> _Info:
+    def get(key: str) -> Any:
+        return next((values[name] for name in KEYS[key] if values.get(name) is not None), None)
+
+    name = text(get("name") or document.path.stem, "camera_name")
+    focal, centre, skew = camera_matrix(get("k"), f"{name}: camera_matrix")
+    model = text(get("model") or "", f"{name}: distortion_model").lower()
+    if model not in MODELS:
+        raise FormatError(
+            f"{name}: found the distortion_model {model!r}, expected one of {', '.join(filter(None, MODELS))}"
+        )
+    family, counts = MODELS[model]
+    ks = coefficients(get("d"), f"{name}: distortion_coefficients", counts)
+    lens = Lens(focal, centre, ks, "fisheye" if family == "fisheye" else "opencv", skew)
+    size = image_size([get("width") or 0, get("height") or 0], f"{name}: image_width, image_height")
+    r, p = get("r"), get("p")
+    rectified = (
+        array(r, (3, 3), f"{name}: rectification_matrix") if r is not None and any(numbers(r, "R")) else np.eye(3)
+    )
+    nearest_rotation(rectified, f"{name}: rectification_matrix")
+    plain = np.concatenate((lens.matrix, np.zeros((3, 1))), axis=1)
+    projection = array(p, (3, 4), f"{name}: projection_matrix") if p is not None and any(numbers(p, "P")) else plain
+    if projection[0, 0] <= 0 or projection[1, 1] <= 0:
+        raise FormatError(
+            f"{name}: projection_matrix: found {projection[0, 0]:g} and {projection[1, 1]:g} on its diagonal"
+        )
+    return _Info(name, lens, size, rectified, projection)
+
+
+def _write(rig: ForeignRig) -> Files:
+    if len(rig.cameras) == 1:
+        camera = rig.cameras[0]
+        return {
+            _file_name(camera): _info_text(camera, np.eye(3), camera.lens.focal_length, camera.lens.principal_point)
+        }
+    left, right = rig.cameras
+    across = right.rotation.T @ right.translation  # minus the baseline, in the left camera
+    # Rectified: x along the baseline to the right, z as near to both optical axes as that leaves free.
+    x = -across / np.linalg.norm(across)
+    turned_round = x[0] < 0
+    x = -x if turned_round else x
+    if abs(x[0]) < 0.5:
+        raise FormatError("one camera stands behind or above the other: a stereo pair of ROS stands side by side")
+    ahead = np.array([0.0, 0.0, 1.0]) + right.rotation.T @ np.array([0.0, 0.0, 1.0])
+    y = np.cross(ahead, x)
+    y /= np.linalg.norm(y)
+    of_left = np.stack((x, y, np.cross(x, y)))
+    of_right = of_left @ right.rotation.T
+    focal = float(min(*left.lens.focal_length, *right.lens.focal_length))
+    width, height = left.image_size or (0, 0)
+    centre = ((width - 1) / 2, (height - 1) / 2)
+    shift = float((of_left @ across)[0])  # Tx / fx'
+    texts = {
+        _file_name(left): _info_text(left, of_left, (focal, focal), centre),
+        _file_name(right): _info_text(right, of_right, (focal, focal), centre, focal * shift),
+    }
+    return texts
+
+
+def _file_name(camera: ForeignCamera) -> str:
+    return f"{Path(camera.name).name}.yaml"
+
+
+def _info_text(
+    camera: ForeignCamera, rectified: Array, focal: tuple[float, float], centre: tuple[float, float], tx: float = 0.0
+) -> bytes:
+    lens = camera.lens
+    model, count = ("plumb_bob", 5) if lens.length <= 5 else ("rational_polynomial", 8)
+    if lens.model == "fisheye":
+        model, count = "equidistant", 4
+    width, height = camera.image_size or (0, 0)
+    projection = [focal[0], 0.0, centre[0], tx, 0.0, focal[1], centre[1], 0.0, 0.0, 0.0, 1.0, 0.0]
+
+    def block(rows: int, columns: int, data: list[float]) -> dict[str, Any]:
+        return {"rows": rows, "cols": columns, "data": Flow(data)}
+
+    return yaml_text(
+        {
+            "image_width": width,
+            "image_height": height,
+            "camera_name": camera.name,
+            "camera_matrix": block(3, 3, lens.matrix.ravel().tolist()),
+            "distortion_model": model,
+            "distortion_coefficients": block(1, count, lens.padded(count)),
+            "rectification_matrix": block(3, 3, rectified.ravel().tolist()),
+            "projection_matrix": block(3, 4, projection),
+        }
+    ).encode()
+
+
+FORMAT = Format(
+    "ros", TITLE, _recognizes, _read, _write, Holds((5, 8), fisheye=True), states_unit=True, from_first=True,
+    cameras=(1, 2),
+)  # fmt: skip

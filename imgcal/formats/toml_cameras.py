@@ -1,0 +1,123 @@
+"""What anipose, Pose2Sim, FreeMoCap and caliscope have in common: a TOML table for each camera. X_cam = R X + t."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from imgcal.formats.foreign_rig import ForeignCamera, FormatError
+from imgcal.formats.lens import Lens
+from imgcal.formats.source import Source
+from imgcal.formats.values import array, camera_matrix, coefficients, image_size, named, numbers, rotation, text
+
+Table = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Tables:
+    """The cameras of a file, and what else stands in it."""
+
+    cameras: Mapping[str, Table]  # by the key of the table
+    metadata: Table
+
+
+def tables_of(source: Source) -> Tables | None:
+    """Find the tables that are cameras; None where there are none, or they do not come from one file."""
+    for document, values in source.mappings:
+        if document.kind != "toml":
+            continue
+        nested = values.get("cameras")
+        group = nested if isinstance(nested, dict) else values
+        cameras = {key: value for key, value in group.items() if is_camera(value)}
+        if cameras:
+            metadata = values.get("metadata")
+            return Tables(cameras, metadata if isinstance(metadata, dict) else {})
+    return None
+
+
+def has_tables(source: Source) -> bool:
+    """Tell whether there are tables of cameras: whose they are is then a question of details."""
+    return tables_of(source) is not None
+
+
+def is_camera(value: Any) -> bool:
+    """Tell whether a table is a camera's: it has, or may lack, a pose, but it has a lens or says that it has none."""
+    return isinstance(value, dict) and ("matrix" in value or ({"rotation_count", "size"} <= value.keys()))
+
+
+def is_missing(value: Any) -> bool:
+    """Tell whether something is not there: no key, an empty list, or the text null."""
+    return value is None or value in ("null", "None", "", [])
+
+
+def cameras_of(tables: Mapping[str, Table], notes: list[str]) -> tuple[ForeignCamera, ...]:
+    """Read the cameras that have a lens and a pose; the others are named in `notes`.
+
+    Raises:
+        FormatError: none is left, or no pose has ever been calibrated.
+    """
+    cameras: list[ForeignCamera] = []
+    without_pose, without_lens, at_origin = [], [], []
+    for key, table in tables.items():
+        name = camera_name(key, table)
+        if is_missing(table.get("matrix")) or is_missing(table.get("distortions")):
+            without_lens.append(name)
+            continue
+        if is_missing(table.get("rotation")) or is_missing(table.get("translation")):
+            without_pose.append(name)
+            continue
+        cameras.append(_camera(name, table))
+        if not any(numbers(table["rotation"], name)) and not any(numbers(table["translation"], name)):
+            at_origin.append(name)
+    if without_lens:
+        notes.append(f"{named(without_lens)}: left out, intrinsics are not calibrated")
+    if without_pose:
+        notes.append(f"{named(without_pose)}: left out, where they stand is not calibrated")
+    if not cameras:
+        raise FormatError("no camera has both intrinsics and a pose: " + "; ".join(notes))
+    if len(at_origin) > 1:
+        raise FormatError(f"{named(at_origin)}: rotation and translation are zero: extrinsics were never calibrated")
+    return tuple(cameras)
+
+
+def camera_name(key: str, table: Table) -> str:
+    """A camera is called what its table says, else by the key."""
+    name = table.get("name", key.removeprefix("cam_") if "name" not in table and "port" in table else key)
+    return text(name, key)
+
+
+def _camera(name: str, table: Table) -> ForeignCamera:
+    focal, centre, skew = camera_matrix(table["matrix"], f"{name}: matrix")
+    fisheye = table.get("fisheye", False)
+    if not isinstance(fisheye, bool):
+        raise FormatError(f"{name}: fisheye: found {fisheye!r}, expected true or false")
+    counts = (4,) if fisheye else (0, 1, 2, 4, 5, 8, 12, 14)
+    ks = coefficients(table["distortions"], f"{name}: distortions", counts)
+    lens = Lens(focal, centre, ks, "fisheye" if fisheye else "opencv", skew)
+    size = None if is_missing(table.get("size")) else image_size(table["size"], f"{name}: size")
+    translation = array(table["translation"], (3,), f"{name}: translation")
+    return ForeignCamera(name, lens, size, rotation(table["rotation"], f"{name}: rotation"), translation)
+
+
+def toml_text(tables: Mapping[str, Mapping[str, Any]]) -> bytes:
+    """Write tables of numbers, lists, texts and booleans."""
+    lines: list[str] = []
+    for name, table in tables.items():
+        lines += [f"[{name}]", *(f"{key} = {_value(value)}" for key, value in table.items()), ""]
+    return "\n".join(lines).encode()
+
+
+def toml_key(name: str) -> str:
+    """A name as a key: bare where that is allowed."""
+    return name if name and all(c.isascii() and (c.isalnum() or c in "_-") for c in name) else _value(name)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_value, value))}]"
+    return repr(value)

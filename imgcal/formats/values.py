@@ -1,0 +1,198 @@
+"""Numbers, matrices and rotations out of the plain values of a file, each checked: one line says what is wrong."""
+
+from __future__ import annotations
+
+import math
+import reprlib
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from imgcal.formats.foreign_rig import FormatError
+from imgcal.formats.lens import Array
+from imgcal.messages import shortened
+from imgcal.types import limits
+
+LARGEST = 1e12
+MOST_COEFFICIENTS = 14
+LOOSEST = 5e-3  # how far the columns of a rotation may be from orthonormal: three digits
+EXACT = 1e-6  # beyond, the file's rotation has been rounded, and that is said
+
+
+def number(value: Any, what: str) -> float:
+    """Read one finite number; text that is a number counts (XML)."""
+    found = value
+    if isinstance(value, str):
+        try:
+            found = float(value)
+        except ValueError:
+            found = None
+    if isinstance(found, bool) or not isinstance(found, int | float) or not abs(found) <= LARGEST:
+        raise FormatError(f"{what}: found {reprlib.repr(value)}, expected a finite number")
+    return float(found)
+
+
+def numbers(value: Any, what: str) -> list[float]:
+    """Read all numbers of a list, of nested lists, of `{rows, cols, data}`, or of text with spaces between."""
+    if isinstance(value, dict) and "data" in value:
+        value = value["data"]
+    if isinstance(value, str):
+        value = value.replace(",", " ").split()
+    if not isinstance(value, list):
+        return [number(value, what)]
+    found: list[float] = []
+    for part in value:
+        found.extend(numbers(part, what) if isinstance(part, list) else [number(part, what)])
+    return found
+
+
+def array(value: Any, shape: tuple[int, ...], what: str) -> Array:
+    """Read as many finite numbers as a shape has, however they are nested."""
+    found = numbers(value, what)
+    if len(found) != math.prod(shape):
+        wanted = " x ".join(map(str, shape))
+        raise FormatError(f"{what}: found {len(found)} numbers, expected {wanted}")
+    return np.array(found).reshape(shape)
+
+
+def coefficients(value: Any, what: str, counts: Sequence[int] = (0, 4, 5, 8, 12, 14)) -> tuple[float, ...]:
+    """Read distortion coefficients, of which there may be so many."""
+    found = numbers(value, what) if value is not None else []
+    if len(found) not in counts:
+        wanted = ", ".join(map(str, counts))
+        raise FormatError(f"{what}: found {len(found)} distortion coefficients, expected {wanted}")
+    return tuple(found)
+
+
+def camera_matrix(value: Any, what: str) -> tuple[tuple[float, float], tuple[float, float], float]:
+    """Read K: focal lengths, principal point and skew."""
+    k = array(value, (3, 3), what)
+    if k[2, 2] == 0 or not np.allclose(k / k[2, 2] * np.array([[0, 0, 0], [1, 0, 0], [1, 1, 1]]), np.diag([0, 0, 1])):
+        raise FormatError(
+            f"{what}: found {np.round(k, 6).tolist()}, expected a camera matrix [fx 0 cx; 0 fy cy; 0 0 1]"
+        )
+    k = k / k[2, 2]
+    return focal_length(k[0, 0], k[1, 1], what), (float(k[0, 2]), float(k[1, 2])), float(k[0, 1])
+
+
+def focal_length(fx: Any, fy: Any, what: str) -> tuple[float, float]:
+    """Read the focal lengths, which are plausible numbers of pixels."""
+    both = number(fx, what), number(fy, what)
+    if not all(limits.FOCAL_LENGTH.low <= value <= limits.FOCAL_LENGTH.high for value in both):
+        raise FormatError(
+            f"{what}: found the focal lengths {both[0]:g} and {both[1]:g}, expected {limits.FOCAL_LENGTH}"
+        )
+    return both
+
+
+def image_size(value: Any, what: str) -> tuple[int, int] | None:
+    """Read width and height; None where the file has none (absent, or zeros)."""
+    if value is None:
+        return None
+    width, height = array(value, (2,), what)
+    if width == height == 0:
+        return None
+    if not all(side == int(side) and 1 <= side <= limits.LONGEST_SIDE for side in (width, height)):
+        raise FormatError(f"{what}: found {width:g} x {height:g}, expected width and height in pixels")
+    return int(width), int(height)
+
+
+def nearest_rotation(matrix: Array, what: str) -> Array:
+    """Take the rotation that is nearest to a matrix of a file, whose digits are rounded.
+
+    Raises:
+        FormatError: it is no rotation, but a mirror or something else.
+    """
+    if np.abs(matrix @ matrix.T - np.eye(3)).max() > LOOSEST:
+        raise FormatError(f"{what}: found {np.round(matrix, 4).tolist()}, expected a rotation matrix")
+    if np.linalg.det(matrix) < 0:
+        raise FormatError(f"{what}: found a mirror (determinant -1), expected a rotation matrix")
+    left, _, right = np.linalg.svd(matrix)
+    return np.asarray(left @ right)
+
+
+def rotation(value: Any, what: str) -> Array:
+    """Read a rotation: a 3 x 3 matrix, or a rotation vector in rad (Rodrigues) where there are three numbers."""
+    found = numbers(value, what)
+    if len(found) == 3:
+        return rotation_of_vector(np.array(found))
+    return nearest_rotation(array(found, (3, 3), what), what)
+
+
+def rotation_of_vector(vector: Array) -> Array:
+    """The rotation matrix of a rotation vector in rad."""
+    angle = float(np.linalg.norm(vector))
+    if angle < 1e-12:
+        return np.eye(3) + cross(vector)
+    axis = vector / angle
+    return np.asarray(
+        np.cos(angle) * np.eye(3) + np.sin(angle) * cross(axis) + (1 - np.cos(angle)) * np.outer(axis, axis)
+    )
+
+
+def vector_of_rotation(matrix: Array) -> Array:
+    """The rotation vector in rad of a rotation matrix; of a half turn, too."""
+    w, x, y, z = quaternion_of_rotation(matrix)
+    axis = np.array([x, y, z])
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-15:
+        return 2 * axis
+    return axis * (2 * math.atan2(sine, w) / sine)
+
+
+def rotation_of_quaternion(value: Any, what: str) -> Array:
+    """The rotation matrix of a Hamilton quaternion w, x, y, z, which is normalized first."""
+    q = array(value, (4,), what)
+    length = float(np.linalg.norm(q))
+    if not 0.5 < length < 2:
+        raise FormatError(f"{what}: found a quaternion of length {length:g}, expected 1")
+    w, x, y, z = q / length
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def quaternion_of_rotation(matrix: Array) -> Array:
+    """The Hamilton quaternion w, x, y, z with w >= 0: the eigenvector that is stable at every angle."""
+    (a, b, c), (d, e, f), (g, h, i) = matrix
+    symmetric = np.array(
+        [
+            [a + e + i, h - f, c - g, d - b],
+            [h - f, a - e - i, b + d, c + g],
+            [c - g, b + d, e - a - i, f + h],
+            [d - b, c + g, f + h, i - a - e],
+        ]
+    )
+    q = np.linalg.eigh(symmetric)[1][:, -1]
+    return np.asarray(q if q[0] >= 0 else -q)
+
+
+def cross(vector: Array) -> Array:
+    """The matrix that multiplies from the left as the cross product does."""
+    x, y, z = vector
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
+def mapping(value: Any, what: str) -> dict[str, Any]:
+    """Read a mapping."""
+    if not isinstance(value, dict):
+        raise FormatError(f"{what}: found {reprlib.repr(value)}, expected keys and values")
+    return value
+
+
+def text(value: Any, what: str) -> str:
+    """Read a short text; a number is one, too (names of cameras)."""
+    if isinstance(value, bool) or not isinstance(value, str | int | float):
+        raise FormatError(f"{what}: found {reprlib.repr(value)}, expected text")
+    return str(value)
+
+
+def named(names: Sequence[str]) -> str:
+    """Name cameras in a sentence: `camera a`, `cameras a, b`."""
+    shown = ", ".join(shortened(name) for name in names[:8]) + (f", ... ({len(names)})" if len(names) > 8 else "")
+    return f"camera{'s' if len(names) > 1 else ''} {shown}"

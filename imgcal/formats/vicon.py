@@ -1,0 +1,87 @@
+"""Vicon `.xcp`: XML, millimetres. ORIENTATION is the quaternion x, y, z, w of cam_from_world, POSITION the place.
+
+The distortion takes a point of the image to where a pinhole would have put it, with k in powers of pixels: whoever
+takes its numbers for OpenCV's has none. Another lens model takes its place by a fit.
+"""
+
+from __future__ import annotations
+
+from imgcal.formats.documents import Element
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
+from imgcal.formats.format import Format
+from imgcal.formats.lens import Lens
+from imgcal.formats.source import Source
+from imgcal.formats.values import array, focal_length, image_size, named, number, numbers, rotation_of_quaternion
+
+TITLE = "Vicon calibration (.xcp)"
+
+
+def _recognizes(source: Source) -> bool:
+    return any(root.all("KeyFrame") or root.all("Camera") for root in source.roots("Cameras"))
+
+
+def _read(source: Source) -> ForeignRig:
+    root = source.roots("Cameras")[0]
+    cameras: list[ForeignCamera] = []
+    lost: list[str] = []
+    several: list[str] = []
+    for element in root.all("Camera"):
+        name = element.attributes.get("DEVICEID") or element.attributes.get("USERID") or str(len(cameras) + 1)
+        frames = [frame for frame in element.all("KeyFrame") if "POSITION" in frame.attributes]
+        if not frames:
+            lost.append(name)
+            continue
+        if len(frames) > 1:
+            several.append(name)
+        cameras.append(_camera(name, element, frames[0]))
+    if not cameras:
+        raise FormatError("no camera has a KeyFrame with a pose: it was never calibrated")
+    notes = [
+        "millimetres, z up",
+        "distortion: from the image to the ideal, in pixels (VICON_RADIAL2, else VICON_RADIAL); others get it by a fit",
+        "whether pixel centres lie at 0 or 0.5 is not documented: up to half a pixel is open",
+    ]
+    if lost:
+        notes.append(f"{named(lost)}: left out, without a KeyFrame")
+    if several:
+        notes.append(f"{named(several)}: moves (several KeyFrames); the first is taken")
+    return ForeignRig(FORMAT.name, tuple(cameras), "mm", "Vicon's world (z up)", tuple(notes))
+
+
+def _camera(name: str, element: Element, frame: Element) -> ForeignCamera:
+    def get(key: str) -> str:
+        if key not in frame.attributes:
+            raise FormatError(f"{name}: no {key}")
+        return frame.attributes[key]
+
+    aspect = number(element.attributes.get("PIXEL_ASPECT_RATIO", "1"), f"{name}: PIXEL_ASPECT_RATIO")
+    if not 0.1 <= aspect <= 10:
+        raise FormatError(f"{name}: PIXEL_ASPECT_RATIO: found {aspect:g}, expected near 1")
+    along = number(get("FOCAL_LENGTH"), f"{name}: FOCAL_LENGTH")
+    focal = focal_length(along, along / aspect, f"{name}: FOCAL_LENGTH")
+    x, y = array(get("PRINCIPAL_POINT"), (2,), f"{name}: PRINCIPAL_POINT").tolist()
+    skew = number(element.attributes.get("SKEW", "0"), f"{name}: SKEW")
+    ks = _distortion(name, frame, (x, y))
+    sensor = element.attributes.get("SENSOR_SIZE")
+    size = image_size(numbers(sensor, name), f"{name}: SENSOR_SIZE") if sensor else None
+    quaternion = numbers(get("ORIENTATION"), f"{name}: ORIENTATION")
+    rotation = rotation_of_quaternion([*quaternion[3:], *quaternion[:3]], f"{name}: ORIENTATION")
+    centre = array(get("POSITION"), (3,), f"{name}: POSITION")
+    lens = Lens(focal, (x, y), ks, "to_ideal", skew)
+    return ForeignCamera(name, lens, size, rotation, -rotation @ centre)
+
+
+def _distortion(name: str, frame: Element, centre: tuple[float, float]) -> tuple[float, ...]:
+    """k1, k2, k3 in pixels; VICON_RADIAL2 has a centre of its own, too."""
+    second, first = frame.attributes.get("VICON_RADIAL2"), frame.attributes.get("VICON_RADIAL")
+    if second:
+        found = numbers(" ".join(second.split()[1:]), f"{name}: VICON_RADIAL2")
+        if len(found) < 4:
+            raise FormatError(f"{name}: VICON_RADIAL2: found {len(found)} numbers, expected a centre and coefficients")
+        ks = (*found[2:5], 0.0, 0.0)[:3]
+        return (*ks, found[0] - centre[0], found[1] - centre[1]) if any(ks) else ()
+    found = numbers(first, f"{name}: VICON_RADIAL") if first else []
+    return tuple(found[:3])
+
+
+FORMAT = Format("vicon", TITLE, _recognizes, _read, states_unit=True)

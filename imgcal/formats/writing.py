@@ -1,0 +1,139 @@
+"""A rig in the files of a tool, read back and compared before anybody gets them."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from imgcal.errors import InputError
+from imgcal.formats.conversion import LIMIT, NATIVE, Held, describe_lens, from_camera_rig, held_by, to_camera_rig
+from imgcal.formats.foreign_rig import ForeignRig
+from imgcal.formats.format import Files, Format
+from imgcal.formats.registry import FORMATS, format_named, read_foreign_rig
+from imgcal.formats.units import in_millimetres, millimetres
+from imgcal.formats.verification import worst_difference
+from imgcal.io import RigCovariance, rig_from_text, rig_text
+
+OURS = "imgcal"
+MOST_PX = 1e-6  # that a file may be off when it is read back: the digits of a double
+
+
+@dataclass(frozen=True)
+class Written:
+    """Files that say a rig, and how well they say it."""
+
+    files: Files
+    notes: tuple[str, ...]  # what the target has no place for, and which lenses were fitted
+    round_trip: float  # px, of what is read back from the files against what was to be written; same lens models
+    between_models: float  # px, against what was read from the source, with the source's own lens models
+    points: int  # known points that were compared
+
+
+def converted(rig: ForeignRig, to: str, name: str, limit: float = LIMIT, unit: str | None = None) -> Written:
+    """Make the files of a format, read them back, and compare.
+
+    Args:
+        rig: in millimetres, with image sizes.
+        to: name of the format; "imgcal" = our own.
+        name: of the rig, where there is a place for it.
+        limit: pixels that a fitted lens may be off.
+        unit: of the lengths in the files, where the format leaves that to its user; None = its custom.
+
+    Raises:
+        InputError: the format is only read, or it cannot hold so many cameras.
+        RefusedError: a lens cannot be said within `limit`.
+    """
+    if to == OURS:
+        held = held_by(rig, NATIVE, "a rig file of ours", limit)
+        text = rig_text(to_camera_rig(held.rig, name), name, _kept_covariance(held))
+        back = from_camera_rig(rig_from_text(text, name))
+        return _compared(rig, held, back, {"": text.encode()}, [])
+    target = format_named(to)
+    if target.write is None:
+        able = ", ".join(one.name for one in FORMATS if one.write is not None)
+        raise InputError(f"--to {to}: {target.title} is only read, expected one of imgcal, {able}")
+    least, most = target.cameras
+    if not least <= len(rig.cameras) <= most:
+        count = f"{least}" if least == most else f"{least} to {most}"
+        raise InputError(
+            f"--to {to}: {target.title} holds {count} cameras, found {len(rig.cameras)}: choose with --cameras"
+        )
+    held = held_by(rig, target.holds, target.title, limit)
+    notes = ["standard deviations are left out: the format has no place for them"] if rig.covariance is not None else []
+    files_unit = unit or target.unit
+    if unit is not None and target.states_unit and millimetres(unit) != millimetres(target.unit):
+        raise InputError(f"--out-unit {unit}: {target.title} is always in {target.unit}")
+    placed = held.rig.seen_from_first() if target.from_first else held.rig
+    if target.from_first and rig.format != to and len(rig.cameras) > 1:
+        notes.append(f"the frame of the files is that of camera {rig.names[0]}")
+    length = millimetres(files_unit)
+    notes.append(f"lengths in the files: {files_unit}")
+    files = target.write(placed.scaled(1.0 / length, files_unit))
+    back = _read_back(files, target, files_unit)
+    if sorted(back.names) == sorted(rig.names):  # files of a folder come in the order of their names
+        back = selected(back, tuple(rig.names))
+    else:
+        notes.append(f"cameras are called otherwise there, in this order: {', '.join(back.names[:8])}")
+    return _compared(rig, held, back, files, notes)
+
+
+def _kept_covariance(held: Held) -> RigCovariance | None:
+    """The uncertainty is that of the parameters as they were: with fitted ones it is another."""
+    return held.rig.covariance if all(fit.exact for fit in held.fits) else None
+
+
+def _read_back(files: Files, target: Format, unit: str) -> ForeignRig:
+    with tempfile.TemporaryDirectory() as folder:
+        for name, content in files.items():
+            (Path(folder) / (name or "calibration.txt")).write_bytes(content)
+        where = Path(folder) if "" not in files else Path(folder) / "calibration.txt"
+        return in_millimetres(read_foreign_rig(where, target.name), target.name, None if target.states_unit else unit)
+
+
+def _compared(rig: ForeignRig, held: Held, back: ForeignRig, files: Files, notes: list[str]) -> Written:
+    """Compare what was read back with what was to be written, and with the source."""
+    exact, _ = worst_difference(held.rig, back)
+    between, points = worst_difference(rig, back)
+    if not exact <= MOST_PX:
+        raise RuntimeError(f"what was written is read back {exact:.3g} px off")
+    for camera, fit in zip(rig.cameras, held.fits, strict=True):
+        if not fit.exact:
+            notes.append(
+                f"camera {camera.name}: {describe_lens(camera.lens)} -> {describe_lens(fit.lens)}, fitted over the "
+                f"image: worst {fit.worst:.2g} px, RMS {fit.rms:.2g} px"
+            )
+    if rig.covariance is not None and held.worst > 0:
+        notes.append("standard deviations are left out: they are those of other lens parameters")
+    return Written(files, tuple(notes), exact, between, points)
+
+
+def selected(rig: ForeignRig, names: tuple[str, ...]) -> ForeignRig:
+    """Keep the cameras of some names, in that order.
+
+    Raises:
+        InputError: a name that the rig does not have, or twice.
+    """
+    unknown = [name for name in names if name not in rig.names]
+    if unknown or len(set(names)) < len(names):
+        raise InputError(
+            f"--cameras: found {', '.join(names)}, expected names out of {', '.join(rig.names)}, each once"
+        )
+    by_name = {camera.name: camera for camera in rig.cameras}
+    own = rig.own.select([rig.names.index(name) for name in names]) if rig.own is not None else None
+    chosen = replace(rig, cameras=tuple(by_name[name] for name in names), covariance=None, own=own)
+    return chosen if rig.covariance is None else _with_uncertainty(chosen, rig, rig.covariance)
+
+
+def _with_uncertainty(chosen: ForeignRig, rig: ForeignRig, covariance: RigCovariance) -> ForeignRig:
+    """What is known of the cameras that were chosen, unless it is relative to one that was not."""
+    if covariance.reference_camera is not None and covariance.reference_camera not in chosen.names:
+        note = f"standard deviations are left out: they are relative to camera {covariance.reference_camera}"
+        return replace(chosen, notes=(*chosen.notes, note))
+    index = [rig.names.index(name) for name in chosen.names]
+    std, matrix = covariance.std[index], covariance.matrix
+    if matrix is not None:
+        size = len(rig.names)
+        blocks = matrix.reshape(size, -1, size, matrix.shape[0] // size)[index][:, :, index]
+        matrix = blocks.reshape(std.numel(), std.numel())
+    return replace(chosen, covariance=replace(covariance, std=std, matrix=matrix))

@@ -1,0 +1,48 @@
+import struct
+from pathlib import Path
+
+import pytest
+
+from imgcal.errors import InputError
+from imgcal.formats import converted, read_foreign_rig
+from tests.imgcal.formats.rigs import apart, brown, fisheye, put_files, read_in_mm, rig_of
+
+
+def folder_of(tmp_path: Path, without: str = "") -> Path:
+    files = converted(rig_of(brown(-0.1, 0.02), fisheye(0.01), brown(0, 0, 0, 0, 0.01)), "colmap-binary", "x").files
+    return put_files(tmp_path / "model", {name: content for name, content in files.items() if name != without})
+
+
+def test_rigs_and_images(tmp_path: Path) -> None:
+    rig = rig_of(brown(-0.1, 0.02), fisheye(0.01), brown(0, 0, 0, 0, 0.01))
+    folder = folder_of(tmp_path)
+    assert apart(rig, read_in_mm(folder / "cameras.bin", "m")) < 1e-8
+    (folder / "rigs.bin").unlink()
+    assert apart(rig, read_in_mm(folder, "m")) < 1e-8
+    (folder / "images.bin").unlink()
+    with pytest.raises(InputError, match="intrinsics alone"):
+        read_foreign_rig(folder)
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "rigs.bin"])
+def test_a_file_that_ends_too_early(tmp_path: Path, name: str) -> None:
+    folder = folder_of(tmp_path)
+    content = (folder / name).read_bytes()
+    for cut in range(0, len(content), 7):
+        (folder / name).write_bytes(content[:cut])
+        with pytest.raises(InputError, match="this is a COLMAP model"):
+            read_foreign_rig(folder)
+
+
+def test_counts_are_compared_with_the_file(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path)
+    for name in ("cameras.bin", "images.bin", "rigs.bin"):
+        content = (folder / name).read_bytes()
+        (folder / name).write_bytes(struct.pack("<Q", 2**62) + content[8:])
+        with pytest.raises(InputError, match="in the middle of a record"):
+            read_foreign_rig(folder)
+        (folder / name).write_bytes(content)
+    content = (folder / "cameras.bin").read_bytes()
+    (folder / "cameras.bin").write_bytes(content[:12] + struct.pack("<i", 99) + content[16:])
+    with pytest.raises(InputError, match="model number 99"):
+        read_foreign_rig(folder)

@@ -1,0 +1,92 @@
+import numpy as np
+import pytest
+
+from imgcal.formats.chains import compose, inverse
+from imgcal.formats.colmap_model import COUNTS, ColmapCamera, ColmapImage, ColmapRig, model_of_rig, rig_of_model, seven
+from imgcal.formats.foreign_rig import FormatError
+from imgcal.formats.values import rotation_of_vector
+from tests.imgcal.formats.rigs import brown, rig_of
+
+DRAW = np.random.default_rng(3)
+CAMERAS = [ColmapCamera(n, "PINHOLE", (1280, 800), (900.0, 901.0, 640.0, 400.0)) for n in (1, 2)]
+
+
+def pose() -> tuple[np.ndarray, np.ndarray]:
+    return rotation_of_vector(DRAW.normal(size=3) * 0.3), DRAW.normal(size=3)
+
+
+@pytest.mark.parametrize(
+    ("model", "parameters", "focal", "centre", "coefficients"),
+    [
+        ("SIMPLE_PINHOLE", (900, 640, 400), (900, 900), (639.5, 399.5), ()),
+        ("PINHOLE", (900, 901, 640, 400), (900, 901), (639.5, 399.5), ()),
+        ("SIMPLE_RADIAL", (900, 640, 400, 0.1), (900, 900), (639.5, 399.5), (0.1,)),
+        ("RADIAL", (900, 640, 400, 0.1, 0.2), (900, 900), (639.5, 399.5), (0.1, 0.2)),
+        ("OPENCV", (900, 901, 640, 400, 1, 2, 3, 4), (900, 901), (639.5, 399.5), (1, 2, 3, 4)),
+        ("FULL_OPENCV", (900, 901, 640, 400, *range(8)), (900, 901), (639.5, 399.5), tuple(range(8))),
+        ("OPENCV_FISHEYE", (900, 901, 640, 400, 1, 2, 3, 4), (900, 901), (639.5, 399.5), (1, 2, 3, 4)),
+        ("RADIAL_FISHEYE", (900, 640, 400, 0.1, 0.2), (900, 900), (639.5, 399.5), (0.1, 0.2)),
+    ],
+)
+def test_lenses(model: str, parameters: tuple, focal: tuple, centre: tuple, coefficients: tuple) -> None:
+    lens = ColmapCamera(1, model, (1280, 800), parameters).lens()
+    assert (lens.focal_length, lens.principal_point, lens.coefficients) == (focal, centre, coefficients)
+    assert lens.model == ("fisheye" if "FISHEYE" in model else "opencv")
+
+
+@pytest.mark.parametrize("model", ["FOV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE", "NEW"])
+def test_lenses_without_counterpart(model: str) -> None:
+    with pytest.raises(FormatError, match=f"the model {model} has no counterpart"):
+        ColmapCamera(1, model, (1280, 800), (900.0,) * COUNTS.get(model, 3)).lens()
+
+
+def images(poses: dict[str, tuple[np.ndarray, np.ndarray]]) -> list[ColmapImage]:
+    return [ColmapImage(n, one, 1 if name.startswith("a") else 2, name) for n, (name, one) in enumerate(poses.items())]
+
+
+def test_images_of_fixed_cameras_are_a_rig() -> None:
+    first, later, b_from_a = pose(), pose(), pose()
+    taken = {
+        "a/0.png": first,
+        "b/0.png": compose(b_from_a, first),
+        "b/1.png": compose(b_from_a, later),
+        "a/1.png": later,
+    }
+    rig = rig_of_model("colmap", CAMERAS, images(taken), [])
+    assert (rig.names, rig.unit) == (["a", "b"], None)
+    assert np.allclose(rig.cameras[1].translation, compose(b_from_a, first)[1])  # the world, at the first frame
+    taken["b/1.png"] = pose()
+    with pytest.raises(FormatError, match="camera b stands otherwise to a in '1'"):
+        rig_of_model("colmap", CAMERAS, images(taken), [])
+
+
+def test_images_of_one_moment_are_a_rig() -> None:
+    taken = {"a_left.png": pose(), "b_right.png": pose()}
+    rig = rig_of_model("colmap", CAMERAS, images(taken), [ColmapRig(1, {1: None}), ColmapRig(2, {2: None})])
+    assert rig.names == ["a_left", "b_right"]
+    with pytest.raises(FormatError, match="found no rig and 1 images"):
+        rig_of_model("colmap", CAMERAS, images(taken)[:1], [])
+
+
+def test_a_rig_names_cameras_by_the_folders_of_their_images() -> None:
+    rigs = [ColmapRig(1, {1: (np.eye(3), np.zeros(3)), 2: pose()})]
+    taken = {"a/left/0.png": pose(), "b/right/0.png": pose()}
+    assert rig_of_model("colmap", CAMERAS, images(taken), rigs).names == ["left", "right"]
+    assert rig_of_model("colmap", CAMERAS, [], rigs).names == ["1", "2"]
+    with pytest.raises(FormatError, match="camera 2 without a pose"):
+        rig_of_model("colmap", CAMERAS, [], [ColmapRig(1, {1: (np.eye(3), np.zeros(3)), 2: None})])
+    with pytest.raises(FormatError, match="found 2 rigs"):
+        rig_of_model("colmap", CAMERAS, [], rigs * 2)
+
+
+def test_a_rig_taken_apart() -> None:
+    rig = rig_of(brown(-0.1), brown(0, 0, 0, 0, 0, 0.1), brown())
+    cameras, images_, colmap_rig, rig_from_world = model_of_rig(rig)
+    assert [camera.model for camera in cameras] == ["OPENCV", "FULL_OPENCV", "PINHOLE"]
+    assert cameras[0].parameters[2] == rig.cameras[0].lens.principal_point[0] + 0.5
+    sensor = colmap_rig.sensors[3]
+    assert sensor is not None
+    together = compose(sensor, rig_from_world)
+    assert np.allclose(together[1], images_[2].pose[1])
+    assert np.allclose(compose(together, inverse(images_[2].pose))[0], np.eye(3))
+    assert np.allclose(seven((np.eye(3), np.ones(3))), [1, 0, 0, 0, 1, 1, 1])

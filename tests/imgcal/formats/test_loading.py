@@ -1,0 +1,61 @@
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+import imgcal
+from imgcal.errors import InputError, RefusedError
+from imgcal.formats import converted, load_rig
+from imgcal.io import save_rig
+from imgcal.types import CameraRig
+from tests.imgcal.formats.rigs import brown, put, put_files, rig_of
+
+
+def test_ours_as_ever(tmp_path: Path, o10: CameraRig) -> None:
+    assert imgcal.load_rig is load_rig
+    assert torch.equal(load_rig("O10").focal_length, o10.focal_length)
+    save_rig(o10, tmp_path / "rig.yaml")
+    assert torch.equal(load_rig(tmp_path / "rig.yaml").distortion, o10.distortion)
+    with pytest.raises(InputError, match="O11: no such file, nor one of the shipped rigs"):
+        load_rig("O11")
+    with pytest.raises(InputError, match="says its unit"):
+        load_rig(tmp_path / "rig.yaml", unit="m")
+    with pytest.raises(InputError, match="format"):
+        load_rig(put(tmp_path, a__yaml="format: imgcal-rig/9\n") / "a.yaml")
+
+
+def test_another_tool_s_is_simply_read(tmp_path: Path) -> None:
+    rig = rig_of(brown(-0.1, 0.02), brown(0.05), names=("cam0", "cam1"))
+    path = put_files(tmp_path, converted(rig, "kalibr", "x").files)
+    ours = load_rig(path)
+    assert (ours.name, ours.camera_names) == ("calibration", ("cam0", "cam1"))
+    apart = torch.linalg.vector_norm(ours.positions[1] - ours.positions[0])
+    assert float(apart) == pytest.approx(float(((rig.cameras[1].centre - rig.cameras[0].centre) ** 2).sum() ** 0.5))
+
+
+def test_what_it_does_not_say_is_asked_for(tmp_path: Path) -> None:
+    folder = put_files(tmp_path / "pair", converted(rig_of(brown(-0.1), brown()), "opencv-stereo", "x").files)
+    with pytest.raises(InputError, match=r'in Python load_rig.*unit="mm"'):
+        load_rig(folder)
+    assert load_rig(folder, unit="mm").name == "pair"
+    text = (folder / "intrinsics.yml").read_text().replace("image_width", "x").replace("image_height", "y")
+    (folder / "intrinsics.yml").write_text(text)
+    with pytest.raises(InputError, match=r"image_size=\(1280, 720\)"):
+        load_rig(folder, unit="mm")
+    sizes = load_rig(folder, unit="mm", image_size={"1": (1280, 960), "2": (640, 480)}).image_size
+    assert sizes.tolist() == [[1280, 960], [640, 480]]
+    assert load_rig(folder, unit="mm", image_size=(1280, 960)).image_size.tolist() == [[1280, 960]] * 2
+
+
+def test_a_lens_that_is_not_ours(tmp_path: Path) -> None:
+    cameras = {f"cam{n}": {"camera_model": "omni", "intrinsics": [1, 2, 3, 4, 5]} for n in range(2)}
+    with pytest.raises(InputError, match="this is a Kalibr camchain: cam0: an omnidirectional"):
+        load_rig(put(tmp_path, a__yaml=yaml.safe_dump(cameras)) / "a.yaml")
+    odd = brown(*([0.01] * 12))
+    path = put_files(tmp_path / "b", converted(rig_of(odd, brown()), "multical", "x").files)
+    with pytest.raises(RefusedError, match="`fit_limit` allows more"):
+        load_rig(path)
+    assert load_rig(path, fit_limit=50.0).num_cameras == 2
+    with pytest.raises(InputError, match="found the format 'x'"):
+        load_rig(path, format="x")

@@ -1,0 +1,134 @@
+"""Which format a file is; and the gate: real files of every tool, against pixels that other programs have computed."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from imgcal.errors import InputError
+from imgcal.formats import FORMATS, format_named, is_foreign, read_foreign_rig
+from imgcal.formats.file_storage import storage_text
+from imgcal.io import data_path
+from imgcal.types import limits
+from tests.imgcal.formats.rigs import put, read_in_mm
+
+SAMPLES = {
+    "anipose/melokeo_4cam.toml": "anipose",
+    "caliscope/post_optimization/camera_array.toml": "caliscope",
+    "caliscope/post_optimization/config.toml": "caliscope",
+    "caliscope/quality_control/camera_array.toml": "caliscope",
+    "colmap/rig4_bin": "colmap-binary",
+    "colmap/rig4_rig_config.json": "colmap-rig-config",
+    "colmap/rig4_txt": "colmap",
+    "easymocap/anerf_6cam": "easymocap",
+    "freemocap/session_camera_calibration.toml": "freemocap",
+    "kalibr/hdpr_7cam.yaml": "kalibr",
+    "kalibr/kumar_mixed.yaml": "kalibr",
+    "mrcal/opencv8_pair": "mrcal",
+    "multical/rig_4cam_master.json": "multical",
+    "opencv/multiview_cv5_4cam.yaml": "opencv-multiview",
+    "opencv/stereo_unlook": "opencv-stereo",
+    "optitrack_mcal/cork_260414_1415.mcal": "motive",
+    "pose2sim/Calib_qualisys.toml": "pose2sim",
+    "pymvg/example_3cam.json": "pymvg",
+    "qualisys/pose2sim_demo.qca.txt": "qualisys",
+    "ros_camera_info/mono_test_calibration.yaml": "ros",
+    "ros_camera_info/zed": "ros",
+}
+WORST = 1e-6  # px
+
+
+@pytest.mark.parametrize("name", SAMPLES)
+def test_real_files_are_where_other_programs_put_them(formats: Path, name: str) -> None:
+    expected = json.loads((formats / f"{name}.expected.json").read_text())
+    unit = "mm" if "mm" in expected["unit_note"].split(";")[0] else "m"
+    rig = read_in_mm(formats / name, unit)
+    assert rig.format == SAMPLES[name]
+    for camera, row in zip(rig.cameras, expected["cameras"], strict=True):
+        uv = camera.project(np.array(row["points_rig_mm"]))
+        assert np.abs(uv - np.array(row["uv"])).max() < WORST
+        assert camera.image_size in (None, tuple(row["image_size"]))
+
+
+def test_cameras_of_images_alone(formats: Path) -> None:
+    """Images of two cameras in three moments, without a rig: the rig's frame is COLMAP's world in the first of them."""
+    expected = json.loads((formats / "colmap/kapture_t265.expected.json").read_text())
+    rig = read_in_mm(formats / "colmap/kapture_t265", "m")
+    assert rig.names == ["rightraw", "leftraw"]
+    for camera, row in zip(rig.cameras, expected["cameras"], strict=False):
+        assert row["name"] == f"{camera.name}/frame_000000001.jpg"
+        assert np.abs(camera.project(np.array(row["points_rig_mm"])) - np.array(row["uv"])).max() < WORST
+
+
+@pytest.mark.parametrize("name", [one.name for one in FORMATS])
+def test_a_format_that_the_user_names_must_be_possible(tmp_path: Path, name: str) -> None:
+    for content in ("a: 1\n", "cam0: {camera_model: pinhole}\n"):
+        with pytest.raises(InputError, match=r"this is no|this is a"):
+            read_foreign_rig(put(tmp_path, a__yaml=content) / "a.yaml", name)
+
+
+def test_formats_by_name() -> None:
+    assert format_named("kalibr").title == "Kalibr camchain"
+    assert len({one.name for one in FORMATS}) == len(FORMATS)
+    with pytest.raises(InputError, match=r"found the format 'calibr', expected one of imgcal, anipose"):
+        format_named("calibr")
+
+
+@pytest.mark.parametrize(
+    ("files", "said"),
+    [
+        (
+            {"a__yaml": "a: 1\n"},
+            r"found none of the keys of a calibration \(its keys: a\), expected `format: imgcal-rig/1`",
+        ),
+        ({"a__yaml": ""}, "found none of the keys"),
+        ({"a__yaml": "a: [\n"}, "not valid YAML"),
+        (
+            {"a__yml": storage_text({"camera_matrix": np.eye(3), "distortion_coefficients": np.zeros((1, 5))})},
+            "one camera",
+        ),
+        ({"a__json": '{"frames": [{"transform_matrix": []}]}'}, "nerfstudio"),
+        ({"a__yml": storage_text({"R": np.eye(3), "T": np.zeros((3, 1))})}, "extrinsics alone"),
+        ({"a__cal": b"\0" * 50}, "binary"),
+    ],
+)
+def test_what_is_no_rig_is_named(tmp_path: Path, files: dict[str, str | bytes], said: str) -> None:
+    folder = put(tmp_path, **files)
+    with pytest.raises(InputError, match=said):
+        read_foreign_rig(folder / next(iter(files)).replace("__", "."))
+
+
+def test_a_folder_without_a_calibration(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"found b.yaml, notes.md, expected"):
+        read_foreign_rig(put(tmp_path, notes__md="x", b__yaml="a: ["))
+
+
+def test_names_are_those_of_files(tmp_path: Path) -> None:
+    table = """[{key}]
+name = "{name}"
+size = [640, 480]
+matrix = [[900.0, 0, 320], [0, 900, 240], [0, 0, 1]]
+distortions = [0.0, 0, 0, 0, 0]
+rotation = [0, {turn}, 0]
+translation = [0, 0, {turn}]
+"""
+    names = ["cam/left", "cam_left", "..", "right"]
+    text = "\n".join(table.format(key=f"cam_{n}", name=name, turn=0.1 * n) for n, name in enumerate(names))
+    rig = read_foreign_rig(put(tmp_path, a__toml=text) / "a.toml")
+    assert rig.names == ["cam_left", "cam_left_2", "camera3", "right"]
+    assert any("cam/left -> cam_left" in note for note in rig.notes)
+
+
+def test_there_are_only_so_many_cameras(tmp_path: Path) -> None:
+    row = '{"name": "a", "K": [[9, 0, 3], [0, 9, 2], [0, 0, 1]], "Q": [0.1, 0, 0], "translation": [0, 0, 1]}'
+    text = f'{{"camera_system": [{",".join([row] * (limits.MOST_CAMERAS + 1))}]}}'
+    with pytest.raises(InputError, match="found 257 cameras"):
+        read_foreign_rig(put(tmp_path, a__json=text) / "a.json")
+
+
+def test_our_own_files_are_told_from_others(tmp_path: Path) -> None:
+    assert not is_foreign(data_path("rigs", "O10.yaml"))
+    assert is_foreign(put(tmp_path, a__yaml="cam0: {}"))
+    assert is_foreign(tmp_path / "a.yaml")
+    assert not is_foreign(tmp_path / "nothing")
