@@ -1,3 +1,4 @@
+from .alone import is_few_and_flat, labels_by_shape
 from .ambiguities import lattice_shifts, near_turns
 from .assignment import distances_to_nearest, mutual_nearest
 from .blobs import pattern_prior
@@ -32,7 +33,9 @@ __all__ = [
     "associate",
     "distances_to_nearest",
     "identify",
+    "is_few_and_flat",
     "judge",
+    "labels_by_shape",
     "lattice_shifts",
     "matched_to_rig",
     "mutual_nearest",

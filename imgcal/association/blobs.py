@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.errors import InputError
-from imgcal.geometry import kernels
+from imgcal.geometry import lens_codes, lens_kernels
 from imgcal.types import CameraRig, Detections
 from renderers.compiling import njit
 
@@ -77,18 +77,17 @@ def gather(detections: Detections, rig: CameraRig) -> PaddedBlobs:
     radius[camera, slot] = detections.radius[rows]
     lens = (rig.focal_length.numpy(), rig.principal_point.numpy(), rig.distortion.numpy())
     ideal = np.full(uv.shape, FAR, dtype=np.float32)
-    _undistort(uv, count, *lens, ideal)
+    _undistort(uv, count, *lens, lens_codes(rig.lens_model, *rig.distortion.shape), ideal)
     return PaddedBlobs(uv, ideal, sigma, radius, row, count, len(detections))
 
 
 @njit(cache=True)
-def _undistort(uv, count, focal, principal, distortion, ideal):
+def _undistort(uv, count, focal, principal, distortion, lenses, ideal):
     """Fill pixels from the principal point, without distortion; see `PaddedBlobs.ideal`."""
     for c in range(len(uv)):
-        k1, k2, p1, p2, k3 = distortion[c]
         for m in range(count[c]):
             xd, yd = (uv[c, m, 0] - principal[c, 0]) / focal[c, 0], (uv[c, m, 1] - principal[c, 1]) / focal[c, 1]
-            x, y = kernels.undistort(xd, yd, k1, k2, p1, p2, k3)
+            x, y = lens_kernels.undistort(lenses, c, xd, yd, distortion[c])
             mean = (focal[c, 0] + focal[c, 1]) / 2
             ideal[c, m, 0], ideal[c, m, 1] = mean * x, mean * y
 

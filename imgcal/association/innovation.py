@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from imgcal.association.blobs import PaddedBlobs
 from imgcal.estimation import Problem, Solution
-from imgcal.geometry import NEAREST_DEPTH, kernels
+from imgcal.geometry import NEAREST_DEPTH, kernels, lens_codes, lens_kernels
 from renderers.compiling import njit
 
 THRESHOLD = 3.0
@@ -60,6 +60,7 @@ def innovations(
     complexity = np.full(count, np.inf)
     equations, state = solution.equations, solution.state
     factory, step = problem.factory, state.offset * problem.prior_std
+    lenses = lens_codes(factory.lens_model, *factory.distortion.shape[-2:])
     given = [
         np.ascontiguousarray(tensor.numpy())
         for tensor in (
@@ -82,7 +83,7 @@ def innovations(
         complexity[k] = _factorize(eliminated, whitened, kept)
         if np.isfinite(complexity[k]):
             _compare(
-                (*(array[k] for array in given), radius_squared),
+                (*(array[k] for array in given), radius_squared, lenses),
                 (eliminated, whitened, kept),
                 (blobs.uv, noise, typical, blobs.count, labels[k], sigma[k] ** 2),
                 (squared[k], log_det[k], own[k], residual[k], freedom[k], uv[k]),
@@ -127,7 +128,8 @@ def _factorize(blocks, coupling, kept):
     for c in range(len(blocks)):
         if not kernels.cholesky(blocks[c]):
             return np.inf
-        for i in range(15):
+        size = blocks.shape[1]
+        for i in range(size):
             log_det += 2 * np.log(blocks[c, i, i])
             for j in range(6):
                 for k in range(i):
@@ -135,7 +137,7 @@ def _factorize(blocks, coupling, kept):
                 coupling[c, i, j] /= blocks[c, i, i]
         for i in range(6):
             for j in range(6):
-                for k in range(15):
+                for k in range(blocks.shape[1]):
                     kept[i, j] -= coupling[c, k, i] * coupling[c, k, j]
     if not kernels.cholesky(kept):
         return np.inf
@@ -154,11 +156,12 @@ def _compare(given, factors, blobs, outputs):
         blobs: their places, noise, usual noise and number, what they are labelled, and noise beyond their own.
         outputs: as in `Innovations`.
     """
-    rotation0, turn, position, focal, principal, distortion, prior_std, rotated, centre, radius_squared = given
+    rotation0, turn, position, focal, principal, distortion, prior_std, rotated, centre, radius_squared, lenses = given
     eliminated, whitened, kept = factors
     blob_uv, blob_noise, typical_noise, blob_count, labels, extra = blobs
     squared, log_det, own, residual, freedom, uv = outputs
-    rows, parts = np.empty((2, 21)), np.empty((2, 21))
+    free = 10 + lens_kernels.width_of(lenses, distortion)
+    rows, parts = np.empty((2, free + 6)), np.empty((2, free + 6))
     rotation, exponential, left = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     unit = max(1.0, np.sqrt(centre[0] ** 2 + centre[1] ** 2 + centre[2] ** 2))
     for c in range(len(rotation0)):
@@ -167,7 +170,7 @@ def _compare(given, factors, blobs, outputs):
         for n in range(len(rotated)):
             _rows(
                 rotated[n], rotation, left, centre, position[c],
-                focal[c], principal[c], distortion[c], prior_std[c], radius_squared[n], unit, rows, uv[c, n],
+                focal[c], principal[c], lenses, c, distortion[c], prior_std[c], radius_squared[n], unit, rows, uv[c, n],
             )  # fmt: skip
             uu, uv_, vv = _whiten(rows, eliminated[c], whitened[c], kept, parts)
             label = labels[c, n]
@@ -207,9 +210,10 @@ def _compare(given, factors, blobs, outputs):
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _rows(
-    rotated, rotation, left, centre, position, focal, principal, distortion, prior_std, radius_squared, unit, rows, uv
+    rotated, rotation, left, centre, position, focal, principal, lenses, camera, distortion, prior_std, radius_squared,
+    unit, rows, uv,
 ):  # fmt: skip
-    """Fill the Jacobian (2, 21) of a pixel by 15 whitened camera and 6 pose parameters, and the pixel.
+    """Fill the Jacobian (2, K + 6) of a pixel by K whitened camera and 6 pose parameters, and the pixel.
 
     To the last digit that of the fit (`linearization_cpu.linearize_rig`): where a label alone decides a parameter,
     nothing is left of it but the difference of two almost equal numbers.
@@ -219,10 +223,11 @@ def _rows(
     px = rotation[0, 0] * ox + rotation[0, 1] * oy + rotation[0, 2] * oz
     py = rotation[1, 0] * ox + rotation[1, 1] * oy + rotation[1, 2] * oz
     pz = rotation[2, 0] * ox + rotation[2, 1] * oy + rotation[2, 2] * oz
-    per_depth, log_slope, x, y, rr, xd, yd, jxx, jxy, jyy = kernels.lens(
-        px, py, max(pz, NEAREST_DEPTH), radius_squared,
-        distortion[0], distortion[1], distortion[2], distortion[3], distortion[4],
-    )  # fmt: skip
+    free = len(prior_std)
+    per_depth, log_slope, x, y, rr, xd, yd, jxx, jxy, jyy = lens_kernels.image_of(
+        lenses, camera, px, py, max(pz, NEAREST_DEPTH), radius_squared, distortion
+    )
+    lens_kernels.by_coefficients(lenses, camera, x, y, rr, distortion, focal[0], focal[1], 10, rows)
     uv[0], uv[1] = focal[0] * xd + principal[0], focal[1] * yd + principal[1]
     for r in range(2):
         along_x, along_y = (jxx, jxy) if r == 0 else (jxy, jyy)
@@ -235,40 +240,35 @@ def _rows(
         for i in range(3):
             rows[r, i] = (tx * left[0, i] + ty * left[1, i] + tz * left[2, i]) * prior_std[i]
         rows[r, 3], rows[r, 4], rows[r, 5] = -bx * prior_std[3], -by * prior_std[4], -bz * prior_std[5]
-        rows[r, 15], rows[r, 16], rows[r, 17] = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-        rows[r, 18], rows[r, 19], rows[r, 20] = bx * unit, by * unit, bz * unit
+        rows[r, free], rows[r, free + 1], rows[r, free + 2] = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+        rows[r, free + 3], rows[r, free + 4], rows[r, free + 5] = bx * unit, by * unit, bz * unit
     for r in range(2):
-        at, along, mixed = (x, xd, 12) if r == 0 else (y, yd, 13)
+        along = xd if r == 0 else yd
         rows[r, 6 + r], rows[r, 7 - r] = along * prior_std[6 + r], 0.0
         rows[r, 8 + r], rows[r, 9 - r] = prior_std[8 + r], 0.0
-        power = focal[r] * at * rr
-        rows[r, 10], rows[r, 11], rows[r, 14] = (
-            power * prior_std[10],
-            power * rr * prior_std[11],
-            power * rr * rr * prior_std[14],
-        )
-        rows[r, mixed] = focal[r] * 2 * x * y * prior_std[mixed]
-        rows[r, 25 - mixed] = focal[r] * (rr + 2 * at * at) * prior_std[25 - mixed]
+        for i in range(free - 10):
+            rows[r, 10 + i] *= prior_std[10 + i]
 
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _whiten(rows, eliminated, whitened, kept, parts):
     """Apply the inverse of the arrow's triangular factor; return the covariance parts @ parts.T: uu, uv, vv."""
+    free = len(eliminated)
     for r in range(2):
-        for i in range(15):
+        for i in range(free):
             value = rows[r, i]
             for j in range(i):
                 value -= eliminated[i, j] * parts[r, j]
             parts[r, i] = value / eliminated[i, i]
         for i in range(6):
-            value = rows[r, 15 + i]
-            for j in range(15):
+            value = rows[r, free + i]
+            for j in range(free):
                 value -= whitened[j, i] * parts[r, j]
             for j in range(i):
-                value -= kept[i, j] * parts[r, 15 + j]
-            parts[r, 15 + i] = value / kept[i, i]
+                value -= kept[i, j] * parts[r, free + j]
+            parts[r, free + i] = value / kept[i, i]
     uu, uv, vv = 0.0, 0.0, 0.0
-    for i in range(21):
+    for i in range(free + 6):
         uu += parts[0, i] * parts[0, i]
         uv += parts[0, i] * parts[1, i]
         vv += parts[1, i] * parts[1, i]

@@ -37,6 +37,10 @@ class Associations:
     detections: Detections  # `fiducial` filled in, -1 = not used
     snapshots: tuple[SnapshotIdentity, ...]  # S
 
+    def __repr__(self) -> str:
+        """Say how much was decided, and how."""
+        return f"Associations({len(self.used)} of {len(self.snapshots)} snapshots {self.identity}, {self.detections!r})"
+
     @property
     def used(self) -> list[int]:
         """Numbers of the snapshots that are not refused."""

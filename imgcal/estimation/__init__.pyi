@@ -1,6 +1,7 @@
 from . import lm_cpu
 from .accuracy import MAP_DEPTHS, MAP_SIZE, PredictedError, WorkingVolume, predicted_error
 from .blocks import BlockScatter, block_scatter
+from .brought import Brought
 from .change_points import CLIP, LEAST_SNAPSHOTS
 from .covariance import (
     camera_covariance,
@@ -13,7 +14,9 @@ from .covariance import (
     relative_jacobian,
     whitened_covariance,
 )
+from .cusum import Cusum, cusum_threshold
 from .gauge import aligned
+from .held_rig import HeldRigFit, fit_pose
 from .implicit import attach_gradient, map_cost
 from .levenberg_marquardt import Solution
 from .linearization import (
@@ -39,16 +42,19 @@ from .map_estimate import (
     minimize,
     object_prior_std,
 )
-from .map_operator import encoded, map_state
+from .map_operator import encoded, map_state, with_lenses, without_lenses
 from .moves import find_moves
+from .object_change import ObjectChange, changed_object
 from .object_shape import SNAPSHOTS_TO_BEND, FiducialOffset, ShapeEvidence, offsets
 from .pose_initialization import initial_pose
 from .pose_support import ON_A_LINE, UndeterminedPosesError, require_poses
-from .rig_changes import CHANGES, change_scores, jump
+from .recent_snapshots import RecentSnapshots
+from .rig_changes import CHANGES, ChangeTest, change_of_errors, pixel_changes, spread_of
 from .rig_error import displaced, error_between, step_by_error
 from .rig_filter import Absorbed, RigBelief, RigFilter, absorbed, aged, widened
+from .rig_initialization import K3, ColdStart, cold_start, ordinary_lens
 from .rig_monitor import Change, RigMonitor
-from .rig_uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian
+from .rig_uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian, uncertainty_over
 from .robust_losses import squared
 from .steady_cameras import Gauge
 from .variance_components import BENT, ObjectQuestion, Start, estimate_variance_components
@@ -57,6 +63,7 @@ __all__ = [
     "BENT",
     "CHANGES",
     "CLIP",
+    "K3",
     "LEAST_SNAPSHOTS",
     "MAP_DEPTHS",
     "MAP_SIZE",
@@ -65,15 +72,22 @@ __all__ = [
     "SNAPSHOTS_TO_BEND",
     "Absorbed",
     "BlockScatter",
+    "Brought",
     "Change",
+    "ChangeTest",
+    "ColdStart",
+    "Cusum",
     "Estimate",
     "EstimationOptions",
     "FiducialOffset",
     "Gauge",
+    "HeldRigFit",
     "NormalEquations",
+    "ObjectChange",
     "ObjectQuestion",
     "PredictedError",
     "Problem",
+    "RecentSnapshots",
     "RigBelief",
     "RigFilter",
     "RigMonitor",
@@ -91,7 +105,10 @@ __all__ = [
     "block_scatter",
     "camera_covariance",
     "camera_std",
-    "change_scores",
+    "change_of_errors",
+    "changed_object",
+    "cold_start",
+    "cusum_threshold",
     "displaced",
     "encoded",
     "equations_at",
@@ -99,11 +116,11 @@ __all__ = [
     "estimate",
     "estimate_variance_components",
     "find_moves",
+    "fit_pose",
     "flat_std",
     "initial_pose",
     "initial_state",
     "inverse_or_zero",
-    "jump",
     "linearize",
     "lm_cpu",
     "make_estimate",
@@ -115,6 +132,8 @@ __all__ = [
     "object_covariance",
     "object_prior_std",
     "offsets",
+    "ordinary_lens",
+    "pixel_changes",
     "pixel_jacobian",
     "points_at",
     "pose_at",
@@ -126,8 +145,12 @@ __all__ = [
     "require_poses",
     "retract",
     "rig_at",
+    "spread_of",
     "squared",
     "step_by_error",
+    "uncertainty_over",
     "whitened_covariance",
     "widened",
+    "with_lenses",
+    "without_lenses",
 ]

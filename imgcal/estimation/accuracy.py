@@ -11,7 +11,7 @@ from torch import Tensor
 
 from imgcal.errors import InputError
 from imgcal.estimation import Estimate, camera_covariance
-from imgcal.estimation.rig_uncertainty import RigUncertainty, rig_uncertainty, without_gradient
+from imgcal.estimation.rig_uncertainty import RigUncertainty, uncertainty_over, without_gradient
 from imgcal.geometry import rotate, undistort
 from imgcal.types import CameraRig
 
@@ -83,6 +83,10 @@ class PredictedError:
     maps: Tensor  # (C, D, H, W) pixels over the image; nan where a pixel belongs to no ray
     map_depths: Tensor  # (C, D) mm; nan for a camera that sees nothing of the volume
     map_inside: Tensor  # (C, D, H, W) bool, in the working volume
+
+    def __repr__(self) -> str:
+        """Give the medians: `PredictedError(0.003 mm, 0.002 px, 10 cameras)`."""
+        return f"PredictedError({self.median_mm:.2g} mm, {self.median_px:.2g} px, {len(self.camera_names)} cameras)"
 
     @property
     def median_px(self) -> float:
@@ -174,7 +178,7 @@ def predicted_error(
     Args:
         calibration: what `calibrate` or `estimate` gave, without batch axes.
         volume: where the rig is used; None = `working_volume(calibration)`.
-        covariance: (15 C, 15 C) of all cameras' parameters; None = `joint_covariance(calibration)`.
+        covariance: (K C, K C) of all cameras' parameters; None = `joint_covariance(calibration)`.
 
     Raises:
         InputError: an estimate with batch axes.
@@ -206,7 +210,7 @@ def predicted_error(
     grid = volume.grid()
     shape, points = grid.shape[:-1], grid.flatten(0, -2)
     anchors = volume.grid(ANCHORS).flatten(0, -2)
-    uncertainty = rig_uncertainty(rig, covariance.detach().to(points), anchors)
+    uncertainty = uncertainty_over(rig, covariance.detach().to(points), anchors)
     projection = rig.project(points)
     seen, noise = projection.visible, _noise(found)
     maps, depths, inside = _maps(uncertainty, volume, torch.where(seen, projection.depth, torch.nan))
@@ -225,7 +229,7 @@ def predicted_error(
 
 
 def joint_covariance(calibration: Estimate) -> Tensor:
-    """Covariance of all cameras' parameters that the prediction starts from: (15 C, 15 C).
+    """Covariance of all cameras' parameters that the prediction starts from: (K C, K C).
 
     The flat one: what `camera_covariance` adds by second order is mostly that a motion of the whole rig, of which
     nothing but the prior is known, bends the parameters. That is no error, and a linear projection cannot take it out
@@ -275,7 +279,8 @@ def _rays(rig: CameraRig, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     rows, columns = ((torch.arange(n, dtype=torch.float64, device=rig.focal_length.device) + 0.5) / n for n in size)
     share = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1).flatten(0, 1)
     uv = share * rig.image_size[:, None] - 0.5
-    return undistort((uv - rig.principal_point[:, None]) / rig.focal_length[:, None], rig.distortion)
+    xy = (uv - rig.principal_point[:, None]) / rig.focal_length[:, None]
+    return undistort(xy, rig.distortion, rig.lens_model)
 
 
 def _noise(calibration: Estimate) -> float:

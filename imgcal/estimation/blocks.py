@@ -21,7 +21,6 @@ from imgcal.estimation.levenberg_marquardt import Solution
 from imgcal.estimation.linearization import Problem
 from imgcal.estimation.map_estimate import equations_by_snapshot
 from imgcal.estimation.robust_losses import NamedLoss
-from imgcal.types import PARAMETERS
 
 LEAST_BLOCKS = 6
 """Blocks whose scatter is trusted."""
@@ -60,7 +59,7 @@ def block_scatter(problem: Problem, solution: Solution, loss: NamedLoss) -> Bloc
     pull = (solution.state.offset - equations.camera_gradient).flatten(1)  # the prior's own pull taken out
     pull = pull - pull.mean(0)
     found, size = BlockScatter(), 1
-    numbers = torch.arange(PARAMETERS * cameras).view(cameras, PARAMETERS)
+    numbers = torch.arange(pull.shape[1]).view(cameras, -1)
     kinds = [_whitened(pull, covariance, numbers[:, part].flatten()) for part in POOLED]
     while snapshots // size >= LEAST_BLOCKS:
         count = snapshots // size
@@ -75,7 +74,7 @@ def block_scatter(problem: Problem, solution: Solution, loss: NamedLoss) -> Bloc
 
 
 def _whitened(pull: Tensor, covariance: Tensor, rows: Tensor) -> Tensor:
-    """Influences (S, D) of pulls (S, 15 C) on parameters of a kind, along directions in which noise makes their sum
+    """Influences (S, D) of pulls (S, K C) on parameters of a kind, along directions in which noise makes their sum
     vary by one; parameters of which the data say nothing are left out.
     """
     columns = covariance[:, rows]

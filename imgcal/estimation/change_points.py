@@ -24,7 +24,6 @@ from scipy.special import chdtrc, chdtri
 from imgcal.estimation.linearization import Problem, State
 from imgcal.estimation.map_estimate import equations_by_snapshot
 from imgcal.estimation.robust_losses import NamedLoss
-from imgcal.types import PARAMETERS
 
 STEP = 8
 """Values of a camera that may step: rotation, position, focal lengths."""
@@ -58,15 +57,15 @@ class Step:
 class Blocks:
     """Normal equations snapshot by snapshot, poses eliminated: whitened values of V cameras."""
 
-    camera: Array  # (S, V, 15, 15) information of the labels
-    gradient: Array  # (S, V, 15) with clipped residuals
-    coupling: Array  # (S, 6, 15 V) with the pose, which is whitened
+    camera: Array  # (S, V, K, K) information of the labels
+    gradient: Array  # (S, V, K) with clipped residuals
+    coupling: Array  # (S, 6, K V) with the pose, which is whitened
     pull: Array  # (S, 6) gradient of the whitened pose
-    prior: Array  # (V, 15) offsets: the prior's gradient
+    prior: Array  # (V, K) offsets: the prior's gradient
 
     @cached_property
     def information(self) -> Array:
-        """Of all cameras together, poses eliminated: (15 V, 15 V)."""
+        """Of all cameras together, poses eliminated: (K V, K V)."""
         tall = self.coupling.reshape(-1, self.prior.size)
         total = np.eye(self.prior.size) - tall.T @ tall
         blocks = total.reshape(*self.prior.shape, *self.prior.shape)
@@ -81,12 +80,12 @@ class Blocks:
 
     @cached_property
     def covariance(self) -> Array:
-        """Of all cameras' whitened values: (15 V, 15 V)."""
+        """Of all cameras' whitened values: (K V, K V)."""
         return np.asarray(np.linalg.inv(self.information), dtype=np.float64)
 
     @cached_property
     def downhill(self) -> Array:
-        """Newton's step of all cameras' values: (15 V,)."""
+        """Newton's step of all cameras' values: (K V,)."""
         gradient = self.gradient.sum(0) + self.prior
         tall = self.coupling.reshape(-1, self.prior.size)
         right = gradient.ravel() - self.pull.ravel() @ tall
@@ -95,13 +94,14 @@ class Blocks:
     def statistics(self, cameras: Sequence[int], rows: NDArray[np.int64]) -> Array:
         """Score statistics of steps of some cameras before each of some snapshots, in increasing order: (R, K)."""
         chosen, size = np.asarray(cameras), self.prior.size
-        stepping = (PARAMETERS * chosen[:, None] + np.arange(STEP)).ravel()
+        width = self.prior.shape[1]
+        stepping = (width * chosen[:, None] + np.arange(STEP)).ravel()
         mine = self.coupling[:, :, stepping]  # (S, 6, 8 K)
         ends = [*rows[1:], len(mine)]
         cross = np.empty((len(rows), len(stepping), size))
         for part, first, end in zip(cross, rows, ends, strict=True):
             part[:] = -mine[first:end].reshape(-1, len(stepping)).T @ self.coupling[first:end].reshape(-1, size)
-        blocks = cross.reshape(len(rows), len(chosen), STEP, -1, PARAMETERS)
+        blocks = cross.reshape(len(rows), len(chosen), STEP, -1, width)
         number = np.arange(len(chosen))
         blocks[:, number, :, chosen] += np.add.reduceat(self.camera[:, chosen, :STEP], rows).swapaxes(0, 1)
         score = self.gradient[:, chosen, :STEP].reshape(len(mine), -1) - (self.pull[:, None] @ mine)[:, 0]
@@ -133,7 +133,7 @@ def blocks_of(problem: Problem, state: State) -> Blocks:
     pull = torch.linalg.solve_triangular(lower, clipped.pose_gradient[:, 0, :, None], upper=False)[..., 0]
     # The prior's pull is the same in each of them, and counts once.
     gradient = clipped.camera_gradient - state.offset
-    camera = full.camera - torch.eye(PARAMETERS, dtype=lower.dtype)
+    camera = full.camera - torch.eye(full.camera.shape[-1], dtype=lower.dtype)
     return Blocks(
         camera.numpy(), gradient.numpy(), coupling.contiguous().numpy(), pull.numpy(), state.offset[0].numpy()
     )

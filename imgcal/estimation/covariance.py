@@ -23,7 +23,7 @@ from imgcal.estimation.levenberg_marquardt import Solution, factorize
 from imgcal.estimation.linearization import POSE_PARAMETERS, NormalEquations, points_at
 from imgcal.estimation.map_estimate import Estimate
 from imgcal.geometry import RigidTransform, cross_matrix, kernels, left_jacobian
-from imgcal.types import PARAMETERS, CameraRig
+from imgcal.types import CameraRig
 from renderers.compiling import njit
 
 UNDETERMINED = "covariance: the observations do not determine the object's pose in every snapshot"
@@ -40,9 +40,9 @@ def camera_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
             of snapshots where that was larger.
 
     Returns:
-        (*B, 15 C, 15 C) in the units and order of `rig.PARAMETER_NAMES`, camera after camera; rotations are small left
-        rotations about the estimated orientation. Includes the gauge: a motion of the whole rig is known only as well
-        as the prior knows it; see `relative_covariance`.
+        (*B, K C, K C) in the units and order of `CameraRig.parameter_names`, camera after camera; rotations are small
+        left rotations about the estimated orientation. Includes the gauge: a motion of the whole rig is known only as
+        well as the prior knows it; see `relative_covariance`.
 
     Raises:
         RefusedError: the information is singular (a snapshot with too few fiducials).
@@ -53,11 +53,11 @@ def camera_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
         # The prior's unit information contributes the covariance's square; only the rest comes from the observations.
         by_prior = covariance @ covariance
         covariance = by_prior + estimate.inflation**2 * (covariance - by_prior)
-    scale = _unwhitening(estimate).flatten(1, 2)  # (B, 15 C, 15): one block a camera
-    blocks = covariance.unflatten(1, (cameras, PARAMETERS)).unflatten(-1, (cameras, PARAMETERS))
-    per_camera = scale.unflatten(1, (cameras, PARAMETERS))
+    scale = _unwhitening(estimate).flatten(1, 2)  # (B, K C, K): one block a camera
+    blocks = covariance.unflatten(1, (cameras, -1)).unflatten(-1, (cameras, -1))
+    per_camera = scale.unflatten(1, (cameras, -1))
     physical = torch.einsum("bcij,bcjdk,bdlk->bcidl", per_camera, blocks, per_camera)
-    size = cameras * PARAMETERS
+    size = covariance.shape[-1]
     result = physical.reshape(*estimate.chi2.shape, size, size)
     if not curved:
         return result
@@ -66,26 +66,26 @@ def camera_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
 
 
 def whitened_covariance(solution: Solution) -> Tensor:
-    """Joint covariance of all cameras' whitened offsets: (B, 15 C, 15 C)."""
+    """Joint covariance of all cameras' whitened offsets: (B, K C, K C)."""
     equations = solution.equations
     factorization = solution.factorization
     reduced, cameras = factorization.reduced, equations.camera.shape[1]
     if bool(reduced.failed.any()):
         raise RefusedError(UNDETERMINED)
     if not factorization.cameras_first:
-        size = PARAMETERS * cameras
+        size = equations.camera_gradient[0].numel()
         return torch.cholesky_inverse(reduced.kept)[:, :size, :size]
     inverse = torch.cholesky_inverse(reduced.eliminated)
     half = torch.linalg.solve_triangular(reduced.eliminated.mT, reduced.whitened, upper=True).flatten(1, 2)
     prior_std = torch.linalg.solve_triangular(reduced.kept, half.mT, upper=False)
     covariance = prior_std.mT @ prior_std
-    blocks = covariance.unflatten(1, (cameras, PARAMETERS)).unflatten(-1, (cameras, PARAMETERS))
+    blocks = covariance.unflatten(1, (cameras, -1)).unflatten(-1, (cameras, -1))
     blocks.diagonal(dim1=1, dim2=3).add_(inverse.permute(0, 2, 3, 1))
     return covariance
 
 
 def camera_std(estimate: Estimate) -> Tensor:
-    """One standard deviation of every parameter: (*B, C, 15).
+    """One standard deviation of every parameter: (*B, C, K).
 
     Examples:
         >>> import imgcal
@@ -100,18 +100,18 @@ def camera_std(estimate: Estimate) -> Tensor:
         (torch.Size([4, 15]), True)
     """
     variance = camera_covariance(estimate).diagonal(dim1=-2, dim2=-1)
-    return variance.clamp_min(0).sqrt().unflatten(-1, (estimate.rig.num_cameras, PARAMETERS))
+    return variance.clamp_min(0).sqrt().unflatten(-1, (estimate.rig.num_cameras, -1))
 
 
 def flat_std(estimate: Estimate) -> Tensor:
-    """`camera_std` without the second order, in a hundredth of the time: (*B, C, 15)."""
+    """`camera_std` without the second order, in a hundredth of the time: (*B, C, K)."""
     left = torch.from_numpy(remaining_variance(estimate.solution)).to(estimate.problem.prior_std)
     std = left.clamp_min(0).sqrt() * estimate.problem.prior_std
     return std.reshape(*estimate.chi2.shape, *std.shape[1:])
 
 
 def remaining_variance(solution: Solution) -> NDArray[np.float64]:
-    """Part of each factory value's prior variance that the observations leave: (B, C, 15), 1 = they say nothing.
+    """Part of each factory value's prior variance that the observations leave: (B, C, K), 1 = they say nothing.
 
     What `camera_std` gives over the spread, squared, but for the curvature of rotations; in a fraction of the time.
 
@@ -122,7 +122,7 @@ def remaining_variance(solution: Solution) -> NDArray[np.float64]:
     snapshots, cameras = equations.coupling.shape[1:3]
     if equations.cost.device.type != "cpu":
         diagonal = whitened_covariance(solution).diagonal(dim1=-2, dim2=-1)
-        variance = diagonal.unflatten(-1, (cameras, PARAMETERS)).cpu().numpy()
+        variance = diagonal.unflatten(-1, (cameras, -1)).cpu().numpy()
     elif snapshots <= FEW_SNAPSHOTS and equations.object is None:
         variance = _by_poses(equations)
     else:
@@ -133,7 +133,7 @@ def remaining_variance(solution: Solution) -> NDArray[np.float64]:
 
 
 def _by_poses(equations: NormalEquations) -> NDArray[np.float64]:
-    """Diagonals (B, C, 15) by way of the poses' dense information."""
+    """Diagonals (B, C, K) by way of the poses' dense information."""
     camera, coupling, pose = _doubles(equations.camera, equations.coupling, equations.pose)
     variance = np.empty(camera.shape[:3])
     for b in range(len(variance)):
@@ -143,13 +143,13 @@ def _by_poses(equations: NormalEquations) -> NDArray[np.float64]:
 
 
 def _by_cameras(equations: NormalEquations) -> NDArray[np.float64]:
-    """Diagonals (B, C, 15) by way of the dense information of the cameras and, behind them, of the object."""
+    """Diagonals (B, C, K) by way of the dense information of the cameras and, behind them, of the object."""
     camera, coupling, pose = _doubles(equations.camera, equations.coupling, equations.pose)
     batch, cameras = camera.shape[:2]
-    coupling = coupling.transpose(0, 1, 4, 2, 3).reshape(*pose.shape[:3], -1)  # (B, S, 6, 15 C)
+    coupling = coupling.transpose(0, 1, 4, 2, 3).reshape(*pose.shape[:3], -1)  # (B, S, 6, K C)
     wide = coupling.shape[-1]
     kept = np.zeros((batch, wide, wide))
-    blocks = kept.reshape(batch, cameras, PARAMETERS, cameras, PARAMETERS)
+    blocks = kept.reshape(*camera.shape[:3], *camera.shape[1:3])
     blocks[:, range(cameras), :, range(cameras)] = camera.swapaxes(0, 1)
     if equations.object is not None:
         own = equations.object
@@ -158,7 +158,7 @@ def _by_cameras(equations: NormalEquations) -> NDArray[np.float64]:
             (np.concatenate((kept, across), 2), np.concatenate((across.swapaxes(1, 2), square), 2)), 1
         )
         coupling = np.concatenate((coupling, with_pose), 3)
-    variance = np.empty((batch, cameras, PARAMETERS))
+    variance = np.empty(camera.shape[:3])
     for b in range(batch):
         _diagonal_without_poses(kept[b], np.ascontiguousarray(coupling[b]), pose[b], variance[b].reshape(-1))
     return variance
@@ -206,7 +206,7 @@ def _diagonal_without_poses(kept, coupling, poses, result):
 
 @njit(cache=True)
 def _diagonal(blocks, coupling, poses, result):
-    """Diagonal (C, 15) of the inverse of the arrow of blocks (C, 15, 15), coupling (C, 15, 6 S), poses (S, 6, 6).
+    """Diagonal (C, K) of the inverse of the arrow of blocks (C, K, K), coupling (C, K, 6 S), poses (S, 6, 6).
 
     The first two arrays are overwritten; nan where a factorization fails.
     """
@@ -270,7 +270,7 @@ def relative_covariance(estimate: Estimate, reference: int = 0) -> Tensor:
     """Covariance with the extrinsics relative to a reference camera: free of the gauge.
 
     Returns:
-        (*B, 15 C, 15 C) like `camera_covariance`; the rotation is that of cam_from_reference, the position that of the
+        (*B, K C, K C) like `camera_covariance`; the rotation is that of cam_from_reference, the position that of the
         camera in the reference camera's frame. The reference's own six entries are zero.
     """
     covariance = camera_covariance(estimate, curved=False)
@@ -284,7 +284,7 @@ def relative_covariance(estimate: Estimate, reference: int = 0) -> Tensor:
 
 
 def relative_jacobian(rig: CameraRig, reference: int) -> Tensor:
-    """Derivative of all parameters relative to a reference camera by the parameters: (*B, 15 C, 15 C).
+    """Derivative of all parameters relative to a reference camera by the parameters: (*B, K C, K C).
 
     For cam_from_reference = R_i R_r^T, a left rotation w_i - R_i R_r^T w_r; for the position p = R_r (c_i - c_r), the
     change w_r x p + R_r (dc_i - dc_r).
@@ -293,9 +293,9 @@ def relative_jacobian(rig: CameraRig, reference: int) -> Tensor:
     to_reference = rotation[..., reference : reference + 1, :, :]
     relative = rotation @ to_reference.mT  # (*B, C, 3, 3)
     place = (to_reference @ (positions - positions[..., reference : reference + 1, :])[..., None]).squeeze(-1)
-    eye = torch.eye(cameras * PARAMETERS, dtype=rotation.dtype, device=rotation.device)
+    eye = torch.eye(cameras * rig.num_parameters, dtype=rotation.dtype, device=rotation.device)
     jacobian = eye.expand(*rotation.shape[:-3], -1, -1).clone()
-    blocks = jacobian.unflatten(-2, (cameras, PARAMETERS)).unflatten(-1, (cameras, PARAMETERS))
+    blocks = jacobian.unflatten(-2, (cameras, -1)).unflatten(-1, (cameras, -1))
     for i in range(cameras):
         blocks[..., i, 3:6, i, 3:6] = to_reference.squeeze(-3)
         blocks[..., i, 0:3, reference, 0:3] -= relative[..., i, :, :]
@@ -306,7 +306,7 @@ def relative_jacobian(rig: CameraRig, reference: int) -> Tensor:
 
 
 def relative_difference(rig: CameraRig, other: CameraRig, reference: int = 0) -> Tensor:
-    """Error of a rig against another one, extrinsics relative to a reference camera: (*B, C, 15), gauge-free.
+    """Error of a rig against another one, extrinsics relative to a reference camera: (*B, C, K), gauge-free.
 
     Examples:
         >>> import imgcal
@@ -325,7 +325,7 @@ def _relative_to(rig: CameraRig, reference: int) -> CameraRig:
 
 
 def _unwhitening(estimate: Estimate) -> Tensor:
-    """Derivative of the parameters by the whitened offsets: (B, C, 15, 15)."""
+    """Derivative of the parameters by the whitened offsets: (B, C, K, K)."""
     problem, state = estimate.problem, estimate.solution.state
     prior_std = problem.prior_std.detach()
     scale = torch.diag_embed(prior_std)

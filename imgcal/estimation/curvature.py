@@ -36,7 +36,7 @@ from imgcal.estimation.linearization import (
     with_scale,
 )
 from imgcal.estimation.map_estimate import Estimate
-from imgcal.types import PARAMETERS, CameraRig
+from imgcal.types import CameraRig
 
 MOST_PAIRS, LEAST_PAIRS = 256, 64
 """Drawn for one snapshot; for many, where the posterior is narrow and hardly curved."""
@@ -80,7 +80,7 @@ def _moved_rigs(problem: Problem, state: State, x: Step, follow: Step, sign: int
 
 
 def _draw(factorization: Factorization, state: State, pairs: int, generator: torch.Generator) -> Step:
-    """Draw steps from the flat posterior: camera (B, K, C, 15), pose (B, K, S, 6), object (B, K, M)."""
+    """Draw steps from the flat posterior: camera (B, K, C, parameters), pose (B, K, S, 6), object (B, K, M)."""
     reduced = factorization.reduced
     batch, count, size, wide = reduced.whitened.shape
     kept, eliminated = (
@@ -94,14 +94,14 @@ def _draw(factorization: Factorization, state: State, pairs: int, generator: tor
     blocks, border = kept.mT[..., : wide - own], kept.mT[..., wide - own :]
     if factorization.cameras_first:
         return Step(eliminated, blocks.unflatten(-1, (-1, POSE_PARAMETERS)), border if own else None)
-    return Step(blocks.unflatten(-1, (-1, PARAMETERS)), eliminated, border if own else None)
+    return Step(blocks.unflatten(-1, state.offset.shape[1:]), eliminated, border if own else None)
 
 
 def _follow(problem: Problem, state: State, factorization: Factorization, x: Step) -> Step:
     """d(x) for steps (B, K, ...)."""
     at = jacobian_at(problem, state)
     squared = problem.root_weight.square()[..., None, None, :]
-    by_rig = at.by_rig[..., : PARAMETERS + POSE_PARAMETERS, :, :] * squared
+    by_rig = at.by_rig[..., :-1, :, :] * squared
     by_object = None if at.by_fiducial is None else with_scale(problem, at.by_fiducial) * squared
     steps = []
     for first in range(0, x.camera.shape[1], AT_ONCE):
@@ -109,7 +109,7 @@ def _follow(problem: Problem, state: State, factorization: Factorization, x: Ste
         there, back = (_residual(problem, state, some, sign) for sign in (1, -1))
         bend = 0.5 * (there + back) - at.residual.unsqueeze(1)  # (B, K, S, C, 2, N)
         right = -torch.einsum("bscirn,bkscrn->bksci", by_rig, bend)
-        camera, pose, own = right[..., :PARAMETERS].sum(2), right[..., PARAMETERS:].sum(3), None
+        camera, pose, own = right[..., :-POSE_PARAMETERS].sum(2), right[..., -POSE_PARAMETERS:].sum(3), None
         if by_object is not None and problem.object_prior_std is not None:
             sums = torch.einsum("bscirn,bkscrn->bkin", by_object, bend)
             own = -object_columns(sums) * problem.object_prior_std.unsqueeze(1)

@@ -41,7 +41,7 @@ def aligned(rig: CameraRig, reference: CameraRig, points_reference: Tensor, came
     observations = Observations(there.uv[None], torch.full_like(there.uv[None, ..., 0], FINE), seen[None])
     cloud = CalibrationObject(points_reference, torch.ones_like(points_reference))
     start = RigidTransform.identity(1, dtype=points_reference.dtype)
-    held = torch.zeros(len(chosen), 15, dtype=points_reference.dtype)
+    held = torch.zeros(len(chosen), rig.num_parameters, dtype=points_reference.dtype)
     fit = estimate(
         observations, rig.select(chosen), cloud, start, prior_std=held, options=EstimationOptions(loss="cauchy")
     )

@@ -21,7 +21,6 @@ from imgcal.estimation.linearization import (
     retract,
 )
 from imgcal.estimation.robust_losses import RobustKernel
-from imgcal.types import PARAMETERS
 
 LEAST_DAMPING = 1e-9
 MOST_DAMPING = 1e12
@@ -151,9 +150,9 @@ def factorize(
     camera, pose, own = equations.camera, equations.pose, equations.object
     if damping is not None:
         camera, pose = _damped(camera, damping), _damped(pose, damping)
-    coupling = equations.coupling  # (B, S, C, 15, 6)
+    coupling = equations.coupling  # (B, S, C, K, 6)
     if cameras_first is None:
-        cameras_first = POSE_PARAMETERS * pose.shape[1] <= PARAMETERS * camera.shape[1]
+        cameras_first = POSE_PARAMETERS * pose.shape[1] <= camera.shape[-1] * camera.shape[1]
     border = None
     if own is not None:
         square = own.own if damping is None else _damped(own.own.unsqueeze(1), damping).squeeze(1)

@@ -1,6 +1,6 @@
 """Reprojection residuals with analytic Jacobians, summed into the blocks of the normal equations.
 
-The unknowns are, for each camera, 15 offsets from the factory values, *whitened*: divided by the prior's standard
+The unknowns are, for each camera, K offsets from the factory values, *whitened*: divided by the prior's standard
 deviation, so that the prior is the unit matrix and a parameter of zero spread stays fixed; for each snapshot, 6
 local offsets of the object: a rotation (left, about its centroid) and a translation in units of the object's depth;
 and, where the object is known within tolerances only, its own M = 3 N + 1 offsets, whitened as well: of each
@@ -21,12 +21,14 @@ from torch import Tensor
 
 from imgcal.geometry import (
     NEAREST_DEPTH,
+    ModelNames,
     RigidTransform,
+    distort_by_coefficients,
     distort_with_jacobian,
     left_jacobian,
     rotation_from_vector,
 )
-from imgcal.types import PARAMETERS, CameraRig
+from imgcal.types import CameraRig
 
 POSE_PARAMETERS = 6
 
@@ -41,7 +43,7 @@ class Problem:
     centroid: Tensor  # (3,) mm in the object's frame
     radius_squared: Tensor | None  # (N,) mm^2
     factory: CameraRig  # (B,)
-    prior_std: Tensor  # (B, C, 15) prior standard deviation of each parameter
+    prior_std: Tensor  # (B, C, K) prior standard deviation of each parameter
     object_prior_std: Tensor | None = None  # (B, M) prior standard deviation of the object's parameters; None = exact
 
     def select(self, rows: Tensor) -> Problem:
@@ -61,7 +63,7 @@ class Problem:
 class State:
     """What is sought."""
 
-    offset: Tensor  # (B, C, 15) whitened: (parameter - factory) / spread
+    offset: Tensor  # (B, C, K) whitened: (parameter - factory) / spread
     rotation: Tensor  # (B, S, 3, 3) rig_from_object
     centre: Tensor  # (B, S, 3) mm, the object's centroid in the rig frame
     object_offset: Tensor | None = None  # (B, M) whitened; None = the object is exact
@@ -71,7 +73,7 @@ class State:
 class ObjectEquations:
     """The object's part of the normal equations; `own` includes the prior's unit matrix, `gradient` its pull."""
 
-    camera: Tensor  # (B, C, 15, M) coupling with the cameras
+    camera: Tensor  # (B, C, K, M) coupling with the cameras
     pose: Tensor  # (B, S, 6, M) coupling with the poses
     own: Tensor  # (B, M, M)
     gradient: Tensor  # (B, M)
@@ -82,17 +84,17 @@ class NormalEquations:
     """Gauss-Newton blocks at a state. `camera` includes the prior's unit matrix, `camera_gradient` its pull."""
 
     cost: Tensor  # (B,) half the sum of robust squared residuals, data and prior
-    camera: Tensor  # (B, C, 15, 15)
-    coupling: Tensor  # (B, S, C, 15, 6)
+    camera: Tensor  # (B, C, K, K)
+    coupling: Tensor  # (B, S, C, K, 6)
     pose: Tensor  # (B, S, 6, 6)
-    camera_gradient: Tensor  # (B, C, 15)
+    camera_gradient: Tensor  # (B, C, K)
     pose_gradient: Tensor  # (B, S, 6)
     residual: Tensor  # (B, S, C, 2, N) pixels, predicted minus observed
     object: ObjectEquations | None = None  # None = the object is exact
 
 
 def rig_at(problem: Problem, offset: Tensor) -> CameraRig:
-    """Turn whitened offsets (B, C, 15) into a rig."""
+    """Turn whitened offsets (B, C, K) into a rig."""
     return problem.factory.retract(offset * problem.prior_std)
 
 
@@ -113,7 +115,7 @@ def points_at(problem: Problem, state: State) -> Tensor:
 class Step(NamedTuple):
     """A change of a state, or a vector that is paired with one, such as a gradient."""
 
-    camera: Tensor  # (B, C, 15) whitened
+    camera: Tensor  # (B, C, K) whitened
     pose: Tensor  # (B, S, 6)
     object: Tensor | None = None  # (B, M) whitened; None = the object is exact
 
@@ -153,9 +155,10 @@ def linearize(problem: Problem, state: State, loss: Callable[[Tensor], tuple[Ten
     cost = torch.where(at.behind, torch.inf, cost)
 
     root_weight = (problem.root_weight * slope.sqrt())[..., None, None, :]
-    rows = (at.by_rig * root_weight).flatten(-2)  # (B, S, C, 22, 2N): 15 camera, 6 pose, 1 residual
+    rows = (at.by_rig * root_weight).flatten(-2)  # (B, S, C, K + 7, 2N): K camera, 6 pose, 1 residual
     products = rows @ rows.mT
-    k, last = PARAMETERS, PARAMETERS + POSE_PARAMETERS
+    k = state.offset.shape[-1]
+    last = k + POSE_PARAMETERS
     over_snapshots = products[..., :k, :].sum(1)
     over_cameras = products[..., k:, k:].sum(2)
     eye = torch.eye(k, dtype=rows.dtype, device=rows.device)
@@ -192,12 +195,12 @@ def _object_equations(problem: Problem, offset: Tensor, rows: Tensor, by_fiducia
     Args:
         problem: what is given.
         offset: (B, M) the object's state.
-        rows: (B, S, C, 22, 2, N) weighted Jacobian and residual, as `_jacobian` orders them.
+        rows: (B, S, C, K + 7, 2, N) weighted Jacobian and residual, as `_jacobian` orders them.
         by_fiducial: (B, S, C, 3, 2, N) weighted derivative of each pixel by its own fiducial's coordinates (mm).
     """
     fiducials = rows.shape[-1]
     each = with_scale(problem, by_fiducial)
-    to_rest = torch.einsum("bscirn,bscjrn->bscijn", rows, each)  # (B, S, C, 22, 4, N)
+    to_rest = torch.einsum("bscirn,bscjrn->bscijn", rows, each)  # (B, S, C, K + 7, 4, N)
     prior_std = problem.object_prior_std
     assert prior_std is not None
 
@@ -210,10 +213,11 @@ def _object_equations(problem: Problem, offset: Tensor, rows: Tensor, by_fiducia
     own[:, -1, -1] = among[:, 3, 3].sum(-1)
     own = own * prior_std[:, :, None] * prior_std[:, None]
     wide = prior_std[:, None, None]
-    last = PARAMETERS + POSE_PARAMETERS
+    first = rows.shape[-3] - POSE_PARAMETERS - 1
+    last = first + POSE_PARAMETERS
     return ObjectEquations(
-        camera=object_columns(to_rest[..., :PARAMETERS, :, :].sum(1)) * wide,
-        pose=object_columns(to_rest[..., PARAMETERS:last, :, :].sum(2)) * wide,
+        camera=object_columns(to_rest[..., :first, :, :].sum(1)) * wide,
+        pose=object_columns(to_rest[..., first:last, :, :].sum(2)) * wide,
         own=own + torch.eye(size, dtype=own.dtype, device=own.device),
         gradient=object_columns(to_rest[..., last, :, :].sum((1, 2))) * prior_std + offset,
     )
@@ -228,7 +232,7 @@ def _depth_unit(state: State) -> Tensor:
 class Jacobian:
     """Derivatives of the pixels at a state."""
 
-    by_rig: Tensor  # (B, S, C, 22, 2, N): by 15 whitened camera and 6 pose parameters; the residual as last row
+    by_rig: Tensor  # (B, S, C, K + 7, 2, N): by K whitened camera and 6 pose parameters; the residual as last row
     by_fiducial: Tensor | None  # (B, S, C, 3, 2, N) by the fiducial's own coordinates (mm); None = the object is exact
     residual: Tensor  # (B, S, C, 2, N) pixels, predicted minus observed
     behind: Tensor  # (B,) bool: a seen fiducial lies behind its camera
@@ -255,27 +259,29 @@ def jacobian_at(problem: Problem, state: State) -> Jacobian:
     position = (factory.positions + parameters[..., 3:6])[:, None, :, :, None]
     focal = (factory.focal_length + parameters[..., 6:8])[:, None, :, :, None]
     principal = (factory.principal_point + parameters[..., 8:10])[:, None, :, :, None]
-    distortion = (factory.distortion + parameters[..., 10:15])[:, None, :, :, None]
+    distortion = (factory.distortion + parameters[..., 10:])[:, None]
 
     rotated = (state.rotation @ points_at(problem, state).mT.unsqueeze(1)).unsqueeze(2)  # (B, S, 1, 3, N)
     points = rotation @ (rotated + state.centre[:, :, None, :, None] - position)  # (B, S, C, 3, N)
     behind = ((points[..., 2, :] <= NEAREST_DEPTH) & (problem.root_weight > 0)).flatten(1).any(-1)
 
-    lens = _lens(points, problem.radius_squared, focal, distortion)
+    lens = _lens(points, problem.radius_squared, focal, distortion, factory.lens_model)
     residual = lens.distorted * focal + principal - problem.uv
     by_turn = torch.linalg.cross(points.unsqueeze(-2).expand_as(lens.by_point), lens.by_point, dim=-3)
     by_centre = (rotation.mT @ lens.by_point.flatten(-2)).unflatten(-1, lens.by_point.shape[-2:])
 
-    jacobian = residual.new_zeros(*residual.shape[:3], PARAMETERS + POSE_PARAMETERS + 1, *residual.shape[3:])
+    k = parameters.shape[-1]
+    jacobian = residual.new_zeros(*residual.shape[:3], k + POSE_PARAMETERS + 1, *residual.shape[3:])
     jacobian[..., 0:3, :, :] = (left_jacobian(turn).mT.unsqueeze(1) @ by_turn.flatten(-2)).view_as(by_turn)
     jacobian[..., 3:6, :, :] = -by_centre
     jacobian[..., 6:8, :, :].diagonal(dim1=-3, dim2=-2).copy_(lens.distorted.mT)
     jacobian[..., 8:10, :, :].diagonal(dim1=-3, dim2=-2).fill_(1)
-    jacobian[..., 10:15, :, :] = lens.by_distortion
-    jacobian[..., :15, :, :] *= problem.prior_std[:, None, :, :, None, None]
-    torch.linalg.cross(rotated.unsqueeze(-2).expand_as(by_centre), by_centre, dim=-3, out=jacobian[..., 15:18, :, :])
-    torch.mul(by_centre, _depth_unit(state)[:, :, None, :, None, None], out=jacobian[..., 18:21, :, :])
-    jacobian[..., 21, :, :] = residual
+    jacobian[..., 10:k, :, :] = lens.by_distortion
+    jacobian[..., :k, :, :] *= problem.prior_std[:, None, :, :, None, None]
+    by_turn = jacobian[..., k : k + 3, :, :]
+    torch.linalg.cross(rotated.unsqueeze(-2).expand_as(by_centre), by_centre, dim=-3, out=by_turn)
+    torch.mul(by_centre, _depth_unit(state)[:, :, None, :, None, None], out=jacobian[..., k + 3 : k + 6, :, :])
+    jacobian[..., -1, :, :] = residual
     by_fiducial = None
     if problem.object_prior_std is not None:
         turned = state.rotation.mT.unsqueeze(2) @ by_centre.flatten(-2)
@@ -287,12 +293,14 @@ def jacobian_at(problem: Problem, state: State) -> Jacobian:
 class _Lens:
     distorted: Tensor  # (B, S, C, 2, N) on the z = 1 plane
     by_point: Tensor  # (B, S, C, 3, 2, N) pixels per mm: derivative with respect to the point in the camera
-    by_distortion: Tensor  # (B, S, C, 5, 2, N) pixels
+    by_distortion: Tensor  # (B, S, C, D, 2, N) pixels
 
 
-def _lens(points: Tensor, radius_squared: Tensor | None, focal: Tensor, distortion: Tensor) -> _Lens:
-    """Image of points (B, S, C, 3, N), for focal (B, 1, C, 2, 1), distortion (B, 1, C, 5, 1), and its derivatives."""
-    depth = points[..., 2:, :].clamp_min(NEAREST_DEPTH)
+def _lens(
+    points: Tensor, radius_squared: Tensor | None, focal: Tensor, distortion: Tensor, models: ModelNames
+) -> _Lens:
+    """Image of points (B, S, C, 3, N), for focal (B, 1, C, 2, 1), distortion (B, 1, C, D), and its derivatives."""
+    depth = points[..., 2, :].clamp_min(NEAREST_DEPTH)
     if radius_squared is None:
         per_depth = 1 / depth
         log_slope = -per_depth
@@ -301,17 +309,11 @@ def _lens(points: Tensor, radius_squared: Tensor | None, focal: Tensor, distorti
         squared = depth * depth
         per_depth = depth / (squared - radius_squared)
         log_slope = -(squared + radius_squared) / (depth * (squared - radius_squared))
-    xy = points[..., :2, :] * per_depth
-    x, y = xy[..., :1, :], xy[..., 1:, :]
-    k1, k2, p1, p2, k3 = distortion.split(1, dim=-2)
-    xd, yd, jxx, jxy, jyy, rr = distort_with_jacobian(x, y, k1, k2, p1, p2, k3)
-    xy2 = 2 * x * y
-    by_p1 = torch.cat((xy2, rr + 2 * y * y), dim=-2)
-    by_p2 = torch.cat((rr + 2 * x * x, xy2), dim=-2)
-    by_x = focal * per_depth * torch.cat((jxx, jxy), dim=-2)
-    by_y = focal * per_depth * torch.cat((jxy, jyy), dim=-2)
-    by_z = (by_x * x + by_y * y) * (log_slope / per_depth)
-    by_k1 = xy * rr
-    by_k2 = by_k1 * rr
-    by_distortion = focal.unsqueeze(-3) * torch.stack((by_k1, by_k2, by_p1, by_p2, by_k2 * rr), dim=-3)
-    return _Lens(torch.cat((xd, yd), dim=-2), torch.stack((by_x, by_y, by_z), dim=-3), by_distortion)
+    x, y = points[..., 0, :] * per_depth, points[..., 1, :] * per_depth
+    xd, yd, jxx, jxy, jyy, _ = distort_with_jacobian(x, y, distortion, models)
+    by_x = focal * per_depth.unsqueeze(-2) * torch.stack((jxx, jxy), dim=-2)
+    by_y = focal * per_depth.unsqueeze(-2) * torch.stack((jxy, jyy), dim=-2)
+    by_z = (by_x * x.unsqueeze(-2) + by_y * y.unsqueeze(-2)) * (log_slope / per_depth).unsqueeze(-2)
+    by_coefficients = torch.stack(distort_by_coefficients(x, y, distortion, models))  # (2, B, S, C, N, D)
+    by_distortion = focal.unsqueeze(-3) * by_coefficients.movedim(0, -1).transpose(-3, -1).transpose(-3, -2)
+    return _Lens(torch.stack((xd, yd), dim=-2), torch.stack((by_x, by_y, by_z), dim=-3), by_distortion)

@@ -1,9 +1,9 @@
 """Residuals and normal equations on CPUs: `linearization.py` compiled to one loop a rig, without temporaries.
 
-Three tuples of arrays go in and out: what is `given` (points of the object and their squared radii, observations and
-the roots of their weights, the factory rig, the prior, that of the object), the `state`, and the `blocks` of the normal
-equations. Layouts: `lm_cpu._Blocks`; what fits each camera and what each snapshot is summed up before it is written.
-The object's own parameters stand behind the coupled ones, and have a border of their own.
+Three tuples of arrays go in and out: what is `given` (points of the object and their squared radii, the lenses' models,
+observations and the roots of their weights, the factory rig, the prior, that of the object), the `state`, and the
+`blocks` of the normal equations. Layouts: `lm_cpu._Blocks`; what fits each camera and what each snapshot is summed up
+before it is written. The object's own parameters stand behind the coupled ones, and have a border of their own.
 """
 
 # Compiled functions take their types from their arguments.
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from imgcal.geometry import NEAREST_DEPTH, kernels
+from imgcal.geometry import NEAREST_DEPTH, kernels, lens_kernels
 from renderers.compiling import njit
 
 
@@ -31,11 +31,11 @@ def linearize_all(given, state, blocks, cost, cameras_first, loss, threshold):
 def given_of(given, b):
     """What is given of one rig; the points and their radii are those of all."""
     (
-        points, radius_squared, uv, root_weight,
+        points, radius_squared, lenses, uv, root_weight,
         rotation0, position0, focal0, principal0, distortion0, prior_std, own_std,
     ) = given  # fmt: skip
     return (
-        points, radius_squared, uv[b], root_weight[b],
+        points, radius_squared, lenses, uv[b], root_weight[b],
         rotation0[b], position0[b], focal0[b], principal0[b], distortion0[b], prior_std[b], own_std[b],
     )  # fmt: skip
 
@@ -60,27 +60,29 @@ def blocks_of(blocks, b):
 def linearize_rig(given, state, blocks, cameras_first, loss, threshold):
     """Fill the blocks of the normal equations and return the cost."""
     (
-        points, radius_squared, uv, root_weight,
+        points, radius_squared, lenses, uv, root_weight,
         rotation0, position0, focal0, principal0, distortion0, prior_std, own_std,
     ) = given  # fmt: skip
     offset, rotation, centre, own_offset = state
     camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual = blocks
     snapshots, cameras, fiducials = root_weight.shape
-    kind = uv.dtype
+    kind, free = uv.dtype, 10 + lens_kernels.width_of(lenses, distortion0)
+    wide = free + 6
     for s in range(snapshots):
         for i in range(6):
             pose_gradient[s, i] = 0
             for j in range(6):
                 pose[s, i, j] = 0
-    rows = np.zeros((2, 21), dtype=kind)
-    products = np.empty((21, 21), dtype=kind)
-    gradient = np.empty(21, dtype=kind)
+    rows = np.zeros((2, wide), dtype=kind)
+    products = np.empty((wide, wide), dtype=kind)
+    gradient = np.empty(wide, dtype=kind)
     turned, left, rotation_cam = (
         np.empty((3, 3), dtype=kind),
         np.empty((3, 3), dtype=kind),
         np.empty((3, 3), dtype=kind),
     )
-    parameters = np.empty(15, dtype=kind)
+    parameters = np.empty(free, dtype=kind)
+    coefficients = np.empty(free - 10, dtype=kind)
     rotated, point = np.empty(3, dtype=kind), np.empty(3, dtype=kind)
     derivative, back = np.empty((2, 3), dtype=kind), np.empty(3, dtype=kind)
     bent, scale = len(own_std) > 0, 1.0
@@ -90,24 +92,20 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold):
         cost = _start_object(own_offset, coupling, border, own_gradient)
         scale += own_offset[-1] * own_std[-1]
     for c in range(cameras):
-        for i in range(15):
+        for i in range(free):
             parameters[i] = offset[c, i] * prior_std[c, i]
             cost += 0.5 * offset[c, i] ** 2
             camera_gradient[c, i] = offset[c, i]
-            for j in range(15):
+            for j in range(free):
                 camera[c, i, j] = 1.0 if i == j else 0.0
         kernels.exponential(parameters, turned, left)
         kernels.multiply(turned, rotation0[c], rotation_cam)
         fx, fy = focal0[c, 0] + parameters[6], focal0[c, 1] + parameters[7]
         cx, cy = principal0[c, 0] + parameters[8], principal0[c, 1] + parameters[9]
-        k1, k2, p1 = (
-            distortion0[c, 0] + parameters[10],
-            distortion0[c, 1] + parameters[11],
-            distortion0[c, 2] + parameters[12],
-        )
-        p2, k3 = distortion0[c, 3] + parameters[13], distortion0[c, 4] + parameters[14]
+        for i in range(free - 10):
+            coefficients[i] = distortion0[c, i] + parameters[10 + i]
         for s in range(snapshots):
-            for i in range(21):
+            for i in range(wide):
                 gradient[i] = 0
                 for j in range(i + 1):
                     products[i, j] = 0
@@ -130,8 +128,8 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold):
                     cost = np.inf
                 depth = max(point[2], NEAREST_DEPTH)
 
-                per_depth, log_slope, x, y, rr, xd, yd, jxx, jxy, jyy = kernels.lens(
-                    point[0], point[1], depth, radius_squared[n], k1, k2, p1, p2, k3
+                per_depth, log_slope, x, y, rr, xd, yd, jxx, jxy, jyy = lens_kernels.image_of(
+                    lenses, c, point[0], point[1], depth, radius_squared[n], coefficients
                 )
                 ru, rv = fx * xd + cx - uv[s, c, 0, n], fy * yd + cy - uv[s, c, 1, n]
                 residual[s, c, 0, n], residual[s, c, 1, n] = ru, rv
@@ -155,10 +153,10 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold):
                         rows[r, i] = left[0, i] * t0 + left[1, i] * t1 + left[2, i] * t2
                         back[i] = rotation_cam[0, i] * d0 + rotation_cam[1, i] * d1 + rotation_cam[2, i] * d2
                         rows[r, 3 + i] = -back[i]
-                        rows[r, 18 + i] = back[i] * unit
-                    rows[r, 15] = rotated[1] * back[2] - rotated[2] * back[1]
-                    rows[r, 16] = rotated[2] * back[0] - rotated[0] * back[2]
-                    rows[r, 17] = rotated[0] * back[1] - rotated[1] * back[0]
+                        rows[r, free + 3 + i] = back[i] * unit
+                    rows[r, free] = rotated[1] * back[2] - rotated[2] * back[1]
+                    rows[r, free + 1] = rotated[2] * back[0] - rotated[0] * back[2]
+                    rows[r, free + 2] = rotated[0] * back[1] - rotated[1] * back[0]
                     if bent:
                         for i in range(3):
                             rows_own[r, i] = (
@@ -173,22 +171,20 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold):
                             rows_own[r, i] *= own_std[3 * n + i]
                 rows[0, 6], rows[1, 7] = xd * weight, yd * weight
                 rows[0, 8], rows[1, 9] = weight, weight
-                rows[0, 10], rows[1, 10] = fx_w * x * rr, fy_w * y * rr
-                rows[0, 11], rows[1, 11] = rows[0, 10] * rr, rows[1, 10] * rr
-                rows[0, 12], rows[1, 12] = fx_w * 2 * x * y, fy_w * (rr + 2 * y * y)
-                rows[0, 13], rows[1, 13] = fx_w * (rr + 2 * x * x), fy_w * 2 * x * y
-                rows[0, 14], rows[1, 14] = rows[0, 11] * rr, rows[1, 11] * rr
-                for i in range(15):
+                lens_kernels.by_coefficients(lenses, c, x, y, rr, coefficients, fx_w, fy_w, 10, rows)
+                for i in range(free):
                     rows[0, i] *= prior_std[c, i]
                     rows[1, i] *= prior_std[c, i]
                 ru, rv = ru * weight, rv * weight
                 if bent:
                     _add_object(rows, rows_own, ru, rv, c, s, n, coupling, border, own_gradient, cameras_first)
-                for i in range(21):
+                for i in range(wide):
                     gradient[i] += rows[0, i] * ru + rows[1, i] * rv
                     for j in range(i + 1):
                         products[i, j] += rows[0, i] * rows[0, j] + rows[1, i] * rows[1, j]
-            _distribute(products, gradient, c, s, camera, coupling, pose, camera_gradient, pose_gradient, cameras_first)
+            _distribute(
+                products, gradient, c, s, free, camera, coupling, pose, camera_gradient, pose_gradient, cameras_first
+            )
     return cost
 
 
@@ -213,19 +209,19 @@ def _start_object(own_offset, coupling, border, own_gradient):
 def _add_object(rows, rows_own, ru, rv, c, s, n, coupling, border, own_gradient, cameras_first):
     """Add what one observation says of its fiducial's coordinates and of the object's scale."""
     size, wide = border.shape
-    first, last = wide - size, size - 1
+    first, last, free = wide - size, size - 1, rows.shape[1] - 6
     for k in range(4):
         own = 3 * n + k if k < 3 else last
         mine_u, mine_v = rows_own[0, k], rows_own[1, k]
         own_gradient[own] += mine_u * ru + mine_v * rv
-        for i in range(15):
+        for i in range(free):
             product = rows[0, i] * mine_u + rows[1, i] * mine_v
             if cameras_first:
                 coupling[c, i, first + own] += product
             else:
-                border[own, 15 * c + i] += product
+                border[own, free * c + i] += product
         for i in range(6):
-            product = rows[0, 15 + i] * mine_u + rows[1, 15 + i] * mine_v
+            product = rows[0, free + i] * mine_u + rows[1, free + i] * mine_v
             if cameras_first:
                 border[own, 6 * s + i] += product
             else:
@@ -236,23 +232,23 @@ def _add_object(rows, rows_own, ru, rv, c, s, n, coupling, border, own_gradient,
 
 
 @njit(cache=True, fastmath=kernels.FAST)
-def _distribute(products, gradient, c, s, camera, coupling, pose, camera_gradient, pose_gradient, cameras_first):
+def _distribute(products, gradient, c, s, free, camera, coupling, pose, camera_gradient, pose_gradient, cameras_first):
     """Add the lower triangle of one camera's products with one snapshot to the blocks."""
-    for i in range(15):
+    for i in range(free):
         camera_gradient[c, i] += gradient[i]
         for j in range(i + 1):
             camera[c, i, j] += products[i, j]
             camera[c, j, i] = camera[c, i, j]
     for i in range(6):
-        pose_gradient[s, i] += gradient[15 + i]
+        pose_gradient[s, i] += gradient[free + i]
         for j in range(i + 1):
-            pose[s, i, j] += products[15 + i, 15 + j]
+            pose[s, i, j] += products[free + i, free + j]
             pose[s, j, i] = pose[s, i, j]
-        for j in range(15):
+        for j in range(free):
             if cameras_first:
-                coupling[c, j, 6 * s + i] = products[15 + i, j]
+                coupling[c, j, 6 * s + i] = products[free + i, j]
             else:
-                coupling[s, i, 15 * c + j] = products[15 + i, j]
+                coupling[s, i, free * c + j] = products[free + i, j]
 
 
 @njit(cache=True, fastmath=kernels.FAST)
@@ -280,7 +276,7 @@ def move(state, camera_step, pose_step, own_step, new):
     for i in range(len(own_offset)):
         new_own_offset[i] = own_offset[i] + own_step[i]
     for c in range(len(offset)):
-        for i in range(15):
+        for i in range(offset.shape[1]):
             new_offset[c, i] = offset[c, i] + camera_step[c, i]
     turned, left = np.empty((3, 3), dtype=offset.dtype), np.empty((3, 3), dtype=offset.dtype)
     for s in range(len(centre)):

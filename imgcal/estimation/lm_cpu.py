@@ -35,7 +35,7 @@ from imgcal.estimation.linearization_cpu import (
     state_of,
     turn_all,
 )
-from imgcal.geometry import RigidTransform, kernels
+from imgcal.geometry import RigidTransform, kernels, lens_codes
 from imgcal.types import CameraRig
 from renderers.compiling import njit
 
@@ -60,7 +60,7 @@ def minimize(
     blocks = _Blocks.of(problem, rows=max(count, 2))
     converged = np.zeros(count, dtype=np.bool_)
     iterations = np.zeros(count, dtype=np.int64)
-    shared, given = _shared(problem), _arrays((*_given(problem), own_std))
+    shared, given = shared_given(problem), _arrays((*_given(problem), own_std))
     compiled = (_arrays(_parts(state)), _arrays(blocks.parts), *_arrays((blocks.cost,)), converged, iterations)
     limits = (blocks.cameras_first, LOSS_CODES[loss], threshold, max_iterations)
     tolerances = (tolerance + pixel_rounding(problem)).numpy()
@@ -92,7 +92,7 @@ def linearize(problem: Problem, state: State, loss: str, threshold: float) -> No
     """Do the work of `linearization.linearize` for tensors on the CPU, without gradients; the loss as in `minimize`."""
     own_std, state = _object_of(problem, state, len(problem.uv))
     blocks = _Blocks.of(problem, len(problem.uv))
-    given = (*_shared(problem), *_arrays((*_given(problem), own_std)))
+    given = (*shared_given(problem), *_arrays((*_given(problem), own_std)))
     arrays = (_arrays(_parts(state)), _arrays(blocks.parts), *_arrays((blocks.cost,)))
     linearize_all(given, *arrays, blocks.cameras_first, LOSS_CODES[loss], threshold)  # type: ignore[call-arg]
     return blocks.equations()
@@ -103,11 +103,11 @@ class _Blocks:
     """The normal equations as the compiled loops lay them out, B rigs; M columns of the object stand behind."""
 
     cameras_first: bool
-    camera: Tensor  # (B, C, 15, 15)
-    coupling: Tensor  # (B, C, 15, 6 S + M) where cameras are eliminated first, else (B, S, 6, 15 C + M)
+    camera: Tensor  # (B, C, K, K)
+    coupling: Tensor  # (B, C, K, 6 S + M) where cameras are eliminated first, else (B, S, 6, K C + M)
     pose: Tensor  # (B, S, 6, 6)
     border: Tensor  # (B, M, as wide), lower triangle
-    camera_gradient: Tensor  # (B, C, 15)
+    camera_gradient: Tensor  # (B, C, K)
     pose_gradient: Tensor  # (B, S, 6)
     own_gradient: Tensor  # (B, M)
     residual: Tensor  # (B, S, C, 2, N)
@@ -118,11 +118,12 @@ class _Blocks:
         """Make room for so many of those of a problem."""
         _, snapshots, cameras, _, fiducials = problem.uv.shape
         own = 0 if problem.object_prior_std is None else problem.object_prior_std.shape[1]
-        cameras_first = 6 * snapshots <= 15 * cameras
-        shape = (cameras, 15, 6 * snapshots + own) if cameras_first else (snapshots, 6, 15 * cameras + own)
+        free = problem.prior_std.shape[-1]
+        cameras_first = 6 * snapshots <= free * cameras
+        shape = (cameras, free, 6 * snapshots + own) if cameras_first else (snapshots, 6, free * cameras + own)
         sizes = (
-            (cameras, 15, 15), shape, (snapshots, 6, 6), (own, shape[-1]),
-            (cameras, 15), (snapshots, 6), (own,), (snapshots, cameras, 2, fiducials), (),
+            (cameras, free, free), shape, (snapshots, 6, 6), (own, shape[-1]),
+            (cameras, free), (snapshots, 6), (own,), (snapshots, cameras, 2, fiducials), (),
         )  # fmt: skip
         return cls(cameras_first, *(problem.uv.new_empty(rows, *size) for size in sizes))
 
@@ -143,7 +144,7 @@ class _Blocks:
         if self.cameras_first:
             blocks = coupling.unflatten(-1, (-1, 6)).permute(0, 3, 1, 2, 4)
         else:
-            blocks = coupling.unflatten(-1, (-1, 15)).permute(0, 1, 3, 4, 2)
+            blocks = coupling.unflatten(-1, (self.camera.shape[1], -1)).permute(0, 1, 3, 4, 2)
         gradients = (self.camera_gradient, self.pose_gradient)
         equations = NormalEquations(self.cost, self.camera, blocks, self.pose, *gradients, self.residual)
         if not self.border.shape[1]:
@@ -151,7 +152,7 @@ class _Blocks:
         if self.cameras_first:
             pair = (self.coupling[..., wide:], across.unflatten(-1, (-1, 6)).permute(0, 2, 3, 1))
         else:
-            pair = (across.unflatten(-1, (-1, 15)).permute(0, 2, 3, 1), self.coupling[..., wide:])
+            pair = (across.unflatten(-1, (self.camera.shape[1], -1)).permute(0, 2, 3, 1), self.coupling[..., wide:])
         lower = self.border[..., wide:]
         square = lower.tril() + lower.tril(-1).mT
         return replace(equations, object=ObjectEquations(*pair, square, self.own_gradient))
@@ -185,9 +186,11 @@ def _parts(state: State) -> tuple[Tensor, ...]:
     return (state.offset, state.rotation, state.centre, state.object_offset)
 
 
-def _shared(problem: Problem) -> tuple[np.ndarray, ...]:
+def shared_given(problem: Problem) -> tuple[np.ndarray | None, ...]:
+    """What `linearization_cpu` is given of all rigs alike."""
     points, squared = problem.points, problem.radius_squared
-    return _arrays((points, points.new_zeros(len(points)) if squared is None else squared))
+    given = _arrays((points, points.new_zeros(len(points)) if squared is None else squared))
+    return (*given, lens_codes(problem.factory.lens_model, *problem.factory.distortion.shape[-2:]))
 
 
 def rig_at(problem: Problem, offset: Tensor) -> CameraRig:
@@ -201,7 +204,7 @@ def rig_at(problem: Problem, offset: Tensor) -> CameraRig:
         factory,
         focal_length=factory.focal_length + parameters[..., 6:8],
         principal_point=factory.principal_point + parameters[..., 8:10],
-        distortion=factory.distortion + parameters[..., 10:15],
+        distortion=factory.distortion + parameters[..., 10:],
         cam_from_rig=RigidTransform(rotation, translation),
     )
 

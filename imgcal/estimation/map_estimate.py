@@ -22,7 +22,8 @@ from imgcal.estimation.linearization import (
 from imgcal.estimation.pose_initialization import initial_pose
 from imgcal.estimation.robust_losses import NamedLoss
 from imgcal.geometry import RigidTransform
-from imgcal.types import PARAMETERS, CalibrationObject, CameraRig, Observations, RigPrior, check_observations
+from imgcal.messages import brief
+from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior, check_observations
 
 PATIENCE = 15
 """Steps after which a rig begins again; from factory values within their prior, 6 are usual."""
@@ -79,7 +80,7 @@ class Estimate:
     """Factor on what noise adds to standard deviations, where blocks of snapshots scatter more: `block_scatter`."""
 
     def covariance(self, reference: int = 0) -> Tensor:
-        """Covariance of the cameras relative to one of them: (*B, 15 C, 15 C); see `relative_covariance`."""
+        """Covariance of the cameras relative to one of them: (*B, K C, K C); see `relative_covariance`."""
         from imgcal.estimation.covariance import relative_covariance  # it builds on this module
 
         return relative_covariance(self, reference)
@@ -94,6 +95,11 @@ class Estimate:
         """RMS reprojection error of the seen fiducials, over both axes: (*B) pixels."""
         count = (self.problem.root_weight > 0).flatten(1).sum(1).clamp_min(1).reshape(self.chi2.shape)
         return (self.residual.square().flatten(len(self.chi2.shape)).sum(-1) / (2 * count)).sqrt()
+
+    def __repr__(self) -> str:
+        """Say what it is, and shapes instead of walls of numbers."""
+        poses = brief(self.rig_from_object.translation)
+        return f"Estimate({self.rig!r}, poses {poses}, residual {brief(self.residual)}, {self.iterations} iterations)"
 
 
 def estimate(
@@ -117,7 +123,7 @@ def estimate(
         obj: N fiducials; a radius makes their images ellipses, whose centres are what is observed. Where it has
             tolerances, its shape is estimated too, one shape for all snapshots.
         rig_from_object: (*B, S) first guess of the poses; None = `initial_pose`.
-        prior_std: (*B, C, 15) standard deviation of each factory value in the order of `PARAMETER_NAMES`; zero keeps a
+        prior_std: (*B, C, K) standard deviation of each factory value, as `CameraRig.parameter_names`; zero keeps a
             value fixed; None = the rig's own prior, or `RigPrior()`.
         initial_rig: (*B) where to start, a network's output for example; None = the factory rig.
         options: how to minimize.
@@ -263,7 +269,7 @@ def make_problem(
     batch = observations.seen.shape[:-3]
     count = batch.numel()
     uv, sigma = observations.uv, observations.sigma
-    rig = rig.to(uv.dtype)
+    rig, width = rig.to(uv.dtype), rig.num_parameters
     if prior_std is None:
         prior_std = (rig.prior or RigPrior()).std(rig)
     seen = observations.seen.reshape(count, *observations.seen.shape[-3:])
@@ -281,7 +287,7 @@ def make_problem(
         factory=rig.map_tensors(
             lambda tensor, axes: tensor.expand(*batch, *tensor.shape[-axes:]).reshape(count, *tensor.shape[-axes:])
         ),
-        prior_std=prior_std.to(uv).expand(*batch, cameras, PARAMETERS).reshape(count, cameras, PARAMETERS),
+        prior_std=rig.only_existing(prior_std.to(uv)).expand(*batch, cameras, width).reshape(count, cameras, width),
     )
 
 

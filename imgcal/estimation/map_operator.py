@@ -13,7 +13,7 @@ from imgcal.estimation.levenberg_marquardt import Solution
 from imgcal.estimation.linearization import Problem, State, rig_at
 from imgcal.estimation.map_estimate import EstimationOptions, equations_at, initial_state, make_loss, minimize
 from imgcal.estimation.pose_initialization import initial_pose
-from imgcal.geometry import RigidTransform
+from imgcal.geometry import ModelNames, RigidTransform, named_lenses
 from imgcal.operators import Operator, Tensors
 from imgcal.types import CalibrationObject, CameraRig, Observations
 
@@ -51,7 +51,7 @@ def map_state(problem: Problem, start: State, options: str) -> tuple[State, Tens
         start.rotation,
         start.centre,
         empty if start.object_offset is None else start.object_offset,
-        options=options,
+        options=with_lenses(rig, options),
     )
     return _state(*state), converged
 
@@ -61,8 +61,20 @@ def encoded(options: EstimationOptions) -> str:
     return json.dumps(asdict(options))
 
 
+def with_lenses(rig: CameraRig, options: str) -> str:
+    """Put the lens models of a rig, which no tensor says, before what else an operator is told."""
+    return f"{','.join(rig.lens_models)}|{options}"
+
+
+def without_lenses(options: str) -> tuple[ModelNames, str]:
+    """Invert `with_lenses`."""
+    names, _, rest = options.partition("|")
+    return named_lenses(names.split(",")), rest
+
+
 def _compute(inputs: Tensors, options: str) -> Tensors:
-    problem, start = _problem(*inputs[:-4]), _state(*inputs[-4:])
+    lenses, options = without_lenses(options)
+    problem, start = _problem(lenses, *inputs[:-4]), _state(*inputs[-4:])
     how = EstimationOptions(**json.loads(options))
     if not start.rotation.shape[1]:
         obj = CalibrationObject(problem.points + problem.centroid, problem.points, radius=_radius(problem))
@@ -79,8 +91,10 @@ def _compute(inputs: Tensors, options: str) -> Tensors:
 
 def _attach(inputs: Tensors, outputs: Tensors, options: str) -> Tensors:
     *state, converged = outputs
-    loss, problem, found = make_loss(EstimationOptions(**json.loads(options))), _problem(*inputs[:-4]), _state(*state)
-    constant = _problem(*(tensor.detach() for tensor in inputs[:-4]))
+    lenses, options = without_lenses(options)
+    problem, found = _problem(lenses, *inputs[:-4]), _state(*state)
+    loss = make_loss(EstimationOptions(**json.loads(options)))
+    constant = _problem(lenses, *(tensor.detach() for tensor in inputs[:-4]))
     attached = attach_gradient(problem, Solution(found, equations_at(constant, found, loss), converged, 0), loss)
     own = state[-1] if attached.object_offset is None else attached.object_offset
     return attached.offset, attached.rotation, attached.centre, own, converged
@@ -95,19 +109,20 @@ def _like(inputs: Tensors, options: str) -> Tensors:
 
 
 def _problem(
-    uv: Tensor, root_weight: Tensor, points: Tensor, centroid: Tensor, radius_squared: Tensor, focal_length: Tensor,
-    principal_point: Tensor, distortion: Tensor, rotation: Tensor, translation: Tensor, image_size: Tensor,
-    prior_std: Tensor, object_prior_std: Tensor,
+    lenses: ModelNames, uv: Tensor, root_weight: Tensor, points: Tensor, centroid: Tensor, radius_squared: Tensor,
+    focal_length: Tensor, principal_point: Tensor, distortion: Tensor, rotation: Tensor, translation: Tensor,
+    image_size: Tensor, prior_std: Tensor, object_prior_std: Tensor,
 ) -> Problem:  # fmt: skip
     transform = RigidTransform(rotation, translation)
     names = tuple(str(camera) for camera in range(len(image_size)))
+    factory = CameraRig(focal_length, principal_point, distortion, transform, image_size, names, lens_model=lenses)
     return Problem(
         uv=uv,
         root_weight=root_weight,
         points=points,
         centroid=centroid,
         radius_squared=radius_squared if len(radius_squared) else None,
-        factory=CameraRig(focal_length, principal_point, distortion, transform, image_size, names),
+        factory=factory,
         prior_std=prior_std,
         object_prior_std=object_prior_std if object_prior_std.shape[1] else None,
     )

@@ -30,7 +30,7 @@ from imgcal.estimation.change_points import (
 from imgcal.estimation.linearization import Problem, State, points_at, pose_at, rig_at
 from imgcal.estimation.map_estimate import minimize
 from imgcal.estimation.robust_losses import huber
-from imgcal.types import PARAMETERS, Kind, MovedCamera
+from imgcal.types import Kind, MovedCamera
 
 ERROR = 1e-5
 """Probability of naming a camera in a capture in which none has moved, as far as noise is what it is said to be."""
@@ -135,10 +135,10 @@ class Places:
     def change(self, before: int, after: int, noise: float) -> Change:
         """Difference between two places of a camera, with what is known of it."""
         offset, prior_std = self.state.offset[0].numpy(), self.problem.prior_std[0, before].numpy()
-        covariance = self.blocks.covariance.reshape(len(self.camera), PARAMETERS, len(self.camera), PARAMETERS)
+        covariance = self.blocks.covariance.reshape(len(self.camera), len(prior_std), len(self.camera), len(prior_std))
         joint = covariance[before, :, before] + covariance[after, :, after]
         joint = joint - covariance[before, :, after] - covariance[after, :, before]
-        information: Array = np.linalg.inv(noise * joint + 1e-12 * np.eye(PARAMETERS)).astype(np.float64)
+        information: Array = np.linalg.inv(noise * joint + 1e-12 * np.eye(len(prior_std))).astype(np.float64)
         return Change(information, information @ (offset[after] - offset[before]), prior_std)
 
 
@@ -146,9 +146,9 @@ class Places:
 class Change:
     """A difference of a camera's values, whitened by the prior."""
 
-    information: Array  # (15, 15)
-    pull: Array  # (15,) information times the difference
-    prior_std: Array  # (15,) standard deviations of the prior
+    information: Array  # (K, K)
+    pull: Array  # (K,) information times the difference
+    prior_std: Array  # (K,) standard deviations of the prior
 
     def gain(self, part: slice) -> float:
         """Chi-squared of the difference where only a part of the values may differ."""
@@ -159,7 +159,7 @@ class Change:
         """Tell whether a motion, or another focal length, explains it: errors of the lens would take all values."""
         kinds = max(self.gain(part) for part, _ in KINDS.values())
         motion = max(self.gain(MOTION), self.gain(KINDS["focal_length"][0]))
-        others = PARAMETERS - MOTION.stop  # each of them takes one from noise alone
+        others = int((self.prior_std > 0).sum()) - MOTION.stop  # each of them takes one from noise alone
         return kinds >= LEAST_GAIN and motion >= LEAST_MOTION * (self.gain(slice(None)) - others)
 
     def size(self) -> tuple[Kind, float, float]:

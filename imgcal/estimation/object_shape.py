@@ -18,10 +18,16 @@ from scipy.special import fdtrc, ndtri
 
 from imgcal.estimation.covariance import object_covariance
 from imgcal.estimation.levenberg_marquardt import Solution, factorize
-from imgcal.estimation.linearization import Problem, State, jacobian_at, points_at, robust_weight
+from imgcal.estimation.linearization import (
+    POSE_PARAMETERS,
+    Problem,
+    State,
+    jacobian_at,
+    points_at,
+    robust_weight,
+)
 from imgcal.estimation.map_estimate import Estimate, equations_at
 from imgcal.estimation.robust_losses import NamedLoss, RobustKernel
-from imgcal.types import PARAMETERS
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -175,7 +181,7 @@ def pull_scatter(problem: Problem, state: State, loss: RobustKernel) -> float:
     at = jacobian_at(problem, state)
     assert at.by_fiducial is not None
     weight = robust_weight(problem, at, loss)[0, :, :, None, None, :]
-    by_pose, by_fiducial = at.by_rig[0, ..., PARAMETERS:-1, :, :], at.by_fiducial[0]  # (S, C, 6 or 3, 2, N)
+    by_pose, by_fiducial = at.by_rig[0, ..., -POSE_PARAMETERS - 1 : -1, :, :], at.by_fiducial[0]  # (S, C, 6 or 3, 2, N)
     pull = (by_fiducial * weight * at.residual[0].unsqueeze(-3)).sum((1, 3)).mT.flatten(1)  # (S, 3 N)
     # The poses have adapted to each snapshot: what they took is no longer in its pull.
     own = (by_fiducial.square() * weight).sum((1, 3)).mT.flatten(1)

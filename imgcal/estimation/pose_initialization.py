@@ -22,7 +22,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from imgcal.geometry import RigidTransform, kernels, rotation_from_vector, undistort, undistort_cpu
+from imgcal.geometry import ModelNames, RigidTransform, kernels, rotation_from_vector, undistort, undistort_cpu
 from imgcal.types import CalibrationObject, CameraRig, Observations
 from renderers.compiling import njit
 
@@ -95,7 +95,7 @@ def initial_pose(
 
 
 def _rays(
-    observations: Observations, rig: CameraRig, undistort: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+    observations: Observations, rig: CameraRig, undistort: Callable[[Tensor, Tensor, ModelNames], tuple[Tensor, Tensor]]
 ) -> tuple[Tensor, Tensor]:
     """Viewing rays in the rig frame, rigs and snapshots flattened: unit directions (P, C, N, 3), origins (P, C, 3)."""
     dtype = observations.uv.dtype
@@ -103,8 +103,8 @@ def _rays(
     uv = torch.where(observations.seen[..., None], observations.uv, rig.principal_point.unsqueeze(-2).unsqueeze(-4))
     flat = (rig.principal_point, rig.focal_length)
     principal, focal = (value.unsqueeze(-2).unsqueeze(-4) for value in flat)
-    distortion = rig.distortion.unsqueeze(-3).expand(*uv.shape[:-2], 5)
-    xy, _ = undistort((uv - principal) / focal, distortion)
+    distortion = rig.distortion.unsqueeze(-3).expand(*uv.shape[:-2], -1)
+    xy, _ = undistort((uv - principal) / focal, distortion, rig.lens_model)
     directions = torch.nn.functional.normalize(torch.cat((xy, torch.ones_like(xy[..., :1])), dim=-1), dim=-1)
     rotation = rig.cam_from_rig.rotation.unsqueeze(-4)
     rays = (directions @ rotation).reshape(-1, *directions.shape[-3:])

@@ -1,26 +1,30 @@
-"""Has a camera changed since a belief was held? What has been learnt since is tested, kind of change by kind of change.
+"""Has a camera changed? What later snapshots say is compared with what was known before, kind of change by kind.
 
-Between a belief and a later one about the same rig lie snapshots. If nothing changed, the later one differs from the
-earlier one by no more than what was learnt: its difference has the covariance P_before - P_after, and the pull of the
-snapshots on each parameter the covariance G = A - A S^-1 A, where A is the information that they brought and S that of
-the later belief. A jump d of one camera's parameters before the first of these snapshots adds G d. The score test of
-each kind of change of each camera asks whether that is there (a generalized likelihood ratio with the jump estimated);
-nothing but the two beliefs is needed.
+Let P be the covariance of what was known, A the information that the later snapshots brought and g their pull at what
+was known before. If nothing changed, the pull that is left once both have been put together, r = g - A S^-1 g with
+S = P^-1 + A, has the covariance G = A - A S^-1 A. A jump d of a camera's parameters adds G d. The score test of each
+kind of change of each camera asks whether that is there (a generalized likelihood ratio with the jump estimated), and
+the same r and G tell how probable any jump is of which only the spread is known.
 
-Source: Hausman, "Specification Tests in Econometrics", 1978; Willsky and Jones, "A Generalized Likelihood Ratio
-Approach to the Detection and Estimation of Jumps in Linear Systems", 1976.
+A camera model is never exact, and an object that hardly moves shows the same error in every snapshot. A jump that
+moves the image by less than `MODEL_ERROR` is therefore taken to be there always.
+
+Source: Willsky and Jones, "A Generalized Likelihood Ratio Approach to the Detection and Estimation of Jumps in Linear
+Systems", 1976; Hausman, "Specification Tests in Econometrics", 1978.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from imgcal.estimation.rig_error import error_between, step_by_error
-from imgcal.estimation.rig_filter import RigBelief
-from imgcal.types import PARAMETERS
+from imgcal.errors import RefusedError
+from imgcal.estimation.rig_error import step_by_error
+from imgcal.types import CameraRig
 
 CHANGES: Mapping[str, slice] = {
     "rotation": slice(0, 3),
@@ -29,76 +33,150 @@ CHANGES: Mapping[str, slice] = {
     "principal_point": slice(8, 10),
 }
 """Kinds of change, and where they stand among a camera's parameters."""
+JUMPS = (0.6, 6.0, 60.0, 600.0)
+"""Pixels, standard deviations of a change, before anything is known of it, each as probable as the others: by how much
+it moves the image, whatever its kind, so that no kind is preferred."""
+LARGE = 60.0
+"""Pixels, the same of a camera that has moved, as far as that is learnt from what it still labels ..."""
+LENS = 60.0
+"""... and the most of focal length, principal point and distortion, which no push changes by more."""
+DISTORTED = 2e-4
+"""Standard deviation of the distortion for each such pixel, where the kind of change is not known."""
 LEAST_LEARNT = 1e-6
 """Directions of which less was learnt than this share of the most of their kind do not take part."""
+MODEL_ERROR = 0.02
+"""Pixels, one standard deviation of each axis: by how much a camera's image may be off in a way that changes slowly."""
+SLOPE = 0.25
+"""Tangent of the angle to the optical axis at which a change of the focal length counts as what it moves there."""
+USUAL_DISTANCE = 1000.0  # mm, of a rig that has no working distance
 
 
-def change_scores(before: RigBelief, after: RigBelief) -> dict[str, Tensor]:
-    """Test each camera for each kind of change between two beliefs.
-
-    Args:
-        before: the earlier belief, aged to the time of the later one.
-        after: the later one, which has learnt more.
-
-    Returns:
-        For each of `CHANGES` (C,): chi-squared, where nothing has changed, with as many degrees of freedom as the kind
-        has parameters.
-    """
-    wide = before.rig.num_cameras * PARAMETERS
-    cameras = (error_between(after.rig, before.rig) / before.unit).flatten()
-    difference = torch.cat((cameras, after.object_offset - before.object_offset))
-    pull = (before.information @ difference)[:wide].unflatten(0, (-1, PARAMETERS))
-    change = _own_change(before)
-    pull = (change.mT @ pull[..., None])[..., 0]
-    learnt = change.mT @ _learnt(before.information, after.factor, before.rig.num_cameras) @ change
-    return {kind: _score(pull[:, part], learnt[:, part, part]) for kind, part in CHANGES.items()}
+def pixel_changes(rig: CameraRig) -> Tensor:
+    """Change of each parameter that moves the image by about a pixel: (C, K)."""
+    focal = rig.focal_length.mean(-1, keepdim=True)
+    change = torch.ones(rig.num_cameras, rig.num_parameters, dtype=torch.float64)
+    change[:, :3] /= focal
+    change[:, 2] /= SLOPE
+    change[:, 3:6] *= (rig.working_distance or USUAL_DISTANCE) / focal
+    change[:, 5] /= SLOPE
+    change[:, 6:8] /= SLOPE
+    change[:, 10:] = DISTORTED * rig.has_coefficient
+    return change
 
 
-def jump(before: RigBelief, let_free: RigBelief, after: RigBelief, camera: int, kind: str) -> tuple[Tensor, Tensor]:
-    """Estimate a change of one camera of one kind, were there no other change.
+def spread_of(changes: Mapping[int, str | None], pixels: Tensor, jump: float = LARGE) -> Tensor:
+    """Standard deviations (C, K) of changes of some kinds by camera, None = of all; zero where nothing changes.
 
     Args:
-        before: what was believed before it.
-        let_free: the same, the camera widened: what the later snapshots were absorbed into.
-        after: what came of that.
-        camera: its number.
-        kind: of `CHANGES`, K numbers.
-
-    Returns:
-        The most probable change (K,) and its covariance (K, K).
+        changes: kinds by camera.
+        pixels: (C, K) see `pixel_changes`.
+        jump: pixels.
     """
-    part, cameras = CHANGES[kind], before.rig.num_cameras
-    wide = cameras * PARAMETERS
-    brought = after.information - let_free.information
-    difference = torch.cat(((error_between(after.rig, before.rig) / before.unit).flatten(),
-                            after.object_offset - before.object_offset))  # fmt: skip
-    pull = after.information @ difference  # of the snapshots, at what was believed before
-    factor = torch.linalg.cholesky(before.information + brought)
-    pull = pull - brought @ torch.cholesky_solve(pull[:, None], factor)[:, 0]
-    change = _own_change(before)
-    learnt = change.mT @ _learnt(before.information, factor, cameras) @ change
-    covariance = torch.linalg.pinv(learnt[camera, part, part], hermitian=True)
-    own = (change.mT @ pull[:wide].unflatten(0, (cameras, PARAMETERS))[..., None])[camera, part, 0]
-    return covariance @ own, covariance
+    std = torch.zeros_like(pixels)
+    for camera, kind in changes.items():
+        part = slice(None) if kind is None else CHANGES[kind]
+        std[camera, part] = jump * pixels[camera, part]
+    std[:, 6:] *= min(1.0, LENS / jump)
+    return std
 
 
-def _own_change(belief: RigBelief) -> Tensor:
-    """Error in units by a change of a camera's own parameters: (C, 15, 15); a turn about its centre shifts nothing."""
-    return torch.linalg.inv(step_by_error(belief.rig)) / belief.unit[:, :, None]
+def change_of_errors(rig: CameraRig, unit: Tensor) -> Tensor:
+    """Error in units by a change of a camera's own parameters: (C, K, K); a turn about its centre shifts nothing."""
+    return torch.linalg.inv(step_by_error(rig)) / unit[:, :, None]
 
 
-def _learnt(before: Tensor, after: Tensor, cameras: int) -> Tensor:
-    """Diagonal blocks (C, 15, 15) of G, by the information before (D, D) and the factor (D, D) of that after."""
-    wide = cameras * PARAMETERS
-    half = torch.linalg.solve_triangular(after, before, upper=False)[:, :wide]
-    blocks = before[:wide, :wide].unflatten(0, (-1, PARAMETERS)).unflatten(-1, (-1, PARAMETERS))
-    columns = half.unflatten(-1, (-1, PARAMETERS)).movedim(1, 0)
-    return blocks.diagonal(dim1=0, dim2=2).movedim(-1, 0) - columns.mT @ columns
+@dataclass(frozen=True)
+class ChangeTest:
+    """What is left of the pull on every camera's own parameters: the two numbers r and G of every test."""
+
+    pull: Tensor  # (K C,)
+    learnt: Tensor  # (K C, K C) its covariance where nothing has changed
+    pixels: Tensor  # (C, K) see `pixel_changes`
+
+    @classmethod
+    def of(cls, information: Tensor, brought: Tensor, pull: Tensor, change: Tensor, pixels: Tensor) -> ChangeTest:
+        """Prepare the tests.
+
+        Args:
+            information: (D, D) of what was known before, aged to the time of the later snapshots.
+            brought: (D, D) information of the later snapshots.
+            pull: (D,) of the later snapshots, where what was known before put the rig.
+            change: (C, K, K) see `change_of_errors`.
+            pixels: (C, K) see `pixel_changes`.
+
+        Raises:
+            RefusedError: nothing is known of the rig.
+        """
+        cameras = len(change)
+        wide = pixels.numel()
+        factor, failed = torch.linalg.cholesky_ex(information + brought)
+        if bool(failed):
+            raise RefusedError("estimation: these observations leave a rig that nothing is known of")
+        half = torch.linalg.solve_triangular(factor, torch.cat((brought[:, :wide], pull[:, None]), 1), upper=False)
+        left = torch.cat((brought[:wide, :wide], pull[:wide, None]), 1) - half[:, :wide].mT @ half
+        own = torch.einsum("cij,cik->cjk", change, left.unflatten(0, (cameras, -1)))  # (C, K, K C + 1)
+        learnt = own[..., :-1].unflatten(-1, (cameras, -1))
+        learnt = torch.einsum("cidj,djk->cidk", learnt, change).reshape(wide, wide)
+        return cls(own[..., -1].flatten(), 0.5 * (learnt + learnt.mT), pixels)
+
+    def scores(self) -> dict[str, Tensor]:
+        """Test each camera for each kind of change: for each of `CHANGES` (C,).
+
+        Chi-squared, where nothing has changed, with at most as many degrees of freedom as the kind has parameters.
+        """
+        cameras = len(self.pixels)
+        pull = self.pull.unflatten(0, (cameras, -1))
+        learnt = self.learnt.unflatten(0, (cameras, -1)).unflatten(-1, (cameras, -1))
+        own = learnt.diagonal(dim1=0, dim2=2).movedim(-1, 0)  # (C, K, K)
+        return {
+            kind: _score(pull[:, part], own[:, part, part], MODEL_ERROR * self.pixels[:, part])
+            for kind, part in CHANGES.items()
+        }
+
+    def odds(self, changes: Mapping[int, str | None]) -> float:
+        """Log odds that cameras have changed in some ways, None = in any, against that nothing has."""
+        found = []
+        for jump in JUMPS:
+            _, factor, pull = self._free(changes, jump)
+            found.append(0.5 * pull.square().sum() - factor.diagonal().log().sum() - math.log(len(JUMPS)))
+        return float(torch.logsumexp(torch.stack(found), 0))
+
+    def given(self, changes: Mapping[int, str | None]) -> ChangeTest:
+        """Test for others where some cameras may have changed."""
+        scaled, factor, pull = self._free(changes, LARGE)
+        taken = torch.linalg.solve_triangular(factor, scaled, upper=False)
+        return ChangeTest(self.pull - taken.mT @ pull, self.learnt - taken.mT @ taken, self.pixels)
+
+    def jump(self, camera: int, kind: str) -> tuple[Tensor, Tensor]:
+        """Estimate a change of a camera of a kind with K numbers, were there no other: (K,) and covariance (K, K)."""
+        first = camera * self.pixels.shape[1]
+        part = slice(first + CHANGES[kind].start, first + CHANGES[kind].stop)
+        covariance = torch.linalg.pinv(self.learnt[part, part], hermitian=True)
+        return covariance @ self.pull[part], covariance
+
+    def _free(self, changes: Mapping[int, str | None], jump: float) -> tuple[Tensor, Tensor, Tensor]:
+        """What R parameters that may have changed do, in units of their standard deviations.
+
+        Returns:
+            Covariance with all pulls (R, K C), Cholesky factor (R, R) of their own, the jump included, and the
+            whitened pull (R,).
+        """
+        std = spread_of(changes, self.pixels, jump).flatten()
+        rows = std.nonzero()[:, 0]
+        scaled = std[rows, None] * self.learnt[rows]
+        own = scaled[:, rows] * std[rows]
+        factor = torch.linalg.cholesky(own + torch.eye(len(rows), dtype=std.dtype))
+        pull = torch.linalg.solve_triangular(factor, (std * self.pull)[rows, None], upper=False)[:, 0]
+        return scaled, factor, pull
 
 
-def _score(pull: Tensor, variance: Tensor) -> Tensor:
-    """Squares of (C, K) in units of their covariance (C, K, K), along what is known of it: (C,)."""
-    scale = variance.diagonal(dim1=-2, dim2=-1).clamp_min(1e-30).sqrt()
-    values, vectors = torch.linalg.eigh(variance / (scale[:, :, None] * scale[:, None, :]))
-    along = (vectors.mT @ (pull / scale)[..., None])[..., 0].square()
-    return torch.where(values > LEAST_LEARNT, along / values.clamp_min(LEAST_LEARNT), 0.0).sum(-1)
+def _score(pull: Tensor, learnt: Tensor, model_error: Tensor) -> Tensor:
+    """Squares (C,) of (C, K) in units of their covariance (C, K, K) and of what model errors (C, K) add to it."""
+    scale = learnt.diagonal(dim1=-2, dim2=-1).clamp_min(1e-30).sqrt()
+    values, vectors = torch.linalg.eigh(learnt / (scale[:, :, None] * scale[:, None, :]))
+    known = values > LEAST_LEARNT
+    root = torch.where(known, values, 1.0).sqrt()
+    along = torch.where(known, (vectors.mT @ (pull / scale)[..., None])[..., 0] / root, 0.0)
+    moved = (scale * model_error)[:, :, None] * vectors * torch.where(known, root, 0.0)[:, None, :]
+    covariance = torch.eye(pull.shape[-1], dtype=pull.dtype) + moved.mT @ moved
+    return (along * torch.linalg.solve(covariance, along[..., None])[..., 0]).sum(-1)

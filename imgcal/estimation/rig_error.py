@@ -25,7 +25,7 @@ from imgcal.geometry import (
     rotation_from_vector,
     vector_from_rotation,
 )
-from imgcal.types import PARAMETERS, CameraRig
+from imgcal.types import CameraRig
 
 
 def displaced(rig: CameraRig, error: Tensor) -> CameraRig:
@@ -33,7 +33,7 @@ def displaced(rig: CameraRig, error: Tensor) -> CameraRig:
 
     Args:
         rig: (*B).
-        error: (*B, C, 15): rotation (rad) and translation (mm) of the camera in the rig's frame, then focal length,
+        error: (*B, C, K): rotation (rad) and translation (mm) of the camera in the rig's frame, then focal length,
             principal point (pixels) and distortion.
 
     Returns:
@@ -46,13 +46,13 @@ def displaced(rig: CameraRig, error: Tensor) -> CameraRig:
         rig,
         focal_length=rig.focal_length + error[..., 6:8],
         principal_point=rig.principal_point + error[..., 8:10],
-        distortion=rig.distortion + error[..., 10:15],
+        distortion=rig.distortion + error[..., 10:],
         cam_from_rig=RigidTransform(rotation, -rotate(rotation, positions)),
     )
 
 
 def error_between(rig: CameraRig, reference: CameraRig) -> Tensor:
-    """Invert `displaced`: the error (*B, C, 15) that takes `reference` to `rig`."""
+    """Invert `displaced`: the error (*B, C, K) that takes `reference` to `rig`."""
     turn = rig.cam_from_rig.rotation.mT @ reference.cam_from_rig.rotation
     parts = (
         vector_from_rotation(turn),
@@ -73,11 +73,11 @@ def step_by_error(rig: CameraRig, turned: Tensor | None = None) -> Tensor:
             this rig itself.
 
     Returns:
-        (*B, C, 15, 15).
+        (*B, C, K, K).
     """
     rotation, positions = rig.cam_from_rig.rotation, rig.positions
     jacobian = torch.zeros(
-        *positions.shape[:-1], PARAMETERS, PARAMETERS, dtype=positions.dtype, device=positions.device
+        *positions.shape[:-1], rig.num_parameters, rig.num_parameters, dtype=positions.dtype, device=positions.device
     )
     jacobian.diagonal(dim1=-2, dim2=-1)[..., 3:] = 1
     jacobian[..., :3, :3] = -rotation if turned is None else -torch.linalg.solve(left_jacobian(turned), rotation)

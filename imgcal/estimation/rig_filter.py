@@ -11,11 +11,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from imgcal.errors import RefusedError
+from imgcal.estimation import lm_cpu, rig_filter_cpu
+from imgcal.estimation.brought import Brought, add_blocks
 from imgcal.estimation.linearization import NormalEquations, Problem, State, pose_at, retract
 from imgcal.estimation.map_estimate import (
     EstimationOptions,
@@ -27,15 +31,23 @@ from imgcal.estimation.map_estimate import (
 )
 from imgcal.estimation.rig_error import displaced, error_between, step_by_error
 from imgcal.geometry import RigidTransform
-from imgcal.types import PARAMETERS, CalibrationObject, CameraRig, DriftRate, Observations, RigPrior
+from imgcal.types import CalibrationObject, CameraRig, DriftRate, Observations, RigPrior
 
-LEAST_STD = (1e-9,) * 3 + (1e-6,) * 3 + (1e-6,) * 4 + (1e-9,) * 5
+LEAST_STD = (1e-9,) * 3 + (1e-6,) * 3 + (1e-6,) * 4
+LEAST_COEFFICIENT = 1e-9
 """Standard deviation (rad, mm, pixels, 1) of a value that is fixed: small, and not zero."""
 MOST_DAMPING = 1e8
-SLACK = 0.01
-"""By how much the cost may rise in a step, relative: its derivative is approximate where the belief is far away."""
-DAMPED = 1e-3
-"""Damping below which a step that is as short as the tolerance shows that this is the minimum."""
+SLACK = 1e-6
+"""By how much the cost may rise in a step, relative: rounding."""
+DAMPED, STALLED = 1e-3, 10.0
+"""Damping up to which a step that is as short as the tolerance shows that this is the minimum; the second where lightly
+damped steps have failed: their direction is approximate where the belief is far away."""
+
+WHY_NOT = {
+    rig_filter_cpu.NO_POSE: "the observations do not determine the object's pose in every snapshot",
+    rig_filter_cpu.NOTHING_KNOWN: "these observations leave a rig that nothing is known of: labels may be wrong",
+    rig_filter_cpu.NO_MINIMUM: "found no minimum for these observations, expected one: labels may be wrong",
+}
 
 TOGETHER = (*range(2, 17), 20, 25, 32, 40, 50, 64, 80, 100, 128)
 """Numbers of snapshots that are absorbed together once there are as many."""
@@ -53,37 +65,39 @@ class RigBelief:
     rig: CameraRig  # without batch axes, float64
     obj: CalibrationObject  # with its tolerances, as it was given
     object_offset: Tensor  # (M,) in units of its prior standard deviation: what is known of it; M = 0 where it is exact
-    factor: Tensor  # (D, D) lower Cholesky factor of the information; D = 15 C + M
-    unit: Tensor  # (C, 15) rad, mm, pixels, 1: of the cameras' errors
+    factor: Tensor  # (D, D) lower Cholesky factor of the information; D = K C + M
+    unit: Tensor  # (C, K) rad, mm, pixels, 1: of the cameras' errors
 
     @classmethod
     def of_prior(cls, rig: CameraRig, obj: CalibrationObject, prior_std: Tensor | None = None) -> RigBelief:
-        """What the factory says: `prior_std` (C, 15), None = as the rig file has it."""
+        """What the factory says: `prior_std` (C, K), None = as the rig file has it."""
         rig = rig.to(torch.float64)
         std = (rig.prior or RigPrior()).std(rig) if prior_std is None else prior_std
-        unit = std.double().clamp_min(torch.tensor(LEAST_STD, dtype=torch.float64))
+        least = torch.full((rig.num_parameters,), LEAST_COEFFICIENT, dtype=torch.float64)
+        least[: len(LEAST_STD)] = torch.tensor(LEAST_STD, dtype=torch.float64)
+        unit = std.double().clamp_min(least)
         step = _whitened(step_by_error(rig), unit)
-        own, wide = 0 if obj.exact else 3 * obj.num_fiducials + 1, rig.num_cameras * PARAMETERS
+        own, wide = 0 if obj.exact else 3 * obj.num_fiducials + 1, rig.num_cameras * rig.num_parameters
         information = torch.eye(wide + own, dtype=torch.float64)
-        _add_blocks(information, step.mT @ step - torch.eye(PARAMETERS, dtype=torch.float64))
+        add_blocks(information, step.mT @ step - torch.eye(rig.num_parameters, dtype=torch.float64))
         return cls(rig, obj, rig.focal_length.new_zeros(own), _cholesky(information), unit)
 
-    @property
+    @cached_property
     def information(self) -> Tensor:
         """Inverse covariance (D, D) of the errors in their units."""
         return self.factor @ self.factor.mT
 
     def covariance(self) -> Tensor:
-        """Joint covariance (15 C, 15 C) of the cameras in the units and order of `PARAMETER_NAMES`."""
-        wide = self.rig.num_cameras * PARAMETERS
+        """Joint covariance (K C, K C) of the cameras in the units and order of `CameraRig.parameter_names`."""
+        cameras, wide = self.rig.num_cameras, self.unit.numel()
         covariance = torch.cholesky_inverse(self.factor)[:wide, :wide]
-        blocks = covariance.unflatten(0, (-1, PARAMETERS)).unflatten(-1, (-1, PARAMETERS))
+        blocks = covariance.unflatten(0, (cameras, -1)).unflatten(-1, (cameras, -1))
         step = step_by_error(self.rig) * self.unit[:, None, :]
         return torch.einsum("cij,cjdk,dlk->cidl", step, blocks, step).reshape(wide, wide)
 
     def std(self) -> Tensor:
-        """One standard deviation of every parameter: (C, 15)."""
-        return self.covariance().diagonal().clamp_min(0).sqrt().unflatten(0, (-1, PARAMETERS))
+        """One standard deviation of every parameter: (C, K)."""
+        return self.covariance().diagonal().clamp_min(0).sqrt().view(self.unit.shape)
 
     @property
     def points_object(self) -> Tensor:
@@ -105,6 +119,8 @@ class Absorbed:
     chi2: float  # sum of squared whitened residuals (robust), and of the change in standard deviations of the belief
     dof: int  # 2 observations - 6 snapshots: what chi2 is expected to be
     evidence: float  # log probability of what was seen, up to what is the same for every belief before it (Laplace)
+    before: RigBelief  # what they were absorbed into
+    brought: Brought  # what they say by themselves
 
 
 def absorbed(
@@ -124,20 +140,91 @@ def absorbed(
     Raises:
         RefusedError: the observations do not determine the object's pose, or no minimum was found.
     """
+    if belief.factor.device.type == "cpu":
+        return _absorbed_compiled(belief, observations, rig_from_object, options)
+    return absorbed_in_tensors(belief, observations, rig_from_object, options)
+
+
+def _absorbed_compiled(
+    belief: RigBelief, observations: Observations, rig_from_object: RigidTransform, options: EstimationOptions
+) -> Absorbed:
+    """Do the work of `absorbed` in one compiled call."""
+    obj, rig = belief.obj, belief.rig
+    own_std = obj.points.new_zeros(0) if obj.exact else object_prior_std(obj)
+    seen = observations.seen.numpy()
+    uv = np.where(seen[..., None], observations.uv.numpy(), 0.0).astype(np.float64).swapaxes(-1, -2)
+    root_weight = np.where(seen, 1 / np.where(seen, observations.sigma.numpy(), 1.0), 0.0).astype(np.float64)
+    centroid = obj.points.mean(0)
+    problem = Problem(
+        torch.from_numpy(uv).unsqueeze(0), torch.from_numpy(root_weight).unsqueeze(0), obj.points - centroid, centroid,
+        None if obj.radius is None else obj.radius.double().square(), rig, belief.unit,
+    )  # fmt: skip
+    rotation = np.ascontiguousarray(rig_from_object.rotation.detach().double().reshape(-1, 3, 3).numpy())
+    translation = rig_from_object.translation.detach().double().reshape(-1, 3).numpy()
+    turned = rig.cam_from_rig.rotation.contiguous().numpy()
+    position = -(turned.swapaxes(-1, -2) @ rig.cam_from_rig.translation.numpy()[..., None])[..., 0]
+    values = (rig.focal_length, rig.principal_point, rig.distortion)
+    known = rig_filter_cpu.RigArrays(turned, position, *(value.contiguous().numpy() for value in values))
+    loss = (lm_cpu.LOSS_CODES[options.loss], float(options.threshold))
+    found = rig_filter_cpu.absorb(
+        lm_cpu.shared_given(problem),
+        (np.ascontiguousarray(uv), root_weight),
+        (known, belief.unit.numpy(), belief.object_offset.numpy(), own_std.numpy(), belief.information.numpy()),
+        (rotation, translation + rotation @ centroid.numpy()),
+        (*loss, options.max_iterations, options.tolerance, SLACK, DAMPED, STALLED, MOST_DAMPING),
+    )
+    if found.status:
+        raise RefusedError(f"estimation: {WHY_NOT[found.status]}")
+    now = replace(belief, rig=_rig_of(found.rig, rig), object_offset=torch.from_numpy(found.own))
+    now = replace(now, factor=torch.from_numpy(found.factor))
+    vars(now)["information"] = torch.from_numpy(found.information)  # what the property would make of the factor
+    brought = Brought(
+        _rig_of(found.from_rig, rig), torch.from_numpy(found.from_own), belief.unit,
+        *(torch.from_numpy(part) for part in (found.camera, found.border, found.carried, found.pull)),
+    )  # fmt: skip
+    poses = RigidTransform(
+        torch.from_numpy(found.rotation), torch.from_numpy(found.centre - found.rotation @ centroid.numpy())
+    )
+    residual = np.where(seen[..., None], found.residual.swapaxes(-1, -2), 0.0)
+    learnt = np.log(found.factor.diagonal()).sum() - float(belief.factor.diagonal().log().sum())
+    dof = 2 * int(seen.sum()) - 6 * len(seen)
+    rest = (torch.from_numpy(residual), 2 * found.cost, dof, -float(learnt) - found.cost)
+    return Absorbed(now, poses, *rest, belief, brought)
+
+
+def _rig_of(values: rig_filter_cpu.RigArrays, like: CameraRig) -> CameraRig:
+    translation = -(values.rotation @ values.position[..., None])[..., 0]
+    return replace(
+        like,
+        focal_length=torch.from_numpy(values.focal_length),
+        principal_point=torch.from_numpy(values.principal_point),
+        distortion=torch.from_numpy(values.distortion),
+        cam_from_rig=RigidTransform(torch.from_numpy(values.rotation), torch.from_numpy(translation)),
+    )
+
+
+def absorbed_in_tensors(
+    belief: RigBelief,
+    observations: Observations,
+    rig_from_object: RigidTransform,
+    options: EstimationOptions = EstimationOptions(),
+) -> Absorbed:
+    """Do the work of `absorbed` in tensors: on any device, and slowly."""
     at = _Linearization.of(belief, observations, rig_from_object, options)
-    damping = 0.0
-    for _ in range(options.max_iterations):
-        step, gain, factor = at.step(damping)
+    damping, light = 0.0, DAMPED
+    for iteration in range(options.max_iterations):
+        tolerance = options.tolerance * rig_filter_cpu.LOOSER ** max(0, iteration - rig_filter_cpu.PATIENCE)
+        step, gain, factor, brought = at.step(damping)
         trial = at.moved(step)
         if trial.cost <= at.cost + SLACK * max(1.0, at.cost):
-            if gain <= options.tolerance and damping <= DAMPED:
-                return trial.absorbed(factor)
+            if gain <= tolerance and damping <= light:
+                return trial.absorbed(factor, brought)
             at, damping = trial, 0.0 if damping <= 1e-6 else damping / 8
         else:
-            damping = max(8 * damping, 1e-4)
+            damping, light = max(8 * damping, 1e-4), STALLED
             if damping > MOST_DAMPING:
                 break
-    raise RefusedError("estimation: found no minimum for these observations, expected one: labels may be wrong")
+    raise RefusedError(f"estimation: {WHY_NOT[rig_filter_cpu.NO_MINIMUM]}")
 
 
 def aged(belief: RigBelief, seconds: float, rate: DriftRate) -> RigBelief:
@@ -153,11 +240,16 @@ def aged(belief: RigBelief, seconds: float, rate: DriftRate) -> RigBelief:
 
 
 def widened(belief: RigBelief, variance: Tensor) -> RigBelief:
-    """Know less of some parameters: add variances (C, 15), in the units and order of `PARAMETER_NAMES`."""
-    error_by_step = torch.linalg.inv(step_by_error(belief.rig)) / belief.unit[:, :, None]
+    """Know less of some parameters: add variances (C, K), in the units and order of `CameraRig.parameter_names`."""
     covariance = torch.cholesky_inverse(belief.factor)
-    _add_blocks(covariance, error_by_step @ torch.diag_embed(variance) @ error_by_step.mT)
+    add_blocks(covariance, error_covariance(belief, variance))
     return replace(belief, factor=_cholesky(torch.cholesky_inverse(_cholesky(covariance))))
+
+
+def error_covariance(belief: RigBelief, variance: Tensor) -> Tensor:
+    """Covariance (C, K, K) of errors in units, of variances (C, K) of a camera's own parameters."""
+    error_by_step = torch.linalg.inv(step_by_error(belief.rig)) / belief.unit[:, :, None]
+    return error_by_step @ torch.diag_embed(variance) @ error_by_step.mT
 
 
 class RigFilter:
@@ -194,7 +286,7 @@ class RigFilter:
             obj: the calibration object.
             rate: how fast the rig wanders; None = as the rig says.
             options: how to minimize.
-            prior_std: (C, 15) how far the factory values may be off; None = as the rig says.
+            prior_std: (C, K) how far the factory values may be off; None = as the rig says.
         """
         self.rate, self.options = rate or rig.drift_rate or DriftRate(), options
         self.belief = RigBelief.of_prior(rig, obj, prior_std)
@@ -225,7 +317,8 @@ class RigFilter:
         due = self._waited if self._waited >= LEAST_SECONDS else 0.0
         result = absorbed(aged(self.belief, due, self.rate), observations, rig_from_object, self.options)
         self.belief, self._waited, self.count = result.belief, self._waited - due, self.count + 1
-        self._young = self._young and len(self._early) < MEMORY and self._span <= YOUNG_SECONDS
+        still = self._span <= YOUNG_SECONDS or not any(vars(self.rate).values())  # a steady rig stands still for ever
+        self._young = self._young and len(self._early) < MEMORY and still
         if self._young:
             self._early.append((observations, result.rig_from_object))
         else:
@@ -238,7 +331,7 @@ class RigFilter:
         return len(self._early) in TOGETHER
 
     def relinearize(self) -> Absorbed:
-        """Absorb the first snapshots anew, all together; the result is that of the last one."""
+        """Absorb the first snapshots anew, all together; `rig_from_object` and `residual` are those of the last one."""
         result = absorbed(self._first, *joined(self._early), self.options)
         self.belief, self._waited = aged(result.belief, self._span, self.rate), 0.0
         last = replace(result, rig_from_object=result.rig_from_object[-1:], residual=result.residual[-1:])
@@ -258,6 +351,10 @@ class RigFilter:
         self.belief, self._first, self._early = result.belief, first, list(snapshots)
         self._young, self._span, self._waited = True, 0.0, 0.0
         return result
+
+    def suppose(self, first: RigBelief, belief: RigBelief) -> None:
+        """Hold other beliefs: before the first snapshots that are kept, and now."""
+        self._first, self.belief, self._waited = first, belief, 0.0
 
 
 def joined(snapshots: Sequence[tuple[Observations, RigidTransform]]) -> tuple[Observations, RigidTransform]:
@@ -306,7 +403,7 @@ class _Linearization:
         data = float(equations.cost.sum()) - (0.0 if own is None else 0.5 * float(own.square().sum()))
         return cls(belief, problem, state, options, equations, change, prior + data)
 
-    def step(self, damping: float) -> tuple[Tensor, float, Tensor]:
+    def step(self, damping: float) -> tuple[Tensor, float, Tensor, Brought]:
         """Newton's step.
 
         The derivative of the distance by the error is taken as the unit matrix. It is nearly so, and what it adds would
@@ -314,24 +411,24 @@ class _Linearization:
 
         Returns:
             The step (D,) of cameras and object, by how much it should lower the cost, and the factor (D, D) of the
-            information.
+            information, and what the snapshots say by themselves.
         """
-        information, pull = self._information()
-        information = information + self.belief.information
-        pull = pull - self.belief.factor @ (self.belief.factor.mT @ self.distance)
+        brought = self._brought()
+        information = brought.information() + self.belief.information
+        pull = brought.pull.sum(0) - self.belief.factor @ (self.belief.factor.mT @ self.distance)
         damped = factor = _cholesky(information)
         if damping:
             damped = _cholesky(information + damping * information.diagonal().diag())
         step = torch.cholesky_solve(pull[:, None], damped)[:, 0]
         right = self.equations.pose_gradient[:, 0]
         gain = 0.5 * float((right * _solved(self.equations.pose[:, 0], right)).sum())
-        return step, gain + 0.5 * float(step @ pull), factor
+        return step, gain + 0.5 * float(step @ pull), factor, brought
 
     def moved(self, step: Tensor) -> _Linearization:
         """Take a step of cameras and object; poses follow."""
         problem, state, equations = self.problem, self.state, self.equations
-        wide = problem.prior_std.shape[1] * PARAMETERS
-        error = step[:wide].unflatten(0, (-1, PARAMETERS))
+        wide = problem.prior_std[0].numel()
+        error = step[:wide].view(problem.prior_std.shape[1:])
         by_offset = torch.einsum("cij,cj->ci", self._basis(), error)
         right = equations.pose_gradient[:, 0] + torch.einsum("scip,ci->sp", equations.coupling[:, 0], by_offset)
         own = step[wide:]
@@ -344,7 +441,7 @@ class _Linearization:
         problem = replace(problem, factory=rig.expand(len(pose)))
         return self._at(self.belief, problem, state, self.options)
 
-    def absorbed(self, factor: Tensor) -> Absorbed:
+    def absorbed(self, factor: Tensor, brought: Brought) -> Absorbed:
         """What is known now, its information being that of the last step, which was hardly any."""
         own = self.state.object_offset
         belief = replace(
@@ -358,39 +455,36 @@ class _Linearization:
         poses = pose_at(self.problem, self.state)
         dof = 2 * int(seen.sum()) - 6 * len(seen)
         known = self.belief.factor.diagonal().log().sum() - factor.diagonal().log().sum()
-        return Absorbed(belief, poses.reshape(len(seen)), residual, 2 * self.cost, dof, float(known) - self.cost)
+        evidence = float(known) - self.cost
+        rest = (poses.reshape(len(seen)), residual, 2 * self.cost, dof, evidence)
+        return Absorbed(belief, *rest, self.belief, brought)
 
     def _basis(self) -> Tensor:
-        """Whitened offsets of the problem by errors in units: (C, 15, 15)."""
+        """Whitened offsets of the problem by errors in units: (C, K, K)."""
         return _whitened(step_by_error(self.problem.factory[0]), self.belief.unit)
 
-    def _information(self) -> tuple[Tensor, Tensor]:
-        """What the snapshots say about cameras and object, poses eliminated: (D, D), and their pull (D,)."""
+    def _brought(self) -> Brought:
+        """What the snapshots say about cameras and object, poses eliminated."""
         equations, own, offset = self.equations, self.equations.object, self.state.object_offset
         basis = self._basis()
-        wide = len(basis) * PARAMETERS
-        camera = equations.camera - torch.eye(PARAMETERS, dtype=torch.float64)
-        pull = torch.einsum("cij,ci->cj", basis, equations.camera_gradient.sum(0)).flatten()
-        coupling = (basis.mT @ equations.coupling[:, 0]).flatten(1, 2)  # (S, 15 C, 6)
+        camera = equations.camera - torch.eye(equations.camera.shape[-1], dtype=torch.float64)
+        pull = torch.einsum("cij,sci->scj", basis, equations.camera_gradient).flatten(1)
+        coupling = (basis.mT @ equations.coupling[:, 0]).flatten(1, 2)  # (S, K C, 6)
+        border, there = pull.new_zeros(len(pull), 0, pull.shape[1]), pull.new_zeros(0)
         if own is not None and offset is not None:
             coupling = torch.cat((coupling, own.pose[:, 0].mT), dim=1)
-            pull = torch.cat((pull, (own.gradient - offset).sum(0)))
+            pull = torch.cat((pull, own.gradient - offset), dim=1)
+            across = torch.einsum("cij,scim->smcj", basis, own.camera).flatten(2)
+            alone = own.own - torch.eye(own.own.shape[-1], dtype=torch.float64)
+            border, there = torch.cat((across, alone), dim=2), offset[0]
         factor, failed = torch.linalg.cholesky_ex(equations.pose[:, 0])
         if bool(failed.any()):
-            raise RefusedError("estimation: the observations do not determine the object's pose in every snapshot")
+            raise RefusedError(f"estimation: {WHY_NOT[rig_filter_cpu.NO_POSE]}")
         carried = torch.linalg.solve_triangular(factor, coupling.mT, upper=False)  # (S, 6, D)
         gradient = torch.linalg.solve_triangular(factor, equations.pose_gradient[:, 0, :, None], upper=False)
-        flat = carried.flatten(0, 1)
-        information = -(flat.mT @ flat)
-        _add_blocks(information, basis.mT @ camera.sum(0) @ basis)
-        if own is not None:
-            across = torch.einsum("cij,scim->cjm", basis, own.camera).flatten(0, 1)
-            information[:wide, wide:] += across
-            information[wide:, :wide] += across.mT
-            information[wide:, wide:] += own.own.sum(0) - len(camera) * torch.eye(
-                own.own.shape[-1], dtype=torch.float64
-            )
-        return information, (carried.mT @ gradient).sum((0, 2)) - pull
+        pull = (carried.mT @ gradient)[..., 0] - pull
+        blocks = basis.mT @ camera @ basis
+        return Brought(self.problem.factory[0], there, self.belief.unit, blocks, border, carried, pull)
 
 
 def _cholesky(matrix: Tensor) -> Tensor:
@@ -401,7 +495,7 @@ def _cholesky(matrix: Tensor) -> Tensor:
     """
     factor, failed = torch.linalg.cholesky_ex(matrix)
     if bool(failed):
-        raise RefusedError("estimation: these observations leave a rig that nothing is known of: labels may be wrong")
+        raise RefusedError(f"estimation: {WHY_NOT[rig_filter_cpu.NOTHING_KNOWN]}")
     return factor
 
 
@@ -411,13 +505,5 @@ def _solved(matrices: Tensor, vectors: Tensor) -> Tensor:
 
 
 def _whitened(step: Tensor, unit: Tensor) -> Tensor:
-    """Whitened offsets by errors in units, of the derivative of a step by an error: (C, 15, 15)."""
+    """Whitened offsets by errors in units, of the derivative of a step by an error: (C, K, K)."""
     return step * unit[:, None, :] / unit[:, :, None]
-
-
-def _add_blocks(matrix: Tensor, blocks: Tensor) -> None:
-    """Add (C, 15, 15) along the diagonal of the cameras' part."""
-    count = len(blocks)
-    wide = matrix[: count * PARAMETERS, : count * PARAMETERS]
-    square = wide.unflatten(0, (count, PARAMETERS)).unflatten(-1, (count, PARAMETERS))
-    square.diagonal(dim1=0, dim2=2).add_(blocks.movedim(0, -1))

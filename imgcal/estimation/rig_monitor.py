@@ -3,34 +3,53 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections import deque
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from imgcal.errors import RefusedError
-from imgcal.estimation.rig_changes import CHANGES, change_scores, jump
-from imgcal.estimation.rig_filter import Absorbed, RigBelief, RigFilter, absorbed, aged, joined, widened
+from imgcal.estimation.cusum import Cusum
+from imgcal.estimation.object_change import ObjectChange, changed_object
+from imgcal.estimation.recent_snapshots import SCREENED, RecentSnapshots
+from imgcal.estimation.rig_changes import CHANGES, JUMPS, LARGE, ChangeTest, change_of_errors, pixel_changes, spread_of
+from imgcal.estimation.rig_error import displaced, error_between
+from imgcal.estimation.rig_filter import YOUNG_SECONDS, Absorbed, RigBelief, RigFilter, absorbed, aged, joined, widened
 from imgcal.geometry import RigidTransform
-from imgcal.types import PARAMETERS, Observations
+from imgcal.types import CameraRig, Observations
 
 SIGNIFICANT = 60.0
 """Chi-squared (two or three degrees of freedom) that a camera which stands still exceeds once in 10^12 tests."""
+SUSPECTED = 20.0
+"""The same of the quick test, from which the other one is asked: a third of it where half of what is known is new."""
+SLOW = {16: 16, 64: 32}
+"""Numbers of snapshots that are tested without a suspicion, and after how many each: where little was known before."""
+REMAINING = 20.0
+"""What is left of the significance without the snapshot that speaks most for a change: one wrong label is none."""
 LEAST_AGE = 2
 """Snapshots that must agree that something has changed."""
-NEARBY = 3
+NEARBY = 4
 """Snapshots around the most significant one among which the first one after a change is looked for."""
-OLDEST = 64
-"""Snapshots within which a change must show: one second at 60 a second."""
+FALSE_ALARMS = 1e9
+"""Snapshots for one false alarm of misfit, which is then asked whether the object has changed."""
+MOST_MISFIT = 4.0
+"""Standard deviations by which one snapshot counts at most."""
+LEAST_USUAL = 30
+"""Snapshots from which it is known how well they usually fit."""
+OBJECT_ODDS = 30.0
+"""Log odds from which the object has changed where no camera has."""
 DECIDED = 5.0
-"""Log odds of a kind of change against every other, from which it is told."""
-JUDGED = (4, 8, 16, 32, 48, 64)
+"""Log odds of a kind of change against every other, from which it is told ..."""
+ALONE, MIXED = 3.0, 15.0
+"""... against a change of all kinds at once, and of that against each: what is believed wrongly does no harm then."""
+MOST_EXCESS = 4.0
+"""Chi-squared per degree of freedom up to which a snapshot fits that is else refused."""
+JUDGED = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
 """Numbers of snapshots since a change at which its kind is asked for."""
-JUMP = {"rotation": 0.05, "position": 20.0, "focal_length": 30.0, "principal_point": 20.0}
-"""Standard deviations (rad, mm, pixels) of a change of each kind before anything is known of it."""
-DISTORTED = 0.01  # of the distortion, where the kind of change is not known
 
 
 @dataclass(frozen=True)
@@ -39,19 +58,40 @@ class Change:
 
     camera: int
     since: int  # number of the first snapshot, counted from 0, that saw it from its new place
-    kind: str  # of `CHANGES`; "unknown" = not decided yet
+    kind: str  # of `CHANGES`; "unknown" = not decided yet, or none of them alone
     size: float  # rad, mm or pixels; nan where the kind is not known
     sigma: float  # one standard deviation of it
+    decided: bool = False  # the last that will be said of it
 
 
-@dataclass(frozen=True)
-class _Seen:
-    """A snapshot, and what was believed before it."""
+@dataclass
+class _Open:
+    """What was believed before some cameras changed, and what has been seen since, in one chart."""
 
     before: RigBelief
-    observations: Observations
-    rig_from_object: RigidTransform
-    evidence: float  # of nothing having changed with it
+    origin: RigBelief  # of the chart: rig and object where the later snapshots led, when they were last linearized
+    brought: Tensor  # (D, D)
+    weighted: Tensor  # (D,) pull at the origin
+    count: int  # snapshots
+    seconds: float
+    kinds: dict[int, str | None]  # of the cameras that changed; None = not decided
+
+    @property
+    def late(self) -> bool:
+        """Tell whether more snapshots are not worth waiting for."""
+        return self.count >= JUDGED[-1] or self.seconds > YOUNG_SECONDS
+
+    def distance(self, belief: RigBelief) -> Tensor:
+        """Error (D,) in the chart of what was believed at some time.
+
+        Cameras that changed are compared by their own parameters, so that a large change of one kind is of no other.
+        """
+        at = _distance(belief.rig, belief.object_offset, self.origin)
+        change, step = change_of_errors(belief.rig, belief.unit), self.origin.rig.local(belief.rig)
+        width = belief.rig.num_parameters
+        for camera in self.kinds:
+            at[camera * width : (camera + 1) * width] = -(change[camera] @ step[camera])
+        return at
 
 
 class RigMonitor:
@@ -68,12 +108,18 @@ class RigMonitor:
         """Watch over a filter, which is to be updated by this monitor alone from now on."""
         self.filter = rig_filter
         self.open: dict[int, Change] = {}  # changes whose kind is not decided yet, by camera
-        self._recent: deque[_Seen] = deque(maxlen=OLDEST)  # comparable with what is believed now
-        self._before = rig_filter.belief  # what was believed before the first open change ...
-        self._since: list[_Seen] = []  # ... and what has been seen since then
+        self.object_change: ObjectChange | None = None  # that became known with the latest snapshot
+        self._misfit, self._usual = Cusum(1, 1.0, FALSE_ALARMS), deque[float](maxlen=256)
+        self._recent = RecentSnapshots(rig_filter.belief, rig_filter.rate)
+        self._since: _Open | None = None
+        self._suspect: int | None = None  # the camera without which the last snapshot would not have been refused
 
     def update(
-        self, observations: Observations, rig_from_object: RigidTransform, seconds: float = 0.0
+        self,
+        observations: Observations,
+        rig_from_object: RigidTransform,
+        seconds: float = 0.0,
+        moved: Collection[int] = (),
     ) -> tuple[Absorbed, tuple[Change, ...]]:
         """Learn from a snapshot.
 
@@ -81,122 +127,278 @@ class RigMonitor:
             observations: (1, C, N).
             rig_from_object: (1,) first guess of the object's pose.
             seconds: since the update before.
+            moved: cameras that are known to have moved before this snapshot, how far they may.
 
         Returns:
             What was learnt, and the changes that became known with this snapshot: first that there is one, then, once
             that is decided, of which kind it is.
 
         Raises:
-            RefusedError: see `absorbed`.
+            RefusedError: see `absorbed`. What no minimum is found for, but for one camera, is refused once; if the next
+                snapshot says the same, that camera has moved.
         """
-        before = aged(self.filter.belief, seconds, self.filter.rate)
-        result = self.filter.follow(observations, rig_from_object, seconds)
-        seen = _Seen(before, observations, result.rig_from_object, result.evidence)
-        self._recent.append(seen)
-        if self.open:
-            self._since.append(seen)
-        found = self._most_significant()
+        self.object_change = None
+        if moved:
+            return self._moved(moved, observations, rig_from_object, seconds)
+        try:
+            result = self.filter.follow(observations, rig_from_object, seconds)
+        except RefusedError:
+            suspect, self._suspect = self._suspect, self._contradicting(observations, rig_from_object)
+            if suspect is None or suspect != self._suspect:
+                raise
+            return self._moved((suspect,), observations, rig_from_object, seconds)
+        self._suspect = None
+        self._recent.append(result, observations, seconds)
+        if self._since is not None:
+            self._took(self._since, result, seconds)
+        found = self._found()
+        misfit = self._misfitting(result)
+        if found is None and misfit and self._since is None:
+            anew = self._learnt_object(misfit)
+            if anew is not None:
+                return anew, ()
         if found is not None:
-            return self._alarmed(*found)
+            with contextlib.suppress(RefusedError):  # what cannot be learnt anew is tested again with the next snapshot
+                return self._alarmed(found)
         if self.filter.due:
             result = self.filter.relinearize()
-            self._recent.clear()  # beliefs from before have another linearization
-        if self.open and len(self._since) in JUDGED:
-            return self._judged()
+            self._recent.relinearized(result)
+            if self._since is not None:
+                self._since = _opened(result, self._since.before, self._since.seconds, self._since.kinds)
+        if self._since is not None and (self._since.late or self._since.count in JUDGED):
+            return result, self._judged(self._since.late)
         return result, ()
 
-    def _most_significant(self) -> tuple[int, int] | None:
-        """The camera that has surely changed, and before how many snapshots; None = no camera."""
-        count, known = len(self._recent), self.filter.count
-        due = [age for age in (2, 4, 8, 16, 32, 64) if LEAST_AGE <= age <= count and known % (age // 2) == 0]
-        if max((float(self._scores(age).max()) for age in due), default=0.0) < SIGNIFICANT:
-            return None
-        scores = torch.stack([self._scores(age) for age in range(LEAST_AGE, count + 1)])  # (ages, C)
-        age, camera = divmod(int(scores.argmax()), scores.shape[1])
-        return camera, age + LEAST_AGE
+    def _moved(
+        self, cameras: Collection[int], observations: Observations, rig_from_object: RigidTransform, seconds: float
+    ) -> tuple[Absorbed, tuple[Change, ...]]:
+        """Learn from a snapshot before which cameras have moved, it does not matter how far."""
+        told = list(self._judged(last=True))
+        before = aged(self.filter.belief, seconds, self.filter.rate)
+        free: dict[int, str | None] = dict.fromkeys(sorted(cameras))
+        first = _let_free(before, free, JUMPS[-1])
+        result = self.filter.restart(first, [(observations, rig_from_object)])
+        self.filter.count += 1
+        self._recent.began(result, observations, seconds)
+        self._suspect = None
+        return result, (*told, *self._begin(free, result, before, seconds))
 
-    def _scores(self, age: int) -> Tensor:
-        """Largest score of each camera (C,) of any kind, since so many snapshots ago; open changes are known."""
-        return self._worst(self._recent[-age].before, self.filter.belief)
+    def _contradicting(self, observations: Observations, rig_from_object: RigidTransform) -> int | None:
+        """The camera that may have moved where a snapshot is refused; None = no single one."""
+        found: dict[int, float] = {}
+        for camera in observations.seen[0].any(-1).nonzero()[:, 0].tolist():
+            free = _let_free(self.filter.belief, {camera: None}, JUMPS[-1])
+            with contextlib.suppress(RefusedError):
+                result = absorbed(free, observations, rig_from_object, self.filter.options)
+                if result.chi2 <= MOST_EXCESS * max(result.dof, 1):
+                    found[camera] = result.evidence
+        return max(found, key=lambda camera: found[camera], default=None)
 
-    def _worst(self, before: RigBelief, after: RigBelief) -> Tensor:
-        scores = torch.stack(list(change_scores(before, after).values())).amax(0)
-        scores[list(self.open)] = 0.0
-        return scores
+    def _begin(self, free: dict[int, str | None], result: Absorbed, before: RigBelief, seconds: float) -> list[Change]:
+        """Open changes of cameras, and return those that are new."""
+        told, nan = [], float("nan")
+        for camera, kind in free.items():
+            if kind is None and camera not in self.open:
+                number = self.filter.count - len(result.brought)
+                self.open[camera] = Change(camera, number, "unknown", nan, nan)
+                told.append(self.open[camera])
+        self._since = _opened(result, before, seconds, free)
+        return told
 
-    def _alarmed(self, camera: int, age: int) -> tuple[Absorbed, tuple[Change, ...]]:
+    def _found(self) -> int | None:
+        """Before how many snapshots some camera has surely changed; None = none has."""
+        ages = {age for age, every in SLOW.items() if age <= len(self._recent) and self.filter.count % every == 0}
+        screened = self._recent.screened()
+        if screened.max() >= SUSPECTED:
+            ages.add(int(SCREENED[int(screened.max(1).argmax())]))
+        for age in sorted(ages):
+            scores = self._recent.test(age).scores()
+            kind = max(scores, key=lambda name: float(scores[name].max()))
+            camera = int(scores[kind].argmax())
+            if float(scores[kind][camera]) >= SIGNIFICANT and self._recent.steady(age, camera, kind) >= REMAINING:
+                return age
+        return None
+
+    def _alarmed(self, age: int) -> tuple[Absorbed, tuple[Change, ...]]:
         """Let cameras free that have changed, the surest first, until what has been seen since then is explained."""
         told: list[Change] = []
-        if not self.open:
-            age = self._age(camera, age)
-            self._since = list(self._recent)[-age:]
-            self._before = self._since[0].before
-        since = self.filter.count - age
-        while True:
-            self.open[camera] = Change(camera, since, "unknown", float("nan"), float("nan"))
-            told.append(self.open[camera])
-            before = self._let_free({})
-            result = self.filter.restart(before, self._snapshots())
-            self._recent.clear()
-            scores = self._worst(before, result.belief)
-            if float(scores.max()) < SIGNIFICANT:
-                return result, tuple(told)
-            camera = int(scores.argmax())
+        free: dict[int, str | None] = {}
+        since, test = self._since, self._recent.test(age)
+        age = self._age(_surest(test, set()), age)
+        if since is not None and age >= since.count - NEARBY:  # it was then that the open ones changed
+            again = _surest(self._recent.test(age), set()) in since.kinds
+            age = age if again else since.count  # again: the first snapshots were from the old place
+            before, seconds, free = since.before, since.seconds, dict(since.kinds)
+        else:
+            told = list(self._judged(last=True))
+            before, seconds = self._recent.belief_before(age), self._recent.seconds(age)
+        test, known = self._recent.test(age), bool(free)
+        while not free or _worst(test.given(free), set(free)) >= SIGNIFICANT:
+            free[_surest(test.given(free), set(free))] = None
+        snapshots = self._recent.snapshots(age)
+        moved = absorbed(_let_free(before, free), *joined(snapshots), self.filter.options)
+        if not known and (found := changed_object(before, snapshots, self.filter.options, moved.evidence)) is not None:
+            return self._learn_object(*found, snapshots), tuple(told)
+        result = self.filter.restart(_let_free(before, free), snapshots)
+        self._recent.restarted(result, age)
+        return result, (*told, *self._begin(free, result, before, seconds))
+
+    def _misfitting(self, result: Absorbed) -> int:
+        """Number of snapshots that fit worse than is usual; 0 = they fit."""
+        ratio = result.chi2 / max(result.dof, 1)
+        self._usual.append(ratio)
+        step = (ratio / float(np.median(self._usual)) - 1) * math.sqrt(max(result.dof, 1) / 2)
+        risen = self._misfit.update([min(step, MOST_MISFIT)])
+        return int(self._misfit.found[0]) if risen[0] and len(self._usual) >= LEAST_USUAL else 0
+
+    def _learnt_object(self, age: int) -> Absorbed | None:
+        """Learn the object anew where snapshots fit worse because it has changed."""
+        age = min(age, len(self._recent))
+        try:
+            before, snapshots = self._recent.belief_before(age), self._recent.snapshots(age)
+            steady = absorbed(before, *joined(snapshots), self.filter.options)
+        except RefusedError:
+            return None
+        found = changed_object(before, snapshots, self.filter.options, steady.evidence + OBJECT_ODDS)
+        return None if found is None else self._learn_object(*found, snapshots)
+
+    def _learn_object(
+        self, change: ObjectChange, before: RigBelief, snapshots: list[tuple[Observations, RigidTransform]]
+    ) -> Absorbed:
+        """Go on with an object that is not as it was; its shape is learnt from now on."""
+        result = self.filter.restart(before, snapshots)
+        self.object_change = replace(change, since=self.filter.count - len(snapshots))
+        recent = RecentSnapshots(result.belief, self.filter.rate)
+        recent.took(self._recent, result)
+        self._recent = recent
+        return result
 
     def _age(self, camera: int, age: int) -> int:
-        """Number of snapshots since a camera changed, by the evidence of the snapshots before and after."""
-        seen = list(self._recent)
-        oldest = min(age + NEARBY, len(seen))
+        """Number of snapshots since a camera changed, by how probable that is."""
         found: dict[int, float] = {}
-        for candidate in range(max(age - NEARBY, 1), oldest + 1):
-            still, later = seen[len(seen) - oldest : len(seen) - candidate], seen[-candidate:]
-            free = _widened(later[0].before, {camera: None})
-            given = joined([(s.observations, s.rig_from_object) for s in later])
-            with contextlib.suppress(RefusedError):
-                changed = absorbed(free, *given, self.filter.options).evidence
-                found[candidate] = sum(s.evidence for s in still) + changed
-        return max(found, key=lambda candidate: found[candidate], default=age)
 
-    def _judged(self) -> tuple[Absorbed, tuple[Change, ...]]:
+        def ask(candidates: set[int]) -> int:
+            for candidate in candidates - found.keys():
+                if 1 <= candidate <= len(self._recent):
+                    found[candidate] = self._recent.test(candidate, aged=False).odds({camera: None})
+            return max(found, key=lambda candidate: found[candidate])
+
+        best = ask({int(n) for n in SCREENED} | {age, 1})
+        for _ in range(NEARBY):
+            nearest = ask(set(range(best - NEARBY, best + NEARBY + 1)))
+            if nearest == best:
+                break
+            best = nearest
+        return best
+
+    def _took(self, since: _Open, result: Absorbed, seconds: float) -> None:
+        """Add what a snapshot has brought since a change."""
+        brought = result.brought
+        information = brought.information()
+        at = _distance(brought.rig, brought.object_offset, since.origin)
+        since.brought, since.weighted = since.brought + information, since.weighted + brought.pull[0] + information @ at
+        since.count, since.seconds = since.count + 1, since.seconds + seconds
+
+    def _judged(self, last: bool) -> tuple[Change, ...]:
         """Decide what kind of change each open one is, where the snapshots since can tell, or it is time."""
-        told, kinds, given = [], {}, joined(self._snapshots())
+        since = self._since
+        if since is None:
+            return ()
+        test = self._tested(since)
+        told, kinds = [], dict[int, str | None]()
         for camera, change in self.open.items():
-            supposed = {kind: self._let_free({camera: kind}) for kind in CHANGES}
-            found = {kind: absorbed(before, *given, self.filter.options) for kind, before in supposed.items()}
-            best, second = sorted(found, key=lambda kind: -found[kind].evidence)[:2]
-            if found[best].evidence - found[second].evidence >= DECIDED or len(self._since) >= OLDEST:
+            others = {other: kind for other, kind in since.kinds.items() if other != camera}
+            odds = {kind: test.odds({**others, camera: kind}) for kind in (*CHANGES, None)}
+            best, second = sorted(odds, key=lambda kind: -odds[kind])[:2]
+            least = MIXED if best is None else ALONE if second is None else DECIDED
+            if odds[best] - odds[second] >= least:
                 kinds[camera] = best
-                size = self._size(camera, best, supposed[best], found[best].belief)
-                told.append(Change(camera, change.since, best, *size))
-        result = self.filter.restart(self._let_free(kinds), self._snapshots())
-        self._recent.clear()
+            elif last:
+                kinds[camera] = None  # told as what it most probably is, and believed to be anything
+                best = max(CHANGES, key=lambda kind: odds[kind]) if since.late else None
+            else:
+                continue
+            size = (float("nan"), float("nan")) if best is None else _size(test.given(others), camera, best)
+            told.append(Change(camera, change.since, best or "unknown", *size, decided=True))
+        since.kinds.update(kinds)
+        if any(kind is not None for kind in kinds.values()):
+            self._suppose(since, test)
         self.open = {camera: change for camera, change in self.open.items() if camera not in kinds}
-        self._since = self._since if self.open else []
-        return result, tuple(told)
+        if not self.open:
+            self._since = None
+        return tuple(told)
 
-    def _let_free(self, kinds: Mapping[int, str]) -> RigBelief:
-        """What was believed before, the cameras with open changes widened: in all ways where the kind is not given."""
-        return _widened(self._before, {camera: kinds.get(camera) for camera in self.open})
+    def _tested(self, since: _Open) -> ChangeTest:
+        """What the snapshots since the change say against what was believed before it."""
+        before = since.before
+        known = aged(before, since.seconds, self.filter.rate).information
+        pull = since.weighted - since.brought @ since.distance(before)
+        change = change_of_errors(before.rig, before.unit)
+        return ChangeTest.of(known, since.brought, pull, change, pixel_changes(before.rig))
 
-    def _snapshots(self) -> list[tuple[Observations, RigidTransform]]:
-        """All that has been seen since the first open change."""
-        return [(seen.observations, seen.rig_from_object) for seen in self._since]
+    def _suppose(self, since: _Open, test: ChangeTest) -> None:
+        """Believe that cameras have changed in some ways only.
 
-    def _size(self, camera: int, kind: str, let_free: RigBelief, after: RigBelief) -> tuple[float, float]:
-        """How far a camera went, were it of this kind alone, and the standard deviation of that."""
-        change, covariance = jump(self._before, let_free, after, camera, kind)
-        size = float(change.norm())
-        along = change / max(size, 1e-30)
-        return size, float((along @ covariance @ along).clamp_min(0).sqrt())
+        What was believed is moved along with them first: a large turn is no small one times a number.
+        """
+        step = torch.zeros_like(since.before.unit)
+        for camera, kind in since.kinds.items():
+            if kind is not None:
+                others = {other: known for other, known in since.kinds.items() if other != camera}
+                step[camera, CHANGES[kind]] = test.given(others).jump(camera, kind)[0]
+        first = _let_free(replace(since.before, rig=since.before.rig.retract(step)), since.kinds)
+        information = first.information + since.brought
+        factor = torch.linalg.cholesky(information)
+        pull = first.information @ since.distance(first) + since.weighted
+        error = torch.cholesky_solve(pull[:, None], factor)[:, 0]
+        origin, wide = since.origin, first.unit.numel()
+        rig = displaced(origin.rig, error[:wide].view(first.unit.shape) * first.unit)
+        belief = replace(first, rig=rig, object_offset=origin.object_offset + error[wide:], factor=factor)
+        self.filter.suppose(first, aged(belief, since.seconds, self.filter.rate))
+        self._recent.rebased(belief, information)
 
 
-def _widened(belief: RigBelief, cameras: Mapping[int, str | None]) -> RigBelief:
-    """Let cameras have changed in some way; None = in all ways."""
-    variance = torch.zeros(belief.rig.num_cameras, PARAMETERS, dtype=torch.float64)
-    for camera, known in cameras.items():
-        for kind, part in CHANGES.items():
-            if known in (None, kind):
-                variance[camera, part] = JUMP[kind] ** 2
-        if known is None:
-            variance[camera, 10:] = DISTORTED**2
-    return widened(belief, variance)
+def _opened(result: Absorbed, before: RigBelief, seconds: float, kinds: dict[int, str | None]) -> _Open:
+    """Begin to collect what is seen after a change, with the snapshots that were absorbed together."""
+    brought = result.brought
+    origin = replace(result.belief, rig=brought.rig, object_offset=brought.object_offset)
+    return _Open(before, origin, brought.information(), brought.pull.sum(0), len(brought), seconds, kinds)
+
+
+def _distance(rig: CameraRig, object_offset: Tensor, origin: RigBelief) -> Tensor:
+    """Error (D,) of a rig and an object in a chart."""
+    cameras = (error_between(rig, origin.rig) / origin.unit).flatten()
+    return torch.cat((cameras, object_offset - origin.object_offset))
+
+
+def _worst(test: ChangeTest, known: set[int]) -> float:
+    """Largest score of any kind of a camera that is not known to have changed."""
+    return (
+        max(
+            float(scores[camera])
+            for scores in test.scores().values()
+            for camera in range(len(scores))
+            if camera not in known
+        )
+        if len(known) < len(test.pixels)
+        else 0.0
+    )
+
+
+def _surest(test: ChangeTest, known: set[int]) -> int:
+    """The camera whose change, of any kind, is most probable; of those that are not known to have changed."""
+    odds = {camera: test.odds({camera: None}) for camera in range(len(test.pixels)) if camera not in known}
+    return max(odds, key=lambda camera: odds[camera])
+
+
+def _size(test: ChangeTest, camera: int, kind: str) -> tuple[float, float]:
+    """How far a camera went, were it of this kind alone, and the standard deviation of that."""
+    change, covariance = test.jump(camera, kind)
+    size = float(change.norm())
+    along = change / max(size, 1e-30)
+    return size, float((along @ covariance @ along).clamp_min(0).sqrt())
+
+
+def _let_free(belief: RigBelief, changes: Mapping[int, str | None], jump: float = LARGE) -> RigBelief:
+    """Let cameras have changed in some way, None = in all ways, by so many pixels."""
+    return widened(belief, spread_of(changes, pixel_changes(belief.rig), jump).square())

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from imgcal.errors import RefusedError
-from imgcal.geometry import cross_matrix, distort_with_jacobian
-from imgcal.types import PARAMETERS, CameraRig
+from imgcal.geometry import cross_matrix, distort_by_coefficients, distort_with_jacobian
+from imgcal.types import CameraRig
 
 ROUNDS = 3
 """Of weighing the points of the alignment by the error that the alignment before leaves at them."""
@@ -31,18 +31,19 @@ class RigUncertainty:
     """
 
     rig: CameraRig  # C cameras, no batch axes
-    covariance: Tensor  # (15 C, 15 C) before any alignment
+    covariance: Tensor  # (K C, K C) before any alignment
     points: Tensor  # (P, 3) mm, over which is aligned
     px_weight: Tensor  # (C, P) of each pixel in the alignment, 0 where the camera does not see the point
     mm_weight: Tensor  # (P,) of each triangulated point, 0 where fewer than two cameras see it
-    px_covariance: Tensor  # (15 C, 15 C) after the alignment in pixels; nan where too little is seen for one
-    mm_covariance: Tensor  # (15 C, 15 C) after the alignment in mm; nan where cameras share too little for one
+    px_covariance: Tensor  # (K C, K C) after the alignment in pixels; nan where too little is seen for one
+    mm_covariance: Tensor  # (K C, K C) after the alignment in mm; nan where cameras share too little for one
 
     def without(self, cameras: Collection[int]) -> RigUncertainty:
         """Leave cameras out, and align the others anew."""
         kept = [i for i in range(self.rig.num_cameras) if i not in cameras]
-        rows = torch.tensor([PARAMETERS * i + j for i in kept for j in range(PARAMETERS)], device=self.points.device)
-        return rig_uncertainty(self.rig.select(kept), self.covariance[rows[:, None], rows], self.points)
+        width = self.rig.num_parameters
+        rows = torch.tensor([width * i + j for i in kept for j in range(width)], device=self.points.device)
+        return uncertainty_over(self.rig.select(kept), self.covariance[rows[:, None], rows], self.points)
 
     def pixel_error(self, points: Tensor) -> Tensor:
         """Predicted error of each camera's pixel of points: (C, P) px, expected (RMS) length of the difference.
@@ -53,8 +54,8 @@ class RigUncertainty:
         """
         rows = pixel_jacobian(self.rig, points).flatten(1, 2)  # (C, 2 P, 15)
         cameras = self.rig.num_cameras
-        blocks = self.px_covariance.unflatten(0, (cameras, PARAMETERS)).unflatten(-1, (cameras, PARAMETERS))
-        own = blocks.diagonal(dim1=0, dim2=2).permute(2, 0, 1)  # (C, 15, 15)
+        blocks = self.px_covariance.unflatten(0, (cameras, -1)).unflatten(-1, (cameras, -1))
+        own = blocks.diagonal(dim1=0, dim2=2).permute(2, 0, 1)  # (C, K, K)
         variance = ((rows @ own) * rows).sum(-1).unflatten(1, (-1, 2)).sum(-1)
         return variance.clamp_min(0).sqrt()
 
@@ -77,12 +78,12 @@ class RigUncertainty:
         return torch.where(seen.sum(0) >= 2, variance.clamp_min(0).sqrt(), torch.nan)
 
 
-def rig_uncertainty(rig: CameraRig, covariance: Tensor, points: Tensor) -> RigUncertainty:
+def uncertainty_over(rig: CameraRig, covariance: Tensor, points: Tensor) -> RigUncertainty:
     """Remove the gauge from the covariance of a rig's parameters.
 
     Args:
         rig: C cameras, no batch axes.
-        covariance: (15 C, 15 C) of all cameras' parameters, as `estimation.camera_covariance`.
+        covariance: (K C, K C) of all cameras' parameters, as `estimation.camera_covariance`.
         points: (P, 3) mm over which estimated and true rig are laid upon one another.
     """
     seen = rig.project(points).visible
@@ -145,13 +146,13 @@ def _aligned_if_possible(covariance: Tensor, motion: Tensor, metric: Tensor) -> 
 
 
 def rigid_motion(rig: CameraRig, centre: Tensor) -> Tensor:
-    """Change of all parameters with a motion of the whole rig: (15 C, 6), turn about `centre` (rad), then shift (mm).
+    """Change of all parameters with a motion of the whole rig: (K C, 6), turn about `centre` (rad), then shift (mm).
 
     A camera's position moves by w x (position - centre) + t, its left rotation is -R w. A point that moves along
     keeps its pixels.
     """
     turn = rig.cam_from_rig.rotation
-    motion = turn.new_zeros(rig.num_cameras, PARAMETERS, 6)
+    motion = turn.new_zeros(rig.num_cameras, rig.num_parameters, 6)
     motion[:, 0:3, 0:3] = -turn
     motion[:, 3:6, 0:3] = -cross_matrix(rig.positions - centre)
     motion[:, 3:6, 3:6] = torch.eye(3, dtype=turn.dtype, device=turn.device)
@@ -159,7 +160,7 @@ def rigid_motion(rig: CameraRig, centre: Tensor) -> Tensor:
 
 
 def pixel_jacobian(rig: CameraRig, points: Tensor) -> Tensor:
-    """Derivative of the pixels of points by the parameters of their camera: (C, P, 2, 15).
+    """Derivative of the pixels of points by the parameters of their camera: (C, P, 2, K).
 
     Args:
         rig: C cameras, no batch axes.
@@ -170,21 +171,18 @@ def pixel_jacobian(rig: CameraRig, points: Tensor) -> Tensor:
     depth = in_camera[..., 2:]
     xy = in_camera[..., :2] / depth
     x, y = xy.unbind(-1)
-    xd, yd, jxx, jxy, jyy, rr = distort_with_jacobian(x, y, *rig.distortion[:, None].unbind(-1))
+    xd, yd, jxx, jxy, jyy, _ = distort_with_jacobian(x, y, rig.distortion, rig.lens_model)
     focal = rig.focal_length[:, None]
     by_xy = torch.stack((jxx, jxy, jxy, jyy), -1).unflatten(-1, (2, 2)) * focal[..., None]
     by_point = torch.cat((by_xy, -(by_xy @ xy[..., None])), -1) / depth[..., None]  # (C, P, 2, 3) of the camera frame
     along = in_camera[..., None, :].expand_as(by_point)
-    jacobian = by_point.new_zeros(*by_point.shape[:-1], PARAMETERS)
+    jacobian = by_point.new_zeros(*by_point.shape[:-1], rig.num_parameters)
     jacobian[..., 0:3] = torch.linalg.cross(along, by_point)
     jacobian[..., 3:6] = -(by_point @ rotation[:, None])
     jacobian[..., 6:8] = torch.diag_embed(torch.stack((xd, yd), -1))
     jacobian[..., 8:10] = torch.eye(2, dtype=xy.dtype, device=xy.device)
-    by_p1 = torch.stack((2 * x * y, rr + 2 * y * y), -1)
-    by_p2 = torch.stack((rr + 2 * x * x, 2 * x * y), -1)
-    radial = [xy * rr[..., None] ** power for power in (1, 2, 3)]
-    by_distortion = torch.stack((radial[0], radial[1], by_p1, by_p2, radial[2]), -1)
-    jacobian[..., 10:15] = by_distortion * focal[..., None]
+    by_coefficients = torch.stack(distort_by_coefficients(x, y, rig.distortion, rig.lens_model), dim=-2)
+    jacobian[..., 10:] = by_coefficients * focal[..., None]
     return jacobian
 
 
@@ -195,7 +193,7 @@ def _triangulation(rig: CameraRig, points: Tensor, seen: Tensor) -> tuple[Tensor
     the pixels by the parameters, and K by the point.
 
     Returns:
-        (P, 3, 15 C) mm by parameter, without the sign; (P, 3, 3) sum of K^T K, 1 / mm^2 for pixels of unit variance.
+        (P, 3, K C) mm by parameter, without the sign; (P, 3, 3) sum of K^T K, 1 / mm^2 for pixels of unit variance.
     """
     by_camera = pixel_jacobian(rig, points)
     by_point = -by_camera[..., 3:6] * seen[..., None, None]

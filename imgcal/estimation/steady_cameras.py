@@ -17,7 +17,7 @@ from imgcal.estimation.curvature import curvature_covariance
 from imgcal.estimation.map_estimate import Estimate
 from imgcal.estimation.rig_error import error_between, step_by_error
 from imgcal.geometry import RigidTransform, rotation_from_vector
-from imgcal.types import PARAMETERS, CameraRig
+from imgcal.types import CameraRig
 
 EXTRINSICS = 6
 SCALE = (0.01,) * 3 + (10.0,) * 3
@@ -67,22 +67,22 @@ class Gauge:
         return rig
 
     def difference(self, rig: CameraRig, factory: CameraRig) -> Tensor:
-        """Change of every parameter, the motion of the whole rig taken out: (*B, C, 15)."""
+        """Change of every parameter, the motion of the whole rig taken out: (*B, C, K)."""
         return self.laid(rig, factory).local(factory)
 
     def jacobian(self, factory: CameraRig) -> Tensor:
-        """Derivative of the difference by the parameters: (15 C, 15 C)."""
+        """Derivative of the difference by the parameters: (K C, K C)."""
         cameras = factory.num_cameras
         step = step_by_error(factory)[:, :EXTRINSICS, :EXTRINSICS]
         averaging = self._averaging(factory).unflatten(-1, (cameras, EXTRINSICS))  # (6, C, 6)
         common = torch.einsum("cij,jdk,dkl->cidl", step, averaging, torch.linalg.inv(step))
-        jacobian = torch.eye(cameras * PARAMETERS, dtype=torch.float64)
-        blocks = jacobian.unflatten(0, (cameras, PARAMETERS)).unflatten(-1, (cameras, PARAMETERS))
+        jacobian = torch.eye(cameras * factory.num_parameters, dtype=torch.float64)
+        blocks = jacobian.unflatten(0, (cameras, -1)).unflatten(-1, (cameras, -1))
         blocks[:, :EXTRINSICS, :, :EXTRINSICS] -= common
         return jacobian
 
     def std(self, estimate: Estimate) -> Tensor:
-        """One standard deviation of the difference of an estimate, without batch axes, from anything: (C, 15)."""
+        """One standard deviation of the difference of an estimate, without batch axes, from anything: (C, K)."""
         jacobian = self.jacobian(estimate.rig)
         covariance = jacobian @ camera_covariance(estimate, curved=False) @ jacobian.mT
         centre = estimate.rig.reshape(1).map_tensors(lambda tensor, _: tensor.unsqueeze(1))
@@ -92,12 +92,12 @@ class Gauge:
         return self._root(covariance.diagonal())
 
     def prior_std(self, factory: CameraRig, std: Tensor) -> Tensor:
-        """The same before the data, of independent standard deviations (C, 15): (C, 15)."""
+        """The same before the data, of independent standard deviations (C, K): (C, K)."""
         return self._root(self.jacobian(factory).square() @ std.double().flatten().square())
 
     def _root(self, variance: Tensor) -> Tensor:
         """Standard deviations; exactly zero where a camera is the reference."""
-        std = variance.clamp_min(0).sqrt().unflatten(0, (-1, PARAMETERS)).clone()
+        std = variance.clamp_min(0).sqrt().unflatten(0, (len(self.weights), -1)).clone()
         if self.reference is not None:
             std[self.reference, :EXTRINSICS] = 0
         return std
@@ -110,5 +110,5 @@ class Gauge:
 
 
 def _scaled(step: Tensor) -> Tensor:
-    """Extrinsics (..., 6 or 15) in units that count alike: (..., 6)."""
+    """Extrinsics (..., 6 or K) in units that count alike: (..., 6)."""
     return step[..., :EXTRINSICS] / step.new_tensor(SCALE)

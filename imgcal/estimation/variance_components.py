@@ -25,7 +25,7 @@ KINDS = {
     "position": slice(3, 6),
     "focal_length": slice(6, 8),
     "principal_point": slice(8, 10),
-    "distortion": slice(10, 15),
+    "distortion": slice(10, None),
 }
 ROUNDS = 40
 """Of fits at most: noise, outliers, object and prior follow each other, and most captures need three to six."""
@@ -104,7 +104,7 @@ class _Fit:
 
     @cached_property
     def remaining(self) -> NDArray[np.float64]:
-        """Part of each factory value's prior variance that the observations leave: (C, 15)."""
+        """Part of each factory value's prior variance that the observations leave: (C, K)."""
         return np.asarray(remaining_variance(self.solution)[0])
 
     @cached_property
@@ -326,8 +326,8 @@ def _additive_noise(squared: NDArray[np.floating], variance: NDArray[np.floating
 def _too_narrow(offset: NDArray[np.floating], remaining: NDArray[np.float64]) -> dict[str, float]:
     """Kinds of values that have drifted more than their prior allows: factor by which the prior is too narrow.
 
-    The whitened offsets (C, 15) of a kind should have a mean square of one, over as many values as the data determine:
-    those of which they leave little (C, 15) of the prior's variance.
+    The whitened offsets (C, K) of a kind should have a mean square of one, over as many values as the data determine:
+    those of which they leave little (C, K) of the prior's variance.
     """
     factors = {}
     for kind, part in KINDS.items():

@@ -15,7 +15,7 @@ from imgcal.estimation.accuracy import (
     joint_covariance,
     working_volume,
 )
-from imgcal.geometry.projection import undistort
+from imgcal.geometry.lenses import undistort
 from imgcal.synthesis.captures import simulate_truth, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
 from imgcal.types.observations import Observations

@@ -10,7 +10,7 @@ from imgcal.errors import RefusedError
 from imgcal.estimation.pose_support import UndeterminedPosesError, require_poses
 from imgcal.io import load_object, load_rig
 from imgcal.pipeline.calibration import calibrate
-from imgcal.synthesis.captures import simulate_volume, true_detections
+from imgcal.synthesis import simulate_volume, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
 
 STEM = 3  # the fiducial of the wand that does not lie on a line with the others

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from imgcal.errors import RefusedError
-from imgcal.estimation.rig_uncertainty import aligned_covariance, pixel_jacobian, rig_uncertainty, rigid_motion
+from imgcal.estimation.rig_uncertainty import aligned_covariance, pixel_jacobian, rigid_motion, uncertainty_over
 from imgcal.evaluation.true_error import true_error
 from imgcal.geometry.transforms import RigidTransform
 
@@ -57,17 +57,17 @@ def test_a_motion_of_the_whole_rig_does_not_count(rig, points):
     motion = rigid_motion(rig, points.mean(0))
     unknown = covariance + motion @ torch.diag(torch.tensor([1e-4] * 3 + [100.0] * 3, dtype=F64)) @ motion.mT
     seen = torch.ones(3, len(points), dtype=torch.bool)
-    first, second = (rig_uncertainty(rig, c, points) for c in (covariance, unknown))
+    first, second = (uncertainty_over(rig, c, points) for c in (covariance, unknown))
     torch.testing.assert_close(first.pixel_error(points), second.pixel_error(points), rtol=1e-5, atol=0)
     torch.testing.assert_close(first.point_error(points, seen), second.point_error(points, seen), rtol=1e-5, atol=0)
     # What is known of nothing but the gauge is no error at all.
-    gauge = rig_uncertainty(rig, motion @ motion.mT, points)
+    gauge = uncertainty_over(rig, motion @ motion.mT, points)
     assert gauge.pixel_error(points).max() < 1e-4 * (motion @ motion.mT).diagonal().sqrt().max()
 
 
 def test_sampled_rigs_scatter_as_predicted(rig, points):
     covariance, factor = covariance_of(rig)
-    found = rig_uncertainty(rig, covariance, points)
+    found = uncertainty_over(rig, covariance, points)
     held_out = points[:10] + 20
     seen = torch.ones(3, 10, dtype=torch.bool)
     generator = torch.Generator().manual_seed(1)
@@ -88,17 +88,17 @@ def test_sampled_rigs_scatter_as_predicted(rig, points):
 def test_one_bad_camera_does_not_spoil_the_others(o10, points):
     rig = o10.select(range(6))
     covariance, _ = covariance_of(rig, 1e-4)
-    good = rig_uncertainty(rig, covariance, points).pixel_error(points)
+    good = uncertainty_over(rig, covariance, points).pixel_error(points)
     bad = covariance.clone()
     bad[30:45, 30:45] += torch.diag(torch.tensor([1e-2] * 3 + [10.0] * 3 + [20.0] * 4 + [0.01] * 5, dtype=F64)) ** 2
-    error = rig_uncertainty(rig, bad, points).pixel_error(points).median(dim=1).values
+    error = uncertainty_over(rig, bad, points).pixel_error(points).median(dim=1).values
     assert error[2] > 5
     others = [0, 1, 3, 4, 5]
     assert (error[others] < 1.5 * good.median(dim=1).values[others]).all()
 
 
 def test_noise_of_the_pixels_adds_to_triangulated_points(rig, points):
-    found = rig_uncertainty(rig, covariance_of(rig)[0], points)
+    found = uncertainty_over(rig, covariance_of(rig)[0], points)
     seen = torch.ones(3, len(points), dtype=torch.bool)
     alone, with_noise = found.point_error(points, seen), found.point_error(points, seen, 0.5)
     rows = -pixel_jacobian(rig, points[:1])[:, 0, :, 3:6].flatten(0, 1)
@@ -107,7 +107,7 @@ def test_noise_of_the_pixels_adds_to_triangulated_points(rig, points):
 
 
 def test_points_of_one_camera_have_no_place(rig, points):
-    found = rig_uncertainty(rig, covariance_of(rig)[0], points)
+    found = uncertainty_over(rig, covariance_of(rig)[0], points)
     seen = torch.ones(3, len(points), dtype=torch.bool)
     seen[1:, 4] = False
     assert found.point_error(points, seen).isnan().nonzero().squeeze(-1).tolist() == [4]
@@ -116,7 +116,7 @@ def test_points_of_one_camera_have_no_place(rig, points):
 def test_nothing_in_view_says_nothing(rig, points):
     covariance, _ = covariance_of(rig)
     behind = points - torch.tensor([0.0, 0.0, 2000.0], dtype=F64)
-    found = rig_uncertainty(rig, covariance, behind)
+    found = uncertainty_over(rig, covariance, behind)
     assert found.pixel_error(points).isnan().all()
     assert found.point_error(points, torch.ones(3, len(points), dtype=torch.bool)).isnan().all()
     motion = rigid_motion(rig, points.mean(0))

@@ -1,0 +1,100 @@
+"""Has the object changed, not a camera? What is believed, with the object's shape or size let free."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from imgcal.errors import RefusedError
+from imgcal.estimation.map_estimate import EstimationOptions, object_prior_std
+from imgcal.estimation.rig_filter import Absorbed, RigBelief, absorbed, joined
+from imgcal.geometry import RigidTransform
+from imgcal.types import Observations
+
+BENT = 3.0
+"""Millimetres, one standard deviation of each axis: how far a fiducial may be off that is."""
+SCALED = 0.1
+"""The same of the object's scale, relative."""
+
+
+@dataclass(frozen=True)
+class ObjectChange:
+    """What happened to the object."""
+
+    fiducial: int | None  # the one that is somewhere else; None = the object has another scale: it is another one
+    since: int  # number of the first snapshot, counted from 0, that saw it so
+    size: float  # mm that the fiducial went, or the relative change of scale
+    sigma: float  # one standard deviation of it
+    odds: float  # log odds against that cameras have moved
+
+
+def let_object_free(belief: RigBelief, fiducial: int | None) -> RigBelief:
+    """Let a fiducial be off, or, where that is None, the scale."""
+    obj, known, wide = belief.obj, len(belief.object_offset), belief.unit.numel()
+    number = -1 if fiducial is None else fiducial
+    if not known:
+        tolerance = torch.zeros(obj.num_fiducials, dtype=torch.float64)
+        if fiducial is not None:
+            tolerance[fiducial] = BENT
+        obj = replace(obj, tolerance=tolerance, scale_tolerance=SCALED if fiducial is None else 0.0)
+        size = 3 * obj.num_fiducials + 1
+        factor = torch.eye(wide + size, dtype=torch.float64)
+        factor[:wide, :wide] = belief.factor
+        return replace(belief, obj=obj, object_offset=belief.object_offset.new_zeros(size), factor=factor)
+    std = object_prior_std(obj)
+    rows = torch.arange(known)[slice(-1, None) if fiducial is None else slice(3 * number, 3 * number + 3)]
+    spread = torch.zeros(wide + known, dtype=torch.float64)
+    spread[wide + rows] = (SCALED if fiducial is None else BENT) / std[rows].clamp_min(1e-6)
+    covariance = torch.cholesky_inverse(belief.factor) + spread.square().diag()
+    return replace(belief, factor=torch.linalg.cholesky(torch.cholesky_inverse(torch.linalg.cholesky(covariance))))
+
+
+def changed_object(
+    before: RigBelief,
+    snapshots: Sequence[tuple[Observations, RigidTransform]],
+    options: EstimationOptions,
+    cameras: float,
+) -> tuple[ObjectChange, RigBelief] | None:
+    """Ask whether a change of the object explains some snapshots better than cameras that moved.
+
+    Args:
+        before: what was believed before them.
+        snapshots: observations (1, C, N) and the object's pose (1,) of each.
+        options: how to minimize.
+        cameras: evidence of the cameras' having moved; see `Absorbed`.
+
+    Returns:
+        The most probable change, its `since` being zero, and what was believed before with that let free; None =
+        cameras have moved.
+    """
+    given = joined(list(snapshots))
+    seen = given[0].seen.any(0).any(0)
+    best: tuple[float, int | None, Absorbed] | None = None
+    for fiducial in (None, *seen.nonzero()[:, 0].tolist()):
+        try:
+            result = absorbed(let_object_free(before, fiducial), *given, options)
+        except RefusedError:
+            continue
+        if best is None or result.evidence > best[0]:
+            best = result.evidence, fiducial, result
+    if best is None or best[0] <= cameras:
+        return None
+    evidence, fiducial, result = best
+    size, sigma = _size(before, result.belief, fiducial)
+    return ObjectChange(fiducial, 0, size, sigma, evidence - cameras), result.before
+
+
+def _size(before: RigBelief, after: RigBelief, fiducial: int | None) -> tuple[float, float]:
+    """How far it went, and the standard deviation of that."""
+    std = object_prior_std(after.obj)
+    rows = torch.tensor([len(std) - 1]) if fiducial is None else 3 * fiducial + torch.arange(3)
+    was = before.object_offset if len(before.object_offset) else torch.zeros_like(std)
+    change: Tensor = ((after.object_offset - was) * std)[rows]
+    wide = after.unit.numel()
+    covariance = torch.cholesky_inverse(after.factor)[wide:, wide:][rows[:, None], rows] * std[rows] * std[rows, None]
+    size = float(change.norm())
+    along = change / max(size, 1e-30)
+    return (float(change[0]) if fiducial is None else size), float((along @ covariance @ along).clamp_min(0).sqrt())

@@ -1,0 +1,290 @@
+"""The latest snapshots that a filter has absorbed, in a form that tells quickly whether a camera has changed since.
+
+All of them stand in one chart: errors of the rig in units, whose origin does not matter. What was known before any of
+them is what was known before the first one and what those between brought; when the filter has aged its belief, a new
+such base begins.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.errors import RefusedError
+from imgcal.estimation.brought import Brought, add_blocks
+from imgcal.estimation.recent_screening import add_error, screen
+from imgcal.estimation.rig_changes import CHANGES, ChangeTest, change_of_errors, pixel_changes
+from imgcal.estimation.rig_error import displaced
+from imgcal.estimation.rig_filter import Absorbed, RigBelief, error_covariance
+from imgcal.geometry import RigidTransform
+from imgcal.types import CameraRig, DriftRate, Observations
+
+OLDEST = 64
+"""Snapshots within which a change must show: one second at 60 a second."""
+MOST_BASES = 8
+"""How often the belief may have aged within them."""
+SCREENED = np.array((2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64))
+"""Numbers of snapshots that are screened."""
+PARTS = np.array([(part.start, part.stop) for part in CHANGES.values()])
+
+
+@dataclass
+class _Base:
+    """What was known before a snapshot."""
+
+    number: int  # of the snapshot
+    information: Tensor  # (D, D)
+    weighted: Tensor  # (D,) information times the error of what was most probable
+
+
+@dataclass(frozen=True)
+class _Seen:
+    observations: Observations
+    rig_from_object: RigidTransform
+    seconds: float  # since the snapshot before
+
+
+class RecentSnapshots:
+    """A ring of the latest `OLDEST` snapshots."""
+
+    def __init__(self, belief: RigBelief, rate: DriftRate) -> None:
+        """Begin with none.
+
+        Args:
+            belief: of the filter.
+            rate: at which it ages.
+        """
+        (cameras, free), wide = belief.unit.shape, len(belief.factor)
+        self._rate, self._belief = rate, belief
+        self._unit = belief.unit.numpy()
+        self._camera = np.zeros((OLDEST, cameras, free, free))
+        self._own = np.zeros_like(self._camera)  # the same, what the poses take away included
+        self._carried = np.zeros((OLDEST, 6, wide))
+        self._border = np.zeros((OLDEST, wide - cameras * free, wide))
+        self._weighted = np.zeros((OLDEST, wide))  # pull, as it would be at the chart's origin
+        self._pixels = pixel_changes(belief.rig)
+        self._begin(belief.rig, belief.object_offset)
+
+    def _begin(self, rig: CameraRig, object_offset: Tensor) -> None:
+        """Begin with none, the chart's origin at a rig."""
+        self._seen: deque[_Seen] = deque()
+        self._bases: list[_Base] = []
+        self._next = 0  # number of the next snapshot
+        self._aged = True  # the next snapshot needs a base
+        self._rig = _arrays(rig)  # the last one of which the error was asked for ...
+        self._at = np.zeros_like(self._weighted[0])  # ... and that error
+        self._at[self._unit.size :] = object_offset.numpy()
+        self._change = change_of_errors(rig, torch.from_numpy(self._unit))
+
+    def __len__(self) -> int:
+        return len(self._seen)
+
+    def append(self, result: Absorbed, observations: Observations, seconds: float) -> None:
+        """Take a snapshot that has just been absorbed.
+
+        Args:
+            result: of the filter.
+            observations: (1, C, N).
+            seconds: since the snapshot before.
+        """
+        while len(self._seen) >= OLDEST or len(self._bases) >= MOST_BASES:
+            self._drop()
+        if self._aged or self._belief is not result.before:
+            before = self._error(result.before.rig, result.before.object_offset)
+            information = result.before.information
+            self._bases.append(_Base(self._next, information, information @ before))
+            self._change = change_of_errors(result.before.rig, result.before.unit)
+        self._put(result.brought, self._error(result.brought.rig, result.brought.object_offset))
+        self._seen.append(_Seen(observations, result.rig_from_object, seconds))
+        self._follow(result.belief)
+        self._aged = False
+
+    def relinearized(self, result: Absorbed) -> None:
+        """Take the same snapshots, and any number before them, as they are where they lead together."""
+        brought, before, seen = result.brought, result.before, self._seen
+        self._begin(brought.rig, brought.object_offset)
+        origin = torch.from_numpy(self._at.copy())
+        information = before.information
+        weighted = information @ (origin + brought.distance_from(before.rig, before.object_offset))
+        first = len(brought) - len(seen)
+        if first:
+            earlier = brought.select(slice(0, first))
+            gained = earlier.information()
+            information, weighted = information + gained, weighted + earlier.pull.sum(0) + gained @ origin
+        self._bases = [_Base(0, information, weighted)]
+        for s, entry in enumerate(seen):
+            self._put(brought.select(slice(first + s, first + s + 1)), origin)
+            self._seen.append(entry)
+        self._follow(result.belief)
+
+    def restarted(self, result: Absorbed, last: int) -> None:
+        """Forget all but the last snapshots, which were absorbed together."""
+        while len(self._seen) > last:
+            self._seen.popleft()
+        self.relinearized(result)
+
+    def began(self, result: Absorbed, observations: Observations, seconds: float) -> None:
+        """Forget all snapshots, and take one that another belief than the last one has absorbed."""
+        self._seen = deque((_Seen(observations, result.rig_from_object, seconds),))
+        self.relinearized(result)
+
+    def took(self, other: RecentSnapshots, result: Absorbed) -> None:
+        """Take over the last snapshots of another ring, which were absorbed together."""
+        self._seen = deque(list(other._seen)[-len(result.brought) :])
+        self.relinearized(result)
+
+    def rebased(self, belief: RigBelief, information: Tensor) -> None:
+        """Believe something else, of which these snapshots brought a part.
+
+        Args:
+            belief: what is believed now.
+            information: (D, D) of it, before it was aged.
+        """
+        at = self._follow(belief)
+        brought, weighted = self._sums(0, self._next)
+        self._bases = [_Base(self._next - len(self), information - brought, information @ at - weighted)]
+        self._aged = True
+
+    def snapshots(self, age: int) -> list[tuple[Observations, RigidTransform]]:
+        """The latest `age` ones."""
+        return [(entry.observations, entry.rig_from_object) for entry in list(self._seen)[-age:]]
+
+    def seconds(self, age: int) -> float:
+        """How long ago the snapshot before the latest `age` ones was."""
+        return sum(entry.seconds for entry in list(self._seen)[-age:])
+
+    def screened(self) -> NDArray[np.float64]:
+        """Score each camera since each of `SCREENED`: (ages, C); see `screen`."""
+        order = (self._next - 1 - np.arange(len(self))) % OLDEST
+        scores = np.empty((len(SCREENED), len(self._change)))
+        parts = (self._camera, self._own, self._carried, self._border, self._weighted)
+        screen(*parts, order, self._at, self._change.numpy(), PARTS, SCREENED, scores)
+        return scores
+
+    def test(self, age: int, aged: bool = True) -> ChangeTest:
+        """Test for changes before the latest `age` snapshots.
+
+        Args:
+            age: how many.
+            aged: all that the rig may have wandered since then may have happened then.
+
+        Raises:
+            RefusedError: nothing is known of the rig.
+        """
+        number = self._next - age
+        information, at = self._known(number)
+        brought, weighted = self._sums(number, self._next)
+        pull = weighted - brought @ at
+        variance = self._rate.std(self._belief.rig).square() * (self.seconds(age) / 3600)
+        if aged and bool(variance.any()):
+            covariance = torch.cholesky_inverse(_cholesky(information))
+            add_blocks(covariance, error_covariance(self._belief, variance))
+            information = torch.cholesky_inverse(_cholesky(covariance))
+        return ChangeTest.of(information, brought, pull, self._change, self._pixels)
+
+    def steady(self, age: int, camera: int, kind: str) -> float:
+        """Score of a change of a camera, all else taken to be known, without the snapshot that speaks most for it."""
+        number, part = self._next - age, CHANGES[kind]
+        _, at = self._known(number)
+        own, pull = [], []
+        row = slice(camera * self._unit.shape[1], (camera + 1) * self._unit.shape[1])
+        change = self._change[camera, :, part]
+        for k in range(number, self._next):
+            brought, weighted = self._sums(k, k + 1)
+            pull.append(change.mT @ (weighted - brought @ at)[row])
+            own.append(change.mT @ brought[row, row] @ change)
+        pulls, blocks = torch.stack(pull), torch.stack(own)
+        left, weight = pulls.sum(0) - pulls, blocks.sum(0) - blocks
+        weight = weight + 1e-9 * torch.diag_embed(blocks.sum(0).diagonal()).clamp_min(1e-30)
+        return float((left * torch.linalg.solve(weight, left[..., None])[..., 0]).sum(-1).min())
+
+    def belief_before(self, age: int) -> RigBelief:
+        """What was believed before the latest `age` snapshots.
+
+        Raises:
+            RefusedError: nothing was known of the rig.
+        """
+        information, at = self._known(self._next - age)
+        wide = self._unit.size
+        error = (at - torch.from_numpy(self._at))[:wide].view(self._unit.shape)
+        rig = displaced(self._belief.rig, error * self._belief.unit)
+        return replace(self._belief, rig=rig, object_offset=at[wide:], factor=_cholesky(information))
+
+    def _known(self, number: int) -> tuple[Tensor, Tensor]:
+        """Information (D, D) before a snapshot, and what was most probable (D,)."""
+        base = next(base for base in reversed(self._bases) if base.number <= number)
+        brought, weighted = self._sums(base.number, number)
+        information, weighted = base.information + brought, base.weighted + weighted
+        factor = _cholesky(information)
+        return information, torch.cholesky_solve(weighted[:, None], factor)[:, 0]
+
+    def _sums(self, first: int, last: int) -> tuple[Tensor, Tensor]:
+        """Information (D, D) and weighted errors (D,) of some snapshots."""
+        first = max(first, self._next - len(self))
+        rows = np.arange(first, last) % OLDEST
+        carried = torch.from_numpy(self._carried[rows].reshape(-1, self._at.size))
+        information = -(carried.mT @ carried)
+        add_blocks(information, torch.from_numpy(self._camera[rows].sum(0)))
+        wide = self._unit.size
+        if self._border.shape[1]:
+            border = torch.from_numpy(self._border[rows].sum(0))
+            information[wide:] += border
+            information[:wide, wide:] += border[:, :wide].mT
+        return information, torch.from_numpy(self._weighted[rows].sum(0))
+
+    def _put(self, brought: Brought, at: Tensor) -> None:
+        """Write the numbers of one snapshot, linearized at an error, into the ring."""
+        row = self._next % OLDEST
+        camera, carried, border = brought.camera[0].numpy(), brought.carried[0].numpy(), brought.border[0].numpy()
+        wide, error = self._unit.size, at.numpy()
+        taken = carried[:, :wide].reshape(6, *self._unit.shape)
+        self._camera[row], self._carried[row], self._border[row] = camera, carried, border
+        self._own[row] = camera - np.einsum("qci,qcj->cij", taken, taken)
+        weighted = brought.pull[0].numpy() - carried.T @ (carried @ error)
+        weighted[:wide] += np.einsum("cij,cj->ci", camera, error[:wide].reshape(self._unit.shape)).ravel()
+        weighted[:wide] += border[:, :wide].T @ error[wide:]
+        weighted[wide:] += border @ error
+        self._weighted[row] = weighted
+        self._next += 1
+
+    def _drop(self) -> None:
+        """Forget the oldest snapshot: it becomes part of what was known before."""
+        base = self._bases[0]
+        if len(self._bases) > 1 and self._bases[1].number == base.number + 1:
+            self._bases.pop(0)
+        else:
+            brought, weighted = self._sums(base.number, base.number + 1)
+            self._bases[0] = _Base(base.number + 1, base.information + brought, base.weighted + weighted)
+        self._seen.popleft()
+
+    def _follow(self, belief: RigBelief) -> Tensor:
+        """Remember what is believed now, and return its error."""
+        self._belief = belief
+        return self._error(belief.rig, belief.object_offset)
+
+    def _error(self, rig: CameraRig, object_offset: Tensor) -> Tensor:
+        """Error (D,) of a rig in the chart."""
+        arrays, wide = _arrays(rig), self._unit.size
+        add_error(*arrays, *self._rig, self._unit, self._at[:wide].reshape(self._unit.shape))  # type: ignore[call-arg]
+        self._rig = arrays
+        self._at[wide:] = object_offset.numpy()
+        return torch.from_numpy(self._at.copy())
+
+
+def _arrays(rig: CameraRig) -> tuple[NDArray[np.float64], ...]:
+    """Rotation (C, 3, 3), translation (C, 3) and lens (C, 9) of a rig."""
+    lens = torch.cat((rig.focal_length, rig.principal_point, rig.distortion), dim=-1)
+    parts = (rig.cam_from_rig.rotation, rig.cam_from_rig.translation, lens)
+    return tuple(part.contiguous().numpy() for part in parts)
+
+
+def _cholesky(matrix: Tensor) -> Tensor:
+    factor, failed = torch.linalg.cholesky_ex(matrix)
+    if bool(failed):
+        raise RefusedError("estimation: these observations leave a rig that nothing is known of")
+    return factor

@@ -1,0 +1,40 @@
+"""The object changes while the rig stands still: no camera is blamed, and the new shape is learnt."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+import imgcal
+from imgcal.estimation import RigFilter, RigMonitor
+from imgcal.synthesis import PhysicalDrift, simulate_truth
+from imgcal.types import Observations
+
+NOISE = 0.1
+
+
+@pytest.mark.parametrize("fiducial", [2, None])
+@pytest.mark.parametrize("tolerance", [0.0, 0.02])
+def test_a_change_of_the_object_is_told_and_learnt(fiducial: int | None, tolerance: float) -> None:
+    factory, obj, generator = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), torch.Generator().manual_seed(3)
+    if tolerance:
+        obj = replace(obj, tolerance=torch.full((8,), tolerance, dtype=torch.float64), scale_tolerance=1e-4)
+    truth = simulate_truth(factory, obj, 60, generator, PhysicalDrift())
+    monitor, points, told, found = RigMonitor(RigFilter(factory, obj)), obj.points.clone(), [], None
+    for s in range(60):
+        if s == 45 and fiducial is not None:
+            points[fiducial] += torch.tensor([0.6, -0.5, 0.6])
+        elif s == 45:
+            points = points.mean(0) + 1.01 * (points - points.mean(0))
+        image = truth.rig.expand(1).project(truth.rig_from_object[s : s + 1].apply(points))
+        uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
+        there = Observations(uv, torch.full(uv.shape[:-1], NOISE, dtype=torch.float64), image.visible)
+        _, changes = monitor.update(there, truth.rig_from_object[s : s + 1], 1 / 60)
+        told += changes
+        found = monitor.object_change or found
+    assert told == []
+    assert found is not None
+    assert (found.fiducial, found.since) == (fiducial, 45)
+    assert abs(found.size - (0.01 if fiducial is None else 0.985)) < 5 * found.sigma
+    off = monitor.filter.belief.points_object - points
+    assert float((off - off.mean(0)).norm(dim=-1).max()) < 0.1

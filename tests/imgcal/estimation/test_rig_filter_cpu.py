@@ -1,0 +1,74 @@
+"""The compiled loop against the same in tensors."""
+
+from dataclasses import fields, replace
+
+import pytest
+import torch
+
+import imgcal
+from imgcal.errors import RefusedError
+from imgcal.estimation import Absorbed, EstimationOptions, RigBelief, absorbed, error_between
+from imgcal.estimation.rig_filter import absorbed_in_tensors
+from imgcal.synthesis import PhysicalDrift, simulate_truth
+from imgcal.types import Observations
+
+NOISE = 0.1
+
+
+def scene(loose: bool, radius: bool, count: int = 5):
+    """A belief, snapshots, and poses that are a little off."""
+    factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+    if loose:
+        obj = replace(obj, tolerance=torch.full((8,), 0.3, dtype=torch.float64), scale_tolerance=1e-3)
+    if radius:
+        obj = replace(obj, radius=torch.full((8,), 8.0, dtype=torch.float64))
+    generator = torch.Generator().manual_seed(5)
+    truth = simulate_truth(factory, obj, count, generator, PhysicalDrift())
+    uv = truth.uv + NOISE * torch.randn(truth.uv.shape, generator=generator, dtype=torch.float64)
+    uv[0, 1, 2] += 30.0  # a wrong label
+    seen = torch.rand(uv.shape[:-1], generator=generator) > 0.1
+    observations = Observations(uv, torch.full(seen.shape, NOISE, dtype=torch.float64), seen)
+    return RigBelief.of_prior(factory, obj), observations, truth.rig_from_object
+
+
+def same(first: Absorbed, second: Absorbed) -> None:
+    unit = first.before.unit
+    assert float((error_between(first.belief.rig, second.belief.rig) / unit).abs().max()) < 1e-4
+    torch.testing.assert_close(first.belief.object_offset, second.belief.object_offset, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(first.belief.information, second.belief.information, rtol=1e-3, atol=1e-2)
+    assert torch.equal(first.belief.factor, first.belief.factor.tril())
+    torch.testing.assert_close(first.belief.factor @ first.belief.factor.mT, first.belief.information)
+    for name in ("chi2", "dof", "evidence"):
+        assert getattr(first, name) == pytest.approx(getattr(second, name), rel=1e-3, abs=1e-2)
+    torch.testing.assert_close(first.residual, second.residual, rtol=0, atol=1e-3)
+    torch.testing.assert_close(first.rig_from_object.rotation, second.rig_from_object.rotation, rtol=0, atol=1e-6)
+    torch.testing.assert_close(first.rig_from_object.translation, second.rig_from_object.translation, rtol=0, atol=1e-3)
+    brought, other = first.brought, second.brought
+    assert float((error_between(brought.rig, other.rig) / unit).abs().max()) < 1e-4
+    for entry in fields(brought):
+        if entry.name in ("camera", "border", "carried", "pull"):
+            found, expected = getattr(brought, entry.name), getattr(other, entry.name)
+            scale = float(expected.abs().max()) if expected.numel() else 1.0
+            torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4 * scale)
+
+
+@pytest.mark.parametrize("loose", [False, True])
+@pytest.mark.parametrize("radius", [False, True])
+@pytest.mark.parametrize("loss", ["squared", "huber"])
+def test_both_find_the_same(loose: bool, radius: bool, loss) -> None:
+    belief, observations, poses = scene(loose, radius)
+    options = EstimationOptions(loss=loss)
+    first, second = (function(belief, observations, poses, options) for function in (absorbed, absorbed_in_tensors))
+    same(first, second)
+    later = tuple(x[:1] for x in (observations.uv, observations.sigma, observations.seen))
+    again = (first.belief, Observations(*later), first.rig_from_object[:1], options)
+    same(absorbed(*again), absorbed_in_tensors(*again))
+
+
+def test_both_refuse_a_snapshot_without_a_pose() -> None:
+    belief, observations, poses = scene(False, False, 2)
+    few = observations.seen.clone()
+    few[1] = False
+    for function in (absorbed, absorbed_in_tensors):
+        with pytest.raises(RefusedError, match="do not determine the object's pose"):
+            function(belief, replace(observations, seen=few), poses)
