@@ -1,8 +1,28 @@
+from .clock import ClockOffsets
+from .events import EVENT_KINDS, ChangeKind, Event, EventKind
+from .foreign_object import ForeignObject
+from .image_quality import ImageQuality
+from .keeper import RigKeeper
+from .keeper_file import KeeperFile
 from .recalibrator import Recalibrator
+from .rig_state import CameraHealth, RigState
+from .sequential_test import SequentialTest
 from .warmup import warm_up, warm_up_fits
 
 __all__ = [
+    "EVENT_KINDS",
+    "CameraHealth",
+    "ChangeKind",
+    "ClockOffsets",
+    "Event",
+    "EventKind",
+    "ForeignObject",
+    "ImageQuality",
+    "KeeperFile",
     "Recalibrator",
+    "RigKeeper",
+    "RigState",
+    "SequentialTest",
     "warm_up",
     "warm_up_fits",
 ]

@@ -63,7 +63,8 @@ def without_strays(
     """
     seen = to_observations(blobs, rig, obj)
     even = replace(seen, sigma=torch.full_like(seen.sigma, options.identity_error))
-    held, robust = torch.zeros(rig.num_cameras, 15, dtype=seen.uv.dtype), replace(options.estimation, loss="cauchy")
+    held = torch.zeros(rig.num_cameras, rig.num_parameters, dtype=seen.uv.dtype)
+    robust = replace(options.estimation, loss="cauchy")
     fit = estimate(even, rig, obj, pose.reshape(1), prior_std=held, options=robust)
     distance = fit.residual[0].norm(dim=-1)  # (C, N)
     usual = distance[seen.seen[0]].median() if bool(seen.seen.any()) else torch.inf

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections import deque
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from types import TracebackType
 from typing import Literal
@@ -15,8 +13,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imgcal.association import PipelineOptions, Proposer, Sight, SnapshotIdentity, Tracker, lattice_shifts
-from imgcal.detection import DetectionOptions, Frame, detect_snapshot, to_detections
+from imgcal.association import PipelineOptions, Proposer, SnapshotIdentity
+from imgcal.detection import DetectionOptions, Frame
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import aligned, flat_std
 from imgcal.geometry import RigidTransform
@@ -31,21 +29,15 @@ from imgcal.online.following import (
     widened,
     without_strays,
 )
+from imgcal.online.labelling import LEAST_FOLLOWED, NEAR, Labelling
 from imgcal.online.motion import measured_move
 from imgcal.online.resection import resected
 from imgcal.online.window import RELEARNT, SIGNIFICANT, Kept, Usual, Window, WindowFit
-from imgcal.pipeline import Calibration, DetectorName, checked_detections, checked_frames, proposer_of
+from imgcal.pipeline import Calibration, DetectorName, checked_frames
 from imgcal.types import CalibrationObject, CameraRig, Detections, MovedCamera, RigPrior
 
-MOST_FOLLOWED = 64
-"""Fiducials of a lattice up to which a snapshot may be labelled by the last prediction alone; a larger one could have
-slipped by a pitch unnoticed."""
-LEAST_FOLLOWED = 0.9
-"""Share of the last snapshot's labels that must be found again, and fit."""
 REMEMBERED = 8
 """Latest snapshots that are compared with a new one which does not fit, however small the window."""
-
-NEAR = "near the last prediction"
 
 CameraState = Literal["seen", "recent", "kept", "factory", "astray"]
 
@@ -118,7 +110,7 @@ class Recalibrator:
         rig = rig.to(torch.float64)
         self.rig, self.obj, self.detection, self.window = rig, obj, detection, window
         self.options = replace(options, blind_cameras=True)
-        self._tracker = Tracker(rig, obj, self.options, remembered=0)
+        self._labelling = Labelling(rig, obj, self.options, detection, detector)
         self._fit = WindowFit(rig, obj, self.options, window)
         self._recent: deque[Kept] = deque(maxlen=max(window, REMEMBERED))
         self._prior_std = (rig.prior or RigPrior()).std(rig)
@@ -126,17 +118,10 @@ class Recalibrator:
         self._fitted: Calibration | None = None  # the same without what is kept of cameras that are not in the window
         self._last: dict[int, _Last] = {}
         self._lost: dict[int, tuple[int, int]] = {}  # camera -> when it went astray, how often since
-        self._follows = False  # the last snapshot says where the object is now
         self._spare: deque[NDArray[np.int64]] = deque(maxlen=15)
         self._tests: deque[float] = deque(maxlen=200)
         self._additive_noises: deque[float] = deque(maxlen=10)
-        self._count = self._refused = 0
-        self._proposer: Proposer | None = None
-        self._where_blobs_fail = True
-        if detector != "classical":
-            self._proposer, self._where_blobs_fail = proposer_of(detector)
-        self._slips = obj.num_fiducials > MOST_FOLLOWED and bool(lattice_shifts(obj))
-        self._pool = ThreadPoolExecutor(min(rig.num_cameras, os.cpu_count() or 1))
+        self._count = 0
 
     def __enter__(self) -> Recalibrator:
         """Return itself."""
@@ -146,7 +131,7 @@ class Recalibrator:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """End the threads."""
-        self._pool.shutdown()
+        self._labelling.close()
 
     def update(self, source: Mapping[str, Frame | None] | Detections) -> LiveCalibration:
         """Recalibrate from a new snapshot.
@@ -164,32 +149,22 @@ class Recalibrator:
         """
         name = f"{self._count:05d}"
         self._count += 1
-        detections = self._blobs(source, name)
+        source = source if isinstance(source, Detections) else checked_frames(source, self._labelling.rig)
+        detections = self._labelling.blobs(source, name)
         usable = detections.select(detections.usable)
         coded = usable.fiducial.copy() if (usable.fiducial >= 0).any() else None
         followed = self._follow(usable, name) if coded is None else None
         if followed is not None:
             return followed
-        self._follows = False
         frames = None if isinstance(source, Detections) or coded is not None else source
-        return self._concluded(*self._decided(usable, name, coded, frames))
+        return self._concluded(*self._labelling.decided(usable, name, coded, frames, self._known()))
 
-    def _blobs(self, source: Mapping[str, Frame | None] | Detections, name: str) -> Detections:
-        if isinstance(source, Detections):
-            if len(source.snapshot_names) != 1:
-                raise InputError(f"detections: found {len(source.snapshot_names)} snapshots, expected one")
-            if len(np.unique(source.snapshot)) <= 1:  # its number in a longer table does not matter
-                source = replace(source, snapshot=np.zeros_like(source.snapshot))
-            return replace(checked_detections(source, self.rig, self.obj), snapshot_names=(name,))
-        given = checked_frames(source, self.rig)
-        frames: dict[str, Frame | None] = {}
-        for camera in self.rig.camera_names:
-            frame = given.get(camera)
-            if isinstance(frame, Sequence):
-                raise InputError(f"camera {camera}: found {len(frame)} frames, expected one of this moment, or None")
-            frames[camera] = frame
-        blobs = detect_snapshot(frames, self.detection, pool=self._pool)
-        return to_detections([blobs], self.rig.camera_names, (name,))
+    def _known(self) -> tuple[CameraRig, Tensor] | None:
+        """The rig, and with some reserve how well it is known; None = nothing but the factory calibration."""
+        if self._latest is None:
+            return None
+        prior = (self.rig.prior or RigPrior()).std(self.rig)
+        return self._latest.rig, torch.minimum(2 * flat_std(self._latest.estimate), prior)
 
     def _follow(self, blobs: Detections, name: str) -> LiveCalibration | None:
         """Label blobs by the last result's prediction, where the object has moved little; None = not to be trusted.
@@ -197,7 +172,7 @@ class Recalibrator:
         What is accepted here has been fitted: as many labels as before, hardly any of them an outlier.
         """
         latest = self._latest
-        if latest is None or not self._follows or self._slips:
+        if latest is None or not self._labelling.follows or self._labelling.slips:
             return None
         points = latest.rig_from_object[-1:].apply(latest.points_object)
         predicted = latest.rig.expand(1).project_values(points, self.obj.radius).uv[0].numpy()  # (C, N, 2)
@@ -211,46 +186,6 @@ class Recalibrator:
             return self._concluded(blobs, snapshot, least=LEAST_FOLLOWED * before)
         except RefusedError:
             return None
-
-    def _decided(
-        self,
-        usable: Detections,
-        name: str,
-        coded: NDArray[np.int64] | None,
-        frames: Mapping[str, Frame | None] | None,
-    ) -> tuple[Detections, SnapshotIdentity]:
-        """Label a snapshot by itself, with what is known of the rig."""
-        prior, tracker = (self.rig.prior or RigPrior()).std(self.rig), self._tracker
-        tracker.rig, tracker.prior_std = self.rig, prior
-        if self._latest is not None:
-            tracker.rig, tracker.prior_std = self._latest.rig, torch.minimum(2 * flat_std(self._latest.estimate), prior)
-        if self._proposer is not None and frames is not None and not self._where_blobs_fail:
-            return self._looked(self._proposer, usable, name, frames)
-        snapshot, labels = tracker.decide(usable, name) if coded is None else tracker.accept(name, coded)
-        if snapshot.status == "refused" and self._proposer is not None and frames is not None:
-            return self._looked(self._proposer, usable, name, frames)
-        again = self._latest is not None and self._refused & (self._refused - 1) == 0
-        if snapshot.status == "refused" and coded is None and again:
-            # What was known may hold no more. Another try is dear: after 1, 2, 4, 8, ... refusals in a row.
-            tracker.rig, tracker.prior_std = self.rig, prior
-            snapshot, labels = tracker.decide(usable, name)
-        if snapshot.status == "refused":
-            self._refused += 1
-            raise RefusedError(f"identity: {snapshot.reason}")
-        self._refused = 0
-        return replace(usable, fiducial=labels), snapshot
-
-    def _looked(
-        self, proposer: Proposer, blobs: Detections, name: str, frames: Mapping[str, Frame | None]
-    ) -> tuple[Detections, SnapshotIdentity]:
-        """Label a snapshot by what a proposer sees in its frames."""
-        sight = Sight(proposer, lambda _: frames, self._where_blobs_fail, self.detection)
-        snapshot, labels, found = self._tracker.look(sight, 0, blobs, name)
-        if snapshot.status == "refused":
-            self._refused += 1
-            raise RefusedError(f"identity: {snapshot.reason}")
-        self._refused = 0
-        return replace(found, fiducial=labels), snapshot
 
     def _usual(self) -> Usual:
         """What earlier fits looked like."""
@@ -294,8 +229,8 @@ class Recalibrator:
         self._recent.extend(window.kept)
         self._prior_std = window.prior_std
         self._spare.append(spare_blobs(window.kept[-1].blobs, self.rig.num_cameras))
-        self._latest, self._fitted, self._follows = live, result, True
-        self._tracker.follow(result.rig_from_object[-1])
+        self._latest, self._fitted = live, result
+        self._labelling.follow(result.rig_from_object[-1])
         return live
 
     def _contradicted(self, newest: Kept) -> bool:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.estimation import EstimationOptions, estimate
-from imgcal.geometry import RigidTransform
+from imgcal.geometry import RigidTransform, undistort_cpu
 from imgcal.types import CalibrationObject, CameraRig, Observations
 
 TRIES = 600
@@ -72,9 +72,9 @@ def _ideal(uv: NDArray[np.float64], camera: CameraRig) -> NDArray[np.float64]:
     """Take the lens out: (M, 2) on the z = 1 plane."""
     if not len(uv):
         return np.zeros((0, 2))
-    (fx, fy), (cx, cy) = camera.focal_length[0].tolist(), camera.principal_point[0].tolist()
-    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    return np.asarray(cv2.undistortPoints(uv[:, None], matrix, camera.distortion[0].numpy())[:, 0], dtype=np.float64)
+    at = (torch.from_numpy(uv)[None] - camera.principal_point[:, None]) / camera.focal_length[:, None]
+    xy, _ = undistort_cpu(at, camera.distortion, camera.lens_model)
+    return xy[0].numpy()
 
 
 def _hypotheses(
@@ -141,7 +141,7 @@ def _fitted(
     observations = Observations(
         given, torch.full_like(given[..., 0], 1.0), torch.ones_like(given[..., 0], dtype=torch.bool)
     )
-    held = torch.zeros(1, 15, dtype=points_rig.dtype)
+    held = torch.zeros(1, camera.num_parameters, dtype=points_rig.dtype)
     fit = estimate(
         observations,
         camera,

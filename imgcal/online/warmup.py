@@ -11,6 +11,7 @@ import torch
 from imgcal.detection import detect
 from imgcal.errors import RefusedError
 from imgcal.io import load_object, load_rig
+from imgcal.online.keeper import RigKeeper
 from imgcal.online.recalibrator import Recalibrator
 from imgcal.pipeline import calibrate, score
 from imgcal.synthesis import (
@@ -81,6 +82,10 @@ def _from_frames(
     for detector in ("classical", "matched"):
         with _whatever_comes():
             calibrate(stacks, rig, obj, detector=detector)
+    with RigKeeper(rig, obj) as keeper:
+        for number, shot in enumerate((shots[0], *shots)):
+            with _whatever_comes():
+                keeper.update(shot, float(number))
     with Recalibrator(rig, obj, window=2) as recalibrator:
         for shot in (shots[0], *shots):
             with _whatever_comes():

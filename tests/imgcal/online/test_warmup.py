@@ -60,6 +60,7 @@ print(json.dumps(Compiled.names))
 """
 
 UNUSED = {"_minimize_all", "_pair", "_gradients", "_through_profile"}  # many rigs at once, and training
+OTHER_LENSES = "_chosen.<locals>"  # compiled where a rig has one
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +78,8 @@ def run(script: str, folder: Path, *arguments: str) -> subprocess.CompletedProce
 
 def test_all_is_compiled_ahead_and_nothing_later(compiled: Path, tmp_path: Path) -> None:
     first = run(WARM, compiled)
-    assert set(json.loads(first.stdout.splitlines()[-1])) == UNUSED
+    left = {name for name in json.loads(first.stdout.splitlines()[-1]) if not name.startswith(OTHER_LENSES)}
+    assert left == UNUSED
     assert first.stderr.splitlines()[0] == "imgcal: compiling, which takes a while"
     assert "functions compiled in" in first.stderr and f"kept in {compiled}" in first.stderr
     second = run(USE, compiled, "data/samples/O10", str(tmp_path))

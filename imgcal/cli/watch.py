@@ -1,0 +1,219 @@
+"""`imgcal watch`: a running rig is kept calibrated, and whoever wants to know is told."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any
+
+import torch
+import tyro
+from rich.console import Console
+
+from imgcal.cli.common import make_folder, open_rig
+from imgcal.cli.watch_display import Display
+from imgcal.detection import DetectionOptions
+from imgcal.errors import InputError, RefusedError
+from imgcal.extras import advice, missing
+from imgcal.io import load_object, open_input
+from imgcal.messages import shortened
+from imgcal.online import Event, RigKeeper
+from imgcal.pipeline import DetectorName
+from imgcal.types import CalibrationObject, CameraRig, Detections
+from imgcal.watch import (
+    CURRENT,
+    STATE,
+    Bag,
+    BlobTable,
+    Folder,
+    Hook,
+    Intake,
+    JsonLines,
+    Metrics,
+    Progress,
+    Source,
+    Tally,
+    Timing,
+    Videos,
+    ZeroMQ,
+    holds_videos,
+)
+from imgcal.watch import Watch as Loop
+
+USUAL_RATE = 30.0  # snapshots a second of a table of blobs
+
+
+@dataclass(frozen=True)
+class Watch:
+    """Keep a running rig calibrated: every snapshot is learnt from, and what moves is told.
+
+    INPUT is what the cameras write or send:
+    a folder that is being filled with frames/<camera>/<snapshot>.png, or that holds a video a camera;
+    tcp://host:port or ipc://path, frames or blobs from another process through ZeroMQ;
+    - for blobs on standard input, a line of JSON each: {"camera": "cam01", "time": 12.5, "uv": [[u, v], ...]};
+    a rosbag2 folder or .mcap file; a table of blobs (.csv, .csv.gz).
+
+    OUT gets rig.yaml (the rig as it is now, replaced in one step), history/ (as it was), events.jsonl (what happened:
+    a line of JSON each) and state.json, from which the same command goes on after any end, even a power failure.
+    Ends with the input, or at Ctrl-C. Example: imgcal watch tcp://127.0.0.1:5555 --rig factory.yaml --object
+    object.csv --out out/watch
+    """
+
+    input: Annotated[str, tyro.conf.Positional]  #: folder, address, file or -
+    rig: str  #: factory rig: file, or the name of a shipped one
+    object: str  #: object: file, or the name of a shipped one
+    out: Path  #: folder to write
+    fresh: bool = False  #: forget what an earlier run left in OUT, begin from the factory rig
+    tolerance: float = Timing.tolerance  #: s that the time stamps of one snapshot may be apart
+    patience: float = Timing.patience  #: s that a camera is waited for
+    keep_all: bool = False  #: drop no snapshot where they come faster than they are worked on: for recordings in pipes
+    rate: float | None = None  #: snapshots a second of a table of blobs (30)
+    topic: tuple[str, ...] = ()  #: CAMERA=TOPIC of a recording, where the topic does not name the camera
+    videos_differ: bool = False  #: accept videos whose lengths or time stamps differ: frames go together by time
+    until_idle: float | None = None  #: end when a folder has got no new frame for so many seconds
+    remove: bool = False  #: delete the frames of a folder once they are read
+    metrics: str | None = None  #: [HOST:]PORT for Prometheus; the host is 127.0.0.1 if not given
+    serve: str | None = None  #: [HOST:]PORT of the live page; the host is 127.0.0.1 if not given
+    hook: str | None = None
+    """command to run for each event, without a shell; the event is its standard input, a line of JSON"""
+    detector: DetectorName = "classical"  #: who finds the fiducials in frames, as for imgcal calibrate
+    detection: Annotated[DetectionOptions, tyro.conf.arg(name="")] = field(default_factory=DetectionOptions)
+
+    def run(self) -> None:
+        """Watch until the end."""
+        rig, obj = open_rig(self.rig), load_object(self.object)
+        folder = make_folder(self.out)
+        progress = None if self.fresh else Progress.load(folder)
+        intake = Intake(
+            self._source(rig, obj, progress), rig, Timing(self.tolerance, self.patience), self.keep_all,
+            after=None if progress is None else progress.time,
+        )  # fmt: skip
+        hook = None if self.hook is None else Hook(self.hook)
+        display = Display(Console(file=sys.stdout, soft_wrap=True), intake)
+        with contextlib.ExitStack() as stack:
+            keeper, restored = self._keeper(folder, rig, obj)
+            stack.enter_context(keeper)
+            page = None
+            if self.serve is not None:
+                from imgcal.live_page import LivePage, parse_address  # brings a server along, which is not in the core
+
+                page = stack.enter_context(LivePage(rig, obj, parse_address(self.serve)))
+                print(page.notice)
+            loop = stack.enter_context(Loop(keeper, folder, hook, page, display.tell, display.warn))
+            if self.metrics is not None:
+                stack.enter_context(Metrics(loop.tally, intake, hook, metrics_address(self.metrics)))
+            stopped = stack.enter_context(_stopping())
+            stack.enter_context(intake)
+            stack.enter_context(display.of(loop.tally))
+            if restored:
+                loop.tell(Event(time.time(), 0, "restart", message="started again from what was known"))
+            loop.run(intake, stopped, display.draw)
+        tally = loop.tally
+        said = f"{tally.snapshots:,} snapshots, {sum(tally.events.values()):,} events: {self.out / CURRENT}"
+        if stopped.interrupted:
+            raise KeyboardInterrupt(f"interrupted after {said}; the same command goes on from there")
+        if tally.latest is None or tally.learnt == 0:
+            raise RefusedError(self._nothing(tally, intake, progress))
+        print(said)
+
+    def _source(self, rig: CameraRig, obj: CalibrationObject, progress: Progress | None) -> Source:
+        """Find out what INPUT is."""
+        if self.input == "-":
+            return JsonLines(sys.stdin.fileno())
+        if "://" in self.input:
+            self._require("zmq", "an address")
+            return ZeroMQ((self.input,))
+        path = Path(self.input)
+        if path.suffix.lower() == ".mcap" or (path / "metadata.yaml").is_file():
+            self._require("rosbags", "a recording")
+            return Bag(path, rig, _topics(self.topic))
+        if path.is_dir() and not holds_videos(path):
+            name = None if progress is None else progress.name
+            return Folder(path, rig, self.remove, name, self.until_idle)
+        if path.is_dir():
+            return Videos(path, rig, self.videos_differ)
+        rate = USUAL_RATE if self.rate is None else self.rate
+        if not 0 < rate < 1e6:
+            raise InputError(f"--rate: found {rate:g}, expected snapshots a second")
+        source = open_input(path, rig, obj.num_fiducials)
+        assert isinstance(source, Detections)  # folders are seen to above
+        return BlobTable(source, rate)
+
+    def _keeper(self, folder: Path, rig: CameraRig, obj: CalibrationObject) -> tuple[RigKeeper, bool]:
+        """Begin, or go on with what an earlier run knew; says whether it did."""
+        path = folder / STATE
+        if self.fresh or not path.is_file():
+            return RigKeeper(rig, obj, detection=self.detection, detector=self.detector), False
+        keeper = RigKeeper.restore(path, detection=self.detection, detector=self.detector)
+        same_object = torch.equal(keeper.obj.points, obj.points.to(keeper.obj.points))
+        if keeper.factory.camera_names != rig.camera_names or not same_object:
+            what = f"--object {self.object}" if keeper.factory.camera_names == rig.camera_names else f"--rig {self.rig}"
+            raise InputError(f"{path}: found what is known of another than {what}; --fresh begins anew")
+        return keeper, True
+
+    def _require(self, library: str, what: str) -> None:
+        if missing(library):
+            raise InputError(f"{shortened(self.input)}: {what} {advice(library)}")
+
+    def _nothing(self, tally: Tally, intake: Intake, progress: Progress | None) -> str:
+        """Say why nothing was learnt."""
+        if tally.latest is not None:
+            return f"watch: no snapshot taught anything: {tally.latest.refused}"
+        if intake.reasons:
+            return f"watch: no snapshot came: {intake.reasons[-1]}"
+        if progress is not None and intake.known_before:
+            return f"watch: all {intake.known_before:,} snapshots were known; --fresh begins from the factory rig"
+        return "watch: no snapshot came"
+
+
+class _Stopped(threading.Event):
+    """Set by Ctrl-C or by whoever ends services."""
+
+    interrupted = False
+
+
+@contextlib.contextmanager
+def _stopping() -> Iterator[_Stopped]:
+    """End cleanly at SIGINT and SIGTERM; a second Ctrl-C does not wait."""
+    stopped = _Stopped()
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        if stopped.is_set():
+            raise KeyboardInterrupt
+        stopped.interrupted = number == signal.SIGINT
+        stopped.set()
+
+    before: dict[signal.Signals, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            if signal.getsignal(number) != signal.SIG_IGN:  # in the background of a shell, Ctrl-C is not for us
+                before[number] = signal.signal(number, stop)
+    try:
+        yield stopped
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def metrics_address(text: str) -> tuple[str, int]:
+    """Read [HOST:]PORT; the host is this machine alone if it is not given."""
+    host, _, port = text.rpartition(":")
+    if not re.fullmatch(r"\d{1,5}", port) or int(port) >= 2**16:
+        raise InputError(f"found {shortened(text)!r}, expected [HOST:]PORT")
+    return host.strip("[]") or "127.0.0.1", int(port)
+
+
+def _topics(given: tuple[str, ...]) -> dict[str, str]:
+    pairs = [text.partition("=") for text in given]
+    wrong = [camera for camera, _, topic in pairs if not camera or not topic]
+    if wrong:
+        raise InputError(f"--topic: found {shortened(wrong[0])!r}, expected CAMERA=TOPIC")
+    return {camera: topic for camera, _, topic in pairs}

@@ -1,0 +1,100 @@
+"""What `imgcal watch` shows: a line that changes in a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Iterator
+from datetime import datetime
+
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
+
+from imgcal.messages import one_line
+from imgcal.online import Event
+from imgcal.watch import Intake, Tally
+
+SAID_EVERY = 10.0  # s between two lines where nobody looks at a terminal
+DRAWN_EVERY = 0.25  # s
+SHOWN = ("late", "duplicate", "astray")  # what is told of exposures where it happens; missing ones show as lost cameras
+CLOCK_SIGMAS = 5.0
+LEAST_OFFSET = 5e-4  # s: smaller ones are the exposure's length
+
+
+class Display:
+    """Shows how it goes; with `rich` where somebody looks."""
+
+    def __init__(self, console: Console, intake: Intake) -> None:
+        """Prepare; nothing is shown before `of`."""
+        self._console, self._intake, self._tally = console, intake, Tally()
+        self._live: Live | None = None
+        self._drawn = self._said = -SAID_EVERY
+        self._snapshots = 0
+        self._rate = 0.0
+
+    @contextlib.contextmanager
+    def of(self, tally: Tally) -> Iterator[None]:
+        """Show what this tally says while the block runs."""
+        self._tally = tally
+        self._drawn = self._said = time.monotonic()
+        if not self._console.is_terminal:
+            yield
+            return
+        with Live(Text("waiting for the first snapshot"), console=self._console, auto_refresh=False) as self._live:
+            yield
+            self._live.update(Text(self.line()), refresh=True)
+        self._live = None
+
+    def tell(self, event: Event) -> None:
+        """Show an event."""
+        at = datetime.fromtimestamp(event.time).strftime("%H:%M:%S")
+        self._print(f"{at} {event.kind.replace('_', ' ')}: {event.message}")
+
+    def warn(self, message: str) -> None:
+        """Show what could not be done."""
+        self._print(f"note: {one_line(message)}")
+
+    def draw(self) -> None:
+        """Show how it goes, now and then."""
+        now = time.monotonic()
+        every = DRAWN_EVERY if self._live is not None else SAID_EVERY
+        if now - self._drawn < every:
+            return
+        self._rate = (self._tally.snapshots - self._snapshots) / (now - self._drawn)
+        self._drawn, self._snapshots = now, self._tally.snapshots
+        if self._live is not None:
+            self._live.update(Text(self.line(), no_wrap=True, overflow="ellipsis"), refresh=True)
+        else:
+            self._print(self.line())
+
+    def line(self) -> str:
+        """Say in one line how it goes."""
+        tally, intake = self._tally, self._intake
+        state = tally.latest
+        parts = ["waiting for the first snapshot" if state is None else state.sentence]
+        if state is not None and state.refused is not None:
+            parts.append("nothing learnt now")
+        parts.append(f"{tally.snapshots:,} snapshots, {self._rate:.3g}/s")
+        counts = {"refused": tally.refused, "dropped": intake.dropped, "unreadable": intake.unreadable.total()}
+        counts |= {kind: intake.synchronizer.counts[kind].total() for kind in SHOWN}
+        parts += [f"{count:,} {kind}" for kind, count in counts.items() if count]
+        parts += self._clocks()
+        return " | ".join(parts)
+
+    def _clocks(self) -> list[str]:
+        """Name the cameras whose time stamps do not say when they expose."""
+        state = self._tally.latest
+        if state is None:
+            return []
+        found = []
+        for name, offset, sigma in zip(
+            state.factory.camera_names, state.clock_offset.tolist(), state.clock_offset_sigma.tolist(), strict=True
+        ):
+            if abs(offset) > max(CLOCK_SIGMAS * sigma, LEAST_OFFSET):
+                stamped = self._tally.stamps.get(name, 0.0)
+                found.append(f"{name} exposes {1e3 * (offset - stamped):+.1f} ms beside its time stamps")
+        return found
+
+    def _print(self, text: str) -> None:
+        self._console.print(text, markup=False, highlight=False, soft_wrap=True)

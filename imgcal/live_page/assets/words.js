@@ -1,0 +1,79 @@
+// Words, numbers and elements. Names and messages come from elsewhere: they become text, never markup.
+
+const page = { hello: null, layout: null, state: null, history: null, events: [], volume: null, controls: null, pictures: new Map(), selected: 0, span: "fine" };
+
+const HEALTH = {
+  ok: ["good", "as calibrated"], doubtful: ["caution", "in doubt"], relearning: ["caution", "re-learning"], dirty: ["caution", "dirty"], defocused: ["caution", "out of focus"],
+  blind: ["bad", "sees nothing"], lost: ["bad", "lost"], unseen: ["none", "not looked at yet"],
+};
+const ORDER = ["none", "good", "caution", "bad"];
+
+const $ = (id) => document.getElementById(id);
+const toneOf = (camera) => (page.state ? (HEALTH[page.state.health[camera]] || ["none"])[0] : "none");
+const wordOf = (camera) => (page.state ? (HEALTH[page.state.health[camera]] || ["", page.state.health[camera]])[1] : "waiting");
+
+const NAMED = ["good", "caution", "bad", "ghost", "line", "ink", "muted", "after", "before", "panel", "page"];
+let inks = null;
+function colours() { // of the style sheet, as a canvas takes them; they change between light and dark
+  if (!inks) {
+    const probe = document.body.appendChild(document.createElement("i"));
+    inks = Object.fromEntries(NAMED.map((name) => { probe.style.color = `var(--${name})`; return [name, getComputedStyle(probe).color]; }));
+    inks.none = inks.ghost;
+    probe.remove();
+  }
+  return inks;
+}
+
+function make(tag, attributes = {}, ...children) {
+  const svg = ["svg", "path", "circle", "rect", "line", "text", "g", "title"].includes(tag);
+  const element = svg ? document.createElementNS("http://www.w3.org/2000/svg", tag) : document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) if (value !== null && value !== undefined) element.setAttribute(name, value);
+  element.append(...children);
+  return element;
+}
+
+function say(element, text) { // only what changed, so that screen readers hear it once
+  if (element.textContent !== text) element.textContent = text;
+}
+
+// A sign has a shape as well as a colour.
+const SHAPES = {
+  good: ["M4.2 8.4l2.6 2.6 5-5.6"], caution: ["M8 4v4.8", "M8 11.6v.2"], bad: ["M5.3 5.3l5.4 5.4", "M10.7 5.3l-5.4 5.4"], none: [],
+};
+function sign(tone) {
+  const disc = make("circle", { cx: 8, cy: 8, r: tone === "none" ? 6 : 7, class: tone === "none" ? "ring" : "tone", "stroke-width": tone === "none" ? 1.6 : 0 });
+  const marks = SHAPES[tone].map((d) => make("path", { d, fill: "none", stroke: "var(--page)", "stroke-width": 1.9, "stroke-linecap": "round", "stroke-linejoin": "round" }));
+  return make("svg", { viewBox: "0 0 16 16", class: tone, "aria-hidden": "true" }, disc, ...marks);
+}
+
+function digits(value, count = 2) { // 0.0123 -> "0.012", 123.4 -> "123"
+  if (value === null || value === undefined) return "–";
+  const size = Math.abs(value);
+  if (size < 1e-9) return "0";
+  const places = Math.max(0, Math.min(6, count - 1 - Math.floor(Math.log10(size) + 1e-9)));
+  return value.toFixed(places).replace("-", "−");
+}
+
+function withSigma(value, sigma) { // as many places as the deviation has
+  if (value === null || value === undefined) return ["–", ""];
+  if (sigma === null || sigma === undefined) return [digits(value), ""];
+  const places = Math.max(0, Math.min(5, 1 - Math.floor(Math.log10(Math.max(sigma, 1e-5)) + 1)));
+  const shown = value.toFixed(places);
+  return [(Number(shown) === 0 ? shown.replace("-", "") : shown).replace("-", "−"), " ± " + sigma.toFixed(places)];
+}
+
+const clock = (seconds) => new Date(seconds * 1000).toLocaleTimeString([], { hour12: false });
+const readable = (event) => { // numbers as they are printed, and when it was
+  const text = event.message.replaceAll(" +- ", " ± ");
+  return event.since === null || !["moved", "relearnt"].includes(event.kind) ? text : text.replace(/(, re-learnt|$)/, ` at ${clock(event.since)}$1`);
+};
+const shortClock = (seconds) => clock(seconds).slice(0, 5);
+const plural = (count, noun) => `${count} ${noun}${count === 1 ? "" : "s"}`;
+
+const COMMON = () => {
+  const names = page.hello.cameras;
+  if (names.length < 2) return "";
+  let prefix = names[0];
+  for (const name of names) while (!name.startsWith(prefix)) prefix = prefix.slice(0, -1);
+  return names.some((name) => name.length === prefix.length) ? "" : prefix.replace(/\d+$/, "");
+};

@@ -1,0 +1,196 @@
+"""`Board`: all that the page shows, in constant memory, as the latest message of each kind."""
+
+from __future__ import annotations
+
+import base64
+import math
+import time
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imgcal.live_page.text import rounded, stream_event
+from imgcal.live_page.timelines import Timelines, change_of, sigmas_of
+
+MOST_EVENTS = 200
+MOST_VISITED = 400  # places of the object that are drawn
+VISITED_SECONDS = 1.0
+LAYOUT_SECONDS = 5.0
+ALARMS = frozenset({"moved", "camera_lost", "dirty", "defocused", "object_bent", "object_exchanged", "clock_slip"})
+"""Events that wait for somebody to acknowledge them."""
+
+Array = NDArray[np.float64]
+
+
+class Board:
+    """Takes what the loop's process sends, and says what is new for those who look on.
+
+    Messages are made as bytes of server-sent events, once for all viewers. A message replaces the one before it of the
+    same key, so that nobody who reads slowly needs more than the latest of each.
+    """
+
+    def __init__(self, greeting: Mapping[str, Any]) -> None:
+        """Begin with what the loop's process said first."""
+        self.greeting = greeting
+        self.instance = f"{time.time_ns():x}"  # another one: the server was started again
+        self.events: deque[dict[str, Any]] = deque(maxlen=MOST_EVENTS)
+        self.count = 0  # of events so far
+        self.state: dict[str, Any] | None = None
+        self.paused = False
+        self.switched: set[str] = set()  # actions that are on
+        self.advice: dict[str, Any] | None = None
+        self._std: Array | None = None
+        self._timelines = Timelines()
+        self._visited: deque[list[float]] = deque(maxlen=MOST_VISITED)
+        self._visited_at = self._layout_at = -math.inf
+        self._pictures: dict[str, Any] = {}
+        self._rate = _Rate()
+        self._layout = greeting["arrangement"]
+        self._value = np.full((len(greeting["cameras"]), 4), np.nan)
+        self._sigma = self._value.copy()
+
+    def take(self, kind: str, content: Mapping[str, Any]) -> dict[str, bytes]:
+        """Take a message; returns what is new, by key."""
+        match kind:
+            case "state":
+                return self._take_state(content)
+            case "picture":
+                return self._take_picture(content)
+            case "event":
+                return self._take_event(content)
+        return {}
+
+    def take_change(self, time: float, layout: dict[str, Any], change: Array, focal_length: Array) -> dict[str, bytes]:
+        """Take the rig of a moment: how it is drawn, its change against the factory (C, 15), focal lengths (C, 2)."""
+        self._value[:, :3] = change_of(change, focal_length)
+        if self._std is not None:
+            self._sigma = sigmas_of(self._std, focal_length)
+        self._timelines.add(time, self._value.copy(), self._sigma)
+        if abs(time - self._layout_at) < LAYOUT_SECONDS:
+            return {}
+        self._layout_at, self._layout = time, layout
+        return {"layout": stream_event("layout", layout), "volume": stream_event("volume", self._volume())}
+
+    def take_advice(self, advice: dict[str, Any], std: Array) -> dict[str, bytes]:
+        """Take what has been computed of a belief: predicted error and guidance, and deviations (C, 15)."""
+        self._std, self.advice = std, advice
+        return {"volume": stream_event("volume", self._volume())}
+
+    def acknowledge(self, number: int) -> dict[str, bytes]:
+        """Note that somebody has seen an event, and all before it."""
+        for event in self.events:
+            event["open"] = event["open"] and event["number"] > number
+        return {"events": stream_event("events", list(self.events))}
+
+    def switch(self, name: str) -> dict[str, bytes]:
+        """Note that a command was given that has a state."""
+        if name in ("pause", "resume"):
+            self.paused = name == "pause"
+        else:
+            self.switched ^= {name}
+        return {"controls": stream_event("controls", self._controls())}
+
+    def everything(self) -> dict[str, bytes]:
+        """All that somebody needs who looks for the first time."""
+        return {key: stream_event(key.partition(":")[0], content) for key, content in self.contents().items()}
+
+    def contents(self) -> dict[str, Any]:
+        """The same as plain values; a report is made of them, too."""
+        found: dict[str, Any] = {
+            "hello": self._hello(),
+            "layout": self._layout,
+            "controls": self._controls(),
+            "history": self._timelines.content(),
+            "events": list(self.events),
+            "volume": self._volume(),
+        }
+        if self.state is not None:
+            found["state"] = self.state
+        return found | self._pictures
+
+    def _hello(self) -> dict[str, Any]:
+        given = self.greeting
+        return {
+            "instance": self.instance,
+            "title": given["title"],
+            "version": given["version"],
+            "rig": given["rig_name"],
+            "object": given["object_name"],
+            "cameras": list(given["cameras"]),
+            "fiducials": len(given["points"]),
+            "sizes": given["image_size"].tolist(),
+            "actions": [
+                {"name": a.name, "label": a.label, "ofCamera": a.of_camera, "undo": a.undo} for a in given["actions"]
+            ],
+        }
+
+    def _controls(self) -> dict[str, Any]:
+        return {"paused": self.paused, "on": sorted(self.switched)}
+
+    def _take_state(self, content: Mapping[str, Any]) -> dict[str, bytes]:
+        now, points = float(content["time"]), content["object"]
+        self._value[:, 3] = content["residual"]
+        self.state = {
+            "time": now,
+            "snapshot": content["snapshot"],
+            "rate": self._rate(time.monotonic(), content["snapshot"]),
+            "sentence": content["sentence"],
+            "refused": content["refused"],
+            "health": content["health"],
+            "value": rounded(self._value),
+            "sigma": rounded(self._sigma),
+            "sees": content["sees"].tolist(),
+            "object": None if points is None else rounded(points),
+        }
+        if points is not None and abs(now - self._visited_at) >= VISITED_SECONDS:
+            self._visited_at = now
+            self._visited.append(rounded(points.mean(0), 4))
+        return {"state": stream_event("state", self.state)}
+
+    def _take_picture(self, content: Mapping[str, Any]) -> dict[str, bytes]:
+        jpeg = content["jpeg"]
+        key = f"picture:{content['camera']}"
+        self._pictures[key] = {
+            "camera": content["camera"],
+            "time": content["time"],
+            "jpeg": None if jpeg is None else base64.b64encode(jpeg).decode(),
+            "detected": rounded(content["detected"], 4),
+            "labelled": content["labelled"].tolist(),
+            "predicted": rounded(content["predicted"], 4),
+        }
+        return {key: stream_event("picture", self._pictures[key])}
+
+    def _take_event(self, content: Mapping[str, Any]) -> dict[str, bytes]:
+        numbers = ("time", "since", "size", "sigma")
+        plain = {k: _known(v) if k in numbers else v for k, v in content.items()}
+        waits = plain["kind"] in ALARMS
+        for event in self.events:  # what is known better now, or is over, takes the place of what was told first
+            if event["open"] and event["camera"] == plain["camera"] and event["since"] == plain["since"] is not None:
+                event["open"], waits = False, True
+        if plain["kind"] == "factory":
+            self._visited.clear()
+        self.events.append(plain | {"number": self.count, "open": waits})
+        self.count += 1
+        return {"events": stream_event("events", list(self.events))}
+
+    def _volume(self) -> dict[str, Any]:
+        return {"advice": self.advice, "visited": list(self._visited)}
+
+
+class _Rate:
+    """How many snapshots there are in a second, smoothed over some."""
+
+    def __init__(self) -> None:
+        self._marks: deque[tuple[float, int]] = deque(maxlen=30)
+
+    def __call__(self, now: float, snapshot: int) -> float | None:
+        self._marks.append((now, snapshot))
+        (start, first), (end, last) = self._marks[0], self._marks[-1]
+        return None if end - start < 0.5 else round((last - first) / (end - start), 1)
+
+
+def _known(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else float(value)

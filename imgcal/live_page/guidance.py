@@ -1,0 +1,136 @@
+"""How well the volume is known, and where the object teaches the most: computed now and then, beside the server."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.estimation import Gauge, RigBelief, WorkingVolume, pixel_jacobian, uncertainty_over
+from imgcal.geometry import cross_matrix
+from imgcal.live_page.text import rounded
+from imgcal.types import CameraRig
+
+FEW_CAMERAS = 16
+FINE, COARSE = 9, 7
+"""Points along each side of the volume for few cameras, and for many."""
+PLACES = {True: 4, False: 3}
+"""Places along each side where the object is tried, for few cameras and for many."""
+MOST_POINTS = 8  # fiducials that a try takes
+USUAL_SIGMA = 0.1  # px
+
+
+def compare(content: dict[str, Any]) -> tuple[CameraRig, NDArray[np.float64]]:
+    """Read a rig (`contents.rig_message`): the rig, and its change (C, 15) against the factory, as most see it."""
+    rig, factory = pickle.loads(content["pickled"])
+    return rig, Gauge.of_most(rig, factory).difference(rig, factory).numpy()
+
+
+def look(
+    content: dict[str, Any], points_object: NDArray[np.float64], volume: WorkingVolume
+) -> tuple[dict[str, Any], NDArray[np.float64]]:
+    """Compute what the page says of the volume.
+
+    Args:
+        content: a message with a belief (`contents.belief_message`).
+        points_object: (N, 3) mm.
+        volume: where the object is seen.
+
+    Returns:
+        Plain values for the page; one standard deviation of each camera's change against the factory (C, 15).
+
+    Raises:
+        RefusedError: the information is singular.
+    """
+    belief, factory, turn = pickle.loads(content["pickled"])
+    rig, covariance = belief.rig, belief.covariance()
+    std = change_std(rig, factory, covariance)
+    few = rig.num_cameras <= FEW_CAMERAS
+    grid = volume.grid(FINE if few else COARSE)
+    points = grid.flatten(0, -2)
+    seen = rig.project(points).visible
+    uncertainty = uncertainty_over(rig, covariance, volume.grid(5 if few else 4).flatten(0, -2))
+    mm = uncertainty.point_error(points, seen)
+    sigma = content["sigma"] or USUAL_SIGMA
+    shape = torch.as_tensor(points_object)
+    shape = (shape - shape.mean(0))[_spread(len(shape))] @ turn.mT
+    places = _inner(volume, shape).grid(PLACES[few]).flatten(0, -2)
+    gain = information_gain(belief, covariance, places, shape, sigma)
+    known = mm[mm.isfinite()]
+    best = int(gain.argmax())
+    advice = {
+        "low": rounded(volume.low.numpy()),
+        "high": rounded(volume.high.numpy()),
+        "mm": rounded(mm.view(grid.shape[:-1]).numpy(), 3),
+        "count": seen.sum(0).view(grid.shape[:-1]).tolist(),
+        "median": _value(known.median()) if len(known) else None,
+        "p95": _value(known.quantile(0.95)) if len(known) else None,
+        "places": rounded(places.numpy(), 4),
+        "gain": rounded(gain.numpy(), 3),
+        "best": best if float(gain[best]) > 0 else None,
+    }
+    return advice, std.numpy()
+
+
+def change_std(rig: CameraRig, factory: CameraRig, covariance: Tensor) -> Tensor:
+    """One standard deviation of each camera's change against the factory, as most cameras see it: (C, 15)."""
+    jacobian = Gauge.of_most(rig, factory).jacobian(factory)
+    variance = ((jacobian @ covariance) * jacobian).sum(-1)
+    return variance.clamp_min(0).sqrt().unflatten(0, (rig.num_cameras, -1))
+
+
+def information_gain(belief: RigBelief, covariance: Tensor, places: Tensor, shape: Tensor, sigma: float) -> Tensor:
+    """How much one more snapshot would teach about the rig, with the object at some places: (P,) nat.
+
+    Half the logarithm of the determinants' ratio of covariances before and after, the pose eliminated: what no
+    snapshot shows, as a motion of the whole rig, does not count.
+
+    Args:
+        belief: of the rig.
+        covariance: (15 C, 15 C) of its cameras.
+        places: (P, 3) mm where the object's middle is tried.
+        shape: (N, 3) mm of its fiducials about its middle, in the rig's frame.
+        sigma: px, of each axis of what is measured.
+
+    Source: Lindley 1956, "On a measure of the information provided by an experiment".
+    """
+    rig, found = belief.rig, []
+    turned = -cross_matrix(shape)  # (N, 3, 3): motion of each fiducial when the object turns
+    pose = torch.cat((turned, torch.eye(3, dtype=shape.dtype).expand_as(turned)), -1)  # (N, 3, 6)
+    for place in places:
+        points = place + shape
+        seen = rig.project(points).visible
+        cameras, fiducials = seen.nonzero(as_tuple=True)
+        if len(cameras) < 4:
+            found.append(0.0)
+            continue
+        own = pixel_jacobian(rig, points)[cameras, fiducials] / sigma  # (K, 2, 15)
+        # A camera's step to one side shifts pixels as the point's to the other does.
+        by_pose = (-own[..., 3:6] @ pose[fiducials]).flatten(0, 1)  # (2 K, 6)
+        basis = torch.linalg.qr(by_pose).Q
+        rows = own.new_zeros(len(cameras), 2, rig.num_cameras, rig.num_parameters)
+        rows[torch.arange(len(cameras)), :, cameras] = own
+        rows = rows.flatten(2).flatten(0, 1)
+        rows = rows - basis @ (basis.mT @ rows)
+        inner = rows @ covariance @ rows.mT
+        found.append(0.5 * float(torch.logdet(inner + torch.eye(len(inner), dtype=inner.dtype))))
+    return torch.tensor([value if math.isfinite(value) else 0.0 for value in found], dtype=torch.float64)
+
+
+def _inner(volume: WorkingVolume, shape: Tensor) -> WorkingVolume:
+    """Where the object's middle may be for all of it to be inside, or at least half of each side."""
+    reach = torch.minimum(shape.abs().amax(0), (volume.high - volume.low) / 4)
+    return WorkingVolume(volume.low + reach, volume.high - reach)
+
+
+def _spread(count: int) -> Tensor:
+    return torch.linspace(0, count - 1, min(count, MOST_POINTS)).round().long()
+
+
+def _value(number: Tensor) -> float:
+    return float(f"{float(number):.4g}")

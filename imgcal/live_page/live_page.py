@@ -1,0 +1,286 @@
+"""`LivePage`: the loop's side of the page. It hands over what is new, and waits for nobody.
+
+The server is a process of its own, so that people who look on take nothing from the loop. `publish` keeps what came
+last and returns; a thread shrinks frames and passes them on, at most so often, while somebody looks. A server that
+ends is started again; the address stays open meanwhile.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import queue
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import NDArray
+
+import imgcal
+from imgcal.extras import missing
+from imgcal.live_page.address import Address, checked_token
+from imgcal.live_page.commands import Action, Command
+from imgcal.live_page.contents import (
+    belief_message,
+    event_message,
+    greeting,
+    picture_message,
+    rig_message,
+    state_message,
+)
+from imgcal.live_page.viewing_volume import viewing_volume
+from imgcal.live_page.wire import framed
+from imgcal.online import Event, RigState
+from imgcal.types import CalibrationObject, CameraRig
+
+Frame = NDArray[np.uint8] | NDArray[np.uint16]
+
+STATES_A_SECOND = 10.0
+PICTURES_A_SECOND = 2.0  # of each camera
+RIG_SECONDS = 0.5
+BELIEF_SECONDS = 1.0  # for ten cameras; longer for more, squared
+MOST_EVENTS = 1000  # that wait to be passed on
+MOST_COMMANDS = 64  # that wait to be fetched
+RESTART_SECONDS = 2.0  # between two starts of the server
+SERVER = "from imgcal.live_page.process import main; main({listening}, {pipe})"
+
+
+class LivePage:
+    """A page on which a running rig is watched. A context manager: leaving it ends the server.
+
+    Examples:
+        >>> import imgcal
+        >>> rig, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+        >>> with LivePage(rig, obj, Address(port=0)) as page:
+        ...     page.commands(), page.url.startswith("http://127.0.0.1:")
+        ([], True)
+    """
+
+    def __init__(
+        self,
+        rig: CameraRig,
+        obj: CalibrationObject,
+        address: Address = Address(),
+        *,
+        token: str | None = None,
+        actions: Sequence[Action] = (),
+        title: str = "live",
+    ) -> None:
+        """Open the address and start the server.
+
+        Args:
+            rig: the factory calibration, without batch axes.
+            obj: the calibration object.
+            address: where to listen. Any but this machine's own asks everybody for the token.
+            token: for those who look on from elsewhere; None = a new one.
+            actions: buttons beside those that every page has.
+            title: of the page.
+
+        Raises:
+            InputError: the address is taken, or the token too short.
+            ModuleNotFoundError: the libraries of the extra `live` are not installed.
+        """
+        if library := missing("uvicorn"):
+            raise ModuleNotFoundError(f"No module named {library!r}", name=library)
+        self._token = checked_token(token)
+        self._listening = address.listen()
+        self.address = Address(address.host, self._listening.getsockname()[1])
+        self._greeting = greeting(rig, obj, viewing_volume(rig), self.address, self._token, actions, title)
+        self._rig, self._obj = rig, obj
+        self._latest: RigState | None = None
+        self._pictured: tuple[RigState, Mapping[str, Frame | None]] | None = None  # the latest that came with frames
+        self._events: list[Event] = []
+        self._news = threading.Condition()
+        self._commands: queue.Queue[Command] = queue.Queue(MOST_COMMANDS)
+        self._viewers = 0
+        self._closing = False
+        self._started = 0.0
+        self._server: subprocess.Popen[bytes] | None = None
+        self._pipe: socket.socket | None = None
+        self._start()
+        self._sender = threading.Thread(target=self._send, name="live page", daemon=True)
+        self._sender.start()
+
+    @property
+    def url(self) -> str:
+        """What to open in a browser, with the token where one is asked for."""
+        return self.address.url(None if self.address.local else self._token)
+
+    @property
+    def notice(self) -> str:
+        """What to tell who started this."""
+        if self.address.local:
+            return f"live page: {self.url} (this machine only)"
+        return (
+            f"live page: {self.url}\nwhoever has this address with its token can watch and command the rig; what is "
+            "sent is not encrypted"
+        )
+
+    def publish(self, state: RigState, frames: Mapping[str, Frame | None] | None = None) -> None:
+        """Show a new state; returns at once. States that come faster than they are shown are passed over.
+
+        Args:
+            state: what the last snapshot taught.
+            frames: grey images (H, W) of this snapshot, which are not to be changed from now on. Where some states come
+                without, pictures are of those that have them.
+        """
+        with self._news:
+            self._latest = state
+            if frames or self._pictured is None:
+                self._pictured = (state, frames or {})
+            elif not self._pictured[1]:  # there never were any: blobs alone
+                self._pictured = (state, {})
+            if state.events and len(self._events) < MOST_EVENTS:
+                self._events.extend(state.events)
+            self._news.notify()
+
+    def tell(self, event: Event) -> None:
+        """Show an event that came with no state, with the next one."""
+        with self._news:
+            self._events.append(event)
+
+    def commands(self) -> list[Command]:
+        """What has been asked for since the last call; never waits."""
+        found = []
+        with contextlib.suppress(queue.Empty):
+            while True:
+                found.append(self._commands.get_nowait())
+        return found
+
+    def close(self) -> None:
+        """End the server."""
+        with self._news:
+            if self._closing:
+                return
+            self._closing = True
+            self._news.notify()
+        self._stop()
+        self._listening.close()
+        self._sender.join(timeout=5)
+
+    def __enter__(self) -> LivePage:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the server."""
+        self.close()
+
+    def _start(self) -> None:
+        """Start the server, and a thread that listens to it."""
+        ours, theirs = socket.socketpair()
+        code = SERVER.format(listening=self._listening.fileno(), pipe=theirs.fileno())
+        # Not from the current folder, which anybody may have filled.
+        path = os.pathsep.join(filter(None, (str(Path(imgcal.__file__).parents[1]), os.environ.get("PYTHONPATH"))))
+        self._server = subprocess.Popen(
+            [sys.executable, "-P", "-c", code],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            env=os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
+            pass_fds=(self._listening.fileno(), theirs.fileno()),
+            start_new_session=True,  # an interruption of the loop is not its own
+        )
+        theirs.close()
+        self._pipe, self._started = ours, time.monotonic()
+        ours.sendall(framed("greeting", self._greeting))
+        threading.Thread(target=self._listen, args=(ours,), name="live page commands", daemon=True).start()
+
+    def _stop(self) -> None:
+        if self._pipe is not None:
+            with contextlib.suppress(OSError):
+                self._pipe.shutdown(socket.SHUT_RDWR)  # the server ends with it
+            self._pipe.close()
+        if self._server is not None:
+            try:
+                self._server.wait(timeout=3)
+            except subprocess.TimeoutExpired:
+                self._server.kill()
+                self._server.wait()
+
+    def _listen(self, pipe: socket.socket) -> None:
+        """Take what the server says: lines of JSON, which it has checked."""
+        with contextlib.suppress(OSError, ValueError), pipe.makefile("r", encoding="utf-8") as lines:
+            for line in lines:
+                content = json.loads(line)
+                if "viewers" in content:
+                    self._viewers = int(content["viewers"])
+                    continue
+                with contextlib.suppress(queue.Full):
+                    self._commands.put_nowait(Command(**content))
+
+    def _send(self) -> None:
+        """Pass on what is new, until the page is closed."""
+        courier = _Courier(self._rig, self._obj)
+        while not self._closing:
+            with self._news:
+                self._news.wait_for(lambda: self._latest is not None or self._closing, timeout=1 / STATES_A_SECOND)
+                latest, pictured, events = self._latest, self._pictured, self._events
+                self._latest = None
+                self._events = [] if latest is not None else events
+            begun = time.monotonic()
+            try:
+                if latest is not None:
+                    self._pass_on(courier.messages(latest, events))
+                if self._viewers and pictured is not None:
+                    self._pass_on(courier.pictures(*pictured))
+            except OSError:
+                with self._news:
+                    self._events = [*events, *self._events]
+                    self._latest = self._latest or latest
+                self._restart()
+                courier = _Courier(self._rig, self._obj)
+            time.sleep(max(0.0, 1 / STATES_A_SECOND - (time.monotonic() - begun)))
+
+    def _pass_on(self, messages: Iterator[bytes]) -> None:
+        assert self._pipe is not None
+        for message in messages:
+            self._pipe.sendall(message)
+
+    def _restart(self) -> None:
+        time.sleep(max(0.0, RESTART_SECONDS - (time.monotonic() - self._started)))
+        if not self._closing:
+            self._stop()
+            with contextlib.suppress(OSError):
+                self._start()
+
+
+class _Courier:
+    """Turns what is new into messages, and remembers what is due when."""
+
+    def __init__(self, rig: CameraRig, obj: CalibrationObject) -> None:
+        self._obj, self._cameras = obj, rig.num_cameras
+        self._shown = np.full(rig.num_cameras, -1)  # snapshot of each camera's latest picture ...
+        self._shown_at = np.zeros(rig.num_cameras)  # ... and when it was passed on, s
+        self._rig_at = self._belief_at = 0.0  # s
+        self._belief_seconds = BELIEF_SECONDS * max(rig.num_cameras / 10, 1.0) ** 2
+
+    def messages(self, state: RigState, events: Sequence[Event]) -> Iterator[bytes]:
+        """A new state, and what of it is due."""
+        now = time.monotonic()
+        for event in events:
+            yield framed("event", event_message(event))
+        yield framed("state", state_message(state, self._obj))
+        if now - self._rig_at >= RIG_SECONDS or events:
+            self._rig_at = now
+            yield framed("rig", rig_message(state))
+        if now - self._belief_at >= self._belief_seconds:
+            self._belief_at = now
+            yield framed("belief", belief_message(state))
+
+    def pictures(self, state: RigState, frames: Mapping[str, Frame | None]) -> Iterator[bytes]:
+        """Those of the cameras that have waited the longest, as many as keep them all as new as they are to be."""
+        now = time.monotonic()
+        share = int(np.ceil(self._cameras * PICTURES_A_SECOND / STATES_A_SECOND))
+        waiting = np.flatnonzero((self._shown < state.snapshot) & (now - self._shown_at >= 0.9 / PICTURES_A_SECOND))
+        for camera in waiting[np.argsort(self._shown_at[waiting], kind="stable")][:share].tolist():
+            self._shown[camera], self._shown_at[camera] = state.snapshot, now
+            yield framed("picture", picture_message(state, camera, frames))

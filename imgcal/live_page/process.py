@@ -1,0 +1,148 @@
+"""The server's process: what the loop sends goes to the board, what the board says to the viewers."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import socket
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import uvicorn
+
+from imgcal.live_page.board import Board
+from imgcal.live_page.security import Gate
+from imgcal.live_page.server import Application
+from imgcal.live_page.wire import read_message
+
+POLITE = 5  # how much rather the loop runs than this
+GUIDANCE_SECONDS = 3.0  # rest between two computations, and twice as long as the last one took
+MOST_CONNECTIONS = 256
+MOST_HEADERS = 16384  # bytes
+BUFFER = 1 << 20
+
+
+def main(listening: int, pipe: int) -> None:
+    """Serve until the loop's process closes the pipe.
+
+    Args:
+        listening: number of the open file of the socket on which viewers come.
+        pipe: the same of the socket to the loop's process.
+    """
+    with contextlib.suppress(OSError):
+        os.nice(POLITE)
+    with contextlib.suppress(KeyboardInterrupt):
+        asyncio.run(_serve(socket.socket(fileno=listening), socket.socket(fileno=pipe)))
+
+
+async def _serve(listening: socket.socket, pipe: socket.socket) -> None:
+    reader, writer = await asyncio.open_connection(sock=pipe, limit=BUFFER)
+    try:
+        _, greeting = await read_message(reader)
+    except asyncio.IncompleteReadError:
+        return
+    board, guide = Board(greeting), Guide(greeting)
+
+    def tell(content: dict[str, Any]) -> None:
+        if not writer.is_closing():  # the loop may have ended
+            writer.write(json.dumps(content).encode() + b"\n")
+
+    application = Application(board, Gate(greeting["address"], greeting["token"]), guide.rig_yaml, tell)
+    server = uvicorn.Server(
+        uvicorn.Config(
+            application, http="h11", ws="none", lifespan="off", interface="asgi3", access_log=False,
+            log_level="error", server_header=False, proxy_headers=False, limit_concurrency=MOST_CONNECTIONS,
+            h11_max_incomplete_event_size=MOST_HEADERS, timeout_graceful_shutdown=1, loop="asyncio",
+        )
+    )  # fmt: skip
+    serving = asyncio.ensure_future(server.serve(sockets=[listening]))
+    with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError):
+        while True:
+            kind, content = await read_message(reader)
+            if kind in ("rig", "belief"):
+                guide.learn(kind, content, application)
+            else:
+                application.spread(board.take(kind, content))
+    server.should_exit = True
+    with contextlib.suppress(asyncio.TimeoutError):
+        await asyncio.wait_for(serving, 2)
+    os._exit(0)  # a computation of the volume is not waited for
+
+
+class Guide:
+    """Computes what follows from rigs and beliefs beside the server; what comes while it computes is passed over."""
+
+    def __init__(self, greeting: dict[str, Any]) -> None:
+        """Begin with what the loop's process said first."""
+        self._greeting = greeting
+        self._pool = ThreadPoolExecutor(2, initializer=_of_one_thread)
+        self._waiting: dict[str, dict[str, Any]] = {}
+        self._tasks: dict[str, asyncio.Task[None]] = {}
+        self._rig: Any = None
+        self._std: Any = None
+
+    def learn(self, kind: str, content: dict[str, Any], application: Application) -> None:
+        """Take a rig or a belief, and have the viewers told what follows from it."""
+        self._waiting[kind] = content
+        if kind not in self._tasks or self._tasks[kind].done():
+            work = self._compare if kind == "rig" else self._look
+            self._tasks[kind] = asyncio.get_running_loop().create_task(work(application))
+
+    async def _compare(self, application: Application) -> None:
+        loop = asyncio.get_running_loop()
+        while "rig" in self._waiting:
+            found = await loop.run_in_executor(self._pool, self._compared, self._waiting.pop("rig"))
+            application.spread(application.board.take_change(*found))
+
+    async def _look(self, application: Application) -> None:
+        loop = asyncio.get_running_loop()
+        while "belief" in self._waiting:
+            begun = loop.time()
+            found = await loop.run_in_executor(self._pool, self._looked, self._waiting.pop("belief"))
+            if found is not None:
+                application.spread(application.board.take_advice(*found))
+            await asyncio.sleep(max(GUIDANCE_SECONDS, 2 * (loop.time() - begun)))
+
+    def _compared(self, content: dict[str, Any]) -> Any:
+        from imgcal.live_page.arrangement import arrangement
+        from imgcal.live_page.guidance import compare
+
+        self._rig, change = compare(content)
+        layout = arrangement(self._rig, self._volume())
+        return content["time"], layout, change, self._rig.focal_length.numpy()
+
+    def _looked(self, content: dict[str, Any]) -> Any:
+        from imgcal.errors import RefusedError
+        from imgcal.live_page.guidance import look
+
+        try:
+            advice, self._std = look(content, self._greeting["points"], self._volume())
+        except RefusedError:  # nothing can be said yet
+            return None
+        return advice, self._std
+
+    def _volume(self) -> Any:
+        import torch
+
+        from imgcal.estimation import WorkingVolume
+
+        return WorkingVolume(*(torch.as_tensor(corner) for corner in self._greeting["volume"]))
+
+    def rig_yaml(self) -> str | None:
+        """The present rig as a rig file, with its deviations where they are known; None before the first snapshot."""
+        if self._rig is None:
+            return None
+        import torch
+
+        from imgcal.io import RigCovariance, rig_text
+
+        std = None if self._std is None else RigCovariance(torch.as_tensor(self._std))
+        return rig_text(self._rig, covariance=std)
+
+
+def _of_one_thread() -> None:
+    import torch
+
+    torch.set_num_threads(1)

@@ -1,0 +1,212 @@
+"""The server's few answers: the page, the stream of what is new, commands, and two downloads."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Awaitable, Callable, Mapping, MutableMapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from imgcal.live_page.board import Board
+from imgcal.live_page.commands import Command, read_command
+from imgcal.live_page.page import live_page, report_page
+from imgcal.live_page.security import HEADERS, Allowance, Gate, Refusal
+
+MOST_VIEWERS = 64
+MOST_BODY = 1024  # bytes of a command
+BODY_SECONDS = 5.0
+STUCK_SECONDS = 20.0  # a viewer that takes nothing for so long is sent away
+ALIVE_SECONDS = 10.0  # between signs of life where nothing is new
+JSON = "application/json"
+
+Message = MutableMapping[str, Any]  # of ASGI, as the three below
+Scope = Message
+Receive = Callable[[], Awaitable[Message]]
+Send = Callable[[Message], Awaitable[None]]
+Answer = tuple[int, str, bytes, dict[str, str]]  # status, type, body, further headers
+
+
+@dataclass(eq=False)
+class Viewer:
+    """What one viewer has not been sent yet: the latest of each key, so that it cannot grow."""
+
+    pending: dict[str, bytes] = field(default_factory=dict)
+    news: asyncio.Event = field(default_factory=asyncio.Event)
+
+    def add(self, messages: Mapping[str, bytes]) -> None:
+        """Put messages in the place of older ones of the same keys."""
+        self.pending |= messages
+        self.news.set()
+
+    def take(self) -> bytes:
+        """Take all that is pending."""
+        self.news.clear()
+        taken, self.pending = self.pending, {}
+        return b"".join(taken.values())
+
+
+class Application:
+    """An ASGI application; everything that a request can reach is in this file."""
+
+    def __init__(
+        self, board: Board, gate: Gate, rig_yaml: Callable[[], str | None], tell: Callable[[dict[str, Any]], None]
+    ) -> None:
+        """Make it.
+
+        Args:
+            board: what is shown.
+            gate: who may ask.
+            rig_yaml: the present rig file; None = not known yet.
+            tell: passes an object on to the loop's process.
+        """
+        self.board, self.gate, self._rig_yaml, self._tell = board, gate, rig_yaml, tell
+        self.viewers: set[Viewer] = set()
+        self._commands, self._downloads = Allowance(10, 5.0), Allowance(4, 1.0)
+        self._cameras = tuple(board.greeting["cameras"])
+        self._actions = {action.name: action for action in board.greeting["actions"]}
+
+    def spread(self, messages: Mapping[str, bytes]) -> None:
+        """Hand messages to all viewers; none of them is waited for."""
+        for viewer in self.viewers:
+            viewer.add(messages)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request."""
+        if scope["type"] != "http":
+            return
+        headers: dict[str, list[str]] = {}
+        for name, value in scope["headers"]:
+            headers.setdefault(name.decode("latin-1").lower(), []).append(value.decode("latin-1"))
+        method, path = scope["method"], scope["path"]
+        if path == "/" and method == "GET" and scope["query_string"]:
+            refused = self.gate.refusal("GET", path, headers)
+            if refused is None or refused.status == 401:
+                await _answer(send, self._admitted(scope["query_string"].decode("latin-1")))
+                return
+        refused = self.gate.refusal(method, path, headers)
+        if refused is not None:
+            await _answer(send, _refused(refused))
+        elif path == "/stream" and method == "GET":
+            await self._stream(receive, send)
+        elif path == "/command":
+            await _answer(send, await self._command(method, headers, receive))
+        else:
+            await _answer(send, self._page(path) if method != "POST" else _refused(Refusal(405, "expected GET")))
+
+    def _admitted(self, query: str) -> Answer:
+        """Give whoever opens the address with the token a cookie, and the address without it."""
+        if not self.gate.token_of_query(query):
+            return _refused(Refusal(401, "expected the token that was printed where imgcal was started"))
+        cookie = f"{self.gate.cookie}={self.gate.token}; Path=/; HttpOnly; SameSite=Strict"
+        return 303, "text/plain", b"", {"Location": "/", "Set-Cookie": cookie}
+
+    def _page(self, path: str) -> Answer:
+        if path == "/":
+            page = live_page(self.board.greeting["title"], self.gate.token)
+            return 200, "text/html; charset=utf-8", page.text.encode(), {"Content-Security-Policy": page.policy}
+        if path == "/favicon.ico":
+            return 204, "image/x-icon", b"", {}
+        if path not in ("/rig.yaml", "/report.html"):
+            return _refused(Refusal(404, "there is nothing of that name"))
+        if not self._downloads.take():
+            return _refused(Refusal(429, "too many downloads at once"))
+        if path == "/report.html":
+            page = report_page(self.board.greeting["title"], self.board.contents())
+            attached = {"Content-Disposition": 'attachment; filename="report.html"'}
+            return 200, "text/html; charset=utf-8", page.text.encode(), attached
+        text = self._rig_yaml()
+        if text is None:
+            return _refused(Refusal(503, "no snapshot has come yet"))
+        return 200, "application/yaml", text.encode(), {"Content-Disposition": 'attachment; filename="rig.yaml"'}
+
+    async def _command(self, method: str, headers: Mapping[str, list[str]], receive: Receive) -> Answer:
+        if method != "POST":
+            return _refused(Refusal(405, "expected POST"))
+        if headers.get("content-type") != [JSON]:
+            return _refused(Refusal(415, f"expected {JSON}"))
+        if not self._commands.take():
+            return _refused(Refusal(429, "too many commands at once"))
+        try:
+            body = await asyncio.wait_for(_body(receive), BODY_SECONDS)
+            given = json.loads(body)
+            command = read_command(given, self._cameras, self._actions, self.board.count)
+        except _TooLargeError:
+            return _refused(Refusal(413, f"expected at most {MOST_BODY} bytes"))
+        except (ValueError, RecursionError, TimeoutError) as error:
+            reason = str(error) if type(error) is ValueError else "expected a command as JSON"
+            return _refused(Refusal(400, reason))
+        self._obey(command)
+        return 200, JSON, b"{}", {}
+
+    def _obey(self, command: Command) -> None:
+        self._tell(asdict(command))
+        if command.name == "acknowledge":
+            assert command.event is not None
+            self.spread(self.board.acknowledge(command.event))
+        elif command.name in ("pause", "resume") or (
+            command.name in self._actions and self._actions[command.name].undo is not None
+        ):
+            self.spread(self.board.switch(command.name))
+
+    async def _stream(self, receive: Receive, send: Send) -> None:
+        """Send what is new, for as long as the viewer takes it."""
+        if len(self.viewers) >= MOST_VIEWERS:
+            await _answer(send, _refused(Refusal(503, f"{MOST_VIEWERS} viewers are here already")))
+            return
+        viewer = Viewer()
+        viewer.add(self.board.everything())
+        self.viewers.add(viewer)
+        self._tell({"viewers": len(self.viewers)})
+        gone = asyncio.ensure_future(_disconnected(receive))
+        try:
+            head = HEADERS | {"Content-Type": "text/event-stream", "X-Accel-Buffering": "no"}
+            await send({"type": "http.response.start", "status": 200, "headers": _raw(head)})
+            while not gone.done():
+                waiting = asyncio.ensure_future(viewer.news.wait())
+                await asyncio.wait((waiting, gone), timeout=ALIVE_SECONDS, return_when=asyncio.FIRST_COMPLETED)
+                waiting.cancel()
+                chunk = viewer.take() or b": still here\n\n"
+                message = {"type": "http.response.body", "body": chunk, "more_body": True}
+                await asyncio.wait_for(send(message), STUCK_SECONDS)
+        except TimeoutError:
+            pass  # the connection is closed, since the answer has no end
+        finally:
+            gone.cancel()
+            self.viewers.discard(viewer)
+            self._tell({"viewers": len(self.viewers)})
+
+
+class _TooLargeError(Exception):
+    """A body is longer than any command."""
+
+
+async def _body(receive: Receive) -> bytes:
+    body = b""
+    while True:
+        message = await receive()
+        body += message.get("body", b"")
+        if len(body) > MOST_BODY:
+            raise _TooLargeError
+        if not message.get("more_body"):
+            return body
+
+
+async def _disconnected(receive: Receive) -> None:
+    while (await receive())["type"] != "http.disconnect":
+        pass
+
+
+async def _answer(send: Send, answer: Answer) -> None:
+    status, kind, body, further = answer
+    head = HEADERS | {"Content-Type": kind, "Content-Length": str(len(body))} | further
+    await send({"type": "http.response.start", "status": status, "headers": _raw(head)})
+    await send({"type": "http.response.body", "body": body})
+
+
+def _refused(refusal: Refusal) -> Answer:
+    return refusal.status, "text/plain; charset=utf-8", f"{refusal.reason}\n".encode(), {}
+
+
+def _raw(headers: Mapping[str, str]) -> list[tuple[bytes, bytes]]:
+    return [(name.lower().encode("latin-1"), value.encode("latin-1")) for name, value in headers.items()]

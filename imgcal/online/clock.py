@@ -1,0 +1,135 @@
+"""Does a camera expose at another time than the others? What its blobs are off along the object's motion tells."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imgcal.detection import Frame
+from imgcal.estimation import Absorbed
+from imgcal.online.events import Event
+from imgcal.online.rig_state import RigState
+
+MEMORY = 5.0
+"""Seconds after which a residual counts for less, by a factor e."""
+LONGEST = 0.2
+"""Seconds between snapshots up to which the difference of predictions is a velocity."""
+SIGNIFICANT, LEAST = 40.0, 1e-3
+"""Chi-squared (one degree of freedom, once in 10^9 independent looks by chance), and seconds, from which it is told."""
+LEAST_MEMORY = 1.0
+"""Seconds of motion before anything is told."""
+STEP, STEPS = 0.2, 3
+"""Pixels by which a camera's image must be otherwise, and for how many snapshots, to begin it anew."""
+LEAST_DETERMINED = 1e-6
+"""Determinant, of ones on the diagonal, from which motion and shift are told apart."""
+MOST_PIXELS = 50.0
+"""Residuals beyond are wrong labels."""
+
+
+class ClockOffsets:
+    """Estimates when each camera exposes, against the median camera.
+
+    Residuals are explained by a time (the object's velocity in the image times it) and a constant shift of the image
+    together: a camera that was bumped shifts its image the same way wherever the object goes.
+    """
+
+    name = "clock"
+
+    def __init__(self, cameras: int) -> None:
+        """Begin with nothing known."""
+        self._normal, self._right = np.zeros((cameras, 3, 3)), np.zeros((cameras, 3))
+        self._other = np.zeros(cameras, dtype=np.int64)  # snapshots in a row that are otherwise
+        self._last: tuple[float, NDArray[np.float64]] | None = None
+        self._seconds = 0.0  # of motion that has been seen
+        self._told = np.zeros(cameras)  # s, what was told last
+        self._period = math.nan
+
+    def __call__(
+        self, state: RigState, frames: Mapping[str, Frame | None] | None, absorbed: Absorbed | None
+    ) -> Iterable[Event]:
+        """See `SequentialTest`."""
+        last, self._last = self._last, (state.time, state.predicted)
+        if last is None or state.rig_from_object is None or not 0 < state.time - last[0] <= LONGEST:
+            return ()
+        self._period = state.time - last[0]
+        self._add(state, (state.predicted - last[1]) / self._period)
+        offset, sigma = self.offsets()
+        changed = np.abs(offset - self._told)
+        sure = changed > np.maximum(math.sqrt(SIGNIFICANT) * sigma, LEAST)
+        if self._seconds < LEAST_MEMORY or not sure.any():
+            return ()
+        camera = int(np.argmax(np.where(sure, changed / sigma, 0.0)))  # one at a time: the others may lean on it
+        self._told[camera] = offset[camera]
+        return (self._event(state, camera, float(offset[camera]), float(sigma[camera])),)
+
+    def offsets(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """By how much each camera exposes after the median one, and its standard deviation: (C,) s; nan = unknown."""
+        power = np.diagonal(self._normal, axis1=1, axis2=2)
+        scale = np.sqrt(np.maximum(power, 1e-30))
+        scaled = self._normal / (scale[:, :, None] * scale[:, None])
+        known = (power.min(1) > 0) & (np.linalg.det(scaled) > LEAST_DETERMINED)
+        inverse = np.linalg.inv(np.where(known[:, None, None], scaled, np.eye(3)))
+        offset = np.where(known, (inverse[:, 0] * self._right / scale).sum(1) / scale[:, 0], np.nan)
+        sigma = np.where(known, np.sqrt(inverse[:, 0, 0]) / scale[:, 0], np.nan)
+        return offset - (np.nanmedian(offset) if known.any() else 0.0), sigma
+
+    def _add(self, state: RigState, velocity: NDArray[np.float64]) -> None:
+        """Add the residuals of a snapshot; `velocity` (C, N, 2) pixels a second."""
+        keep = math.exp(-self._period / MEMORY)
+        self._normal *= keep
+        self._right *= keep
+        self._seconds = self._seconds * keep + self._period
+        blobs = state.detections
+        rows = np.flatnonzero((blobs.fiducial >= 0) & blobs.usable)
+        camera, fiducial = blobs.camera[rows], blobs.fiducial[rows]
+        residual, motion = blobs.uv[rows] - state.predicted[camera, fiducial], velocity[camera, fiducial]
+        good = (
+            np.isfinite(residual).all(1) & np.isfinite(motion).all(1) & (np.linalg.norm(residual, axis=1) < MOST_PIXELS)
+        )
+        weight = 1 / np.square(blobs.sigma[rows])
+        design = np.zeros((len(rows), 2, 3))
+        design[:, :, 0] = motion
+        design[:, 0, 1] = design[:, 1, 2] = 1.0
+        for c in np.unique(camera[good]):
+            pick = good & (camera == c)
+            part, w = design[pick], weight[pick]
+            self._forget(c, part, residual[pick], float(np.median(blobs.sigma[rows[pick]])))
+            self._normal[c] += np.einsum("nij,nik,n->jk", part, part, w)
+            self._right[c] += np.einsum("nij,ni,n->j", part, residual[pick], w)
+
+    def _forget(self, camera: int, design: NDArray[np.float64], residual: NDArray[np.float64], sigma: float) -> None:
+        """Begin a camera anew that no longer does what it did: it was bumped, or its clock has slipped."""
+        known = self._normal[camera]
+        scale = np.sqrt(np.maximum(np.diag(known), 1e-30))
+        if np.linalg.det(known / (scale[:, None] * scale)) <= LEAST_DETERMINED:
+            return
+        off = np.median(residual - design @ np.linalg.solve(known, self._right[camera]), axis=0)
+        other = float(np.linalg.norm(off)) > max(STEP, 6 * sigma / math.sqrt(len(residual)))
+        self._other[camera] = self._other[camera] + 1 if other else 0
+        if self._other[camera] >= STEPS:
+            self._normal[camera], self._right[camera], self._other[camera] = 0.0, 0.0, 0
+
+    def _event(self, state: RigState, camera: int, offset: float, sigma: float) -> Event:
+        name = state.factory.camera_names[camera]
+        how = "later" if offset > 0 else "earlier"
+        message = f"{name} exposes {1e3 * abs(offset):.3g} +- {1e3 * sigma:.1g} ms {how} than the other cameras"
+        frames = (offset / self._period, sigma / self._period)
+        evidence = (offset / sigma) ** 2
+        return Event(
+            state.time, state.snapshot, "clock_slip", name, None, None, *frames, "frames", evidence, message=message
+        )
+
+    def saved(self) -> dict[str, Any]:
+        """See `SequentialTest`."""
+        return {"told": self._told.tolist()}
+
+    def restored(self, values: dict[str, Any]) -> None:
+        """See `SequentialTest`."""
+        told = np.array(values["told"], dtype=np.float64)
+        if told.shape != self._told.shape or not np.isfinite(told).all():
+            raise ValueError(f"{self.name}: expected seconds of {len(self._told)} cameras")
+        self._told = told

@@ -1,0 +1,113 @@
+"""Slow drift of a running rig, which the filter follows without alarm, told when it has become worth knowing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+from torch import Tensor
+
+from imgcal.estimation import CHANGES, Gauge, RigBelief
+from imgcal.online.events import UNITS, ChangeKind, Event
+from imgcal.online.relearning import relative_std
+from imgcal.types import CameraRig
+
+EVERY_SECONDS = 10.0
+"""Between two looks."""
+WORTH = {"rotation": math.radians(0.05), "position": 0.5, "focal_length": 1.0, "principal_point": 1.0}
+"""Drift (rad, mm, pixels) that is told, where it is sure."""
+SURE = 5.0
+"""Standard deviations that the values had when the drift began to be measured."""
+HOW = {
+    "rotation": "has slowly turned by",
+    "position": "has slowly shifted by",
+    "focal_length": "has slowly changed its focal length by",
+    "principal_point": "has slowly changed its principal point by",
+}
+
+
+@dataclass
+class DriftWatch:
+    """Compares a rig with what it was when it was last told of, or learnt."""
+
+    names: tuple[str, ...]
+    looked: float | None = None  # s since the epoch
+    reference: CameraRig | None = None
+    std: Tensor | None = None  # (C, 15) of the reference
+    since: dict[int, float] = field(default_factory=dict)  # camera -> time of its reference
+    unsettled: frozenset[int] = frozenset()  # at any time since the last look
+
+    def take(self, belief: RigBelief, unsettled: frozenset[int], time: float, number: int) -> list[Event]:
+        """Say which cameras have drifted.
+
+        Args:
+            belief: what is known now.
+            unsettled: cameras that moved and are not known again, or do not see the object.
+            time: s since the epoch.
+            number: of the update.
+        """
+        self.unsettled |= unsettled
+        if self.looked is not None and 0 <= time - self.looked < EVERY_SECONDS:
+            return []
+        unsettled, self.unsettled = self.unsettled, frozenset()
+        self.looked = time
+        std = relative_std(belief)
+        if self.reference is None or self.std is None:
+            self._begin(range(len(self.names)), belief, std, time)
+            return []
+        change = Gauge.of_most(belief.rig, self.reference).difference(belief.rig, self.reference)
+        events, anew = [], set(unsettled)
+        for camera in range(len(self.names)):
+            if camera in unsettled:
+                continue
+            found = self._largest(change[camera], self.std[camera])
+            if found is not None:
+                events.append(self._event(camera, *found, std[camera], time, number))
+                anew.add(camera)
+            elif bool((std[camera, :10] < 0.5 * self.std[camera, :10]).any()):
+                anew.add(camera)  # what changed until now may have been learning
+        self._begin(anew, belief, std, time)
+        return events
+
+    def _largest(self, change: Tensor, std: Tensor) -> tuple[ChangeKind, float] | None:
+        """The kind of change that stands out most, where one is worth telling, and its size."""
+        best: tuple[float, ChangeKind, float] | None = None
+        for kind, part in CHANGES.items():
+            size = float(change[part].norm())
+            least = max(WORTH[kind], SURE * float(std[part].max()))
+            if size >= least and (best is None or size / least > best[0]):
+                best = size / least, kind, size  # type: ignore[assignment]
+        return None if best is None else best[1:]
+
+    def _event(self, camera: int, kind: ChangeKind, size: float, std: Tensor, time: float, number: int) -> Event:
+        unit, name = UNITS[kind], self.names[camera]
+        scale = math.degrees(1.0) if unit == "deg" else 1.0
+        assert self.std is not None
+        part = CHANGES[kind]
+        sigma = float((self.std[camera, part].square() + std[part].square()).max().sqrt()) * scale
+        size, minutes = size * scale, (time - self.since[camera]) / 60
+        message = f"{name} {HOW[kind]} {size:.2g} {unit} in {minutes:.1f} minutes"
+        return Event(time, number, "drift", name, self.since[camera], kind, size, sigma, unit, message=message)
+
+    def _begin(self, cameras: Iterable[int], belief: RigBelief, std: Tensor, time: float) -> None:
+        """Measure the drift of some cameras from now on."""
+        chosen = sorted(cameras)
+        if self.reference is None or self.std is None:
+            self.reference, self.std = belief.rig, std
+        elif chosen:
+            now = Gauge.of_most(belief.rig, self.reference).laid(belief.rig, self.reference)
+            self.reference, self.std = with_cameras(self.reference, now, chosen), self.std.clone()
+            self.std[chosen] = std[chosen]
+        self.since |= dict.fromkeys(chosen, time)
+
+
+def with_cameras(rig: CameraRig, other: CameraRig, cameras: list[int]) -> CameraRig:
+    """Replace cameras by those of another rig, both without batch axes."""
+
+    def put(tensor: Tensor, source: Tensor) -> Tensor:
+        changed = tensor.clone()
+        changed[cameras] = source[cameras]
+        return changed
+
+    return CameraRig.combine((rig, other), lambda pair: put(*pair))

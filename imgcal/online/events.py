@@ -1,0 +1,85 @@
+"""What happened to a rig that is kept calibrated: one line of `events.jsonl` each."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Literal, get_args
+
+EventKind = Literal[
+    "moved",
+    "relearnt",
+    "drift",
+    "camera_lost",
+    "camera_back",
+    "dirty",
+    "defocused",
+    "clean",
+    "object_bent",
+    "object_exchanged",
+    "clock_slip",
+    "restart",
+    "factory",
+]
+ChangeKind = Literal["rotation", "position", "focal_length", "principal_point", "unknown"]
+Unit = Literal["deg", "mm", "px", "frames"]
+
+UNITS: dict[ChangeKind, Unit | None] = {
+    "rotation": "deg", "position": "mm", "focal_length": "px", "principal_point": "px", "unknown": None,
+}  # fmt: skip
+EVENT_KINDS: tuple[EventKind, ...] = get_args(EventKind)
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that became known about a rig.
+
+    Of a camera that moved there are two: one as soon as it is sure, with the change `unknown`, and a second one with
+    the same camera and `since` once it is decided how it moved and how far.
+
+    Examples:
+        >>> event = Event(1.5, 90, "moved", "cam07", since=1.48, change="rotation", size=0.3, sigma=0.01, unit="deg",
+        ...               evidence=412.0, message="cam07 turned 0.3 degrees")
+        >>> json.loads(event.to_json())["time"], json.loads(event.to_json())["kind"]
+        ('1970-01-01T00:00:01.500+00:00', 'rotation')
+    """
+
+    time: float  # s since the epoch: when it became known
+    snapshot: int  # number of the update that it became known with
+    kind: EventKind
+    camera: str | None = None
+    since: float | None = None  # s since the epoch: when it happened
+    change: ChangeKind | None = None
+    size: float | None = None  # in `unit`
+    sigma: float | None = None  # one standard deviation of the size
+    unit: Unit | None = None
+    evidence: float | None = None  # chi-squared of standing still, of a camera that moved
+    message: str = ""  # one sentence
+
+    def to_json(self) -> str:
+        """Write one line of `events.jsonl`: times in ISO 8601, UTC; `event` is what happened, `kind` how it changed."""
+        values = {
+            "event": self.kind,
+            "camera": self.camera,
+            "snapshot": snapshot_name(self.snapshot),
+            "time": iso_time(self.time),
+            "since": None if self.since is None else iso_time(self.since),
+            "kind": self.change,
+            "size": self.size,
+            "sigma": self.sigma,
+            "unit": self.unit,
+            "evidence": self.evidence,
+            "message": self.message,
+        }
+        return json.dumps(values, allow_nan=False, ensure_ascii=False)
+
+
+def snapshot_name(number: int) -> str:
+    """Name of the update of a number."""
+    return f"{number:05d}"
+
+
+def iso_time(seconds: float) -> str:
+    """ISO 8601 of seconds since the epoch, to the millisecond, in UTC."""
+    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds")

@@ -1,0 +1,58 @@
+"""Is that another object? As many blobs as fiducials, and for seconds nobody can tell which is which."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from imgcal.detection import Frame
+from imgcal.estimation import Absorbed
+from imgcal.online.events import Event
+from imgcal.online.rig_state import RigState
+
+SECONDS, SNAPSHOTS = 3.0, 30
+"""How long, and how often in a row, a snapshot must be refused: an object half hidden is refused for moments."""
+SHARE, CAMERAS = 0.6, 2
+"""Blobs, in parts of the object's fiducials, from which a camera sees something like it, and cameras that must."""
+
+
+class ForeignObject:
+    """Tells once when what is seen is no longer the object; again after the object has been seen."""
+
+    name = "foreign object"
+
+    def __init__(self) -> None:
+        """Begin before the object has been seen."""
+        self._known = False  # the object has been seen since the last alarm
+        self._since: float | None = None  # s, of the first refused snapshot
+        self._times = 0
+
+    def __call__(
+        self, state: RigState, frames: Mapping[str, Frame | None] | None, absorbed: Absorbed | None
+    ) -> Iterable[Event]:
+        """See `SequentialTest`."""
+        if state.refused is None:
+            self._known, self._since, self._times = True, None, 0
+            return ()
+        blobs = state.detections
+        count = np.bincount(blobs.camera[blobs.usable], minlength=len(blobs.camera_names))
+        if (count >= SHARE * len(state.belief.points_object)).sum() < CAMERAS:
+            self._since, self._times = None, 0
+            return ()
+        self._since = state.time if self._since is None else self._since
+        self._times += 1
+        if not self._known or self._times < SNAPSHOTS or state.time - self._since < SECONDS:
+            return ()
+        self._known = False
+        message = "what the cameras see is not the object, or it is bent beyond recognition"
+        return (Event(state.time, state.snapshot, "object_exchanged", None, self._since, message=message),)
+
+    def saved(self) -> dict[str, Any]:
+        """See `SequentialTest`."""
+        return {"known": self._known}
+
+    def restored(self, values: dict[str, Any]) -> None:
+        """See `SequentialTest`."""
+        self._known = bool(values["known"])

@@ -1,0 +1,151 @@
+"""Is a camera getting dirty, or out of focus? Its blobs, second after second, against what they used to be."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imgcal.detection import Frame
+from imgcal.estimation import Absorbed, Cusum
+from imgcal.online.events import Event, EventKind
+from imgcal.online.rig_state import RigState
+
+BLOCK = 1.0
+"""Seconds that are put together: neighbouring snapshots say the same."""
+LEAST_VALUES = 10
+"""Blobs in such a block from which its median counts."""
+LEARNT = 30
+"""Blocks that say what is usual."""
+RUN_LENGTH = 1e6
+"""Blocks for one false alarm of a camera and value: eleven days in which it sees the object."""
+LEAST_SPREAD = np.array((0.03, 0.15, 0.05))
+"""Standard deviations of a block at least: size (3 %), uncertainty (15 %), share that is missing (5 %)."""
+CLEAN, CLEAN_BLOCKS = 1.5, 5
+"""Standard deviations within which a value is as usual again, and for how many blocks it must be."""
+MARGIN = 0.05
+"""Of the image's size, from its border, within which a fiducial may as well be out of view."""
+SAID: tuple[tuple[EventKind, str], ...] = (
+    ("defocused", "shows blobs that are larger than they used to be: out of focus"),
+    ("dirty", "shows blobs that are fainter than they used to be: dirty, or badly lit"),
+    ("dirty", "misses fiducials that other cameras see: dirty, or half covered"),
+)
+
+
+class ImageQuality:
+    """Follows size and uncertainty of blobs, and the share that is missing, camera by camera.
+
+    A blob is as large as its fiducial is near; its uncertainty says how bright it is against the noise.
+    Page's cumulative sum of medians over a second is compared with the first half minute.
+    """
+
+    name = "image quality"
+
+    def __init__(self, cameras: int) -> None:
+        """Begin with cameras whose images are good."""
+        self._cameras = cameras
+        self._values: list[list[list[float]]] = [[[] for _ in range(cameras)] for _ in SAID]
+        self._began: float | None = None  # s, of the block
+        self._count = np.zeros((3, cameras), dtype=np.int64)  # blocks that have been learnt
+        self._sum, self._squares = np.zeros((3, cameras)), np.zeros((3, cameras))
+        self._usual = np.zeros((3, cameras), dtype=np.int64)  # blocks in a row that are as usual
+        self._bad = np.zeros((3, cameras), dtype=bool)
+        self._test = Cusum(3 * cameras, 1.0, RUN_LENGTH)
+
+    def __call__(
+        self, state: RigState, frames: Mapping[str, Frame | None] | None, absorbed: Absorbed | None
+    ) -> Iterable[Event]:
+        """See `SequentialTest`."""
+        if self._began is None or not 0 <= state.time - self._began < 10 * BLOCK:
+            self._began, self._values = state.time, [[[] for _ in range(self._cameras)] for _ in SAID]
+        events = self._judged(state) if state.time - self._began >= BLOCK else []
+        if state.rig_from_object is not None:
+            self._collect(state)
+        return events
+
+    def _collect(self, state: RigState) -> None:
+        """Add the blobs of a snapshot."""
+        assert state.rig_from_object is not None
+        blobs, rig = state.detections, state.rig
+        rows = np.flatnonzero((blobs.fiducial >= 0) & blobs.usable)
+        camera, fiducial = blobs.camera[rows], blobs.fiducial[rows]
+        points = state.rig_from_object.apply(state.belief.points_object)
+        depth = rig.expand(1).project_values(points[None], None).depth[0].numpy()[camera, fiducial]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            size = np.log(blobs.radius[rows] * depth / rig.focal_length.mean(-1).numpy()[camera])
+            sigma = np.log(blobs.sigma[rows] / depth)  # a lamp is as bright as it is near
+        for number, values in enumerate((size, sigma)):
+            for c, value in zip(camera.tolist(), values.tolist(), strict=True):
+                if np.isfinite(value):
+                    self._values[number][c].append(value)
+        seen = np.zeros(state.predicted.shape[:2], dtype=bool)
+        seen[camera, fiducial] = True
+        image = rig.image_size.numpy()[:, None]
+        with np.errstate(invalid="ignore"):
+            inside = ((state.predicted > MARGIN * image) & (state.predicted < (1 - MARGIN) * image)).all(-1)
+        expected = inside & (seen.sum(0) - seen >= 2)
+        for c in range(self._cameras):
+            self._values[2][c].extend((~seen[c, expected[c]]).astype(float).tolist())
+
+    def _judged(self, state: RigState) -> list[Event]:
+        """Compare a block with those before, and begin the next one."""
+        enough = [[len(v) >= LEAST_VALUES for v in values] for values in self._values]
+        middle = (np.median, np.median, np.mean)
+        block = np.array(
+            [
+                [middle[n](v) if ok else np.nan for v, ok in zip(self._values[n], enough[n], strict=True)]
+                for n in range(3)
+            ]
+        )
+        self._began, self._values = state.time, [[[] for _ in range(self._cameras)] for _ in SAID]
+        learning = np.isfinite(block) & (self._count < LEARNT)
+        self._count += learning
+        self._sum += np.where(learning, block, 0.0)
+        self._squares += np.where(learning, np.square(np.nan_to_num(block)), 0.0)
+        mean = self._sum / np.maximum(self._count, 1)
+        spread = np.sqrt(np.maximum(self._squares / np.maximum(self._count, 1) - mean**2, 0.0))
+        z = (block - mean) / np.maximum(spread, LEAST_SPREAD[:, None])
+        z[(self._count < LEARNT) | learning] = np.nan
+        risen = self._test.update(z.ravel()).reshape(z.shape)
+        self._usual = np.where(np.isnan(z), self._usual, np.where(z < CLEAN, self._usual + 1, 0))
+        return self._told(state, risen & ~self._bad, self._bad & (self._usual >= CLEAN_BLOCKS), z)
+
+    def _told(
+        self, state: RigState, worse: NDArray[np.bool_], better: NDArray[np.bool_], z: NDArray[Any]
+    ) -> list[Event]:
+        events, names = [], state.factory.camera_names
+        was = self._bad.any(0)
+        age = self._test.found.reshape(z.shape)
+        for number, camera in zip(*np.nonzero(worse), strict=True):
+            kind, message = SAID[number]
+            since = state.time - BLOCK * float(age[number, camera])
+            events.append(
+                Event(
+                    state.time, state.snapshot, kind, names[camera], since, evidence=float(z[number, camera]),
+                    message=f"{names[camera]} {message}",
+                )
+            )  # fmt: skip
+        self._bad = (self._bad | worse) & ~better
+        self._usual[worse] = 0
+        for camera in np.flatnonzero(was & ~self._bad.any(0)):
+            message = f"{names[camera]} shows blobs as it used to"
+            events.append(Event(state.time, state.snapshot, "clean", names[camera], message=message))
+        return events
+
+    def saved(self) -> dict[str, Any]:
+        """See `SequentialTest`."""
+        return {
+            "count": self._count.tolist(), "sum": self._sum.tolist(), "squares": self._squares.tolist(),
+            "bad": self._bad.tolist(), "usual": self._usual.tolist(),
+        }  # fmt: skip
+
+    def restored(self, values: dict[str, Any]) -> None:
+        """See `SequentialTest`."""
+        shape = (3, self._cameras)
+        kept = {name: np.array(values[name], dtype=np.float64) for name in ("count", "sum", "squares", "bad", "usual")}
+        if any(array.shape != shape or not np.isfinite(array).all() for array in kept.values()):
+            raise ValueError(f"{self.name}: expected numbers of {shape[1]} cameras")
+        self._count, self._usual = kept["count"].astype(np.int64), kept["usual"].astype(np.int64)
+        self._sum, self._squares, self._bad = kept["sum"], kept["squares"], kept["bad"] > 0

@@ -1,0 +1,152 @@
+"""Which labels of a snapshot fit a rig that is known: single ones that do not are strays, most of a camera's a move.
+
+Where a camera turns, shifts or zooms a little, its image of the object is turned, shifted or stretched as a whole. What
+is left of each camera's residuals without such a motion of its image tells strays; the motion itself, against that of
+most cameras, tells whether the camera is where it was.
+"""
+
+# Compiled functions take their types from their arguments.
+# ruff: noqa: ANN001, ANN202
+# mypy: allow-untyped-defs, no-check-untyped-defs
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imgcal.association import PipelineOptions, to_observations
+from imgcal.estimation import EstimationOptions, fit_pose
+from imgcal.geometry import RigidTransform, kernels
+from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
+from renderers.compiling import njit
+
+MOST_APART = 5.0
+"""Times what is usual in a snapshot that a label, or the image of a whole camera, may be off."""
+LEAST_LABELS = 3
+"""Of a camera, from which it can be said that they agree with each other."""
+LEAST_AGREEING = 0.5
+"""Share of a camera's labels that must agree with each other."""
+DEPTH = 0.2
+"""Of the motion of a camera's image, what the object's depth may add to single fiducials."""
+ROUNDS = 6
+
+
+@dataclass(frozen=True)
+class Checked:
+    """Labels of a snapshot, and how they go with a rig."""
+
+    blobs: Detections  # strays have lost their labels
+    rig_from_object: RigidTransform  # (1,) most probable for the rig as it is known
+    off: NDArray[np.bool_]  # (C,) the labels agree with each other, and lie elsewhere
+    usual: float  # px, how far off the image of a camera is: the median of all cameras
+    labels: int
+
+
+def check_labels(
+    named: Detections,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    rig_from_object: RigidTransform,
+    options: PipelineOptions,
+) -> Checked:
+    """Fit the object's pose with a rig that is known, and see which labels do not go with it.
+
+    Args:
+        named: blobs of one snapshot, labelled.
+        rig: as it is known.
+        obj: the calibration object, as it is known.
+        rig_from_object: (1,) first guess of its pose.
+        options: how far blobs may be off at all.
+
+    Raises:
+        RefusedError: the labels do not determine the pose.
+    """
+    seen = to_observations(named, rig, obj)
+    even = Observations(seen.uv, seen.sigma.new_full(seen.sigma.shape, options.identity_error), seen.seen)
+    fit = fit_pose(even, rig, obj.points, obj.radius, rig_from_object, EstimationOptions(loss="cauchy"))
+    uv, there = seen.uv[0].numpy(), seen.seen[0].numpy()
+    rest, moved = np.full(there.shape, np.nan), np.full(len(there), np.nan)
+    _compare(uv, fit.residual, there, options.identity_error, rest, moved)
+    usual_rest = float(np.median(rest[there])) if there.any() else 0.0
+    told = np.isfinite(moved)
+    usual = float(np.median(moved[told])) if told.any() else 0.0
+    least = options.identity_error + MOST_APART * usual_rest
+    stray = there & (rest > least + DEPTH * np.nan_to_num(moved)[:, None])
+    off = told & (np.nan_to_num(moved) > options.identity_error + MOST_APART * usual)
+    given, left = there.sum(1), (there & ~stray).sum(1)
+    nonsense = off & ((left < LEAST_AGREEING * given) | (left < LEAST_LABELS))
+    stray |= there & nonsense[:, None]
+    off &= ~nonsense
+    # A few labels are compared with the rig, there being nothing else.
+    distance = np.linalg.norm(fit.residual, axis=-1)
+    limit = options.identity_error + MOST_APART * float(np.median(distance[there])) if there.any() else 0.0
+    stray |= there & ~told[:, None] & (distance > limit)
+    rows = named.fiducial >= 0
+    lost = stray[named.camera[rows], named.fiducial[rows]]
+    fiducial = named.fiducial.copy()
+    fiducial[rows] = np.where(lost, -1, fiducial[rows])
+    blobs = replace(named, fiducial=fiducial)
+    return Checked(blobs, fit.rig_from_object, off, usual, int((fiducial >= 0).sum()))
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _compare(uv, residual, seen, scale, rest, moved):
+    """Write what is left of each label's residual without a motion of its camera's image, and the RMS of the motion.
+
+    The motion is a shift, with four labels a turn and a scale as well, with six a linear map; Cauchy's weights find it
+    from the median shift.
+    """
+    cameras, fiducials = seen.shape
+    at, off, weight = np.empty((fiducials, 2)), np.empty((fiducials, 2)), np.empty(fiducials)
+    number = np.empty(fiducials, np.int64)
+    for c in range(cameras):
+        count = 0
+        for n in range(fiducials):
+            if seen[c, n]:
+                number[count] = n
+                for i in range(2):
+                    at[count, i], off[count, i] = uv[c, n, i] + residual[c, n, i], residual[c, n, i]
+                count += 1
+        if count < 3:
+            for k in range(count):
+                rest[c, number[k]] = 0.0
+            continue
+        shift_u, shift_v = np.median(off[:count, 0]), np.median(off[:count, 1])
+        uu, uv_, vu, vv, middle_u, middle_v = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for _ in range(ROUNDS):
+            total, sum_u, sum_v, mean_u, mean_v = 0.0, 0.0, 0.0, 0.0, 0.0
+            for k in range(count):
+                x, y = at[k, 0] - middle_u, at[k, 1] - middle_v
+                u = off[k, 0] - shift_u - uu * x - uv_ * y
+                v = off[k, 1] - shift_v - vu * x - vv * y
+                weight[k] = 1 / (1 + (u * u + v * v) / (scale * scale))
+                total += weight[k]
+                mean_u += weight[k] * at[k, 0]
+                mean_v += weight[k] * at[k, 1]
+                sum_u += weight[k] * off[k, 0]
+                sum_v += weight[k] * off[k, 1]
+            middle_u, middle_v = mean_u / total, mean_v / total
+            shift_u, shift_v = sum_u / total, sum_v / total
+            if count >= 4:
+                xx, xy, yy, xu, xv, yu, yv = 1e-9, 0.0, 1e-9, 0.0, 0.0, 0.0, 0.0
+                for k in range(count):
+                    x, y = at[k, 0] - middle_u, at[k, 1] - middle_v
+                    u, v, w = off[k, 0] - shift_u, off[k, 1] - shift_v, weight[k]
+                    xx, xy, yy = xx + w * x * x, xy + w * x * y, yy + w * y * y
+                    xu, xv, yu, yv = xu + w * x * u, xv + w * x * v, yu + w * y * u, yv + w * y * v
+                determinant = xx * yy - xy * xy
+                if count >= 6 and determinant > 1e-4 * (xx + yy) ** 2:
+                    uu, uv_ = (yy * xu - xy * yu) / determinant, (xx * yu - xy * xu) / determinant
+                    vu, vv = (yy * xv - xy * yv) / determinant, (xx * yv - xy * xv) / determinant
+                else:
+                    uu, vu = (xu + yv) / (xx + yy), (xv - yu) / (xx + yy)
+                    uv_, vv = -vu, uu
+        total = 0.0
+        for k in range(count):
+            x, y = at[k, 0] - middle_u, at[k, 1] - middle_v
+            u, v = shift_u + uu * x + uv_ * y, shift_v + vu * x + vv * y
+            total += u * u + v * v
+            rest[c, number[k]] = np.sqrt((off[k, 0] - u) ** 2 + (off[k, 1] - v) ** 2)
+        moved[c] = np.sqrt(total / count)

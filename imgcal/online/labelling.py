@@ -1,0 +1,181 @@
+"""What a running rig does with each snapshot before anything is estimated: blobs of frames, and labels of blobs."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.association import PipelineOptions, Proposer, Sight, SnapshotIdentity, Tracker, lattice_shifts
+from imgcal.detection import DetectionOptions, Frame, detect_snapshot, to_detections
+from imgcal.errors import InputError, RefusedError
+from imgcal.geometry import RigidTransform
+from imgcal.pipeline import DetectorName, checked_detections, checked_frames, proposer_of
+from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
+
+MOST_FOLLOWED = 64
+"""Fiducials of a lattice up to which a snapshot may be labelled by the last prediction alone; a larger one could have
+slipped by a pitch unnoticed."""
+LEAST_FOLLOWED = 0.9
+"""Share of the last snapshot's labels that must be found again, and fit."""
+
+NEAR = "near the last prediction"
+
+
+class Labelling:
+    """Finds blobs, and labels those of a snapshot that the last prediction does not label. Owns a pool of threads.
+
+    Examples:
+        >>> import torch, imgcal
+        >>> from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
+        >>> factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+        >>> truth = simulate_truth(factory, obj, 1, torch.Generator().manual_seed(1), PhysicalDrift())
+        >>> labelling = Labelling(factory, obj, PipelineOptions(), DetectionOptions(), "classical")
+        >>> blobs = labelling.blobs(true_detections(truth), "first")
+        >>> labelled, snapshot = labelling.decided(blobs, "first", blobs.fiducial, None, None)
+        >>> snapshot.status
+        'coded'
+        >>> labelling.close()
+    """
+
+    def __init__(
+        self,
+        rig: CameraRig,
+        obj: CalibrationObject,
+        options: PipelineOptions,
+        detection: DetectionOptions,
+        detector: DetectorName | Proposer,
+    ) -> None:
+        """Start with the factory calibration; arguments as of `Recalibrator`."""
+        self.rig, self.obj, self.options, self.detection = rig, obj, options, detection
+        self.follows = False  # the last snapshot says where the object is now
+        self.slips = obj.num_fiducials > MOST_FOLLOWED and bool(lattice_shifts(obj))
+        self._tracker = Tracker(rig, obj, options, remembered=0)
+        self._refused = 0
+        self._proposer: Proposer | None = None
+        self._where_blobs_fail = True
+        if detector != "classical":
+            self._proposer, self._where_blobs_fail = proposer_of(detector)
+        self._pool = ThreadPoolExecutor(min(rig.num_cameras, os.cpu_count() or 1))
+
+    def close(self) -> None:
+        """End the threads."""
+        self._pool.shutdown()
+
+    def blobs(self, source: Mapping[str, Frame | None] | Detections, name: str) -> Detections:
+        """Find the blobs of a snapshot, and give it a name.
+
+        Args:
+            source: frames by camera, (H, W), None = no frame; or blobs that were found elsewhere, labelled or not.
+            name: of the snapshot.
+
+        Raises:
+            InputError: see `Recalibrator.update`.
+        """
+        if isinstance(source, Detections):
+            if len(source.snapshot_names) != 1:
+                raise InputError(f"detections: found {len(source.snapshot_names)} snapshots, expected one")
+            if len(np.unique(source.snapshot)) <= 1:  # its number in a longer table does not matter
+                source = replace(source, snapshot=np.zeros_like(source.snapshot))
+            return replace(checked_detections(source, self.rig, self.obj), snapshot_names=(name,))
+        given = checked_frames(source, self.rig)
+        frames: dict[str, Frame | None] = {}
+        for camera in self.rig.camera_names:
+            frame = given.get(camera)
+            if isinstance(frame, Sequence):
+                raise InputError(f"camera {camera}: found {len(frame)} frames, expected one of this moment, or None")
+            frames[camera] = frame
+        blobs = detect_snapshot(frames, self.detection, pool=self._pool)
+        return to_detections([blobs], self.rig.camera_names, (name,))
+
+    def decided(
+        self,
+        usable: Detections,
+        name: str,
+        coded: NDArray[np.int64] | None,
+        frames: Mapping[str, Frame | None] | None,
+        known: tuple[CameraRig, Tensor] | None,
+    ) -> tuple[Detections, SnapshotIdentity]:
+        """Label a snapshot by itself, with what is known of the rig.
+
+        Args:
+            usable: its blobs.
+            name: its name.
+            coded: (M,) labels that came with them; None = none did.
+            frames: those that the blobs were found in, for a proposer; None = there are none.
+            known: the rig, and how well it is known (C, 15); None = as the factory says.
+
+        Raises:
+            RefusedError: it cannot be told which blob is which.
+        """
+        self.follows = False
+        prior, tracker = (self.rig.prior or RigPrior()).std(self.rig), self._tracker
+        tracker.rig, tracker.prior_std = known or (self.rig, prior)
+        if self._proposer is not None and frames is not None and not self._where_blobs_fail:
+            return self._looked(self._proposer, usable, name, frames)
+        snapshot, labels = tracker.decide(usable, name) if coded is None else tracker.accept(name, coded)
+        if snapshot.status == "refused" and self._proposer is not None and frames is not None:
+            return self._looked(self._proposer, usable, name, frames)
+        again = known is not None and self._refused & (self._refused - 1) == 0
+        if snapshot.status == "refused" and coded is None and again:
+            # What was known may hold no more. Another try is dear: after 1, 2, 4, 8, ... refusals in a row.
+            tracker.rig, tracker.prior_std = self.rig, prior
+            snapshot, labels = tracker.decide(usable, name)
+        if snapshot.status == "refused":
+            self._refused += 1
+            raise RefusedError(f"identity: {snapshot.reason}")
+        self._refused = 0
+        return replace(usable, fiducial=labels), snapshot
+
+    def _looked(
+        self, proposer: Proposer, blobs: Detections, name: str, frames: Mapping[str, Frame | None]
+    ) -> tuple[Detections, SnapshotIdentity]:
+        """Label a snapshot by what a proposer sees in its frames."""
+        sight = Sight(proposer, lambda _: frames, self._where_blobs_fail, self.detection)
+        snapshot, labels, found = self._tracker.look(sight, 0, blobs, name)
+        if snapshot.status == "refused":
+            self._refused += 1
+            raise RefusedError(f"identity: {snapshot.reason}")
+        self._refused = 0
+        return replace(found, fiducial=labels), snapshot
+
+    def follow(self, pose: RigidTransform) -> None:
+        """Take over the object's pose in the latest snapshot: the next one is near it."""
+        self._tracker.follow(pose)
+        self.follows = True
+
+    def saved(self) -> dict[str, Any]:
+        """What is remembered from snapshot to snapshot."""
+        tracker = self._tracker
+        return {
+            "follows": self.follows,
+            "refused": self._refused,
+            "pose": tracker.pose,
+            "alternatives": tracker.alternatives,
+            "in_vain": tracker.in_vain,
+            "looks_in_vain": tracker.looks_in_vain,
+        }
+
+    def restored(self, values: dict[str, Any]) -> None:
+        """Take over what `saved` gave.
+
+        Raises:
+            ValueError: it is not that.
+        """
+        fresh = self.saved()
+        if values.keys() != fresh.keys() or any(
+            type(values[name]) is not type(fresh[name]) for name in fresh if name != "pose"
+        ):
+            raise ValueError("labelling: found other values than are written here")
+        pose = values["pose"]
+        if pose is not None and not (isinstance(pose, RigidTransform) and pose.rotation.shape[-2:] == (3, 3)):
+            raise ValueError("labelling: found no pose")
+        self.follows, self._refused, self._tracker.pose = values["follows"], values["refused"], pose
+        self._tracker.alternatives, self._tracker.in_vain = values["alternatives"], values["in_vain"]
+        self._tracker.looks_in_vain = values["looks_in_vain"]

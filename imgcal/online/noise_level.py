@@ -1,0 +1,109 @@
+"""How large the noise of a running rig's blobs is, beyond what the blobs say themselves."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+
+from imgcal.association import PipelineOptions, SnapshotIdentity
+from imgcal.errors import RefusedError
+from imgcal.estimation import Absorbed
+from imgcal.geometry import RigidTransform
+from imgcal.online.labelling import NEAR
+from imgcal.online.window import Kept, stacked
+from imgcal.pipeline import fit_labelled
+from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
+
+ASKED = (1, 2, 4, 8, 16, 32)
+"""Numbers of first snapshots that are asked together."""
+OTHER = 1.2
+"""Factor between two noise levels that are told apart."""
+EVERY = 64
+"""Snapshots after which it is asked again, of as many."""
+
+
+class NoiseLevel:
+    """Asks the first snapshots together, and each later one by what it leaves."""
+
+    def __init__(self, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions) -> None:
+        """Begin with the noise that the blobs say."""
+        self._rig, self._obj, self._options = rig, obj, options
+        self.additive = 0.0  # px
+        self.restart()
+
+    def restart(self) -> None:
+        """Ask first snapshots again."""
+        self._early: list[Kept] = []
+        self._asking = True
+        self._ratios: deque[float] = deque(maxlen=EVERY)
+        self.first: list[tuple[Detections, RigidTransform]] = []  # snapshots that showed another noise, and poses
+
+    def take(self, blobs: Detections, observations: Observations, result: Absorbed, steady: bool, count: int) -> bool:
+        """Take a snapshot that has been learnt.
+
+        Args:
+            blobs: labelled.
+            observations: the same, with the noise that was believed.
+            result: what they taught.
+            steady: no camera is in doubt.
+            count: snapshots learnt.
+
+        Returns:
+            Whether the first snapshots should be learnt again: `first` has them all.
+        """
+        again = False
+        if self._asking:
+            self._asking = steady and count == len(self._early) + 1 and count <= ASKED[-1]
+            if self._asking:
+                identity = SnapshotIdentity(f"{count}", "by_tracking", NEAR, 1, result.rig_from_object[0])
+                self._early.append(Kept(blobs, identity))
+                again = count in ASKED and self._asked()
+                if count == ASKED[-1]:
+                    self._asking = False
+            if not self._asking:
+                self._early = []
+        if steady:
+            self._follow(observations, result, count)
+        return again
+
+    def _asked(self) -> bool:
+        """Ask the first snapshots together how large the noise is."""
+        try:
+            fit = fit_labelled(stacked(tuple(self._early), self._rig), self._rig, self._obj, self._options)
+        except RefusedError:
+            return False
+        before, now = self.additive, fit.additive_noise
+        if not self._differs(now):
+            return False
+        self.additive = now
+        poses = fit.rig_from_object
+        if len(poses.translation) != len(self._early):
+            self.additive = before
+            return False
+        self.first = [(kept.blobs, poses[number : number + 1]) for number, kept in enumerate(self._early)]
+        return True
+
+    def _differs(self, additive: float) -> bool:
+        sigma = float(np.median(self._early[-1].blobs.sigma))
+        before, now = math.hypot(sigma, self.additive), math.hypot(sigma, additive)
+        return max(before, now) > OTHER * min(before, now)
+
+    def _follow(self, observations: Observations, result: Absorbed, count: int) -> None:
+        """Follow the noise by what single snapshots leave."""
+        seen = observations.seen[0]
+        squared = (result.residual[0].square().sum(-1) / observations.sigma[0].square())[seen]
+        if result.dof <= 0:
+            return
+        # The median of squared residuals of two coordinates is 2 log 2; outliers do not count.
+        free = result.dof / (2 * len(squared))
+        self._ratios.append(float(squared.median()) / (2 * math.log(2) * free))
+        if count % EVERY or len(self._ratios) < EVERY:
+            return
+        ratio = float(np.median(self._ratios))
+        if max(ratio, 1 / max(ratio, 1e-9)) > OTHER**2:
+            variance = float(observations.sigma[0][seen].square().median())
+            own = max(variance - self.additive**2, 0.0)
+            self.additive = math.sqrt(max(variance * ratio - own, 0.0))
+            self._ratios.clear()

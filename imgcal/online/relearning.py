@@ -1,0 +1,97 @@
+"""Cameras that moved: what is told of them, until they are known again as well as before."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from imgcal.estimation import CHANGES, Change, Gauge, RigBelief
+from imgcal.online.events import UNITS, ChangeKind, Event
+
+RELEARNT = 1.1
+"""Times the standard deviations that a camera's values had before it moved, from which it is known again."""
+EVERY = 4
+"""Snapshots between two looks at that."""
+EXTRINSICS_AND_PINHOLE = 10
+"""Values of a camera that are compared: the distortion changes with none of the changes that are told."""
+
+HOW: dict[ChangeKind, str] = {
+    "rotation": "turned",
+    "position": "was shifted by",
+    "focal_length": "changed its focal length by",
+    "principal_point": "changed its principal point by",
+    "unknown": "moved",
+}
+
+
+@dataclass
+class Relearning:
+    """Remembers cameras that moved."""
+
+    names: tuple[str, ...]
+    events: dict[int, Event] = field(default_factory=dict)  # camera -> what was told of it last
+    before: dict[int, Tensor] = field(default_factory=dict)  # camera -> (15,) std before it moved
+
+    def told(self, change: Change, since: float, time: float, number: int, before: RigBelief) -> Event:
+        """Tell of a change.
+
+        Args:
+            change: by the monitor.
+            since: s since the epoch, when it happened.
+            time: s since the epoch, now.
+            number: of the update.
+            before: a belief before the change.
+        """
+        kind: ChangeKind = change.kind  # type: ignore[assignment]
+        unit, name = UNITS[kind], self.names[change.camera]
+        scale = math.degrees(1.0) if unit == "deg" else 1.0
+        size, sigma = (None, None) if unit is None else (change.size * scale, change.sigma * scale)
+        how = HOW[kind] if size is None else f"{HOW[kind]} {size:.3g} +- {sigma:.1g} {unit}"
+        event = Event(time, number, "moved", name, since, kind, size, sigma, unit, message=f"{name} {how}")
+        self.events[change.camera] = event
+        if change.camera not in self.before:
+            self.before[change.camera] = relative_std(before)[change.camera]
+        return event
+
+    def learnt(self, belief: RigBelief, still_open: frozenset[int], time: float, number: int) -> list[Event]:
+        """Say which cameras are known again as well as before."""
+        waiting = [camera for camera in self.events if camera not in still_open]
+        if not waiting or number % EVERY:
+            return []
+        std, told = relative_std(belief), []
+        for camera in waiting:
+            part = slice(0, EXTRINSICS_AND_PINHOLE)
+            if bool((std[camera, part] <= RELEARNT * self.before[camera][part]).all()):
+                event = self.events.pop(camera)
+                del self.before[camera]
+                sigma = sigma_of(std[camera], event.change)
+                known = "" if sigma is None else f" to {sigma:.2g} {event.unit}"
+                told.append(
+                    replace(
+                        event,
+                        time=time,
+                        snapshot=number,
+                        kind="relearnt",
+                        sigma=sigma,
+                        message=f"{event.message}, re-learnt{known}",
+                    )
+                )
+        return told
+
+
+def relative_std(belief: RigBelief) -> Tensor:
+    """One standard deviation of every parameter against the mean of all cameras: (C, 15)."""
+    count = belief.rig.num_cameras
+    jacobian = Gauge(torch.full((count,), 1 / count, dtype=torch.float64)).jacobian(belief.rig)
+    spread = (jacobian @ belief.covariance() * jacobian).sum(1)
+    return spread.clamp_min(0).sqrt().view(belief.unit.shape)
+
+
+def sigma_of(std: Tensor, change: ChangeKind | None) -> float | None:
+    """Standard deviation of the worst direction of a kind of change, of a camera's (15,), in the unit of its event."""
+    if change is None or change not in CHANGES:
+        return None
+    return float(std[CHANGES[change]].max()) * (math.degrees(1.0) if change == "rotation" else 1.0)

@@ -1,0 +1,77 @@
+"""What is known of a running rig after a snapshot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.estimation import Gauge, RigBelief
+from imgcal.geometry import RigidTransform
+from imgcal.online.events import Event
+from imgcal.types import CameraRig, Detections
+
+CameraHealth = Literal["ok", "doubtful", "relearning", "blind", "dirty", "defocused", "lost", "unseen"]
+
+
+@dataclass(frozen=True)
+class RigState:
+    """A rig that is kept calibrated, as it is after a snapshot.
+
+    Health of a camera: `ok`, what is said of it holds; `doubtful`, its last snapshots do not fit, and it is not decided
+    yet whether it moved; `relearning`, it has moved, and is not known again as well as before; `lost`, nothing comes
+    from it, or what it sees cannot be told apart: its values may hold no more; `unseen`, it has not seen the object
+    yet: the factory's values. The others are told by detectors that look at frames.
+
+    Examples:
+        >>> import torch, imgcal
+        >>> from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
+        >>> factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+        >>> truth = simulate_truth(factory, obj, 1, torch.Generator().manual_seed(1), PhysicalDrift())
+        >>> with imgcal.RigKeeper(factory, obj) as keeper:
+        ...     state = keeper.update(true_detections(truth), time=0.0)
+        >>> state.cameras["cam01"], state.refused, state.events
+        ('ok', None, ())
+    """
+
+    time: float  # s since the epoch
+    snapshot: int  # number of the update
+    belief: RigBelief  # the rig, and how surely it is known
+    factory: CameraRig
+    cameras: Mapping[str, CameraHealth]
+    sentence: str  # of state, for people
+    refused: str | None  # why this snapshot taught nothing
+    detections: Detections  # blobs of this snapshot, labelled where identified
+    predicted: NDArray[np.float64]  # (C, N, 2) pixels where the rig puts the fiducials; nan where that is not known
+    residual: NDArray[np.float64]  # (C,) RMS pixels of this snapshot; nan where nothing was seen
+    rig_from_object: RigidTransform | None
+    events: tuple[Event, ...]  # that became known with this snapshot
+    clock_offset: NDArray[np.float64]  # (C,) s that a camera exposes later than most; nan = not known
+    clock_offset_sigma: NDArray[np.float64]  # (C,) s, one standard deviation
+
+    @property
+    def rig(self) -> CameraRig:
+        """The rig as it is now."""
+        return self.belief.rig
+
+    @cached_property
+    def gauge(self) -> Gauge:
+        """Which cameras are taken to have stood still since the factory calibration: what most agree on."""
+        return Gauge.of_most(self.rig, self.factory)
+
+    @cached_property
+    def moved(self) -> Tensor:
+        """Change of every parameter against the factory rig, a motion of the whole rig taken out: (C, 15)."""
+        return self.gauge.difference(self.rig, self.factory)
+
+    @cached_property
+    def std(self) -> Tensor:
+        """One standard deviation of `moved`, and so of the cameras against most of the others: (C, 15)."""
+        jacobian = self.gauge.jacobian(self.rig)
+        spread = (jacobian @ self.belief.covariance() * jacobian).sum(1)
+        return spread.clamp_min(0).sqrt().unflatten(0, (-1, self.rig.num_parameters))

@@ -1,0 +1,102 @@
+"""Which cameras of a running rig see the object: those that are lost, and those that are back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imgcal.online.events import Event
+from imgcal.types import CameraRig, Detections
+
+LEAST_EXPECTED = 3
+"""Fiducials that a camera should see before it says anything that it sees none."""
+MARGIN = 0.05
+"""Of the image's size, from its border, within which a fiducial may as well be out of view."""
+ABSENT_SECONDS, ABSENT_SNAPSHOTS = 2.0, 30
+"""How long, and how often, a camera must miss what it should see before it counts as lost: arms hide objects, too."""
+SILENT_SECONDS = 0.5
+"""How long no frame comes from a camera before it counts as lost."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """What was looked at in a snapshot."""
+
+    time: float
+    number: int
+    blobs: Detections  # labelled
+    predicted: NDArray[np.float64]  # (C, N, 2), nan where that is not known
+    astray: frozenset[int]  # cameras that see what may be the object, and not where it should be
+    silent: frozenset[int]  # cameras without a frame
+
+
+@dataclass
+class Sightings:
+    """Follows every camera."""
+
+    names: tuple[str, ...]
+    seen: set[int] = field(default_factory=set)  # cameras that have ever had labels
+    lost: dict[int, float] = field(default_factory=dict)  # camera -> since when
+    missing: dict[int, tuple[float, int]] = field(default_factory=dict)  # not lost yet: since when, how often
+    silent: dict[int, float] = field(default_factory=dict)  # since when no frame came
+
+    def take(self, rig: CameraRig, look: Look) -> list[Event]:
+        """Say which cameras are lost or back with a snapshot."""
+        labelled = set(np.unique(look.blobs.camera[look.blobs.fiducial >= 0]).tolist())
+        self.seen |= labelled
+        self.silent = {camera: self.silent.get(camera, look.time) for camera in look.silent}
+        absent = self._should_see(rig, look.predicted) - labelled - look.astray - look.silent
+        for camera in list(self.missing):
+            if camera in labelled:
+                del self.missing[camera]
+        for camera in absent:
+            first, times = self.missing.get(camera, (look.time, 0))
+            self.missing[camera] = first, times + 1
+        events = []
+        for camera in range(len(self.names)):
+            why = self._why(camera, look)
+            if why is not None and camera not in self.lost:
+                since, message = why
+                self.lost[camera] = since
+                events.append(self._event("camera_lost", camera, since, message, look))
+            elif camera in self.lost and camera in labelled:
+                since = self.lost.pop(camera)
+                events.append(self._event("camera_back", camera, since, "sees the object again", look))
+        return events
+
+    def _why(self, camera: int, look: Look) -> tuple[float, str] | None:
+        if camera in look.astray:
+            return look.time, "sees what may be the object, but not where it should be"
+        if camera in self.silent and look.time - self.silent[camera] >= SILENT_SECONDS:
+            return self.silent[camera], "sends no frames"
+        first, times = self.missing.get(camera, (look.time, 0))
+        if times >= ABSENT_SNAPSHOTS and look.time - first >= ABSENT_SECONDS:
+            return first, "does not see the object, which should be in view"
+        return None
+
+    def _should_see(self, rig: CameraRig, predicted: NDArray[np.float64]) -> set[int]:
+        """Cameras in which the object is well inside of the image."""
+        size = rig.image_size.numpy()[:, None]
+        with np.errstate(invalid="ignore"):
+            inside = ((predicted > MARGIN * size) & (predicted < (1 - MARGIN) * size)).all(-1)
+        return set(np.flatnonzero(inside.sum(1) >= LEAST_EXPECTED).tolist())
+
+    def _event(self, kind: str, camera: int, since: float, message: str, look: Look) -> Event:
+        name = self.names[camera]
+        return Event(look.time, look.number, kind, name, since, message=f"{name} {message}")  # type: ignore[arg-type]
+
+    def saved(self) -> dict[str, object]:
+        """Plain values."""
+        return {
+            "seen": sorted(self.seen),
+            "lost": _pairs(self.lost),
+            "missing": [[camera, *entry] for camera, entry in sorted(self.missing.items())],
+            "silent": _pairs(self.silent),
+        }
+
+
+def _pairs(values: Mapping[int, float]) -> list[list[float]]:
+    return [[camera, since] for camera, since in sorted(values.items())]

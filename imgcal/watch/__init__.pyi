@@ -1,0 +1,46 @@
+from .bags import Bag
+from .event_log import EventLog
+from .exposures import CameraBlobs, Exposure, Item, Source, Unreadable, checked
+from .folder import Folder
+from .hook import Hook
+from .intake import Intake
+from .json_lines import JsonLines
+from .loop import PROGRESS, STATE, Keeper, Page, Progress, Watch
+from .metrics import Metrics, Tally
+from .recordings import BlobTable, Videos, holds_videos
+from .rig_files import CURRENT, RigFiles
+from .synchronization import COUNTS, Synchronizer, TimedSnapshot, Timing
+from .zeromq import ZeroMQ
+
+__all__ = [
+    "COUNTS",
+    "CURRENT",
+    "PROGRESS",
+    "STATE",
+    "Bag",
+    "BlobTable",
+    "CameraBlobs",
+    "EventLog",
+    "Exposure",
+    "Folder",
+    "Hook",
+    "Intake",
+    "Item",
+    "JsonLines",
+    "Keeper",
+    "Metrics",
+    "Page",
+    "Progress",
+    "RigFiles",
+    "Source",
+    "Synchronizer",
+    "Tally",
+    "TimedSnapshot",
+    "Timing",
+    "Unreadable",
+    "Videos",
+    "Watch",
+    "ZeroMQ",
+    "checked",
+    "holds_videos",
+]

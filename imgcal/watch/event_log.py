@@ -1,0 +1,67 @@
+"""`events.jsonl`: one line an event, whole whatever happens to the process."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from imgcal.errors import InputError
+from imgcal.online import Event
+
+MOST_BYTES = 2**26
+"""Size from which on events go to a new file; the one before is kept, `events.1.jsonl`."""
+LONGEST = 2**16  # bytes of a line, more than any event takes
+
+
+class EventLog:
+    """Appends events to a file.
+
+    A line is written by one call of the system: a killed process leaves it whole or not at all. What a power failure
+    left of a line is cut off.
+    """
+
+    def __init__(self, path: Path, most_bytes: int = MOST_BYTES) -> None:
+        """Open or make the file.
+
+        Raises:
+            InputError: it cannot be written.
+        """
+        self.path, self._most = path, most_bytes
+        try:
+            self._cut()
+            self._descriptor = self._opened()
+        except OSError as error:
+            raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+    def append(self, event: Event) -> None:
+        """Write an event.
+
+        Raises:
+            OSError: the disk is full, for example; nothing of the line is there then.
+        """
+        line = event.to_json().encode(errors="replace") + b"\n"
+        size = os.fstat(self._descriptor).st_size
+        if size and size + len(line) > self._most:
+            os.close(self._descriptor)
+            os.replace(self.path, self.path.with_name(f"{self.path.stem}.1{self.path.suffix}"))
+            self._descriptor, size = self._opened(), 0
+        written = os.write(self._descriptor, line)
+        if written < len(line):
+            os.ftruncate(self._descriptor, size)
+            raise OSError(f"{self.path}: {written} of {len(line)} bytes could be written")
+
+    def close(self) -> None:
+        """Close the file."""
+        os.close(self._descriptor)
+
+    def _opened(self) -> int:
+        return os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o644)
+
+    def _cut(self) -> None:
+        """Cut off an unfinished line."""
+        if not self.path.exists() or not (size := self.path.stat().st_size):
+            return
+        with open(self.path, "r+b") as file:
+            file.seek(max(size - LONGEST, 0))
+            end = file.read()
+            file.truncate(size - len(end) + end.rfind(b"\n") + 1)

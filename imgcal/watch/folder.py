@@ -1,0 +1,135 @@
+"""A folder that is being filled with frames: `frames/<camera>/<snapshot>.png`, on a disk or a network share."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import OrderedDict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from imgcal.errors import InputError
+from imgcal.io import IMAGE_SUFFIXES, is_file_name, natural_key, nearest, read_frame
+from imgcal.messages import listed
+from imgcal.types import CameraRig
+from imgcal.watch.exposures import Exposure, Item, Unreadable
+
+TICK = 0.05  # s between two looks
+GIVEN_UP = 2.0  # s during which a file that cannot be read may still be completed
+REMEMBERED = 4096  # names of each camera's files that have been read; earlier ones count as read, too
+
+
+@dataclass(frozen=True)
+class Folder:
+    """Frames of a capture that grows; the name of a file is that of its snapshot.
+
+    No file is taken half-written: its size must have been the same at two looks, and the image must be complete. A name
+    that begins with a dot, or ends in no image's suffix (`1.png.part`), is not looked at.
+    """
+
+    folder: Path  # holds frames/<camera name>/
+    rig: CameraRig
+    remove: bool = False  # frames that have been read are deleted
+    after: str | None = None  # snapshots up to this one have been seen before
+    until_idle: float | None = None  # s without a new file after which it is complete; None = never
+    live: bool = True
+
+    def items(self) -> Iterator[Item]:
+        """Give frames snapshot by snapshot, those that are there first, then as they come."""
+        frames = self.folder / "frames"
+        yield from self._checked(frames)
+        cameras = {name: _Camera(frames / name, self.after) for name in self.rig.camera_names}
+        heard = time.monotonic()
+        while self.until_idle is None or time.monotonic() - heard < self.until_idle:
+            now = time.monotonic()
+            ready = [(path, name) for name, camera in cameras.items() for path in camera.ready(now)]
+            for path, name in sorted(ready, key=lambda pair: (natural_key(pair[0].stem), pair[1])):
+                item = self._read(cameras[name], name, path, now)
+                if item is not None:
+                    heard = time.monotonic()
+                    yield item
+            yield None
+            time.sleep(TICK)
+
+    def _checked(self, frames: Path) -> Iterator[Item]:
+        """Find what a typing error looks like; the folders of the cameras themselves may come later."""
+        if not self.folder.is_dir():
+            raise InputError(f"{self.folder}: no such folder, expected one that holds or will hold frames/<camera>/")
+        if not frames.is_dir() and any((self.folder / name).exists() for name in self.rig.camera_names):
+            raise InputError(
+                f"{self.folder}: found the folders of cameras, expected a folder that holds frames/<camera>/"
+            )
+        for path in sorted(frames.iterdir()) if frames.is_dir() else ():
+            if not path.name.startswith(".") and path.name not in self.rig.camera_names:
+                expected = f"the cameras of rig {self.rig.name}: {listed(self.rig.camera_names)}"
+                yield Unreadable(f"{path}: expected {expected}{nearest(path.name, self.rig.camera_names)}")
+
+    def _read(self, camera: _Camera, name: str, path: Path, now: float) -> Item:
+        """Read a file whose size is steady; None = its writer may not be done with it."""
+        size = self.rig.image_size[self.rig.camera_names.index(name)].tolist()
+        try:
+            changed = path.stat().st_mtime
+            frame = read_frame(path, size=(size[0], size[1]))
+        except (InputError, OSError) as error:
+            if not camera.gives_up(path, now):
+                return None
+            return Unreadable(str(error), name)
+        camera.done(path)
+        if self.remove:
+            path.unlink(missing_ok=True)
+        return Exposure(name, changed, frame, path.stem)
+
+
+class _Camera:
+    """Which files of a camera are new, and no longer growing."""
+
+    def __init__(self, folder: Path, after: str | None) -> None:
+        self._folder = folder
+        self._floor = None if after is None else natural_key(after)
+        self._read: OrderedDict[str, None] = OrderedDict()
+        self._growing: dict[str, tuple[int, int]] = {}  # size and time of change at the last look
+        self._since: dict[str, float] = {}  # when a file was first found steady, yet unreadable
+
+    def ready(self, now: float) -> list[Path]:
+        """The new files whose size has not changed since the last look."""
+        steady: list[Path] = []
+        growing: dict[str, tuple[int, int]] = {}
+        try:
+            with os.scandir(self._folder) as entries:
+                for entry in entries:
+                    if not self._is_new(entry.name):
+                        continue
+                    state = entry.stat()
+                    seen = (state.st_size, state.st_mtime_ns)
+                    growing[entry.name] = seen
+                    if seen == self._growing.get(entry.name) and state.st_size:
+                        steady.append(self._folder / entry.name)
+        except OSError:  # not there yet, or a share that is away for a while
+            return []
+        self._growing = growing
+        self._since = {name: since for name, since in self._since.items() if name in growing}
+        return steady
+
+    def done(self, path: Path) -> None:
+        """Remember that a file has been dealt with; in bounded memory."""
+        self._growing.pop(path.name, None)
+        self._since.pop(path.name, None)
+        self._read[path.name] = None
+        if len(self._read) > REMEMBERED:
+            first, _ = self._read.popitem(last=False)
+            key = natural_key(Path(first).stem)
+            self._floor = key if self._floor is None else max(self._floor, key)
+
+    def gives_up(self, path: Path, now: float) -> bool:
+        """Tell whether a steady file has been unreadable for so long that it will stay so."""
+        if now - self._since.setdefault(path.name, now) < GIVEN_UP:
+            return False
+        self.done(path)
+        return True
+
+    def _is_new(self, name: str) -> bool:
+        stem, _, suffix = name.rpartition(".")
+        if name.startswith(".") or f".{suffix.lower()}" not in IMAGE_SUFFIXES or name in self._read:
+            return False
+        return is_file_name(stem) and (self._floor is None or natural_key(stem) > self._floor)

@@ -1,0 +1,160 @@
+"""A source that is read by a thread of its own, and the few snapshots that wait to be worked on."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections import Counter, deque
+from types import TracebackType
+
+from imgcal.errors import InputError
+from imgcal.messages import one_line
+from imgcal.types import CameraRig
+from imgcal.watch.exposures import Exposure, Item, Source, Unreadable, checked
+from imgcal.watch.synchronization import Synchronizer, TimedSnapshot, Timing
+
+MOST_WAITING = 8
+"""Snapshots that wait; more, and the oldest is dropped where the source is live. Otherwise the source waits."""
+MOST_BYTES = 2**30
+"""Memory of their frames; more, and the oldest go as well."""
+LATELY = 3  # reasons that are kept
+WOKEN = 0.2  # s
+
+
+class Intake:
+    """Snapshots of a source as they become complete. A context manager: leaving it ends the thread.
+
+    What cannot be read is counted and left out; what ends the source is raised by `next`.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        rig: CameraRig,
+        timing: Timing = Timing(),
+        keep_all: bool = False,
+        waiting: int = MOST_WAITING,
+        after: float | None = None,
+    ) -> None:
+        """Prepare to read.
+
+        Args:
+            source: where exposures come from.
+            rig: what they are compared with.
+            timing: when they belong together.
+            keep_all: drop nothing, even if the source is live: it is taken for a recording.
+            waiting: most snapshots that wait.
+            after: s, time of the last snapshot of a recording that an earlier run has worked on; None = none.
+        """
+        self.live = source.live and not keep_all
+        self.synchronizer = Synchronizer(rig.camera_names, timing)
+        self.dropped = 0
+        """Snapshots that were complete and not worked on in time."""
+        self.unreadable: Counter[str] = Counter()
+        """By camera; "" = not known."""
+        self.reasons: deque[str] = deque(maxlen=LATELY)
+        """Why the latest ones could not be read."""
+        self.known_before = 0
+        """Snapshots of a recording that an earlier run has worked on."""
+        self._source, self._rig, self._most = source, rig, waiting
+        self._after = None if source.live else after
+        self._snapshots: deque[TimedSnapshot] = deque()
+        self._bytes = 0
+        self._changed = threading.Condition()
+        self._closing = self._ended = False
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._read, name="intake", daemon=True)  # a read may hang in a driver
+
+    def __enter__(self) -> Intake:
+        """Begin to read."""
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End reading."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        self._thread.join(timeout=2.0)
+
+    @property
+    def waiting(self) -> int:
+        """Number of snapshots that wait to be worked on."""
+        return len(self._snapshots)
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing more will come."""
+        with self._changed:
+            return self._ended and not self._snapshots
+
+    def next(self, timeout: float) -> TimedSnapshot | None:
+        """Take the oldest snapshot that waits; None = none came within so many seconds.
+
+        Raises:
+            InputError: the source cannot go on. All that came before has been taken.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._snapshots or self._ended, timeout)
+            if self._snapshots:
+                snapshot = self._snapshots.popleft()
+                self._bytes -= snapshot.num_bytes
+                self._changed.notify_all()
+                return snapshot
+            if self._error is not None:
+                raise self._error
+            return None
+
+    def _read(self) -> None:
+        items = self._source.items()
+        try:
+            with contextlib.closing(items):  # type: ignore[type-var]  # a generator
+                for item in items:
+                    if self._closing:
+                        return
+                    self._take(item)
+            for snapshot in self.synchronizer.flush():
+                self._put(snapshot)
+        except BaseException as error:
+            self._error = error
+        finally:
+            with self._changed:
+                self._ended = True
+                self._changed.notify_all()
+
+    def _take(self, item: Item) -> None:
+        now = time.monotonic() if self.live else 0.0
+        if isinstance(item, Exposure):
+            try:
+                done = self.synchronizer.add(checked(item, self._rig), now)
+            except InputError as error:
+                known = item.camera if item.camera in self._rig.camera_names else ""
+                self._note(Unreadable(str(error), known))
+                return
+        else:
+            if item is not None:
+                self._note(item)
+            done = self.synchronizer.waited(now)
+        for snapshot in done:
+            self._put(snapshot)
+
+    def _note(self, item: Unreadable) -> None:
+        self.unreadable[item.camera or ""] += 1
+        self.reasons.append(one_line(item.reason))
+
+    def _put(self, snapshot: TimedSnapshot) -> None:
+        if self._after is not None and snapshot.time <= self._after:
+            self.known_before += 1
+            return
+        with self._changed:
+            while not self.live and len(self._snapshots) >= self._most and not self._closing:
+                self._changed.wait(WOKEN)
+            self._snapshots.append(snapshot)
+            self._bytes += snapshot.num_bytes
+            while len(self._snapshots) > 1 and (len(self._snapshots) > self._most or self._bytes > MOST_BYTES):
+                self._bytes -= self._snapshots.popleft().num_bytes
+                self.dropped += 1
+            self._changed.notify_all()

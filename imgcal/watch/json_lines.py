@@ -1,0 +1,62 @@
+"""Blobs from another process through a pipe: a line of JSON for each camera and moment."""
+
+from __future__ import annotations
+
+import os
+import select
+import stat
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from imgcal.errors import InputError
+from imgcal.watch.exposures import Item, Unreadable
+from imgcal.watch.wire import LONGEST_LINE, exposure_from_json
+
+TICK = 0.05  # s
+AT_ONCE = 2**16  # bytes
+
+
+@dataclass(frozen=True)
+class JsonLines:
+    """Reads a file descriptor to its end, for example 0, standard input."""
+
+    descriptor: int
+
+    @property
+    def live(self) -> bool:
+        """A file waits; what writes into a pipe goes on by itself."""
+        return not stat.S_ISREG(os.fstat(self.descriptor).st_mode)
+
+    def items(self) -> Iterator[Item]:
+        """Read lines; one that is too long is left out, and read over in bounded memory."""
+        parts: list[bytes] = []
+        length = 0
+        while True:
+            ready, _, _ = select.select([self.descriptor], [], [], TICK)
+            if not ready:
+                yield None
+                continue
+            chunk = os.read(self.descriptor, AT_ONCE)
+            *lines, rest = chunk.split(b"\n")
+            for line in lines:
+                yield from _item(parts, line, length)
+                parts, length = [], 0
+            length += len(rest)
+            if length <= LONGEST_LINE:
+                parts.append(rest)
+            if not chunk:
+                yield from _item(parts, b"", length)
+                return
+
+
+def _item(parts: list[bytes], last: bytes, length: int) -> Iterator[Item]:
+    if length + len(last) > LONGEST_LINE:
+        yield Unreadable(f"found a line of {length + len(last):,} bytes, expected at most {LONGEST_LINE:,}")
+        return
+    line = b"".join((*parts, last)).strip()
+    if not line:
+        return
+    try:
+        yield exposure_from_json(line)
+    except InputError as error:
+        yield Unreadable(str(error))

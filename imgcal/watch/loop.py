@@ -1,0 +1,250 @@
+"""The loop of a rig that is watched: a snapshot in, what is known out, the state kept for the next start."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol
+
+from imgcal.errors import InputError
+from imgcal.io import Frame, read_json, write_text
+from imgcal.online import Event, RigState
+from imgcal.types import CameraRig, Detections
+from imgcal.watch.event_log import EventLog
+from imgcal.watch.hook import Hook
+from imgcal.watch.intake import Intake
+from imgcal.watch.metrics import Tally
+from imgcal.watch.rig_files import RigFiles
+from imgcal.watch.synchronization import TimedSnapshot
+
+STATE, PROGRESS, EVENTS = "state.json", "progress.json", "events.jsonl"
+SAVED_EVERY = 1.0  # s between two savings of what is known
+LOOKED_EVERY = 0.1  # s that is waited for a snapshot before other things are seen to
+KEPT_EVERY = 3600.0  # s between two rigs of the history, where nothing happens
+IN_HISTORY = frozenset({"moved", "relearnt", "drift", "factory", "restart"})
+"""Events whose rig is kept."""
+
+
+class Writable(Protocol):
+    """What is known, as it was at one moment."""
+
+    def write(self, path: Path) -> None:
+        """Write it in one step."""
+
+
+class Keeper(Protocol):
+    """What keeps the rig calibrated: a `RigKeeper`."""
+
+    factory: CameraRig
+
+    def update(self, source: Mapping[str, Frame | None] | Detections, time: float) -> RigState:
+        """Learn from a snapshot."""
+
+    def saved(self) -> Writable:
+        """Take down what is known, within milliseconds."""
+
+    def accept_as_factory(self) -> Event:
+        """Make the present rig the factory calibration."""
+
+
+class Page(Protocol):
+    """Who shows what is known to people."""
+
+    def publish(self, state: RigState, frames: Mapping[str, Frame | None] | None) -> None:
+        """Take what is known after a snapshot; must return at once."""
+
+    def tell(self, event: Event) -> None:
+        """Take an event that came with no snapshot; must return at once."""
+
+    def commands(self) -> Iterable[Any]:
+        """Give what people have asked for since the last call, each with a `name`; must return at once."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a source has been worked on."""
+
+    time: float  # s, of the last snapshot
+    name: str | None = None  # of it, where its source names snapshots
+
+    def save(self, folder: Path) -> None:
+        """Write it in one step."""
+        write_text(folder / PROGRESS, json.dumps({"time": self.time, "name": self.name}) + "\n")
+
+    @classmethod
+    def load(cls, folder: Path) -> Progress | None:
+        """Read it; None = there is none.
+
+        Raises:
+            InputError: the file is none of ours.
+        """
+        path = folder / PROGRESS
+        if not path.is_file():
+            return None
+        try:
+            entry = read_json(path.read_text())
+            time, name = float(entry["time"]), entry["name"]
+            if not (name is None or isinstance(name, str)):
+                raise ValueError("the name is no text")
+        except (ValueError, TypeError, KeyError, OverflowError) as error:
+            raise InputError(f"{path}: found {error}, expected what imgcal watch writes") from error
+        return cls(time, name)
+
+
+class Watch:
+    """Works on one snapshot after another. A context manager: leaving it saves what is known.
+
+    Whatever cannot be written is counted, said once, and tried again: a full disk does not end the watching.
+    """
+
+    def __init__(
+        self,
+        keeper: Keeper,
+        folder: Path,
+        hook: Hook | None = None,
+        page: Page | None = None,
+        told: Callable[[Event], None] = lambda event: None,
+        problem: Callable[[str], None] = lambda message: None,
+    ) -> None:
+        """Open the outputs.
+
+        Args:
+            keeper: what keeps the rig; not closed here.
+            folder: for rig.yaml, its history, events.jsonl and the state; must exist.
+            hook: command for events.
+            page: shows what is known.
+            told: gets every event.
+            problem: gets what could not be written, once.
+
+        Raises:
+            InputError: events.jsonl cannot be written.
+        """
+        self.keeper, self.folder, self.tally = keeper, folder, Tally()
+        self.paused = False
+        self._hook, self._page, self._told, self._problem = hook, page, told, problem
+        self._log, self._files = EventLog(folder / EVENTS), RigFiles(folder)
+        self._saved = time.monotonic()
+        self._progress: Progress | None = None
+        self._unsaved = False
+        self._kept: float | None = None  # s, time of the snapshot whose rig went into the history last
+
+    def __enter__(self) -> Watch:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Save what is known, and close the outputs."""
+        self.save()
+        self._files.close()
+        self._log.close()
+        if self._hook is not None:
+            self._hook.close()
+
+    def run(self, intake: Intake, stopped: threading.Event, looked: Callable[[], None] = lambda: None) -> None:
+        """Work on what comes until it ends, or until told to stop.
+
+        Args:
+            intake: gives snapshots.
+            stopped: may be set by anybody.
+            looked: called after each snapshot, and ten times a second while none comes.
+
+        Raises:
+            InputError: the source cannot go on.
+        """
+        while not stopped.is_set():
+            snapshot = intake.next(LOOKED_EVERY)
+            if snapshot is None and intake.ended:
+                return
+            self._obey()
+            if snapshot is not None:
+                self.take(snapshot)
+            if time.monotonic() - self._saved >= SAVED_EVERY:
+                self.save()
+            looked()
+
+    def take(self, snapshot: TimedSnapshot) -> RigState | None:
+        """Work on one snapshot; None = it could not be used, or nothing is to be learnt now."""
+        if self.paused:
+            self.tally.paused += 1
+            return None
+        names = self.keeper.factory.camera_names
+        started = time.perf_counter()
+        self.tally.snapshots += 1
+        try:
+            state = self.keeper.update(snapshot.source(names), snapshot.time)
+        except InputError as error:
+            self.tally.unusable += 1
+            self._failed("snapshots", str(error))
+            return None
+        self.tally.update_took(time.perf_counter() - started)
+        self.tally.refused += state.refused is not None
+        self.tally.latest = state
+        for exposure in snapshot.exposures.values():
+            self.tally.stamped(exposure.camera, exposure.time - snapshot.time)
+        self._progress, self._unsaved = Progress(snapshot.time, snapshot.name), True
+        for event in state.events:
+            self.tell(event)
+        if self._page is not None:
+            self._page.publish(state, snapshot.frames(names))
+        return state
+
+    def tell(self, event: Event) -> None:
+        """Give an event to all who want to know."""
+        self.tally.events[event.kind] += 1
+        try:
+            self._log.append(event)
+        except OSError as error:
+            self._failed(EVENTS, str(error))
+        if self._hook is not None:
+            self._hook.tell(event)
+        if self.tally.latest is not None and event.kind in IN_HISTORY:
+            self._keep(self.tally.latest)
+        if self._page is not None and (self.tally.latest is None or event not in self.tally.latest.events):
+            self._page.tell(event)  # the others come with their state
+        self._told(event)
+
+    def save(self) -> None:
+        """Write what is known: what a start after this moment goes on from."""
+        self._saved = time.monotonic()
+        state = self.tally.latest
+        unsaved = self._unsaved or self._files.problem is not None
+        if state is None or self._progress is None or not unsaved:
+            return
+        if self._files.problem is not None:
+            self._failed("files", self._files.problem)
+        memory, progress = self.keeper.saved(), self._progress
+
+        def write() -> None:
+            # In this order: a snapshot may be lost between the two, but is never learnt twice.
+            progress.save(self.folder)
+            memory.write(self.folder / STATE)
+
+        self._files.write(state, also=write)
+        self._unsaved = False
+        if self._kept is None or abs(state.time - self._kept) >= KEPT_EVERY:
+            self._keep(state)
+
+    def _keep(self, state: RigState) -> None:
+        self._kept = state.time
+        self._files.write(state, keep=True)
+
+    def _failed(self, output: str, message: str) -> None:
+        self.tally.problems[output] += 1
+        if self.tally.problems[output] == 1:
+            self._problem(message)
+
+    def _obey(self) -> None:
+        """Do what people have asked for."""
+        for command in () if self._page is None else self._page.commands():
+            if command.name in ("pause", "resume"):
+                self.paused = command.name == "pause"
+            elif command.name == "factory":
+                self.tell(self.keeper.accept_as_factory())
+                self._unsaved = True

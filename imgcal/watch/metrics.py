@@ -1,0 +1,182 @@
+"""What a running rig is like, in Prometheus' format, read when somebody asks: the loop does nothing for it."""
+
+from __future__ import annotations
+
+import bisect
+import math
+from collections import Counter
+from collections.abc import Iterator
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from imgcal.errors import InputError
+from imgcal.online import EVENT_KINDS, RigState
+from imgcal.watch.hook import Hook
+from imgcal.watch.intake import Intake
+
+if TYPE_CHECKING:
+    from prometheus_client import Metric
+
+BUCKETS = (0.001, 0.002, 0.003, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 5.0)
+"""Seconds of an update."""
+
+
+STAMPS = 100
+"""Time stamps of which the mean is formed."""
+
+
+class Tally:
+    """What the loop counts; one thread writes, others may read."""
+
+    def __init__(self) -> None:
+        self.snapshots = self.refused = self.unusable = self.paused = 0
+        """Snapshots worked on, those of them that taught nothing or could not be used; those that came while paused."""
+        self.events: Counter[str] = Counter()
+        self.problems: Counter[str] = Counter()
+        """Failures to write, by what was to be written."""
+        self.latest: RigState | None = None
+        self.stamps: dict[str, float] = {}
+        """By camera: how far its time stamps are after those of its snapshots, in the mean of the latest; seconds."""
+        self.seconds = 0.0
+        """Spent on updates, all together."""
+        self.took = [0] * (len(BUCKETS) + 1)
+        """Updates that took up to each of `BUCKETS`, and longer."""
+
+    @property
+    def learnt(self) -> int:
+        """Snapshots that taught something."""
+        return self.snapshots - self.refused - self.unusable
+
+    def stamped(self, camera: str, offset: float) -> None:
+        """Count a time stamp."""
+        before = self.stamps.get(camera, offset)
+        self.stamps[camera] = before + (offset - before) / STAMPS
+
+    def update_took(self, seconds: float) -> None:
+        """Count the time of an update."""
+        self.seconds += seconds
+        self.took[bisect.bisect_left(BUCKETS, seconds)] += 1
+
+
+class Metrics:
+    """Serves them by HTTP. A context manager: leaving it ends the server."""
+
+    def __init__(self, tally: Tally, intake: Intake, hook: Hook | None, address: tuple[str, int]) -> None:
+        """Say what to serve, and where: 127.0.0.1 unless others are to read it."""
+        self._tally, self._intake, self._hook, self._address = tally, intake, hook, address
+
+    def __enter__(self) -> Metrics:
+        """Begin to serve.
+
+        Raises:
+            InputError: the address is taken, or none of this machine's.
+        """
+        from prometheus_client import CollectorRegistry, start_http_server  # not in the core
+
+        registry = CollectorRegistry()
+        registry.register(self)
+        host, port = self._address
+        try:
+            self._server, self._thread = start_http_server(port, host, registry)
+        except (OSError, OverflowError) as error:
+            raise InputError(f"--metrics: {host}:{port} cannot be listened on: {error}") from error
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the server."""
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+    @property
+    def port(self) -> int:
+        """Where it listens; of 0, which was chosen."""
+        return int(self._server.server_port)
+
+    def collect(self) -> Iterator[Metric]:
+        """Give the metrics as they are now."""
+        from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
+
+        tally, intake = self._tally, self._intake
+        yield _counter("snapshots", "Snapshots worked on", tally.snapshots)
+        yield _counter("snapshots_refused", "Snapshots that taught nothing", tally.refused)
+        yield _counter("snapshots_unusable", "Snapshots that were no input", tally.unusable)
+        yield _counter("snapshots_dropped", "Snapshots that came faster than they were worked on", intake.dropped)
+        yield _counter("snapshots_paused", "Snapshots that came while paused", tally.paused)
+        yield _gauge("snapshots_waiting", "Snapshots that wait to be worked on", intake.waiting)
+        yield _counter("clock_leaps", "Leaps of all cameras' clocks together", intake.synchronizer.leaps)
+        for kind, counts in intake.synchronizer.counts.items():
+            family = CounterMetricFamily(f"imgcal_exposures_{kind}", f"Exposures {kind}", labels=["camera"])
+            for camera, count in list(counts.items()):
+                family.add_metric([camera], count)
+            yield family
+        unreadable = CounterMetricFamily("imgcal_exposures_unreadable", "What could not be read", labels=["camera"])
+        for camera, count in list(intake.unreadable.items()):
+            unreadable.add_metric([camera], count)
+        yield unreadable
+        events = CounterMetricFamily("imgcal_events", "Events", labels=["event"])
+        for kind in EVENT_KINDS:
+            events.add_metric([kind], tally.events[kind])
+        yield events
+        problems = CounterMetricFamily("imgcal_write_failures", "Failures to write", labels=["output"])
+        for output, count in list(tally.problems.items()):
+            problems.add_metric([output], count)
+        yield problems
+        if self._hook is not None:
+            yield _counter("hook_dropped", "Events that the hook command never got", self._hook.dropped)
+            yield _counter("hook_failed", "Runs of the hook command that failed", self._hook.failed)
+        took = HistogramMetricFamily("imgcal_update_seconds", "Time of an update")
+        total, buckets = 0, []
+        for limit, count in zip((*BUCKETS, math.inf), tally.took, strict=True):
+            total += count
+            buckets.append(("+Inf" if math.isinf(limit) else str(limit), total))
+        took.add_metric([], buckets, tally.seconds)
+        yield took
+        stamps = GaugeMetricFamily(
+            "imgcal_stamp_offset_seconds", "Time stamps of each camera against their snapshots'", labels=["camera"]
+        )
+        for camera, offset in list(tally.stamps.items()):
+            stamps.add_metric([camera], offset)
+        yield stamps
+        if tally.latest is not None:
+            yield from _of_cameras(tally.latest)
+
+
+def _of_cameras(state: RigState) -> Iterator[Metric]:
+    """What is known of each camera."""
+    from prometheus_client.core import GaugeMetricFamily
+
+    names = state.factory.camera_names
+    yield _gauge("snapshot_time_seconds", "Time of the latest snapshot", state.time)
+    health = GaugeMetricFamily("imgcal_camera", "Health of each camera: 1", labels=["camera", "state"])
+    for camera, found in state.cameras.items():
+        health.add_metric([camera, found], 1)
+    yield health
+    columns: tuple[tuple[str, str, Any], ...] = (
+        ("residual_pixels", "RMS residual of the latest snapshot", state.residual),
+        ("clock_offset_seconds", "How much later each camera exposes than most, by the motion", state.clock_offset),
+        ("clock_offset_sigma_seconds", "One standard deviation of it", state.clock_offset_sigma),
+        ("rotation_radians", "Turn of each camera since the factory calibration", state.moved[:, :3].norm(dim=1)),
+        ("position_millimetres", "Shift of each camera", state.moved[:, 3:6].norm(dim=1)),
+        ("focal_length_pixels", "Change of the focal length", state.moved[:, 6:8].abs().amax(1)),
+    )
+    for name, words, values in columns:
+        family = GaugeMetricFamily(f"imgcal_{name}", words, labels=["camera"])
+        for camera, value in zip(names, values.tolist(), strict=True):
+            if math.isfinite(value):
+                family.add_metric([camera], value)
+        yield family
+
+
+def _counter(name: str, words: str, value: float) -> Metric:
+    from prometheus_client.core import CounterMetricFamily
+
+    return CounterMetricFamily(f"imgcal_{name}", words, value)
+
+
+def _gauge(name: str, words: str, value: float) -> Metric:
+    from prometheus_client.core import GaugeMetricFamily
+
+    return GaugeMetricFamily(f"imgcal_{name}", words, value)

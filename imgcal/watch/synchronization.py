@@ -1,0 +1,262 @@
+"""Snapshots from exposures that come one by one, each with the time stamp of its camera: late, twice, or never."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from imgcal.errors import InputError
+from imgcal.io import Frame
+from imgcal.types import Detections
+from imgcal.watch.exposures import CameraBlobs, Exposure
+
+MOST_PENDING = 32
+"""Snapshots that are waited for at a time; beyond, the oldest goes on as it is."""
+OUT_AFTER = 10
+"""Snapshots in a row without a camera, after which nobody waits for it."""
+LEAP = 10.0
+"""Seconds by which a clock may not leap: the exposure is left out, unless the other cameras' clocks did the same."""
+LONGEST_ASTRAY = 100
+"""Exposures in a row by clocks that have leapt, after which these are believed."""
+REMEMBERED = 4096
+"""Names of snapshots that are known to have gone on."""
+
+COUNTS = ("received", "missing", "late", "duplicate", "out_of_order", "astray")
+"""What is counted for each camera.
+
+`missing`: snapshots without it. `late`: it came after its snapshot had gone on. `duplicate`: its second of a snapshot.
+`astray`: its clock is more than `LEAP` off. These three are left out. `out_of_order`: earlier than one before; used
+where its snapshot has not gone on.
+"""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """When exposures belong together, and how long the missing ones are waited for."""
+
+    tolerance: float = 0.005  # s between the earliest and the latest time stamp of a snapshot, at most
+    patience: float = 0.1  # s that missing exposures are waited for
+
+    def __post_init__(self) -> None:
+        for name in ("tolerance", "patience"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and 0 <= value <= LEAP / 2):
+                raise InputError(f"{name}: found {value:g}, expected 0 to {LEAP / 2:g} s")
+
+
+@dataclass(frozen=True)
+class TimedSnapshot:
+    """What the cameras saw at one moment."""
+
+    time: float  # s, the middle one of the time stamps
+    exposures: Mapping[str, Exposure]  # by camera, those that came
+    name: str | None = None  # where the source names snapshots
+
+    def frames(self, camera_names: tuple[str, ...]) -> dict[str, Frame | None]:
+        """Frame of each camera; None = none came, or blobs."""
+        contents = {name: self.exposures[name].content for name in camera_names if name in self.exposures}
+        return {name: None if isinstance(found := contents.get(name), CameraBlobs) else found for name in camera_names}
+
+    def source(self, camera_names: tuple[str, ...]) -> dict[str, Frame | None] | Detections:
+        """What a recalibration takes: frames by camera, or, where blobs came, these."""
+        given = [
+            (camera, content)
+            for camera, name in enumerate(camera_names)
+            if name in self.exposures and isinstance(content := self.exposures[name].content, CameraBlobs)
+        ]
+        if not given:
+            return self.frames(camera_names)
+        camera = np.repeat([camera for camera, _ in given], [len(blobs.uv) for _, blobs in given]).astype(np.int64)
+        count = len(camera)
+        return Detections(
+            uv=np.concatenate([blobs.uv for _, blobs in given]),
+            sigma=np.concatenate([blobs.sigma for _, blobs in given]),
+            camera=camera,
+            snapshot=np.zeros(count, dtype=np.int64),
+            fiducial=np.full(count, -1, dtype=np.int64),
+            radius=np.concatenate([blobs.radius for _, blobs in given]),
+            flags=np.zeros(count, dtype=np.uint8),
+            camera_names=camera_names,
+            snapshot_names=(self.name or "0",),
+        )
+
+    @property
+    def num_bytes(self) -> int:
+        """Memory that its frames take."""
+        return sum(e.content.nbytes for e in self.exposures.values() if not isinstance(e.content, CameraBlobs))
+
+
+@dataclass
+class _Pending:
+    """A snapshot that is being gathered."""
+
+    name: str | None
+    arrived: float  # s, when its first exposure came
+    exposures: dict[str, Exposure] = field(default_factory=dict)
+    earliest: float = math.inf
+    latest: float = -math.inf
+
+    def add(self, exposure: Exposure) -> None:
+        self.exposures[exposure.camera] = exposure
+        self.earliest, self.latest = min(self.earliest, exposure.time), max(self.latest, exposure.time)
+
+    def distance(self, time: float) -> float:
+        return abs(time - (self.earliest + self.latest) / 2)
+
+    def spread(self, time: float) -> float:
+        """Between the earliest and the latest time stamp, would this one be added."""
+        return max(self.latest, time) - min(self.earliest, time)
+
+    def finished(self) -> TimedSnapshot:
+        times = sorted(exposure.time for exposure in self.exposures.values())
+        return TimedSnapshot(times[len(times) // 2], self.exposures, self.name)
+
+
+class Synchronizer:
+    """Gathers exposures to snapshots, in bounded memory.
+
+    A snapshot goes on when all cameras that are there have given theirs, or when `patience` has passed. Snapshots go on
+    in the order of their times; named ones in the order in which they came. No single clock decides what time it is:
+    the cameras' time stamps do, the middle one of them.
+
+    Examples:
+        >>> pair = Synchronizer(("left", "right"), Timing())
+        >>> pair.add(Exposure("left", 0.001, CameraBlobs.of([])))
+        ()
+        >>> [snapshot.time for snapshot in pair.add(Exposure("right", 0.002, CameraBlobs.of([])))]
+        [0.002]
+    """
+
+    def __init__(self, camera_names: tuple[str, ...], timing: Timing) -> None:
+        self.camera_names, self.timing = camera_names, timing
+        self.counts: dict[str, Counter[str]] = {kind: Counter(dict.fromkeys(camera_names, 0)) for kind in COUNTS}
+        self.leaps = 0
+        """How often all clocks leapt together."""
+        self._pending: list[_Pending] = []  # in the order in which they will go on
+        self._absent = Counter(dict.fromkeys(camera_names, 0))  # snapshots in a row without a camera
+        self._newest: dict[str, float] = {}  # latest time stamp of each camera
+        self._offset: dict[str, float] = {}  # its last time stamp, against this machine's clock when it came
+        self._gone = (-math.inf, -math.inf)  # earliest and latest time stamp of the snapshot that went on last
+        self._names: deque[str] = deque(maxlen=REMEMBERED)
+        self._known: set[str] = set()  # the same
+        self._astray: dict[str, Exposure] = {}  # the last one of each camera whose clock has leapt
+        self._astray_in_a_row = 0
+
+    @property
+    def waiting(self) -> int:
+        """Number of snapshots that are being gathered."""
+        return len(self._pending)
+
+    def add(self, exposure: Exposure, now: float = 0.0) -> tuple[TimedSnapshot, ...]:
+        """Take an exposure of one of the cameras.
+
+        Args:
+            exposure: checked.
+            now: s, this machine's clock; 0 for recordings, which come as fast as they are read.
+
+        Returns:
+            The snapshots that need not wait any more, the earliest first.
+        """
+        self.counts["received"][exposure.camera] += 1
+        if exposure.snapshot is not None or not self._has_leapt(exposure, now):
+            self._take(exposure, now)
+            return self.waited(now)
+        self.counts["astray"][exposure.camera] += 1
+        self._astray[exposure.camera] = exposure
+        self._astray_in_a_row += 1
+        believed = [held for held in self._astray.values() if abs(held.time - exposure.time) <= LEAP]
+        if 2 * len(believed) <= len(self._there()) and self._astray_in_a_row < LONGEST_ASTRAY:
+            return self.waited(now)
+        done = self.flush()
+        self._begin_anew()
+        for held in sorted(believed, key=lambda held: held.time):
+            self.counts["astray"][held.camera] -= 1
+            self._take(held, now)
+        return done + self.waited(now)
+
+    def waited(self, now: float) -> tuple[TimedSnapshot, ...]:
+        """Give the snapshots that need not wait any more; to be called now and then while nothing comes."""
+        done: list[TimedSnapshot] = []
+        while self._pending and self._may_go(self._pending[0], now):
+            done.append(self._went_on(self._pending.pop(0)))
+        return tuple(done)
+
+    def flush(self) -> tuple[TimedSnapshot, ...]:
+        """Give all that is being gathered, as it is."""
+        pending, self._pending = self._pending, []
+        return tuple(self._went_on(snapshot) for snapshot in pending)
+
+    def _take(self, exposure: Exposure, now: float) -> None:
+        camera, before = exposure.camera, self._newest.get(exposure.camera, -math.inf)
+        self._astray.pop(camera, None)
+        self._astray_in_a_row = 0
+        self._absent[camera] = 0
+        self._offset[camera] = exposure.time - now
+        self.counts["out_of_order"][camera] += exposure.time < before
+        self._newest[camera] = max(before, exposure.time)
+        pending = self._place(exposure, now)
+        if pending is None:
+            self.counts["late"][camera] += 1
+        elif camera in pending.exposures:
+            self.counts["duplicate"][camera] += 1
+        else:
+            pending.add(exposure)
+
+    def _place(self, exposure: Exposure, now: float) -> _Pending | None:
+        """Find the snapshot of an exposure, or begin a new one; None = it has gone on already."""
+        name, time = exposure.snapshot, exposure.time
+        near = [pending for pending in self._pending if pending.name == name]
+        if name is None:
+            near = [pending for pending in near if pending.spread(time) <= self.timing.tolerance]
+        if near:
+            return min(near, key=lambda pending: pending.distance(time))
+        earliest, latest = self._gone
+        if name in self._known or (name is None and (time <= latest or time - earliest <= self.timing.tolerance)):
+            return None
+        new = _Pending(name, now)
+        later = [i for i, pending in enumerate(self._pending) if pending.name is None and pending.earliest > time]
+        self._pending.insert(later[0] if name is None and later else len(self._pending), new)
+        return new
+
+    def _may_go(self, pending: _Pending, now: float) -> bool:
+        if len(self._pending) > MOST_PENDING or all(name in pending.exposures for name in self._there()):
+            return True
+        if pending.name is not None:
+            return now - pending.arrived > self.timing.patience
+        return self._clock(now) - pending.latest > self.timing.patience
+
+    def _went_on(self, pending: _Pending) -> TimedSnapshot:
+        if pending.name is None:
+            self._gone = pending.earliest, pending.latest
+        else:
+            if len(self._names) == REMEMBERED:
+                self._known.discard(self._names[0])
+            self._names.append(pending.name)
+            self._known.add(pending.name)
+        for name in self.camera_names:
+            if name not in pending.exposures:
+                self._absent[name] += 1
+                self.counts["missing"][name] += 1
+        return pending.finished()
+
+    def _there(self) -> list[str]:
+        """The cameras that are waited for."""
+        return [name for name in self.camera_names if self._absent[name] < OUT_AFTER]
+
+    def _clock(self, now: float) -> float:
+        """What the cameras' clocks say now: the middle one, of two the one that is behind."""
+        offsets = sorted(self._offset[name] for name in self._there() if name in self._offset)
+        return now + offsets[(len(offsets) - 1) // 2] if offsets else math.nan
+
+    def _has_leapt(self, exposure: Exposure, now: float) -> bool:
+        return abs(exposure.time - self._clock(now)) > LEAP
+
+    def _begin_anew(self) -> None:
+        self.leaps += 1
+        self._newest.clear()
+        self._offset.clear()
+        self._gone = (-math.inf, -math.inf)

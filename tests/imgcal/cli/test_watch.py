@@ -1,0 +1,174 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from imgcal.cli.main import main
+from imgcal.cli.watch import metrics_address
+from imgcal.errors import InputError
+from imgcal.io import load_object, load_rig, save_detections, save_rig
+from imgcal.types.observations import Detections
+from tests.imgcal.streams import Stream
+
+SNAPSHOTS, BUMPED_AT = 60, 30
+
+
+@pytest.fixture(scope="module")
+def stream():
+    return Stream("T4", "asymmetric8", SNAPSHOTS, seed=3)
+
+
+@pytest.fixture(scope="module")
+def blobs(stream):
+    """Blobs of all snapshots; the second camera is turned by 0.3 degrees on the way."""
+    bumped = stream.bumped([1], turn_deg=0.3)
+    parts = [stream.blobs(s, bumped if s >= BUMPED_AT else stream.true)[0] for s in range(SNAPSHOTS)]
+    columns = ("uv", "sigma", "camera", "fiducial", "radius", "flags")
+    whole = {name: np.concatenate([getattr(part, name) for part in parts]) for name in columns}
+    snapshot = np.repeat(np.arange(SNAPSHOTS), [len(part) for part in parts])
+    names = tuple(f"{s:03d}" for s in range(SNAPSHOTS))
+    return Detections(**whole, snapshot=snapshot, camera_names=stream.rig.camera_names, snapshot_names=names)
+
+
+def lines(blobs):
+    """The same as lines of JSON."""
+    found = []
+    for s in range(SNAPSHOTS):
+        for camera, name in enumerate(blobs.camera_names):
+            uv = blobs.uv[(blobs.snapshot == s) & (blobs.camera == camera)].tolist()
+            found.append(json.dumps({"camera": name, "time": s / 60, "uv": uv, "sigma": 0.07}) + "\n")
+    return found
+
+
+def watch(source, out, *more):
+    return main(["watch", str(source), "--rig", "T4", "--object", "asymmetric8", "--out", str(out), *more])
+
+
+def events(out):
+    return [json.loads(line) for line in (out / "events.jsonl").read_text().split("\n")[:-1]]
+
+
+def test_a_table_of_blobs_is_watched_once(blobs, stream, tmp_path, capsys):
+    save_detections(blobs, tmp_path / "blobs.csv.gz")
+    out = tmp_path / "out"
+    assert watch(tmp_path / "blobs.csv.gz", out, "--rate", "60", "--hook", "true", "--metrics", "0") == 0
+    said = capsys.readouterr()
+    assert f"60 snapshots, {len(events(out))} events: {out}/rig.yaml" in said.out and "moved: cam02" in said.out
+    moved = [event for event in events(out) if event["event"] == "moved"]
+    assert {event["camera"] for event in moved} == {"cam02"}
+    assert moved[0]["since"] == "1970-01-01T00:00:00.500+00:00"
+    found = load_rig(out / "rig.yaml")
+    truth = stream.bumped([1])  # of no size
+    off = torch.rad2deg(found.local(truth)[:, :3].norm(dim=1))
+    assert off.max() < 1.0 and (out / "state.json").is_file() and list(out.glob("history/*/*.yaml"))
+    assert watch(tmp_path / "blobs.csv.gz", out, "--rate", "60") == 3
+    assert "all 60 snapshots were known; --fresh begins from the factory rig" in capsys.readouterr().err
+    assert watch(tmp_path / "blobs.csv.gz", out, "--rate", "60", "--fresh") == 0
+
+
+def test_lines_on_standard_input_and_garbage_among_them(blobs, tmp_path, monkeypatch, capsys):
+    given = lines(blobs)[: 4 * 20]
+    given[10:10] = ["junk\n", '{"camera": "cam09", "time": 0.1, "uv": []}\n']
+    (tmp_path / "lines").write_text("".join(given))
+    with open(tmp_path / "lines") as file:
+        monkeypatch.setattr(sys, "stdin", file)
+        assert watch("-", tmp_path / "out") == 0
+    assert "20 snapshots" in capsys.readouterr().out
+    assert json.loads((tmp_path / "out" / "progress.json").read_text())["time"] == pytest.approx(19 / 60)
+
+
+def test_a_killed_process_goes_on_and_ctrl_c_ends_it_cleanly(blobs, tmp_path):
+    zmq = pytest.importorskip("zmq")
+    given, out, address = lines(blobs)[: 4 * BUMPED_AT], tmp_path / "out", f"ipc://{tmp_path}/blobs"
+    command = [sys.executable, "-m", "imgcal", "watch", address, "--rig", "T4", "--object", "asymmetric8"]
+    with zmq.Context() as context, context.socket(zmq.PUB) as socket:
+        socket.linger = 0
+        socket.bind(address)
+        number = 0
+
+        def started():
+            return subprocess.Popen(
+                [*command, "--out", str(out)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                env=os.environ | {"PYTHONPATH": str(Path.cwd())},
+                preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+            )  # fmt: skip
+
+        def sent_until(condition):
+            nonlocal number
+            ends = time.monotonic() + 120
+            while not condition():
+                assert time.monotonic() < ends
+                for line in given[4 * (number % BUMPED_AT) :][:4]:
+                    socket.send_string(json.dumps({**json.loads(line), "time": 1.7e9 + number / 60}))
+                number += 1
+                time.sleep(1 / 60)
+
+        process = started()
+        sent_until(lambda: (out / "state.json").is_file())
+        process.kill()
+        process.communicate()
+        saved = (out / "progress.json").read_text()
+        process = started()
+        sent_until(lambda: (out / "progress.json").read_text() != saved)
+        process.send_signal(signal.SIGINT)
+        said, complaint = process.communicate(timeout=30)
+    assert process.returncode == 130
+    (line,) = [text for text in complaint.splitlines() if "compiling" not in text]
+    assert line.startswith("imgcal: interrupted after ") and line.endswith("the same command goes on from there")
+    assert [event["event"] for event in events(out)].count("restart") == 1 and "restart: started again" in said
+    assert load_rig(out / "rig.yaml").num_cameras == 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["absent"], 2, "absent: no such file or folder"),
+        (["tcp://nowhere"], 2, "expected an address tcp://host:port"),
+        (["absent.mcap"], 2, "absent.mcap: no such file"),
+        (["absent.csv", "--rate", "0"], 2, "--rate: found 0"),
+        (["-", "--tolerance", "-1"], 2, "tolerance: found -1"),
+        (["-", "--hook", "no-such-program"], 2, "--hook: found 'no-such-program'"),
+        (["-", "--metrics", "nowhere"], 2, "found 'nowhere', expected [HOST:]PORT"),
+        (["bag.mcap", "--topic", "cam01"], 2, "--topic: found 'cam01', expected CAMERA=TOPIC"),
+        (["empty", "--until-idle", "0.1"], 3, "watch: no snapshot came"),
+        (["typing", "--until-idle", "0.1"], 3, "nearest: cam01"),
+    ],
+)
+def test_mistakes(arguments, code, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "typing" / "frames" / "cam1").mkdir(parents=True)
+    (tmp_path / "nothing").write_text("")
+    with open(tmp_path / "nothing") as file:
+        monkeypatch.setattr(sys, "stdin", file)
+        assert watch(arguments[0], "out", *arguments[1:]) == code
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+
+
+def test_what_is_known_of_another_rig_is_not_gone_on_with(blobs, tmp_path, capsys):
+    save_detections(blobs.of_snapshots(0, 5), tmp_path / "blobs.csv")
+    assert watch(tmp_path / "blobs.csv", tmp_path / "out") == 0
+    rig = load_rig("T4").select([0, 1])
+    save_rig(rig, tmp_path / "pair.yaml")
+    for option, name in (("--rig", str(tmp_path / "pair.yaml")), ("--object", "cube8")):
+        given = {"--rig": "T4", "--object": "asymmetric8", option: name}
+        arguments = [word for pair in given.items() for word in pair]
+        assert main(["watch", str(tmp_path), *arguments, "--out", str(tmp_path / "out")]) == 2
+        assert f"another than {option} {name}; --fresh begins anew" in capsys.readouterr().err
+    assert load_object("cube8").num_fiducials == 8
+
+
+def test_addresses():
+    assert metrics_address("9100") == ("127.0.0.1", 9100) and metrics_address("0.0.0.0:9100") == ("0.0.0.0", 9100)
+    assert metrics_address("[::1]:80") == ("::1", 80)
+    for text in ("", "a:b", "1:70000", "-5", ":"):
+        with pytest.raises(InputError, match=r"expected \[HOST:\]PORT"):
+            metrics_address(text)

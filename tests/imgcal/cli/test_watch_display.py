@@ -1,0 +1,60 @@
+import io
+from dataclasses import replace
+
+import numpy as np
+from rich.console import Console
+
+from imgcal.cli import watch_display as module
+from imgcal.cli.watch_display import Display
+from imgcal.watch.exposures import Unreadable
+from imgcal.watch.intake import Intake
+from imgcal.watch.metrics import Tally
+from tests.imgcal.watch.states import RIG, event, some_state
+
+
+class Nothing:
+    live = False
+
+    def items(self):
+        yield Unreadable("junk")
+
+
+def display(monkeypatch, terminal):
+    text = io.StringIO()
+    with Intake(Nothing(), RIG) as intake:
+        intake.next(1.0)
+    monkeypatch.setattr(module, "SAID_EVERY", 0.0)
+    monkeypatch.setattr(module, "DRAWN_EVERY", 0.0)
+    return Display(Console(file=text, force_terminal=terminal, width=200), intake), text, Tally()
+
+
+def test_plain_lines_where_nobody_looks(monkeypatch):
+    shown, text, tally = display(monkeypatch, False)
+    with shown.of(tally):
+        shown.draw()
+        shown.tell(event(3, "camera_lost", message="cam02 [red]is lost[/red]"))
+        shown.warn("state.json: disk\nfull")
+        tally.latest, tally.snapshots, tally.refused = some_state(), 5, 2
+        shown.draw()
+    first, second, third, last = text.getvalue().splitlines()
+    assert first.startswith("waiting for the first snapshot | 0 snapshots, 0/s | 1 unreadable")
+    assert second.endswith(" camera lost: cam02 [red]is lost[/red]") and third == "note: state.json: disk full"
+    assert last.startswith("all 4 cameras are calibrated | 5 snapshots") and "2 refused" in last and "\x1b" not in last
+
+
+def test_one_line_that_changes_in_a_terminal(monkeypatch):
+    shown, text, tally = display(monkeypatch, True)
+    with shown.of(tally):
+        shown.draw()
+        shown.tell(event())
+        shown.draw()
+    assert "\x1b" in text.getvalue() and text.getvalue().count("moved: cam02 moved") == 1
+
+
+def test_a_clock_that_is_off_is_named(monkeypatch):
+    shown, _, tally = display(monkeypatch, False)
+    offset, sigma = np.array([0.0, 0.004, np.nan, 0.001]), np.array([1e-4, 1e-4, np.nan, 1e-3])
+    tally.latest = replace(some_state(), clock_offset=offset, clock_offset_sigma=sigma)
+    tally.stamps = {"cam02": -0.0005}
+    with shown.of(tally):
+        assert shown.line().endswith("| cam02 exposes +4.5 ms beside its time stamps")

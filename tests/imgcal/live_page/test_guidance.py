@@ -1,0 +1,66 @@
+import numpy as np
+import pytest
+import torch
+
+from imgcal.estimation import RigBelief, absorbed
+from imgcal.live_page.contents import belief_message, rig_message
+from imgcal.live_page.guidance import change_std, compare, information_gain, look
+from imgcal.live_page.viewing_volume import viewing_volume
+from imgcal.types.observations import Observations
+from tests.imgcal.live_page.pages import made_state
+
+PLACES = torch.tensor([[0.0, 0.0, 850.0], [150.0, 80.0, 800.0], [0.0, 0.0, -500.0]]).double()
+
+
+def seen_at(rig, obj, place):
+    state = made_state(rig, obj, place=place)
+    observations = Observations(
+        torch.as_tensor(state.predicted)[None],
+        torch.full((1, rig.num_cameras, obj.num_fiducials), 0.1).double(),
+        torch.ones(1, rig.num_cameras, obj.num_fiducials, dtype=torch.bool),
+    )
+    return observations, state.rig_from_object.reshape(1)
+
+
+def test_the_gain_is_what_the_filter_learns(o10, asymmetric8):
+    """Information gain against the determinants of the filter's own covariance before and after such a snapshot."""
+    belief = RigBelief.of_prior(o10, asymmetric8)
+    observations, pose = seen_at(o10, asymmetric8, PLACES[1])
+    after = absorbed(belief, observations, pose).belief
+    expected = float(after.factor.diagonal().log().sum() - belief.factor.diagonal().log().sum())
+    points = pose.apply(asymmetric8.points)[0]
+    shape, middle = points - points.mean(0), points.mean(0)
+    gain = information_gain(belief, belief.covariance(), middle[None], shape, 0.1)
+    assert float(gain[0]) == pytest.approx(expected, rel=0.02)
+
+
+def test_nothing_is_learnt_where_nothing_is_seen_and_less_where_one_has_been(o10, asymmetric8):
+    belief = RigBelief.of_prior(o10, asymmetric8)
+    shape = asymmetric8.points - asymmetric8.points.mean(0)
+    before = information_gain(belief, belief.covariance(), PLACES, shape, 0.1)
+    assert before[2] == 0 and before[0] > 10
+    after = absorbed(belief, *seen_at(o10, asymmetric8, PLACES[0])).belief
+    gain = information_gain(after, after.covariance(), PLACES, shape, 0.1)
+    assert gain[0] < gain[1] < before[1]
+
+
+def test_the_page_is_told_how_well_the_volume_is_known(o10, asymmetric8):
+    state = made_state(o10, asymmetric8)
+    advice, std = look(belief_message(state), asymmetric8.points.numpy(), viewing_volume(o10))
+    assert np.shape(advice["mm"]) == np.shape(advice["count"]) == (9, 9, 9)
+    assert 0 < advice["median"] < advice["p95"] and advice["best"] == int(np.argmax(advice["gain"]))
+    expected = change_std(o10, o10, state.belief.covariance())
+    assert std == pytest.approx(expected.numpy())
+    assert std == pytest.approx(state.std.numpy(), rel=1e-6)
+
+
+def test_a_camera_that_turned_has_turned_and_no_other(o10, asymmetric8):
+    from dataclasses import replace
+
+    state = made_state(o10, asymmetric8)
+    step = torch.zeros(10, 15).double()
+    step[6, 1] = 0.005
+    state = replace(state, belief=replace(state.belief, rig=state.belief.rig.retract(step)))
+    _, change = compare(rig_message(state))
+    turned = np.linalg.norm(change[:, :3], axis=1)
+    assert turned[6] == pytest.approx(0.005, rel=1e-3) and np.delete(turned, 6).max() < 1e-4

@@ -1,0 +1,24 @@
+import json
+
+from imgcal.online import Event
+
+
+def test_an_event_is_one_line_with_its_times_in_words() -> None:
+    event = Event(
+        1.5, 90, "moved", "cam07", 1.25, "rotation", 0.3, 0.01, "deg", 412.0, "cam07 turned\n0.3 degrees"
+    )  # fmt: skip
+    line = event.to_json()
+    assert "\n" not in line
+    assert json.loads(line) == {
+        "event": "moved",
+        "camera": "cam07",
+        "snapshot": "00090",
+        "time": "1970-01-01T00:00:01.500+00:00",
+        "since": "1970-01-01T00:00:01.250+00:00",
+        "kind": "rotation",
+        "size": 0.3,
+        "sigma": 0.01,
+        "unit": "deg",
+        "evidence": 412.0,
+        "message": "cam07 turned\n0.3 degrees",
+    }

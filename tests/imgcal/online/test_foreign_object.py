@@ -1,0 +1,35 @@
+"""What is seen is not the object: told once, after seconds; an absent object is none."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from imgcal.online import ForeignObject
+from tests.imgcal.online.states import state_at
+
+
+def watched(test: ForeignObject, refused: str | None, blobs: bool, first: float, count: int) -> list:
+    """Watch some snapshots at twenty a second."""
+    state, events = state_at(0, first), []
+    shown = state.detections if blobs else state.detections.select(np.zeros(32, dtype=bool))
+    for number in range(count):
+        events += test(replace(state, time=first + number / 20, refused=refused, detections=shown), None, None)
+    return events
+
+
+def test_a_foreign_object_is_told_once() -> None:
+    test = ForeignObject()
+    assert watched(test, "identity", True, 0.0, 200) == []  # the object has never been seen
+    assert watched(test, None, True, 10.0, 1) == []
+    (event,) = watched(test, "identity", True, 11.0, 200)
+    assert (event.kind, event.camera, event.since) == ("object_exchanged", None, 11.0)
+    assert 14.0 <= event.time < 14.2
+    again = ForeignObject()
+    again.restored(test.saved())
+    assert watched(again, "identity", True, 30.0, 200) == []
+
+
+def test_an_absent_object_is_no_foreign_one() -> None:
+    test = ForeignObject()
+    watched(test, None, True, 0.0, 1)
+    assert watched(test, "identity", False, 1.0, 200) == []

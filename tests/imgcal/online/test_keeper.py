@@ -1,0 +1,129 @@
+"""A rig that is kept calibrated: steady, bumped, without its object, and asked nonsense."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import imgcal
+from imgcal.errors import InputError
+from imgcal.online import Event, RigKeeper, RigState
+from imgcal.types import CameraRig, Detections
+from scripts.benchmarks.rig_streams import Bump, Conditions, Stream
+
+
+def kept(stream: Stream, count: int) -> list[RigState]:
+    with RigKeeper(stream.factory, stream.obj) as keeper:
+        return [keeper.update(blobs, time) for time, blobs in stream.snapshots(count)]
+
+
+def stream(seed: int, **given) -> Stream:
+    return Stream(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), seed, **given)
+
+
+def normalized(state: RigState, truth: CameraRig) -> float:
+    """RMS of the errors of the relations between cameras, in standard deviations."""
+    error = state.gauge.difference(state.rig, truth)
+    return float((error / state.std).square().mean().sqrt())
+
+
+def test_a_steady_rig_is_learnt_without_alarm() -> None:
+    made = stream(1)
+    states = kept(made, 12)
+    assert all(state.refused is None and not state.events for state in states)
+    assert states[-1].sentence == "all 4 cameras are calibrated"
+    assert 0.5 < normalized(states[-1], made.rig) < 1.6
+    assert (states[-1].std[:, 6] < 0.6 * states[0].std[:, 6]).all()
+    last = states[-1]
+    rows = last.detections.fiducial >= 0
+    shown = last.predicted[last.detections.camera[rows], last.detections.fiducial[rows]]
+    assert np.abs(shown - last.detections.uv[rows]).max() < 1.0
+    assert (last.residual < 0.3).all()
+
+
+def test_a_bump_is_told_and_learnt_again() -> None:
+    made = stream(2, bumps=[Bump(26, 1, "rotation", math.radians(0.5))])
+    states = kept(made, 90)
+    events = [event for state in states for event in state.events]
+    assert [event.kind for event in events] == ["moved", "moved", "relearnt"]
+    assert (events[1].change, events[2].change) == ("rotation", "rotation")
+    assert events[1].size == pytest.approx(0.5, abs=0.06)
+    assert {event.camera for event in events} == {"cam02"}
+    assert all(event.since is not None and abs(event.since * 60 - 26) <= 3 for event in events)
+    assert events[0].snapshot <= 30
+    for state in states[26::4]:
+        if state.cameras["cam02"] == "ok":
+            error = state.gauge.difference(state.rig, made.rig) / state.std
+            assert error[1].square().mean().sqrt() < 3
+
+
+def test_a_snapshot_without_the_object_teaches_nothing_and_the_next_one_is_tried_afresh() -> None:
+    made = stream(3, absent=[(3, 6)])
+    states = kept(made, 8)
+    assert [state.refused is not None for state in states] == [False] * 3 + [True] * 3 + [False] * 2
+    assert states[5].belief is states[2].belief
+    assert np.isnan(states[4].predicted).all()
+
+
+def test_an_object_that_jumps_between_snapshots_is_found_again() -> None:
+    made = stream(7, conditions=Conditions(rate=1.5, clutter=0.0))
+    states = kept(made, 16)
+    assert all(state.refused is None and not state.events for state in states)
+    assert all(float(np.nanmax(state.residual)) < 1.5 for state in states[4:])
+
+
+def test_tests_see_every_snapshot_and_tell_of_cameras() -> None:
+    class Dirty:
+        name = "dirty"
+
+        def __call__(self, state, frames, absorbed):
+            assert frames is None
+            assert (absorbed is None) == (state.refused is not None)
+            kind = {1: "dirty", 3: "clean"}.get(state.snapshot)
+            return [] if kind is None else [Event(state.time, state.snapshot, kind, "cam03", message="a lens")]
+
+        def saved(self):
+            return {}
+
+        def restored(self, values):
+            assert not values
+
+    made = stream(8, absent=[(2, 3)])
+    with RigKeeper(made.factory, made.obj, tests=[Dirty()]) as keeper:
+        states = [keeper.update(blobs, time) for time, blobs in made.snapshots(4)]
+    assert [state.cameras["cam03"] for state in states] == ["ok", "dirty", "dirty", "ok"]
+    assert [event.kind for state in states for event in state.events] == ["dirty", "clean"]
+    assert states[1].sentence == "cam03 dirty"
+
+
+def test_present_values_may_become_those_of_the_factory() -> None:
+    made = stream(4)
+    with RigKeeper(made.factory, made.obj) as keeper:
+        for number in range(3):
+            state = keeper.update(made.snapshot(number), number / 60)
+        assert float(state.moved[:, 6:8].abs().max()) > 1.0
+        assert keeper.accept_as_factory().kind == "factory"
+        again = keeper.update(made.snapshot(3), 3 / 60)
+    assert float(again.moved[:, 6:8].abs().max()) < 5.0
+    assert bool((again.belief.std() <= state.belief.std()).all())
+
+
+@pytest.mark.parametrize("time", [math.nan, math.inf, -1.0])
+def test_a_time_that_is_none_is_refused(time: float) -> None:
+    made = stream(5)
+    with RigKeeper(made.factory, made.obj) as keeper, pytest.raises(InputError, match="time: found"):
+        keeper.update(made.snapshot(0), time)
+
+
+def test_labels_that_came_with_the_blobs_are_used() -> None:
+    made = stream(6, conditions=Conditions(labelled=True, clutter=0.0))
+    states = kept(made, 3)
+    assert all(state.refused is None for state in states)
+    blobs: Detections = made.snapshot(3)
+    swapped = replace(blobs, fiducial=np.roll(blobs.fiducial, 1))
+    with RigKeeper(made.factory, made.obj) as keeper:
+        assert keeper.update(blobs, 0.0).refused is None
+        assert keeper.update(swapped, 0.0).belief.rig.focal_length.isfinite().all()
+    assert torch.isfinite(states[-1].std).all()

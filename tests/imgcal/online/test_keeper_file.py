@@ -1,0 +1,164 @@
+"""A keeper goes on from its file as if nothing had happened; files that were changed are refused in one line."""
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import imgcal
+from imgcal.errors import InputError
+from imgcal.online import RigKeeper, RigState
+from scripts.benchmarks.rig_streams import Bump, Stream
+
+CHILD = """
+import sys
+import imgcal
+from scripts.benchmarks.rig_streams import Stream
+made = Stream(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), 3)
+with imgcal.RigKeeper(made.factory, made.obj) as keeper:
+    for time, blobs in made.snapshots(10**6):
+        keeper.update(blobs, time)
+        if keeper.belief is not None and round(time * 60) % 3 == 2:
+            keeper.save(sys.argv[1])
+            print(round(time * 60), flush=True)
+"""
+
+
+def stream() -> Stream:
+    bumps = [Bump(11, 1, "rotation", math.radians(0.5))]
+    return Stream(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), 3, bumps=bumps, absent=[(14, 15)])
+
+
+def alike(first: RigState, second: RigState) -> bool:
+    beliefs = first.belief, second.belief
+    return (
+        first.sentence == second.sentence
+        and first.cameras == second.cameras
+        and first.refused == second.refused
+        and first.events == second.events
+        and all(torch.equal(getattr(*pair), getattr(beliefs[1], pair[1])) for pair in [(beliefs[0], "factor")])
+        and torch.equal(beliefs[0].rig.focal_length, beliefs[1].rig.focal_length)
+        and torch.equal(beliefs[0].rig.cam_from_rig.rotation, beliefs[1].rig.cam_from_rig.rotation)
+        and np.array_equal(first.residual, second.residual, equal_nan=True)
+    )
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory):
+    """States of a rig, and the file that was saved while a camera was being learnt again."""
+    made, path, states = stream(), tmp_path_factory.mktemp("keeper") / "state.json", []
+    with RigKeeper(made.factory, made.obj) as keeper:
+        for number, (seconds, blobs) in enumerate(made.snapshots(22)):
+            states.append((seconds, blobs, keeper.update(blobs, seconds)))
+            if number == 15:
+                keeper.save(path)
+    return path, states
+
+
+def test_the_same_snapshots_give_the_same_states(saved, tmp_path: Path) -> None:
+    path, states = saved
+    assert states[15][2].cameras["cam02"] == "relearning"
+    with RigKeeper.restore(path) as keeper:
+        for seconds, blobs, state in states[16:]:
+            assert alike(keeper.update(blobs, seconds), state)
+        keeper.save(tmp_path / "again.json")
+    assert [path.name for path in tmp_path.iterdir()] == ["again.json"]
+
+
+def test_people_can_read_it(saved) -> None:
+    content = json.loads(saved[0].read_text())
+    assert content["format"] == "imgcal-keeper/1"
+    assert content["sentence"].startswith("cam02 moved")
+    assert content["snapshot"] == "00015"
+    assert content["cameras"]["cam01"] == "ok"
+    assert content["rig"][0] == "format: imgcal-rig/1"
+    assert saved[0].read_text().index("memory") < 20_000
+
+
+def _classes(value):
+    if isinstance(value, dict):
+        if "of" in value:
+            yield value
+        for inner in value.values():
+            yield from _classes(inner)
+    elif isinstance(value, list):
+        for inner in value:
+            yield from _classes(inner)
+
+
+MUTATIONS = {
+    "a class of another module": lambda m: next(_classes(m)).update(of="subprocess:Popen"),
+    "a method": lambda m: next(_classes(m)).update(of="imgcal.types.rig:CameraRig.select"),
+    "no class": lambda m: next(_classes(m)).update(of=7),
+    "other values": lambda m: next(_classes(m))["values"].clear(),
+    "no memory": lambda m: m.clear(),
+    "a list": lambda m: m.update({"dict": 3}),
+    "another number of values": lambda m: m["dict"][0][1]["dict"].pop(),
+}
+
+
+@pytest.mark.parametrize("change", MUTATIONS)
+def test_files_that_were_changed_are_refused_in_one_line(saved, tmp_path: Path, change: str) -> None:
+    content = json.loads(saved[0].read_text())
+    MUTATIONS[change](content["memory"])
+    path = tmp_path / "state.json"
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError) as told:
+        RigKeeper.restore(path)
+    assert str(told.value).startswith(str(path))
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"format": "imgcal-rig/1"}', "[" * 100_000, "\xff\x00"])
+def test_other_files_are_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "state.json"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(InputError, match=r"state\.json"):
+        RigKeeper.restore(path)
+    with pytest.raises(InputError, match="no such file"):
+        RigKeeper.restore(tmp_path / "nothing.json")
+
+
+def test_arrays_that_were_changed_are_refused(saved, tmp_path: Path) -> None:
+    generator = np.random.default_rng(1)
+    content = saved[0].read_text()
+    places = [i for i in range(len(content) - 40) if content.startswith('"tensor": ["float64", [', i)]
+    for place in generator.choice(places, 6, replace=False):
+        digits = place + len('"tensor": ["float64", [')
+        path = tmp_path / "state.json"
+        path.write_text(f"{content[:digits]}7{content[digits:]}")
+        with pytest.raises(InputError, match="was not written here"):
+            RigKeeper.restore(path)
+
+
+def test_a_process_that_is_killed_leaves_a_file_to_go_on_from(tmp_path: Path) -> None:
+    path = tmp_path / "state.json"
+    child = subprocess.Popen([sys.executable, "-c", CHILD, str(path)], stdout=subprocess.PIPE, text=True)
+    assert child.stdout is not None
+    reached = [int(child.stdout.readline()) for _ in range(2)]
+    time.sleep(0.05)
+    os.kill(child.pid, signal.SIGKILL)
+    child.communicate()
+    made = Stream(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), 3)
+    with RigKeeper.restore(path) as keeper:
+        count = keeper.saved().snapshot + 1
+        assert count > reached[-1]
+        shots = list(made.snapshots(count + 2))
+        for seconds, blobs in shots[count:]:
+            state = keeper.update(blobs, seconds)
+    with RigKeeper(made.factory, made.obj) as steady:
+        for seconds, blobs in shots:
+            expected = steady.update(blobs, seconds)
+    # Within one process the same bits, see above; two that compile at the same time may differ in the last.
+    assert (state.sentence, state.cameras, state.refused) == (expected.sentence, expected.cameras, expected.refused)
+    scale = float(expected.belief.factor.abs().max())
+    torch.testing.assert_close(state.belief.factor, expected.belief.factor, rtol=0, atol=1e-9 * scale)
+    torch.testing.assert_close(state.belief.rig.focal_length, expected.belief.rig.focal_length, rtol=1e-9, atol=0)

@@ -1,0 +1,22 @@
+"""Noise beyond what blobs say of themselves is found, and the first snapshots are learnt with it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import imgcal
+from imgcal.online import RigKeeper
+from scripts.benchmarks.rig_streams import Conditions, Stream
+
+
+@pytest.mark.parametrize(("said", "expected"), [(0.3, 0.0), (0.03, 0.3)])
+def test_the_noise_is_found(said: float, expected: float) -> None:
+    made = Stream(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), 8, Conditions(noise=0.3, clutter=0.0))
+    with RigKeeper(made.factory, made.obj) as keeper:
+        for time, blobs in made.snapshots(10):
+            state = keeper.update(replace(blobs, sigma=np.full(len(blobs), said)), time)
+    error = state.gauge.difference(state.rig, made.rig) / state.std
+    assert 0.5 < float(error.square().mean().sqrt()) < 1.7
+    absorbed_noise = keeper.noise
+    assert absorbed_noise == pytest.approx(expected, abs=0.06)

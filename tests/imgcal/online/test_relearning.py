@@ -1,0 +1,32 @@
+"""What is told of a camera that moved, and when it is known again."""
+
+import math
+
+import pytest
+import torch
+
+import imgcal
+from imgcal.estimation import Change, RigBelief, widened
+from imgcal.online.relearning import Relearning, relative_std, sigma_of
+
+
+def test_a_camera_is_known_again_when_it_is_known_as_well_as_before() -> None:
+    rig, obj = imgcal.load_rig("T4").to(torch.float64), imgcal.load_object("asymmetric8")
+    known = RigBelief.of_prior(rig, obj)
+    relearning = Relearning(rig.camera_names)
+    first = relearning.told(Change(1, 0, "unknown", math.nan, math.nan), 1.0, 1.1, 4, known)
+    assert (first.camera, first.change, first.size, first.message) == ("cam02", "unknown", None, "cam02 moved")
+    change = Change(1, 0, "rotation", math.radians(0.3), math.radians(0.01))
+    told = relearning.told(change, 1.0, 1.2, 8, known)
+    assert (told.change, told.unit) == ("rotation", "deg")
+    assert told.size == pytest.approx(0.3)
+    assert told.message == "cam02 turned 0.3 +- 0.01 deg"
+    variance = torch.zeros(4, 15, dtype=torch.float64)
+    variance[1, :3] = 0.05**2
+    wide = widened(known, variance)
+    assert relearning.learnt(wide, frozenset(), 1.3, 12) == []
+    assert relearning.learnt(known, frozenset({1}), 1.3, 12) == []
+    (learnt,) = relearning.learnt(known, frozenset(), 1.4, 16)
+    assert (learnt.kind, learnt.camera, learnt.since, learnt.snapshot) == ("relearnt", "cam02", 1.0, 16)
+    assert learnt.sigma == pytest.approx(sigma_of(relative_std(known)[1], "rotation"))
+    assert relearning.events == {}

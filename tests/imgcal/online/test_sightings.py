@@ -1,0 +1,51 @@
+"""Cameras that are lost and back."""
+
+import numpy as np
+import pytest
+import torch
+
+import imgcal
+from imgcal.online.sightings import Look, Sightings
+from imgcal.types import Detections
+
+
+def look(time: float, labelled: list[int], astray: frozenset[int] = frozenset(), silent: frozenset[int] = frozenset()):
+    """A snapshot in which the object is in the middle of all four images."""
+    count = len(labelled)
+    blobs = Detections(
+        np.full((count, 2), 500.0), np.ones(count), np.array(labelled, dtype=np.int64), np.zeros(count, np.int64),
+        np.zeros(count, np.int64), np.ones(count), np.zeros(count, np.uint8), ("a", "b", "c", "d"), ("0",),
+    )  # fmt: skip
+    return Look(time, round(time * 60), blobs, np.full((4, 8, 2), 500.0), astray, silent)
+
+
+def kinds(sightings: Sightings, looks: list[Look]) -> list[tuple[str, str | None, float | None]]:
+    rig = imgcal.load_rig("T4").to(torch.float64)
+    return [(e.kind, e.camera, e.since) for given in looks for e in sightings.take(rig, given)]
+
+
+def test_a_camera_that_misses_the_object_for_seconds_is_lost_and_one_that_is_covered_for_a_moment_is_not() -> None:
+    sightings = Sightings(("a", "b", "c", "d"))
+    assert kinds(sightings, [look(s / 30, [0, 1, 2] if s < 30 else [0, 1, 2, 3]) for s in range(60)]) == []
+    assert sightings.seen == {0, 1, 2, 3}
+    told = kinds(sightings, [look(2 + s / 30, [0, 1, 2]) for s in range(100)])
+    assert told == [("camera_lost", "d", pytest.approx(2.0))]
+    assert kinds(sightings, [look(6.0, [0, 1, 2, 3])]) == [("camera_back", "d", pytest.approx(2.0))]
+
+
+def test_a_camera_that_is_astray_or_silent_is_lost() -> None:
+    sightings = Sightings(("a", "b", "c", "d"))
+    assert kinds(sightings, [look(0.0, [0, 1, 3], astray=frozenset({2}))]) == [("camera_lost", "c", 0.0)]
+    given = [look(1 + s / 10, [0, 1, 3], silent=frozenset({1})) for s in range(7)]
+    # Labels of a camera without a frame come from nowhere here: it is back at once.
+    assert ("camera_lost", "b", 1.0) in kinds(sightings, given)
+    assert sightings.lost.keys() >= {2}
+
+
+def test_a_camera_that_cannot_see_the_object_misses_nothing() -> None:
+    sightings, rig = Sightings(("a", "b", "c", "d")), imgcal.load_rig("T4").to(torch.float64)
+    for s in range(120):
+        given = look(s / 30, [0, 1])
+        given.predicted[3] = np.nan
+        given.predicted[2] = 5.0  # at the border
+        assert sightings.take(rig, given) == []

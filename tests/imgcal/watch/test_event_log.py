@@ -1,0 +1,92 @@
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from imgcal.errors import InputError
+from imgcal.watch.event_log import EventLog
+from tests.imgcal.watch.states import event
+
+
+def lines(path):
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def test_events_are_appended_over_restarts(tmp_path):
+    path = tmp_path / "events.jsonl"
+    for start in range(3):
+        log = EventLog(path)
+        log.append(event(start, message="line\nbreak \udcff"))
+        log.close()
+    assert [line["snapshot"] for line in lines(path)] == ["00000", "00001", "00002"]
+    assert path.read_bytes().count(b"\n") == 3
+
+
+@pytest.mark.parametrize("left", [b'{"event": "mov', b"\x00" * 5000])
+def test_what_a_power_failure_left_of_a_line_is_cut_off(left, tmp_path):
+    path = tmp_path / "events.jsonl"
+    log = EventLog(path)
+    log.append(event(1))
+    log.close()
+    with open(path, "ab") as file:
+        file.write(left)
+    log = EventLog(path)
+    log.append(event(2))
+    log.close()
+    assert [line["snapshot"] for line in lines(path)] == ["00001", "00002"]
+
+
+def test_it_does_not_grow_for_ever(tmp_path):
+    log = EventLog(tmp_path / "events.jsonl", most_bytes=1000)
+    for number in range(50):
+        log.append(event(number))
+    log.close()
+    kept = [*lines(tmp_path / "events.1.jsonl"), *lines(tmp_path / "events.jsonl")]
+    assert [line["snapshot"] for line in kept] == [f"{n:05d}" for n in range(50 - len(kept), 50)] and len(kept) > 4
+    assert sum(path.stat().st_size for path in tmp_path.iterdir()) <= 2000
+
+
+def test_a_full_disk_leaves_whole_lines(tmp_path):
+    path = tmp_path / "events.jsonl"
+    log = EventLog(path)
+    log.append(event(1))
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 20, limits[1]))
+    try:
+        with pytest.raises(OSError, match=r"20 of|too large"):
+            log.append(event(2))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    log.append(event(3))
+    log.close()
+    assert [line["snapshot"] for line in lines(path)] == ["00001", "00003"]
+
+
+def test_lines_are_whole_after_sigkill(tmp_path):
+    path = tmp_path / "events.jsonl"
+    code = (
+        "import sys\nfrom pathlib import Path\nfrom imgcal.online.events import Event\n"
+        "from imgcal.watch.event_log import EventLog\nlog = EventLog(Path(sys.argv[1]))\n"
+        "for number in range(10**9): log.append(Event(1.7e9, number, 'moved', 'cam02', message='x' * 3000))\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code, path], env=os.environ | {"PYTHONPATH": str(Path.cwd())})
+    ends = time.monotonic() + 60
+    while time.monotonic() < ends and not (path.exists() and path.stat().st_size > 100_000):
+        time.sleep(0.01)
+    process.kill()
+    process.wait()
+    found = lines(path)
+    assert [line["snapshot"] for line in found] == [f"{n:05d}" for n in range(len(found))] and len(found) > 10
+
+
+def test_a_folder_in_its_place(tmp_path):
+    (tmp_path / "events.jsonl").mkdir()
+    with pytest.raises(InputError, match="cannot be written"):
+        EventLog(tmp_path / "events.jsonl")

@@ -1,0 +1,134 @@
+import os
+import threading
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from imgcal.errors import InputError
+from imgcal.io import load_rig
+from imgcal.io.frames import write_frame
+from imgcal.watch import folder as module
+from imgcal.watch.exposures import Exposure, Unreadable
+from imgcal.watch.folder import Folder
+
+RIG = load_rig("T4")
+HEIGHT, WIDTH = 1088, 2048
+
+
+@pytest.fixture
+def rig():
+    import torch
+
+    return RIG.resized(torch.tensor([64, 34]))
+
+
+def frame(level=0):
+    return np.full((34, 64), level, np.uint8)
+
+
+def put(folder, camera, name, level=0):
+    (folder / "frames" / camera).mkdir(parents=True, exist_ok=True)
+    write_frame(folder / "frames" / camera / f"{name}.png", frame(level))
+
+
+def until(items, count):
+    """The next items that are something."""
+    found, ends = [], time.monotonic() + 20
+    while len(found) < count:
+        item = next(items)
+        found += [] if item is None else [item]
+        assert time.monotonic() < ends
+    return found
+
+
+def test_what_is_there_and_what_comes_in_the_order_of_names(tmp_path, rig):
+    for name in ("10", "9"):
+        for camera in ("cam02", "cam01"):
+            put(tmp_path, camera, name, int(name))
+    items = Folder(tmp_path, rig).items()
+    found = until(items, 4)
+    assert [(e.snapshot, e.camera, e.content[0, 0]) for e in found] == [
+        ("9", "cam01", 9), ("9", "cam02", 9), ("10", "cam01", 10), ("10", "cam02", 10),
+    ]  # fmt: skip
+    put(tmp_path, "cam03", "11")  # a camera whose folder was not there
+    (exposure,) = until(items, 1)
+    assert (exposure.camera, exposure.snapshot) == ("cam03", "11")
+    assert exposure.time == pytest.approx(time.time(), abs=5)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".bmp", ".pgm", ".jpg"])
+def test_no_frame_is_taken_while_it_is_written(suffix, tmp_path, rig):
+    content = cv2.imencode(suffix, np.random.default_rng(0).integers(0, 255, (34, 64), np.uint8))[1].tobytes()
+    path = tmp_path / "frames" / "cam01" / f"1{suffix}"
+    path.parent.mkdir(parents=True)
+    whole = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+
+    def write():  # as over a slow network
+        with open(path, "wb", buffering=0) as file:
+            for start in range(0, len(content), len(content) // 6):
+                file.write(content[start : start + len(content) // 6])
+                time.sleep(0.04)
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    (exposure,) = until(Folder(tmp_path, rig).items(), 1)
+    writer.join()
+    assert isinstance(exposure, Exposure) and (exposure.content == whole).all()
+
+
+def test_a_writer_that_pauses_is_waited_for_and_one_that_died_is_given_up(tmp_path, rig, monkeypatch):
+    monkeypatch.setattr(module, "GIVEN_UP", 0.6)
+    put(tmp_path, "cam01", "1")
+    put(tmp_path, "cam02", "1")
+    content = (tmp_path / "frames" / "cam01" / "1.png").read_bytes()
+    for camera in ("cam01", "cam02"):
+        (tmp_path / "frames" / camera / "2.png").write_bytes(content[:-20])
+    items = Folder(tmp_path, rig).items()
+    assert {e.snapshot for e in until(items, 2)} == {"1"}
+    for _ in range(4):
+        assert next(items) is None
+    (tmp_path / "frames" / "cam01" / "2.png").write_bytes(content)
+    first, second = until(items, 2)
+    assert (first.camera, first.snapshot) == ("cam01", "2")
+    assert isinstance(second, Unreadable) and second.camera == "cam02" and "truncated" in second.reason
+    put(tmp_path, "cam02", "3")
+    assert until(items, 1)[0].snapshot == "3"
+
+
+def test_other_files_and_hidden_ones_are_not_looked_at(tmp_path, rig):
+    put(tmp_path, "cam01", "1")
+    for name in (".2.png", "2.png.part", "notes.txt"):
+        (tmp_path / "frames" / "cam01" / name).write_bytes(b"junk")
+    os.mkfifo(tmp_path / "frames" / "cam01" / "3.png")
+    items = Folder(tmp_path, rig, until_idle=0.3).items()
+    assert [e.snapshot for e in items if e is not None] == ["1"]
+
+
+def test_snapshots_before_a_restart_are_not_read_again_and_read_ones_are_removed(tmp_path, rig):
+    for name in ("8", "9", "10", "11"):
+        put(tmp_path, "cam01", name)
+    items = Folder(tmp_path, rig, remove=True, after="9", until_idle=0.3).items()
+    assert [e.snapshot for e in items if e is not None] == ["10", "11"]
+    assert sorted(path.name for path in tmp_path.glob("frames/cam01/*")) == ["8.png", "9.png"]
+
+
+def test_what_is_remembered_is_bounded_and_nothing_is_read_twice(tmp_path, rig, monkeypatch):
+    monkeypatch.setattr(module, "REMEMBERED", 4)
+    items = Folder(tmp_path, rig).items()
+    for name in range(20):
+        put(tmp_path, "cam01", str(name))
+        assert until(items, 1)[0].snapshot == str(name)
+    assert [next(items) for _ in range(3)] == [None] * 3
+
+
+def test_what_a_hurried_user_does(tmp_path, rig):
+    put(tmp_path, "cam01", "1")
+    with pytest.raises(InputError, match="no such folder"):
+        next(Folder(tmp_path / "absent", rig).items())
+    with pytest.raises(InputError, match="found the folders of cameras, expected a folder that holds"):
+        next(Folder(tmp_path / "frames", rig).items())
+    put(tmp_path, "cam1", "1")
+    item = next(Folder(tmp_path, rig).items())
+    assert isinstance(item, Unreadable) and "nearest: cam01" in item.reason

@@ -1,0 +1,86 @@
+import json
+import sys
+import time
+
+import pytest
+
+from imgcal.errors import InputError
+from imgcal.watch import hook as module
+from imgcal.watch.hook import Hook
+from tests.imgcal.watch.states import event
+
+EVIL = '"; touch evil; $(touch evil) `touch evil` | touch evil'
+
+
+def script(tmp_path, code):
+    path = tmp_path / "hook.py"
+    path.write_text(code)
+    return f"{sys.executable} -S {path} {tmp_path}/out"
+
+
+def until(condition, seconds=20.0):
+    ends = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < ends
+        time.sleep(0.01)
+
+
+def test_the_event_is_standard_input_and_no_shell_sees_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code = (
+        "import os, sys\n"
+        "open(sys.argv[1], 'a').write(sys.stdin.read() + os.environ['IMGCAL_EVENT'] + os.environ['IMGCAL_CAMERA'])"
+    )
+    hook = Hook(script(tmp_path, code))
+    hook.tell(event(7, camera="cam02", message=EVIL))
+    hook.close()
+    line, rest = (tmp_path / "out").read_text().split("\n")
+    assert json.loads(line)["message"] == EVIL and rest == "movedcam02"
+    assert not (tmp_path / "evil").exists() and (hook.failed, hook.dropped) == (0, 0)
+
+
+def test_one_that_hangs_is_killed_with_what_it_started_and_never_waited_for(tmp_path):
+    code = (
+        "import subprocess, sys, time\n"
+        f"child = subprocess.Popen([{sys.executable!r}, '-S', '-c', 'import time; time.sleep(60)'])\n"
+        "open(sys.argv[1], 'a').write(f'{child.pid}\\n'); time.sleep(60)"
+    )
+    hook = Hook(script(tmp_path, code), timeout=1.0)
+    started = time.monotonic()
+    hook.tell(event())
+    assert time.monotonic() - started < 0.5
+    until(lambda: hook.failed == 1)
+    (child,) = (tmp_path / "out").read_text().split()
+    until(lambda: not _runs(child))
+    hook.close()
+
+
+def _runs(pid):
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rsplit(")", 1)[1].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_more_events_than_it_can_take_are_dropped_and_counted(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "MOST_WAITING", 3)
+    hook = Hook(script(tmp_path, "import sys, time; time.sleep(0.3); open(sys.argv[1], 'a').write(sys.stdin.read())"))
+    for number in range(10):
+        hook.tell(event(number))
+    hook.close()
+    names = [json.loads(line)["snapshot"] for line in (tmp_path / "out").read_text().splitlines()]
+    assert names[-3:] == ["00007", "00008", "00009"] and len(names) + hook.dropped == 10
+
+
+def test_one_that_fails_is_counted(tmp_path):
+    hook = Hook(script(tmp_path, "raise SystemExit(3)"))
+    hook.tell(event())
+    hook.close()
+    assert hook.failed == 1
+
+
+@pytest.mark.parametrize("command", ["", "no-such-program --now", "echo 'open", "   "])
+def test_commands_that_are_none(command):
+    with pytest.raises(InputError, match="--hook: found"):
+        Hook(command)

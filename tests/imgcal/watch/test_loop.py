@@ -1,0 +1,154 @@
+import json
+import shutil
+import threading
+import time
+from types import SimpleNamespace
+
+import pytest
+
+from imgcal.errors import InputError
+from imgcal.watch import loop as module
+from imgcal.watch.exposures import CameraBlobs, Exposure
+from imgcal.watch.intake import Intake
+from imgcal.watch.loop import Progress, Watch
+from imgcal.watch.synchronization import TimedSnapshot
+from tests.imgcal.watch.states import RIG, KeeperOfStates, event
+
+NOTHING = CameraBlobs.of([])
+
+
+def snapshot(time, name=None, lag=0.0):
+    given = {camera: Exposure(camera, time + lag * (camera == "cam02"), NOTHING, name) for camera in RIG.camera_names}
+    return TimedSnapshot(time, given, name)
+
+
+class Snapshots:
+    """A source of snapshots, at times that are given."""
+
+    live = False
+
+    def __init__(self, *times):
+        self._times = times
+
+    def items(self):
+        for seconds in self._times:
+            yield from snapshot(seconds).exposures.values()
+
+
+class PageOfLists:
+    def __init__(self):
+        self.published, self.told, self.asked = [], [], []
+
+    def publish(self, state, frames):
+        self.published.append((state.snapshot, set(frames)))
+
+    def tell(self, event):
+        self.told.append(event)
+
+    def commands(self):
+        asked, self.asked = self.asked, []
+        return [SimpleNamespace(name=name, camera=None, event=None) for name in asked]
+
+
+def events_of(folder):
+    return [json.loads(line)["event"] for line in (folder / "events.jsonl").read_text().split("\n")[:-1]]
+
+
+def test_events_go_to_all_who_want_to_know_and_rigs_are_kept(tmp_path):
+    keeper, page, told = KeeperOfStates(), PageOfLists(), []
+    keeper.events = {1: [event(1), event(1, "camera_lost")]}
+    with Watch(keeper, tmp_path, page=page, told=told.append) as loop:
+        loop.tell(event(0, "restart"))
+        for number in range(3):
+            loop.take(snapshot(1.7e9 + number))
+    assert events_of(tmp_path) == ["restart", "moved", "camera_lost"] == [e.kind for e in told]
+    assert [e.kind for e in page.told] == ["restart"]
+    assert page.published == [(n, set(RIG.camera_names)) for n in range(3)]
+    assert [path.name for path in tmp_path.glob("history/*/*")] == ["221321.000.yaml"]
+    assert (tmp_path / "rig.yaml").is_file() and json.loads((tmp_path / "state.json").read_text()) == 3
+
+
+def test_the_state_is_saved_once_a_second_after_how_far_the_source_is(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "SAVED_EVERY", 0.05)
+    keeper = KeeperOfStates()
+
+    class Slow(Snapshots):
+        live = True
+
+        def items(self):
+            for item in super().items():
+                time.sleep(0.01)
+                yield item
+
+    with Watch(keeper, tmp_path) as loop, Intake(Slow(*(k / 10 for k in range(10))), RIG) as intake:
+        loop.run(intake, threading.Event())
+    assert 3 <= len(keeper.saves) <= 10 and keeper.saves[-1] == 10
+    assert Progress.load(tmp_path) == Progress(0.9)
+
+
+def test_nothing_is_written_where_nothing_is_known(tmp_path):
+    with Watch(KeeperOfStates(), tmp_path) as loop:
+        loop.save()
+    assert [path.name for path in tmp_path.iterdir()] == ["events.jsonl"] and Progress.load(tmp_path) is None
+
+
+def test_input_that_cannot_be_used_does_not_end_it(tmp_path):
+    told = []
+    with Watch(KeeperOfStates(fails=[0, 2]), tmp_path, problem=told.append) as loop:
+        assert [loop.take(snapshot(float(k))) is None for k in range(4)] == [True, False, True, False]
+    assert loop.tally.unusable == 2 and loop.tally.learnt == 2 and told == ["frames of two rigs"]
+
+
+def test_what_cannot_be_written_is_counted_said_once_and_written_later(tmp_path):
+    told = []
+    (tmp_path / "state.json").mkdir()
+    with Watch(KeeperOfStates(), tmp_path, problem=told.append) as loop:
+        for number in range(3):
+            loop.take(snapshot(float(number)))
+            loop.save()
+            time.sleep(0.2)
+        loop.save()
+        assert loop.tally.problems["files"] >= 2 and len(told) == 1 and "state.json" in told[0]
+        shutil.rmtree(tmp_path / "state.json")
+    assert json.loads((tmp_path / "state.json").read_text()) == 3
+
+
+def test_people_pause_go_on_and_accept_the_rig(tmp_path):
+    keeper, page = KeeperOfStates(), PageOfLists()
+    with Watch(keeper, tmp_path, page=page) as loop:
+        for asked in ([], ["pause"], [], ["resume", "factory", "acknowledge"]):
+            page.asked = list(asked)
+            with Intake(Snapshots(float(len(keeper.sources))), RIG) as intake:
+                loop.run(intake, threading.Event())
+    assert len(keeper.sources) == 2 and loop.tally.paused == 2
+    assert events_of(tmp_path) == ["factory"] == [e.kind for e in page.told]
+
+
+def test_it_stops_when_told(tmp_path):
+    stopped = threading.Event()
+
+    class Endless(Snapshots):
+        def items(self):
+            k = 0
+            while True:
+                k += 1
+                yield from snapshot(float(k)).exposures.values()
+
+    keeper = KeeperOfStates()
+    with Watch(keeper, tmp_path) as loop, Intake(Endless(), RIG) as intake:
+        loop.run(intake, stopped, lambda: stopped.set() if len(keeper.sources) == 5 else None)
+    assert len(keeper.sources) == 5 == keeper.saves[-1]
+
+
+def test_time_stamps_of_cameras_are_compared_with_their_snapshots(tmp_path):
+    with Watch(KeeperOfStates(), tmp_path) as loop:
+        for number in range(300):
+            loop.take(snapshot(float(number), lag=0.004))
+    assert loop.tally.stamps == pytest.approx({"cam01": 0, "cam02": 0.004, "cam03": 0, "cam04": 0})
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[1]", '{"time": "x", "name": null}', '{"time": 1, "name": 2}', "[" * 5000])
+def test_progress_that_is_none_of_ours(text, tmp_path):
+    (tmp_path / "progress.json").write_text(text)
+    with pytest.raises(InputError, match=r"progress\.json: found"):
+        Progress.load(tmp_path)

@@ -1,0 +1,71 @@
+import urllib.error
+import urllib.request
+
+import pytest
+
+from imgcal.errors import InputError
+from imgcal.watch.exposures import CameraBlobs, Exposure, Unreadable
+from imgcal.watch.hook import Hook
+from imgcal.watch.intake import Intake
+from imgcal.watch.loop import Watch
+from imgcal.watch.metrics import BUCKETS, Metrics, Tally
+from tests.imgcal.watch.states import RIG, KeeperOfStates, event
+
+parser = pytest.importorskip("prometheus_client.parser")
+
+
+class Given:
+    live = False
+
+    def items(self):
+        yield Unreadable("junk", "cam01")
+        for k in range(3):
+            for camera in RIG.camera_names[: 4 - (k == 1)]:
+                yield Exposure(camera, k / 60, CameraBlobs.of([]))
+
+
+def scraped(metrics):
+    with urllib.request.urlopen(f"http://127.0.0.1:{metrics.port}/metrics", timeout=10) as reply:
+        text = reply.read().decode()
+    return {
+        (sample.name, *sorted(sample.labels.values())): sample.value
+        for family in parser.text_string_to_metric_families(text)
+        for sample in family.samples
+    }
+
+
+def test_what_is_counted_is_served(tmp_path):
+    keeper, hook = KeeperOfStates(), Hook("true")
+    keeper.events = {1: [event(1), event(1, "camera_lost")]}
+    intake = Intake(Given(), RIG)
+    with Watch(keeper, tmp_path, hook) as loop, Metrics(loop.tally, intake, hook, ("127.0.0.1", 0)) as metrics:
+        assert scraped(metrics)["imgcal_snapshots_total",] == 0
+        with intake:
+            while (snapshot := intake.next(1.0)) is not None:
+                loop.take(snapshot)
+        found = scraped(metrics)
+    assert found["imgcal_snapshots_total",] == 3
+    assert found["imgcal_exposures_missing_total", "cam04"] == 1
+    assert found["imgcal_exposures_unreadable_total", "cam01"] == 1
+    assert found["imgcal_events_total", "moved"] == 1 and found["imgcal_events_total", "drift"] == 0
+    assert found["imgcal_camera", "cam01", "ok"] == 1
+    assert found["imgcal_update_seconds_count",] == found["imgcal_update_seconds_bucket", "+Inf"] == 3
+    assert found["imgcal_clock_offset_seconds", "cam02"] == 0 == found["imgcal_stamp_offset_seconds", "cam02"]
+    assert found["imgcal_rotation_radians", "cam03"] >= 0
+
+
+def test_only_this_machine_may_read_it_and_the_address_may_be_taken(tmp_path):
+    intake = Intake(Given(), RIG)
+    with Metrics(Tally(), intake, None, ("127.0.0.1", 0)) as metrics:
+        port = metrics.port
+        with pytest.raises(InputError, match=rf"--metrics: 127\.0\.0\.1:{port} cannot"):
+            Metrics(Tally(), intake, None, ("127.0.0.1", port)).__enter__()
+    with pytest.raises(urllib.error.URLError):
+        urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=2)
+
+
+def test_times_are_counted_by_their_limits():
+    tally = Tally()
+    for seconds in (0.0005, BUCKETS[0], 0.0011, 100.0):
+        tally.update_took(seconds)
+    assert tally.took[:2] == [2, 1] and tally.took[-1] == 1

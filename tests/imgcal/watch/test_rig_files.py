@@ -1,0 +1,74 @@
+import threading
+import time
+from dataclasses import replace
+
+import pytest
+import torch
+
+from imgcal.io import load_rig, load_rig_covariance
+from imgcal.watch.rig_files import RigFiles
+from tests.imgcal.watch.states import some_state
+
+
+@pytest.fixture(scope="module")
+def state():
+    return some_state(time=1.7e9)
+
+
+def test_the_rig_with_its_standard_deviations_and_its_history(state, tmp_path):
+    files = RigFiles(tmp_path)
+    files.write(state)
+    files.write(replace(state, time=1.7e9 + 3600), keep=True)
+    files.close()
+    assert torch.allclose(load_rig(tmp_path / "rig.yaml").focal_length, state.rig.focal_length)
+    assert torch.allclose(load_rig_covariance(tmp_path / "rig.yaml").std, state.std, rtol=1e-5)
+    assert [str(path.relative_to(tmp_path)) for path in tmp_path.glob("history/*/*")] == [
+        "history/2023-11-14/231320.000.yaml"
+    ]
+    assert files.problem is None
+
+
+def test_the_history_is_bounded_over_restarts(state, tmp_path):
+    for day in range(6):
+        files = RigFiles(tmp_path, most_kept=3)
+        files.write(replace(state, time=1.7e9 + 86400 * day), keep=True)
+        files.close()
+    assert sorted(path.parent.name for path in tmp_path.glob("history/*/*")) == [
+        "2023-11-17",
+        "2023-11-18",
+        "2023-11-19",
+    ]
+    assert len(list(tmp_path.glob("history/*"))) == 3
+
+
+def test_a_reader_never_finds_half_a_rig(state, tmp_path):
+    files, stop, found = RigFiles(tmp_path), threading.Event(), []
+    files.write(state)
+
+    def read():
+        while not stop.is_set():
+            if (tmp_path / "rig.yaml").exists():
+                found.append(load_rig(tmp_path / "rig.yaml").num_cameras)
+            time.sleep(0.02)
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    for number in range(6):
+        files.write(replace(state, time=1.7e9 + number), keep=True)
+    files.close()
+    stop.set()
+    reader.join()
+    assert set(found) == {4}
+
+
+def test_what_cannot_be_written_is_said_and_tried_again(state, tmp_path):
+    (tmp_path / "rig.yaml").mkdir()
+    files = RigFiles(tmp_path)
+    files.write(state)
+    while files.problem is None:
+        pass
+    assert "rig.yaml" in files.problem
+    (tmp_path / "rig.yaml").rmdir()
+    files.write(state)
+    files.close()
+    assert files.problem is None and (tmp_path / "rig.yaml").is_file()

@@ -1,0 +1,191 @@
+import random
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from imgcal.errors import InputError
+from imgcal.types.observations import Detections
+from imgcal.watch.exposures import CameraBlobs, Exposure
+from imgcal.watch.synchronization import MOST_PENDING, OUT_AFTER, REMEMBERED, Synchronizer, Timing
+
+NOTHING = CameraBlobs.of([])
+ABC = ("a", "b", "c")
+
+
+def at(camera, time, snapshot=None):
+    return Exposure(camera, time, NOTHING, snapshot)
+
+
+def cameras(snapshots):
+    return ["".join(sorted(snapshot.exposures)) for snapshot in snapshots]
+
+
+def test_a_snapshot_goes_on_when_all_have_given_theirs():
+    sync = Synchronizer(ABC, Timing(tolerance=0.005))
+    assert sync.add(at("b", 1.000)) == sync.add(at("a", 1.004)) == ()
+    (snapshot,) = sync.add(at("c", 1.001))
+    assert (snapshot.time, cameras([snapshot])) == (1.001, ["abc"])
+
+
+def test_the_tolerance_is_between_the_earliest_and_the_latest():
+    sync = Synchronizer(ABC, Timing(tolerance=0.005))
+    for camera, time in (("a", 1.004), ("b", 1.0), ("c", 0.998)):
+        assert sync.add(at(camera, time)) == ()
+    assert cameras(sync.flush()) == ["c", "ab"]
+
+
+def test_a_missing_camera_is_waited_for_by_the_time_stamps_of_the_others():
+    sync = Synchronizer(ABC, Timing(patience=0.1))
+    done = [s for k in range(20) for camera in "ab" for s in sync.add(at(camera, k / 60))]
+    assert [s.time for s in done] == [k / 60 for k in range(len(done))]
+    assert sync.waiting <= 7 and sync.counts["missing"]["c"] == len(done) > 10
+
+
+def test_nobody_waits_for_a_camera_that_is_out_and_one_that_is_back_is_waited_for():
+    sync = Synchronizer(ABC, Timing(patience=0.1))
+    for k in range(60):
+        sync.add(at("a", k / 60))
+        sync.add(at("b", k / 60))
+    assert sync.waiting == 0
+    sync.add(at("c", 1.0))
+    sync.add(at("a", 1.0))
+    assert sync.waiting == 1
+    assert cameras(sync.add(at("b", 1.0))) == ["abc"]
+
+
+def test_a_camera_that_always_comes_a_little_later_is_not_out_for_ever():
+    sync = Synchronizer(ABC, Timing(patience=0.1))
+    done = []
+    for k in range(40):  # c is quiet at first, and then one snapshot behind the others
+        for camera in "ab":
+            done += sync.add(at(camera, k / 60))
+        if k > 20:
+            done += sync.add(at("c", (k - 1) / 60))
+    assert cameras(done[-10:]) == ["abc"] * 10
+
+
+def test_the_clock_of_this_machine_ends_the_waiting_when_nothing_more_comes():
+    sync = Synchronizer(ABC, Timing(patience=0.1))
+    sync.add(at("a", 5.0), now=100.0)
+    assert sync.waited(100.05) == ()
+    assert cameras(sync.waited(100.11)) == ["a"]
+
+
+def test_late_duplicate_and_out_of_order_exposures_are_counted():
+    sync = Synchronizer(ABC, Timing())
+    for time in (0.0, 0.02):
+        for camera in ABC:
+            sync.add(at(camera, time))
+    assert sync.add(at("a", 0.001)) == ()  # of the first one
+    sync.add(at("a", 0.06))
+    sync.add(at("a", 0.0601))
+    sync.add(at("b", 0.06))
+    assert sync.add(at("b", 0.04)) == ()  # before 0.06, which waits
+    assert [s.time for s in sync.add(at("c", 0.06))] == []  # 0.04 goes first
+    assert cameras(sync.flush()) == ["b", "abc"]
+    counts = {kind: dict(counter) for kind, counter in sync.counts.items() if sum(counter.values())}
+    assert counts["late"] == {"a": 1, "b": 0, "c": 0} == counts["duplicate"]
+    assert counts["out_of_order"] == {"a": 1, "b": 1, "c": 0}
+    assert "astray" not in counts
+
+
+def test_snapshots_always_go_on_in_the_order_of_time_whatever_comes():
+    draw = random.Random(3)
+    sync, times = Synchronizer(ABC, Timing(patience=0.05)), []
+    for k in range(3000):
+        for camera in ABC:
+            if draw.random() < 0.1:
+                continue
+            late = draw.choice((0, 0, 0, 1, 5))
+            times += [s.time for s in sync.add(at(camera, (k - late) / 60 + draw.uniform(-0.002, 0.002)))]
+    assert len(times) > 2000 and times == sorted(times)
+
+
+def test_one_clock_that_leaps_is_left_out_and_does_not_hold_up_the_others():
+    for leap in (-3600.0, 3600.0):
+        sync, done = Synchronizer(ABC, Timing()), []
+        for k in range(200):
+            for camera in ABC:
+                wrong = leap if camera == "b" and k >= 50 else 0.0
+                done += sync.add(at(camera, 1000 + k / 60 + wrong))
+        assert len(done) >= 200 - 8 and all(999 < s.time < 1005 for s in done), leap
+        assert sync.counts["astray"]["b"] == 150 and sync.leaps == 0
+        assert cameras(done[:50]) == ["abc"] * 50 and cameras(done[-5:]) == ["ac"] * 5
+
+
+@pytest.mark.parametrize("leap", [-3600.0, 3600.0])
+def test_clocks_that_leap_together_are_followed_and_nothing_is_lost(leap):
+    sync = Synchronizer(ABC, Timing())
+    done = [s for k in range(100) for c in ABC for s in sync.add(at(c, k / 60 + (leap if k >= 50 else 0.0)))]
+    assert cameras(done) == ["abc"] * 100
+    assert sync.leaps == 1 and sum(sync.counts["astray"].values()) == 0
+
+
+def test_the_last_camera_that_is_left_may_have_another_clock():
+    sync, done = Synchronizer(("a", "b"), Timing()), []
+    for k in range(600):
+        for camera in ("a", "b") if k < 50 else ("b",):
+            done += sync.add(at(camera, k / 60 + (1e6 if k >= 50 else 0.0)))
+    assert len(done) > 550 - 150 and done[-1].time > 1e6
+
+
+def test_single_wrong_time_stamps_do_not_disturb_the_others():
+    sync, done = Synchronizer(ABC, Timing()), []
+    draw = random.Random(1)
+    for k in range(1000):
+        for camera in ABC:
+            time = 100 + k / 60
+            if camera == "a" and k % 10 == 0:
+                time += draw.choice((-8.0, 8.0, 1e9))
+            done += sync.add(at(camera, time), now=k / 60)
+    assert cameras(done).count("abc") >= 850 and len(done) >= 950
+
+
+def test_named_snapshots_go_by_their_names():
+    sync = Synchronizer(("a", "b"), Timing(patience=0.1))
+    assert sync.add(at("a", 5.0, "1"), now=1.0) == sync.add(at("a", 5.0, "2"), now=1.0) == ()
+    done = sync.add(at("b", 9.0, "1"), now=1.01)
+    assert [(s.name, s.time) for s in done] == [("1", 9.0)]
+    assert [s.name for s in sync.waited(1.2)] == ["2"]
+    assert sync.add(at("b", 5.0, "2"), now=1.2) == () and sync.counts["late"]["b"] == 1
+
+
+def test_memory_does_not_grow():
+    sync = Synchronizer(ABC, Timing(patience=1.0))
+
+    def run(first, last):
+        for k in range(first, last):
+            sync.add(at("a", float(k), f"{k:08d}"))
+            assert sync.waiting <= MOST_PENDING + 1
+
+    run(0, 2 * REMEMBERED)
+    tracemalloc.start()
+    run(2 * REMEMBERED, 3 * REMEMBERED)
+    before = tracemalloc.get_traced_memory()[0]
+    run(3 * REMEMBERED, 4 * REMEMBERED)
+    after = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert after - before < 50_000
+    assert OUT_AFTER < MOST_PENDING
+
+
+def test_blobs_become_detections_and_frames_stay_frames():
+    sync = Synchronizer(("a", "b"), Timing())
+    sync.add(Exposure("b", 0.0, CameraBlobs.of([[1.0, 2.0], [3.0, 4.0]], 0.2)))
+    (snapshot,) = sync.add(Exposure("a", 0.0, CameraBlobs.of([[5.0, 6.0]])))
+    found = snapshot.source(("a", "b"))
+    assert isinstance(found, Detections)
+    assert found.camera.tolist() == [0, 1, 1] and found.sigma.tolist() == [0.1, 0.2, 0.2]
+    assert found.uv.tolist() == [[5, 6], [1, 2], [3, 4]]
+    assert snapshot.frames(("a", "b")) == {"a": None, "b": None} and snapshot.num_bytes == 0
+    frame = np.zeros((2, 3), np.uint8)
+    sync.add(Exposure("a", 1.0, frame))
+    (snapshot,) = sync.flush()
+    assert snapshot.source(("a", "b")) == {"a": frame, "b": None} and snapshot.num_bytes == 6
+
+
+@pytest.mark.parametrize("values", [{"tolerance": -1.0}, {"patience": float("nan")}, {"patience": 60.0}])
+def test_impossible_timings(values):
+    with pytest.raises(InputError, match="expected 0 to 5 s"):
+        Timing(**values)
