@@ -75,7 +75,7 @@ def rms_by_camera(content: ReportContent) -> Markup:
     names = [svg.shortened(name) for name in content.cameras]
     margin = 24 + 6.5 * max(len(name) for name in names)
     limits = (float(both.min()) - 0.1, float(both.max()) + 0.1)
-    axes = Axes(margin, 430, 6, 12 + 22 * count, limits, (0, 1))
+    axes = Axes(margin, 330, 6, 12 + 22 * count, limits, (0, 1))
     parts = [svg.grid(axes, "RMS error (px), logarithmic", log_x=True)]
     for i, name in enumerate(names):
         y = 20 + 22 * i
@@ -92,7 +92,7 @@ def rms_by_camera(content: ReportContent) -> Markup:
             words = f"{svg.pixels(before[i])} → {words}"
         parts.append(svg.dots(np.array([right]), np.array([y]), "mark after"))
         parts.append(svg.text(axes.right + 8, y + 4, words, anchor="start"))
-    return svg.drawing(560, 50 + 22 * count, "RMS error of each camera before and after recalibration", *parts)
+    return svg.drawing(450, 50 + 22 * count, "RMS error of each camera before and after recalibration", *parts)
 
 
 def fiducial_rms(content: ReportContent) -> Array:
@@ -108,8 +108,8 @@ def rms_by_fiducial(content: ReportContent) -> Markup:
     rms = fiducial_rms(content)
     number = np.bincount(content.labels[content.used], minlength=len(rms))
     median = float(np.nanmedian(rms))
-    axes = Axes(48, 550, 10, 220, (-0.5, len(rms) - 0.5), (0, 1.1 * max(float(np.nanmax(rms)), 1e-9)))
-    width = 502 / len(rms)
+    axes = Axes(62, 450, 10, 220, (-0.5, len(rms) - 0.5), (0, 1.1 * max(float(np.nanmax(rms)), 1e-9)))
+    width = (axes.right - axes.left) / len(rms)
     gap = max(min(0.25 * width, 6), width - 36)
     parts = [svg.grid(axes, "fiducial (row of the object file, from 0)", "RMS error after (px)")]
     for i in np.flatnonzero(number):
@@ -119,7 +119,7 @@ def rms_by_fiducial(content: ReportContent) -> Markup:
         parts.append(svg.box(left + gap / 2, top, width - gap, axes.bottom - top, kind, tip))
     y = float(axes.y(median))
     parts.append(svg.line(axes.left, y, axes.right, y, "median"))
-    return svg.drawing(560, 260, "RMS error of each fiducial after recalibration", *parts)
+    return svg.drawing(460, 260, "RMS error of each fiducial after recalibration", *parts)
 
 
 def coverage_limits(content: ReportContent) -> Array:

@@ -13,15 +13,10 @@ from numpy.typing import NDArray
 
 from imgcal.estimation import Gauge, PredictedError
 from imgcal.geometry import RigidTransform
-from imgcal.types import PARAMETERS, CameraRig, Detections
+from imgcal.pipeline import MOVED, UNDETERMINED
+from imgcal.types import CameraRig, Detections
 
 Array = NDArray[np.float64]
-
-MOVED = 3.0
-"""A value has moved when its change from the factory is larger than this many standard deviations."""
-
-UNDETERMINED = 0.8
-"""A value is not determined by the data when its standard deviation is still this share of the prior's."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +34,7 @@ class ReportContent:
     """Everything on the page. A field that a refused run cannot fill keeps its default.
 
     Convention: extrinsics in `std` and `prior_std` are those of `gauge`; parameters in the order of
-    `rig.PARAMETER_NAMES`.
+    `CameraRig.parameter_names`.
     """
 
     title: str
@@ -54,11 +49,14 @@ class ReportContent:
     predicted_before: Array | None = None  # (M, 2) pixels by the factory rig, pose refitted; nan where not used
     predicted_after: Array | None = None  # (M, 2) pixels by the recalibrated rig; nan where not used
     sigma: Array | None = None  # (M,) pixels, as weighted in the estimate; None = as detected
-    std: Array | None = None  # (C, 15) posterior standard deviation of the change
-    prior_std: Array | None = None  # (C, 15) standard deviation before the data
+    std: Array | None = None  # (C, K) posterior standard deviation of the change
+    prior_std: Array | None = None  # (C, K) standard deviation before the data
     gauge: Gauge | None = None  # which cameras are taken to have stood still; None = nothing is compared
     predicted: PredictedError | None = None  # over the working volume
     moves: tuple[str, ...] = ()  # cameras that moved during the capture, in words; earlier snapshots are rejected
+    late: tuple[str, ...] = ()  # cameras whose frames are of other moments, in words; these took no part
+    unknown: tuple[str, ...] = ()  # what the data do not say, in words
+    advice: str = ""  # where to move the object, in words
     unexplained: NDArray[np.int64] | None = None  # (C,) blobs that may be fiducials in view, not where these should be
     object_points: Array | None = None  # (N, 3) mm
     rig_from_object: RigidTransform | None = None  # (S) in the recalibrated rig's frame; nan for rejected snapshots
@@ -79,8 +77,8 @@ class ReportContent:
             "predicted_before": (blobs, 2),
             "predicted_after": (blobs, 2),
             "sigma": (blobs,),
-            "std": (cameras, PARAMETERS),
-            "prior_std": (cameras, PARAMETERS),
+            "std": self.shape,
+            "prior_std": self.shape,
         }
         for name, shape in expected.items():
             value = getattr(self, name)
@@ -95,6 +93,11 @@ class ReportContent:
     def cameras(self) -> tuple[str, ...]:
         """Names of the cameras, C."""
         return self.factory.camera_names
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Number of cameras and of parameters of each: C, K."""
+        return self.factory.num_cameras, self.factory.num_parameters
 
     @cached_property
     def image_size(self) -> NDArray[np.int64]:
@@ -131,7 +134,7 @@ class ReportContent:
 
     @cached_property
     def change(self) -> Array | None:
-        """Recalibrated minus factory, a motion of the whole rig taken out: (C, 15)."""
+        """Recalibrated minus factory, a motion of the whole rig taken out: (C, K)."""
         if self.laid is None:
             return None
         return self.laid.local(self.factory.to(torch.float64)).detach().cpu().numpy()
@@ -150,24 +153,24 @@ class ReportContent:
 
     @cached_property
     def fixed(self) -> NDArray[np.bool_]:
-        """Mark values that could not change, the extrinsics of a reference camera among them: (C, 15) bool."""
-        fixed = np.zeros((len(self.cameras), PARAMETERS), dtype=bool) if self.std is None else self.std <= 0
+        """Mark values that could not change, the extrinsics of a reference camera among them: (C, K) bool."""
+        fixed = np.zeros(self.shape, dtype=bool) if self.std is None else self.std <= 0
         if self.reference is not None:
             fixed[self.reference, :6] = True
         return fixed
 
     @cached_property
     def moved(self) -> NDArray[np.bool_]:
-        """Mark changes larger than `MOVED` standard deviations: (C, 15) bool."""
+        """Mark changes larger than `MOVED` standard deviations: (C, K) bool."""
         if self.change is None or self.std is None:
-            return np.zeros((len(self.cameras), PARAMETERS), dtype=bool)
+            return np.zeros(self.shape, dtype=bool)
         return (np.abs(self.change) > MOVED * self.std) & ~self.fixed
 
     @cached_property
     def undetermined(self) -> NDArray[np.bool_]:
-        """Mark values of which the data say little that the prior did not: (C, 15) bool."""
+        """Mark values of which the data say little that the prior did not: (C, K) bool."""
         if self.std is None or self.prior_std is None:
-            return np.zeros((len(self.cameras), PARAMETERS), dtype=bool)
+            return np.zeros(self.shape, dtype=bool)
         return (self.std > UNDETERMINED * self.prior_std) & ~self.fixed
 
     def rms_by(self, group: NDArray[np.int64], residual: Array, count: int) -> Array:

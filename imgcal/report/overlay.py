@@ -1,47 +1,60 @@
-"""One overlay a camera: a frame, the blobs found in it, and where both rigs predict them, as plotly figures."""
+"""One overlay a camera: a frame, the blobs found in it, and where both rigs predict them, as a drawing.
+
+Marks keep their size on the screen however far a drawing is enlarged: the style sheet scales the symbols of `SYMBOLS`
+by --k, pixels of the frame in one of the screen.
+"""
 
 from __future__ import annotations
 
 import base64
+from concurrent.futures import ThreadPoolExecutor
+from html import escape
 
 import cv2
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
+from imgcal.report import svg
 from imgcal.report.content import Array, ReportContent
-from imgcal.report.scene import Figure
+
+Frame = NDArray[np.uint8] | NDArray[np.uint16]
 
 WIDTHS = (1000, 800, 640, 480, 320, 200)  # px, of a frame in the page: the first whose frames fit together
-LARGEST_FRAMES = 4_000_000  # bytes of all frames in the page
+LARGEST_FRAMES = 1_500_000  # bytes of all frames in the page
+QUALITY = 65  # of WebP
 GAMMA = 0.6  # below 1 lifts the dark ground of infrared frames
 BRIGHT_PIXELS = 20  # may be white in a stretched frame
 LARGEST_OVERLAY = 600  # blobs drawn in one camera
 OVERLAYS_WITH_ALL = 16  # with more cameras, blobs drawn in one camera become fewer in proportion
+USUAL_WIDTH = 560  # px on the screen
 
-LAYERS = ("labelled", "unlabelled", "before", "after")
 SYMBOLS = {
-    "labelled": ("circle-open", "#22c55e", 13, "detected"),
-    "unlabelled": ("diamond-open", "#e0409a", 11, "detected, unlabelled or not used"),
-    "before": ("x-thin-open", "#ff8c1a", 9, "predicted before"),
-    "after": ("cross-thin-open", "#3b9dff", 9, "predicted after"),
+    "labelled": ("M-6 0a6 6 0 1 0 12 0a6 6 0 1 0-12 0", "detected"),
+    "unlabelled": ("M0-6l6 6l-6 6l-6-6z", "detected, unlabelled or not used"),
+    "before": ("M-4.5-4.5l9 9M4.5-4.5l-9 9", "predicted before"),
+    "after": ("M0-5.5v11M-5.5 0h11", "predicted after"),
 }
-"""Marker, colour, size and words of each layer; the colours hold on black and on white frames."""
+"""Layers: path around (0, 0), and words. Their colours, in the style sheet, hold on black and on white frames."""
 
 
-def overlay_figures(content: ReportContent) -> list[Figure]:
-    """Build the overlay of each camera; pixels are those of the full frame."""
+def overlays(content: ReportContent) -> list[Markup]:
+    """Draw the overlay of each camera; coordinates are pixels of the full frame."""
     pictures = picture_uris(content.frames) if content.frames else [None] * len(content.cameras)
     return [_overlay(content, camera, picture) for camera, picture in enumerate(pictures)]
 
 
-def picture_uris(frames: tuple[NDArray[np.uint8] | NDArray[np.uint16] | None, ...]) -> list[str | None]:
+def picture_uris(frames: tuple[Frame | None, ...]) -> list[str | None]:
     """Compress frames to data URIs, as wide as the page's size allows, grey levels stretched for the eye."""
-    files: list[bytes | None] = []
-    for width in WIDTHS:
-        files = [None if frame is None else _jpeg(frame, width) for frame in frames]
-        if sum(len(file) for file in files if file) <= LARGEST_FRAMES:
-            break
-    return [None if file is None else "data:image/jpeg;base64," + base64.b64encode(file).decode() for file in files]
+    there = [frame for frame in frames if frame is not None]
+    some = there[:: max(len(there) // 3, 1)]
+    with ThreadPoolExecutor() as pool:
+        for width in WIDTHS:
+            tried = [len(_webp(frame, width)) for frame in some]
+            if np.mean(tried or [0]) * len(there) <= LARGEST_FRAMES:
+                break
+        files = list(pool.map(lambda frame: None if frame is None else _webp(frame, width), frames))
+    return [None if file is None else "data:image/webp;base64," + base64.b64encode(file).decode() for file in files]
 
 
 def blobs_drawn(content: ReportContent) -> int:
@@ -49,93 +62,73 @@ def blobs_drawn(content: ReportContent) -> int:
     return min(LARGEST_OVERLAY, max(50, LARGEST_OVERLAY * OVERLAYS_WITH_ALL // len(content.cameras)))
 
 
-def _jpeg(frame: NDArray[np.uint8] | NDArray[np.uint16], width: int) -> bytes:
+def _webp(frame: Frame, width: int) -> bytes:
     height = max(round(frame.shape[0] * width / frame.shape[1]), 1)
     grey: NDArray[np.floating] = frame.astype(np.float32)
     if width < frame.shape[1]:
         grey = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
     # A few blobs of some pixels each are all that is bright: a quantile would clip them or drown them in noise.
-    low = float(np.quantile(grey, 0.02))
-    high = float(np.sort(grey, axis=None)[-BRIGHT_PIXELS:].min())
+    ranks = int(0.02 * grey.size), max(grey.size - BRIGHT_PIXELS, 0)
+    low, high = (float(value) for value in np.partition(grey, ranks, axis=None)[list(ranks)])
     share = np.clip((grey - low) / max(high - low, 0.15 * high, 1.0), 0, 1)
     stretched = 255 * share**GAMMA
-    return cv2.imencode(".jpg", stretched.astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 82])[1].tobytes()
+    return cv2.imencode(".webp", stretched.astype(np.uint8), [cv2.IMWRITE_WEBP_QUALITY, QUALITY])[1].tobytes()
 
 
-def _overlay(content: ReportContent, camera: int, picture: str | None) -> Figure:
+def _overlay(content: ReportContent, camera: int, picture: str | None) -> Markup:
     width, height = (int(x) for x in content.image_size[camera])
     d = content.detections
     rows = np.flatnonzero((d.camera == camera) & (d.snapshot == content.frame_snapshot))[: blobs_drawn(content)]
     used = content.used[rows] if content.used.any() else content.labels[rows] >= 0
-    scale = min(max((60 / max(len(rows), 1)) ** 0.5, 0.45), 1.0)
-    data = [
-        _marks("labelled", d.uv[rows[used]], _words(content, rows[used]), scale),
-        _marks("unlabelled", d.uv[rows[~used]], _words(content, rows[~used]), scale),
-    ]
+    parts = [f'<rect class="edge" x="-0.5" y="-0.5" width="{width}" height="{height}"/>']
+    if picture is not None:
+        parts.append(
+            f'<image href="{picture}" x="-0.5" y="-0.5" width="{width}" height="{height}" preserveAspectRatio="none"/>'
+        )
+    parts.append(_marks("labelled", d.uv[rows[used]], _words(content, rows[used])))
+    parts.append(_marks("unlabelled", d.uv[rows[~used]], _words(content, rows[~used])))
     for layer, predicted in (("before", content.predicted_before), ("after", content.predicted_after)):
         if predicted is None:
             continue
         shown = rows[np.isfinite(predicted[rows]).all(axis=1)]
         size = np.linalg.norm(predicted[shown] - d.uv[shown], axis=1)
-        words = [f"fiducial {content.labels[r]}, {layer}: {s:.2f} px off" for r, s in zip(shown, size, strict=True)]
-        if layer == "before":
-            data.append(_links(d.uv[shown], predicted[shown]))
-        data.append(_marks(layer, predicted[shown], words, scale))
-    return {"data": data, "layout": _layout(width, height, picture, d.uv[rows[used]])}
+        words = [
+            f"fiducial {content.labels[r]}, {layer}: {svg.pixels(s)} px off" for r, s in zip(shown, size, strict=True)
+        ]
+        links = _links(d.uv[shown], predicted[shown]) if layer == "before" else ""
+        parts.append(_marks(layer, predicted[shown], words, links))
+    near = " ".join(svg.number(x) for x in _near(d.uv[rows[used]], width, height))
+    crowded = " crowded" if len(rows) > 150 else ""
+    return Markup(
+        f'<svg class="overlay{crowded}" viewBox="-0.5 -0.5 {width} {height}" data-near="{near}" '
+        f'style="--k:{width / USUAL_WIDTH:.3g}" role="img" aria-label="Overlay of {escape(content.cameras[camera])}">'
+        f"{''.join(parts)}</svg>"
+    )
 
 
 def _words(content: ReportContent, rows: NDArray[np.int64]) -> list[str]:
-    label = content.labels[rows]
-    return [f"fiducial {f}" if f >= 0 else "unlabelled" for f in label]
+    return [f"fiducial {f}" if f >= 0 else "unlabelled" for f in content.labels[rows]]
 
 
-def _marks(layer: str, uv: Array, words: list[str], scale: float) -> Figure:
-    symbol, colour, size, name = SYMBOLS[layer]
-    line = {"color": colour, "width": 1.8}
-    marker = {"symbol": symbol, "size": round(size * scale, 1), "color": colour, "line": line}
-    return {
-        "type": "scatter", "mode": "markers", "name": name, "meta": layer, "marker": marker, "text": words,
-        "hoverinfo": "text+x+y", "x": uv[:, 0].round(2).tolist(), "y": uv[:, 1].round(2).tolist(),
-    }  # fmt: skip
+def _marks(layer: str, uv: Array, words: list[str], links: str = "") -> str:
+    uses = (
+        f'<use href="#mark-{layer}" x="{u:.2f}" y="{v:.2f}"><title>{word}, at ({u:.2f}, {v:.2f})</title></use>'
+        for (u, v), word in zip(uv, words, strict=True)
+    )
+    return f'<g class="{layer}">{links}{"".join(uses)}</g>'
 
 
-def _links(observed: Array, predicted: Array) -> Figure:
+def _links(observed: Array, predicted: Array) -> str:
     """Lines from each blob to where the factory rig predicts it."""
-    columns: list[list[float | None]] = [
-        [v for a, b in zip(observed[:, i], predicted[:, i], strict=True) for v in (round(a, 2), round(b, 2), None)]
-        for i in (0, 1)
-    ]
-    return {
-        "type": "scatter", "mode": "lines", "meta": "before", "hoverinfo": "skip", "x": columns[0], "y": columns[1],
-        "line": {"color": SYMBOLS["before"][1], "width": 1},
-    }  # fmt: skip
+    steps = (f"M{a[0]:.2f} {a[1]:.2f}L{b[0]:.2f} {b[1]:.2f}" for a, b in zip(observed, predicted, strict=True))
+    return f'<path d="{"".join(steps)}"/>'
 
 
-def _layout(width: int, height: int, picture: str | None, uv: Array) -> Figure:
-    """Axes in full-resolution pixels; `meta.near` is the part around the object, for looking closer."""
-    near = [-0.5, width - 0.5, -0.5, height - 0.5]
-    if len(uv):
-        (left, top), (right, bottom) = uv.min(axis=0), uv.max(axis=0)
-        half_width = 0.6 * max(right - left, (bottom - top) * width / height) + 20
-        half_height = half_width * height / width
-        u, v = (left + right) / 2, (top + bottom) / 2
-        near = [u - half_width, u + half_width, v - half_height, v + half_height]
-    axis = {
-        "showgrid": False, "zeroline": False, "color": "var(--muted)", "tickfont": {"size": 10}, "ticks": "outside",
-        "ticklen": 3,
-    }  # fmt: skip
-    edge = {"color": "var(--line)", "width": 1}
-    outline = {"type": "rect", "x0": -0.5, "y0": -0.5, "x1": width - 0.5, "y1": height - 0.5, "line": edge}
-    layout: Figure = {
-        "margin": {"l": 34, "r": 4, "t": 4, "b": 22}, "showlegend": False, "hovermode": "closest", "dragmode": "zoom",
-        "xaxis": {**axis, "range": [-0.5, width - 0.5], "constrain": "domain"},
-        "yaxis": {**axis, "range": [height - 0.5, -0.5], "scaleanchor": "x", "constrain": "domain"},
-        "shapes": [outline],
-        "meta": {"near": [round(float(v), 1) for v in near], "aspect": round(height / width, 4)},
-    }  # fmt: skip
-    if picture is not None:
-        layout["images"] = [{
-            "source": picture, "xref": "x", "yref": "y", "x": -0.5, "y": -0.5, "sizex": width, "sizey": height,
-            "sizing": "stretch", "layer": "below", "yanchor": "top", "xanchor": "left",
-        }]  # fmt: skip
-    return layout
+def _near(uv: Array, width: int, height: int) -> tuple[float, float, float, float]:
+    """The part around the object, for looking closer: left, top, width, height, in the proportions of the frame."""
+    if not len(uv):
+        return -0.5, -0.5, width, height
+    (left, top), (right, bottom) = uv.min(axis=0), uv.max(axis=0)
+    half = 0.6 * max(right - left, (bottom - top) * width / height) + 20
+    u, v = (left + right) / 2, (top + bottom) / 2
+    return u - half, v - half * height / width, 2 * half, 2 * half * height / width

@@ -15,13 +15,13 @@ from pathlib import Path
 import jinja2
 import numpy as np
 from markupsafe import Markup
-from plotly.offline import get_plotlyjs
 
 from imgcal.io import write_text
+from imgcal.pipeline import MOVED, UNDETERMINED
 from imgcal.report import accuracy, charts, overlay, scene, svg, tables
-from imgcal.report.content import MOVED, UNDETERMINED, ReportContent
+from imgcal.report.content import ReportContent
+from imgcal.report.rig_view import Scene, rig_view_script
 from imgcal.report.verdict import judge
-from imgcal.types import PARAMETER_NAMES
 
 LARGEST_SNAPSHOT_TABLE = 400
 
@@ -46,14 +46,13 @@ def write_report(content: ReportContent, path: str | Path) -> None:
 
 def render(content: ReportContent) -> str:
     """Build the page; the same content gives the same text."""
-    script = _resource("report.js")
+    scripts = rig_view_script(), _resource("report.js")
     parts = dict(
         content=content,
         verdict=judge(content),
         style=Markup(_resource("report.css")),
-        script=Markup(script),
-        plotly=Markup(get_plotlyjs()),
-        policy=_policy(script),
+        scripts=[Markup(script) for script in scripts],
+        policy=_policy(scripts),
         snapshots=_snapshots(content),
         residuals=_residuals(content),
         coverage=_coverage(content),
@@ -63,7 +62,7 @@ def render(content: ReportContent) -> str:
         rows=tables.camera_rows(content),
         groups=tables.GROUPS,
         knowledge=list(zip(content.cameras, tables.knowledge(content), strict=False)),
-        parameters=PARAMETER_NAMES,
+        parameters=content.factory.parameter_names,
         limits={"moved": MOVED, "undetermined": round(100 * UNDETERMINED)},
         times=charts.time_bars(content.seconds) if content.seconds else None,
         total=charts.duration(sum(content.seconds.values())),
@@ -84,19 +83,19 @@ def _resource(name: str) -> str:
     return files("imgcal.report").joinpath("templates", name).read_text(encoding="utf-8")
 
 
-def _policy(script: str) -> str:
-    """Forbid the page every connection, and every script but the two that it carries."""
-    digests = (hashlib.sha256(text.encode()).digest() for text in (get_plotlyjs(), script))
+def _policy(scripts: tuple[str, ...]) -> str:
+    """Forbid the page every connection, and every script but those that it carries."""
+    digests = (hashlib.sha256(text.encode()).digest() for text in scripts)
     hashes = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
     return (
-        f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data: blob:; "
+        f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data:; "
         "base-uri 'none'; form-action 'none'"
     )
 
 
-def _figure(figure: scene.Figure) -> Markup:
+def _values(scene: Scene) -> Markup:
     """JSON that stands safely inside `<script>`."""
-    text = json.dumps(figure, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+    text = json.dumps(scene, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))
 
 
@@ -185,12 +184,12 @@ def _accuracy(content: ReportContent) -> dict[str, object] | None:
 
 
 def _rig(content: ReportContent) -> dict[str, object]:
-    figure = scene.rig_figure(content)
+    drawn = scene.drawn_scene(content)
     snapshots, fiducials = scene.drawn_fiducials(content)
     return {
-        "figure": _figure(figure),
-        "factors": figure["layout"]["meta"]["factors"],
-        "start": figure["layout"]["meta"]["start"],
+        "scene": _values(drawn.values),
+        "factors": drawn.factors,
+        "start": drawn.start,
         "snapshots": len(snapshots),
         "fiducials": len(fiducials),
     }
@@ -199,13 +198,12 @@ def _rig(content: ReportContent) -> dict[str, object]:
 def _overlays(content: ReportContent) -> dict[str, object]:
     names = content.detections.snapshot_names
     panels = []
-    for i, figure in enumerate(overlay.overlay_figures(content)):
+    for i, drawn in enumerate(overlay.overlays(content)):
         pictured = bool(content.frames) and content.frames[i] is not None
-        panels.append(Panel(content.cameras[i], _figure(figure), "" if pictured else "no frame"))
+        panels.append(Panel(content.cameras[i], drawn, "" if pictured else "no frame"))
     return {
         "panels": panels,
-        "aspects": [round(float(h / w), 4) for w, h in content.image_size],
-        "layers": [(layer, overlay.SYMBOLS[layer]) for layer in overlay.LAYERS],
+        "symbols": overlay.SYMBOLS,
         "snapshot": names[content.frame_snapshot] if content.frame_snapshot < len(names) else "",
         "stretched": any(frame is not None for frame in content.frames),
     }

@@ -20,6 +20,10 @@ def sightings(content: ReportContent) -> list[tuple[str, str]]:
         )
         for move in content.moves
     ]
+    notes += [
+        (f"{words[:1].upper()}{words[1:]}; these took no part.", "Export the frames of that camera anew, all of them.")
+        for words in content.late
+    ]
     used = np.bincount(content.detections.camera[content.used], minlength=len(content.cameras))
     blobs = np.bincount(content.detections.camera, minlength=len(content.cameras))
     if content.unexplained is not None:

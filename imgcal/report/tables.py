@@ -7,20 +7,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from imgcal.geometry import LENS_MODELS
 from imgcal.report import svg
 from imgcal.report.content import ReportContent
-from imgcal.types import PARAMETER_NAMES
 
 MINUS = "\N{MINUS SIGN}"
 
 GROUPS: tuple[tuple[str, slice, tuple[str, ...], float], ...] = (
     ("focal length (px)", slice(6, 8), ("fx", "fy"), 1.0),
     ("principal point (px)", slice(8, 10), ("cx", "cy"), 1.0),
-    ("distortion (10⁻³)", slice(10, 15), ("k1", "k2", "p1", "p2", "k3"), 1e3),
+    ("distortion (10⁻³)", slice(10, None), (), 1e3),
     ("rotation (deg)", slice(0, 3), ("x", "y", "z"), 180 / math.pi),
     ("position (mm)", slice(3, 6), ("x", "y", "z"), 1.0),
 )
-"""Columns: heading, which parameters, their names, factor to the unit shown."""
+"""Columns: heading, which parameters, their names (none = those of the camera's lens), factor to the unit shown."""
 
 
 @dataclass(frozen=True)
@@ -80,14 +80,14 @@ def camera_rows(content: ReportContent) -> list[CameraRow]:
 
 
 def knowledge(content: ReportContent) -> list[list[Knowledge]]:
-    """Compare the standard deviations after and before the data: C rows of 15 cells; none when refused."""
+    """Compare the standard deviations after and before the data: C rows of K cells; none when refused."""
     std, prior = content.std, content.prior_std
     if std is None or prior is None:
         return []
     rows = []
     for camera, name in enumerate(content.cameras):
         cells = []
-        for i, parameter in enumerate(PARAMETER_NAMES):
+        for i, parameter in enumerate(content.factory.parameter_names):
             if content.fixed[camera, i]:
                 fixed = "reference" if camera == content.reference and i < 6 else "fixed"
                 cells.append(Knowledge("·", 0, False, f"{name} {parameter}: {fixed}"))
@@ -114,11 +114,12 @@ def _changes(
     if content.change is None or content.recalibrated is None:
         return ()
     rig = content.recalibrated
+    names = names or LENS_MODELS[rig.lens_models[camera]].coefficients
     absolute = {
         6: rig.focal_length[camera], 8: rig.principal_point[camera], 10: rig.distortion[camera],
     }.get(columns.start)  # fmt: skip
     cells = []
-    for k, (i, name) in enumerate(zip(range(columns.start, columns.stop), names, strict=True)):
+    for k, (i, name) in enumerate(zip(range(columns.start, columns.start + len(names)), names, strict=True)):
         spread = math.nan if content.std is None else content.std[camera, i]
         change, std = signed(content.change[camera, i] * factor, spread * factor)
         kind = "moved" if content.moved[camera, i] else "unknown" if content.undetermined[camera, i] else ""

@@ -8,9 +8,10 @@ from typing import Literal
 
 import numpy as np
 
+from imgcal.pipeline import MOVED
 from imgcal.report.accuracy import advice, length, sentences
 from imgcal.report.charts import duration
-from imgcal.report.content import MOVED, ReportContent
+from imgcal.report.content import ReportContent
 from imgcal.report.sightings import sightings
 from imgcal.report.svg import grouped, pixels
 
@@ -18,6 +19,9 @@ GOOD_CHI2 = 1.5  # above, the residuals are larger than the stated noise
 SMALL_CHI2 = 0.5  # below, the noise was overstated
 MOST_FIGURES = 6  # at the top of the page: one row
 FEW_OBSERVATIONS = 15  # of a camera: fewer than its parameters
+
+NOT_IDENTIFIED = "identity"
+"""Refusals that begin so could not tell which blob is which; the others had labels, which the report does not know."""
 
 IDENTITY = {
     "coded": "The fiducials came labelled with the input.",
@@ -48,6 +52,7 @@ class Verdict:
     headline: str
     found: tuple[str, ...]
     reservations: tuple[str, ...]
+    unknown: tuple[str, ...]
     next_steps: tuple[str, ...]
     figures: tuple[KeyFigure, ...]
 
@@ -61,13 +66,15 @@ def judge(content: ReportContent) -> Verdict:
     found = (_improvement(content), *sentences(content), *_movement(content), identity)
     if content.reason:
         found = (*found, content.reason)
+    further = (*advice(content), *([content.advice] if content.advice else []))
     if reservations:
         return Verdict(
-            "caution", "Recalibrated, with reservations", found, tuple(r for r, _ in reservations),
-            (*dict.fromkeys(step for _, step in reservations if step), *advice(content), _CHECK), _figures(content),
+            "caution", "Recalibrated, with reservations", found, tuple(r for r, _ in reservations), content.unknown,
+            (*dict.fromkeys(step for _, step in reservations if step), *further, _CHECK), _figures(content),
         )  # fmt: skip
-    headline = "Recalibrated: the result explains the images as well as the measurement noise allows"
-    return Verdict("good", headline, found, (), (*advice(content), _CHECK, _KEEP), _figures(content))
+    where = " where the object was seen" if content.unknown else ""
+    headline = f"Recalibrated{where}: the result explains the images as well as the measurement noise allows"
+    return Verdict("good", headline, found, (), content.unknown, (*further, _CHECK, _KEEP), _figures(content))
 
 
 _CHECK = "Check the new rig on snapshots that took no part here: imgcal score CAPTURE --rig rig.yaml --object OBJECT."
@@ -182,7 +189,7 @@ def _refused(content: ReportContent) -> Verdict:
     figures = [
         KeyFigure(f"{used} / {total}", "snapshots accepted"),
         KeyFigure(grouped(len(d)), "blobs found"),
-        KeyFigure(grouped(labelled), "blobs labelled"),
+        *([KeyFigure(grouped(labelled), "blobs labelled")] if content.reason.startswith(NOT_IDENTIFIED) else []),
         KeyFigure(f"{int((blobs > 0).sum())} / {len(blobs)}", "cameras with blobs"),
     ]
     if content.seconds:
@@ -190,7 +197,7 @@ def _refused(content: ReportContent) -> Verdict:
     headline = "Refused: the data cannot decide the calibration"
     reason = content.reason or "The data do not decide between several answers."
     found = (reason, "No calibration was written; keep the one in use.")
-    return Verdict("refused", headline, found, (), tuple(_helpful(content)), tuple(figures))
+    return Verdict("refused", headline, found, (), (), tuple(_helpful(content)), tuple(figures))
 
 
 def _helpful(content: ReportContent) -> list[str]:
@@ -203,7 +210,7 @@ def _helpful(content: ReportContent) -> list[str]:
         steps.append("No blob was found: check exposure, infrared light, and the polarity (bright or dark markers).")
     elif blind:
         steps.append(f"Nothing was found in {_listed(blind)}: check exposure, cabling and the view.")
-    if labelled < 0.5 * total:
+    if labelled < 0.5 * total and content.reason.startswith(NOT_IDENTIFIED):
         steps.append(
             f"{grouped(total - labelled)} of {grouped(total)} blobs could not be labelled: cover or mask reflections, "
             "and check that the object file is that of the object in the images."

@@ -134,7 +134,7 @@ def refused(content: ReportContent) -> ReportContent:
     rejected = "5 of 8 blobs a camera explained, at least 0.45 of what could be seen needed"
     return replace(
         content, title="O10, refused", status="refused", identity="refused", recalibrated=None,
-        reason="No labelling wins clearly: the best two explain 31 and 30 of 80 blobs.",
+        reason="identity: no labelling wins clearly: the best two explain 31 and 30 of 80 blobs.",
         labels=np.full_like(content.labels, -1), predicted_before=None, predicted_after=None, std=None, prior_std=None,
         rig_from_object=None, predicted=None, chi2_per_dof=float("nan"), rms_before=float("nan"),
         rms_after=float("nan"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 from dataclasses import replace
 
 import cv2
@@ -10,44 +11,43 @@ import numpy as np
 import pytest
 
 from imgcal.report import ReportContent
-from imgcal.report.overlay import overlay_figures, picture_uris
-from imgcal.report.scene import Figure
+from imgcal.report.overlay import overlays, picture_uris
 
 
-def _layer(figure: Figure, layer: str) -> np.ndarray:
-    trace = next(t for t in figure["data"] if t["meta"] == layer and t["mode"] == "markers")
-    return np.array([trace["x"], trace["y"]]).T
+def _layer(drawing: str, layer: str) -> np.ndarray:
+    marks = re.findall(rf'<use href="#mark-{layer}" x="([-\d.]+)" y="([-\d.]+)">', drawing)
+    return np.array(marks, dtype=float).reshape(-1, 2)
 
 
 def _decode(uri: str | None) -> np.ndarray:
     assert uri is not None
-    data = base64.b64decode(uri.removeprefix("data:image/jpeg;base64,"))
+    data = base64.b64decode(uri.removeprefix("data:image/webp;base64,"))
     return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
 
 
 def test_layers_hold_the_blobs_of_the_snapshot(content: ReportContent) -> None:
     d = content.detections
     assert content.predicted_after is not None
-    for camera, figure in enumerate(overlay_figures(content)):
+    for camera, drawing in enumerate(overlays(content)):
         rows = (d.camera == camera) & (d.snapshot == 0)
-        np.testing.assert_allclose(_layer(figure, "labelled"), d.uv[rows & content.used], atol=0.006)
-        np.testing.assert_allclose(_layer(figure, "unlabelled"), d.uv[rows & ~content.used], atol=0.006)
-        np.testing.assert_allclose(_layer(figure, "after"), content.predicted_after[rows & content.used], atol=0.006)
-        image = figure["layout"]["images"][0]
-        assert (image["x"], image["y"], image["sizex"], image["sizey"]) == (-0.5, -0.5, 2048, 1088)
+        np.testing.assert_allclose(_layer(drawing, "labelled"), d.uv[rows & content.used], atol=0.006)
+        np.testing.assert_allclose(_layer(drawing, "unlabelled"), d.uv[rows & ~content.used], atol=0.006)
+        np.testing.assert_allclose(_layer(drawing, "after"), content.predicted_after[rows & content.used], atol=0.006)
+        assert ' x="-0.5" y="-0.5" width="2048" height="1088" preserveAspectRatio="none"/>' in drawing
+        assert 'viewBox="-0.5 -0.5 2048 1088"' in drawing
 
 
 def test_refused_overlay_has_detections_alone(refused_content: ReportContent) -> None:
-    for figure in overlay_figures(refused_content):
-        assert {trace["meta"] for trace in figure["data"]} == {"labelled", "unlabelled"}
-        assert len(_layer(figure, "labelled")) == 0
+    for drawing in overlays(refused_content):
+        assert re.findall('<g class="(.*?)">', drawing) == ["labelled", "unlabelled"]
+        assert len(_layer(drawing, "labelled")) == 0
 
 
 def test_missing_frames_leave_the_overlay_plain(content: ReportContent) -> None:
-    figures = overlay_figures(replace(content, frames=(None, *content.frames[1:])))
-    assert "images" not in figures[0]["layout"]
-    assert "images" in figures[1]["layout"]
-    assert _layer(figures[0], "labelled").shape == _layer(overlay_figures(content)[0], "labelled").shape
+    drawings = overlays(replace(content, frames=(None, *content.frames[1:])))
+    assert "<image" not in drawings[0]
+    assert "<image" in drawings[1]
+    assert _layer(drawings[0], "labelled").shape == _layer(overlays(content)[0], "labelled").shape
 
 
 @pytest.mark.parametrize(("dtype", "top"), [(np.uint8, 200), (np.uint16, 4000), (np.uint16, 60000)])

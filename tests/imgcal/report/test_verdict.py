@@ -84,3 +84,19 @@ def test_single_camera_has_no_neighbours(single_content: ReportContent) -> None:
     verdict = judge(single_content)
     assert "One camera" in " ".join(verdict.found)
     assert "cameras moved" not in {figure.name for figure in verdict.figures}
+
+
+def test_what_is_not_known_is_said_in_a_good_verdict(content: ReportContent) -> None:
+    known = judge(content)
+    assert known.level == "good" and known.unknown == () and "where the object was seen" not in known.headline
+    words, advice = "Not determined by these data: k3.", "Move the object by +100 mm in x."
+    partly = judge(replace(content, unknown=(words,), advice=advice))
+    assert partly.level == "good" and partly.unknown == (words,)
+    assert partly.headline.startswith("Recalibrated where the object was seen") and advice in partly.next_steps
+
+
+def test_a_refusal_that_is_not_about_identity_says_nothing_of_labels(refused_content: ReportContent) -> None:
+    by_prior = replace(refused_content, reason="estimation: camera cam01: position x would differ by 300 mm")
+    verdict = judge(by_prior)
+    assert not any("label" in step for step in verdict.next_steps)
+    assert not any("labelled" in figure.name for figure in verdict.figures)

@@ -1,0 +1,152 @@
+"""`imgcal fleet`: many captures, recalibrated on all cores or a cluster, and what they teach together."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from imgcal.cli.common import check_folder, open_rig
+from imgcal.errors import InputError, RefusedError
+from imgcal.extras import advice, missing
+from imgcal.fleet import Dataset, Engine, FleetCount, KindOfRig, LearntPrior, Manifest, Settings, kinds_of_rigs
+from imgcal.fleet import recalibrate_fleet as recalibrate
+from imgcal.io import load_object, write_text, yaml_text
+from imgcal.pipeline import DetectorName
+from imgcal.types import RigPrior
+
+EVERY = 60.0  # s between lines where nobody looks at a terminal
+NEEDED = ("ray", "pyarrow", "fsspec", "filelock")
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """Recalibrate every capture of a table, on all cores of this machine or on a cluster, and learn from all of them.
+
+    MANIFEST is a CSV or Parquet file with a column `capture` (folder or table of blobs; a path beside the manifest, or
+    a URL) and, where they are known, `rig`, `object`, `device`, `time`, `hours` since the factory calibration, and
+    further columns of numbers such as `temperature`. OUT/results is a Parquet dataset with a row a capture, also for
+    those that were refused, are damaged, hang or crash; a rerun does what is missing or has changed. OUT/prior.yaml is
+    the drift prior that the fleet teaches, for rig files; OUT/report.html shows it, and the cameras that do not belong.
+    Example: imgcal fleet captures.csv --rig rig.yaml --object object.csv --out fleet
+    """
+
+    manifest: Annotated[str, tyro.conf.Positional]  #: table of captures: a file or URL
+    out: Path  #: folder of the results
+    rig: str | None = None  #: factory rig of rows that name none: file, or the name of a shipped one
+    object: str | None = None  #: object of rows that name none: file, or the name of a shipped one
+    address: str | None = None  #: running Ray cluster to join; none = this machine's cores
+    cores: int | None = None  #: of this machine; none = all
+    detector: DetectorName = "classical"  #: who finds the fiducials in frames, as for `imgcal calibrate`
+    blind_cameras: bool = False  #: accept cameras that see nothing; they keep their factory values
+    seconds: float = 300.0  #: that a capture may take
+    memory_mb: float = 4096.0  #: that a capture may take, beyond what a process needs anyway
+    keep_rigs: bool = False  #: write the recalibrated rig file of every capture to OUT/rigs, too
+    again: bool = False  #: try once more what timed out, crashed or ran out of memory
+    covariates: tuple[str, ...] = ()  #: columns that drift may depend on, temperature for example
+    by_camera: bool = False  #: learn a spread for each camera, not one for all
+    batch: int = 32  #: captures that travel together
+
+    def run(self) -> None:
+        """Recalibrate, then learn."""
+        if lacking := missing(*NEEDED):
+            raise InputError(f"imgcal fleet {advice(lacking)}")
+        check_folder(self.out)
+        for name, value in (("--seconds", self.seconds), ("--memory-mb", self.memory_mb), ("--batch", self.batch)):
+            if not 0 < value < 1e9:
+                raise InputError(f"{name}: found {value:g}, expected more than 0")
+        before = RigPrior() if self.rig is None else open_rig(self.rig).prior or RigPrior()
+        if self.object is not None:
+            load_object(self.object)  # what is wrong for all is said at once
+        manifest, dataset = Manifest(self.manifest, self.rig, self.object), Dataset(self.out)
+        settings = Settings(self.blind_cameras, self.detector, self.seconds, self.memory_mb, self.keep_rigs)
+        started = time.perf_counter()
+        with Engine(self.address, self.cores) as engine, _told() as tell:
+            count = recalibrate(manifest, dataset, engine, settings, again=self.again, tell=tell, batch=self.batch)
+        print(f"{_said(count)}, {time.perf_counter() - started:.0f} s: {dataset.folder}")
+        if self.keep_rigs:
+            dataset.write_rigs(self.out / "rigs")
+        self._learn(dataset, before)
+
+    def _learn(self, dataset: Dataset, before: RigPrior) -> None:
+        """Write the prior and the page."""
+        taught: list[tuple[KindOfRig, LearntPrior | None, str]] = []
+        for kind in kinds_of_rigs(dataset):
+            try:
+                taught.append((kind, kind.learn(self.covariates, by_camera=self.by_camera), ""))
+            except RefusedError as error:
+                taught.append((kind, None, str(error)))
+        if taught and (learnt := taught[0][1]) is not None:
+            write_text(self.out / "prior.yaml", yaml_text({"prior": _rounded(asdict(learnt.prior()))}))
+            write_text(self.out / "lessons.json", json.dumps(_lessons(taught[0][0], learnt), indent=2) + "\n")
+            for spread in learnt.spreads:
+                camera = "" if spread.camera is None else f" of {spread.camera}"
+                print(f"{spread.kind}{camera}: spread {spread.value:.4g} +- {spread.sigma:.1g}")
+            print(f"{len(learnt.outliers)} cameras do not belong; prior {self.out / 'prior.yaml'}")
+        for _, _, reason in taught:
+            if reason:
+                print(f"note: no prior: {reason}", file=sys.stderr)
+        if lacking := missing("jinja2"):
+            print(f"note: no report.html, which {advice(lacking)}", file=sys.stderr)
+            return
+        from imgcal.report import Taught, write_fleet_report
+
+        write_fleet_report(dataset, [Taught(*one) for one in taught], before, self.out / "report.html")
+        print(f"report {self.out / 'report.html'}")
+
+
+def _rounded(values: dict[str, float]) -> dict[str, float]:
+    return {name: float(f"{value:.6g}") for name, value in values.items()}
+
+
+def _lessons(kind: KindOfRig, learnt: LearntPrior) -> dict[str, Any]:
+    """What scripts read: every spread, outlier and slope."""
+    outliers = [asdict(one) | {"device": kind.devices[one.device]} for one in learnt.outliers]
+    return {
+        "cameras": list(kind.cameras),
+        "devices": len(kind.devices),
+        "spreads": [asdict(spread) for spread in learnt.spreads],
+        "outliers": outliers,
+        "trends": [asdict(trend) for trend in learnt.trends],
+    }
+
+
+def _said(count: FleetCount) -> str:
+    parts = [f"{number} {status.replace('_', ' ')}" for status, number in count.status.most_common()]
+    known = f"{count.known} done before" if count.known else ""
+    return ", ".join([f"{count.read} captures", *parts, *([known] if known else [])])
+
+
+@contextmanager
+def _told() -> Iterator[Callable[[FleetCount], None]]:
+    """Show how far a run is: a bar on a terminal, a line a minute elsewhere."""
+    console = Console(file=sys.stderr)
+    started = last = time.monotonic()
+    if not console.is_terminal:
+
+        def line(count: FleetCount) -> None:
+            nonlocal last
+            if time.monotonic() - last > EVERY:
+                last = time.monotonic()
+                print(f"{_said(count)}, {count.read / (last - started):.1f}/s", file=sys.stderr, flush=True)
+
+        yield line
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("starting", total=None)
+
+        def show(count: FleetCount) -> None:
+            rate = count.read / max(time.monotonic() - started, 1e-9)
+            bar.update(task, description=f"{_said(count)}, {rate:.1f}/s", completed=count.read, total=count.total)
+
+        yield show

@@ -1,0 +1,115 @@
+"""What one calibration after another says about drift, the prior that each was made with taken out again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from imgcal.errors import InputError
+from imgcal.estimation import Estimate, whitened_covariance
+from imgcal.types import PARAMETER_NAMES, CameraRig, RigPrior
+
+KINDS = ("rotation", "position", "focal_length", "principal_point", "distortion")
+"""Kinds of value as a rig file's `prior:` names them, and in the order in which a camera's parameters stand."""
+
+
+def unit_of(rig: CameraRig) -> Tensor:
+    """What a spread of one means for each parameter: (C, 15) rad, mm, the focal length in pixels, pixels, one."""
+    return RigPrior(1.0, 1.0, 1.0, 1.0, 1.0).std(rig)
+
+
+@dataclass(frozen=True)
+class DriftInformation:
+    """What images alone say of how far devices are from their factory values: a Gaussian likelihood for each.
+
+    Directions in which they say nothing, a motion of the whole rig above all, have no information; so nothing has to
+    be said about a gauge.
+    """
+
+    camera_names: tuple[str, ...]
+    information: Tensor  # (D, P, P) float64, P parameters of all cameras in units of `unit_of`; positive semidefinite
+    score: Tensor  # (D, P) information times the offset that the images ask for
+
+    def __post_init__(self) -> None:
+        devices, size = self.score.shape
+        if self.information.shape != (devices, size, size) or size % len(self.camera_names):
+            raise InputError(
+                f"drift information: found information {tuple(self.information.shape)} and score "
+                f"{tuple(self.score.shape)}, expected (D, P, P) and (D, P) of {len(self.camera_names)} cameras"
+            )
+
+    @classmethod
+    def of(cls, estimate: Estimate) -> DriftInformation:
+        """Take the prior out of estimates.
+
+        Args:
+            estimate: (D) or one without batch axes.
+
+        Raises:
+            RefusedError: the information of an estimate is singular.
+            InputError: lenses of another kind than the usual one.
+        """
+        problem, solution = estimate.problem, estimate.solution
+        if estimate.rig.parameter_names != PARAMETER_NAMES:
+            found = ", ".join(dict.fromkeys(estimate.rig.lens_models))
+            raise InputError(f"rig {estimate.rig.name}: found the lens models {found}, expected brown_conrady")
+        return cls.whitened(
+            estimate.rig.camera_names,
+            torch.linalg.inv(whitened_covariance(solution)),
+            solution.state.offset.flatten(1),
+            problem.prior_std.flatten(1),
+            unit_of(problem.factory).expand(problem.prior_std.shape).flatten(1),
+            torch.full((len(problem.prior_std),), estimate.inflation, dtype=torch.float64),
+        )
+
+    @classmethod
+    def whitened(
+        cls,
+        camera_names: tuple[str, ...],
+        precision: Tensor,
+        offset: Tensor,
+        prior_std: Tensor,
+        unit: Tensor,
+        inflation: Tensor,
+    ) -> DriftInformation:
+        """Take the prior out of what is kept in units of it.
+
+        Args:
+            camera_names: C of them.
+            precision: (D, P, P) inverse covariance, the prior's part the identity.
+            offset: (D, P) estimated.
+            prior_std: (D, P) standard deviations of the prior; what it holds fixed, at zero, tells nothing.
+            unit: (D, P) of `unit_of`.
+            inflation: (D) factor on what noise adds to standard deviations.
+        """
+        scale = torch.where(prior_std > 0, unit / prior_std.clamp_min(1e-300), 0.0) / inflation[:, None]
+        data = precision - torch.eye(precision.shape[-1], dtype=precision.dtype)
+        information = scale[:, :, None] * data * scale[:, None, :]
+        asked = scale * (precision @ offset[..., None])[..., 0] / inflation[:, None]
+        return cls(camera_names, 0.5 * (information + information.mT), asked)
+
+    @classmethod
+    def joined(cls, parts: Sequence[DriftInformation]) -> DriftInformation:
+        """Put devices behind one another.
+
+        Raises:
+            InputError: none, or of different cameras.
+        """
+        if not parts or any(part.camera_names != parts[0].camera_names for part in parts):
+            raise InputError("drift information: found parts of different rigs or none, expected the same cameras")
+        information = torch.cat([part.information for part in parts])
+        return cls(parts[0].camera_names, information, torch.cat([part.score for part in parts]))
+
+    @property
+    def parameters(self) -> int:
+        """Parameters of a camera."""
+        return self.score.shape[1] // len(self.camera_names)
+
+    def __len__(self) -> int:
+        return len(self.score)
+
+    def __getitem__(self, rows: Tensor | slice) -> DriftInformation:
+        return DriftInformation(self.camera_names, self.information[rows], self.score[rows])

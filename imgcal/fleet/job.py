@@ -1,0 +1,279 @@
+"""One capture of a fleet: fetched, recalibrated as `imgcal calibrate` does, and put into a row, whatever happens."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import gzip
+import hashlib
+import json
+import resource
+import signal
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from types import FrameType
+from typing import Any, Literal
+
+import torch
+
+import imgcal
+from imgcal.association import PipelineOptions
+from imgcal.errors import InputError, RefusedError
+from imgcal.estimation import flat_std, whitened_covariance
+from imgcal.fleet.drift_information import unit_of
+from imgcal.fleet.manifest import Item, opened, reason_of
+from imgcal.formats import load_rig
+from imgcal.io import Capture, load_object, open_input, rig_text, shipped_names
+from imgcal.messages import one_line
+from imgcal.pipeline import Calibration, Detector, DetectorName, calibrate, detect_capture, sight_of_capture
+from imgcal.types import CalibrationObject, CameraRig
+
+Status = Literal["ok", "refused", "unusable", "unreachable", "timed_out", "out_of_memory", "crashed", "fault"]
+STATUSES: tuple[Status, ...] = (
+    "ok", "refused", "unusable", "unreachable", "timed_out", "out_of_memory", "crashed", "fault",
+)  # fmt: skip
+"""What became of a capture. `unusable`: its files are wrong; `unreachable`: not to be read; `fault`: one of imgcal."""
+TRANSIENT = frozenset({"unreachable", "timed_out", "out_of_memory", "crashed"})
+"""What another try may mend."""
+BLOCK = 1 << 20
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How every capture is treated."""
+
+    blind_cameras: bool = False
+    detector: DetectorName = "classical"
+    seconds: float = 300.0  # that a capture may take
+    memory_mb: float = 4096.0  # that it may take beyond what the process has already
+    keep_rig: bool = False  # the text of its rig file, too
+
+    def key(self) -> str:
+        """What results depend on, as text."""
+        decides = {"blind_cameras": self.blind_cameras, "detector": self.detector, "version": imgcal.__version__}
+        return json.dumps(decides, sort_keys=True)
+
+
+class TooLongError(Exception):
+    """The time that a capture may take is over."""
+
+
+def item_of(item: Item) -> str:
+    """Name a row of the manifest by what it says, whatever its files hold: 32 hexadecimal digits."""
+    said = json.dumps([item.capture, item.rig, item.object, item.device, item.time])
+    return hashlib.blake2b(said.encode(), digest_size=16).hexdigest()
+
+
+def processed(item: Item, settings: Settings, known: frozenset[str] | Any = frozenset()) -> dict[str, Any] | None:
+    """Recalibrate one capture.
+
+    Args:
+        item: what to fetch.
+        settings: how to treat it.
+        known: keys that need not be done again.
+
+    Returns:
+        A row of the results; None where its key is known. Never raises for what is wrong with a capture.
+    """
+    started = time.perf_counter()
+    row = _row_of(item)
+    status, extra = "ok", dict[str, Any]()
+    try:
+        if item.fault:
+            raise InputError(item.fault)
+        with tempfile.TemporaryDirectory(prefix="imgcal-fleet-") as folder, _limited(settings):
+            path = fetched(item.capture, Path(folder))
+            row["key"] = content_key(path, item, settings)
+            if row["key"] in known:
+                return None
+            extra = _recalibrated(path, *_world(item.rig, item.object), settings)
+    except RefusedError as error:
+        status, row["reason"] = "refused", one_line(error.reason)
+    except InputError as error:
+        status, row["reason"] = "unusable", one_line(str(error))
+    except _Unreachable as error:
+        status, row["reason"] = "unreachable", one_line(str(error))
+    except TooLongError:
+        status, row["reason"] = "timed_out", f"took longer than {settings.seconds:g} s"
+    except Exception as error:
+        status, row["reason"] = _fault(error, settings)
+    return row | {"status": status, "seconds": time.perf_counter() - started} | extra
+
+
+def failed_row(item: Item, status: Status, reason: str) -> dict[str, Any]:
+    """Row of a capture whose process did not live to tell."""
+    return _row_of(item) | {"status": status, "reason": reason, "seconds": 0.0}
+
+
+def _row_of(item: Item) -> dict[str, Any]:
+    """What a row says of its capture, whatever becomes of it."""
+    moment = None if item.time is None else datetime.datetime.fromtimestamp(item.time, datetime.UTC)
+    return {
+        "item": item_of(item), "key": "", "device": item.device, "time": moment, "capture": item.capture,
+        "rig": item.rig, "object": item.object, "given": list(item.given), "reason": "",
+    }  # fmt: skip
+
+
+class _Unreachable(Exception):
+    """A file that could not be fetched: the network's matter, or a wrong path."""
+
+
+def fetched(url: str, folder: Path) -> Path:
+    """Bring a capture to this machine; a local one stays where it is.
+
+    Raises:
+        InputError: a local path that is not there.
+        _Unreachable: anything else that stands between.
+    """
+    if "://" not in url:
+        return Path(url)
+    import fsspec
+
+    try:
+        system, path = fsspec.core.url_to_fs(url)
+        name = path.rstrip("/").rsplit("/", 1)[-1]
+        system.get(path.rstrip("/"), str(folder / name), recursive=system.isdir(path))
+    except TooLongError:
+        raise
+    except Exception as error:
+        raise _Unreachable(f"{url}: cannot be read: {reason_of(error)}") from error
+    return folder / name
+
+
+def content_key(path: Path, item: Item, settings: Settings) -> str:
+    """Digest of everything that a result depends on: 32 hexadecimal digits."""
+    digest = hashlib.blake2b(digest_size=16)
+    digest.update(f"{settings.key()}\n{item_of(item)}\n".encode())
+    for url in (item.rig, item.object):
+        digest.update(_content_of(url))
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    for file in files:
+        digest.update(f"{file.relative_to(path)}\n".encode())
+        try:
+            with open(file, "rb") as stream:
+                while block := stream.read(BLOCK):
+                    digest.update(block)
+        except OSError as error:
+            raise InputError(f"{file}: cannot be read: {error.strerror or error}") from error
+    return digest.hexdigest()
+
+
+def _content_of(url: str) -> bytes:
+    """Bytes of a rig or object file; the name itself of a shipped one."""
+    return url.encode() if _is_shipped(url) else _small_file(url, _stamp(url))
+
+
+def _is_shipped(name: str) -> bool:
+    return name in (*shipped_names("rigs", ".yaml"), *shipped_names("objects", ".csv"))
+
+
+def _stamp(url: str) -> str:
+    """Something that changes when a file does, without reading it where that can be."""
+    if "://" in url:
+        return str(int(time.time()) // 60)  # asked for again every minute
+    try:
+        found = Path(url).stat()
+    except OSError as error:
+        raise InputError(f"{url}: cannot be read: {error.strerror}") from error
+    return f"{found.st_mtime_ns} {found.st_size} {found.st_ino}"
+
+
+@lru_cache(maxsize=256)
+def _small_file(url: str, stamp: str) -> bytes:
+    with opened(url) as file:
+        return bytes(file.read())
+
+
+def _world(rig: str, obj: str) -> tuple[CameraRig, CalibrationObject]:
+    return _loaded(rig, _content_of(rig), "rig"), _loaded(obj, _content_of(obj), "object")
+
+
+@lru_cache(maxsize=256)
+def _loaded(url: str, content: bytes, kind: Literal["rig", "object"]) -> Any:
+    load = load_rig if kind == "rig" else load_object
+    if "://" not in url:
+        return load(url)
+    with tempfile.TemporaryDirectory(prefix="imgcal-fleet-") as folder:
+        path = Path(folder) / url.rsplit("/", 1)[-1]
+        path.write_bytes(gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content)
+        return load(str(path))
+
+
+def _recalibrated(path: Path, rig: CameraRig, obj: CalibrationObject, settings: Settings) -> dict[str, Any]:
+    """The columns of a capture that was recalibrated."""
+    source = open_input(path, rig, obj.num_fiducials)
+    detector: Detector = "classical"
+    if isinstance(source, Capture):
+        if settings.detector != "classical":
+            detector = sight_of_capture(source, settings.detector)
+        source, _ = detect_capture(source)
+    options = PipelineOptions(blind_cameras=settings.blind_cameras)
+    result = calibrate(source, rig, obj, options, detector=detector)
+    return columns_of(result) | ({"rig_file": rig_text(result.rig)} if settings.keep_rig else {})
+
+
+def columns_of(result: Calibration) -> dict[str, Any]:
+    """What a row keeps of a calibration; `information_factor` is R of R^T R = 1 + information / prior, row by row."""
+    estimate, solution = result.estimate, result.estimate.solution
+    whitened = torch.linalg.inv(whitened_covariance(solution))[0]
+    factor = torch.linalg.cholesky(0.5 * (whitened + whitened.mT), upper=True)
+    upper = torch.triu_indices(*factor.shape)
+    offset = result.rig.local(result.factory)
+    return {
+        "cameras": list(result.rig.camera_names),
+        "identity": result.identity,
+        "offset": offset.flatten().tolist(),
+        "std": flat_std(estimate).flatten().tolist(),
+        "prior_std": estimate.problem.prior_std.flatten().tolist(),
+        "unit": unit_of(result.factory).flatten().tolist(),
+        "whitened_offset": solution.state.offset.flatten().tolist(),
+        "information_factor": factor[upper[0], upper[1]].float().tolist(),
+        "inflation": float(estimate.inflation),
+        "rms_px": float(result.rms),
+        "chi2_per_dof": float(result.chi2_per_dof),
+        "snapshots": len(result.labelled.used),
+        "labels": int(result.observations.seen.sum()),
+        "outliers": result.outliers,
+        "moved": [str(move) for move in result.moved],
+    }
+
+
+def _fault(error: Exception, settings: Settings) -> tuple[Status, str]:
+    text = one_line(f"{type(error).__name__}: {error}")
+    memory = isinstance(error, MemoryError) or any(
+        words in text for words in ("not enough memory", "allocate memory", "Insufficient memory", "bad_alloc")
+    )
+    if memory:
+        return "out_of_memory", f"needed more than {settings.memory_mb:g} MB"
+    return "fault", text
+
+
+@contextlib.contextmanager
+def _limited(settings: Settings) -> Iterator[None]:
+    """Hold what runs in the block to its time and memory, where the system can."""
+
+    def over(number: int, frame: FrameType | None) -> None:
+        raise TooLongError
+
+    timed = threading.current_thread() is threading.main_thread()
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    pages = int(Path("/proc/self/statm").read_text().split()[0]) if Path("/proc/self/statm").exists() else 0
+    limit = pages * resource.getpagesize() + int(settings.memory_mb * 2**20)
+    old = None
+    try:
+        if timed:
+            old = signal.signal(signal.SIGALRM, over)
+            signal.setitimer(signal.ITIMER_REAL, settings.seconds)
+        if pages:
+            resource.setrlimit(resource.RLIMIT_AS, (limit, before[1]))
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+        if timed:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+            signal.signal(signal.SIGALRM, old)

@@ -1,0 +1,50 @@
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from imgcal.cli.main import main
+from imgcal.fleet import write_manifest
+from tests.imgcal.fleet.conftest import engine  # noqa: F401  one Ray for all tests
+from tests.imgcal.fleet.small_captures import write_capture
+
+
+@pytest.mark.usefixtures("engine")
+def test_a_fleet_teaches_its_prior(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = []
+    for number in range(10):
+        write_capture(tmp_path / f"{number}.csv", number)
+        rows.append(
+            {"capture": f"{number}.csv", "device": f"<d{number}>", "time": f"2026-01-{number + 1:02d}T00:00:00"}
+        )
+    rows.append({"capture": "gone.csv", "device": "lost", "time": None})
+    write_manifest(tmp_path / "captures.csv", rows)
+    out = tmp_path / "fleet"
+    options = ["--rig", "T4", "--object", "asymmetric8", "--out", str(out)]
+    assert main(["fleet", str(tmp_path / "captures.csv"), *options, "--keep-rigs"]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("11 captures, 10 ok, 1 unusable")
+    prior = yaml.safe_load((out / "prior.yaml").read_text())["prior"]
+    assert 0.002 < prior["rotation"] < 0.006 and 0.8 < prior["position"] < 2.5
+    lessons = json.loads((out / "lessons.json").read_text())
+    assert lessons["devices"] == 10 and len(lessons["spreads"]) == 5
+    assert len(list((out / "rigs").glob("*.yaml"))) == 10
+    page = (out / "report.html").read_text()
+    assert "10 of 11 captures recalibrated" in page and "gone.csv" in page and "<d1>" not in page
+    factory = (Path("data/rigs/T4.yaml").resolve()).read_text()
+    (tmp_path / "rig.yaml").write_text(factory.partition("prior:")[0] + (out / "prior.yaml").read_text())
+    capture = ["calibrate", str(tmp_path / "3.csv"), "--rig", str(tmp_path / "rig.yaml"), "--object", "asymmetric8"]
+    assert main([*capture, "--out", str(tmp_path / "one"), "--no-report"]) == 0
+
+
+def test_hurried_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "m.csv").write_text("frames\na\n")
+    out = ["--out", str(tmp_path / "o")]
+    for arguments, expected in (
+        ([str(tmp_path / "m.csv"), *out, "--rig", "nothing"], "nothing"),
+        ([str(tmp_path / "m.csv"), *out, "--seconds", "0"], "--seconds: found 0"),
+        ([str(tmp_path / "none.csv"), *out], "none.csv: cannot be read"),
+    ):
+        assert main(["fleet", *arguments]) == 2
+        assert expected in capsys.readouterr().err

@@ -1,0 +1,105 @@
+"""Functions that misbehave are sent by value: workers do not have this file's folder on their path."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import pytest
+import ray
+
+from imgcal.fleet import Done, Engine, Lost
+
+
+def square(number: int) -> int:
+    return number * number
+
+
+def misbehaving(items: Sequence[str]) -> list[str]:
+    for item in items:
+        if item == "crash":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if item == "hang":
+            time.sleep(1000)
+    return [item.upper() for item in items]
+
+
+def test_results_come_in_the_order_of_the_items(engine: Engine) -> None:
+    ray.cloudpickle.register_pickle_by_value(__import__(__name__, fromlist=["square"]))
+    assert list(engine.mapped(square, range(20))) == [n * n for n in range(20)]
+
+
+def test_only_the_item_that_kills_its_process_is_lost(engine: Engine) -> None:
+    ray.cloudpickle.register_pickle_by_value(__import__(__name__, fromlist=["square"]))
+    outcomes = list(engine.run(misbehaving, [["a", "crash", "b"], ["c"]]))
+    assert [o.item for o in outcomes if isinstance(o, Lost)] == ["crash"]
+    done = [result for o in outcomes if isinstance(o, Done) for result in o.results]
+    assert sorted(done) == ["A", "B", "C"]
+
+
+def test_what_does_not_end_is_stopped(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+    ray.cloudpickle.register_pickle_by_value(__import__(__name__, fromlist=["square"]))
+    monkeypatch.setattr("imgcal.fleet.engine.GRACE", 2.0)
+    outcomes = list(engine.run(misbehaving, [["a", "hang"]], seconds=1.0))
+    assert [(o.item, o.timed_out) for o in outcomes if isinstance(o, Lost)] == [("hang", True)]
+    assert [o.results for o in outcomes if isinstance(o, Done)] == [["A"]]
+
+
+def test_no_more_is_read_than_is_needed(engine: Engine) -> None:
+    ray.cloudpickle.register_pickle_by_value(__import__(__name__, fromlist=["square"]))
+    read = 0
+
+    def batches() -> Iterator[list[str]]:
+        nonlocal read
+        for _ in range(100):
+            read += 1
+            yield ["a"]
+
+    outcomes = engine.run(misbehaving, batches())
+    next(outcomes)
+    assert read <= 2 * engine.cores + 1
+    assert len(list(outcomes)) == 99
+
+
+def test_an_error_of_the_function_is_raised(engine: Engine) -> None:
+    with pytest.raises(TypeError):
+        list(engine.mapped(len, [1]))
+
+
+CLUSTER = """
+import time
+from ray.cluster_utils import Cluster
+from imgcal.fleet import Done, Engine
+
+def slow(items):
+    time.sleep(0.2)
+    return [item + 1 for item in items]
+
+if __name__ == "__main__":
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+    first = cluster.add_node(num_cpus=1)
+    results, died = [], False
+    with Engine(cluster.address) as engine:
+        for outcome in engine.run(slow, [[n] for n in range(12)]):
+            assert isinstance(outcome, Done), outcome
+            results += outcome.results
+            if len(results) >= 3 and not died:
+                died = True
+                cluster.add_node(num_cpus=1)
+                cluster.remove_node(first, allow_graceful=False)
+    cluster.shutdown()
+    print(sorted(results) == list(range(1, 13)))
+"""
+
+
+def test_a_node_that_dies_costs_time_only(tmp_path: Path) -> None:
+    """Machines are simulated by processes; the one that works is switched off."""
+    (tmp_path / "cluster.py").write_text(CLUSTER)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([*sys.path, str(tmp_path)])}
+    done = subprocess.run(
+        [sys.executable, "cluster.py"], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=240
+    )
+    assert done.stdout.strip().splitlines()[-1:] == ["True"], done.stderr[-2000:]

@@ -1,0 +1,78 @@
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from imgcal.fleet import Item, Settings
+from imgcal.fleet import job as jobs
+from imgcal.fleet.job import content_key, processed
+from tests.imgcal.fleet.small_captures import write_capture
+
+
+def item(path: Path | str, **changes: Any) -> Item:
+    return Item(0, str(path), **({"rig": "T4", "object": "asymmetric8", "device": "d", "time": None} | changes))
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    write_capture(tmp_path / "a.csv", 0)
+    return tmp_path / "a.csv"
+
+
+def test_a_capture_becomes_a_row(capture: Path) -> None:
+    row = processed(item(capture), Settings(keep_rig=True))
+    assert row is not None and row["status"] == "ok" and row["snapshots"] == 2
+    assert len(row["offset"]) == 60 and len(row["information_factor"]) == 60 * 61 // 2
+    assert row["rms_px"] < 0.2 and row["rig_file"].startswith("format: imgcal-rig/1")
+    assert processed(item(capture), Settings(), frozenset({row["key"]})) is None
+
+
+def test_the_key_says_what_a_result_depends_on(capture: Path, tmp_path: Path) -> None:
+    def key(**changes: Any) -> str:
+        return content_key(capture, item(capture, **changes), Settings())
+
+    before = key()
+    assert before == key() and before != key(device="e") and before != key(rig="U7")
+    assert before != content_key(capture, item(capture), Settings(blind_cameras=True))
+    assert before == content_key(capture, item(capture), Settings(seconds=1.0))
+    capture.write_text(capture.read_text() + "\n")
+    assert key() != before
+
+
+@pytest.mark.parametrize(
+    ("changes", "status", "reason"),
+    [
+        ({"rig": "O10"}, "unusable", "cam"),
+        ({"rig": "missing.yaml"}, "unusable", "missing.yaml"),
+        ({"fault": "row 3: found no rig"}, "unusable", "row 3"),
+        ({"capture": "nowhere.csv"}, "unusable", "nowhere.csv"),
+        ({"capture": "nosuch://bucket/a.csv"}, "unreachable", "nosuch"),
+    ],
+)
+def test_what_is_wrong_is_said_in_the_row(capture: Path, changes: dict[str, Any], status: str, reason: str) -> None:
+    path = changes.pop("capture", capture)
+    row = processed(item(path, **changes), Settings())
+    assert row is not None
+    if changes.get("rig") == "O10":  # six cameras of it see nothing: sound, but it cannot decide
+        assert row["status"] in ("unusable", "refused")
+    else:
+        assert row["status"] == status
+    assert reason in row["reason"]
+
+
+@pytest.mark.parametrize(
+    ("behaviour", "status"),
+    [
+        (lambda *_: time.sleep(60), "timed_out"),
+        (lambda *_: bytearray(1 << 40), "out_of_memory"),
+        (lambda *_: [][0], "fault"),
+    ],
+)
+def test_captures_that_hang_or_grow(
+    capture: Path, behaviour: Any, status: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(jobs, "_recalibrated", behaviour)
+    row = processed(item(capture), Settings(seconds=0.5, memory_mb=500))
+    assert row is not None and row["status"] == status
+    assert row["seconds"] < 10 and row["key"]

@@ -1,0 +1,56 @@
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import imgcal
+from imgcal.fleet import Dataset, DriftInformation, Item, Settings, kinds_of_rigs, refusals, unit_of
+from imgcal.fleet.job import failed_row, processed
+from tests.imgcal.fleet.small_captures import write_capture
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Dataset:
+    """Nine devices; the first was seen twice."""
+    dataset, rows = Dataset(tmp_path), list[dict[str, Any] | None]()
+    for number in range(10):
+        path = tmp_path / f"{number}.csv"
+        write_capture(path, number)
+        device = "d0" if number == 9 else f"d{number}"
+        given = (("temperature", 20.0 + number), *([("hours", 1.0)] if number else []))
+        rows.append(
+            processed(Item(number, str(path), "T4", "asymmetric8", device, 86400.0 * number, given), Settings())
+        )
+    with dataset.written() as writer:
+        writer.add([row for row in rows if row is not None])
+        writer.add([failed_row(Item(11, "x", "T4", "cube8", "d11", None), "crashed", "signal: 9")])
+    return dataset
+
+
+def test_the_last_word_of_every_device(dataset: Dataset) -> None:
+    (kind,) = kinds_of_rigs(dataset)
+    assert kind.cameras == imgcal.load_rig("T4").camera_names
+    assert sorted(kind.devices) == [f"d{number}" for number in range(9)]
+    assert kind.given["temperature"][kind.devices.index("d0")] == 29.0  # its second capture
+    assert len(kind.learn(("temperature",)).spreads) == 5
+    with pytest.raises(imgcal.InputError, match="found pressure"):
+        kind.learn(("pressure",))
+
+
+def test_what_a_row_keeps_is_what_the_estimate_said(dataset: Dataset, tmp_path: Path) -> None:
+    (kind,) = kinds_of_rigs(dataset)
+    rig, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+    result = imgcal.calibrate(imgcal.load_detections(tmp_path / "3.csv", rig), rig, obj)
+    direct, kept = DriftInformation.of(result.estimate), kind.drift[torch.tensor([kind.devices.index("d3")])]
+    by_prior = (unit_of(rig) / result.estimate.problem.prior_std[0]).flatten().square()
+    scale = (direct.information.diagonal(dim1=1, dim2=2) + by_prior).sqrt()
+    apart = (direct.information - kept.information) / (scale[:, :, None] * scale[:, None, :])
+    assert float(apart.abs().max()) < 1e-6
+    np.testing.assert_allclose(kept.score / scale, direct.score / scale, rtol=1e-4, atol=1e-3)
+
+
+def test_reasons_are_counted(dataset: Dataset) -> None:
+    assert refusals(dataset)[0] == ("ok", "", 10)
+    assert ("crashed", "signal", 1) in refusals(dataset)

@@ -1,0 +1,108 @@
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+import imgcal
+from imgcal.fleet import Dataset, Engine, Manifest, kinds_of_rigs, recalibrate_fleet, refusals, write_manifest
+from tests.imgcal.fleet.small_captures import write_capture
+
+
+def manifest(folder: Path) -> Manifest:
+    return Manifest(str(folder / "manifest.csv"), "T4", "asymmetric8")
+
+
+def test_what_is_missing_or_changed_is_done_once(fleet: Path, engine: Engine) -> None:
+    dataset = Dataset(fleet / "out")
+    first = recalibrate_fleet(manifest(fleet), dataset, engine, batch=2)
+    assert (first.read, first.known, dict(first.status)) == (6, 0, {"ok": 6})
+    again = recalibrate_fleet(manifest(fleet), dataset, engine, batch=2)
+    assert (again.read, again.known, dict(again.status)) == (6, 6, {})
+    write_capture(fleet / "3.csv", 33)
+    changed = recalibrate_fleet(manifest(fleet), dataset, engine, batch=2)
+    assert (changed.known, dict(changed.status)) == (5, {"ok": 1})
+    assert dataset.latest(("device",)).num_rows == 6
+    (kind,) = kinds_of_rigs(dataset)
+    assert sorted(kind.devices) == [f"d{n}" for n in range(6)] and list(kind.given) == ["temperature"]
+    with pytest.raises(imgcal.RefusedError, match="at least 8"):
+        kind.learn()
+
+
+def test_rows_are_those_of_calibrate(fleet: Path, engine: Engine) -> None:
+    dataset = Dataset(fleet / "out")
+    recalibrate_fleet(manifest(fleet), dataset, engine)
+    rows = {row["device"]: row for row in dataset.latest().to_pylist()}
+    rig, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+    result = imgcal.calibrate(imgcal.load_detections(fleet / "2.csv", rig), rig, obj)
+    assert rows["d2"]["offset"] == result.rig.local(rig).flatten().tolist()
+    assert rows["d2"]["rms_px"] == float(result.rms)
+
+
+def test_one_bad_capture_is_a_row_and_the_same_twice_is_one(fleet: Path, engine: Engine) -> None:
+    (fleet / "bad.csv").write_text("snapshot,camera,u,v\n0,cam01,one,2\n")
+    rows = [{"capture": name} for name in ("0.csv", "bad.csv", "0.csv", "gone.csv")]
+    write_manifest(fleet / "manifest.csv", rows)
+    dataset = Dataset(fleet / "out")
+    count = recalibrate_fleet(manifest(fleet), dataset, engine, batch=1)
+    assert (count.read, count.known, dict(count.status)) == (4, 1, {"ok": 1, "unusable": 2})
+    assert sum(number for status, _, number in refusals(dataset) if status == "unusable") == 2
+
+
+def test_captures_in_a_bucket(fleet: Path, engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+    moto = pytest.importorskip("moto.server")
+    s3fs = pytest.importorskip("s3fs")
+    server = moto.ThreadedMotoServer("127.0.0.1", 0)
+    server.start()
+    try:
+        url = f"http://127.0.0.1:{server._server.server_port}"
+        for name, value in (("AWS_ACCESS_KEY_ID", "a"), ("AWS_SECRET_ACCESS_KEY", "b"), ("AWS_ENDPOINT_URL", url)):
+            monkeypatch.setenv(name, value)
+        system = s3fs.S3FileSystem()
+        system.mkdir("captures")
+        for name in ("0.csv", "manifest.csv"):
+            system.put(str(fleet / name), f"captures/{name}")
+        rows = Manifest("s3://captures/manifest.csv", "T4", "asymmetric8").batches(6)
+        from imgcal.fleet import Settings
+        from imgcal.fleet.job import processed
+
+        items = next(iter(rows))
+        there, not_there = processed(items[0], Settings()), processed(items[1], Settings())
+        assert there is not None and there["status"] == "ok" and there["capture"] == "s3://captures/0.csv"
+        assert not_there is not None and not_there["status"] == "unreachable"
+    finally:
+        server.stop()
+
+
+KILLED = """
+import sys
+from pathlib import Path
+from imgcal.fleet import Dataset, Engine, Manifest, recalibrate_fleet
+folder = Path(sys.argv[1])
+def tell(count):
+    print(count.read, flush=True)
+if __name__ == "__main__":
+    import imgcal.fleet.run as run
+    run.SECONDS = 0.0  # every batch is written at once
+    with Engine(cores=1) as engine:
+        recalibrate_fleet(Manifest(str(folder / "manifest.csv"), "T4", "asymmetric8"), Dataset(folder / "out"), engine, tell=tell, batch=1)
+"""  # noqa: E501
+
+
+def test_a_driver_that_is_killed_goes_on_where_it_was(fleet: Path, engine: Engine) -> None:
+    with subprocess.Popen([sys.executable, "-c", KILLED, str(fleet)], stdout=subprocess.PIPE, text=True) as child:
+        assert child.stdout is not None
+        timer = threading.Timer(120, child.kill)
+        timer.start()
+        for line in child.stdout:
+            if line.strip() == "2":
+                break
+        child.kill()
+        timer.cancel()
+    dataset = Dataset(fleet / "out")
+    done = len(dataset.keys())
+    assert done >= 1
+    count = recalibrate_fleet(manifest(fleet), dataset, engine, batch=1)
+    assert (count.known, count.status["ok"]) == (done, 6 - done)
+    assert dataset.latest(("device",)).num_rows == 6
