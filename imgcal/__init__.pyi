@@ -2,9 +2,10 @@ from .association import PipelineOptions
 from .detection import DetectionOptions, detect
 from .errors import InputError, RefusedError
 from .estimation import Estimate, EstimationOptions, PredictedError, WorkingVolume, estimate, predicted_error
+from .formats import load_rig
 from .geometry import Projection, RigidTransform
-from .io import load_detections, load_object, load_rig, save_detections, save_rig
-from .online import Recalibrator
+from .io import load_detections, load_object, open_capture, save_detections, save_rig
+from .online import Event, Recalibrator, RigKeeper, RigState
 from .pipeline import Calibration, calibrate, score
 from .types import CalibrationObject, CameraRig, Detections, Observations, RigPrior
 
@@ -18,6 +19,7 @@ __all__ = [
     "Detections",
     "Estimate",
     "EstimationOptions",
+    "Event",
     "InputError",
     "Observations",
     "PipelineOptions",
@@ -25,7 +27,9 @@ __all__ = [
     "Projection",
     "Recalibrator",
     "RefusedError",
+    "RigKeeper",
     "RigPrior",
+    "RigState",
     "RigidTransform",
     "WorkingVolume",
     "calibrate",
@@ -34,6 +38,7 @@ __all__ = [
     "load_detections",
     "load_object",
     "load_rig",
+    "open_capture",
     "predicted_error",
     "save_detections",
     "save_rig",

@@ -5,8 +5,11 @@ from __future__ import annotations
 from importlib.util import find_spec
 
 EXTRAS = {
+    "fleet": ("filelock", "fsspec", "pyarrow", "ray"),
     "train": ("accelerate", "tensorboard", "timm"),
-    "report": ("jinja2", "matplotlib", "plotly"),
+    "watch": ("prometheus_client", "zmq", "rosbags"),
+    "report": ("jinja2", "matplotlib"),
+    "live": ("uvicorn",),
 }
 """Libraries of each extra, by the names that they are imported by; `pyproject.toml` has the versions."""
 

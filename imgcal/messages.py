@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import fields
+from typing import Any
 
 MOST_QUOTED = 200  # characters of a file's or another program's text
 LONGEST = 1000  # characters of a message
@@ -31,3 +33,18 @@ def one_line(message: str) -> str:
     """Make one line of it that a terminal takes for text: no line breaks, no control characters, not endless."""
     text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in " ".join(message.split()))
     return text if len(text) <= LONGEST else f"{text[: LONGEST - MOST_QUOTED - 3]}...{text[-MOST_QUOTED:]}"
+
+
+def brief(value: Any) -> str:
+    """Write a value as people read it: of tensors and arrays the type and shape, of long tuples the beginning."""
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        return f"{str(value.dtype).removeprefix('torch.')}{tuple(value.shape)}"
+    if isinstance(value, tuple) and len(value) > 4:
+        return f"({brief(value[0])}, ..., {brief(value[-1])}: {len(value)})"
+    return repr(value)
+
+
+def brief_repr(self: Any) -> str:
+    """Be the `__repr__` of a dataclass of tensors: shapes instead of walls of numbers."""
+    parts = (f"{field.name}={brief(getattr(self, field.name))}" for field in fields(self) if field.repr)
+    return f"{type(self).__name__}({', '.join(parts)})"

@@ -14,12 +14,12 @@ from typing import Annotated, Any
 import torch
 import tyro
 
-from imgcal.association import PipelineOptions, Sight
+from imgcal.association import PipelineOptions
 from imgcal.cli.common import (
     StartPose,
     check_folder,
-    masks_of,
     only_cameras,
+    open_rig,
     parse_range,
     progress,
     read_detections,
@@ -28,6 +28,7 @@ from imgcal.cli.common import (
 )
 from imgcal.cli.counts import blobs_by_camera, counts_by_camera, counts_by_snapshot, doubtful_cameras
 from imgcal.cli.describe import describe, describe_refusal
+from imgcal.cli.findings import UNKNOWN, Findings, findings
 from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import Gauge
@@ -35,26 +36,31 @@ from imgcal.extras import advice, missing
 from imgcal.io import (
     Capture,
     RigCovariance,
+    is_cameras_file,
+    load_cameras,
     load_object,
-    load_rig,
     open_input,
     publishing,
     save_detections,
     save_object,
     save_rig,
+    unplaced,
     write_text,
 )
+from imgcal.messages import listed
 from imgcal.pipeline import (
     Calibration,
     Detector,
     DetectorName,
     LearnedMeasurer,
     calibrate,
+    calibrate_from_scratch,
     load_initializer,
-    proposer_of,
     rms_length,
+    sight_of_capture,
+    unit_doubt,
 )
-from imgcal.types import PARAMETER_NAMES, CalibrationObject, CameraRig, Detections, MovedError, limits
+from imgcal.types import CalibrationObject, CameraRig, Detections, MovedError, limits
 
 WRITTEN = ("report.html", "rig.yaml", "object.csv", "result.json")
 
@@ -70,14 +76,21 @@ class Calibrate:
     OUT/report.html; where the object's fiducials were estimated, too, also OUT/object.csv. If the data cannot decide,
     the reason is in result.json and report.html, no rig.yaml is written and the exit code is 3. OUT changes when all is
     written; any other failure leaves it as it was.
-    Example: imgcal calibrate my_capture --rig factory.yaml --object object.csv --out result
+    Examples: imgcal calibrate my_capture --rig factory.yaml --object object.csv --out result
+    imgcal calibrate my_capture --cameras cameras.yaml --object wand4 --out result
     """
 
     input: Annotated[Path, tyro.conf.Positional]  #: capture folder or detections file
-    rig: str  #: factory rig: file, or the name of a shipped one
     object: str  #: object: file, or the name of a shipped one
     out: Path  #: folder to write
+    rig: str | None = None  #: factory rig: file, or the name of a shipped one
+    cameras: Path | None = None
+    """instead of --rig, where there is no factory calibration: cameras of which only the size of the images and a rough
+    focal length or field of view is known (imgcal rig cameras writes such a file), or a calibration whose places do not
+    count; carry the whole object through what neighbouring cameras see together; the rig's frame is that of its first
+    camera"""
     snapshots: str | None = None  #: A:B, numbers in file order from 0, B excluded
+    videos_differ: bool = False  #: accept videos whose lengths or time stamps differ: frames go together by number
     detector: DetectorName = "classical"
     """who finds the fiducials in frames: classical (blobs), matched (the whole pattern at once, for frames too dim,
     blurred or cluttered for blobs; slower), auto (blobs, and the pattern where these decide nothing), learned (a
@@ -109,9 +122,9 @@ class Calibrate:
         """Calibrate and write."""
         started = time.perf_counter()
         self._check_out()
-        lacking = missing("plotly", "jinja2") if self.report else None
+        lacking = missing("jinja2") if self.report else None
         draws = self.report and lacking is None
-        complete, obj = load_rig(self.rig), self._object()
+        complete, obj = self._rig(), self._object()
         rig = without_cameras(complete, self.without)
         reference = self._reference(rig)
         options = PipelineOptions(
@@ -119,7 +132,8 @@ class Calibrate:
             after_last_move=self.after_last_move,
             start_pose=start_pose(self.start_pose),
         )
-        source = open_input(self.input, complete, obj.num_fiducials)
+        source = open_input(self.input, complete, obj.num_fiducials, self.videos_differ)
+        self._require_frames(source, rig)
         detector = self._detector(source)
         initializer = None if self.first_guess == "none" else load_initializer(self.first_guess, rig, obj)
         loaded = time.perf_counter()
@@ -133,7 +147,13 @@ class Calibrate:
 
         outcome: Calibration | RefusedError
         try:
-            outcome = calibrate(detections, rig, obj, options, initializer=initializer, progress=bar, detector=detector)
+            if self.cameras is not None:
+                outcome = calibrate_from_scratch(detections, rig, obj, options, progress=bar)
+                rig = outcome.factory
+            else:
+                outcome = calibrate(
+                    detections, rig, obj, options, initializer=initializer, progress=bar, detector=detector
+                )
             covariance = trusted_covariance(outcome, reference)
             seconds |= {name: value for name, value in outcome.seconds.items() if name != "detection"}
         except RefusedError as error:
@@ -148,10 +168,11 @@ class Calibrate:
                 save_rig(outcome.rig, out / "rig.yaml", covariance, full=self.full_covariance)
                 if outcome.shape:
                     save_object(outcome.object, out / "object.csv")
-                result = summary(outcome, seconds)
-                content = describe(outcome, self._gauge(outcome), rig, frames, seconds)
+                found = findings(outcome, self._gauge(outcome), covariance)
+                result = summary(outcome, seconds) | found.values
+                content = describe(outcome, found, rig, frames, seconds)
             if draws:
-                from imgcal.report import write_report  # brings plotly along, which is not in the core
+                from imgcal.report import write_report  # brings jinja2 along, which is not in the core
 
                 write_report(content, out / "report.html")
             write_text(out / "result.json", json.dumps(result, indent=2) + "\n")
@@ -161,7 +182,9 @@ class Calibrate:
             save_detections(outcome.labelled_detections, self.labelled)
         for move in outcome.moved:
             print(f"{move}: only the snapshots since then are used")
-        _print(result, self.out, draws)
+        _print(result, found, self.out, draws)
+        if doubt := unit_doubt(rig, obj):
+            print(f"note: {doubt}", file=sys.stderr)
         for note in doubtful_cameras(outcome):
             print(f"note: {note}; see the report", file=sys.stderr)
 
@@ -171,13 +194,31 @@ class Calibrate:
         if self.labelled is not None:
             if not self.labelled.parent.is_dir() or self.labelled.is_dir():
                 raise InputError(f"--labelled: found {self.labelled}, expected a file in an existing folder")
-            for option, given in (("--rig", self.rig), ("--object", self.object), ("INPUT", self.input)):
-                if self.labelled.exists() and Path(given).exists() and self.labelled.samefile(given):
+            for option, given in self._inputs():
+                if self.labelled.exists() and given.exists() and self.labelled.samefile(given):
                     raise InputError(f"--labelled: {self.labelled} is what {option} reads, expected another file")
         for name in WRITTEN:
-            for option, given in (("--rig", self.rig), ("--object", self.object), ("INPUT", self.input)):
-                if (self.out / name).exists() and Path(given).exists() and (self.out / name).samefile(given):
+            for option, given in self._inputs():
+                if (self.out / name).exists() and given.exists() and (self.out / name).samefile(given):
                     raise InputError(f"--out: {self.out / name} is what {option} reads, expected another folder")
+
+    def _inputs(self) -> list[tuple[str, Path]]:
+        """What is read, with the names of the options."""
+        given = {"--rig": self.rig, "--cameras": self.cameras, "--object": self.object, "INPUT": self.input}
+        return [(option, Path(path)) for option, path in given.items() if path is not None]
+
+    def _rig(self) -> CameraRig:
+        """What is known of the cameras."""
+        if (self.rig is None) == (self.cameras is None):
+            found = "neither" if self.rig is None else "both"
+            raise InputError(f"found {found} of --rig and --cameras, expected one: a factory calibration, or none")
+        if self.rig is not None:
+            return open_rig(self.rig)
+        if self.first_guess != "none" or self.detector != "classical":
+            option = "--detector" if self.first_guess == "none" else "--first-guess"
+            raise InputError(f"{option}: found it beside --cameras, expected it with a factory calibration (--rig)")
+        assert self.cameras is not None
+        return load_cameras(self.cameras) if is_cameras_file(self.cameras) else unplaced(open_rig(str(self.cameras)))
 
     def _object(self) -> CalibrationObject:
         """The object with its tolerances."""
@@ -193,15 +234,24 @@ class Calibrate:
             tolerance = torch.full_like(obj.points[:, 0], self.object_tolerance)
         return replace(obj, tolerance=tolerance, scale_tolerance=self.object_scale_tolerance)
 
+    def _require_frames(self, source: Capture | Detections, rig: CameraRig) -> None:
+        """A camera whose folder is missing is not one that saw nothing."""
+        if isinstance(source, Detections) or self.blind_cameras:
+            return
+        without = [name for name in rig.camera_names if not source.files[name]]
+        if without:
+            raise InputError(
+                f"{source.folder / 'frames'}: found no frames of {listed(without)}, expected some of each camera of "
+                f"rig {rig.name}; --without {without[0]} leaves a camera out, --blind-cameras keeps its factory values"
+            )
+
     def _detector(self, source: Capture | Detections) -> Detector:
         """Who finds the fiducials, with the frames of the chosen snapshots."""
         if self.detector == "classical":
             return self.detector
         if isinstance(source, Detections):
             raise InputError(f"--detector {self.detector}: found blobs in {self.input}, expected a capture with frames")
-        proposer, where_blobs_fail = proposer_of(self.detector)
-        first, masks = parse_range(self.snapshots)[0], masks_of(source)
-        return Sight(proposer, lambda s: source.frames_of(first + s), where_blobs_fail, self.detection, masks)
+        return sight_of_capture(source, self.detector, self.detection, parse_range(self.snapshots)[0])
 
     def _reference(self, rig: CameraRig) -> int:
         if self.reference is None:
@@ -225,12 +275,12 @@ def trusted_covariance(calibration: Calibration, reference: int) -> RigCovarianc
         RefusedError: some camera is known so badly that the approximation behind the figures breaks down.
     """
     names = calibration.rig.camera_names
-    covariance = RigCovariance.from_matrix(calibration.estimate.covariance(reference), names[reference])
+    covariance = RigCovariance.from_matrix(calibration.estimate.covariance(reference), len(names), names[reference])
     bad = ~(covariance.std <= WORST_STD)
     if bool(bad.any()):
         camera, parameter = bad.nonzero()[0].tolist()
         raise RefusedError(
-            f"covariance: {PARAMETER_NAMES[parameter]} of camera {names[camera]} is known to "
+            f"covariance: {calibration.rig.parameter_names[parameter]} of camera {names[camera]} is known to "
             f"{float(covariance.std[camera, parameter]):.2g} only: the blobs say next to nothing (their sigma may be "
             "too large, or all of them at one place)"
         )
@@ -257,7 +307,8 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         "identity": calibration.identity,
         "identity_alternatives": alternatives,
         "detector": dict(calibration.detectors),
-        "rms_px_before": rms_length(calibration.before.residual, seen),
+        "from_scratch": calibration.from_scratch,
+        "rms_px_before": None if calibration.from_scratch else rms_length(calibration.before.residual, seen),
         "rms_px_after": rms_length(calibration.residual, seen),
         "first_guess": _guess_summary(calibration),
         "chi2_per_dof": float(calibration.chi2_per_dof),
@@ -268,6 +319,7 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         "snapshots_rejected": len(snapshots) - len(used),
         "rejected": {s.name: s.reason for s in snapshots if s.status == "refused"},
         "moved": [move.as_values() for move in calibration.moved],
+        "late": [vars(late) for late in calibration.late],
         "per_camera": per_camera,
         "per_snapshot": counts_by_snapshot(calibration),
         "object": [
@@ -308,6 +360,7 @@ def refused_summary(
         "identity": None,
         "identity_alternatives": None,
         "detector": {},
+        "from_scratch": None,
         "rms_px_before": None,
         "rms_px_after": None,
         "first_guess": None,
@@ -319,6 +372,7 @@ def refused_summary(
         "snapshots_rejected": len(detections.snapshot_names),
         "rejected": {},
         "moved": [move.as_values() for move in moved],
+        "late": [],
         "per_camera": blobs_by_camera(detections, rig),
         "per_snapshot": {},
         "object": [],
@@ -328,6 +382,7 @@ def refused_summary(
         "object_bent_sigma": None,
         "covariance": None,
         "predicted_error": None,
+        **UNKNOWN,
         "seconds": seconds,
     }
 
@@ -344,12 +399,13 @@ def predicted_line(predicted: dict[str, Any]) -> str:
     return words if worst is None else f"{words}, worst camera {predicted['worst_camera']} {worst:.2g} px"
 
 
-def _print(result: dict[str, Any], out: Path, report: bool) -> None:
+def _print(result: dict[str, Any], found: Findings, out: Path, report: bool) -> None:
     guess = result["first_guess"]
     alone = None if guess is None else guess["rms_px"]
     network = "" if alone is None else f"network alone {alone:.3f} px, "
     before, after = result["rms_px_before"], result["rms_px_after"]
-    print(f"reprojection error before {before:.3f} px, {network}after {after:.4f} px (RMS)")
+    earlier = "without a factory calibration " if before is None else f"before {before:.3f} px, {network}after "
+    print(f"reprojection error {earlier}{after:.4f} px (RMS)")
     if guess is not None and not guess["used"]:
         print("note: the network's guess was no better than the factory calibration: not used", file=sys.stderr)
     print(predicted_line(result["predicted_error"]))
@@ -357,6 +413,8 @@ def _print(result: dict[str, Any], out: Path, report: bool) -> None:
         f"identity {result['identity']}, {result['snapshots_used']} snapshots used, "
         f"{result['snapshots_rejected']} rejected"
     )
+    for line in found.lines:
+        print(line)
     for kind, factor in result["prior_too_narrow"].items():
         kind = kind.replace("_", " ")
         print(f"note: {kind} drifted {factor:.1f} times as far as the rig's prior allows: widened", file=sys.stderr)

@@ -7,27 +7,43 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from imgcal.detection import Blobs, DetectionOptions, detect_snapshot, to_detections, without_dim
+from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError
+from imgcal.formats import format_named, is_foreign, load_rig, read_foreign_rig
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import Capture, Frame
 from imgcal.messages import listed, shortened
-from imgcal.pipeline import LearnedMeasurer
+from imgcal.pipeline import LearnedMeasurer, detect_capture
 from imgcal.types import CameraRig, Detections
 
 Item = TypeVar("Item")
+
+
+def open_rig(given: str) -> CameraRig:
+    """Read what a user gives as `--rig`: a rig file, the name of a shipped rig, or a calibration of another tool.
+
+    Raises:
+        InputError: as `load_rig`; or it is another tool's file of a single camera, which says nothing of a rig.
+    """
+    rig, path = load_rig(given), Path(given)
+    if rig.num_cameras == 1 and path.exists() and is_foreign(path):
+        title = format_named(read_foreign_rig(path).format).title
+        raise InputError(
+            f"{given}: this is a {title} of one camera: where it stands to the others is not in it; give the folder "
+            f"of all files, or make a rig of this one camera: imgcal convert {given} --out rig.yaml"
+        )
+    return rig
 
 
 def parse_range(text: str | None) -> tuple[int, int | None]:
@@ -73,27 +89,8 @@ def read_detections(
         if measurer is not None:
             raise InputError(f"--measurer {measurer.name}: found blobs without frames, expected a capture with frames")
         return source.of_snapshots(first, count if last is None else min(last, count)), {}
-    return _detect_capture(source, first, last, options, measurer)
-
-
-def _detect_capture(
-    capture: Capture, first: int, last: int | None, options: DetectionOptions, measurer: LearnedMeasurer | None
-) -> tuple[Detections, dict[str, Frame | None]]:
-    names = capture.snapshot_names[first:last]
-    masks = masks_of(capture)
-    found: list[Blobs] = []
-    shown: dict[str, Frame | None] = {}
-    with ThreadPoolExecutor() as pool:
-        for _, frames in progress(capture.snapshots(first, last), len(names), "detecting blobs"):
-            shown = shown or dict(frames)
-            blobs = detect_snapshot(frames, options, masks=masks, pool=pool, whole_capture=True)
-            found.append(blobs if measurer is None else measurer(frames, blobs, options))
-    return to_detections(without_dim(found, options), capture.camera_names, names), shown
-
-
-def masks_of(capture: Capture) -> dict[str, NDArray[np.bool_]]:
-    """Read the masks of the cameras that have one: True where the image is to be ignored."""
-    return {camera: mask for camera in capture.camera_names if (mask := capture.mask(camera)) is not None}
+    bar = partial(progress, label="detecting blobs")
+    return detect_capture(source, first, last, options, measurer, bar)
 
 
 def progress(items: Iterable[Item], total: int, label: str) -> Iterator[Item]:

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from imgcal.cli.common import check_folder, counted
+from imgcal.cli.common import check_folder, counted, open_rig
 from imgcal.errors import InputError
-from imgcal.io import load_object, load_rig, nearest, publishing, write_text
+from imgcal.io import load_object, nearest, publishing, write_text
 
 if TYPE_CHECKING:
     from imgcal.evaluation import Contender, Scene
@@ -64,7 +64,7 @@ def compare_captures(
         check_folder(out)
     names = chosen.difficulty or tuple(DIFFICULTIES)
     models = {name: FrameModel(difficulty=DIFFICULTIES[name]) for name in names}
-    scene = Scene(load_rig(rig), load_object(obj), models, chosen.snapshots)
+    scene = Scene(open_rig(rig), load_object(obj), models, chosen.snapshots)
     with counted("calibrating captures", len(models) * chosen.captures) as advance:
         outcomes = compare_detectors(
             [contender(path) for path in detectors], scene, chosen.captures, seed, chosen.processes, advance

@@ -13,7 +13,7 @@ from torch import Tensor
 
 import imgcal
 from imgcal.association import matched_to_rig
-from imgcal.estimation import Gauge
+from imgcal.cli.findings import Findings
 from imgcal.geometry import RigidTransform
 from imgcal.io import Frame
 from imgcal.pipeline import Calibration, rms_length
@@ -56,17 +56,18 @@ def describe_refusal(
 
 def describe(
     calibration: Calibration,
-    gauge: Gauge,
+    found: Findings,
     rig: CameraRig,
     pictures: Pictures,
     seconds: dict[str, float],
 ) -> ReportContent:
-    """Lay a calibration out blob by blob, compared with the factory rig as a gauge says."""
+    """Lay a calibration out blob by blob, compared with the factory rig as the gauge of its motion says."""
+    gauge = found.motion.gauge
     labelled, detections = calibration.labelled, calibration.labelled.detections
     before, sigma = _by_blob(calibration, calibration.before.residual)
     after, _ = _by_blob(calibration, calibration.residual)
     used = np.isfinite(after).all(1)
-    found = np.bincount(detections.snapshot, minlength=len(labelled.snapshots))
+    blobs = np.bincount(detections.snapshot, minlength=len(labelled.snapshots))
     taken = np.bincount(detections.snapshot[used], minlength=len(labelled.snapshots))
     seen = calibration.observations.seen
     return ReportContent(
@@ -79,17 +80,20 @@ def describe(
         labels=detections.fiducial,
         snapshots=tuple(
             SnapshotSummary(s.name, int(f), int(t), s.reason if s.status == "refused" else "")
-            for s, f, t in zip(labelled.snapshots, found, taken, strict=True)
+            for s, f, t in zip(labelled.snapshots, blobs, taken, strict=True)
         ),
         recalibrated=calibration.rig,
         predicted_before=before + detections.uv,
         predicted_after=after + detections.uv,
         sigma=sigma,
-        std=gauge.std(calibration.estimate).numpy(),
+        std=found.motion.std.numpy(),
         prior_std=gauge.prior_std(rig.to(torch.float64), (rig.prior or RigPrior()).std(rig)).numpy(),
         gauge=gauge,
         predicted=calibration.predicted_error,
         moves=tuple(map(str, calibration.moved)),
+        late=tuple(map(str, calibration.late)),
+        unknown=found.knowledge.sentences,
+        advice=found.knowledge.advice,
         unexplained=calibration.tally.unexplained.sum(0),
         object_points=calibration.points_object.double().numpy(),
         rig_from_object=_poses(calibration),
@@ -106,6 +110,8 @@ def describe(
 def _about_object(calibration: Calibration) -> str:
     """Name the fiducials that are not in their places, and those that were not found."""
     words = []
+    if calibration.from_scratch:
+        words.append("There was no factory calibration: what is called so is a first rig made from the same data.")
     if calibration.displaced:
         parts = [f"fiducial {d.fiducial} is {d.distance:.3g} ± {d.sigma:.1g} mm off" for d in calibration.displaced]
         words.append(

@@ -9,9 +9,9 @@ from typing import Annotated
 
 import tyro
 
-from imgcal.cli.common import read_detections
+from imgcal.cli.common import open_rig, read_detections
 from imgcal.detection import DetectionOptions
-from imgcal.io import load_rig, open_capture, save_detections
+from imgcal.io import open_capture, save_detections
 from imgcal.pipeline import LearnedMeasurer
 
 
@@ -27,12 +27,13 @@ class Detect:
     out: Path  #: CSV or CSV.gz to write
     rig: str | None = None  #: rig file or name, to check camera names and image sizes against
     snapshots: str | None = None  #: A:B, numbers in file order from 0, B excluded
+    videos_differ: bool = False  #: accept videos whose lengths or time stamps differ: frames go together by number
     measurer: str | None = None  #: network that measures blobs again: a file, the folder of a run, or a shipped name
     detection: Annotated[DetectionOptions, tyro.conf.arg(name="")] = field(default_factory=DetectionOptions)
 
     def run(self) -> None:
         """Detect and write."""
-        capture = open_capture(self.capture, None if self.rig is None else load_rig(self.rig))
+        capture = open_capture(self.capture, None if self.rig is None else open_rig(self.rig), self.videos_differ)
         measurer = None if self.measurer is None else LearnedMeasurer.load(self.measurer)
         detections, _ = read_detections(capture, self.snapshots, self.detection, measurer)
         save_detections(detections, self.out)

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from rich.console import Console
 
-from imgcal.cli.common import check_folder, counted
+from imgcal.cli.common import check_folder, counted, open_rig
 from imgcal.cli.compare_captures import Captures, compare_captures
 from imgcal.errors import InputError
 from imgcal.extras import advice, missing
-from imgcal.io import load_object, load_rig, publishing
+from imgcal.io import load_object, publishing
 
 if TYPE_CHECKING:
     from imgcal.evaluation import Conditions, Facts, Method, Model, Protocol, Summary
@@ -104,6 +104,14 @@ class Compare:
             rig, obj = self.setting.rig or "O10", self.setting.object or "asymmetric8"
             compare_captures(self.models, self.captured, rig, obj, self.setting.seed, self.out)
             return
+        from imgcal.pipeline import DETECTORS
+
+        named = [path for path in self.models if str(path) in DETECTORS and not path.exists()]
+        if named:
+            raise InputError(
+                f"compare: found {named[0]}, which is a detector, expected networks; detectors are compared on "
+                "captured frames: --captures 20 simulates 20 at every difficulty"
+            )
         if len(self.models) < 2:
             raise InputError(f"compare: found {len(self.models)} models, expected two or more")
         _run(self.models, self.setting, self.baselines, self.out)
@@ -138,7 +146,7 @@ def _load(paths: tuple[Path, ...], setting: Setting) -> list[Model]:
 
     from imgcal.evaluation import load_models
 
-    rig = None if setting.rig is None else load_rig(setting.rig)
+    rig = None if setting.rig is None else open_rig(setting.rig)
     obj = None if setting.object is None else load_object(setting.object)
     device = "cuda" if setting.device == "auto" and torch.cuda.is_available() else "cpu"
     return load_models(paths, rig, obj, device)
@@ -154,7 +162,7 @@ def _conditions(models: list[Model], setting: Setting) -> Conditions:
     elif setting.rig is None or setting.object is None:
         raise InputError("evaluate: found no model, expected --rig and --object")
     else:
-        known = Conditions(load_rig(setting.rig), load_object(setting.object))
+        known = Conditions(open_rig(setting.rig), load_object(setting.object))
     poses: PoseRange = known.pose_range
     if setting.phi is not None:
         low, high = setting.phi

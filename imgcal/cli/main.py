@@ -15,6 +15,7 @@ from typing import Annotated, Any, Protocol, Union
 
 import tyro
 
+import imgcal
 from imgcal.cli.compiling import tells_of_compiling
 from imgcal.cli.interruption import ends_at_once
 from imgcal.errors import InputError, RefusedError
@@ -23,7 +24,7 @@ from imgcal.messages import one_line, quoted
 
 DONE, UNUSABLE, REFUSED, INTERRUPTED = 0, 2, 3, 130
 
-DEBUG = "--debug"
+DEBUG, VERSION = "--debug", "--version"
 
 COMMANDS = {
     "simulate": (
@@ -31,10 +32,18 @@ COMMANDS = {
         "Make a capture: one rig that has drifted from its factory calibration, seen through realistic infrared "
         "frames.",
     ),
+    "rig": (
+        "imgcal.cli.rig",
+        "Make rig files: cameras that look at a point, for simulations, or cameras yet to be calibrated.",
+    ),
     "detect": ("imgcal.cli.detect", "Find blobs in captured frames and measure their centres."),
     "calibrate": (
         "imgcal.cli.calibrate",
         "Recalibrate a rig from captured frames (or a table of blobs) of a known object.",
+    ),
+    "watch": (
+        "imgcal.cli.watch",
+        "Keep a running rig calibrated: every snapshot is learnt from, and what moves is told.",
     ),
     "score": (
         "imgcal.cli.score",
@@ -44,6 +53,10 @@ COMMANDS = {
     "render": (
         "imgcal.cli.render",
         "Redraw captured frames as colour-coded images: every fiducial a soft dot in its own colour, nothing else.",
+    ),
+    "convert": (
+        "imgcal.cli.convert",
+        "Convert the calibration of a rig: another tool's to ours, ours to another tool's, or one tool's to another's.",
     ),
     "describe": ("imgcal.cli.experiment_keys", "List every key of an experiment file: type, default and meaning."),
     "train": ("imgcal.cli.train", "Train a network as an experiment file says."),
@@ -55,15 +68,25 @@ COMMANDS = {
         "imgcal.cli.evaluate",
         "Compare networks side by side on the same random rigs: accuracy alone and refined, time, parameters, size.",
     ),
+    "fleet": (
+        "imgcal.cli.fleet",
+        "Recalibrate every capture of a table, on all cores of this machine or on a cluster, and learn from all of "
+        "them.",
+    ),
+    "demo": (
+        "imgcal.cli.demo",
+        "See it at work: a simulated rig that is kept calibrated, on a page with buttons that bump and cover its "
+        "cameras.",
+    ),
     "warmup": ("imgcal.cli.warmup", "Compile ahead of time what the first calibration would wait for"),
 }
 """Module and summary of each command; the class has the command's name. Imported only when it is asked for."""
 
 DESCRIPTION = """Recalibrate infrared multi-camera rigs from images of a known calibration object.
 
-imgcal COMMAND --help tells more. Exit codes: 0 done, 2 unusable input (or a fault of imgcal's own, which says so),
-3 refused (the data cannot decide), 130 interrupted. With --debug anywhere on the command line, a failure also shows
-its traceback."""
+imgcal COMMAND --help tells more, imgcal --version which one this is. Exit codes: 0 done, 2 unusable input (or a fault
+of imgcal's own, which says so), 3 refused (the data cannot decide), 130 interrupted. With --debug anywhere on the
+command line, a failure also shows its traceback."""
 
 
 class Runnable(Protocol):
@@ -117,6 +140,9 @@ def parse(arguments: list[str]) -> Runnable:
 
 def _understood(arguments: list[str]) -> Runnable:
     first = arguments[0] if arguments else ""
+    if first == VERSION:
+        print(f"imgcal {imgcal.__version__}")
+        raise SystemExit(DONE)
     if first in COMMANDS:
         with ends_at_once():  # imports take a while
             command = _load(first)
@@ -138,7 +164,7 @@ def _summary(name: str) -> Any:
 def _undrawn(box: str) -> str:
     """Take the words from the box that tyro draws about a command line."""
     rows = (line.strip("│╭╮╰╯─| ") for line in box.splitlines()[1:])
-    text = " ".join(row for row in rows if row)
+    text = " ".join(row for row in rows if row.strip("-+"))
     problem, _, hint = text.partition("For full helptext, ")
     problem = problem.partition("Argument helptext:")[0].replace("__tyro-dummy-inner__.", "")
     command = re.search(r"imgcal[a-z ]* --help", hint)

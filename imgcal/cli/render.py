@@ -13,10 +13,10 @@ import torch
 import tyro
 
 from imgcal.association import associate, matched_to_rig, to_observations
-from imgcal.cli.common import check_folder, progress, read_detections
+from imgcal.cli.common import check_folder, open_rig, progress, read_detections
 from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError
-from imgcal.io import load_object, load_rig, open_input, publishing, write_image
+from imgcal.io import load_object, open_input, publishing, write_image
 from imgcal.synthesis import GREY_LEVELS, ImageOptions, render_views
 
 
@@ -35,16 +35,18 @@ class Render:
     size: int = 224  #: width and height of the images, pixels
     dot: float = 1.5  #: standard deviation of a dot, pixels of the output
     snapshots: str | None = None  #: A:B, numbers in file order from 0, B excluded
+    videos_differ: bool = False  #: accept videos whose lengths or time stamps differ: frames go together by number
     detection: Annotated[DetectionOptions, tyro.conf.arg(name="")] = field(default_factory=DetectionOptions)
 
     def run(self) -> None:
         """Render and write."""
         options = ImageOptions(self.size, self.dot)
         check_folder(self.out)
-        rig, obj = load_rig(self.rig), load_object(self.object)
+        rig, obj = open_rig(self.rig), load_object(self.object)
         if any((self.out / camera).exists() for camera in rig.camera_names):
             raise InputError(f"{self.out}: found images of these cameras there already, expected a new folder")
-        detections, _ = read_detections(open_input(self.input, rig, obj.num_fiducials), self.snapshots, self.detection)
+        source = open_input(self.input, rig, obj.num_fiducials, self.videos_differ)
+        detections, _ = read_detections(source, self.snapshots, self.detection)
 
         def bar(snapshots: Iterable[int], total: int) -> Iterable[int]:
             return progress(snapshots, total, "identifying")

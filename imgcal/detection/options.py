@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.errors import InputError
+from imgcal.io import grey_frame
 
 Polarity = Literal["bright", "dark"]
 Frame = NDArray[np.uint8] | NDArray[np.uint16]  # (H, W) grey values
@@ -62,13 +63,12 @@ class DetectionOptions:
 
 
 def checked_frame(frame: object, camera: str) -> Frame:
-    """Return `frame` if it is a grey (H, W) image of 8 or 16 bit, and explain otherwise."""
+    """Return `frame` as a grey (H, W) image of 8 or 16 bit if it is one, also in equal channels; explain otherwise."""
     if not isinstance(frame, np.ndarray):
         raise InputError(f"camera {camera}: found a {type(frame).__name__}, expected a NumPy array (H, W)")
-    if frame.ndim != 2:
-        raise InputError(f"camera {camera}: found a frame of shape {frame.shape}, expected grey (H, W)")
     if frame.dtype not in (np.uint8, np.uint16):
         raise InputError(f"camera {camera}: found {frame.dtype} grey values, expected uint8 or uint16")
+    frame = grey_frame(frame, f"camera {camera}")
     if min(frame.shape) < 16:
         raise InputError(
             f"camera {camera}: found a frame of {frame.shape[1]} x {frame.shape[0]}, expected at least 16 x 16"

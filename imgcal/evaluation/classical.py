@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from torch import Tensor
 
+from imgcal.errors import InputError
 from imgcal.estimation import Problem, State, initial_pose, initial_state, make_problem, pose_at, retract, rig_at
-from imgcal.types import PARAMETERS, CalibrationObject, CameraRig, Observations, Prediction, pack21, unpack21
+from imgcal.types import CalibrationObject, CameraRig, Observations, Prediction, pack21, unpack21
 
 Array = NDArray[np.float64]
 Intrinsics = tuple[Array, Array]  # camera matrix (3, 3), distortion (5,)
@@ -136,6 +137,9 @@ def _array(values: Any) -> Array:
 
 
 def _intrinsics(rig: CameraRig, camera: int) -> Intrinsics:
+    if rig.lens_models[camera] != "brown_conrady":
+        found = f"camera {rig.camera_names[camera]} with the lens model {rig.lens_models[camera]}"
+        raise InputError(f"OpenCV's methods: found {found}, expected brown_conrady lenses")
     fx, fy = rig.focal_length[camera].tolist()
     cx, cy = rig.principal_point[camera].tolist()
     matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
@@ -171,11 +175,11 @@ def bundle_adjustment(
 def _least_squares(problem: Problem, start: State) -> State:
     """Minimize the cost of one rig with one snapshot."""
     cameras = problem.uv.shape[2]
-    split = PARAMETERS * cameras
+    split = problem.prior_std[0].numel()
 
     def at(x: Tensor) -> State:
         """States (R,) at steps (R, 15 C + 6)."""
-        return retract(problem, start, x[:, :split].unflatten(1, (cameras, PARAMETERS)), x[:, None, split:])
+        return retract(problem, start, x[:, :split].unflatten(1, (cameras, -1)), x[:, None, split:])
 
     def residuals(x: Tensor) -> Tensor:
         state = at(x)

@@ -19,7 +19,7 @@ from imgcal.estimation import (
     relative_difference,
     squared,
 )
-from imgcal.types import PARAMETERS, CalibrationObject, CameraRig, Prediction
+from imgcal.types import CalibrationObject, CameraRig, Prediction
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Errors:
     focal_length: Tensor  # pixels
     focal_length_percent: Tensor  # of the true focal length
     principal_point: Tensor  # pixels
-    distortion: Tensor  # all five coefficients alike
+    distortion: Tensor  # all coefficients alike
     rotation_deg: Tensor  # angle
     position: Tensor  # mm, distance
 
@@ -147,7 +147,7 @@ def _summed_up(squares: Tensor, re: Tensor, held_out: Tensor, focal_length: Tens
         focal_length=focal.mean((-1, -2)).sqrt(),
         focal_length_percent=100 * (focal / focal_length.square()).mean((-1, -2)).sqrt(),
         principal_point=squares[..., 8:10].mean((-1, -2)).sqrt(),
-        distortion=squares[..., 10:15].mean((-1, -2)).sqrt(),
+        distortion=squares[..., 10:].mean((-1, -2)).sqrt(),
         rotation_deg=others[..., 0:3].sum(-1).mean(-1).sqrt() * (180 / math.pi),
         position=others[..., 3:6].sum(-1).mean(-1).sqrt(),
     )
@@ -169,9 +169,9 @@ def _re_bound(estimate: Estimate, problem: Problem) -> Tensor:
 def _dense(equations: NormalEquations) -> Tensor:
     """Normal matrix of one snapshot a rig: (B, 15 C + 6, 15 C + 6)."""
     batch, cameras = equations.camera.shape[:2]
-    size = cameras * PARAMETERS
+    size = cameras * equations.camera.shape[-1]
     matrix = equations.camera.new_zeros(batch, size + POSE_PARAMETERS, size + POSE_PARAMETERS)
-    blocks = matrix[:, :size, :size].unflatten(1, (cameras, PARAMETERS)).unflatten(-1, (cameras, PARAMETERS))
+    blocks = matrix[:, :size, :size].unflatten(1, (cameras, -1)).unflatten(-1, (cameras, -1))
     blocks.diagonal(dim1=1, dim2=3).copy_(equations.camera.permute(0, 2, 3, 1))
     coupling = equations.coupling[:, 0].reshape(batch, size, POSE_PARAMETERS)
     matrix[:, :size, size:] = coupling

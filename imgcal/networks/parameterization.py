@@ -15,6 +15,9 @@ POSE_SHIFT = 10.0  # mm that one unit of a head moves the object
 POSE_TURN = 0.05  # rad that one unit of a head turns it, after the first pass
 
 
+LENS = "brown_conrady"
+
+
 @dataclass(frozen=True)
 class RigState:
     """A rig near the factory's and the object's pose, as networks move them."""
@@ -50,6 +53,12 @@ class Parameterization(nn.Module):
         super().__init__()
         if factory.working_distance is None:
             raise InputError(f"rig {factory.name}: found no working_distance, expected one (mm) to start from")
+        for camera, lens in zip(factory.camera_names, factory.lens_models, strict=True):
+            if lens != LENS:
+                raise InputError(
+                    f"rig {factory.name}: camera {camera}: found the lens model {lens}, expected {LENS}: networks know "
+                    "no other"
+                )
         self._factory, self._obj = factory, obj  # for what they hold beside tensors
         self.working_distance = factory.working_distance
         points = obj.points.to(factory.focal_length)

@@ -28,6 +28,9 @@ def check_rig(path: str | Path, trained: CameraRig, rig: CameraRig) -> None:
 
     if rig.camera_names != trained.camera_names:
         refuse("cameras", ", ".join(rig.camera_names), ", ".join(trained.camera_names))
+    for camera, lens, known in zip(rig.camera_names, rig.lens_models, trained.lens_models, strict=True):
+        if lens != known:
+            refuse(f"lens model of {camera}", lens, known)
     values: dict[str, Callable[[CameraRig], Tensor]] = {
         "image size": lambda r: r.image_size,
         "focal length": lambda r: r.focal_length,

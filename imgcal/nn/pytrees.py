@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.utils import _pytree as pytree  # where PyTorch keeps it; it has no other name for it
 
 from imgcal.geometry import Projection, RigidTransform
-from imgcal.types import CalibrationObject, CameraRig, DriftRate, Observations, Prediction, RigPrior, Views
+from imgcal.types import CalibrationObject, CameraRig, DriftRate, Observations, Prediction, RigPrior, Views, Volume
 
 Value = TypeVar("Value")
 
@@ -86,6 +86,7 @@ _LOAD: dict[str, Callable[[Any], Any]] = {
     "Constant": lambda value: Constant(torch.tensor(value["values"], device=value["device"])),
     "RigPrior": lambda value: RigPrior(**value),
     "DriftRate": lambda value: DriftRate(**value),
+    "Volume": lambda value: Volume(tuple(map(tuple, value["points"]))),
     "tuple": tuple,
 }
 
@@ -94,7 +95,7 @@ def _dumped(value: Any) -> Any:
     """Write a constant as JSON can hold it."""
     if isinstance(value, Constant):
         return ["Constant", {"values": value.tensor.tolist(), "device": str(value.tensor.device)}]
-    if isinstance(value, RigPrior | DriftRate):
+    if isinstance(value, RigPrior | DriftRate | Volume):
         return [type(value).__name__, asdict(value)]
     return ["tuple", list(value)] if isinstance(value, tuple) else ["", value]
 
@@ -108,7 +109,21 @@ for _type in (RigidTransform, Projection, Observations, Prediction, Views):
     register(_type)
 # Exported programs hold the inputs that they were traced with, and are read without pickles of unknown types.
 torch.serialization.add_safe_globals(
-    [RigidTransform, Projection, Observations, Prediction, Views, CameraRig, CalibrationObject, RigPrior, DriftRate]
+    [
+        RigidTransform,
+        Projection,
+        Observations,
+        Prediction,
+        Views,
+        CameraRig,
+        CalibrationObject,
+        RigPrior,
+        DriftRate,
+        Volume,
+    ]
 )
-register(CameraRig, ("image_size", "camera_names", "name", "working_distance", "prior", "drift_rate"))
+register(
+    CameraRig,
+    ("image_size", "camera_names", "name", "working_distance", "prior", "drift_rate", "volume", "lens_model"),
+)
 register(CalibrationObject, ("name", "fiducial_names", "scale_tolerance"))

@@ -83,7 +83,7 @@ def project_fiducials(cameras: CameraRig, obj: CalibrationObject) -> Tensor:
     points = torch.cat((points[..., :2], points[..., 2:].clamp_min(LEAST_DEPTH)), dim=-1)
     radius = None if obj.radius is None else obj.radius.to(points)
     lens = (cameras.focal_length, cameras.principal_point, cameras.distortion)
-    return project_kornia(points, *lens, cameras.image_size, radius).uv
+    return project_kornia(points, *lens, cameras.image_size, radius, cameras.lens_model).uv
 
 
 def reprojection_re(difference: Tensor, seen: Tensor | None = None) -> Tensor:

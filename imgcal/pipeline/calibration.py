@@ -47,17 +47,20 @@ from imgcal.pipeline.checks import (
     require_views,
 )
 from imgcal.pipeline.initialization import Initialization, Initializer, residual_of
+from imgcal.pipeline.lateness import LateCamera, late_camera, suspects
 from imgcal.pipeline.measuring import LearnedMeasurer
 from imgcal.pipeline.object_checks import displaced, lost_fiducials, object_offsets
-from imgcal.pipeline.sources import Detector, Frames, blobs_of, sight_of
+from imgcal.pipeline.sources import Detector, Frames, blobs_of, checked_frames, sight_of
 from imgcal.pipeline.steadiness import steady_part
 from imgcal.pipeline.tally import Tally, tally
+from imgcal.pipeline.units import unit_doubt
 from imgcal.types import (
     BlobFlag,
     CalibrationObject,
     CameraRig,
     Detections,
     MovedCamera,
+    MovedError,
     Observations,
     Prediction,
     RigPrior,
@@ -99,6 +102,17 @@ class Calibration:
     guess_used: bool = False  # its guess was nearer to the images than the factory calibration
     seconds: Mapping[str, float] = field(default_factory=dict)  # by stage
     moved: tuple[MovedCamera, ...] = ()  # during the capture; snapshots used are those since then
+    from_scratch: bool = False  # there was no factory calibration: `factory` is a first rig made from the same data
+    late: tuple[LateCamera, ...] = ()  # whose frames, from some snapshot on, are of other moments: these took no part
+
+    def __repr__(self) -> str:
+        """Say what was found: the rig, its error before and after, how the fiducials were identified."""
+        before, after = (2**0.5 * float(rms) for rms in (self.before.rms, self.rms))
+        used = f"{len(self.labelled.used)} of {len(self.labelled.snapshots)} snapshots"
+        return (
+            f"{type(self).__name__}({self.rig!r}, RMS {before:.4g} -> {after:.2g} px, chi2/dof "
+            f"{float(self.chi2_per_dof):.2f}, identity {self.identity}, {used})"
+        )
 
     @property
     def rig(self) -> CameraRig:
@@ -232,22 +246,92 @@ def calibrate(
         ('coded', True)
     """
     started, rig = time.perf_counter(), rig.to(torch.float64)
+    source = source if isinstance(source, Detections) else checked_frames(source, rig)
     detections = blobs_of(source, rig, obj, detection, measurer)
     found = time.perf_counter()
     sight = sight_of(detector, source, detection)
-    labelled = associate(detections, rig, obj, options, progress, sight)
-    identified = time.perf_counter()
-    arranged = arrange(labelled, rig, obj)
-    _require_any_view(arranged, rig, obj)
-    steady = steady_part(arranged, detections if sight is None else _as_given(labelled), rig, obj, options)
-    fit = _fitted(steady.arranged, rig, obj, options, _Known(initializer, fits=steady.fits))
-    require_views(fit.tally, rig)
+    labelled: Associations | None = None
+    try:
+        labelled = associate(detections, rig, obj, options, progress, sight)
+        identified = time.perf_counter()
+        given = detections if sight is None else _as_given(labelled)
+        fit = fit_steady(labelled, given, rig, obj, options, initializer)
+    except RefusedError as error:
+        if doubt := unit_doubt(rig, obj):
+            raise RefusedError(f"{doubt}; so {error.reason}") from error
+        if labelled is not None:
+            arranged = arrange(labelled, rig, obj)
+            labels = arranged.observations.seen.numpy()
+            counts = tally(arranged.labelled, labels, arranged.poses, rig, obj)
+            names = detections.snapshot_names
+            moves = error.moved if isinstance(error, MovedError) else ()
+            moved = tuple((move.camera, names.index(move.snapshot)) for move in moves)
+            for slipped in _late(detections, counts, rig, obj, options, moved):
+                raise RefusedError(
+                    str(slipped),
+                    python="give the frames of each moment, or leave the camera out (rig.select)",
+                    command=f"export its frames anew, or leave it out: --without {slipped.camera}",
+                ) from error
+        raise
     seconds = {
         "detection": found - started,
         "identity": identified - found,
         "estimation": time.perf_counter() - identified,
     }
-    return replace(fit, seconds=seconds, moved=steady.moved)
+    late = _late(detections, fit.tally, rig, obj, options)
+    return replace(fit, seconds=seconds, late=late)
+
+
+def _late(
+    detections: Detections,
+    counts: Tally,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    options: PipelineOptions,
+    moved: tuple[tuple[str, int], ...] = (),
+) -> tuple[LateCamera, ...]:
+    """Cameras that do not agree with the others because their frames are of other moments."""
+
+    def others(blobs: Detections) -> tuple[list[int], RigidTransform]:
+        labelled = associate(blobs, rig, obj, options)
+        fit = _fitted(arrange(labelled, rig, obj), rig, obj, replace(options, blind_cameras=True), _Known())
+        return fit.labelled.used, fit.rig_from_object
+
+    asked = suspects(counts, rig.camera_names, moved)
+    found = (late_camera(detections, rig, obj, camera, around, others) for camera, around in asked.items())
+    return tuple(late for late in found if late is not None)
+
+
+def fit_steady(
+    labelled: Associations,
+    given: Detections,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    options: PipelineOptions,
+    initializer: Initializer | None = None,
+    prior_std: Tensor | None = None,
+) -> Calibration:
+    """Do what `calibrate` does once blobs have labels: steady snapshots, the fit, all checks.
+
+    Args:
+        labelled: all snapshots.
+        given: the same as they came in, with the labels of the input alone.
+        rig: what is known before, float64.
+        obj: the calibration object.
+        options: how sure the result must be.
+        initializer: network whose first guess the estimate starts from.
+        prior_std: (C, 15) how far values may be off, once cameras are known to be steady; None = as the rig says.
+
+    Raises:
+        RefusedError: the data cannot decide.
+    """
+    arranged = arrange(labelled, rig, obj)
+    _require_any_view(arranged, rig, obj)
+    steady = steady_part(arranged, given, rig, obj, options)
+    fits = steady.fits if prior_std is None else ()  # those have the rig's prior
+    fit = _fitted(steady.arranged, rig, obj, options, _Known(initializer, prior_std=prior_std, fits=fits))
+    require_views(fit.tally, rig)
+    return replace(fit, moved=steady.moved)
 
 
 def _as_given(labelled: Associations) -> Detections:

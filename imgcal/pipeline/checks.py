@@ -13,7 +13,7 @@ from imgcal.association import PipelineOptions
 from imgcal.errors import RefusedError
 from imgcal.estimation import Estimate
 from imgcal.pipeline.tally import Tally
-from imgcal.types import PARAMETER_NAMES, CalibrationObject, CameraRig, Observations
+from imgcal.types import CalibrationObject, CameraRig, Observations
 
 LEAST_EXPLAINED = 0.5
 """Of what a camera sees of the object, the share that must be where the rest of the rig expects it."""
@@ -107,7 +107,7 @@ def require_near_prior(
     camera, parameter = divmod(int(drift.argmax()), drift.shape[1])
     kind = max(prior_scale, key=lambda name: prior_scale[name], default="")
     if drift[camera, parameter] > options.largest_drift:
-        name = PARAMETER_NAMES[parameter]
+        name = rig.parameter_names[parameter]
         found = (
             f"camera {rig.camera_names[camera]}: {name.replace('_', ' ')} would differ from its factory value by "
             f"{_with_unit(change[camera, parameter], name)}, with a tolerance (prior) of "

@@ -105,10 +105,10 @@ class LearnedProposer:
         near = self._around(snapshot) if snapshot.candidates else None
         if self.finder is None or (near is not None and self._convinces(near, snapshot)):
             return near or Proposal.declined(snapshot, "found no pose to look around")
-        elsewhere = self.finder.propose(snapshot).rig_from_object
-        if elsewhere is None:
-            return near or Proposal.declined(snapshot, "found no pose to look around")
-        there = self._around(replace(snapshot, candidates=(elsewhere,)))
+        found = self.finder.propose(snapshot)
+        if found.rig_from_object is None:
+            return near or Proposal.declined(snapshot, found.reason)
+        there = self._around(replace(snapshot, candidates=(found.rig_from_object,)))
         return there if near is None or len(there.detections) > len(near.detections) else near
 
     def _convinces(self, proposal: Proposal, snapshot: Snapshot) -> bool:

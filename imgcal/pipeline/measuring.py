@@ -11,7 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from imgcal.detection import Blobs, DetectionOptions, Frame
-from imgcal.io import model_file
+from imgcal.errors import InputError
+from imgcal.io import model_file, nearest, shipped_names
 from imgcal.networks import Measurer, cut_patches, load_measurer, normalized
 from imgcal.types import UNUSABLE, BlobFlag, BlobKind, Detections
 
@@ -54,7 +55,14 @@ class LearnedMeasurer:
         Raises:
             InputError: no such file, or something else in it.
         """
-        return cls(load_measurer(model_file(path)).network, path)
+        file = model_file(path)
+        if not file.is_file():
+            known = [name for name in shipped_names("models", ".safetensors") if name.startswith("measurer")]
+            raise InputError(
+                f"measurer: found {path!r:.80}{nearest(path, known)}, expected {', '.join(known)} (shipped), or a "
+                "network that measures blobs: a file, or the folder of a run of `imgcal train measurer-cnn`"
+            )
+        return cls(load_measurer(file).network, path)
 
     def __call__(self, frames: Mapping[str, Frame | None], blobs: Columns, options: DetectionOptions) -> Columns:
         """Measure the blobs of one snapshot again.

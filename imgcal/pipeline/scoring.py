@@ -14,6 +14,12 @@ from imgcal.estimation import estimate
 from imgcal.pipeline.sources import Frames, blobs_of
 from imgcal.types import CalibrationObject, CameraRig, Detections
 
+OUTLYING = 10.0
+"""Times the median distance: of noise alone, one in 10^30 is so far off."""
+ROUNDS = 5
+LEAST_POINTS = 6
+"""Of a snapshot, for its pose."""
+
 
 def rms_length(residual: Tensor, seen: Tensor) -> float | None:
     """RMS length (px) of the seen residuals, as OpenCV's calibrateCamera defines it; None where nothing was seen.
@@ -37,6 +43,27 @@ class RigScore:
     def distances(self) -> Tensor:
         """Length of each residual: (M,) pixels."""
         return self.residual.norm(dim=-1)[self.seen]
+
+    @property
+    def outliers(self) -> Tensor:
+        """Mark the seen fiducials that are `OUTLYING` times as far off as most of their camera's: (S, C, N) bool.
+
+        Half-hidden and merged markers are, whatever the rig; a median does not see them, an RMS hardly anything else.
+        A camera that is off as a whole has no outliers: it is in the RMS.
+        """
+        distance = torch.where(self.seen, self.residual.norm(dim=-1), torch.nan)
+        own = distance.movedim(1, 0).flatten(1).nanmedian(dim=1).values.nan_to_num(0.0)
+        limit = OUTLYING * own.clamp_min(float(self.distances.median()))
+        return distance > limit[:, None]
+
+    def __repr__(self) -> str:
+        """Give the robust figures first."""
+        distances, outliers = self.distances, self.outliers
+        rms, most = rms_length(self.residual, self.seen & ~outliers), float(distances.median())
+        return (
+            f"RigScore(median {most:.3g} px, RMS {rms:.3g} px without {int(outliers.sum())} outliers of "
+            f"{len(distances)} points, {self.labelled!r})"
+        )
 
 
 def score(
@@ -76,10 +103,23 @@ def score(
     rig = rig.to(torch.float64)
     labelled = associate(blobs_of(source, rig, obj, detection), rig, obj, options, progress)
     observations, poses = observations_of(labelled, rig, obj)
-    fixed = torch.zeros(*rig.distortion.shape[:-1], 15, dtype=rig.distortion.dtype)
+    fixed = torch.zeros(*rig.distortion.shape[:-1], rig.num_parameters, dtype=rig.distortion.dtype)
     # What is reported is an RMS in pixels: centres count alike, however well each was measured.
     even = replace(observations, sigma=torch.full_like(observations.sigma, options.identity_error))
-    fit = estimate(even, rig, obj.taken_as_exact(), poses, prior_std=fixed, options=options.estimation)
-    if not bool(fit.converged):
-        raise RefusedError(f"score: no pose of the object fits (RMS {2**0.5 * float(fit.rms):.3g} px)")
-    return RigScore(labelled, fit.residual, observations.seen)
+    for _ in range(ROUNDS):
+        fit = estimate(even, rig, obj.taken_as_exact(), poses, prior_std=fixed, options=options.estimation)
+        if not bool(fit.converged):
+            raise RefusedError(
+                "score: in some snapshot no pose of the object fits what the cameras see (RMS "
+                f"{2**0.5 * float(fit.rms):.3g} px): the rig or the object is not the one in the images"
+            )
+        poses = fit.rig_from_object
+        points = poses.apply(obj.points.to(rig.focal_length))
+        residual = rig.expand(len(points)).project_values(points, obj.radius).uv - observations.uv
+        scored = RigScore(labelled, torch.where(observations.seen[..., None], residual, 0.0), observations.seen)
+        # The poses, too, are those of most fiducials: what is far off must not pull them.
+        kept = observations.seen & ~scored.outliers
+        if bool((kept == even.seen).all()) or bool((kept.flatten(1).sum(1) < LEAST_POINTS).any()):
+            break
+        even = replace(even, seen=kept)
+    return scored

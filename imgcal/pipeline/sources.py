@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
+from typing import Any
 
 import numpy as np
 
 from imgcal.association import Proposer, Sight, matched_to_rig
 from imgcal.detection import DetectionOptions, Frame, detect
 from imgcal.errors import InputError
-from imgcal.io import MARGIN, model_file, nearest
+from imgcal.io import MARGIN, grey_frame, model_file, nearest
 from imgcal.matching import MatchedFilter
 from imgcal.pipeline.learned import load_proposer
 from imgcal.pipeline.measuring import LearnedMeasurer
@@ -93,24 +94,40 @@ def _in_memory(source: Frames) -> Callable[[int], Mapping[str, Frame | None]]:
     return lambda number: {name: frames[number] if number < len(frames) else None for name, frames in series.items()}
 
 
-def checked_frames(frames: object, rig: CameraRig) -> Frames:
-    """Return frames by camera if all of them are of the rig's cameras and sizes, and explain otherwise."""
+def checked_frames(frames: object, rig: CameraRig) -> dict[str, Any]:
+    """Return frames by camera, in grey, if all of them are of the rig's cameras and sizes, and explain otherwise.
+
+    Frames of three equal channels, as OpenCV reads grey videos, are grey: the same that files may be.
+    """
     if not isinstance(frames, Mapping):
         raise InputError(f"found a {type(frames).__name__}, expected Detections or frames: {{camera name: frame}}")
     sizes = dict(zip(rig.camera_names, rig.image_size.tolist(), strict=True))
+    checked: dict[str, Any] = {}
     for camera, entry in frames.items():
         if camera not in sizes:
             raise InputError(
                 f"frames: found camera {camera!s:.80}, expected cameras of rig {rig.name}: {', '.join(sizes)}"
             )
         width, height = (int(size) for size in sizes[camera])
-        for frame in entry if isinstance(entry, Sequence) and not isinstance(entry, str) else (entry,):
-            if isinstance(frame, np.ndarray) and frame.ndim == 2 and frame.shape != (height, width):
-                raise InputError(
-                    f"camera {camera}: found a frame of {frame.shape[1]}x{frame.shape[0]} pixels, "
-                    f"expected {width}x{height} as in rig {rig.name}"
-                )
-    return frames
+        if isinstance(entry, Sequence) and not isinstance(entry, str):
+            checked[camera] = [_checked_frame(frame, camera, width, height, rig) for frame in entry]
+        else:
+            checked[camera] = _checked_frame(entry, camera, width, height, rig)
+    return checked
+
+
+def _checked_frame(frame: Any, camera: str, width: int, height: int, rig: CameraRig) -> Any:
+    """Look at what is a frame; detection explains what is none."""
+    if not isinstance(frame, np.ndarray):
+        return frame
+    if frame.ndim == 3:
+        frame = grey_frame(frame, f"camera {camera}")
+    if frame.ndim == 2 and frame.shape != (height, width):
+        raise InputError(
+            f"camera {camera}: found a frame of {frame.shape[1]}x{frame.shape[0]} pixels, "
+            f"expected {width}x{height} as in rig {rig.name}"
+        )
+    return frame
 
 
 def checked_detections(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> Detections:

@@ -195,7 +195,7 @@ def robust_pose(views: Views, factory: CameraRig, obj: CalibrationObject, sigma:
     if views.uv is None or views.seen is None:
         raise ValueError("views hold no points")
     uv, rig = views.uv.double(), factory.to(torch.float64)
-    fixed = torch.zeros_like(rig.distortion[..., :1]).expand(rig.num_cameras, 15)
+    fixed = torch.zeros_like(rig.distortion[..., :1]).expand(rig.num_cameras, rig.num_parameters)
     target = Target(uv, views.seen, rig, obj, fixed, sigma)
     pose = initial_pose(observed(uv, views.seen, sigma), rig, obj)[:, 0]
     result = Prediction(rig.expand(len(views)), pose)

@@ -19,8 +19,10 @@ from imgcal.estimation import (
     make_problem,
     pose_at,
     rig_at,
+    with_lenses,
+    without_lenses,
 )
-from imgcal.geometry import RigidTransform
+from imgcal.geometry import ModelNames, RigidTransform
 from imgcal.operators import Operator, Tensors
 from imgcal.refinement.photometric import ShiftPrior
 from imgcal.refinement.render_and_compare import Dots, ImageProblem, ImageRefinementOptions, search
@@ -61,9 +63,9 @@ def refine_images_anywhere(
         points,
         obj.colours,
         radius,
-        options=options,
+        options=with_lenses(factory, options),
     )[:8]
-    return _rig(rig, factory.image_size), RigidTransform(rotation, translation), converged
+    return _rig(rig, factory.image_size, factory.lens_model), RigidTransform(rotation, translation), converged
 
 
 def encoded_image_options(options: ImageRefinementOptions) -> str:
@@ -81,7 +83,8 @@ def _decoded(options: str) -> ImageRefinementOptions:
 
 def _compute(inputs: Tensors, options: str) -> Tensors:
     problem = _problem(inputs, options)
-    guess = Prediction(_rig(inputs[1:6], inputs[13]), RigidTransform(inputs[6], inputs[7]))
+    lenses = problem.factory.lens_model
+    guess = Prediction(_rig(inputs[1:6], inputs[13], lenses), RigidTransform(inputs[6], inputs[7]))
     result, dots = search(problem, guess, inputs[0])
     rig, pose = result.rig.resized(problem.factory.image_size), result.rig_from_object[:, 0]
     seen = (dots.uv, dots.sigma, dots.believed, dots.light, dots.colour)
@@ -95,7 +98,7 @@ def _attach(inputs: Tensors, outputs: Tensors, options: str) -> Tensors:
     uv = known.uv + torch.where(known.believed[..., None], at_rest - at_rest.detach(), 0.0)
     observations = Observations(uv.unsqueeze(1), known.sigma.unsqueeze(1), known.believed.unsqueeze(1))
     given = make_problem(observations, problem.rig, problem.obj, problem.image_spread)
-    found = _rig(outputs[:5], inputs[13]).resized(problem.size)
+    found = _rig(outputs[:5], inputs[13], problem.factory.lens_model).resized(problem.size)
     with torch.no_grad():
         state = initial_state(given, RigidTransform(outputs[5][:, None], outputs[6][:, None]), found)
     loss = make_loss(problem.options.estimation)
@@ -117,9 +120,10 @@ def _like(inputs: Tensors, options: str) -> Tensors:
 
 
 def _problem(inputs: Tensors, options: str) -> ImageProblem:
+    lenses, options = without_lenses(options)
     image_size, prior_std, points, colours, radius = inputs[13:]
     obj = CalibrationObject(points, colours, radius=radius if len(radius) else None)
-    return ImageProblem(_rig(inputs[8:13], image_size), obj, prior_std, _decoded(options))
+    return ImageProblem(_rig(inputs[8:13], image_size, lenses), obj, prior_std, _decoded(options))
 
 
 def _tensors(rig: CameraRig) -> Tensors:
@@ -127,11 +131,11 @@ def _tensors(rig: CameraRig) -> Tensors:
     return rig.focal_length, rig.principal_point, rig.distortion, transform.rotation, transform.translation
 
 
-def _rig(tensors: tuple[Tensor, ...] | list[Tensor], image_size: Tensor) -> CameraRig:
+def _rig(tensors: tuple[Tensor, ...] | list[Tensor], image_size: Tensor, lenses: ModelNames) -> CameraRig:
     focal_length, principal_point, distortion, rotation, translation = tensors
     names = tuple(str(camera) for camera in range(len(image_size)))
     transform = RigidTransform(rotation, translation)
-    return CameraRig(focal_length, principal_point, distortion, transform, image_size, names)
+    return CameraRig(focal_length, principal_point, distortion, transform, image_size, names, lens_model=lenses)
 
 
 _FACTORY = tuple(f"factory_{name}" for name in RIG)

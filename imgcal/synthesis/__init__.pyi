@@ -1,4 +1,15 @@
-from .captures import FrameModel, Shot, Truth, simulate_frames, simulate_shots, simulate_truth, true_detections
+from .arrangements import Lens, Shape, arranged_positions, arranged_rig, look_at
+from .captures import (
+    FrameModel,
+    Frames,
+    Motion,
+    Shot,
+    Truth,
+    simulate_frames,
+    simulate_shots,
+    simulate_truth,
+    true_detections,
+)
 from .colour_coding import GREY_LEVELS, ImageOptions, render_views
 from .corruption import Corrupted, Corruption
 from .crops import CropTruth, Scenes, render_crops, sample_scenes, second_look
@@ -16,6 +27,8 @@ from .rigs import (
     synthesize,
     synthesize_at_once,
 )
+from .simulated_rig import SimulatedRig
+from .volumes import HandHeld, sample_volume, seen_volume, simulate_volume
 
 __all__ = [
     "DIFFICULTIES",
@@ -28,26 +41,38 @@ __all__ = [
     "Difficulty",
     "Drift",
     "FrameModel",
+    "Frames",
+    "HandHeld",
     "ImageOptions",
+    "Lens",
+    "Motion",
     "Patches",
     "PhysicalDrift",
     "PoseRange",
     "RelativeDrift",
     "Scenes",
+    "Shape",
     "Shot",
+    "SimulatedRig",
     "Snapshots",
     "Truth",
+    "arranged_positions",
+    "arranged_rig",
     "expose_patches",
     "host_generator",
+    "look_at",
     "render_crops",
     "render_patches",
     "render_views",
     "sample_scenes",
+    "sample_volume",
     "second_look",
+    "seen_volume",
     "share_of_good_rigs",
     "simulate_frames",
     "simulate_shots",
     "simulate_truth",
+    "simulate_volume",
     "synthesize",
     "synthesize_at_once",
     "true_detections",

@@ -9,7 +9,6 @@ from operator import itemgetter
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from imgcal.geometry import RigidTransform
@@ -17,9 +16,18 @@ from imgcal.synthesis.difficulty import Difficulty, behind_drapes
 from imgcal.synthesis.rigs import Drift, PoseRange, Snapshots, synthesize
 from imgcal.synthesis.spheres import sphere_images
 from imgcal.types import BlobFlag, CalibrationObject, CameraRig, Detections
-from renderers import ClutterModel, SensorModel, Spots, infrared_frames, sample_clutter
+from renderers import ClutterModel, SensorModel, Smear, Spots, infrared_frames, sample_clutter
 
 Frames = dict[str, NDArray[np.uint8] | NDArray[np.uint16]]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How the object moves while a snapshot is taken: where it is a moment before, and a moment after."""
+
+    before: RigidTransform  # (S,) rig_from_object
+    after: RigidTransform  # (S,)
+    seconds: float  # in between
 
 
 @dataclass(frozen=True)
@@ -30,6 +38,7 @@ class Truth:
     rig_from_object: RigidTransform  # (S,)
     uv: Tensor  # (S, C, N, 2) pixels, exact image points
     visible: Tensor | None = None  # (S, C, N) bool, where a camera does not see everything; None = all is seen
+    motion: Motion | None = None  # None = the object rests
 
 
 @dataclass(frozen=True)
@@ -40,6 +49,7 @@ class FrameModel:
     clutter: ClutterModel | None = None
     marker_radius: float = 6.0  # mm, where the object's fiducials have no radius of their own
     difficulty: Difficulty | None = None  # disturbs the frames; its clutter and its light replace those above
+    exposure_ms: float = 0.0  # during which an object that moves is smeared, as fast as it is; see `Truth.motion`
 
 
 def simulate_truth(
@@ -74,37 +84,6 @@ def simulate_truth(
         torch.cat([part.rig_from_object.translation for part in parts]),
     )
     return Truth(true_rig, poses, torch.cat([part.projection.uv for part in parts]))
-
-
-def simulate_volume(
-    rig: CameraRig,
-    obj: CalibrationObject,
-    snapshots: int,
-    generator: torch.Generator,
-    drift: Drift | None,
-    low: tuple[float, float, float] = (-1600.0, -1600.0, 300.0),
-    high: tuple[float, float, float] = (1600.0, 1600.0, 2000.0),
-) -> Truth:
-    """Disturb the rig once, then carry the object through a box: a wand in a room, seen by some cameras at a time.
-
-    Args:
-        rig: the factory rig, without batch axes.
-        obj: the calibration object.
-        snapshots: number of poses, S: positions even in the box, orientations even over all rotations.
-        generator: source of randomness.
-        drift: how the parameters differ from the factory's; None = not at all.
-        low: lower corner of the box for the object's centroid, mm in the rig's frame.
-        high: upper corner of the box.
-    """
-    true_rig = rig if drift is None else drift.apply(rig, generator)
-    points = obj.points.to(rig.focal_length)
-    corners = points.new_tensor((low, high))
-    centres = torch.lerp(corners[0], corners[1], torch.rand(snapshots, 3, generator=generator, dtype=points.dtype))
-    quaternion = torch.randn(snapshots, 4, generator=generator, dtype=points.dtype)
-    rotation = torch.from_numpy(Rotation.from_quat(quaternion.numpy()).as_matrix()).to(points)
-    poses = RigidTransform(rotation, centres - rotation @ points.mean(0))
-    seen = true_rig.expand(snapshots).project(poses.apply(points), obj.radius)
-    return Truth(true_rig, poses, seen.uv, seen.visible)
 
 
 @dataclass(frozen=True)
@@ -145,6 +124,10 @@ def simulate_shots(
             smear = difficulty.smear(rig, truth.rig_from_object[pose], obj.points, obj.radius, generator)
             markers = difficulty.disguise(replace(markers, smear=smear), generator)
             sensor, clutter = difficulty.sensor(sensor, generator), difficulty.clutter
+        if model.exposure_ms > 0 and truth.motion is not None:
+            path = _way(truth, pose, obj) * (1e-3 * model.exposure_ms / truth.motion.seconds)
+            defocus = torch.zeros_like(projection.depth) if markers.smear is None else markers.smear.defocus
+            markers = replace(markers, smear=Smear(path, defocus))
         yield _shot(markers, rig, sensor, clutter, generator)
 
 
@@ -172,6 +155,16 @@ def true_detections(truth: Truth) -> Detections:
         snapshot_names=tuple(f"{s:05d}" for s in range(snapshots)),
     )
     return exact if truth.visible is None else exact.select(truth.visible.reshape(-1).numpy())
+
+
+def _way(truth: Truth, snapshot: int, obj: CalibrationObject) -> Tensor:
+    """How far each marker moves from a moment before a snapshot to a moment after it: (C, N, 2) pixels."""
+    assert truth.motion is not None
+    before, after = (
+        truth.rig.project(where[snapshot].apply(obj.points), obj.radius).uv
+        for where in (truth.motion.before, truth.motion.after)
+    )
+    return after - before
 
 
 def _shot(

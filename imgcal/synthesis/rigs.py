@@ -18,7 +18,7 @@ from imgcal.errors import InputError, RefusedError
 from imgcal.geometry import Projection, RigidTransform, euler_from_rotation, rotate, rotation_from_euler
 from imgcal.io import StrictRecord
 from imgcal.messages import shortened
-from imgcal.types import PARAMETERS, CalibrationObject, CameraRig, RigPrior
+from imgcal.types import CalibrationObject, CameraRig, RigPrior
 
 Angle = Annotated[float, Field(ge=-360, le=360)]
 Kappa = Annotated[float, Field(ge=0, lt=1)]
@@ -100,7 +100,7 @@ class RelativeDrift(StrictRecord):
             rig,
             focal_length=intrinsics[..., 0:2] * rig.focal_length,
             principal_point=intrinsics[..., 2:4] * rig.principal_point,
-            distortion=intrinsics[..., 4:9] * rig.distortion,
+            distortion=intrinsics[..., 4:] * rig.distortion,
             cam_from_rig=RigidTransform(rotation, -rotate(rotation, positions)),
         )
 
@@ -363,5 +363,5 @@ def _parameters_first(
     Elementwise operations keep the memory order of their first operand.
     """
     like = rig.focal_length
-    shape = (PARAMETERS, *batch, *like.shape[:-1])
+    shape = (rig.num_parameters, *batch, *like.shape[:-1])
     return draw(shape, generator=generator, dtype=like.dtype, device=like.device).movedim(0, -1)

@@ -31,9 +31,8 @@ def sphere_images(rig: CameraRig, points_rig: Tensor, radius: Tensor) -> Tensor:
     # In the radial direction the ellipse's squared semi-axis is r^2 (|p|^2 - r^2) / gap^2, across it is r^2 / gap.
     scale = squared / (gap * gap)
     aa, ab, bb = scale * (gap + x * x), scale * x * y, scale * (gap + y * y)
-    k1, k2, p1, p2, k3 = rig.distortion.unsqueeze(-2).unbind(-1)
     cx, cy = x * z / gap, y * z / gap
-    _, _, jxx, jxy, jyy, _ = distort_with_jacobian(cx, cy, k1, k2, p1, p2, k3)
+    _, _, jxx, jxy, jyy, _ = distort_with_jacobian(cx, cy, rig.distortion, rig.lens_model)
     fx, fy = rig.focal_length.unsqueeze(-2).unbind(-1)
     uu = fx * fx * (jxx * jxx * aa + 2 * jxx * jxy * ab + jxy * jxy * bb)
     uv = fx * fy * (jxx * jxy * aa + (jxx * jyy + jxy * jxy) * ab + jxy * jyy * bb)

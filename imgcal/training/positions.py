@@ -15,7 +15,8 @@ from pydantic import ConfigDict, Field
 from torch import Tensor, nn
 
 from imgcal.errors import InputError
-from imgcal.io import load_object, load_rig
+from imgcal.formats import load_rig
+from imgcal.io import load_object
 from imgcal.networks import (
     Checkpoint,
     ImageNetwork,

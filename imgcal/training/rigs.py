@@ -10,7 +10,8 @@ import torch
 from pydantic import ConfigDict, Field
 from torch import Tensor, nn
 
-from imgcal.io import load_object, load_rig, validated
+from imgcal.formats import load_rig
+from imgcal.io import load_object, validated
 from imgcal.networks import Checkpoint, Network, NetworkSpec, build_network, warm_start, without_pretrained
 from imgcal.nn import project_fiducials, reprojection_re
 from imgcal.synthesis import Corruption, share_of_good_rigs

@@ -1,0 +1,58 @@
+"""What a calibration says beside its errors: which cameras have moved, what is not known, and where to go next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from imgcal.estimation import Gauge
+from imgcal.io import RigCovariance
+from imgcal.pipeline import Calibration, Knowledge, Motion, knowledge_of, motion_since_factory
+
+
+@dataclass(frozen=True)
+class Findings:
+    """The same for the printed lines, for result.json and for the report."""
+
+    motion: Motion
+    knowledge: Knowledge
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """The form that scripts read."""
+        motion, known = self.motion, self.knowledge
+        reference = motion.gauge.reference
+        return {
+            "motion": {
+                "relative_to": "most cameras" if reference is None else motion.camera_names[reference],
+                "cameras_moved": [motion.camera_names[c] for c in motion.moved],
+                "per_camera": {
+                    name: {"rotation_deg": float(motion.rotation_deg[c]), "position_mm": float(motion.position_mm[c])}
+                    for c, name in enumerate(motion.camera_names)
+                },
+            },
+            "knowledge": {
+                "coverage": dict(zip(known.camera_names, known.coverage, strict=True)),
+                "undetermined": {name: list(cameras) for name, cameras in known.undetermined.items()},
+                "move_object_to_mm": [list(place.rig_from_centre) for place in known.places],
+            },
+        }
+
+    @property
+    def lines(self) -> list[str]:
+        """What is printed."""
+        lines = [self.motion.sentence] if self.motion.sentence else []
+        if self.knowledge.sentences:
+            lines.append("not known: " + " ".join(self.knowledge.sentences))
+        if self.knowledge.advice:
+            lines.append(self.knowledge.advice)
+        return lines
+
+
+UNKNOWN: dict[str, Any] = {"motion": None, "knowledge": None}
+"""`Findings.values` of a refused run."""
+
+
+def findings(calibration: Calibration, gauge: Gauge, covariance: RigCovariance) -> Findings:
+    """Look at what was found."""
+    return Findings(motion_since_factory(calibration, gauge), knowledge_of(calibration, covariance.std))

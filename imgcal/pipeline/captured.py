@@ -1,0 +1,77 @@
+"""Blobs of a capture on disk, snapshot by snapshot, so that never more than one of them is in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imgcal.association import Sight
+from imgcal.detection import Blobs, DetectionOptions, detect_snapshot, to_detections, without_dim
+from imgcal.io import Capture, Frame
+from imgcal.pipeline.measuring import LearnedMeasurer
+from imgcal.pipeline.sources import DetectorName, proposer_of
+from imgcal.types import Detections
+
+Snapshots = Iterable[tuple[str, dict[str, Frame | None]]]
+Bar = Callable[[Snapshots, int], Snapshots]
+
+
+def detect_capture(
+    capture: Capture,
+    first: int = 0,
+    last: int | None = None,
+    options: DetectionOptions = DetectionOptions(),
+    measurer: LearnedMeasurer | None = None,
+    bar: Bar = lambda snapshots, count: snapshots,
+) -> tuple[Detections, dict[str, Frame | None]]:
+    """Find blobs in the frames of a capture.
+
+    Args:
+        capture: the capture.
+        first: number of the first snapshot.
+        last: number of the snapshot to stop before; None = to the end.
+        options: what counts as a blob.
+        measurer: measures the blobs of frames again.
+        bar: wraps the loop over snapshots, for a progress bar.
+
+    Returns:
+        The blobs, and the frames of the first snapshot, for pictures.
+
+    Raises:
+        InputError: a frame cannot be read.
+    """
+    names, masks = capture.snapshot_names[first:last], masks_of(capture)
+    found: list[Blobs] = []
+    shown: dict[str, Frame | None] = {}
+    with ThreadPoolExecutor() as pool:
+        for _, frames in bar(capture.snapshots(first, last), len(names)):
+            shown = shown or dict(frames)
+            blobs = detect_snapshot(frames, options, masks=masks, pool=pool, whole_capture=True)
+            found.append(blobs if measurer is None else measurer(frames, blobs, options))
+    return to_detections(without_dim(found, options), capture.camera_names, names), shown
+
+
+def masks_of(capture: Capture) -> dict[str, NDArray[np.bool_]]:
+    """Read the masks of the cameras that have one: True where the image is to be ignored."""
+    return {camera: mask for camera in capture.camera_names if (mask := capture.mask(camera)) is not None}
+
+
+def sight_of_capture(
+    capture: Capture, detector: DetectorName, options: DetectionOptions = DetectionOptions(), first: int = 0
+) -> Sight:
+    """Let a detector other than blobs look at the frames of a capture.
+
+    Args:
+        capture: the capture.
+        detector: its name or file.
+        options: how blobs are found beside it.
+        first: number of the first snapshot.
+
+    Raises:
+        InputError: no such detector.
+    """
+    proposer, where_blobs_fail = proposer_of(detector)
+    return Sight(proposer, lambda s: capture.frames_of(first + s), where_blobs_fail, options, masks_of(capture))

@@ -1,0 +1,243 @@
+"""Calibration without a factory calibration: a first rig from the data, and from there as ever.
+
+Labels, where the input has none, come first from single images: what one camera sees of the object says in most of them
+which blob is which fiducial. Cameras that are placed by these vote on all the rest.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.association import (
+    PipelineOptions,
+    Progress,
+    associate,
+    identify,
+    is_few_and_flat,
+    labels_by_shape,
+    to_observations,
+)
+from imgcal.detection import DetectionOptions
+from imgcal.errors import RefusedError
+from imgcal.estimation import K3, ColdStart, cold_start, ordinary_lens
+from imgcal.messages import listed
+from imgcal.pipeline.calibration import Calibration, fit_steady
+from imgcal.pipeline.sources import Frames, blobs_of
+from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior, Volume
+
+ALONE = RigPrior(focal_length=0.05, principal_point=10.0, distortion=0.02, rotation=0.01, position=10.0)
+"""How far a camera may be off while its images are labelled one by one: what it does to the shape of an object."""
+LEAST_BLOBS = 4
+LABELLED_ALONE = 12
+"""Snapshots for each camera that are labelled image by image."""
+MOST_ODD, LIKELY_ODD = 8, 1
+"""Blobs more or fewer than fiducials, beyond which all is alike; and up to which an image is easy to tell."""
+PLACED = RigPrior(focal_length=0.005, principal_point=5.0, distortion=0.02, rotation=0.004, position=10.0)
+"""How far a rig that was made from these may be off, while all the others are labelled."""
+WIDE_ROTATION = 0.05  # rad: of the prior about the first rig, which was made from the same data: next to nothing
+WIDE_POSITION = 0.05  # the same in parts of the largest distance between cameras
+LARGEST_FOCAL_STD = 0.02  # relative
+LARGEST_ROTATION_STD = 0.01  # rad
+LARGEST_POSITION_STD = 0.02  # of the largest distance between cameras
+LARGEST_SPREAD = 2.0  # px, robust, of the first rig's residuals
+
+
+def calibrate_from_scratch(
+    source: Detections | Frames,
+    cameras: CameraRig,
+    obj: CalibrationObject,
+    options: PipelineOptions = PipelineOptions(),
+    *,
+    detection: DetectionOptions = DetectionOptions(),
+    progress: Progress | None = None,
+) -> Calibration:
+    """Calibrate cameras of which nothing is known but images and a rough focal length.
+
+    The object is moved through what the cameras see together; its known size gives the scale, and the rig's frame is
+    that of the first camera.
+
+    Args:
+        source: blobs, labelled or not, or frames in memory.
+        cameras: from `imgcal.io.load_cameras`; a rig's places and its prior for them are not looked at.
+        obj: the calibration object.
+        options: how sure the result must be.
+        detection: how blobs are found in frames.
+        progress: wraps loops over snapshots.
+
+    Returns:
+        As from `calibrate`; its `factory` is the first rig that was made from the data.
+
+    Raises:
+        RefusedError: the data cannot decide where the cameras are, or say too little about them.
+        InputError: the data do not belong to these cameras or this object.
+
+    Examples:
+        >>> import imgcal
+        >>> from imgcal.synthesis import simulate_volume, true_detections
+        >>> rig, wand = imgcal.load_rig("room10").select([0, 2, 5]), imgcal.load_object("wand4")
+        >>> seen = true_detections(simulate_volume(rig, wand, 40, torch.Generator().manual_seed(0), None))
+        >>> found = calibrate_from_scratch(seen, rig, wand).rig
+        >>> apart = (found.positions[1] - found.positions[0]).norm(), (rig.positions[1] - rig.positions[0]).norm()
+        >>> abs(float(apart[0] - apart[1])) < 1  # mm
+        True
+    """
+    started, cameras = time.perf_counter(), _with_prior(cameras)
+    detections = blobs_of(source, cameras, obj, detection)
+    found = time.perf_counter()
+    is_labelled = (detections.fiducial >= 0).any()
+    alone = detections if is_labelled else labels_of_images(detections, cameras, obj, options, progress)
+    first = _first_rig(alone, cameras, obj)
+    placed = replace(first.rig, prior=PLACED)
+    labelled = associate(detections, placed, obj, options, progress)
+    identified = time.perf_counter()
+    start = replace(first.rig, prior=_wide(first.rig, cameras), distortion=first.rig.distortion.clone())
+    start.distortion[:, K3 - 10] = cameras.distortion[:, K3 - 10]  # about which it has a prior that tells
+    std = ordinary_lens(_wide(first.rig, cameras).std(start))
+    fit = fit_steady(labelled, labelled.detections, start, obj, options, prior_std=std)
+    require_determined(fit)
+    seconds = {
+        "detection": found - started,
+        "identity": identified - found,
+        "estimation": time.perf_counter() - identified,
+    }
+    volume = fit.predicted_error.volume
+    box = Volume.box(_corner(volume.low), _corner(volume.high))
+    # What was known before is no prior for what comes after; the defaults are.
+    rig = replace(fit.rig, name=cameras.name, prior=None, volume=box)
+    return replace(fit, estimate=replace(fit.estimate, rig=rig), seconds=seconds, from_scratch=True)
+
+
+def labels_of_images(
+    detections: Detections,
+    cameras: CameraRig,
+    obj: CalibrationObject,
+    options: PipelineOptions,
+    progress: Progress | None = None,
+) -> Detections:
+    """Label the blobs of single images, as many as it takes to place the cameras, by the object's own shape.
+
+    Returns:
+        The detections, with labels in images where one labelling fits and no other does (but for the object's own
+        symmetry, which each image resolves as it likes).
+    """
+    snapshots, count = len(detections.snapshot_names), cameras.num_cameras
+    rows = np.flatnonzero(detections.usable)
+    image = detections.snapshot[rows] * count + detections.camera[rows]
+    order = np.argsort(image, kind="stable")
+    rows, blobs = rows[order], np.bincount(image, minlength=snapshots * count)
+    ends = np.cumsum(blobs)
+    fiducial = np.full(len(detections), -1)
+    if is_few_and_flat(obj):
+        images = np.split(rows, ends[:-1])
+        for c in range(count):
+            mine = images[c::count]
+            blobs_uv, radii = ([column[those] for those in mine] for column in (detections.uv, detections.radius))
+            found = labels_by_shape(blobs_uv, cameras.select([c]), obj, radii)
+            for those, labels in zip(mine, found, strict=True):
+                fiducial[those] = -1 if labels is None else labels
+        return replace(detections, fiducial=fiducial)
+    chosen = _chosen(blobs.reshape(snapshots, count), obj.num_fiducials)
+    numbers = np.flatnonzero(chosen.any(1)).tolist()
+    for s in progress(numbers, len(numbers)) if progress else numbers:
+        for c in np.flatnonzero(chosen[s]).tolist():
+            number = s * count + c
+            those = rows[ends[number] - blobs[number] : ends[number]]
+            fiducial[those] = _labels_alone(detections.select(those), cameras.select([c]), obj, options)
+    return replace(detections, fiducial=fiducial)
+
+
+def _labels_alone(
+    blobs: Detections, camera: CameraRig, obj: CalibrationObject, options: PipelineOptions
+) -> NDArray[np.int64]:
+    """Label the blobs of one image, or none of them."""
+    zeros = np.zeros(len(blobs), dtype=np.int64)
+    image = replace(blobs, camera=zeros, snapshot=zeros, camera_names=camera.camera_names, snapshot_names=("0",))
+    sigma = np.hypot(image.sigma, options.identity_error)
+    found = identify(replace(image, sigma=sigma), camera, obj, ALONE.std(camera), options=options.identity)
+    return found.labels if found.accepted else zeros - 1
+
+
+def _chosen(blobs: NDArray[np.int64], fiducials: int) -> NDArray[np.bool_]:
+    """Choose images (S, C) to label, by their numbers of blobs: in each camera so many, spread over the capture.
+
+    First come those with as many blobs as the object has fiducials, in snapshots that several cameras see.
+    """
+    enough = blobs >= LEAST_BLOBS
+    together = enough & (enough.sum(1, keepdims=True) >= min(2, blobs.shape[1]))
+    odd = np.abs(blobs - fiducials)
+    chosen = np.zeros_like(enough)
+    worth = np.where(together, odd, MOST_ODD).clip(max=MOST_ODD).mean(1)  # of a snapshot, the smaller the better
+    stretches = np.array_split(np.arange(len(blobs)), LABELLED_ALONE)
+    for camera in range(blobs.shape[1]):
+        for stretch in stretches:
+            there = stretch[together[stretch, camera]]
+            if len(there):
+                chosen[there[(worth + odd[:, camera])[there].argmin()], camera] = True
+    # An image helps with what other cameras see at the same time, as far as that is easy to tell.
+    return chosen | (together & chosen.any(1, keepdims=True) & (odd <= LIKELY_ODD))
+
+
+def _first_rig(labelled: Detections, cameras: CameraRig, obj: CalibrationObject) -> ColdStart:
+    """Place the cameras by what has labels."""
+    if not (labelled.fiducial >= 0).any():
+        raise RefusedError(
+            f"identity: in none of {len(labelled.snapshot_names)} snapshots does one camera alone say which blob is "
+            "which fiducial: show the whole object, and few other bright things; and is the field of view right?"
+        )
+    first = cold_start(to_observations(labelled, cameras, obj), cameras, obj)
+    if first.spread > LARGEST_SPREAD:
+        raise RefusedError(
+            f"start without a factory calibration: the best rig misses the labelled blobs by {first.spread:.1f} px, "
+            f"expected at most {LARGEST_SPREAD:g}: the object is not as its file says, labels are wrong, or the field "
+            "of view is far from the truth"
+        )
+    return first
+
+
+def _with_prior(cameras: CameraRig) -> CameraRig:
+    cameras = cameras.to(torch.float64)
+    return cameras if cameras.prior is not None else replace(cameras, prior=RigPrior(0.15, 25.0, 0.1))
+
+
+def _corner(values: Tensor) -> tuple[float, float, float]:
+    """Round a corner of a volume to whole millimetres."""
+    x, y, z = values.round().tolist()
+    return x, y, z
+
+
+def _apart(rig: CameraRig) -> float:
+    """Largest distance between two cameras, mm."""
+    return max(float(torch.cdist(rig.positions, rig.positions).max()), 1.0)
+
+
+def _wide(rig: CameraRig, cameras: CameraRig) -> RigPrior:
+    assert cameras.prior is not None
+    return replace(cameras.prior, rotation=WIDE_ROTATION, position=WIDE_POSITION * _apart(rig))
+
+
+def require_determined(fit: Calibration) -> None:
+    """Raise `RefusedError` where a camera is known so badly that the result would be a guess."""
+    rig = fit.rig
+    std = fit.estimate.covariance(0).diagonal().clamp_min(0).sqrt().unflatten(0, (rig.num_cameras, -1))
+    relative = torch.stack(
+        (
+            (std[:, 6:8] / rig.focal_length).amax(1) / LARGEST_FOCAL_STD,
+            std[:, 0:3].amax(1) / LARGEST_ROTATION_STD,
+            std[:, 3:6].amax(1) / (LARGEST_POSITION_STD * _apart(rig)),
+        )
+    )
+    bad = ~(relative <= 1)
+    if bool(bad.any()):
+        kind, _ = bad.nonzero()[0].tolist()
+        what = ("focal length", "direction", "position")[kind]
+        which = listed(rig.camera_names[c] for c in bad[kind].nonzero().flatten().tolist())
+        raise RefusedError(
+            f"start without a factory calibration: the data say too little about the {what} of camera {which}: carry "
+            "the object through more of what it sees, nearer and farther, turned in all directions"
+        )
