@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from imgcal.io import load_object, load_rig
-from imgcal.synthesis import PhysicalDrift, Truth, simulate_truth, true_detections
-from imgcal.synthesis.captures import simulate_volume
+from imgcal.synthesis import PhysicalDrift, Truth, simulate_truth, simulate_volume, true_detections
 from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
 
 NOISE = 0.1  # px

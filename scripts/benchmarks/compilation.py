@@ -1,4 +1,4 @@
-"""How long does the first `imgcal calibrate` on a machine compile? The sample capture, from an empty cache.
+"""How long does the first `imgcal calibrate` on a machine compile? What `scripts/demo` runs, from an empty cache.
 
 Run as `python -m scripts.benchmarks.compilation`.
 """
@@ -60,7 +60,7 @@ def calibrate(helped: bool) -> dict[str, Any]:
     started, before = time.perf_counter(), os.times()
     with tempfile.TemporaryDirectory() as folder:
         files = ("--rig", str(SAMPLE / "rig.yaml"), "--object", str(SAMPLE / "object.csv"), "--out", f"{folder}/out")
-        if imgcal(["calibrate", str(SAMPLE), *files, "--first-guess", "vit"]):
+        if imgcal(["calibrate", str(SAMPLE), *files]):
             raise SystemExit("the sample was not calibrated")
     after = os.times()
     return {

@@ -19,8 +19,7 @@ import tyro
 from imgcal import InputError, PipelineOptions, RefusedError, calibrate, load_object, load_rig, predicted_error
 from imgcal.evaluation.true_error import true_error
 from imgcal.io import write_text
-from imgcal.synthesis import PoseRange, Truth, true_detections
-from imgcal.synthesis.captures import simulate_volume
+from imgcal.synthesis import PoseRange, Truth, simulate_volume, true_detections
 from imgcal.synthesis.rigs import sample_rig_from_object
 from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
 from scripts.output import ROOT, command, markdown, read_json, replaced, surroundings, write_json

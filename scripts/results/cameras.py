@@ -1,16 +1,17 @@
 """Draw true and predicted cameras in 3D, to turn around in a browser: ``python -m scripts.results.cameras``.
 
-Several random rigs on the hemisphere over the object: true cameras blue, predicted red, the first of each rig yellow.
-Writes out/results/cameras.html, which needs nothing else (plotly is inside: some megabytes).
+Several random rigs on the hemisphere over the object: true cameras blue, predicted ones red.
+Writes out/results/cameras.html, which needs nothing else.
 """
 
 from __future__ import annotations
 
+import json
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from html import escape
 from pathlib import Path
 
-import plotly.graph_objects as go
 import torch
 import tyro
 from torch import Tensor
@@ -19,13 +20,24 @@ from imgcal.errors import InputError
 from imgcal.evaluation import BASELINES, Conditions, Given, Method, load_models, reprojection_error
 from imgcal.evaluation.protocol import draw
 from imgcal.io import load_object, load_rig, write_text
+from imgcal.report import DrawnRig, rig_scene, rig_view_script
 from imgcal.synthesis import RelativeDrift
 from imgcal.training import experiment_of
 from imgcal.types import CameraRig, Prediction
 from scripts.output import ROOT, command, make_folder
 
-AXIS = 60.0  # mm, length of the line that shows where a camera looks
-TRUE, PREDICTED, FIRST, FIDUCIALS = "#2563eb", "#dc2626", "#facc15", "#333333"
+PAGE = """<!DOCTYPE html>
+<html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{title}</title>
+<style>
+:root {{ --page: #fff; --ink: #1b1f24; --muted: #626b75; --line: #e1e4e7; }}
+:root {{ --ghost: #2563eb; --after: #dc2626; --before: #aaa; }}
+body {{ font: 15px sans-serif; margin: 20px; }} canvas {{ width: 100%; height: 88vh; }}
+</style>
+<h1>{title}</h1><p>Blue: true cameras. Red: predicted. Drag to turn, Ctrl and the wheel to zoom.</p>
+<div><canvas tabindex="0"></canvas></div>
+<script>{script}</script><script>new RigView(document.querySelector("canvas")).set({scene});</script>
+</html>
+"""
 
 
 @dataclass(frozen=True)
@@ -54,7 +66,7 @@ def main(arguments: list[str] | None = None) -> None:
     error = float(reprojection_error(cameras, truth, conditions.obj).mean())
     title = f"{conditions.rig.name}, {conditions.obj.name}: {name}, RE {error:.3g} px"
     make_folder(options.out.parent)
-    write_text(options.out, scene(truth, cameras, conditions.obj.points, title).to_html(include_plotlyjs=True))
+    write_text(options.out, drawn(truth, cameras, conditions.obj.points, title))
     print(f"{title}: {options.out}")
 
 
@@ -64,20 +76,19 @@ def predict(method: Method, given: Given, refined: bool) -> Prediction:
     return method.refine(found, given) if refined and method.refine is not None else found
 
 
-def scene(truth: CameraRig, predicted: CameraRig, fiducials: Tensor, title: str) -> go.Figure:
-    """Draw cameras (B, C) in the object's frame, and the object (N, 3)."""
-    traces = [_dots("fiducials", fiducials, FIDUCIALS, 3)]
-    for name, cameras, colour, size in (("true", truth, TRUE, 6), ("predicted", predicted, PREDICTED, 4)):
-        traces.append(_axes(name, cameras, colour))
-        traces.append(_dots(f"{name} cameras", cameras.positions[:, 1:].flatten(0, 1), colour, size))
-    traces.append(_dots("first cameras, true", truth.positions[:, 0], FIRST, 7))
-    traces.append(_dots("first cameras, predicted", predicted.positions[:, 0], FIRST, 4, PREDICTED))
-    layout = go.Layout(
-        title={"text": title},
-        scene={"aspectmode": "data", **{f"{axis}axis": {"title": {"text": f"{axis} (mm)"}} for axis in "xyz"}},
-        margin={"l": 0, "r": 0, "b": 0, "t": 40},
-    )
-    return go.Figure(traces, layout)
+def drawn(truth: CameraRig, predicted: CameraRig, fiducials: Tensor, title: str) -> str:
+    """Make a page of cameras (B, C) in the object's frame, and the object (N, 3)."""
+    rigs = [DrawnRig("true", "--ghost", (_one_rig(truth),)), DrawnRig("predicted", "--after", (_one_rig(predicted),))]
+    scene = json.dumps(rig_scene(rigs, fiducials[None].double().numpy())).replace("<", "\\u003c")
+    return PAGE.format(title=escape(title), script=rig_view_script(), scene=scene)
+
+
+def _one_rig(cameras: CameraRig) -> CameraRig:
+    """All cameras (B, C) as those of one rig, named by its number."""
+    count = cameras.batch_shape[0]
+    flat = cameras.map_tensors(lambda tensor, axes: tensor.flatten(0, 1).unflatten(0, (1, -1)))[0]
+    names = tuple(f"{rig + 1} {name}" for rig in range(count) for name in cameras.camera_names)
+    return replace(flat, image_size=cameras.image_size.repeat(count, 1), camera_names=names)
 
 
 def _chosen(options: Options) -> tuple[Conditions, Method, str]:
@@ -88,22 +99,6 @@ def _chosen(options: Options) -> tuple[Conditions, Method, str]:
     [model] = load_models([options.model])
     name = experiment_of(model.checkpoint.experiment).name + (" + refinement" if options.refined else "")
     return model.conditions, model.method, name
-
-
-def _dots(name: str, points: Tensor, colour: str, size: int, edge: str = "#ffffff") -> go.Scatter3d:
-    x, y, z = points.round(decimals=2).T.tolist()
-    marker = {"size": size, "color": colour, "line": {"color": edge, "width": 1}}
-    return go.Scatter3d(x=x, y=y, z=z, mode="markers", name=name, marker=marker)
-
-
-def _axes(name: str, cameras: CameraRig, colour: str) -> go.Scatter3d:
-    """Lines from the cameras along their optical axes; None separates them."""
-    starts = cameras.positions.flatten(0, 1)
-    ends = starts + AXIS * cameras.cam_from_rig.rotation[..., 2, :].flatten(0, 1)
-    rows = torch.stack((starts, ends), dim=1).round(decimals=2).tolist()
-    x, y, z = ([value for pair in rows for value in (pair[0][axis], pair[1][axis], None)] for axis in range(3))
-    line = {"color": colour, "width": 2}
-    return go.Scatter3d(x=x, y=y, z=z, mode="lines", name=f"{name} axes", line=line, hoverinfo="skip", showlegend=False)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,394 @@
+"""A day of `imgcal watch`, accelerated: cameras fail, frames come late or are garbage, the process is killed.
+
+Usage: python -m scripts.benchmarks.endurance [--hours 24] [--rate 1] [--steady 20000] [--out FILE]
+
+Two parts, of blobs of a simulated rig: a day in which the process is killed (SIGKILL) every few simulated minutes and
+goes on from its files, and one process that is left alone, for its memory and its latency. Both have the same mishaps.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import mmap
+import os
+import random
+import shutil
+import signal
+import struct
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from imgcal.estimation import EstimationOptions, estimate
+from imgcal.io import load_object, load_rig, write_text
+from imgcal.online import RigKeeper  # imported here, for all that are forked
+from imgcal.types import CameraRig, Observations
+from imgcal.watch import STATE, CameraBlobs, Exposure, Intake, Item, Timing, Unreadable, Watch
+from scripts.benchmarks.rig_streams import Bump, Conditions, Stream
+from scripts.output import ROOT, replaced, surroundings, write_json
+
+RESULT, PAGE = ROOT / "docs" / "benchmarks" / "endurance.json", ROOT / "docs" / "watch.md"
+EPOCH = 1.7e9  # s
+SLOWED = 60.0  # the object moves from snapshot to snapshot as at 60 a second
+NOISE = 0.1  # px
+LATE, TWICE, GARBAGE, WRONG_TIME = 0.01, 0.005, 0.005, 0.002  # shares of exposures
+BUMP_DEG = 0.3
+RECORDED_EVERY = 20  # snapshots
+ALLOWED_PX = 0.5  # of a camera that is said to be ok, in the image, where the object is
+SEEN = 60  # snapshots of the object that a bumped camera has given before it is to be known
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Snapshots during which something is the case."""
+
+    first: int
+    last: int  # excluded
+
+    def holds(self, number: int) -> bool:
+        return self.first <= number < self.last
+
+
+class World:
+    """What the cameras see at any moment: the same after every restart."""
+
+    def __init__(self, snapshots: int, rate: float, bumps: int, seed: int = 0) -> None:
+        self.rate, self.snapshots = rate, snapshots
+        self.factory, self.obj = load_rig("T4"), load_object("asymmetric8")
+        draw = random.Random(seed)
+        steps = [
+            Bump(int((i + 0.5) * snapshots / bumps), draw.randrange(self.factory.num_cameras), "rotation",
+                 math.radians(BUMP_DEG))
+            for i in range(bumps)
+        ]  # fmt: skip
+        self.stream = Stream(self.factory, self.obj, seed, Conditions(noise=NOISE), steps)
+        self.bumps = steps
+        self._rigs = [self.stream.rig]
+        for bump in steps:
+            self.stream.rig = self.stream.changed(bump)
+            self._rigs.append(self.stream.rig)
+        self.absent = _stretches(draw, snapshots, 120 * rate, 120 * rate)
+        self.out = [_stretches(draw, snapshots, 1200 * rate, 60 * rate) for _ in self.factory.camera_names]
+
+    def rig(self, number: int) -> CameraRig:
+        return self._rigs[sum(bump.snapshot <= number for bump in self.bumps)]
+
+    def has_shown(self, number: int, camera: int) -> bool:
+        """Tell whether a camera has seen enough since its last bump for that to be known."""
+        last = max((b.snapshot for b in self.bumps if b.camera == camera and b.snapshot <= number), default=None)
+        if last is None:
+            return True
+        out = self.out[camera]
+        return sum(not self.is_absent(n) and not any(s.holds(n) for s in out) for n in range(last, number)) >= SEEN
+
+    def is_absent(self, number: int) -> bool:
+        return any(stretch.holds(number) for stretch in self.absent)
+
+    def exposures(self, number: int) -> list[tuple[int, Item]]:
+        """What is sent, each with the snapshot with which it comes."""
+        noise, rig = np.random.default_rng([7, number]), self.rig(number)
+        pose = self.stream.pose_at(number / self.rate / SLOWED)
+        image = rig.expand(1).project_values(pose.apply(self.obj.points), self.obj.radius)
+        uv = image.uv[0].numpy() + NOISE * noise.standard_normal(image.uv[0].shape)
+        seen = image.visible[0].numpy() & (noise.random(image.visible[0].shape) > 0.1) & (not self.is_absent(number))
+        sent: list[tuple[int, Item]] = []
+        for camera, name in enumerate(rig.camera_names):
+            if any(stretch.holds(number) for stretch in self.out[camera]):
+                continue
+            false = noise.random((noise.poisson(0.5), 2)) * (rig.image_size[camera].numpy() - 1)
+            size = rig.image_size[camera].numpy() - 1
+            places = np.clip(noise.permutation(np.concatenate((uv[camera][seen[camera]], false))), 0, size)
+            time = EPOCH + number / self.rate + noise.uniform(-0.001, 0.001)
+            luck = noise.random(4)
+            if luck[0] < GARBAGE:
+                sent.append((number, _garbage(noise, name, time)))
+                continue
+            if luck[1] < WRONG_TIME:
+                time += float(noise.choice((-1e6, -30.0, -3.0, 3.0, 30.0, 1e6)))
+            exposure = Exposure(name, time, CameraBlobs.of(places, NOISE))
+            sent.append((number + int(noise.integers(1, 4)) * int(luck[2] < LATE), exposure))
+            if luck[3] < TWICE:
+                sent.append((number, exposure))
+        return sent
+
+
+def _stretches(draw: random.Random, snapshots: int, between: float, length: float) -> list[Stretch]:
+    """Stretches of random lengths, with random pauses."""
+    found, at = [], draw.expovariate(1 / between)
+    while at < snapshots:
+        last = at + max(draw.expovariate(1 / length), 1)
+        found.append(Stretch(int(at), int(last)))
+        at = last + draw.expovariate(1 / between)
+    return found
+
+
+def _garbage(noise: np.random.Generator, name: str, time: float) -> Item:
+    """What is no exposure of this rig, or one that shows nothing but noise."""
+    kind = int(noise.integers(5))
+    if kind == 0:
+        return Unreadable("junk", name)
+    if kind == 1:
+        return Exposure("cam99", time, CameraBlobs.of([]))
+    if kind == 2:
+        return Exposure(name, float("nan"), CameraBlobs.of([]))
+    if kind == 3:
+        return Exposure(name, time, CameraBlobs.of([[1e5, 1e5]]))
+    return Exposure(name, time, CameraBlobs.of(noise.random((int(noise.integers(1, 200)), 2)) * 1000, NOISE))
+
+
+class Replay:
+    """The world as a source, from a snapshot on; tells how far it is where a killed process leaves it."""
+
+    live = False
+
+    def __init__(self, world: World, first: int, last: int, place: mmap.mmap) -> None:
+        self._world, self._first, self._last, self._place = world, first, last, place
+
+    def items(self) -> Iterator[Item]:
+        held: list[tuple[int, Item]] = []
+        for number in range(self._first, self._last):
+            sent = self._world.exposures(number)
+            held = [*held, *sent]
+            for due, item in held:
+                if due <= number:
+                    yield item
+            held = [(due, item) for due, item in held if due > number]
+            self._place[:8] = struct.pack("q", number + 1)
+
+
+def live(world: World, folder: Path, first: int, last: int, place: mmap.mmap) -> None:
+    """Watch from a snapshot on, as `imgcal watch` does, and write down how it goes."""
+    path = folder / STATE
+    keeper = RigKeeper.restore(path) if path.is_file() else RigKeeper(world.factory, world.obj)
+    intake = Intake(Replay(world, first, last, place), world.factory, Timing())
+    took: list[float] = []
+    with keeper, Watch(keeper, folder) as loop, open(folder / "record.jsonl", "a", buffering=1) as record:
+        done = 0
+
+        def looked() -> None:
+            nonlocal done
+            tally = loop.tally
+            if tally.latest is None or tally.snapshots < done + RECORDED_EVERY:
+                return
+            done = tally.snapshots
+            state = tally.latest
+            counts = {kind: count.total() for kind, count in intake.synchronizer.counts.items()}
+            entry = {
+                "number": round((state.time - EPOCH) * world.rate), "pid": os.getpid(), "snapshots": tally.snapshots,
+                "learnt": tally.learnt, "seconds": tally.seconds, "cpu": took[-RECORDED_EVERY:],
+                "resident": _resident(), "cameras": dict(state.cameras), "refused": state.refused,
+                "step": state.rig.local(world.factory).tolist(), "counts": counts, "dropped": intake.dropped,
+                "unreadable": intake.unreadable.total(),
+            }  # fmt: skip
+            took.clear()
+            record.write(json.dumps(entry) + "\n")
+
+        update = keeper.update
+
+        def timed(*given: Any) -> Any:
+            started = time.thread_time()
+            result = update(*given)
+            took.append(time.thread_time() - started)
+            return result
+
+        keeper.update = timed  # type: ignore[method-assign, assignment]
+        with intake:
+            loop.run(intake, threading.Event(), looked)
+
+
+def _resident() -> int:
+    """Memory of this process in bytes."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * mmap.PAGESIZE
+
+
+def forked(world: World, folder: Path, first: int, last: int, kill_at: int | None) -> int:
+    """Watch in a process of its own; returns the snapshot that it came to."""
+    place = mmap.mmap(-1, 8)
+    place[:8] = struct.pack("q", first)
+    process = os.fork()
+    if process == 0:
+        try:
+            live(world, folder, first, last, place)
+            os._exit(0)
+        finally:
+            import traceback
+
+            traceback.print_exc()
+            os._exit(1)
+    while True:
+        ended, status = os.waitpid(process, os.WNOHANG)
+        reached = int(struct.unpack("q", place[:8])[0])
+        if ended:
+            if status:
+                raise SystemExit(f"endurance: the watching process ended with {status} at snapshot {reached}")
+            return reached
+        if kill_at is not None and reached >= kill_at:
+            os.kill(process, signal.SIGKILL)
+            os.waitpid(process, 0)
+            return int(struct.unpack("q", place[:8])[0])
+        time.sleep(0.01)
+
+
+def records(folder: Path) -> list[dict[str, Any]]:
+    found = []
+    for line in (folder / "record.jsonl").read_text().splitlines():
+        try:
+            found.append(json.loads(line))
+        except ValueError:  # the process was killed while it wrote this
+            continue
+    return found
+
+
+def errors(world: World, step: Any, number: int) -> np.ndarray:
+    """RMS error (px) of each camera where the object is, its pose fitted to the rig that was told: (C,)."""
+    rig, found = world.rig(number), world.factory.retract(torch.tensor(step, dtype=torch.float64))
+    pose = world.stream.pose_at(number / world.rate / SLOWED)
+    seen = rig.expand(1).project(pose.apply(world.obj.points), world.obj.radius)
+    observations = Observations(seen.uv, torch.full_like(seen.uv[..., 0], 0.3), seen.visible)
+    held = torch.zeros(rig.num_cameras, 15, dtype=torch.float64)
+    fit = estimate(observations, found, world.obj, pose, prior_std=held, options=EstimationOptions(loss="cauchy"))
+    squared = fit.residual.square().sum(-1).sum((0, 2))
+    rms: np.ndarray = (squared / seen.visible.sum((0, 2)).clamp_min(1)).sqrt().numpy()
+    return rms
+
+
+def killed_day(world: World, folder: Path, minutes: float) -> dict[str, Any]:
+    """Part one: SIGKILL every few simulated minutes."""
+    draw, at, lives = random.Random(1), 0, 0
+    started = time.perf_counter()
+    while at < world.snapshots:
+        kill_at = at + max(int(draw.expovariate(1 / (60 * minutes * world.rate))), RECORDED_EVERY)
+        at = forked(world, folder, at, world.snapshots, kill_at if kill_at < world.snapshots else None)
+        lives += 1
+    found = records(folder)
+    told = [json.loads(line) for line in (folder / "events.jsonl").read_text().split("\n")[:-1]]
+    checked, wrong, worst, waited = 0, [], 0.0, 0
+    off: list[float] = []
+    for entry in found:
+        fits = errors(world, entry["step"], entry["number"])
+        for camera, name in enumerate(world.factory.camera_names):
+            if entry["cameras"][name] == "ok" and world.has_shown(entry["number"], camera):
+                checked += 1
+                off.append(float(fits[camera]))
+                if fits[camera] > ALLOWED_PX:
+                    wrong.append((entry["number"], name, round(float(fits[camera]), 3)))
+                    worst = max(worst, float(fits[camera]))
+    last: dict[int, dict[str, Any]] = {}
+    longest = run = 0
+    for entry in found:  # records with the object there that taught nothing since the one before
+        before = last.get(entry["pid"])
+        last[entry["pid"]] = entry
+        idle = before is not None and entry["learnt"] == before["learnt"]
+        there = not any(world.is_absent(n) for n in range(entry["number"] - RECORDED_EVERY, entry["number"]))
+        run = run + RECORDED_EVERY if idle and there else (0 if not idle else run)
+        longest = max(longest, run)
+        waited += idle
+    ends = list(last.values())
+    moved = [event for event in told if event["event"] == "moved"]
+    named = sum(any(_is_of(event, bump, world) for event in moved) for bump in world.bumps)
+    false = [event for event in moved if not any(_is_of(event, bump, world) for bump in world.bumps)]
+    return {
+        "simulated_hours": world.snapshots / world.rate / 3600, "snapshots_per_second": world.rate,
+        "snapshots": world.snapshots, "kills": lives - 1, "seconds": time.perf_counter() - started,
+        "worked_on": sum(e["snapshots"] for e in ends), "learnt": sum(e["learnt"] for e in ends),
+        "with_object": sum(not world.is_absent(n) for n in range(world.snapshots)),
+        "late": sum(e["counts"]["late"] for e in ends), "duplicate": sum(e["counts"]["duplicate"] for e in ends),
+        "astray": sum(e["counts"]["astray"] for e in ends), "missing": sum(e["counts"]["missing"] for e in ends),
+        "unreadable": sum(e["unreadable"] for e in ends),
+        "cameras_checked_while_ok": checked, "error_px_median": float(np.median(off)),
+        "error_px_p99": float(np.quantile(off, 0.99)), "wrong_while_ok": len(wrong), "wrong": wrong[:20],
+        "worst_px": worst, "longest_without_learning": longest,
+        "bumps": len(world.bumps), "bumps_told": named, "moved_events_of_nothing": len(false),
+        "restart_events": sum(event["event"] == "restart" for event in told),
+    }  # fmt: skip
+
+
+def _is_of(event: dict[str, Any], bump: Bump, world: World) -> bool:
+    from datetime import datetime
+
+    since = (datetime.fromisoformat(event["since"]).timestamp() - EPOCH) * world.rate
+    near = bump.snapshot - 5 <= since <= bump.snapshot + 1800 * world.rate  # the camera or the object may be out
+    return near and event["camera"] == world.factory.camera_names[bump.camera]
+
+
+def steady_life(world: World, folder: Path) -> dict[str, Any]:
+    """Part two: one process, its memory and its time."""
+    started = time.perf_counter()
+    forked(world, folder, 0, world.snapshots, None)
+    found = records(folder)
+    tenth = len(found) // 10
+    parts = [found[i * tenth : (i + 1) * tenth] for i in range(10)]
+    resident = [float(np.median([entry["resident"] for entry in part])) / 2**20 for part in parts]
+    p99 = [1e3 * float(np.quantile([s for entry in part for s in entry["cpu"]], 0.99)) for part in parts]
+    p50 = [1e3 * float(np.quantile([s for entry in part for s in entry["cpu"]], 0.5)) for part in parts]
+    return {
+        "snapshots": found[-1]["snapshots"], "seconds": time.perf_counter() - started,
+        "resident_mib_by_tenth": resident, "resident_growth": resident[-1] / resident[1] - 1,
+        "update_cpu_ms_p99_by_tenth": p99, "update_cpu_ms_p50_by_tenth": p50,
+    }  # fmt: skip
+
+
+def table(result: dict[str, Any]) -> str:
+    """The page's table."""
+    day, steady = result["killed_day"], result["steady"]
+    rows = [
+        ("simulated", f"{day['simulated_hours']:.3g} h at {day['snapshots_per_second']:g} snapshots/s"),
+        ("killed and started again", f"{day['kills']} times"),
+        ("snapshots, with the object, learnt from",
+         f"{day['snapshots']:,}, {day['with_object']:,}, {day['learnt']:,}"),
+        ("exposures late, twice, of a clock astray, unreadable",
+         f"{day['late']:,}, {day['duplicate']:,}, {day['astray']:,}, {day['unreadable']:,}"),
+        ("bumps of 0.3 degrees, told with the right camera", f"{day['bumps']}, {day['bumps_told']}"),
+        ("moves told of cameras that stood still", f"{day['moved_events_of_nothing']}"),
+        ("cameras said to be ok, and more than 0.5 px wrong",
+         f"{day['wrong_while_ok']} of {day['cameras_checked_while_ok']:,}"),
+        ("error of cameras said to be ok, median, 99 %",
+         f"{day['error_px_median']:.3f} px, {day['error_px_p99']:.3f} px"),
+        ("longest time without learning while the object was there", f"{day['longest_without_learning']} snapshots"),
+        ("one process, left alone", f"{steady['snapshots']:,} snapshots"),
+        ("its memory, last tenth against the second", f"{100 * steady['resident_growth']:+.2f} %"),
+        ("its update (CPU), 99 %, second tenth and last",
+         f"{steady['update_cpu_ms_p99_by_tenth'][1]:.1f} ms, {steady['update_cpu_ms_p99_by_tenth'][-1]:.1f} ms"),
+    ]  # fmt: skip
+    return "\n".join(["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows)]) + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--hours", type=float, default=24.0)
+    parser.add_argument("--rate", type=float, default=1.0, help="snapshots a (simulated) second")
+    parser.add_argument("--minutes", type=float, default=5.0, help="simulated, between two kills")
+    parser.add_argument("--bumps", type=int, default=12)
+    parser.add_argument("--steady", type=int, default=20_000, help="snapshots of the process that is left alone")
+    parser.add_argument("--out", type=Path, default=RESULT)
+    given = parser.parse_args()
+    words = " ".join(f"--{name} {value:g}" for name, value in vars(given).items() if name != "out")
+    torch.set_num_threads(1)
+    folder = Path(tempfile.mkdtemp(prefix="endurance-"))
+    try:
+        result = {}
+        for name in ("killed_day", "steady"):
+            (folder / name).mkdir()
+        world = World(int(given.hours * 3600 * given.rate), given.rate, given.bumps)
+        result["killed_day"] = killed_day(world, folder / "killed_day", given.minutes)
+        world = World(given.steady, given.rate, max(given.bumps * given.steady // world.snapshots, 1), seed=1)
+        result["steady"] = steady_life(world, folder / "steady")
+    finally:
+        shutil.rmtree(folder)
+    write_json(given.out, {**surroundings(), "command": f"python -m scripts.benchmarks.endurance {words}", **result})
+    print(table(result))
+    if given.out == RESULT:
+        write_text(PAGE, replaced(PAGE.read_text(), {"endurance": table(result)}, PAGE))
+
+
+if __name__ == "__main__":
+    main()

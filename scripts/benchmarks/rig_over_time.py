@@ -1,0 +1,208 @@
+"""Does the filter of a rig know what the batch estimate knows, and is an update fast enough?
+
+Run as `python -m scripts.benchmarks.rig_over_time --out docs/benchmarks/rig_over_time.json`. Three questions: after 1,
+10, 100 and 1,000 snapshots of a steady rig, how far are the filter's standard deviations and values from those of the
+batch estimate from all of them; over many runs, steady and drifting, are its errors as large as it says; and how long
+does `RigKeeper.update` take from blobs, beside `Recalibrator.update` in the same run.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+
+import imgcal
+from imgcal.estimation import EstimationOptions, RigFilter, camera_covariance, estimate, fit_pose
+from imgcal.geometry import RigidTransform
+from imgcal.io import write_text
+from imgcal.synthesis import PhysicalDrift, simulate_truth
+from imgcal.types import CameraRig, Detections, DriftRate, Observations, RigPrior
+from scripts.benchmarks.rig_streams import Conditions, Stream
+from scripts.output import ROOT, command, markdown, replaced, surroundings, write_json
+
+RESULT = ROOT / "docs" / "benchmarks" / "rig_over_time.json"
+PAGE = ROOT / "docs" / "benchmarks.md"
+NOISE = 0.1  # px
+STEADY = DriftRate(0.0, 0.0, 0.0, 0.0, 0.0)
+WARMING = DriftRate(
+    focal_length=2e-4 * 60**0.5, principal_point=0.0, distortion=0.0, rotation=np.deg2rad(0.01), position=0.0
+)
+"""A focal length that walks 0.02 % in a minute, mounts that walk 0.01 degrees in an hour."""
+BETWEEN = 10.0  # s between snapshots of the runs that ask for errors
+SQUARED = EstimationOptions(loss="squared", tolerance=1e-6)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Measure the filter of a rig."""
+
+    rig: str = "O10"  #: of the comparison with the batch estimate
+    counts: tuple[int, ...] = (1, 10, 100, 1000)
+    runs: int = 200
+    snapshots: int = 60  #: of each run
+    updates: int = 400  #: that are timed
+    out: Path | None = None  #: a result file; docs/benchmarks/rig_over_time.json rewrites its tables in the page
+
+
+def seen_by(
+    rig: CameraRig, obj: imgcal.CalibrationObject, poses: RigidTransform, generator: torch.Generator
+) -> Observations:
+    """Noisy observations (S, C, N), a tenth of them hidden."""
+    image = rig.expand(len(poses.translation)).project_values(poses.apply(obj.points), obj.radius)
+    uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
+    seen = image.visible & (torch.rand(image.visible.shape, generator=generator) > 0.1)
+    return Observations(uv, torch.full(seen.shape, NOISE, dtype=torch.float64), seen)
+
+
+def part(observations: Observations, first: int, last: int) -> Observations:
+    return Observations(*(x[first:last] for x in (observations.uv, observations.sigma, observations.seen)))
+
+
+def carried(count: int, generator: torch.Generator, poses: RigidTransform) -> RigidTransform:
+    """Poses of an object that is carried about in front of a rig."""
+    shift = torch.tensor([90.0, 60.0, 60.0]) * (2 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1)
+    return RigidTransform(poses.rotation, poses.translation + shift)
+
+
+def against_batch(options: Options) -> list[dict[str, float]]:
+    """The filter and the batch estimate from the same snapshots."""
+    factory, obj = imgcal.load_rig(options.rig).to(torch.float64), imgcal.load_object("asymmetric8")
+    generator, count = torch.Generator().manual_seed(1), max(options.counts)
+    truth = simulate_truth(factory, obj, count, generator, PhysicalDrift())
+    poses = carried(count, generator, truth.rig_from_object)
+    observations = seen_by(truth.rig, obj, poses, generator)
+    follows, rows = RigFilter(factory, obj, STEADY, SQUARED), []
+    for s in range(count):
+        follows.update(part(observations, s, s + 1), poses[s : s + 1], 1 / 60)
+        if s + 1 not in options.counts:
+            continue
+        fit = estimate(part(observations, 0, s + 1), factory, obj, poses[: s + 1], options=SQUARED)
+        std = camera_covariance(fit, curved=False).diagonal().sqrt()
+        belief = follows.belief
+        errors = [held_out(rig, truth.rig, obj, poses[:20]) for rig in (belief.rig, fit.rig)]
+        ratio = belief.std().flatten() / std
+        rows.append(
+            {
+                "snapshots": s + 1,
+                "largest ratio of sd": float(torch.maximum(ratio, 1 / ratio).max()),
+                "largest difference, sd": float((belief.rig.local(fit.rig).flatten() / std).abs().max()),
+                "held-out RE, filter": errors[0],
+                "held-out RE, batch": errors[1],
+            }
+        )
+    return rows
+
+
+def held_out(rig: CameraRig, truth: CameraRig, obj: imgcal.CalibrationObject, poses: RigidTransform) -> float:
+    """RMS distance (px) on exact images of an object elsewhere, its pose fitted with the rig held."""
+    squared = []
+    for s in range(len(poses.translation)):
+        turned = poses.rotation[s].roll(1, 0)  # another pose than any that was seen
+        there = RigidTransform(turned[None], poses.translation[s : s + 1] * 1.03)
+        image = truth.expand(1).project_values(there.apply(obj.points), obj.radius)
+        seen = Observations(image.uv, torch.full(image.visible.shape, NOISE, dtype=torch.float64), image.visible)
+        fit = fit_pose(seen, rig, obj.points, obj.radius, there, EstimationOptions(loss="squared"))
+        squared.append(float(np.square(fit.residual).sum() / (2 * int(image.visible.sum()))))
+    return float(np.sqrt(np.mean(squared)))
+
+
+def normalized_errors(options: Options, rate: DriftRate) -> list[float]:
+    """Squared error per degree of freedom at the end of each run; rigs are drawn from the prior."""
+    factory, obj = imgcal.load_rig("T4").to(torch.float64), imgcal.load_object("asymmetric8")
+    factory = replace(factory, prior=RigPrior())
+    found = []
+    for run in range(options.runs):
+        generator = torch.Generator().manual_seed(1000 + run)
+        truth = simulate_truth(factory, obj, options.snapshots, generator, PhysicalDrift())
+        poses = carried(options.snapshots, generator, truth.rig_from_object)
+        normal = torch.randn(factory.num_cameras, 15, generator=generator, dtype=torch.float64)
+        rig = factory.retract(RigPrior().std(factory) * normal)
+        follows = RigFilter(factory, obj, rate, SQUARED)
+        for s in range(options.snapshots):
+            if s:
+                walk = rate.std(rig) * (BETWEEN / 3600) ** 0.5
+                rig = rig.retract(walk * torch.randn(walk.shape, generator=generator, dtype=torch.float64))
+            follows.update(seen_by(rig, obj, poses[s : s + 1], generator), poses[s : s + 1], BETWEEN)
+        error = follows.belief.rig.local(rig).flatten()
+        found.append(float(error @ torch.linalg.solve(follows.belief.covariance(), error)) / len(error))
+    return found
+
+
+def times(options: Options) -> dict[str, dict[str, float]]:
+    """CPU time (ms) of updates from the blobs of O10, the two in turns."""
+    factory, obj = imgcal.load_rig("O10"), imgcal.load_object("asymmetric8")
+    stream = Stream(factory, obj, 1, Conditions(noise=0.07, hidden=0.0, clutter=0.0))
+    shots: list[tuple[float, Detections]] = list(stream.snapshots(options.updates + 100))
+    taken: dict[str, list[float]] = {"RigKeeper": [], "Recalibrator": []}
+    with imgcal.RigKeeper(factory, obj) as keeper, imgcal.Recalibrator(factory, obj) as live:
+        for number, (seconds, blobs) in enumerate(shots):
+            for name in taken:
+                begin = time.thread_time()
+                if name == "RigKeeper":
+                    keeper.update(blobs, seconds)
+                else:
+                    live.update(blobs)
+                if number >= 100:
+                    taken[name].append(1e3 * (time.thread_time() - begin))
+    return {
+        name: {"p50": float(np.median(ms)), "p99": float(np.quantile(ms, 0.99)), "best": min(ms)}
+        for name, ms in taken.items()
+    }
+
+
+def tables(result: Mapping[str, Any]) -> dict[str, str]:
+    """Markdown by marker."""
+    batch = [
+        (f"{row['snapshots']:,}", *(f"{value:.3g}" for key, value in row.items() if key != "snapshots"))
+        for row in result["against batch"]
+    ]
+    errors = [
+        (
+            name,
+            f"{np.mean(found):.3f}",
+            f"{np.quantile(found, 0.05):.2f} to {np.quantile(found, 0.95):.2f}",
+            f"{len(found)}",
+        )
+        for name, found in result["normalized errors"].items()
+    ]
+    rows = [(name, *(f"{ms[key]:.2f}" for key in ("p50", "p99", "best"))) for name, ms in result["times"].items()]
+    return {
+        "rig filter against batch": markdown(
+            ("snapshots", "largest ratio of sd", "largest difference, sd", "held-out RE, px", "of the batch estimate"),
+            batch,
+        ),
+        "rig filter errors": markdown(("rig", "squared error per dof", "5 % to 95 %", "runs"), errors),
+        "keeper speed": markdown(("update from blobs, CPU ms", "p50", "p99", "best"), rows),
+    }
+
+
+def main() -> None:
+    """Measure, write, print."""
+    options = tyro.cli(Options, description=__doc__)
+    torch.set_num_threads(1)
+    result = surroundings() | {
+        "against batch": against_batch(options),
+        "normalized errors": {
+            "steady": normalized_errors(options, STEADY),
+            "drifting": normalized_errors(options, WARMING),
+        },
+        "times": times(options),
+    }
+    if options.out is not None:
+        write_json(options.out, result)
+    texts = tables(result)
+    if options.out is not None and options.out.resolve() == RESULT:
+        write_text(PAGE, replaced(PAGE.read_text("utf-8"), texts, PAGE))
+    for text in texts.values():
+        print(text, end="\n\n")
+
+
+if __name__ == "__main__":
+    command(main)

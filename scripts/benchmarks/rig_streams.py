@@ -1,0 +1,120 @@
+"""A simulated rig that watches an object move, as blobs of one snapshot after another."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+import imgcal
+from imgcal.estimation import CHANGES
+from imgcal.geometry import RigidTransform, rotation_from_vector
+from imgcal.synthesis import PhysicalDrift, simulate_truth
+from imgcal.types import CameraRig, Detections, DriftRate
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """How well the object is seen, and how much the rig wanders."""
+
+    noise: float = 0.1  # px
+    hidden: float = 0.1  # share of fiducials
+    clutter: float = 0.5  # false blobs a camera and snapshot
+    rate: float = 60.0  # snapshots/s
+    drift: DriftRate = DriftRate(0.0, 0.0, 0.0, 0.0, 0.0)
+    reach: tuple[float, float, float] = (90.0, 60.0, 60.0)  # mm, how far the object goes from the middle
+    labelled: bool = False
+
+
+@dataclass(frozen=True)
+class Bump:
+    """A camera changes before a snapshot."""
+
+    snapshot: int
+    camera: int
+    kind: str  # of `CHANGES`
+    size: float  # rad, mm, px
+
+
+@dataclass
+class Stream:
+    """Snapshots of a rig; iterate over it once."""
+
+    factory: CameraRig
+    obj: imgcal.CalibrationObject
+    seed: int
+    conditions: Conditions = Conditions()
+    bumps: Sequence[Bump] = ()
+    absent: Sequence[tuple[int, int]] = ()  # snapshots (first, last excluded) without the object
+    out: Mapping[int, tuple[int, int]] = field(default_factory=dict)  # camera -> snapshots without its frames
+
+    def __post_init__(self) -> None:
+        self.generator = torch.Generator().manual_seed(self.seed)
+        truth = simulate_truth(self.factory, self.obj, 1, self.generator, PhysicalDrift())
+        self.rig = truth.rig
+        self.noise = np.random.default_rng(self.seed)
+        self.pose = truth.rig_from_object[:1]
+        self.middle = self.pose.translation[0]
+        phases = torch.rand(6, 2, generator=self.generator, dtype=torch.float64)
+        self.frequency, self.phase = 0.1 + 0.4 * phases[:, 0], 2 * math.pi * phases[:, 1]
+
+    def pose_at(self, seconds: float) -> RigidTransform:
+        wave = torch.sin(2 * math.pi * self.frequency * seconds + self.phase)
+        turn = rotation_from_vector(0.6 * wave[None, :3])
+        shift = wave[3:] * torch.tensor(self.conditions.reach, dtype=torch.float64)
+        return RigidTransform(turn @ self.pose.rotation, (self.middle + shift)[None])
+
+    def changed(self, bump: Bump) -> CameraRig:
+        part, step = CHANGES[bump.kind], torch.zeros(self.rig.num_cameras, 15, dtype=torch.float64)
+        direction = torch.randn(part.stop - part.start, generator=self.generator, dtype=torch.float64)
+        step[bump.camera, part] = bump.size * direction / direction.norm()
+        return self.rig.retract(step)
+
+    def snapshot(self, number: int) -> Detections:
+        """Blobs of a snapshot; `self.rig` and `self.pose` are then the truth of it."""
+        given, noise = self.conditions, self.noise
+        if number:
+            walk = given.drift.std(self.rig) * math.sqrt(1 / given.rate / 3600)
+            if walk.any():
+                self.rig = self.rig.retract(walk * torch.from_numpy(noise.standard_normal(walk.shape)))
+        for bump in self.bumps:
+            if bump.snapshot == number:
+                self.rig = self.changed(bump)
+        there = self.pose_at(number / given.rate)
+        image = self.rig.expand(1).project_values(there.apply(self.obj.points), self.obj.radius)
+        uv, seen = image.uv[0].numpy(), image.visible[0].numpy()
+        uv = uv + given.noise * noise.standard_normal(uv.shape)
+        seen = seen & (noise.random(seen.shape) >= given.hidden)
+        if any(first <= number < last for first, last in self.absent):
+            seen[:] = False
+        cameras, fiducials = np.nonzero(seen)
+        false = noise.poisson(given.clutter, self.rig.num_cameras)
+        where = np.repeat(np.arange(self.rig.num_cameras), false)
+        wrong = noise.random((len(where), 2)) * self.rig.image_size.numpy()[where]
+        camera = np.concatenate((cameras, where))
+        labels = np.concatenate((fiducials if given.labelled else np.full(len(cameras), -1), np.full(len(where), -1)))
+        rows = noise.permutation(len(camera))
+        rows = rows[[not self._is_out(int(camera[r]), number) for r in rows]]
+        return Detections(
+            uv=np.concatenate((uv[cameras, fiducials], wrong))[rows],
+            sigma=np.full(len(rows), given.noise),
+            camera=camera[rows].astype(np.int64),
+            snapshot=np.zeros(len(rows), dtype=np.int64),
+            fiducial=labels[rows].astype(np.int64),
+            radius=np.full(len(rows), 5.0),
+            flags=np.zeros(len(rows), dtype=np.uint8),
+            camera_names=self.rig.camera_names,
+            snapshot_names=(str(number),),
+        )
+
+    def _is_out(self, camera: int, number: int) -> bool:
+        first, last = self.out.get(camera, (0, 0))
+        return first <= number < last
+
+    def snapshots(self, count: int) -> Iterator[tuple[float, Detections]]:
+        """Times (s) and blobs."""
+        for number in range(count):
+            yield number / self.conditions.rate, self.snapshot(number)
