@@ -12,7 +12,7 @@ import pytest
 import imgcal
 from imgcal.cli.main import COMMANDS
 
-HEAVY = {"torch", "numba", "cv2", "scipy", "kornia", "timm", "plotly", "tensorboard", "accelerate", "matplotlib"}
+HEAVY = {"torch", "numba", "cv2", "scipy", "kornia", "timm", "tensorboard", "accelerate", "matplotlib"}
 OF_OTHER_COMMANDS = {"timm", "tensorboard", "accelerate", "matplotlib"}
 
 

@@ -1,8 +1,12 @@
 """Messages stay readable, whatever they quote."""
 
-import pytest
+from dataclasses import dataclass, field
 
-from imgcal.messages import LONGEST, MOST_QUOTED, listed, one_line, quoted, shortened
+import numpy as np
+import pytest
+import torch
+
+from imgcal.messages import LONGEST, MOST_QUOTED, brief_repr, listed, one_line, quoted, shortened
 
 
 @pytest.mark.parametrize("length", [0, 1, 40, 41, 10_000])
@@ -35,3 +39,17 @@ def test_one_line_is_one_line_of_text() -> None:
 def test_a_long_message_keeps_both_its_ends() -> None:
     found = one_line("begin " + "x" * 5000 + " end")
     assert len(found) == LONGEST and found.startswith("begin x") and found.endswith("x end") and "..." in found
+
+
+def test_a_dataclass_of_tensors_shows_shapes() -> None:
+    @dataclass
+    class Seen:
+        uv: torch.Tensor
+        camera: np.ndarray
+        names: tuple[str, ...]
+        more: float = 1.5
+        hidden: int = field(default=0, repr=False)
+        __repr__ = brief_repr
+
+    found = repr(Seen(torch.zeros(4, 0, 2), np.zeros(3, np.int64), ("a", "b", "c", "d", "e")))
+    assert found == "Seen(uv=float32(4, 0, 2), camera=int64(3,), names=('a', ..., 'e': 5), more=1.5)"

@@ -2,6 +2,7 @@
 
 from scripts.benchmarks import honesty_moves, honesty_prediction
 from scripts.output import read_json
+from scripts.results import formats
 
 
 def test_moves_are_whole_and_shown():
@@ -34,3 +35,15 @@ def test_predictions_are_complete_within_the_gate_and_on_the_page():
         assert row["captures"] >= 200 and row["refused"] == 0
         assert all(low < row[unit]["ratio"] < high for unit in ("px", "mm"))
     assert honesty_prediction.table(result) in honesty_prediction.PAGE.read_text("utf-8")
+
+
+def test_formats_are_read_and_written_as_their_tools_have_them():
+    result = read_json(formats.RESULT)
+    for name, row in result["formats"].items():
+        assert row["read"]["worst_px"] < 1e-6, name
+        if row["write"] is not None:
+            assert row["write"]["own_reader_px"] < 1e-8, name
+            assert row["write"]["reader"] is None or row["write"]["worst_px"] < 1e-6, name
+    verified = {name for name, row in result["formats"].items() if row["write"] and row["write"]["reader"]}
+    assert verified == set(formats.READERS)
+    assert formats.table(result) in formats.PAGE.read_text("utf-8")

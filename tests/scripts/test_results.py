@@ -240,7 +240,7 @@ def test_cameras(trained, tmp_path, capsys):
     out = tmp_path / "made" / "cameras.html"
     script("cameras").main(["--count", "2", "--rig", "T4", "--object", "cube8", "--out", str(out)])
     text = out.read_text("utf-8")
-    assert "plotly" in text and "first cameras, true" in text
+    assert "RigView" in text and "2 cam04" in text and "T4, cube8: factory, pose fitted" in text
     script("cameras").main(["--model", str(trained("table1-row08", SMALL, LEVEL)), "--refined", "--out", str(out)])
     assert "O6, cube8: table1-row08 + refinement, RE 0.0" in capsys.readouterr().out
 

@@ -17,16 +17,18 @@ from imgcal.io import (
     load_rig,
     load_rig_covariance,
     read_frame,
+    save_cameras,
     save_detections,
     write_frame,
 )
+from imgcal.synthesis import arranged_rig, simulate_volume
 from imgcal.synthesis.captures import simulate_truth, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift, RelativeDrift
 from imgcal.types.observations import Detections
 
 KEYS = {
     "status", "reason", "identity", "rms_px_before", "rms_px_after", "chi2_per_dof", "snapshots_used",
-    "snapshots_rejected", "per_camera", "predicted_error", "seconds",
+    "snapshots_rejected", "per_camera", "predicted_error", "motion", "knowledge", "seconds",
 }  # fmt: skip
 
 
@@ -58,6 +60,10 @@ def test_frames_to_recalibrated_rig(workplace, tmp_path, capsys):
     predicted = result["predicted_error"]
     assert 0 < predicted["median_px"] < predicted["p95_px"] and 0 < predicted["median_mm"] < predicted["p95_mm"]
     assert f"in the working volume {predicted['median_mm']:.2g} mm (95 %: {predicted['p95_mm']:.2g})" in printed
+    moved = result["motion"]["cameras_moved"]
+    assert result["motion"]["relative_to"] == "most cameras" and f"{len(moved)} of 4 cameras moved" in printed
+    assert set(result["motion"]["per_camera"]) == set(result["knowledge"]["coverage"]) == set(result["per_camera"])
+    assert "not known: Not determined by these data" in printed and "Move the object" in printed
     assert f"before {result['rms_px_before']:.3f} px" in printed and str(out / "report.html") in printed
 
     truth, factory = load_rig(workplace.capture / "truth" / "rig.yaml"), load_rig(workplace.rig)
@@ -152,8 +158,8 @@ def test_empty_frames_are_refused(workplace, broken, tmp_path, capsys):
 
 def test_a_missing_camera_is_named(workplace, broken, tmp_path, capsys):
     shutil.rmtree(broken / "frames" / "cam03")
-    assert calibrate(workplace, broken, tmp_path / "out", "--no-report") == 3
-    assert "cam03" in one_line(capsys)
+    assert calibrate(workplace, broken, tmp_path / "out", "--no-report") == 2
+    assert f"{broken / 'frames'}: found no frames of cam03, expected some" in one_line(capsys)
 
 
 def test_a_missing_frame_is_no_problem(workplace, broken, tmp_path):
@@ -379,3 +385,43 @@ def test_a_matched_filter_looks_at_the_frames_and_needs_them(workplace, tmp_path
     capsys.readouterr()
     assert calibrate(workplace, blobs, tmp_path / "other", "--detector", "matched") == 2
     assert "expected a capture with frames" in one_line(capsys)
+
+
+@pytest.fixture(scope="module")
+def wand_capture(tmp_path_factory):
+    """Labelled blobs of a wand in a small room, and a file of cameras of which little is known."""
+    folder = tmp_path_factory.mktemp("wand")
+    rig = arranged_rig("ring", 3, 2500.0, height=1200.0, target=(0.0, 0.0, 700.0))
+    truth = simulate_volume(rig, load_object("wand4"), 40, torch.Generator().manual_seed(0), PhysicalDrift())
+    save_detections(true_detections(truth), folder / "blobs.csv")
+    save_cameras(dict.fromkeys(rig.camera_names, (1280, 1024)), 60.0, folder / "cameras.yaml")
+    return folder
+
+
+def test_without_a_factory_calibration(wand_capture, tmp_path, capsys):
+    arguments = ["calibrate", str(wand_capture / "blobs.csv"), "--object", "wand4", "--out", str(tmp_path / "out")]
+    assert main([*arguments, "--cameras", str(wand_capture / "cameras.yaml")]) == 0
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert result["from_scratch"] and result["rms_px_before"] is None and result["rms_px_after"] < 0.05
+    assert "without a factory calibration" in capsys.readouterr().out
+    rig = load_rig(tmp_path / "out" / "rig.yaml")
+    assert rig.volume is not None and rig.prior is None and load_rig_covariance(tmp_path / "out" / "rig.yaml")
+    assert "There was no factory calibration" in (tmp_path / "out" / "report.html").read_text()
+    again = [*arguments[:-1], str(tmp_path / "again"), "--rig", str(tmp_path / "out" / "rig.yaml"), "--no-report"]
+    assert main(again) == 0  # what came out is a factory calibration for what comes next
+
+
+@pytest.mark.parametrize(
+    ("more", "expected"),
+    [
+        ([], "neither of --rig and --cameras"),
+        (["--rig", "T4", "--cameras", "cameras.yaml"], "both of --rig and --cameras"),
+        (["--cameras", "absent.yaml"], "absent.yaml"),
+        (["--cameras", "cameras.yaml", "--first-guess", "points"], "--first-guess"),
+        (["--cameras", "cameras.yaml", "--detector", "matched"], "--detector"),
+    ],
+)
+def test_a_factory_calibration_or_none(more, expected, wand_capture, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(wand_capture)
+    assert main(["calibrate", "blobs.csv", "--object", "wand4", "--out", str(tmp_path / "out"), *more]) == 2
+    assert expected in one_line(capsys) and not (tmp_path / "out").exists()

@@ -29,6 +29,7 @@ def test_detectors_are_compared_on_captures(tmp_path, capsys):
         (["--captures", "-1"], "--captures: found -1, expected 1 to 100000"),
         (["--captures", "1", "--processes", "0"], "--processes: found 0"),
         (["--captures", "1", "--rig", "none.yaml"], "none.yaml"),
+        (["matched"], "found classical, which is a detector, expected networks; detectors are compared on captured"),
     ],
 )
 def test_what_cannot_be_done_is_said_in_one_line(arguments, expected, capsys):

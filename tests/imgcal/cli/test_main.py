@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+import imgcal
 from imgcal.cli import main as module
 from imgcal.cli.main import main
 from imgcal.errors import InputError
@@ -62,7 +63,7 @@ def test_debug_may_stand_anywhere_and_is_no_argument_of_the_command(tmp_path, ca
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        ([], "simulate, detect"),
+        ([], "Expected one of {simulate, "),
         (["score", "a\0b", "--rig", "O10", "--object", "cube8"], "zero byte"),
         (["score", "y" * 5000, "--rig", "O10", "--object", "cube8"], "y...: File name too long"),
         (["frobnicate"], "frobnicate"),
@@ -79,6 +80,11 @@ def test_a_command_line_that_cannot_be_read_is_one_line(arguments, expected, cap
     line = one_line(capsys)
     assert line.startswith("imgcal: ") and expected in line and ("--help" in line or arguments[0] == "score")
     assert len(line) < 600 and not set(line) & set("│╭╰─") and "dummy" not in line
+
+
+def test_the_version_is_that_of_the_package(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"imgcal {imgcal.__version__}\n"
 
 
 def test_help_is_no_failure(capsys):

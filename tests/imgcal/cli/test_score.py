@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,7 +16,10 @@ def test_truth_scores_zero_and_factory_does_not(workplace, capsys):
     table = workplace.capture / "truth" / "detections.csv"
     perfect = score(workplace, table, workplace.capture / "truth" / "rig.yaml", capsys)
     factory = score(workplace, table, workplace.rig, capsys)
-    assert set(perfect) == {"rms_px", "median_px", "p95_px", "snapshots_used", "snapshots_rejected", "per_camera"}
+    assert list(perfect) == [
+        "median_px", "p95_px", "rms_px", "outliers", "rms_px_with_outliers", "points", "snapshots_used",
+        "snapshots_rejected", "per_camera",
+    ]  # fmt: skip
     assert perfect["rms_px"] < 1e-6 < 0.1 < factory["rms_px"]
     assert factory["median_px"] <= factory["p95_px"]
     assert perfect["snapshots_used"] == 3 and perfect["snapshots_rejected"] == 0
@@ -32,6 +36,23 @@ def test_noise_is_measured_as_opencv_does(workplace, tmp_path, capsys):
     # RMS length of a 2D residual, less what the three poses took: 96 points, 18 parameters of 192 equations.
     expected = 0.2 * np.sqrt(2 * (192 - 18) / 192)
     assert abs(found["rms_px"] / expected - 1) < 0.15
+
+
+def test_outliers_are_counted_and_do_not_decide(workplace, tmp_path, capsys):
+    truth = load_detections(workplace.capture / "truth" / "detections.csv")
+    noise = np.random.default_rng(0).normal(scale=0.02, size=truth.uv.shape)
+    hidden = np.arange(len(truth)) % 30 == 0
+    blobs = replace(truth, uv=truth.uv + noise + 2.0 * hidden[:, None])
+    save_detections(blobs, tmp_path / "hidden.csv")
+    found = score(workplace, tmp_path / "hidden.csv", workplace.capture / "truth" / "rig.yaml", capsys)
+    assert found["outliers"] == hidden.sum() == sum(camera["outliers"] for camera in found["per_camera"].values())
+    assert found["rms_px"] < 0.08 and found["median_px"] < 0.06
+    assert found["rms_px_with_outliers"] > 0.3
+
+    off = replace(truth, uv=truth.uv + noise + 5.0 * (truth.camera == 1)[:, None])
+    save_detections(off, tmp_path / "off.csv")
+    found = score(workplace, tmp_path / "off.csv", workplace.capture / "truth" / "rig.yaml", capsys)
+    assert found["outliers"] == 0 and found["rms_px"] > 1  # a camera that is off as a whole is not put aside
 
 
 def test_frames_are_scored_too(workplace, capsys):

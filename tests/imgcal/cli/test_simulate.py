@@ -68,6 +68,11 @@ def test_no_drift_keeps_the_factory_rig(tmp_path):
         (["--clutter-model.blobs.count", "1000000000"], "count"),
         (["--clutter-model.blobs.radius", "1", "1e9"], "radius"),
         (["--clutter-model.occluded", "nan"], "occluded"),
+        (["--kappa", "0.1", "--drift", "physical"], "--kappa"),
+        (["--exposure-ms", "5"], "--poses hand-held"),
+        (["--exposure-ms", "nan", "--poses", "hand-held"], "--exposure-ms"),
+        (["--poses", "volume", "--phi-deg", "0", "10"], "--poses hemisphere"),
+        (["--poses", "hand-held", "--speed", "0"], "speed"),
         (["--physical.position", "1e300", "--drift", "physical"], "position"),
         (["--physical.rotation-deg", "-1", "--drift", "physical"], "rotation_deg"),
     ],
@@ -139,3 +144,26 @@ def test_a_named_difficulty(tmp_path):
     assert len(lines) == 1 + 4 * 8
     shares = [float(line.rpartition(",")[2]) for line in lines[1:]]
     assert 0 <= min(shares) < 0.1 and max(shares) > 0.9
+
+
+def test_kappa_alone_is_the_papers_drift(tmp_path):
+    assert simulate(tmp_path / "a", "--kappa", "0.01") == 0
+    truth, factory = load_rig(tmp_path / "a" / "truth" / "rig.yaml"), load_rig("T4")
+    change = (truth.focal_length / factory.focal_length - 1).abs()
+    assert 0.001 < change.max() <= 0.01
+
+
+def test_a_rig_without_working_distance_is_simulated_in_its_volume(tmp_path):
+    assert (
+        main(["rig", "look-at", "--cameras", "3", "--image-size", "160", "128", "--out", str(tmp_path / "r.yaml")]) == 0
+    )
+    arguments = ["simulate", "--rig", str(tmp_path / "r.yaml"), "--object", "wand4", "--snapshots", "3"]
+    assert main([*arguments, "--out", str(tmp_path / "a")]) == 0
+    poses = np.loadtxt(tmp_path / "a" / "truth" / "rig_from_object.csv", delimiter=",", skiprows=1)
+    volume = load_rig(tmp_path / "r.yaml").volume
+    assert volume.contains(poses[:, 4:] + 0.0).sum() >= 2  # the object's origin is not far from its centroid
+    held = ["--poses", "hand-held", "--exposure-ms", "8", "--no-clutter", "--sensor.read-noise", "0"]
+    assert main([*arguments, *held, "--out", str(tmp_path / "b")]) == 0
+    assert main([*arguments, *held, "--exposure-ms", "0", "--out", str(tmp_path / "c")]) == 0
+    smeared, sharp = (read_frame(tmp_path / name / "frames" / "cam01" / "00001.png").max() for name in "bc")
+    assert smeared <= sharp

@@ -251,7 +251,8 @@ def test_several_snapshots_and_missing_cameras():
 @pytest.mark.parametrize(
     ("frames", "message"),
     [
-        ({"a": np.zeros((48, 64, 3), np.uint8)}, "camera a: found a frame of shape"),
+        ({"a": 200 * np.eye(64, 3, dtype=np.uint8)[None].repeat(48, 0)}, "camera a: found a colour image"),
+        ({"a": np.zeros((48, 64, 2), np.uint8)}, "camera a: found a frame of shape"),
         ({"a": np.full((48, 64), np.nan)}, "camera a: found float64"),
         ({"a": np.zeros((48, 64), np.int32)}, "camera a: found int32"),
         ({"a": "frame.png"}, "camera a: found a str"),

@@ -33,7 +33,7 @@ def test_what_is_said_of_the_radius_limits_it() -> None:
     ("frame", "message"),
     [
         ([[1, 2]], "found a list, expected a NumPy array"),
-        (np.zeros((20, 20, 3), np.uint8), r"frame of shape \(20, 20, 3\), expected grey"),
+        (np.zeros((20, 20, 2), np.uint8), r"frame of shape \(20, 20, 2\), expected grey"),
         (np.zeros((20, 20), np.float32), "found float32 grey values"),
         (np.zeros((15, 200), np.uint8), "frame of 200 x 15, expected at least 16 x 16"),
     ],

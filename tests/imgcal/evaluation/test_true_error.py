@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from imgcal.estimation.rig_uncertainty import rig_uncertainty
+from imgcal.estimation.rig_uncertainty import uncertainty_over
 from imgcal.evaluation.true_error import true_error
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
@@ -16,7 +16,7 @@ def uncertainty(o10):
     generator = torch.Generator().manual_seed(0)
     points = 80 * torch.randn(50, 3, generator=generator, dtype=F64) + torch.tensor([0.0, 0.0, 850.0], dtype=F64)
     unit = torch.tensor([1e-3] * 3 + [1.0] * 3 + [2.0] * 4 + [2e-3] * 5, dtype=F64).repeat(10)
-    return rig_uncertainty(o10, torch.diag(unit**2), points)
+    return uncertainty_over(o10, torch.diag(unit**2), points)
 
 
 def test_a_rig_in_another_frame_is_the_same_rig(o10, uncertainty):

@@ -27,6 +27,7 @@ def test_an_honest_calibration(o10, asymmetric8):
     assert 0.8 < result.chi2_per_dof < 1.2
     assert result.rig.local(truth)[:, 6:8].abs().max() < 0.2 * o10.local(truth)[:, 6:8].abs().max()
     assert result.before.rms > 50 * result.rms
+    assert len(repr(result)) < 250 and "identity coded, 6 of 6 snapshots" in repr(result)
     covariance = result.estimate.covariance(reference=2)
     assert torch.equal(covariance, relative_covariance(result.estimate, 2))
     focal = covariance.diagonal().unflatten(0, (-1, 15))[:, 6:8].sqrt()

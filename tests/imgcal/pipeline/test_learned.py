@@ -115,6 +115,24 @@ def test_it_declines_where_nothing_is_seen_and_where_nobody_knows_where_to_look(
 
 
 @dataclass(frozen=True)
+class InVain:
+    """Finds nothing."""
+
+    name: str = "finder"
+
+    def propose(self, snapshot: Snapshot) -> Proposal:
+        return Proposal.declined(snapshot, "no pose of the object stands out in the images")
+
+
+def test_it_says_what_the_finder_says_where_that_finds_nothing() -> None:
+    made = scene()
+    seen = torch.ones(made.place.shape[:-1], dtype=torch.bool)
+    asking = replace(proposer(made.place, seen), finder=InVain())
+    declined = asking.propose(replace(made.snapshot, candidates=()))
+    assert declined.reason == "no pose of the object stands out in the images"
+
+
+@dataclass(frozen=True)
 class Finder:
     """Knows a pose."""
 

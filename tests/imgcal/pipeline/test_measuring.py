@@ -86,6 +86,13 @@ def test_what_is_no_marker_alone_is_flagged(scene, kind, flag):
     assert np.array_equal(flagged.uv, blobs.uv)
 
 
+def test_what_is_no_network_is_said_with_what_was_expected():
+    with pytest.raises(
+        InputError, match=r"^measurer: found 'nothing', expected measurer-cnn \(shipped\), or a network"
+    ):
+        LearnedMeasurer.load("nothing")
+
+
 def test_no_blobs_no_question(scene):
     frame, blobs = scene
     none = blobs.select(np.zeros(len(blobs.uv), bool))

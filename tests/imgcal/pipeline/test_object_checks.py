@@ -10,7 +10,7 @@ from imgcal.errors import RefusedError
 from imgcal.io import load_object, load_rig
 from imgcal.online.recalibrator import Recalibrator
 from imgcal.pipeline import calibrate, score
-from imgcal.synthesis.captures import simulate_truth, simulate_volume, true_detections
+from imgcal.synthesis import simulate_truth, simulate_volume, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
 from imgcal.types.rig import RigPrior
 

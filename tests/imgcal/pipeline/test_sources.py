@@ -33,6 +33,25 @@ EVERYWHERE = pytest.mark.parametrize("job", [calibrate, score, update])
 
 
 @EVERYWHERE
+def test_equal_channels_are_grey_as_in_files(seen, job):
+    rig, obj, frames, _ = seen
+    coloured = {name: np.repeat(frame[..., None], 3, axis=-1) for name, frame in frames.items()}
+    grey, found = job(frames, rig, obj), job(coloured, rig, obj)
+    assert torch.equal(grey.residual, found.residual)
+    first = next(iter(frames))
+    coloured[first] = coloured[first].copy()
+    coloured[first][..., 0] += 9
+    with pytest.raises(InputError, match=f"camera {first}: found a colour image .*, expected grey"):
+        job(coloured, rig, obj)
+
+
+def test_a_proposer_sees_grey_frames(seen):
+    rig, obj, frames, _ = seen
+    coloured = {name: np.repeat(frame[..., None], 3, axis=-1) for name, frame in frames.items()}
+    assert calibrate(coloured, rig, obj, detector="matched").detectors == {"matched": 1}
+
+
+@EVERYWHERE
 @pytest.mark.parametrize(
     ("turn", "found"), [(np.rot90, "544x1024"), (lambda frame: np.ascontiguousarray(frame[::2, ::2]), "512x272")]
 )

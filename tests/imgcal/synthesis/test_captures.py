@@ -4,9 +4,7 @@ import numpy as np
 import torch
 
 from imgcal.detection import DetectionOptions, detect
-from imgcal.io import load_object, load_rig
-from imgcal.pipeline import score
-from imgcal.synthesis.captures import FrameModel, simulate_frames, simulate_truth, simulate_volume, true_detections
+from imgcal.synthesis.captures import FrameModel, simulate_frames, simulate_truth, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift, RelativeDrift
 from renderers import SensorModel
 
@@ -43,15 +41,3 @@ def test_detected_centres_are_the_true_ones(o10, asymmetric8):
 
 def rig_uv(truth, obj):
     return truth.rig.project(truth.rig_from_object[0].apply(obj.points)).uv.numpy()
-
-
-def test_a_wand_in_a_room_is_seen_by_some_cameras_at_a_time():
-    rig, obj = load_rig("room10"), load_object("wand4")
-    truth = simulate_volume(rig, obj, 40, torch.Generator().manual_seed(0), PhysicalDrift())
-    table = true_detections(truth)
-    assert len(table) == int(truth.visible.sum()) < truth.visible.numel()
-    assert 5 < truth.visible.any(-1).sum(1).float().mean() < 10
-    width, height = rig.image_size[0].tolist()
-    assert ((table.uv > -0.5) & (table.uv < [width - 0.5, height - 0.5])).all()
-    error = score(table, truth.rig, obj).distances
-    assert error.max() < 1e-6

@@ -1,0 +1,73 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from imgcal.errors import RefusedError
+from imgcal.io import load_object
+from imgcal.pipeline import calibrate
+from imgcal.pipeline.from_scratch import calibrate_from_scratch
+from imgcal.synthesis import HandHeld, PhysicalDrift, arranged_rig, simulate_volume, true_detections
+from imgcal.types import RigPrior, Volume
+
+FACTORY = arranged_rig(
+    "ring", 4, 3000.0, height=1800.0, target=(0.0, 0.0, 900.0), prior=RigPrior(0.01, 5.0, 0.01, 0.01, 3)
+)
+ROUGH = RigPrior(0.15, 25.0, 0.1, 1.0, 1e6)
+
+
+def capture(obj, snapshots, false=0.0, volume=None, seed=0):
+    """A drifted rig, labelled and unlabelled blobs, and cameras of which little is known."""
+    generator, rng = torch.Generator().manual_seed(seed), np.random.default_rng(seed)
+    truth = simulate_volume(
+        FACTORY, obj, snapshots, generator, PhysicalDrift(), volume=volume, hand=HandHeld(speed=900.0)
+    )
+    exact = true_detections(truth)
+    labelled = replace(exact, uv=exact.uv + 0.05 * rng.normal(size=exact.uv.shape), sigma=np.full(len(exact), 0.05))
+    rows = np.flatnonzero(rng.random(len(labelled)) < false)
+    both = labelled.select(np.concatenate((np.arange(len(labelled)), rows)))
+    both.uv[len(labelled) :] = rng.random((len(rows), 2)) * [1279, 1023]
+    blobs = replace(both, fiducial=np.full(len(both), -1))
+    cameras = replace(truth.rig, focal_length=1.12 * truth.rig.focal_length, prior=ROUGH)
+    cameras = replace(cameras, distortion=torch.zeros_like(cameras.distortion))
+    return truth.rig, labelled, blobs.select(np.lexsort((both.camera, both.snapshot))), cameras
+
+
+def error(found, truth):
+    """Mean error of the distances between cameras, mm."""
+    return float(
+        (torch.cdist(found.positions, found.positions) - torch.cdist(truth.positions, truth.positions)).abs().mean()
+    )
+
+
+def test_from_scratch_is_as_good_as_from_the_factory():
+    wand = load_object("wand4")
+    truth, labelled, blobs, cameras = capture(wand, 100, false=0.15)
+    factory = calibrate(labelled, FACTORY, wand)
+    by_labels, by_blobs = (calibrate_from_scratch(source, cameras, wand) for source in (labelled, blobs))
+    assert (by_labels.identity, by_blobs.identity) == ("coded", "unique")
+    for found in (by_labels, by_blobs):
+        assert found.from_scratch and found.rig.prior is None
+        assert found.predicted_error.median_mm < 1.25 * factory.predicted_error.median_mm
+        assert error(found.rig, truth) < 3 * error(factory.rig, truth) + 0.5
+        place = (found.rig.volume.low[2] + found.rig.volume.high[2]) / 2
+        assert 1500 < place < 4500  # mm in front of the first camera
+
+
+def test_what_the_data_do_not_say_is_refused():
+    wand = load_object("wand4")
+    _, labelled, blobs, cameras = capture(wand, 12, volume=Volume.box((0, 0, 900), (1, 1, 901)))
+    with pytest.raises(RefusedError, match=r"say too little|cannot be placed|do not"):
+        calibrate_from_scratch(labelled, cameras, wand)
+    noise = np.random.default_rng(0).random(blobs.uv.shape) * 1000
+    with pytest.raises(RefusedError, match=r"in none of 12 snapshots|cannot be placed|misses"):
+        calibrate_from_scratch(replace(blobs, uv=noise), cameras, wand)
+
+
+def test_an_object_of_another_shape_is_refused():
+    wand = load_object("wand4")
+    _, labelled, _, cameras = capture(wand, 60)
+    bent = replace(wand, points=wand.points * torch.tensor([1.0, 1.15, 1.0]).double())
+    with pytest.raises(RefusedError):
+        calibrate_from_scratch(labelled, cameras, bent)

@@ -1,0 +1,19 @@
+from pathlib import Path
+
+from scripts.benchmarks import alarms
+from scripts.benchmarks.alarms import Item, done, items, run, summarized, tables
+
+
+def test_a_bump_is_found_and_counted(tmp_path: Path) -> None:
+    entry = run(Item("monitor bump", 0))
+    assert (entry["wrong"], entry["kind"]) == ([], [True])
+    found = summarized([entry])["monitor bump"]
+    assert (found["bumps"], found["within_1_s"], found["right_kind"]) == (1, 1, 1)
+    assert "100.0 %" in tables({"found": {"monitor bump": found}})["alarms bumps"]
+
+
+def test_what_is_done_is_not_done_again(tmp_path: Path) -> None:
+    path = tmp_path / "items.jsonl"
+    path.write_text('{"key": "monitor bump 0"}\n{"key": "monitor bump 0"}\n{"key": "cut o', "utf-8")
+    assert [entry["key"] for entry in done(path)] == ["monitor bump 0"]
+    assert len({item.key for item in items(1.0)}) == sum(alarms.COUNTS.values())

@@ -1,0 +1,72 @@
+"""README's commands and its Python run as printed; those that take long are listed, each with what tries it instead."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from imgcal.cli.main import main
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+BLOCKS = [
+    re.sub(r"^    ", "", block, flags=re.MULTILINE) for block in re.findall(r"(?:^    .*\n|^\n(?=    ))+", README, re.M)
+]
+COMMANDS = [
+    command.split("#")[0].strip()
+    for block in BLOCKS
+    for command in re.sub(r"\\\n\s*", "", block).splitlines()
+    if re.match(r"(imgcal|scripts/\w+|pip) ", command) and not command.startswith("imgcal: ")
+]
+DEMO = next(command for command in COMMANDS if "data/samples/O10" in command)
+LONG = {
+    "pip install": "a network",
+    "scripts/demo": "the same command as the demo's",
+    "scripts/test": "this suite",
+    "imgcal train": "cli/test_train",
+    "imgcal compare": "cli/test_evaluate",
+    "imgcal evaluate": "cli/test_evaluate",
+    "imgcal simulate": "cli/test_simulate: twenty snapshots at full size take half a minute",
+    "imgcal calibrate my_capture": "cli/test_calibrate, from smaller captures",
+    "imgcal rig": "cli/test_rig",
+    "imgcal fleet": "cli/test_fleet",
+    "imgcal watch": "cli/test_watch",
+    "imgcal convert": "cli/test_convert",
+    "imgcal demo": "cli/test_demo",
+}
+"""Beginnings of commands that are not run here."""
+
+
+@pytest.fixture
+def clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with the data of a fresh clone, to write beside."""
+    (tmp_path / "data").symlink_to(ROOT / "data")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_every_command_is_tried_here_or_known_to_take_long() -> None:
+    assert len(COMMANDS) > 6
+    left = [command for command in COMMANDS if command != DEMO and not command.startswith(tuple(LONG))]
+    assert not left, left
+
+
+def test_the_demo_prints_what_stands_there(clone: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(shlex.split(DEMO)[1:]) == 0
+    printed = [re.sub(r"[\d.]+", "#", line) for line in capsys.readouterr().out.splitlines()]
+    block = next(block for block in BLOCKS if "reprojection error before" in block)
+    shown = [re.sub(r"[\d.]+", "#", line) for line in block.splitlines() if line]
+    shown = shown[next(i for i, line in enumerate(shown) if line.startswith("reprojection error")) :]
+    for line in shown:
+        assert any(found.startswith(line.split("; #")[0]) for found in printed), line
+    assert {path.name for path in (clone / "out" / "demo").iterdir()} == {"rig.yaml", "result.json", "report.html"}
+
+
+def test_python_runs_to_its_end(clone: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code = next(block for block in BLOCKS if "import imgcal\n" in block)
+    names: dict[str, object] = {}
+    exec(compile(code, "README.md", "exec"), names)
+    assert (clone / "recalibrated.yaml").is_file()
+    assert "CameraRig('O10 half resolution'" in capsys.readouterr().out
+    assert names["name"] == "00003"  # the live loop has seen the last snapshot
