@@ -1,4 +1,4 @@
-"""`events.jsonl`: one line an event, whole whatever happens to the process."""
+"""`events.jsonl`: one line an event; what a killed process left of a line is cut off when the file is opened again."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ LONGEST = 2**16  # bytes of a line, more than any event takes
 class EventLog:
     """Appends events to a file.
 
-    A line is written by one call of the system: a killed process leaves it whole or not at all. What a power failure
-    left of a line is cut off.
+    A line is written by one call of the system, so all but the last are whole whatever happens to the process. What a
+    kill in the midst of that call, or a power failure, left of the last is cut off when the file is opened again.
     """
 
     def __init__(self, path: Path, most_bytes: int = MOST_BYTES) -> None:

@@ -43,7 +43,7 @@ def test_a_second_process_helps_once_and_ends_with_the_command(cache, monkeypatc
     with tells_of_compiling(helped=True):
         for plus in (1, 2):
             numba.njit(lambda x, plus=plus: x + plus)(1)
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + 120
         while not (cache / "here").exists() and time.monotonic() < deadline:
             time.sleep(0.05)
         assert started[0].poll() is None

@@ -76,7 +76,7 @@ class Client:
         self.page, self.headers = page, {"Host": f"127.0.0.1:{page.address.port}"} | headers
 
     def __call__(self, method, path, body=None, **headers):
-        connection = http.client.HTTPConnection("127.0.0.1", self.page.address.port, timeout=20)
+        connection = http.client.HTTPConnection("127.0.0.1", self.page.address.port, timeout=60)
         sent = {name.replace("_", "-"): v for name, v in (self.headers | headers).items() if v is not None}
         connection.putrequest(method, path, skip_host=True, skip_accept_encoding=True)
         for name, value in sent.items():
@@ -101,6 +101,13 @@ class Client:
                 return answer
             time.sleep(0.1)
 
+    def download(self, path, seconds=60):
+        """A download; one that comes too early is asked for again."""
+        end = time.monotonic() + seconds
+        while (answer := self("GET", path))[0] in (429, 503) and time.monotonic() < end:
+            time.sleep(0.3)
+        return answer
+
     @property
     def origin(self):
         return f"http://{self.headers['Host']}"
@@ -110,13 +117,13 @@ class Stream:
     """Reads the stream of server-sent events."""
 
     def __init__(self, page):
-        self._connection = http.client.HTTPConnection("127.0.0.1", page.address.port, timeout=20)
+        self._connection = http.client.HTTPConnection("127.0.0.1", page.address.port, timeout=60)
         self._connection.request("GET", "/stream")
         self._answer = self._connection.getresponse()
 
     def wait(self, kind, until=lambda content: True):
         """The first message of a kind that is as expected."""
-        name, end = None, time.monotonic() + 15
+        name, end = None, time.monotonic() + 120
         while time.monotonic() < end:
             line = self._answer.readline().decode().rstrip("\n")
             if line.startswith("event: "):

@@ -35,7 +35,7 @@ def put(folder, camera, name, level=0):
 
 def until(items, count):
     """The next items that are something."""
-    found, ends = [], time.monotonic() + 20
+    found, ends = [], time.monotonic() + 90
     while len(found) < count:
         item = next(items)
         found += [] if item is None else [item]
