@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -206,6 +206,7 @@ def predicted_error(
         )
     rig = without_gradient(found.rig)
     volume = working_volume(found) if volume is None else volume
+    volume = replace(volume, low=volume.low.to(rig.focal_length), high=volume.high.to(rig.focal_length))
     covariance = joint_covariance(found) if covariance is None else covariance
     grid = volume.grid()
     shape, points = grid.shape[:-1], grid.flatten(0, -2)

@@ -97,6 +97,12 @@ def test_a_volume_of_ones_own(calibration, predicted):
     assert predicted_error(calibration, volume=far).median_mm > 2 * predicted.median_mm
 
 
+def test_a_volume_of_ones_own_in_single_precision(calibration, predicted):
+    volume = predicted.volume
+    single = replace(volume, low=volume.low.float(), high=volume.high.float())
+    assert predicted_error(calibration, volume=single).median_mm == pytest.approx(predicted.median_mm, rel=1e-4)
+
+
 def test_a_covariance_of_ones_own(calibration, predicted):
     twice = predicted_error(calibration, covariance=4 * joint_covariance(calibration))
     torch.testing.assert_close(twice.px, 2 * predicted.px, equal_nan=True)
