@@ -7,11 +7,13 @@ in which they are small: a block a camera, less the outer product of six rows.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from imgcal.estimation.rig_error import error_between
+from imgcal.estimation.rig_filter_cpu import RigArrays
 from imgcal.types import CameraRig
 
 
@@ -32,6 +34,11 @@ class Brought:
 
     def __len__(self) -> int:
         return len(self.pull)
+
+    @cached_property
+    def arrays(self) -> RigArrays:
+        """Where it was linearized, for compiled loops."""
+        return RigArrays.of(self.rig)
 
     def select(self, snapshots: slice) -> Brought:
         """Keep some snapshots."""

@@ -5,7 +5,9 @@ Source: Page, "Continuous Inspection Schemes", 1954; Siegmund, "Sequential Analy
 
 from __future__ import annotations
 
+import bisect
 import math
+from collections import deque
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -53,10 +55,43 @@ class Cusum:
 
     def update(self, standardized: ArrayLike) -> NDArray[np.bool_]:
         """Add a step, in standard deviations from the mean; nan where there is none. Tell which have risen."""
-        step = np.nan_to_num(np.asarray(standardized, dtype=np.float64) - self.reference, nan=0.0)
+        step = np.asarray(standardized, dtype=np.float64) - self.reference
+        step[np.isnan(step)] = 0.0
         self.value = np.maximum(self.value + step, 0.0)
         self.age = np.where(self.value > 0, self.age + 1, 0)
         risen: NDArray[np.bool_] = self.value > self.threshold
         self.found = np.where(risen, self.age, self.found)
         self.value, self.age = np.where(risen, 0.0, self.value), np.where(risen, 0, self.age)
         return risen
+
+
+class RunningMedian:
+    """Median of the latest numbers.
+
+    Examples:
+        >>> median = RunningMedian(3)
+        >>> for number in (9.0, 1.0, 4.0, 5.0):
+        ...     median.append(number)
+        >>> median.value  # of 1, 4 and 5
+        4.0
+    """
+
+    def __init__(self, most: int) -> None:
+        """Begin with none; `most` are kept."""
+        self._latest, self._sorted = deque[float](maxlen=most), list[float]()
+
+    def __len__(self) -> int:
+        return len(self._latest)
+
+    def append(self, number: float) -> None:
+        """Take a number; the oldest goes where there are too many."""
+        if len(self._latest) == self._latest.maxlen:
+            del self._sorted[bisect.bisect_left(self._sorted, self._latest[0])]
+        self._latest.append(number)
+        bisect.insort(self._sorted, number)
+
+    @property
+    def value(self) -> float:
+        """The median; nan of none."""
+        count = len(self._sorted)
+        return 0.5 * (self._sorted[(count - 1) // 2] + self._sorted[count // 2]) if count else math.nan

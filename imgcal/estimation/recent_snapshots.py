@@ -17,10 +17,11 @@ from torch import Tensor
 
 from imgcal.errors import RefusedError
 from imgcal.estimation.brought import Brought, add_blocks
-from imgcal.estimation.recent_screening import add_error, screen
+from imgcal.estimation.recent_screening import add_error, add_row, put, screen
 from imgcal.estimation.rig_changes import CHANGES, ChangeTest, change_of_errors, pixel_changes
 from imgcal.estimation.rig_error import displaced
 from imgcal.estimation.rig_filter import Absorbed, RigBelief, error_covariance
+from imgcal.estimation.rig_filter_cpu import RigArrays
 from imgcal.geometry import RigidTransform
 from imgcal.types import CameraRig, DriftRate, Observations
 
@@ -40,6 +41,7 @@ class _Base:
     number: int  # of the snapshot
     information: Tensor  # (D, D)
     weighted: Tensor  # (D,) information times the error of what was most probable
+    own: bool = False  # nobody else has these numbers
 
 
 @dataclass(frozen=True)
@@ -63,10 +65,12 @@ class RecentSnapshots:
         self._rate, self._belief = rate, belief
         self._unit = belief.unit.numpy()
         self._camera = np.zeros((OLDEST, cameras, free, free))
-        self._own = np.zeros_like(self._camera)  # the same, what the poses take away included
         self._carried = np.zeros((OLDEST, 6, wide))
         self._border = np.zeros((OLDEST, wide - cameras * free, wide))
         self._weighted = np.zeros((OLDEST, wide))  # pull, as it would be at the chart's origin
+        self._ring = (self._camera, self._carried, self._border, self._weighted)
+        blocks = (OLDEST + 1, cameras, free, free)
+        self._totals = (np.zeros(blocks), np.zeros(blocks))  # rounding: 10^-7 of a snapshot after a year
         self._pixels = pixel_changes(belief.rig)
         self._begin(belief.rig, belief.object_offset)
 
@@ -75,8 +79,10 @@ class RecentSnapshots:
         self._seen: deque[_Seen] = deque()
         self._bases: list[_Base] = []
         self._next = 0  # number of the next snapshot
+        for total in self._totals:
+            total[0] = 0.0
         self._aged = True  # the next snapshot needs a base
-        self._rig = _arrays(rig)  # the last one of which the error was asked for ...
+        self._rig = RigArrays.of(rig)  # the last one of which the error was asked for ...
         self._at = np.zeros_like(self._weighted[0])  # ... and that error
         self._at[self._unit.size :] = object_offset.numpy()
         self._change = change_of_errors(rig, torch.from_numpy(self._unit))
@@ -95,11 +101,11 @@ class RecentSnapshots:
         while len(self._seen) >= OLDEST or len(self._bases) >= MOST_BASES:
             self._drop()
         if self._aged or self._belief is not result.before:
-            before = self._error(result.before.rig, result.before.object_offset)
+            before = self._error(result.before.arrays, result.before.object_offset)
             information = result.before.information
             self._bases.append(_Base(self._next, information, information @ before))
             self._change = change_of_errors(result.before.rig, result.before.unit)
-        self._put(result.brought, self._error(result.brought.rig, result.brought.object_offset))
+        self._put(result.brought, 0, self._error(result.brought.arrays, result.brought.object_offset))
         self._seen.append(_Seen(observations, result.rig_from_object, seconds))
         self._follow(result.belief)
         self._aged = False
@@ -118,7 +124,7 @@ class RecentSnapshots:
             information, weighted = information + gained, weighted + earlier.pull.sum(0) + gained @ origin
         self._bases = [_Base(0, information, weighted)]
         for s, entry in enumerate(seen):
-            self._put(brought.select(slice(first + s, first + s + 1)), origin)
+            self._put(brought, first + s, origin)
             self._seen.append(entry)
         self._follow(result.belief)
 
@@ -160,10 +166,9 @@ class RecentSnapshots:
 
     def screened(self) -> NDArray[np.float64]:
         """Score each camera since each of `SCREENED`: (ages, C); see `screen`."""
-        order = (self._next - 1 - np.arange(len(self))) % OLDEST
         scores = np.empty((len(SCREENED), len(self._change)))
-        parts = (self._camera, self._own, self._carried, self._border, self._weighted)
-        screen(*parts, order, self._at, self._change.numpy(), PARTS, SCREENED, scores)
+        known = (self._at, self._change.numpy(), PARTS)
+        screen(self._ring, self._totals, self._next, len(self), *known, SCREENED, scores)
         return scores
 
     def test(self, age: int, aged: bool = True) -> ChangeTest:
@@ -237,19 +242,10 @@ class RecentSnapshots:
             information[:wide, wide:] += border[:, :wide].mT
         return information, torch.from_numpy(self._weighted[rows].sum(0))
 
-    def _put(self, brought: Brought, at: Tensor) -> None:
+    def _put(self, brought: Brought, number: int, at: Tensor) -> None:
         """Write the numbers of one snapshot, linearized at an error, into the ring."""
-        row = self._next % OLDEST
-        camera, carried, border = brought.camera[0].numpy(), brought.carried[0].numpy(), brought.border[0].numpy()
-        wide, error = self._unit.size, at.numpy()
-        taken = carried[:, :wide].reshape(6, *self._unit.shape)
-        self._camera[row], self._carried[row], self._border[row] = camera, carried, border
-        self._own[row] = camera - np.einsum("qci,qcj->cij", taken, taken)
-        weighted = brought.pull[0].numpy() - carried.T @ (carried @ error)
-        weighted[:wide] += np.einsum("cij,cj->ci", camera, error[:wide].reshape(self._unit.shape)).ravel()
-        weighted[:wide] += border[:, :wide].T @ error[wide:]
-        weighted[wide:] += border @ error
-        self._weighted[row] = weighted
+        parts = (brought.camera, brought.carried, brought.border, brought.pull)
+        put(self._ring, self._totals, self._next, tuple(part[number].numpy() for part in parts), at.numpy())
         self._next += 1
 
     def _drop(self) -> None:
@@ -258,29 +254,24 @@ class RecentSnapshots:
         if len(self._bases) > 1 and self._bases[1].number == base.number + 1:
             self._bases.pop(0)
         else:
-            brought, weighted = self._sums(base.number, base.number + 1)
-            self._bases[0] = _Base(base.number + 1, base.information + brought, base.weighted + weighted)
+            if not base.own:  # the belief has the same numbers
+                base.information, base.own = base.information.clone(), True
+            add_row(self._ring, base.number % OLDEST, base.information.numpy(), base.weighted.numpy())
+            base.number += 1
         self._seen.popleft()
 
     def _follow(self, belief: RigBelief) -> Tensor:
         """Remember what is believed now, and return its error."""
         self._belief = belief
-        return self._error(belief.rig, belief.object_offset)
+        return self._error(belief.arrays, belief.object_offset)
 
-    def _error(self, rig: CameraRig, object_offset: Tensor) -> Tensor:
+    def _error(self, rig: RigArrays, object_offset: Tensor) -> Tensor:
         """Error (D,) of a rig in the chart."""
-        arrays, wide = _arrays(rig), self._unit.size
-        add_error(*arrays, *self._rig, self._unit, self._at[:wide].reshape(self._unit.shape))  # type: ignore[call-arg]
-        self._rig = arrays
+        wide = self._unit.size
+        add_error(rig.parts, self._rig.parts, self._unit, self._at[:wide].reshape(self._unit.shape))
+        self._rig = rig
         self._at[wide:] = object_offset.numpy()
         return torch.from_numpy(self._at.copy())
-
-
-def _arrays(rig: CameraRig) -> tuple[NDArray[np.float64], ...]:
-    """Rotation (C, 3, 3), translation (C, 3) and lens (C, 9) of a rig."""
-    lens = torch.cat((rig.focal_length, rig.principal_point, rig.distortion), dim=-1)
-    parts = (rig.cam_from_rig.rotation, rig.cam_from_rig.translation, lens)
-    return tuple(part.contiguous().numpy() for part in parts)
 
 
 def _cholesky(matrix: Tensor) -> Tensor:

@@ -12,9 +12,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.errors import RefusedError
@@ -30,6 +32,7 @@ from imgcal.estimation.map_estimate import (
     object_prior_std,
 )
 from imgcal.estimation.rig_error import displaced, error_between, step_by_error
+from imgcal.estimation.rig_filter_cpu import RigArrays
 from imgcal.geometry import RigidTransform
 from imgcal.types import CalibrationObject, CameraRig, DriftRate, Observations, RigPrior
 
@@ -56,6 +59,24 @@ YOUNG_SECONDS = 60.0
 """Time over which a rig may be taken to stand still; what it wanders by then is far below the noise of a snapshot."""
 LEAST_SECONDS = 1.0
 """Time that is worth an inversion of the information."""
+
+
+@dataclass(frozen=True)
+class _Constants:
+    """What `rig_filter_cpu.absorb` is given of an object and of lenses."""
+
+    shared: tuple[Any, ...]  # see `linearization_cpu`
+    centroid: NDArray[np.float64]  # (3,) mm
+    own_std: NDArray[np.float64]  # (M,) prior standard deviation of the object's offset
+
+    @classmethod
+    def of(cls, obj: CalibrationObject, rig: CameraRig) -> _Constants:
+        centroid = obj.points.mean(0)
+        own_std = obj.points.new_zeros(0) if obj.exact else object_prior_std(obj)
+        squared = None if obj.radius is None else obj.radius.double().square()
+        none = obj.points.new_zeros(0)
+        problem = Problem(none, none, obj.points - centroid, centroid, squared, rig, none)
+        return cls(lm_cpu.shared_given(problem), centroid.numpy(), own_std.numpy())
 
 
 @dataclass(frozen=True)
@@ -86,6 +107,21 @@ class RigBelief:
     def information(self) -> Tensor:
         """Inverse covariance (D, D) of the errors in their units."""
         return self.factor @ self.factor.mT
+
+    @cached_property
+    def arrays(self) -> RigArrays:
+        """The rig for compiled loops."""
+        return RigArrays.of(self.rig)
+
+    @cached_property
+    def half_log_determinant(self) -> float:
+        """Of the information."""
+        return float(self.factor.diagonal().log().sum())
+
+    @cached_property
+    def constants(self) -> _Constants:
+        """What compiled loops are given of the object and the lenses; the same of all beliefs about them."""
+        return _Constants.of(self.obj, self.rig)
 
     def covariance(self) -> Tensor:
         """Joint covariance (K C, K C) of the cameras in the units and order of `CameraRig.parameter_names`."""
@@ -149,58 +185,55 @@ def _absorbed_compiled(
     belief: RigBelief, observations: Observations, rig_from_object: RigidTransform, options: EstimationOptions
 ) -> Absorbed:
     """Do the work of `absorbed` in one compiled call."""
-    obj, rig = belief.obj, belief.rig
-    own_std = obj.points.new_zeros(0) if obj.exact else object_prior_std(obj)
+    constants, unit = belief.constants, belief.unit
     seen = observations.seen.numpy()
-    uv = np.where(seen[..., None], observations.uv.numpy(), 0.0).astype(np.float64).swapaxes(-1, -2)
-    root_weight = np.where(seen, 1 / np.where(seen, observations.sigma.numpy(), 1.0), 0.0).astype(np.float64)
-    centroid = obj.points.mean(0)
-    problem = Problem(
-        torch.from_numpy(uv).unsqueeze(0), torch.from_numpy(root_weight).unsqueeze(0), obj.points - centroid, centroid,
-        None if obj.radius is None else obj.radius.double().square(), rig, belief.unit,
-    )  # fmt: skip
+    uv = np.where(seen[..., None], observations.uv.numpy(), 0.0).astype(np.float64, copy=False)
+    uv = np.ascontiguousarray(uv.swapaxes(-1, -2))
+    sigma = np.where(seen, observations.sigma.numpy(), np.inf)
     rotation = np.ascontiguousarray(rig_from_object.rotation.detach().double().reshape(-1, 3, 3).numpy())
     translation = rig_from_object.translation.detach().double().reshape(-1, 3).numpy()
-    turned = rig.cam_from_rig.rotation.contiguous().numpy()
-    position = -(turned.swapaxes(-1, -2) @ rig.cam_from_rig.translation.numpy()[..., None])[..., 0]
-    values = (rig.focal_length, rig.principal_point, rig.distortion)
-    known = rig_filter_cpu.RigArrays(turned, position, *(value.contiguous().numpy() for value in values))
     loss = (lm_cpu.LOSS_CODES[options.loss], float(options.threshold))
     found = rig_filter_cpu.absorb(
-        lm_cpu.shared_given(problem),
-        (np.ascontiguousarray(uv), root_weight),
-        (known, belief.unit.numpy(), belief.object_offset.numpy(), own_std.numpy(), belief.information.numpy()),
-        (rotation, translation + rotation @ centroid.numpy()),
+        constants.shared,
+        (uv, (1 / sigma).astype(np.float64, copy=False)),
+        (belief.arrays, unit.numpy(), belief.object_offset.numpy(), constants.own_std, belief.information.numpy()),
+        (rotation, translation + rotation @ constants.centroid),
         (*loss, options.max_iterations, options.tolerance, SLACK, DAMPED, STALLED, MOST_DAMPING),
     )
     if found.status:
         raise RefusedError(f"estimation: {WHY_NOT[found.status]}")
-    now = replace(belief, rig=_rig_of(found.rig, rig), object_offset=torch.from_numpy(found.own))
-    now = replace(now, factor=torch.from_numpy(found.factor))
-    vars(now)["information"] = torch.from_numpy(found.information)  # what the property would make of the factor
+    own, factor = torch.from_numpy(found.own), torch.from_numpy(found.factor)
+    now = RigBelief(_rig_of(found.rig, belief.rig), belief.obj, own, factor, unit)
     brought = Brought(
-        _rig_of(found.from_rig, rig), torch.from_numpy(found.from_own), belief.unit,
+        _rig_of(found.from_rig, belief.rig), torch.from_numpy(found.from_own), unit,
         *(torch.from_numpy(part) for part in (found.camera, found.border, found.carried, found.pull)),
     )  # fmt: skip
-    poses = RigidTransform(
-        torch.from_numpy(found.rotation), torch.from_numpy(found.centre - found.rotation @ centroid.numpy())
-    )
-    residual = np.where(seen[..., None], found.residual.swapaxes(-1, -2), 0.0)
-    learnt = np.log(found.factor.diagonal()).sum() - float(belief.factor.diagonal().log().sum())
-    dof = 2 * int(seen.sum()) - 6 * len(seen)
-    rest = (torch.from_numpy(residual), 2 * found.cost, dof, -float(learnt) - found.cost)
-    return Absorbed(now, poses, *rest, belief, brought)
+    # What the properties would make of it, at hand.
+    half_log_determinant = float(np.log(found.factor.diagonal()).sum())
+    information = torch.from_numpy(found.information)
+    vars(now).update(information=information, arrays=found.rig, constants=constants)
+    vars(now).update(half_log_determinant=half_log_determinant)
+    vars(brought).update(arrays=found.from_rig)
+    translation = found.centre - found.rotation @ constants.centroid
+    poses = RigidTransform(torch.from_numpy(found.rotation), torch.from_numpy(translation))
+    residual = torch.from_numpy(np.where(seen[..., None], found.residual.swapaxes(-1, -2), 0.0))
+    evidence = belief.half_log_determinant - half_log_determinant - found.cost
+    dof = 2 * int(np.count_nonzero(seen)) - 6 * len(seen)
+    return Absorbed(now, poses, residual, 2 * found.cost, dof, evidence, belief, brought)
 
 
-def _rig_of(values: rig_filter_cpu.RigArrays, like: CameraRig) -> CameraRig:
+def _rig_of(values: RigArrays, like: CameraRig) -> CameraRig:
+    """The rig that has these values; `replace` would take longer than a projection."""
     translation = -(values.rotation @ values.position[..., None])[..., 0]
-    return replace(
-        like,
+    rig = object.__new__(CameraRig)
+    vars(rig).update(vars(like))
+    vars(rig).update(
         focal_length=torch.from_numpy(values.focal_length),
         principal_point=torch.from_numpy(values.principal_point),
         distortion=torch.from_numpy(values.distortion),
         cam_from_rig=RigidTransform(torch.from_numpy(values.rotation), torch.from_numpy(translation)),
     )
+    return rig
 
 
 def absorbed_in_tensors(
@@ -235,7 +268,9 @@ def aged(belief: RigBelief, seconds: float, rate: DriftRate) -> RigBelief:
         seconds: how long ago.
         rate: of the walks.
     """
-    variance = rate.std(belief.rig).square() * (max(seconds, 0.0) / 3600)
+    if seconds <= 0:
+        return belief
+    variance = rate.std(belief.rig).square() * (seconds / 3600)
     return widened(belief, variance) if variance.any() else belief
 
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from imgcal.estimation.linearization_cpu import blocks_of, linearize_rig
 from imgcal.geometry import kernels
+from imgcal.types import CameraRig
 from renderers.compiling import njit
 
 Array = NDArray[np.float64]
@@ -40,6 +41,15 @@ class RigArrays:
     focal_length: Array  # (C, 2)
     principal_point: Array  # (C, 2)
     distortion: Array  # (C, K - 10)
+
+    @classmethod
+    def of(cls, rig: CameraRig) -> RigArrays:
+        """Take the values of a rig without batch axes."""
+        rotation = rig.cam_from_rig.rotation.contiguous().numpy()
+        position = -(rotation.swapaxes(-1, -2) @ rig.cam_from_rig.translation.numpy()[..., None])[..., 0]
+        position = np.ascontiguousarray(position)
+        lens = (rig.focal_length, rig.principal_point, rig.distortion)
+        return cls(rotation, position, *(part.contiguous().numpy() for part in lens))
 
     @property
     def parts(self) -> tuple[Array, ...]:
@@ -91,12 +101,8 @@ def absorb(
     (count, cameras, _, fiducials), free = uv.shape, unit.shape[1]
     size = len(own)
     wide = cameras * free + size
-    rigs = tuple(np.stack((part, part)) for part in rig.parts)
-    states = (
-        np.zeros((cameras, free)),
-        *(np.stack((part, part)) for part in poses),
-        np.stack((own, own)),
-    )
+    rigs = tuple(_two_rows(part) for part in rig.parts)
+    states = (np.zeros((cameras, free)), *(_two_rows(part) for part in (*poses, own)))
     blocks = (
         np.empty((2, count, cameras, free, free)), np.empty((2, count, 1, 6, wide)), np.empty((2, count, 1, 6, 6)),
         np.empty((2, count, size, wide)), np.empty((2, count, cameras, free)), np.empty((2, count, 1, 6)),
@@ -126,6 +132,13 @@ def absorb(
         from_rig=RigArrays(*(part[last] for part in rigs)),
         from_own=states[3][last],
     )
+
+
+def _two_rows(part: Array) -> Array:
+    """The first row is what is given; the other is written before it is read."""
+    rows = np.empty((2, *part.shape))
+    rows[0] = part
+    return rows
 
 
 @njit(cache=True, fastmath=kernels.FAST)

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections import deque
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from imgcal.errors import RefusedError
-from imgcal.estimation.cusum import Cusum
+from imgcal.estimation.cusum import Cusum, RunningMedian
 from imgcal.estimation.object_change import ObjectChange, changed_object
 from imgcal.estimation.recent_snapshots import SCREENED, RecentSnapshots
 from imgcal.estimation.rig_changes import CHANGES, JUMPS, LARGE, ChangeTest, change_of_errors, pixel_changes, spread_of
@@ -109,7 +107,7 @@ class RigMonitor:
         self.filter = rig_filter
         self.open: dict[int, Change] = {}  # changes whose kind is not decided yet, by camera
         self.object_change: ObjectChange | None = None  # that became known with the latest snapshot
-        self._misfit, self._usual = Cusum(1, 1.0, FALSE_ALARMS), deque[float](maxlen=256)
+        self._misfit, self._usual = Cusum(1, 1.0, FALSE_ALARMS), RunningMedian(256)
         self._recent = RecentSnapshots(rig_filter.belief, rig_filter.rate)
         self._since: _Open | None = None
         self._suspect: int | None = None  # the camera without which the last snapshot would not have been refused
@@ -247,7 +245,7 @@ class RigMonitor:
         """Number of snapshots that fit worse than is usual; 0 = they fit."""
         ratio = result.chi2 / max(result.dof, 1)
         self._usual.append(ratio)
-        step = (ratio / float(np.median(self._usual)) - 1) * math.sqrt(max(result.dof, 1) / 2)
+        step = (ratio / self._usual.value - 1) * math.sqrt(max(result.dof, 1) / 2)
         risen = self._misfit.update([min(step, MOST_MISFIT)])
         return int(self._misfit.found[0]) if risen[0] and len(self._usual) >= LEAST_USUAL else 0
 

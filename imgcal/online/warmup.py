@@ -10,6 +10,7 @@ import torch
 
 from imgcal.detection import detect
 from imgcal.errors import RefusedError
+from imgcal.estimation import RecentSnapshots, RigFilter
 from imgcal.io import load_object, load_rig
 from imgcal.online.keeper import RigKeeper
 from imgcal.online.recalibrator import Recalibrator
@@ -25,13 +26,14 @@ from imgcal.synthesis import (
     simulate_truth,
     true_detections,
 )
-from imgcal.types import CalibrationObject, CameraRig
+from imgcal.types import CalibrationObject, CameraRig, Observations
 from renderers import SensorModel, palette
 
 RIG, OBJECT, SIZE = "T4", "asymmetric8", (512, 272)
 SNAPSHOTS = 3
 DRIFT = RelativeDrift(0.01, 0.01)
 POSES = PoseRange(phi_deg=(0.0, 28.6), alpha_deg=(0.0, 0.0))
+A_SECOND = 66  # snapshots: more than a filter keeps
 MANY = 12  # enough to ask for moves, for blocks, and for what is known in the way of long captures
 
 
@@ -52,6 +54,7 @@ def warm_up() -> None:
         calibrate(true_detections(simulate_truth(rig, obj, MANY, generator, DRIFT, POSES)), rig, obj)
     _of_a_plane(rig, generator)
     _of_bloomed_lamps()
+    _of_many_snapshots(truth, rig, obj)
     seen = torch.ones(truth.uv.shape[:-1], dtype=torch.bool)
     for uv in (truth.uv, truth.uv.float()):  # of `imgcal render`, and of the networks
         render_views(uv, seen, rig.image_size, obj, ImageOptions(32, 1.5))
@@ -100,6 +103,17 @@ def _of_a_plane(rig: CameraRig, generator: torch.Generator) -> None:
     unlabelled = true_detections(truth)
     with _whatever_comes():
         calibrate(unlabelled, rig, plane)
+
+
+def _of_many_snapshots(truth: Truth, rig: CameraRig, obj: CalibrationObject) -> None:
+    """What is older than a second becomes part of what was known before."""
+    seen = torch.ones(1, *truth.uv.shape[1:-1], dtype=torch.bool)
+    there = Observations(truth.uv[:1], torch.full(seen.shape, 0.1, dtype=torch.float64), seen)
+    follows = RigFilter(rig, obj)
+    recent = RecentSnapshots(follows.belief, follows.rate)
+    with _whatever_comes():
+        for _ in range(A_SECOND):
+            recent.append(follows.follow(there, truth.rig_from_object[:1]), there, 0.0)
 
 
 def _of_bloomed_lamps() -> None:

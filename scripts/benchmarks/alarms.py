@@ -23,7 +23,6 @@ import tyro
 from torch import Tensor
 
 import imgcal
-from imgcal.association import to_observations
 from imgcal.errors import RefusedError
 from imgcal.estimation import (
     Change,
@@ -53,6 +52,8 @@ SWEPT = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
 """Of the sizes of `GATE`; the last is those themselves."""
 BEFORE, AFTER = 300, 300
 """Snapshots before and after a bump: at 60 a second."""
+BLOCK = 100
+"""Snapshots that are simulated at once; `BEFORE` is so many times as many."""
 LONG = 6000
 """Snapshots of an item without a bump."""
 GOAL = 1_730_000
@@ -77,15 +78,15 @@ class Item:
 
 
 COUNTS = {
-    "monitor steady": 300, "monitor drifting": 300, "monitor bump": 500, "monitor sweep": 480, "monitor two": 60,
+    "monitor steady": 145, "monitor drifting": 145, "monitor bump": 500, "monitor sweep": 240, "monitor two": 60,
     "monitor away": 60, "monitor half degree": 60, "monitor creep": 4, "monitor whole rig": 40,
     "keeper steady": 20, "keeper drifting": 20, "keeper bump": 120,
 }  # fmt: skip
-"""Items of each experiment."""
+"""Items of each experiment: without a bump, `GOAL` snapshots together."""
 
-
-LONGER, SLOWER = ("monitor steady", "monitor drifting", "monitor creep"), 8.0
-"""Experiments that take most of the time, and by how much they are behind the others."""
+PACE = {"monitor bump": 1.0, "monitor steady": 3.0, "monitor drifting": 3.0}
+"""When the bumps are done, a third of the long ones is, and of the others a fifth."""
+OTHERS = 5.0
 
 
 class Followed:
@@ -97,26 +98,38 @@ class Followed:
         self.told: list[tuple[int, Change]] = []  # number of the snapshot in the stream
         self.numbers: list[int] = []  # of the stream, of each snapshot of the filter
         self.last = 0
+        self._ahead: Observations | None = None  # snapshots (S,) that are simulated already ...
+        self._rigs, self._labels = stream.rig.expand(1), list[int]()  # ... their true rigs, and how many labels
+        self._first = self._row = 0
 
     def step(self, number: int) -> Observations | None:
-        """Learn from a snapshot; None = the object is not seen."""
-        blobs = self.stream.snapshot(number)
-        observations = to_observations(blobs.select(blobs.fiducial >= 0), self.stream.factory, self.stream.obj)
-        if int(observations.seen.sum()) < 6:
+        """Learn from a snapshot, each being asked for in turn; None = the object is not seen."""
+        row = number - self._first
+        if self._ahead is None or row >= len(self._ahead.uv):
+            self._first, row = number, 0
+            self._ahead, self._rigs = self.stream.labelled(number, number + BLOCK)
+            self._labels = self._ahead.seen.sum((1, 2)).tolist()
+        self._row = row
+        if self._labels[row] < 6:
             return None
+        observations = Observations(*(x[row : row + 1] for x in vars(self._ahead).values()))
         pose = self.pose
         if pose is None or number - self.last > 3:
             pose = initial_pose(observations, self.monitor.filter.belief.rig, self.stream.obj)
+        seconds = (number - self.last) / self.stream.conditions.rate
         try:
-            result, changes = self.monitor.update(
-                observations, pose, (number - self.last) / self.stream.conditions.rate
-            )
+            result, changes = self.monitor.update(observations, pose, seconds)
         except RefusedError:
             return None
         self.pose, self.last = result.rig_from_object, number
         self.numbers.append(number)
         self.told += [(number, change) for change in changes]
         return observations
+
+    @property
+    def truth(self) -> CameraRig:
+        """The rig as it was at the last snapshot that was asked for."""
+        return self._rigs[self._row]
 
 
 def stream_of(seed: int, name: str, drifting: bool = False, bumps: tuple[Bump, ...] = (), **more: Any) -> Stream:
@@ -209,10 +222,10 @@ def half_degree(item: Item) -> dict[str, Any]:
         after = number - bump.snapshot
         if after in (30, 60, 120, 240):
             rigs = (followed.monitor.filter.belief.rig, told.belief.rig)
-            errors[str(after)] = [held_out(rig, stream.rig, stream) for rig in rigs]
+            errors[str(after)] = [held_out(rig, followed.truth, stream) for rig in rigs]
         if after >= 0 and after % 5 == 0 and bump.camera not in followed.monitor.open:
             sure += 1
-            wrong += int(distance(followed.monitor.filter.belief, stream.rig)[bump.camera] > SURELY)
+            wrong += int(distance(followed.monitor.filter.belief, followed.truth)[bump.camera] > SURELY)
     return {
         "rig": name,
         "held_out": errors,
@@ -237,12 +250,11 @@ def creeping(item: Item) -> dict[str, Any]:
     followed, camera = Followed(stream), item.seed % 4
     step = torch.zeros(stream.factory.num_cameras, 15, dtype=torch.float64)
     step[camera, :3] = CREEP * torch.nn.functional.normalize(torch.randn(3, generator=stream.generator), dim=0)
-    start, worst, wrong = stream.rig, 0.0, 0
-    for number in range(600, 36600, 1):
-        stream.rig = stream.rig.retract(step)
+    start, stream.creep, worst, wrong = stream.rig, step, 0.0, 0
+    for number in range(600, 36600):
         followed.step(number)
         if number % 1200 == 0:
-            found = float(distance(followed.monitor.filter.belief, stream.rig)[camera])
+            found = float(distance(followed.monitor.filter.belief, followed.truth)[camera])
             worst, wrong = max(worst, found), wrong + int(found > SURELY)
     moved = Gauge.of_most(followed.monitor.filter.belief.rig, start).difference(
         followed.monitor.filter.belief.rig, start
@@ -312,10 +324,10 @@ def run(item: Item) -> dict[str, Any]:
 
 
 def items(share: float) -> list[Item]:
-    """All of them, or a share; in an order in which every experiment is as far as the others, short ones ahead."""
+    """All of them, or a share; in an order in which all experiments go on together, each at its `PACE`."""
     wanted = {name: max(1, round(share * count)) for name, count in COUNTS.items()}
     every = [
-        (seed / count * (SLOWER if name in LONGER else 1.0), Item(name, seed))
+        (seed / count * PACE.get(name, OTHERS), Item(name, seed))
         for name, count in wanted.items()
         for seed in range(count)
     ]
