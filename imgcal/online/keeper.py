@@ -24,15 +24,15 @@ from imgcal.online.clock import ClockOffsets
 from imgcal.online.default_tests import default_tests
 from imgcal.online.drift_watch import DriftWatch
 from imgcal.online.events import Event, snapshot_name
-from imgcal.online.following import astray, found_again, near_prediction, spare_blobs
+from imgcal.online.following import near_prediction
 from imgcal.online.keeper_file import KeeperFile, read_memory, unusable
 from imgcal.online.label_checks import Checked, check_labels
 from imgcal.online.labelling import LEAST_FOLLOWED, Labelling
 from imgcal.online.memory import Frozen, require_alike
 from imgcal.online.noise_level import NoiseLevel
 from imgcal.online.relearning import Relearning
-from imgcal.online.resection import resected
 from imgcal.online.rig_state import CameraHealth, RigState
+from imgcal.online.search import Search, Surroundings
 from imgcal.online.sequential_test import SequentialTest
 from imgcal.online.sightings import Look, Sightings
 from imgcal.pipeline import DetectorName, checked_frames
@@ -53,14 +53,12 @@ LEAST_LOOKS = 8
 """Snapshots of a camera, from where it stands, from which its values say where its labels must be."""
 PATIENCE = 64
 """Snapshots in a row in which no camera fits: the rig is not the one that is known, and is learnt anew."""
-REMEMBERED = 64
-"""Snapshots without labels by which a camera that is lost is looked for."""
 GREATEST_TIME = 2.0**37
 
 REMEMBERED_VALUES = (
     "factory", "obj", "drift", "_prior", "_monitor", "_noise", "_sightings", "_relearning", "_drift_watch", "_count",
-    "_learnt", "_times", "_poses", "_labels", "_spare", "_usual", "_off", "_looks", "_in_vain", "_unlabelled",
-    "_told_health", "_before", "_pending", "_time",
+    "_learnt", "_times", "_poses", "_labels", "_search", "_usual", "_off", "_looks", "_in_vain", "_told_health",
+    "_before", "_pending", "_time",
 )  # fmt: skip
 """Attributes of a keeper that are saved."""
 
@@ -126,12 +124,11 @@ class RigKeeper:
         self._times: deque[tuple[int, float]] = deque(maxlen=512)  # number in the filter and time of snapshots
         self._poses: deque[tuple[float, RigidTransform]] = deque(maxlen=2)  # (1,) of the last snapshots
         self._labels = 0  # of the last snapshot
-        self._spare: deque[NDArray[np.int64]] = deque(maxlen=15)
+        self._search = Search(rig.num_cameras)
         self._usual: deque[float] = deque(maxlen=64)  # px
         self._off: dict[int, float] = {}  # cameras that did not fit in the last snapshot -> since when
         self._looks = np.zeros(rig.num_cameras, dtype=np.int64)  # snapshots learnt from each camera where it stands
         self._in_vain = 0  # snapshots in a row in which no camera fits
-        self._unlabelled: dict[int, deque[tuple[NDArray[np.float64], Tensor]]] = {}  # of cameras that are lost
         self._told_health: dict[int, CameraHealth] = {}  # by tests
         self._before = self._monitor.filter.belief  # a belief from before what is being decided
         self._pending: list[Event] = []
@@ -347,14 +344,13 @@ class RigKeeper:
         named = replace(usable, fiducial=near_prediction(usable, self._predicted(pose)))
         if (named.fiducial >= 0).sum() < LEAST_FOLLOWED * self._labels:
             return None
+        sought = frozenset(self._search.sought)
         try:
             found = self._searched(self._checked(named, pose))
         except RefusedError:
             return None
         few = found.checked.labels < LEAST_FOLLOWED * self._labels
-        return (
-            None if few or found.astray - self._unlabelled.keys() or found.checked.usual > self._most_usual() else found
-        )
+        return None if few or found.astray - sought or found.checked.usual > self._most_usual() else found
 
     def _extrapolated(self) -> RigidTransform:
         """Where the object should be now: (1,)."""
@@ -396,42 +392,11 @@ class RigKeeper:
 
     def _searched(self, checked: Checked) -> _Labelled:
         """Look for the object in cameras that do not see it where it should be."""
-        usual = np.median(self._spare, axis=0) if self._spare else np.zeros(self._prior.num_cameras)
-        blobs, pose = checked.blobs, checked.rig_from_object[0]
-        if not self._monitor.filter.count or spare_blobs(blobs, self._prior.num_cameras).max(initial=0) < 3:
-            return _Labelled(checked, frozenset())
-        off, missed = checked.off.copy(), set()
-        for camera in np.flatnonzero(astray(blobs, usual, self.belief.rig, self._object, pose)).tolist():
-            again = self._found(blobs, camera, pose)
-            if again is None:
-                missed.add(camera)
-            else:
-                blobs, off[camera] = again, True
-        labels = int((blobs.fiducial >= 0).sum())
-        return _Labelled(replace(checked, blobs=blobs, off=off, labels=labels), frozenset(missed))
-
-    def _found(self, blobs: Detections, camera: int, pose: RigidTransform) -> Detections | None:
-        """Label the blobs of a camera that has moved; None = it cannot be told how."""
         known = self._known()
-        assert known is not None  # nothing is astray before anything is known
-        labelled = found_again(blobs, camera, known[0], self._object, pose, known[1], self.options)
-        if labelled is not None:
-            self._unlabelled.pop(camera, None)
-            return labelled
-        rows = np.flatnonzero(blobs.camera == camera)
-        since = self._unlabelled.setdefault(camera, deque(maxlen=REMEMBERED))
-        since.append((blobs.uv[rows], pose.apply(self.belief.points_object)))
-        if len(since) & (len(since) - 1):  # another try is dear: after 1, 2, 4, 8, ... of them
-            return None
-        places = torch.stack([points for _, points in since])
-        lens, generator = self.belief.rig.select([camera]), np.random.default_rng(len(since))
-        labels = resected([uv for uv, _ in since], places, lens, generator)
-        if labels is None:
-            return None
-        del self._unlabelled[camera]
-        fiducial = blobs.fiducial.copy()
-        fiducial[rows] = labels
-        return replace(blobs, fiducial=fiducial)
+        if known is None:
+            return _Labelled(checked, frozenset())
+        there = Surroundings(*known, self._object, self.options)
+        return _Labelled(*self._search.take(checked, there, self._time, self._count - 1))
 
     def _learn(self, labelled: _Labelled, time: float) -> tuple[Absorbed, tuple[Change, ...]]:
         """Absorb a snapshot; what a camera sees that does not fit for the first time waits for the next one."""
@@ -459,9 +424,8 @@ class RigKeeper:
         self._labelling.follow(result.rig_from_object[0])
         self._poses.append((time, result.rig_from_object))
         self._labels = checked.labels
-        self._spare.append(spare_blobs(checked.blobs, self._prior.num_cameras))
+        self._search.learnt(checked.blobs, self._count - 1)
         self._usual.append(checked.usual)
-        self._unlabelled = {camera: since for camera, since in self._unlabelled.items() if camera in labelled.astray}
         steady = not (off or changes or self._monitor.open)
         if self._noise.take(blobs, observations, result, steady, self._monitor.filter.count):
             result = self._again(result)
@@ -485,7 +449,7 @@ class RigKeeper:
         self._noise.restart()
         self._usual.clear()
         self._times.clear()
-        self._off, self._unlabelled = {}, {}
+        self._off, self._search = {}, Search(self._prior.num_cameras)
         self._looks[:] = 0
         self._relearning = Relearning(self._prior.camera_names)
         self._drift_watch = DriftWatch(self._prior.camera_names)
@@ -497,7 +461,7 @@ class RigKeeper:
         events = []
         for change in changes:
             since = next((t for number, t in self._times if number >= change.since), time)
-            since = min(since, self._off.get(change.camera, since))
+            since = self._search.since(change.camera, min(since, self._off.get(change.camera, since)))
             told = self._relearning.events.get(change.camera)
             if told is not None and told.change == "unknown" and told.since is not None:  # the same, told again
                 since = told.since
@@ -601,7 +565,7 @@ class RigKeeper:
                 found[name] = "unseen"
             elif camera in self._relearning.events:
                 found[name] = "relearning"
-            elif camera in self._off:
+            elif camera in self._off or camera in self._sightings.doubted:
                 found[name] = "doubtful"
             else:
                 found[name] = self._told_health.get(camera, "ok")

@@ -36,6 +36,7 @@ MODULES = frozenset(
         "online.events",
         "online.noise_level",
         "online.relearning",
+        "online.search",
         "online.sightings",
         "online.window",
         "types.calibration_object",

@@ -279,11 +279,11 @@ class Recalibrator:
         places = self._fit.rough(window)[0].rig_from_object[-len(since) :].apply(latest.points_object)
         rows = [np.flatnonzero(kept.blobs.camera == camera) for kept in since]
         seen = [kept.blobs.uv[r] for kept, r in zip(since, rows, strict=True)]
-        labels = resected(seen, places, latest.rig.select([camera]), np.random.default_rng(times))
-        if labels is None:
+        found = resected(seen, places, latest.rig.select([camera]), np.random.default_rng(times))
+        if found is None:
             return None
         fiducial = since[-1].blobs.fiducial.copy()
-        fiducial[rows[-1]] = labels
+        fiducial[rows[-1]] = found.labels
         return replace(since[-1].blobs, fiducial=fiducial)
 
     def _completed(self, result: Calibration, window: Window) -> LiveCalibration:

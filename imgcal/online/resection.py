@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations, permutations
 
 import cv2
@@ -16,21 +16,33 @@ from imgcal.estimation import EstimationOptions, estimate
 from imgcal.geometry import RigidTransform, undistort_cpu
 from imgcal.types import CalibrationObject, CameraRig, Observations
 
-TRIES = 600
-"""Triples of blobs that are taken for triples of fiducials."""
+TRIES = 1200
+"""Triples of blobs that are taken for triples of fiducials: some 300 tries find one that is right."""
+FIRST, SHORTLIST = 4, 128
+"""Snapshots, spread over all, by which all poses are judged, and how many of these are judged by the others, too."""
 ROUGH, FINE = 6.0, 2.0
 """Pixels between a blob and its fiducial: by a pose from three of them, and after a fit of all."""
 LEAST_MATCHES = 8
 """Over all snapshots: four of one snapshot may agree by chance."""
+LEAST_AT_ONCE = 4
+"""In a single snapshot, of a camera whose place is known."""
 LEAST_SHARE = 0.7
 """Of what could be seen: the smaller of blobs and fiducials, snapshot by snapshot."""
 LEAST_LEAD = 1.3
 """Times as many matches as any pose that gives other labels."""
 
 
+@dataclass(frozen=True)
+class Resected:
+    """A camera that was found."""
+
+    labels: NDArray[np.int64]  # (M,) fiducial of each blob of the last snapshot, -1 = none
+    camera: CameraRig  # alone, where it is now
+
+
 def resected(
     blobs: Sequence[NDArray[np.float64]], points_rig: Tensor, camera: CameraRig, generator: np.random.Generator
-) -> NDArray[np.int64] | None:
+) -> Resected | None:
     """Label the blobs of the last snapshot by the one place of the camera that explains all snapshots.
 
     Args:
@@ -40,7 +52,7 @@ def resected(
         generator: chooses among triples where there are many.
 
     Returns:
-        (M,) fiducial of each blob of the last snapshot, -1 = none; None where no place explains enough, or several do.
+        The camera where it is; None where no place explains enough, or several do.
     """
     seen = [_ideal(uv, camera) for uv in blobs]
     points = points_rig.numpy()
@@ -48,6 +60,7 @@ def resected(
     if not len(poses):
         return None
     focal = float(camera.focal_length.mean())
+    poses = poses[_promising(poses, points, seen, ROUGH / focal)]
     labels = [_matches(poses, p, xy, ROUGH / focal) for p, xy in zip(points, seen, strict=True)]  # S x (K, M)
     count = sum((found >= 0).sum(1) for found in labels)
     best = int(np.argmax(count))
@@ -65,7 +78,31 @@ def resected(
     others = count[agree < 0.5 * sum(len(xy) for xy in seen)]
     if matches < max(LEAST_MATCHES, LEAST_SHARE * possible, LEAST_LEAD * others.max(initial=0)):
         return None
-    return final[-1]
+    return Resected(final[-1], fitted)
+
+
+def labels_at(uv: NDArray[np.float64], points_rig: Tensor, camera: CameraRig) -> NDArray[np.int64] | None:
+    """Label the blobs (M, 2) of one snapshot by a camera's known place; None where it explains too few of them.
+
+    Args:
+        uv: pixels.
+        points_rig: (N, 3) mm, where the fiducials are.
+        camera: a rig of one camera.
+    """
+    tolerance = FINE / float(camera.focal_length.mean())
+    labels = _matches(_pose(camera), points_rig.numpy(), _ideal(uv, camera), tolerance)[0]
+    possible = min(int(camera.project(points_rig).visible.sum()), len(uv))
+    found = int((labels >= 0).sum())
+    return labels if found >= LEAST_AT_ONCE and found >= LEAST_SHARE * possible else None
+
+
+def _promising(
+    poses: NDArray[np.float64], points: NDArray[np.float64], seen: list[NDArray[np.float64]], tolerance: float
+) -> NDArray[np.int64]:
+    """Rows of the poses that explain the most of a few snapshots."""
+    some = np.unique(np.linspace(0, len(seen) - 1, FIRST).astype(np.int64)).tolist()
+    count = sum((_matches(poses, points[s], seen[s], tolerance) >= 0).sum(1) for s in some)
+    return np.argsort(-np.asarray(count), kind="stable")[:SHORTLIST]
 
 
 def _ideal(uv: NDArray[np.float64], camera: CameraRig) -> NDArray[np.float64]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,6 +14,11 @@ LEAST_EXPECTED = 3
 """Fiducials that a camera should see before it says anything that it sees none."""
 MARGIN = 0.05
 """Of the image's size, from its border, within which a fiducial may as well be out of view."""
+DOUBTED = 3
+"""Snapshots in a row in which a camera sees nothing of what it should see, from which it is in doubt."""
+ASTRAY = 2
+"""Snapshots in which a camera sees something, and not the object where it should be, before it counts as lost: a single
+one may be garbage. It is in doubt at once."""
 ABSENT_SECONDS, ABSENT_SNAPSHOTS = 2.0, 30
 """How long, and how often, a camera must miss what it should see before it counts as lost: arms hide objects, too."""
 SILENT_SECONDS = 0.5
@@ -42,19 +46,26 @@ class Sightings:
     lost: dict[int, float] = field(default_factory=dict)  # camera -> since when
     missing: dict[int, tuple[float, int]] = field(default_factory=dict)  # not lost yet: since when, how often
     silent: dict[int, float] = field(default_factory=dict)  # since when no frame came
+    astray: dict[int, tuple[float, int]] = field(default_factory=dict)  # since when, and how often
+
+    @property
+    def doubted(self) -> frozenset[int]:
+        """Cameras that may not be where they were."""
+        missing = (camera for camera, (_, times) in self.missing.items() if times >= DOUBTED)
+        return frozenset((*self.astray, *missing))
 
     def take(self, rig: CameraRig, look: Look) -> list[Event]:
         """Say which cameras are lost or back with a snapshot."""
-        labelled = set(np.unique(look.blobs.camera[look.blobs.fiducial >= 0]).tolist())
+        labelled = set(np.unique(look.blobs.camera[look.blobs.fiducial >= 0]).tolist()) - look.astray
         self.seen |= labelled
         self.silent = {camera: self.silent.get(camera, look.time) for camera in look.silent}
         absent = self._should_see(rig, look.predicted) - labelled - look.astray - look.silent
-        for camera in list(self.missing):
-            if camera in labelled:
-                del self.missing[camera]
-        for camera in absent:
-            first, times = self.missing.get(camera, (look.time, 0))
-            self.missing[camera] = first, times + 1
+        for cameras, missed in ((absent, self.missing), (look.astray, self.astray)):
+            for camera in labelled & missed.keys():
+                del missed[camera]
+            for camera in cameras:
+                first, times = missed.get(camera, (look.time, 0))
+                missed[camera] = first, times + 1
         events = []
         for camera in range(len(self.names)):
             why = self._why(camera, look)
@@ -68,13 +79,17 @@ class Sightings:
         return events
 
     def _why(self, camera: int, look: Look) -> tuple[float, str] | None:
-        if camera in look.astray:
-            return look.time, "sees what may be the object, but not where it should be"
+        first, times = self.astray.get(camera, (look.time, 0))
+        if times >= ASTRAY:
+            return first, (
+                "sees what may be the object, but not where it should be: it has moved far; move the object through "
+                "the middle of its image, and it will be found again"
+            )
         if camera in self.silent and look.time - self.silent[camera] >= SILENT_SECONDS:
             return self.silent[camera], "sends no frames"
         first, times = self.missing.get(camera, (look.time, 0))
         if times >= ABSENT_SNAPSHOTS and look.time - first >= ABSENT_SECONDS:
-            return first, "does not see the object, which should be in view"
+            return first, "does not see the object, which should be in view: it is covered, or has turned away"
         return None
 
     def _should_see(self, rig: CameraRig, predicted: NDArray[np.float64]) -> set[int]:
@@ -87,16 +102,3 @@ class Sightings:
     def _event(self, kind: str, camera: int, since: float, message: str, look: Look) -> Event:
         name = self.names[camera]
         return Event(look.time, look.number, kind, name, since, message=f"{name} {message}")  # type: ignore[arg-type]
-
-    def saved(self) -> dict[str, object]:
-        """Plain values."""
-        return {
-            "seen": sorted(self.seen),
-            "lost": _pairs(self.lost),
-            "missing": [[camera, *entry] for camera, entry in sorted(self.missing.items())],
-            "silent": _pairs(self.silent),
-        }
-
-
-def _pairs(values: Mapping[int, float]) -> list[list[float]]:
-    return [[camera, since] for camera, since in sorted(values.items())]

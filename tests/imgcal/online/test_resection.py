@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_equal
 
-from imgcal.online.resection import resected
+from imgcal.online.resection import labels_at, resected
 from tests.imgcal.streams import Stream
 
 
@@ -29,10 +30,13 @@ def test_a_camera_turned_far_is_found(rig, obj, turn_deg):
         blobs, places, labels = sightings(stream, camera, [0, 12, 24, 36], turn_deg)
         if sum(len(uv) >= 5 for uv in blobs) < 2:
             continue  # it looks away now
-        named = resected(blobs, places, stream.rig.select([camera]), np.random.default_rng(0))
-        if named is not None:
+        place = resected(blobs, places, stream.rig.select([camera]), np.random.default_rng(0))
+        if place is not None:
             found += 1
+            named = place.labels
             assert ((named < 0) | (named == labels)).all()
+            assert_equal(labels_at(blobs[-1], places[-1], place.camera), named)
+            assert labels_at(blobs[-1], places[-1], stream.rig.select([camera])) is None
     assert found >= 2
 
 

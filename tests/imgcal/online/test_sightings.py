@@ -35,11 +35,25 @@ def test_a_camera_that_misses_the_object_for_seconds_is_lost_and_one_that_is_cov
 
 def test_a_camera_that_is_astray_or_silent_is_lost() -> None:
     sightings = Sightings(("a", "b", "c", "d"))
-    assert kinds(sightings, [look(0.0, [0, 1, 3], astray=frozenset({2}))]) == [("camera_lost", "c", 0.0)]
+    assert kinds(sightings, [look(0.0, [0, 1, 3], astray=frozenset({2}))]) == []  # it may be garbage ...
+    assert sightings.doubted == {2}
+    assert kinds(sightings, [look(0.1, [0, 1, 2, 3])]) == [] and not sightings.doubted  # ... as it was
+    astray = [look(0.2 + s / 10, [0, 1, 2, 3], astray=frozenset({2})) for s in range(3)]  # a label by chance is none
+    assert kinds(sightings, astray) == [("camera_lost", "c", 0.2)]
     given = [look(1 + s / 10, [0, 1, 3], silent=frozenset({1})) for s in range(7)]
     # Labels of a camera without a frame come from nowhere here: it is back at once.
     assert ("camera_lost", "b", 1.0) in kinds(sightings, given)
     assert sightings.lost.keys() >= {2}
+
+
+def test_a_camera_that_suddenly_sees_nothing_is_in_doubt_before_it_is_lost() -> None:
+    sightings = Sightings(("a", "b", "c", "d"))
+    doubted = []
+    for s in range(4):
+        assert kinds(sightings, [look(s / 60, [0, 1, 2])]) == []
+        doubted.append(sightings.doubted == {3})
+    assert doubted == [False, False, True, True]
+    assert kinds(sightings, [look(0.1, [0, 1, 2, 3])]) == [] and not sightings.doubted
 
 
 def test_a_camera_that_cannot_see_the_object_misses_nothing() -> None:
