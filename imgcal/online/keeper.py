@@ -396,7 +396,8 @@ class RigKeeper:
         if known is None:
             return _Labelled(checked, frozenset())
         there = Surroundings(*known, self._object, self.options)
-        return _Labelled(*self._search.take(checked, there, self._time, self._count - 1))
+        doubted = self._sightings.doubted | self._sightings.lost.keys()
+        return _Labelled(*self._search.take(checked, there, self._time, self._count - 1, doubted))
 
     def _learn(self, labelled: _Labelled, time: float) -> tuple[Absorbed, tuple[Change, ...]]:
         """Absorb a snapshot; what a camera sees that does not fit for the first time waits for the next one."""

@@ -20,6 +20,7 @@ from imgcal.geometry import RigidTransform
 from imgcal.online.following import LEAST_BLOBS, LEAST_EXPLAINED, astray, found_again, spare_blobs
 from imgcal.online.label_checks import Checked
 from imgcal.online.resection import labels_at, resected
+from imgcal.online.sightings import least_back
 from imgcal.types import CalibrationObject, CameraRig, Detections
 
 REMEMBERED = 64
@@ -87,7 +88,9 @@ class Search:
     spare: deque[NDArray[np.int64]] = field(default_factory=lambda: deque(maxlen=USUAL_OF))
     vainly: dict[int, int] = field(default_factory=dict)  # camera -> snapshots in a row that nothing explains
 
-    def take(self, checked: Checked, known: Surroundings, time: float, number: int) -> tuple[Checked, frozenset[int]]:
+    def take(
+        self, checked: Checked, known: Surroundings, time: float, number: int, doubted: frozenset[int] = frozenset()
+    ) -> tuple[Checked, frozenset[int]]:
         """Label the blobs of cameras that do not see the object where it should be, where they are found.
 
         Args:
@@ -95,12 +98,14 @@ class Search:
             known: the rig and the object.
             time: of the snapshot, s.
             number: of the snapshot. The same one may come again, with other labels.
+            doubted: cameras that have not seen the object where it should be for some time.
 
         Returns:
             The snapshot with the labels of those that were found (`off`: they have moved), and the cameras that were
-            not found: whatever labels they had by chance are gone.
+            not found: whatever labels they had by chance are gone, as are those of cameras in doubt.
         """
         pose = checked.rig_from_object[0]
+        checked = self._without_chance(checked, known, doubted)
         suspects = self._suspects(checked.blobs, known, pose)
         if not suspects:
             return checked, frozenset()
@@ -123,6 +128,16 @@ class Search:
             blobs, off[camera], sought.found = replace(blobs, fiducial=named), True, number
         labels_left = int((blobs.fiducial >= 0).sum())
         return replace(checked, blobs=blobs, off=off, labels=labels_left), frozenset(missed)
+
+    def _without_chance(self, checked: Checked, known: Surroundings, doubted: frozenset[int]) -> Checked:
+        """Take away labels of cameras in doubt that are too few to say that they are back."""
+        few = _labelled(checked.blobs, self.num_cameras) < least_back(known.obj.num_fiducials)
+        chance = [camera for camera in (*self.sought, *doubted) if few[camera]]
+        rows = np.isin(checked.blobs.camera, chance) & (checked.blobs.fiducial >= 0)
+        if not rows.any():
+            return checked
+        blobs = replace(checked.blobs, fiducial=np.where(rows, -1, checked.blobs.fiducial))
+        return replace(checked, blobs=blobs, labels=checked.labels - int(rows.sum()))
 
     def learnt(self, blobs: Detections, number: int) -> None:
         """Note a snapshot that has been learnt: which cameras see the object again, and what is usual."""

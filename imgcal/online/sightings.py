@@ -56,10 +56,12 @@ class Sightings:
 
     def take(self, rig: CameraRig, look: Look) -> list[Event]:
         """Say which cameras are lost or back with a snapshot."""
-        labelled = set(np.unique(look.blobs.camera[look.blobs.fiducial >= 0]).tolist()) - look.astray
-        self.seen |= labelled
+        count = np.bincount(look.blobs.camera[look.blobs.fiducial >= 0], minlength=len(self.names))
+        some = set(np.flatnonzero(count).tolist())
+        self.seen |= some
+        labelled = set(np.flatnonzero(count >= least_back(look.predicted.shape[1])).tolist()) - look.astray
         self.silent = {camera: self.silent.get(camera, look.time) for camera in look.silent}
-        absent = self._should_see(rig, look.predicted) - labelled - look.astray - look.silent
+        absent = self._should_see(rig, look.predicted) - some - look.astray - look.silent
         for cameras, missed in ((absent, self.missing), (look.astray, self.astray)):
             for camera in labelled & missed.keys():
                 del missed[camera]
@@ -81,7 +83,7 @@ class Sightings:
     def _why(self, camera: int, look: Look) -> tuple[float, str] | None:
         first, times = self.astray.get(camera, (look.time, 0))
         if times >= ASTRAY:
-            return first, (
+            return min(first, self.missing.get(camera, (first, 0))[0]), (
                 "sees what may be the object, but not where it should be: it has moved far; move the object through "
                 "the middle of its image, and it will be found again"
             )
@@ -102,3 +104,8 @@ class Sightings:
     def _event(self, kind: str, camera: int, since: float, message: str, look: Look) -> Event:
         name = self.names[camera]
         return Event(look.time, look.number, kind, name, since, message=f"{name} {message}")  # type: ignore[arg-type]
+
+
+def least_back(fiducials: int) -> int:
+    """Labels by which a camera that did not see the object is said to see it again: one or two come by chance."""
+    return min(LEAST_EXPECTED, (fiducials + 1) // 2)

@@ -43,6 +43,7 @@ NOISE = 0.1  # px
 LATE, TWICE, GARBAGE, WRONG_TIME = 0.01, 0.005, 0.005, 0.002  # shares of exposures
 BUMP_DEG = 0.3
 RECORDED_EVERY = 20  # snapshots
+WARMING = 400  # snapshots before anything is measured
 ALLOWED_PX = 0.5  # of a camera that is said to be ok, in the image, where the object is
 SEEN = 60  # snapshots of the object that a bumped camera has given before it is to be known
 
@@ -238,6 +239,12 @@ def forked(world: World, folder: Path, first: int, last: int, kill_at: int | Non
         time.sleep(0.01)
 
 
+def warm_up(world: World, folder: Path) -> None:
+    """Watch a little in this process: those that are forked have what is compiled, and do not read it at each start."""
+    live(world, folder, 0, min(WARMING, world.snapshots), mmap.mmap(-1, 8))
+    live(world, folder, 0, 1, mmap.mmap(-1, 8))  # from its file
+
+
 def records(folder: Path) -> list[dict[str, Any]]:
     found = []
     for line in (folder / "record.jsonl").read_text().splitlines():
@@ -376,9 +383,10 @@ def main() -> None:
     folder = Path(tempfile.mkdtemp(prefix="endurance-"))
     try:
         result = {}
-        for name in ("killed_day", "steady"):
+        for name in ("warming", "killed_day", "steady"):
             (folder / name).mkdir()
         world = World(int(given.hours * 3600 * given.rate), given.rate, given.bumps)
+        warm_up(World(WARMING, given.rate, 1), folder / "warming")
         result["killed_day"] = killed_day(world, folder / "killed_day", given.minutes)
         world = World(given.steady, given.rate, max(given.bumps * given.steady // world.snapshots, 1), seed=1)
         result["steady"] = steady_life(world, folder / "steady")

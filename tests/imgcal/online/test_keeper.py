@@ -127,3 +127,39 @@ def test_labels_that_came_with_the_blobs_are_used() -> None:
         assert keeper.update(blobs, 0.0).refused is None
         assert keeper.update(swapped, 0.0).belief.rig.focal_length.isfinite().all()
     assert torch.isfinite(states[-1].std).all()
+
+
+def turned(seed: int, camera: int, degrees: float) -> Stream:
+    return stream(seed, bumps=[Bump(20, camera, "rotation", math.radians(degrees))])
+
+
+def wrong_and_ok(state: RigState, truth: CameraRig, camera: int) -> bool:
+    """Tell whether a camera that has been turned is said to be where it was."""
+    error = state.gauge.difference(state.rig, truth)[camera, :3]
+    return state.cameras[truth.camera_names[camera]] == "ok" and float(error.norm()) > math.radians(1.0)
+
+
+def test_a_camera_that_turns_far_is_never_ok_and_is_found_again() -> None:
+    made = turned(4, 0, 20.0)  # five of eight fiducials stay in view
+    events = []
+    with RigKeeper(made.factory, made.obj) as keeper:
+        for number, (time, blobs) in enumerate(made.snapshots(40)):
+            state = keeper.update(blobs, time)
+            events += state.events
+            assert number < 20 or not wrong_and_ok(state, made.rig, 0)
+    assert {event.camera for event in events} == {"cam01"}
+    last = [event for event in events if event.kind == "moved"][-1]
+    assert last.change == "rotation" and last.size == pytest.approx(20.0, abs=0.5)
+    assert last.since is not None and abs(last.since * 60 - 20) <= 1
+    assert float(state.gauge.difference(state.rig, made.rig)[0, :3].norm()) < math.radians(0.2)
+
+
+def test_a_camera_that_turns_away_is_in_doubt_at_once_and_then_lost() -> None:
+    made = turned(3, 3, 60.0)  # no fiducial stays in view
+    with RigKeeper(made.factory, made.obj) as keeper:
+        states = [keeper.update(made.snapshot(number), number / 60 if number < 30 else number / 10)
+                  for number in range(60)]  # fmt: skip
+    assert not any(wrong_and_ok(state, made.rig, 3) for state in states[23:])
+    lost = [event for state in states for event in state.events]
+    assert [(event.kind, event.camera) for event in lost] == [("camera_lost", "cam04")]
+    assert lost[0].since == pytest.approx(20 / 60, abs=0.05) and "turned away" in lost[0].message

@@ -59,7 +59,9 @@ def seen(stream: Stream, own: np.ndarray | None, fiducial: int = -1) -> Checked:
         zeros.astype(np.uint8), stream.rig.camera_names, ("0",),
     )  # fmt: skip
     off = np.zeros(len(parts), dtype=bool)
-    return Checked(blobs, RigidTransform(pose.rotation[None], pose.translation[None]), off, 0.1, int((labels >= 0).sum()))
+    return Checked(
+        blobs, RigidTransform(pose.rotation[None], pose.translation[None]), off, 0.1, int((labels >= 0).sum())
+    )
 
 
 def strangers(count: int = 6) -> np.ndarray:
