@@ -22,11 +22,11 @@ def screen(ring, totals, number, count, at, change, parts, ages, scores):
     which it does not reach. Where more is known than they brought, the score is at least half of the true one.
 
     Args:
-        ring: of the K latest snapshots, number k in row k % K, see `Brought`: camera (K, C, P, P), information of each
-            camera, were the poses known; carried (K, 6, D), by which the unknown poses take information away; border
-            (K, M, D), information of the object; weighted (K, D), pull at the chart's origin.
-        totals: sums of those before number k, in row k % (K + 1): of `camera`, and of each camera's block of the
-            information, the poses let free; both (K + 1, C, P, P).
+        ring: of the K latest snapshots, number k in row k % K, see `Brought`: carried (K, 6, D), by which the unknown
+            poses take information away; border (K, M, D), information of the object; weighted (K, D), pull at the
+            chart's origin.
+        totals: sums over those before number k, in row k % (K + 1): of the information of each camera, were the poses
+            known, and the same, the poses let free; both (K + 1, C, P, P).
         number: of the next snapshot.
         count: snapshots that there are.
         at: (D,) error of what is believed now.
@@ -35,7 +35,7 @@ def screen(ring, totals, number, count, at, change, parts, ages, scores):
         ages: numbers of snapshots, ascending.
         scores: (ages, C), filled with the largest score of any kind; zero where there are not as many snapshots.
     """
-    _, carried, border, weighted = ring
+    carried, border, weighted = ring
     camera_total, own_total = totals
     cameras, size, rows = camera_total.shape[1], camera_total.shape[2], camera_total.shape[0]
     wide, last = cameras * size, number % camera_total.shape[0]
@@ -175,12 +175,12 @@ def put(ring, totals, number, brought, at):
         ring: see `screen`.
         totals: see `screen`.
         number: of the snapshot.
-        brought: the same as `ring`, but of one snapshot, and the pull (D,) where it was linearized.
+        brought: camera (C, P, P), carried (6, D), border (M, D) and pull (D,) of it.
         at: (D,) error.
     """
     row = number % len(ring[0])
-    camera, carried, border, weighted = ring[0][row], ring[1][row], ring[2][row], ring[3][row]
-    new_camera, new_carried, new_border, pull = brought
+    carried, border, weighted = ring[0][row], ring[1][row], ring[2][row]
+    camera, new_carried, new_border, pull = brought
     before, after = number % len(totals[0]), (number + 1) % len(totals[0])
     camera_before, camera_total = totals[0][before], totals[0][after]
     own_before, own_total = totals[1][before], totals[1][after]
@@ -200,8 +200,7 @@ def put(ring, totals, number, brought, at):
         for i in range(size):
             value = 0.0
             for j in range(size):
-                entry = new_camera[c, i, j]
-                camera[c, i, j] = entry
+                entry = camera[c, i, j]
                 value += entry * at[first + j]
                 camera_total[c, i, j] = camera_before[c, i, j] + entry
                 for q in range(6):
@@ -219,13 +218,15 @@ def put(ring, totals, number, brought, at):
 
 
 @njit(fastmath=kernels.FAST)
-def add_row(ring, row, information, weighted):
-    """Add the information (D, D) and the weighted error (D,) of a row of the ring to sums."""
-    camera, carried, border = ring[0][row], ring[1][row], ring[2][row]
-    cameras, size = camera.shape[0], camera.shape[1]
+def add_row(ring, totals, number, information, weighted):
+    """Add the information (D, D) and the weighted error (D,) of a snapshot of the ring to sums; see `screen`."""
+    row, rows = number % len(ring[0]), len(totals[0])
+    carried, border = ring[0][row], ring[1][row]
+    after, before = totals[0][(number + 1) % rows], totals[0][number % rows]
+    cameras, size = after.shape[0], after.shape[1]
     wide = cameras * size
     for i in range(len(weighted)):
-        weighted[i] += ring[3][row, i]
+        weighted[i] += ring[2][row, i]
         a, b, c = carried[0, i], carried[1, i], carried[2, i]
         d, e, f = carried[3, i], carried[4, i], carried[5, i]
         for j in range(len(weighted)):
@@ -237,7 +238,7 @@ def add_row(ring, row, information, weighted):
         first = k * size
         for i in range(size):
             for j in range(size):
-                information[first + i, first + j] += camera[k, i, j]
+                information[first + i, first + j] += after[k, i, j] - before[k, i, j]
     for m in range(len(border)):
         for i in range(len(weighted)):
             information[wide + m, i] += border[m, i]

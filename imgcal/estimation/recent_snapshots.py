@@ -64,13 +64,12 @@ class RecentSnapshots:
         (cameras, free), wide = belief.unit.shape, len(belief.factor)
         self._rate, self._belief = rate, belief
         self._unit = belief.unit.numpy()
-        self._camera = np.zeros((OLDEST, cameras, free, free))
         self._carried = np.zeros((OLDEST, 6, wide))
         self._border = np.zeros((OLDEST, wide - cameras * free, wide))
         self._weighted = np.zeros((OLDEST, wide))  # pull, as it would be at the chart's origin
-        self._ring = (self._camera, self._carried, self._border, self._weighted)
+        self._ring = (self._carried, self._border, self._weighted)
         blocks = (OLDEST + 1, cameras, free, free)
-        self._totals = (np.zeros(blocks), np.zeros(blocks))  # rounding: 10^-7 of a snapshot after a year
+        self._totals = (np.zeros(blocks), np.zeros(blocks))  # rounded by 10^-7 of a snapshot after a year
         self._pixels = pixel_changes(belief.rig)
         self._begin(belief.rig, belief.object_offset)
 
@@ -234,7 +233,8 @@ class RecentSnapshots:
         rows = np.arange(first, last) % OLDEST
         carried = torch.from_numpy(self._carried[rows].reshape(-1, self._at.size))
         information = -(carried.mT @ carried)
-        add_blocks(information, torch.from_numpy(self._camera[rows].sum(0)))
+        total = self._totals[0]
+        add_blocks(information, torch.from_numpy(total[last % len(total)] - total[first % len(total)]))
         wide = self._unit.size
         if self._border.shape[1]:
             border = torch.from_numpy(self._border[rows].sum(0))
@@ -256,7 +256,7 @@ class RecentSnapshots:
         else:
             if not base.own:  # the belief has the same numbers
                 base.information, base.own = base.information.clone(), True
-            add_row(self._ring, base.number % OLDEST, base.information.numpy(), base.weighted.numpy())
+            add_row(self._ring, self._totals, base.number, base.information.numpy(), base.weighted.numpy())
             base.number += 1
         self._seen.popleft()
 

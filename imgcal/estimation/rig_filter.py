@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
@@ -65,7 +64,7 @@ LEAST_SECONDS = 1.0
 class _Constants:
     """What `rig_filter_cpu.absorb` is given of an object and of lenses."""
 
-    shared: tuple[Any, ...]  # see `linearization_cpu`
+    shared: tuple[NDArray[np.float64] | None, ...]  # see `linearization_cpu`
     centroid: NDArray[np.float64]  # (3,) mm
     own_std: NDArray[np.float64]  # (M,) prior standard deviation of the object's offset
 
@@ -116,7 +115,7 @@ class RigBelief:
     @cached_property
     def half_log_determinant(self) -> float:
         """Of the information."""
-        return float(self.factor.diagonal().log().sum())
+        return float(np.log(self.factor.numpy().diagonal()).sum())
 
     @cached_property
     def constants(self) -> _Constants:

@@ -30,6 +30,7 @@ MODULES = frozenset(
         "estimation.recent_snapshots",
         "estimation.rig_changes",
         "estimation.rig_filter",
+        "estimation.rig_filter_cpu",
         "estimation.rig_monitor",
         "geometry.transforms",
         "online.drift_watch",
