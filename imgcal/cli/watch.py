@@ -91,7 +91,8 @@ class Watch:
         """Watch until the end."""
         rig, obj = open_rig(self.rig), load_object(self.object)
         folder = make_folder(self.out)
-        progress = None if self.fresh else Progress.load(folder)
+        with _going_on():
+            progress = None if self.fresh else Progress.load(folder)
         intake = Intake(
             self._source(rig, obj, progress), rig, Timing(self.tolerance, self.patience), self.keep_all,
             after=None if progress is None else progress.time,
@@ -152,7 +153,8 @@ class Watch:
         path = folder / STATE
         if self.fresh or not path.is_file():
             return RigKeeper(rig, obj, detection=self.detection, detector=self.detector), False
-        keeper = RigKeeper.restore(path, detection=self.detection, detector=self.detector)
+        with _going_on():
+            keeper = RigKeeper.restore(path, detection=self.detection, detector=self.detector)
         same_object = torch.equal(keeper.obj.points, obj.points.to(keeper.obj.points))
         if keeper.factory.camera_names != rig.camera_names or not same_object:
             what = f"--object {self.object}" if keeper.factory.camera_names == rig.camera_names else f"--rig {self.rig}"
@@ -172,6 +174,15 @@ class Watch:
         if progress is not None and intake.known_before:
             return f"watch: all {intake.known_before:,} snapshots were known; --fresh begins from the factory rig"
         return "watch: no snapshot came"
+
+
+@contextlib.contextmanager
+def _going_on() -> Iterator[None]:
+    """Say what to do where what an earlier run left cannot be used."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{error}; --fresh begins anew") from error
 
 
 class _Stopped(threading.Event):

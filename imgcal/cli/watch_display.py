@@ -72,7 +72,7 @@ class Display:
         """Say in one line how it goes."""
         tally, intake = self._tally, self._intake
         state = tally.latest
-        parts = ["waiting for the first snapshot" if state is None else state.sentence]
+        parts = [self._waiting() if state is None else state.sentence]
         if state is not None and state.refused is not None:
             parts.append("nothing learnt now")
         parts.append(f"{tally.snapshots:,} snapshots, {self._rate:.3g}/s")
@@ -81,6 +81,11 @@ class Display:
         parts += [f"{count:,} {kind}" for kind, count in counts.items() if count]
         parts += self._clocks()
         return " | ".join(parts)
+
+    def _waiting(self) -> str:
+        """Say that nothing has come, and what did not look like anything that could."""
+        reasons = self._intake.reasons
+        return "waiting for the first snapshot" + (f": {reasons[-1]}" if reasons else "")
 
     def _clocks(self) -> list[str]:
         """Name the cameras whose time stamps do not say when they expose."""

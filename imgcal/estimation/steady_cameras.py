@@ -50,8 +50,11 @@ class Gauge:
             factory: the calibration that it is compared with.
         """
         weights = torch.ones(rig.num_cameras, dtype=torch.float64)
+        there = cls(weights).laid(rig, factory)
         for round_ in range(ROUNDS):
-            apart = _scaled(cls(weights).difference(rig, factory)).norm(dim=-1).clamp_min(LEAST_APART)
+            if round_:  # from where the last weights led, once is enough
+                there = cls(weights)._nearer(there, factory)
+            apart = _scaled(there.local(factory)).norm(dim=-1).clamp_min(LEAST_APART)
             # First the geometric median, which half of the cameras cannot spoil; then Cauchy's weights about it.
             weights = 1 / apart if round_ < ROUNDS // 2 else 1 / (1 + (apart / apart.median()).square())
             weights = weights / weights.sum()
@@ -60,11 +63,15 @@ class Gauge:
     def laid(self, rig: CameraRig, factory: CameraRig) -> CameraRig:
         """Move a whole rig (*B) onto another one, which may have fewer batch axes."""
         for _ in range(ALIGNMENTS):
-            motion = self._averaging(factory) @ error_between(rig, factory)[..., :EXTRINSICS].flatten(-2)[..., None]
-            turn = rotation_from_vector(motion[..., :3, 0])
-            transform = RigidTransform(turn.unsqueeze(-3), motion[..., 3:, 0].unsqueeze(-2))
-            rig = replace(rig, cam_from_rig=rig.cam_from_rig @ transform)
+            rig = self._nearer(rig, factory)
         return rig
+
+    def _nearer(self, rig: CameraRig, factory: CameraRig) -> CameraRig:
+        """Move a whole rig once."""
+        motion = self._averaging(factory) @ error_between(rig, factory)[..., :EXTRINSICS].flatten(-2)[..., None]
+        turn = rotation_from_vector(motion[..., :3, 0])
+        transform = RigidTransform(turn.unsqueeze(-3), motion[..., 3:, 0].unsqueeze(-2))
+        return replace(rig, cam_from_rig=rig.cam_from_rig @ transform)
 
     def difference(self, rig: CameraRig, factory: CameraRig) -> Tensor:
         """Change of every parameter, the motion of the whole rig taken out: (*B, C, K)."""

@@ -60,6 +60,8 @@ class Folder:
             raise InputError(
                 f"{self.folder}: found the folders of cameras, expected a folder that holds frames/<camera>/"
             )
+        if not frames.is_dir():
+            yield Unreadable(f"{self.folder}: found no folder frames in it, expected frames/<camera>/<snapshot>.png")
         for path in sorted(frames.iterdir()) if frames.is_dir() else ():
             if not path.name.startswith(".") and path.name not in self.rig.camera_names:
                 expected = f"the cameras of rig {self.rig.name}: {listed(self.rig.camera_names)}"

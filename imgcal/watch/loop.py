@@ -92,7 +92,7 @@ class Progress:
             if not (name is None or isinstance(name, str)):
                 raise ValueError("the name is no text")
         except (ValueError, TypeError, KeyError, OverflowError) as error:
-            raise InputError(f"{path}: found {error}, expected what imgcal watch writes") from error
+            raise InputError(f"{path}: found something else than imgcal watch writes there") from error
         return cls(time, name)
 
 
@@ -143,6 +143,8 @@ class Watch:
         """Save what is known, and close the outputs."""
         self.save()
         self._files.close()
+        if self._files.problem is not None:
+            self._failed("files", self._files.problem)
         self._log.close()
         if self._hook is not None:
             self._hook.close()

@@ -79,7 +79,8 @@ class Metrics:
         try:
             self._server, self._thread = start_http_server(port, host, registry)
         except (OSError, OverflowError) as error:
-            raise InputError(f"--metrics: {host}:{port} cannot be listened on: {error}") from error
+            reason = getattr(error, "strerror", None) or error
+            raise InputError(f"--metrics: {host}:{port} cannot be listened on: {reason}") from error
         return self
 
     def __exit__(

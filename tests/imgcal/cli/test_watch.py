@@ -1,6 +1,7 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -137,7 +138,7 @@ def test_a_killed_process_goes_on_and_ctrl_c_ends_it_cleanly(blobs, tmp_path):
         (["-", "--hook", "no-such-program"], 2, "--hook: found 'no-such-program'"),
         (["-", "--metrics", "nowhere"], 2, "found 'nowhere', expected [HOST:]PORT"),
         (["bag.mcap", "--topic", "cam01"], 2, "--topic: found 'cam01', expected CAMERA=TOPIC"),
-        (["empty", "--until-idle", "0.1"], 3, "watch: no snapshot came"),
+        (["empty", "--until-idle", "0.1"], 3, "watch: no snapshot came: empty: found no folder frames in it"),
         (["typing", "--until-idle", "0.1"], 3, "nearest: cam01"),
     ],
 )
@@ -164,6 +165,35 @@ def test_what_is_known_of_another_rig_is_not_gone_on_with(blobs, tmp_path, capsy
         assert main(["watch", str(tmp_path), *arguments, "--out", str(tmp_path / "out")]) == 2
         assert f"another than {option} {name}; --fresh begins anew" in capsys.readouterr().err
     assert load_object("cube8").num_fiducials == 8
+
+
+@pytest.mark.parametrize("name", ["state.json", "progress.json"])
+def test_what_was_left_and_cannot_be_used_is_told_with_the_way_out(name, tmp_path, monkeypatch, capsys):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / name).write_text("[]")
+    with open(tmp_path / "out" / name) as file:
+        monkeypatch.setattr(sys, "stdin", file)
+        assert watch("-", tmp_path / "out") == 2
+    error = capsys.readouterr().err
+    assert name in error and error.endswith("; --fresh begins anew\n") and error.count("\n") == 1
+
+
+@pytest.mark.parametrize("option", ["--serve", "--metrics"])
+def test_a_port_that_is_taken_is_told_in_one_line(option, tmp_path, monkeypatch, capsys):
+    with socket.create_server(("127.0.0.1", 0)) as taken, open(os.devnull) as nothing:
+        monkeypatch.setattr(sys, "stdin", nothing)
+        port = taken.getsockname()[1]
+        assert watch("-", tmp_path / "out", option, str(port)) == 2
+    error = capsys.readouterr().err
+    assert f"127.0.0.1:{port}" in error and "Errno" not in error and error.count("\n") == 1
+
+
+def test_a_rig_that_cannot_be_written_is_told_at_the_end_too(blobs, tmp_path, capsys):
+    save_detections(blobs.of_snapshots(0, 3), tmp_path / "blobs.csv")
+    (tmp_path / "out" / "rig.yaml").mkdir(parents=True)
+    assert watch(tmp_path / "blobs.csv", tmp_path / "out") == 0
+    (note,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: ")]
+    assert "rig.yaml" in note
 
 
 def test_addresses():

@@ -37,7 +37,7 @@ def test_plain_lines_where_nobody_looks(monkeypatch):
         tally.latest, tally.snapshots, tally.refused = some_state(), 5, 2
         shown.draw()
     first, second, third, last = text.getvalue().splitlines()
-    assert first.startswith("waiting for the first snapshot | 0 snapshots, 0/s | 1 unreadable")
+    assert first.startswith("waiting for the first snapshot: junk | 0 snapshots, 0/s | 1 unreadable")
     assert second.endswith(" camera lost: cam02 [red]is lost[/red]") and third == "note: state.json: disk full"
     assert last.startswith("all 4 cameras are calibrated | 5 snapshots") and "2 refused" in last and "\x1b" not in last
 

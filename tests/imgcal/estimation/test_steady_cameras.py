@@ -5,6 +5,7 @@ import torch
 
 import imgcal
 from imgcal.estimation import Gauge, estimate
+from imgcal.estimation.steady_cameras import ALIGNMENTS, ROUNDS, SCALE
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import CameraRig, Observations
@@ -44,6 +45,22 @@ def test_two_of_five_cameras_do_not_spoil_the_vote() -> None:
     rig = factory.retract(step)
     found = Gauge.of_most(rig, factory).difference(rig, factory)
     torch.testing.assert_close(found, step, atol=1e-4, rtol=0)
+
+
+def test_the_vote_is_that_of_rigs_laid_anew_each_round_at_a_fraction_of_the_work(monkeypatch) -> None:
+    factory, generator = imgcal.load_rig("T4").to(torch.float64), torch.Generator().manual_seed(2)
+    step = torch.randn(4, 15, generator=generator, dtype=torch.float64)
+    rig = turned_as_a_whole(factory.retract(step * torch.tensor((1e-3,) * 3 + (1.0,) * 12, dtype=torch.float64)))
+    weights = torch.ones(4, dtype=torch.float64)
+    for round_ in range(ROUNDS):
+        apart = Gauge(weights).difference(rig, factory)[:, :6] / torch.tensor(SCALE, dtype=torch.float64)
+        apart = apart.norm(dim=-1)
+        weights = 1 / apart if round_ < ROUNDS // 2 else 1 / (1 + (apart / apart.median()).square())
+        weights = weights / weights.sum()
+    moves, nearer = [], Gauge._nearer
+    monkeypatch.setattr(Gauge, "_nearer", lambda *given: (moves.append(1), nearer(*given))[1])
+    torch.testing.assert_close(Gauge.of_most(rig, factory).weights, weights, rtol=1e-6, atol=1e-9)
+    assert len(moves) <= ROUNDS + ALIGNMENTS
 
 
 @pytest.mark.parametrize(
