@@ -26,6 +26,8 @@ from imgcal.io import write_bytes, write_text
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "docs" / "results"
+WORK = ROOT / "out" / "work"
+"""What campaigns that were stopped have done."""
 BLUE, RED, GREEN, GREY = "#1f5fa8", "#c43c2f", "#2e8b57", "#777777"
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -15,16 +17,22 @@ from imgcal.cli.common import check_folder, counted, open_rig
 from imgcal.cli.compare_captures import Captures, compare_captures
 from imgcal.errors import InputError
 from imgcal.extras import advice, missing
+from imgcal.fleet import Kept, workers
 from imgcal.io import load_object, publishing
 
 if TYPE_CHECKING:
     from imgcal.evaluation import Conditions, Facts, Method, Model, Protocol, Summary
+    from imgcal.fleet import Mapped
 
 Axis = Literal["kappa", "phi", "noise", "missing", "swapped", "false"]
 
 
 CHECKED_RIGS = 32
 """On which encoders are checked."""
+FEW = 8
+"""Batches that are done before Ray has started."""
+WORK = ".work"
+"""Folder beside results of what has been done, until all is."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +56,8 @@ class Setting:
     sweep: tuple[Axis, ...] = ()  #: draw the error against these, without the slow baselines
     sweep_count: int = 1000  #: rigs at every point of a sweep
     device: Literal["auto", "cpu"] = "auto"  #: where networks run; "auto" = on a GPU if there is one
+    address: str | None = None  #: running Ray cluster that does the work, on its cores; none = this machine
+    cores: int | None = None  #: of this machine; 1 = this process alone; none = all, if that is worth a start of Ray
 
 
 @dataclass(frozen=True)
@@ -129,7 +139,9 @@ def _run(paths: tuple[Path, ...], setting: Setting, baselines: bool, out: Path |
     models = _load(paths, setting)
     conditions = _conditions(models, setting)
     methods = {model.name: model.method for model in models} | (BASELINES if baselines else QUICK_BASELINES)
-    summary = _measure(methods, conditions, protocol, setting)
+    kept = None if out is None else Kept(out / WORK, _scope(models))
+    with _workers(setting, models, protocol, kept) as mapped:
+        summary = _measure(methods, conditions, protocol, setting, mapped)
     summary = replace(summary, facts={model.name: _checked(model, conditions, setting) for model in models})
     _print(summary)
     if out is not None:
@@ -137,6 +149,30 @@ def _run(paths: tuple[Path, ...], setting: Setting, baselines: bool, out: Path |
             written = write(summary, folder)
         for path in written:
             print(f"wrote {out / path.name}", file=sys.stderr)
+    if kept is not None:
+        kept.clear()
+
+
+def _scope(models: list[Model]) -> str:
+    """What results depend on beside rigs and conditions: the weights."""
+    return repr([(model.name, hashlib.sha256(model.path.read_bytes()).hexdigest()) for model in models])
+
+
+@contextmanager
+def _workers(setting: Setting, models: list[Model], protocol: Protocol, kept: Kept | None) -> Iterator[Mapped]:
+    """Processes for what is long enough to be worth their start; on a GPU this one alone."""
+    cores = setting.cores
+    if any(parameter.is_cuda for model in models for parameter in model.checkpoint.network.parameters()):
+        if setting.address is not None or (cores or 1) > 1:
+            raise InputError("--address, --cores: found a GPU, on which one process does it all; expected --device cpu")
+        yield map
+        return
+    if setting.address is None and cores is None and (protocol.batches < FEW or missing("ray")):
+        if protocol.batches >= FEW:
+            print(f"note: on one core alone: --cores {advice('ray')}", file=sys.stderr)
+        cores = 1
+    with workers(setting.address, cores, kept) as mapped:
+        yield mapped
 
 
 def _load(paths: tuple[Path, ...], setting: Setting) -> list[Model]:
@@ -181,7 +217,9 @@ def _conditions(models: list[Model], setting: Setting) -> Conditions:
     return known.at_level(setting.level)
 
 
-def _measure(methods: Mapping[str, Method], conditions: Conditions, protocol: Protocol, setting: Setting) -> Summary:
+def _measure(
+    methods: Mapping[str, Method], conditions: Conditions, protocol: Protocol, setting: Setting, mapped: Mapped
+) -> Summary:
     from imgcal.evaluation import AXES, Summary, evaluate, latency, sweep
 
     fast = {name: method for name, method in methods.items() if method.most is None}
@@ -190,8 +228,8 @@ def _measure(methods: Mapping[str, Method], conditions: Conditions, protocol: Pr
     shares = [min(method.most or protocol.count, protocol.count) for method in methods.values()]
     total = protocol.trials * (protocol.count + sum(shares)) + points * along.count * (1 + len(fast))
     with counted("evaluating", total) as advance:
-        evaluation = evaluate(methods, conditions, protocol, advance)
-        sweeps = tuple(sweep(fast, conditions, axis, along, progress=advance) for axis in setting.sweep)
+        evaluation = evaluate(methods, conditions, protocol, advance, mapped)
+        sweeps = tuple(sweep(fast, conditions, axis, along, progress=advance, mapped=mapped) for axis in setting.sweep)
     repeats = {name: 50 if method.most is None else 10 for name, method in methods.items()}
     took = {name: latency(method, conditions, repeats[name]) for name, method in methods.items()}
     return Summary(evaluation, took, {}, sweeps)

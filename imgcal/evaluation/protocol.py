@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import statistics
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, TypedDict
+from functools import partial
+from typing import Any, Literal, TypedDict
 
 import torch
 from torch import Tensor
@@ -14,6 +16,7 @@ from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import Estimate
 from imgcal.evaluation.methods import Given, Method
 from imgcal.evaluation.metrics import KINDS, Errors, concatenate, cramer_rao, errors
+from imgcal.io import rig_text
 from imgcal.messages import shortened
 from imgcal.refinement import SQUARED, as_prediction, refine_points
 from imgcal.synthesis import LEVELS, Corrupted, Corruption, Degradation, Drift, PoseRange, RelativeDrift, synthesize
@@ -22,9 +25,10 @@ from imgcal.types import CalibrationObject, CameraRig, Prediction, Views
 REFERENCE = "MAP, true inliers"
 LEAST_FIDUCIALS = 3  # different ones that a pose needs
 LEAST_SIGMA = 0.02  # pixels: what exact points are believed to
+STAGES = ("alone", "refined", "one_pass")
 
 Progress = Callable[[int], None]
-"""Called with a number of rigs whenever that many have been given to one more method."""
+"""Called with a number of rigs whenever so many more have been given to a method."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,11 @@ class Protocol:
     seed: int = 0
     batch: int = 512  # rigs at once at most
     bound_count: int = 512  # rigs of a trial whose Cramer-Rao bounds are evaluated, where there is noise
+
+    @property
+    def batches(self) -> int:
+        """Batches of all trials: the work items of `evaluate`."""
+        return self.trials * -(-self.count // self.batch)
 
     def __post_init__(self) -> None:
         for name, least, most in (
@@ -157,12 +166,20 @@ class _Collected:
     one_pass: list[Errors] = field(default_factory=list)
     passes: int = 1
 
+    def add(self, found: Mapping[str, Any]) -> None:
+        """Take what a batch came to."""
+        for name in STAGES:
+            if found[name]:
+                getattr(self, name).append(Errors(**found[name]))
+        self.passes = found["passes"] or self.passes
+
 
 def evaluate(
     methods: Mapping[str, Method],
     conditions: Conditions,
     protocol: Protocol = Protocol(),
     progress: Progress = lambda rigs: None,
+    mapped: Callable[..., Iterator[Any]] = map,
 ) -> Evaluation:
     """Measure methods on random rigs.
 
@@ -170,7 +187,9 @@ def evaluate(
         methods: by the name that they get in tables.
         conditions: what rigs are drawn from, and how their views are corrupted.
         protocol: how many rigs; the same seed gives the same rigs, whatever the methods are.
-        progress: called after each method has done a batch.
+        progress: called after each batch.
+        mapped: who measures batches; called as `map` is. Rigs are drawn here and travel, so that their random numbers
+            depend on nobody: the numbers are the same, whoever measures (`imgcal.fleet.workers`).
 
     Raises:
         RefusedError: too few random rigs see the whole object.
@@ -184,29 +203,21 @@ def evaluate(
         >>> list(evaluation.rows) == [name]
         True
     """
-    done: dict[str, list[_Collected]] = {name: [] for name in methods}
-    reference: list[Errors] = []
-    bounds: list[Errors] = []
-    for trial in range(protocol.trials):
-        parts = {name: _Collected() for name in methods}
-        exact: list[Errors] = []
-        limits: list[Errors] = []
-        for first, batch in _batches(conditions, protocol, trial):
-            fit = batch.reference()
-            exact.append(errors(as_prediction(fit), batch.truth, conditions.obj))
-            if first < protocol.bound_count and conditions.corruption.noise >= LEAST_SIGMA:
-                limits.append(cramer_rao(fit, conditions.obj))
-            progress(len(batch))
-            for name, method in methods.items():
-                _measure(name, method, batch, first, parts[name])
-                progress(len(batch))
-        reference.append(concatenate(exact))
-        bounds.extend([concatenate(limits)] if limits else [])
-        for name, collected in parts.items():
-            done[name].append(collected)
-    limits_of_trials = tuple(bounds)
-    rows = {name: _row(collected, limits_of_trials) for name, collected in done.items()}
-    return Evaluation(conditions, protocol, rows, Scores(tuple(reference), limits_of_trials))
+    done: dict[str, list[_Collected]] = {name: [_Collected() for _ in range(protocol.trials)] for name in methods}
+    reference: list[list[Errors]] = [[] for _ in range(protocol.trials)]
+    bounds: list[list[Errors]] = [[] for _ in range(protocol.trials)]
+    for found in mapped(partial(_measured, dict(methods)), _work(methods, conditions, protocol)):
+        trial = found["trial"]
+        reference[trial].append(Errors(**found["reference"]))
+        if found["bounds"]:
+            bounds[trial].append(Errors(**found["bounds"]))
+        for name, collected in done.items():
+            collected[trial].add(found["rows"][name])
+        progress(found["rigs"])
+    limits = tuple(concatenate(parts) for parts in bounds if parts)
+    rows = {name: _row(collected, limits) for name, collected in done.items()}
+    exact = Scores(tuple(concatenate(parts) for parts in reference), limits)
+    return Evaluation(conditions, protocol, rows, exact)
 
 
 @dataclass(frozen=True)
@@ -250,15 +261,58 @@ def draw(conditions: Conditions, count: int, generator: torch.Generator) -> Samp
     return Sample(Prediction(made.rig, made.rig_from_object), corrupted, conditions, seed)
 
 
-def _batches(conditions: Conditions, protocol: Protocol, trial: int) -> Iterator[tuple[int, Sample]]:
-    """Rigs of a trial with the number of the first one of each batch."""
-    generator = torch.Generator().manual_seed(protocol.seed * 65_536 + trial)
-    for first in range(0, protocol.count, protocol.batch):
-        yield first, draw(conditions, min(protocol.batch, protocol.count - first), generator)
+@dataclass(frozen=True)
+class _Batch:
+    """A batch of a trial: a work item."""
+
+    trial: int
+    first: int  # number of its first rig in the trial
+    sample: Sample
+    bounded: bool  # its Cramer-Rao bounds are wanted
+    methods: tuple[str, ...]
+
+    @property
+    def key(self) -> str:
+        """Digest of all that results depend on, beside what the methods are."""
+        known, given, truth = self.sample.conditions, self.sample.given(), self.sample.truth
+        said = (self.trial, self.first, self.bounded, self.methods, given.seed, known.corruption, known.degradation)
+        digest = hashlib.blake2b(f"{said}\n{known.obj.radius}\n{rig_text(known.rig)}".encode(), digest_size=16)
+        pose, drawn = truth.rig_from_object, truth.rig
+        for tensor in (
+            given.prior_std, given.obj.points, given.uv, given.seen, self.sample.corrupted.inlier, pose.rotation,
+            pose.translation, drawn.focal_length, drawn.principal_point, drawn.distortion, drawn.cam_from_rig.rotation,
+            drawn.cam_from_rig.translation,
+        ):  # fmt: skip
+            digest.update(tensor.contiguous().numpy().tobytes())
+        return digest.hexdigest()
 
 
-def _measure(name: str, method: Method, batch: Sample, first: int, into: _Collected) -> None:
-    """Give a method those rigs of a batch that are its share, a few at a time.
+def _work(methods: Mapping[str, Method], conditions: Conditions, protocol: Protocol) -> Iterator[_Batch]:
+    """Draw all rigs, a batch at a time."""
+    for trial in range(protocol.trials):
+        generator = torch.Generator().manual_seed(protocol.seed * 65_536 + trial)
+        for first in range(0, protocol.count, protocol.batch):
+            sample = draw(conditions, min(protocol.batch, protocol.count - first), generator)
+            bounded = first < protocol.bound_count and conditions.corruption.noise >= LEAST_SIGMA
+            yield _Batch(trial, first, sample, bounded, tuple(methods))
+
+
+def _measured(methods: Mapping[str, Method], batch: _Batch) -> dict[str, Any]:
+    """Give a batch to all methods; what comes back is dicts of numbers and tensors."""
+    sample = batch.sample
+    fit = sample.reference()
+    rows = {name: _measure(name, method, sample, batch.first) for name, method in methods.items()}
+    return {
+        "trial": batch.trial,
+        "reference": vars(errors(as_prediction(fit), sample.truth, sample.conditions.obj)),
+        "bounds": vars(cramer_rao(fit, sample.conditions.obj)) if batch.bounded else None,
+        "rows": rows,
+        "rigs": len(sample) + sum(row["rigs"] for row in rows.values()),
+    }
+
+
+def _measure(name: str, method: Method, batch: Sample, first: int) -> dict[str, Any]:
+    """Give a method those rigs of a batch that are its share, a few at a time: errors of each stage, or None.
 
     Raises:
         InputError: a rig sees too few fiducials.
@@ -266,6 +320,8 @@ def _measure(name: str, method: Method, batch: Sample, first: int, into: _Collec
     """
     count = len(batch) if method.most is None else max(0, min(len(batch), method.most - first))
     size = method.batch or max(count, 1)
+    found: dict[str, list[Errors]] = {name: [] for name in STAGES}
+    number = 0
     for start in range(0, count, size):
         rows = slice(start, min(start + size, count))
         given = batch.given(rows)
@@ -283,12 +339,14 @@ def _measure(name: str, method: Method, batch: Sample, first: int, into: _Collec
                 f"evaluation: {name}: a system of equations has no solution ({error}), though every rig sees at least "
                 f"{least} different fiducials: an object on one line, or a fault of this method"
             ) from error
-        into.passes = len(passes)
-        into.alone.append(errors(passes[-1], truth, given.obj))
+        number = len(passes)
+        found["alone"].append(errors(passes[-1], truth, given.obj))
         if len(passes) > 1:
-            into.one_pass.append(errors(passes[0], truth, given.obj))
+            found["one_pass"].append(errors(passes[0], truth, given.obj))
         if method.refine is not None:
-            into.refined.append(errors(method.refine(passes[-1], given), truth, given.obj))
+            found["refined"].append(errors(method.refine(passes[-1], given), truth, given.obj))
+    joined = {stage: vars(concatenate(parts)) if parts else None for stage, parts in found.items()}
+    return {**joined, "passes": number, "rigs": count}
 
 
 def _row(trials: Sequence[_Collected], bounds: tuple[Errors, ...]) -> Row:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from imgcal.errors import InputError
 from imgcal.evaluation.methods import Method
@@ -59,6 +60,7 @@ def sweep(
     protocol: Protocol,
     values: Sequence[float] | None = None,
     progress: Progress = lambda rigs: None,
+    mapped: Callable[..., Iterator[Any]] = map,
 ) -> Sweep:
     """Evaluate along an axis, everything else as it stands, from equal random numbers.
 
@@ -71,6 +73,7 @@ def sweep(
         protocol: how many rigs at every point.
         values: None = those of the axis.
         progress: see `evaluate`.
+        mapped: see `evaluate`.
 
     Raises:
         InputError: unknown axis.
@@ -78,5 +81,5 @@ def sweep(
     if axis not in AXES:
         raise InputError(f"sweep: found {axis!r}, expected one of {', '.join(AXES)}{nearest(axis, AXES)}")
     chosen = AXES[axis].values if values is None else tuple(values)
-    found = tuple(evaluate(methods, AXES[axis].at(conditions, value), protocol, progress) for value in chosen)
+    found = tuple(evaluate(methods, AXES[axis].at(conditions, value), protocol, progress, mapped) for value in chosen)
     return Sweep(axis, chosen, found)

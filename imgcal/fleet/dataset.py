@@ -33,8 +33,9 @@ def schema() -> Any:
     return pa.schema([
         ("item", text), ("key", text), ("device", text), ("time", pa.timestamp("us", "UTC")), ("capture", text),
         ("rig", text), ("object", text), ("given", pa.map_(text, pa.float64())), ("status", text), ("reason", text),
-        ("seconds", pa.float64()), ("written", pa.timestamp("us", "UTC")), ("cameras", pa.list_(text)),
-        ("identity", text), ("offset", numbers), ("std", numbers), ("prior_std", numbers), ("unit", numbers),
+        ("seconds", pa.float64()), ("cpu_seconds", pa.float64()), ("written", pa.timestamp("us", "UTC")),
+        ("cameras", pa.list_(text)), ("identity", text),
+        ("offset", numbers), ("std", numbers), ("prior_std", numbers), ("unit", numbers),
         ("whitened_offset", numbers), ("information_factor", pa.list_(pa.float32())), ("inflation", pa.float64()),
         ("rms_px", pa.float64()), ("chi2_per_dof", pa.float64()), ("snapshots", pa.int32()), ("labels", pa.int32()),
         ("outliers", pa.int32()), ("moved", pa.list_(text)), ("rig_file", text),
@@ -147,7 +148,7 @@ class Dataset:
         tables = [self._read(path, wanted) for path in self.files()]
         if not tables:
             raise InputError(f"{self.folder}: found no results, expected those of a run of `imgcal fleet`")
-        table = pa.concat_tables(tables)
+        table = pa.concat_tables(tables, promote_options="default")  # older files may lack a column
         last: dict[str, int] = {item: row for row, item in enumerate(table["item"].to_pylist())}
         return table.take(sorted(last.values()))
 

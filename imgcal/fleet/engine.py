@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import socket
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -15,8 +16,9 @@ from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Generic, TypeVar
 
-from imgcal.errors import InputError
+from imgcal.errors import InputError, RefusedError
 from imgcal.fleet.manifest import reason_of
+from imgcal.messages import quoted
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -25,7 +27,10 @@ AHEAD = 2
 """Batches in flight for each core: one that runs and one that waits."""
 ATTEMPTS = 2
 """Of an item by itself, before its process's death is taken for its fault."""
-GRACE = 30.0  # s that a batch may take beyond the limits of its items: starting a process, fetching code
+GRACE = 120.0  # s that a batch may take beyond the limits of its items: starting a process on a machine that is busy
+PATIENCE = 15.0  # s until somebody at an address must have answered
+PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes(3) + b"\4" + bytes(5)
+"""What an HTTP/2 client begins with, empty settings included; a gRPC server answers it with settings of its own."""
 QUIET = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "TQDM_DISABLE": "1"}
 
 
@@ -82,12 +87,17 @@ class Engine:
         import ray
 
         if not ray.is_initialized():
+            if self.address is not None:
+                _ask(self.address)
             where: dict[str, Any] = {"address": self.address}
             if self.address is None:
+                os.environ.setdefault("RAY_worker_niceness", "0")  # as nice as who calls, not 15 more
                 where = {"address": "local", "num_cpus": self.cores, "include_dashboard": False}
             try:
-                ray.init(**where, log_to_driver=False, logging_level=logging.ERROR, configure_logging=False)
+                ray.init(**where, log_to_driver=False, logging_level=logging.ERROR)
             except Exception as error:
+                if self.address is None:
+                    raise InputError(f"Ray cannot be started on this machine: {reason_of(error)}") from error
                 raise InputError(f"--address: found no cluster at {self.address}: {reason_of(error)}") from error
             self._ours = True
         self.cores = int(ray.cluster_resources().get("CPU", self.cores))
@@ -162,14 +172,26 @@ class Engine:
         try:
             yield Done(batch.items, ray.get(reference))
         except ray.exceptions.RayTaskError as error:
+            if isinstance(error.cause, InputError | RefusedError):  # one line, for people
+                raise error.cause from None
             raise error.as_instanceof_cause() from None
         except ray.exceptions.NodeDiedError:
             again.append(batch)  # no fault of its own
         except ray.exceptions.RayError as error:
             yield from _split(batch, again, timed_out=False, reason=reason_of(error))
 
-    def mapped(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    def mapped(
+        self,
+        function: Callable[[Item], Result],
+        items: Iterable[Item],
+        arrived: Callable[[Item, Result], None] = lambda item, result: None,
+    ) -> Iterator[Result]:
         """Do items one at a time, results in the order of the items: the numbers of one process, only sooner.
+
+        Args:
+            function: of an item; sent once to each machine.
+            items: read as they are needed.
+            arrived: told of each result at once, whichever comes first.
 
         Raises:
             RuntimeError: an item takes its process down.
@@ -180,10 +202,35 @@ class Engine:
         for outcome in self.run(_each, numbered, function):
             if isinstance(outcome, Lost):
                 raise RuntimeError(f"item {outcome.item[0]} took its process down: {outcome.reason}")
-            results |= dict(outcome.results)
+            for (number, item), (_, result) in zip(outcome.items, outcome.results, strict=True):
+                arrived(item, result)
+                results[number] = result
             while first in results:
                 yield results.pop(first)
                 first += 1
+
+
+def _ask(address: str) -> None:
+    """Make sure that a gRPC server listens at an address: Ray would wait for one for minutes.
+
+    Raises:
+        InputError: nobody does.
+    """
+    if address in ("auto", "local"):
+        return
+    expected = "expected the head of a running Ray cluster, HOST:PORT as `ray start --head` says it"
+    host, _, port = address.rpartition("://")[2].rpartition(":")
+    if not host or not port.isdecimal():
+        raise InputError(f"--address: found {quoted(address)}, {expected}")
+    try:
+        with socket.create_connection((host.strip("[]"), int(port)), PATIENCE) as connection:
+            if os.environ.get("RAY_USE_TLS", "0") != "1":
+                connection.settimeout(PATIENCE)
+                connection.sendall(PREFACE)
+                if connection.recv(4)[3:] != b"\4":
+                    raise InputError(f"--address: found something that is not Ray at {address}, {expected}")
+    except (OSError, OverflowError) as error:
+        raise InputError(f"--address: found nobody at {address} ({reason_of(error)}), {expected}") from error
 
 
 def _each(items: Sequence[tuple[int, Item]], function: Callable[[Item], Result]) -> list[tuple[int, Result]]:

@@ -80,7 +80,7 @@ def processed(item: Item, settings: Settings, known: frozenset[str] | Any = froz
     Returns:
         A row of the results; None where its key is known. Never raises for what is wrong with a capture.
     """
-    started = time.perf_counter()
+    started, spent = time.perf_counter(), time.process_time()
     row = _row_of(item)
     status, extra = "ok", dict[str, Any]()
     try:
@@ -102,12 +102,13 @@ def processed(item: Item, settings: Settings, known: frozenset[str] | Any = froz
         status, row["reason"] = "timed_out", f"took longer than {settings.seconds:g} s"
     except Exception as error:
         status, row["reason"] = _fault(error, settings)
-    return row | {"status": status, "seconds": time.perf_counter() - started} | extra
+    took = {"seconds": time.perf_counter() - started, "cpu_seconds": time.process_time() - spent}
+    return row | {"status": status} | took | extra
 
 
 def failed_row(item: Item, status: Status, reason: str) -> dict[str, Any]:
     """Row of a capture whose process did not live to tell."""
-    return _row_of(item) | {"status": status, "reason": reason, "seconds": 0.0}
+    return _row_of(item) | {"status": status, "reason": reason, "seconds": 0.0, "cpu_seconds": 0.0}
 
 
 def _row_of(item: Item) -> dict[str, Any]:
@@ -232,7 +233,7 @@ def columns_of(result: Calibration) -> dict[str, Any]:
         "prior_std": estimate.problem.prior_std.flatten().tolist(),
         "unit": unit_of(result.factory).flatten().tolist(),
         "whitened_offset": solution.state.offset.flatten().tolist(),
-        "information_factor": factor[upper[0], upper[1]].float().tolist(),
+        "information_factor": factor[upper[0], upper[1]].float().numpy(),  # thousands: no list of Python's
         "inflation": float(estimate.inflation),
         "rms_px": float(result.rms),
         "chi2_per_dof": float(result.chi2_per_dof),

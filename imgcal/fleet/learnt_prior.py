@@ -164,6 +164,21 @@ def learn_prior(
     return LearntPrior(spreads, tuple(found), trends, len(drift))
 
 
+def outlier_cameras(drift: DriftInformation, prior: RigPrior) -> tuple[OutlierCamera, ...]:
+    """Name the cameras that a prior does not explain, the worst of each device first.
+
+    A score test, at five standard deviations of a Gaussian (two sides): of each kind of value, whatever its direction,
+    and of all values of a camera together.
+
+    Args:
+        drift: D devices.
+        prior: of the fleet, learnt or known.
+    """
+    model = _model(drift, None, False)
+    theta = torch.tensor([getattr(prior, kind) ** 2 for kind, _, _ in model.names], dtype=torch.float64)
+    return tuple(_outliers(drift, model, theta))
+
+
 def standardized_offsets(drift: DriftInformation, learnt: LearntPrior) -> Tensor:
     """Each device's most probable offsets by the learnt prior, over what they scatter by if it is right: (D, P).
 

@@ -11,7 +11,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +24,11 @@ from imgcal.association import to_observations
 from imgcal.estimation import estimate, relative_difference
 from imgcal.estimation.variance_components import KINDS
 from imgcal.evaluation.true_error import true_error
+from imgcal.fleet import Kept, workers
 from imgcal.io import write_text
 from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
 from scripts.benchmarks.honesty_prediction import Case
-from scripts.output import ROOT, command, markdown, read_json, replaced, surroundings, write_json
+from scripts.output import ROOT, WORK, command, markdown, read_json, replaced, surroundings, write_json
 
 RIGS = {"O10": "asymmetric8", "U7": "asymmetric8", "T4": "asymmetric8", "room10": "wand4"}
 SNAPSHOTS = (1, 5, 20, 100)
@@ -216,7 +216,7 @@ def _normalize(found: Calibration, truth: CameraRig, squares: dict[str, list[flo
     squares["joint"].append(float(along[values > 1e-9].mean()))
 
 
-def recovered(name: str, captures: int, seed: int) -> dict[str, Any]:
+def recovered(task: tuple[str, int, int]) -> dict[str, Any]:
     """Bend one fiducial of the wand in 50 snapshots of a room: is it found, and is the rig as good as if it were known?
 
     Returns:
@@ -224,6 +224,7 @@ def recovered(name: str, captures: int, seed: int) -> dict[str, Any]:
         captures) to those with the true object, and `told`, the same of an estimate that is told which fiducial it is:
         what the place of one fiducial costs anybody who has to find it.
     """
+    name, captures, seed = task
     generator, random = torch.Generator().manual_seed(seed), np.random.default_rng(seed)
     obj = load_object("wand4")
     counts: Counter[str] = Counter()
@@ -278,9 +279,8 @@ def effort(repeats: int = 15) -> dict[str, float]:
 
 
 def _row(task: tuple[str, str, int, float, str, int, int]) -> dict[str, Any]:
-    """Run one row; a function of its own for the pool of processes."""
+    """Run one row: a work item."""
     rig, obj, snapshots, tolerance, attack, captures, seed = task
-    torch.set_num_threads(1)
     given = load_object(obj)
     if tolerance:
         given = replace(given, tolerance=torch.full_like(given.points[:, 0], tolerance))
@@ -295,7 +295,13 @@ def _row(task: tuple[str, str, int, float, str, int, int]) -> dict[str, Any]:
         "attack": attack,
         "captures": captures,
     } | found
-    print(*(f"{value}" for value in row.values()), f"{1e3 * seconds:.0f} ms", file=sys.stderr, flush=True)
+    return row | {"ms": 1e3 * seconds}
+
+
+def _told(row: dict[str, Any]) -> dict[str, Any]:
+    """Say on standard error that a row is done, and how long a capture of it took."""
+    took = row.pop("ms")
+    print(*(f"{value}" for value in row.values()), f"{took:.0f} ms", file=sys.stderr, flush=True)
     return row
 
 
@@ -306,7 +312,8 @@ class Options:
     captures: int = 200  #: for each row of sigmas; a quarter as many of 100 snapshots
     attacked: int = 50  #: for each row of attacks
     rigs: tuple[str, ...] = tuple(RIGS)
-    processes: int = 2
+    address: str | None = None  #: running Ray cluster that does the rows; none = this machine
+    cores: int | None = None  #: of this machine; 1 = this process alone; none = all
     wand_only: bool = False  #: measure the bent wand anew, and keep the rest of what is in OUT
     out: Path = RESULT
 
@@ -328,9 +335,10 @@ def main() -> None:
         for s in (1, 20)
         if attack != "as said" and not (attack == "a camera turned 0.5 degrees" and s == 1)
     ]
-    with get_context("spawn").Pool(options.processes) as pool:
-        wands = pool.starmap(recovered, [(name, options.captures, 9000 + i) for i, name in enumerate(BENT)])
-        rows = [] if options.wand_only else pool.map(_row, tasks, chunksize=1)
+    kept = Kept(WORK / "honesty", Path(__file__).read_text("utf-8"))
+    with workers(options.address, options.cores, kept) as mapped:
+        wands = list(mapped(recovered, [(name, options.captures, 9000 + i) for i, name in enumerate(BENT)]))
+        rows = [_told(row) for row in mapped(_row, [] if options.wand_only else tasks)]
     bent = {"bent_wand": dict(zip(BENT, wands, strict=True))}
     result: dict[str, Any]
     if options.wand_only:
@@ -339,6 +347,7 @@ def main() -> None:
         seconds = round(time.monotonic() - began)
         result = before | {"noise_px": NOISE, "seconds": seconds, "rows": rows} | bent | {"estimate_seconds": effort()}
     write_json(options.out, result)
+    kept.clear()
     if options.out == RESULT:
         write_text(PAGE, replaced(PAGE.read_text("utf-8"), tables(read_json(RESULT)), PAGE))
     for text in tables(result).values():

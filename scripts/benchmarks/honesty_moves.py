@@ -13,16 +13,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 import tyro
 
 from imgcal import PipelineOptions, RefusedError, calibrate
 from imgcal.association import associate
+from imgcal.fleet import Kept, Mapped, workers
 from imgcal.io import write_text
 from imgcal.pipeline.steadiness import moves_of
 from imgcal.types import Detections, MovedError
 from scripts.benchmarks import camera_faults as faults
-from scripts.output import ROOT, command, markdown, read_json, replaced, surroundings, write_json
+from scripts.output import ROOT, WORK, command, markdown, read_json, replaced, surroundings, write_json
 
 RESULT = ROOT / "docs" / "benchmarks" / "honesty_moves.json"
 PAGE = ROOT / "docs" / "benchmarks.md"
@@ -95,29 +95,44 @@ def _damaged(table: Detections, rig: faults.CameraRig, how: str) -> Detections:
     return table if how == "lens" else faults.mirrored(table, rig, CAMERA, how)
 
 
-def measure(captures: int, steady_captures: int) -> dict[str, Any]:
+def measure(captures: int, steady_captures: int, mapped: Mapped = map) -> dict[str, Any]:
     """Run everything: `captures` of each fault in a camera, `steady_captures` of each kind of steady ones."""
-    alarms: dict[str, Any] = {}
+    items: list[tuple[Any, ...]] = []
     for fault in STEADY:
         # Where place and time go together is a matter of a volume; poses before a ring are drawn each for itself.
         kinds = list(SCENES)[:1] if fault.endswith("one way") else list(SCENES)
-        found = sum(steady(kinds[seed % len(kinds)], fault, seed) for seed in range(steady_captures))
-        alarms[fault] = {"captures": steady_captures, "alarms": found}
-        print(fault, alarms[fault], file=sys.stderr, flush=True)
-    moves, images = {}, {}
+        items += [("steady", kinds[seed % len(kinds)], fault, seed) for seed in range(steady_captures)]
     for kind in SCENES:
-        for degrees in DEGREES:
-            for share in SHARES:
-                name = f"{kind}, {degrees:g} deg after {100 * share:.0f} %"
-                moves[name] = _counted(bumped(kind, degrees, share, seed) for seed in range(captures))
-                print(name, moves[name], file=sys.stderr, flush=True)
-        for how in IMAGES:
-            images[f"{kind}, {how}"] = _counted(wrong_image(kind, how, seed) for seed in range(captures))
+        cases: list[tuple[Any, ...]] = [("moves", kind, degrees, share) for degrees in DEGREES for share in SHARES]
+        cases += [("images", kind, how) for how in IMAGES]
+        items += [(*case, seed) for case in cases for seed in range(captures)]
+    found: dict[str, dict[str, list[Any]]] = {"steady": {}, "moves": {}, "images": {}}
+    for item, outcome in zip(items, mapped(_outcome, items), strict=True):
+        outcomes = found[item[0]].setdefault(_name(item), [])
+        outcomes.append(outcome)
+        if len(outcomes) == (steady_captures if item[0] == "steady" else captures):
+            print(_name(item), sum(outcomes) if item[0] == "steady" else outcomes, file=sys.stderr, flush=True)
+    alarms = {name: {"captures": len(told), "alarms": sum(told)} for name, told in found["steady"].items()}
+    moves, images = ({name: _counted(told) for name, told in found[part].items()} for part in ("moves", "images"))
     return {"noise_px": faults.NOISE, "snapshots": SNAPSHOTS, "steady": alarms, "moves": moves, "images": images}
 
 
-def _counted(outcomes: Any) -> dict[str, int]:
-    found = list(outcomes)
+def _outcome(item: tuple[Any, ...]) -> bool | str:
+    what, *case = item
+    if what == "steady":
+        return steady(*case)
+    return bumped(*case) if what == "moves" else wrong_image(*case)
+
+
+def _name(item: tuple[Any, ...]) -> str:
+    """Row of the table that a work item belongs to."""
+    what, kind, *rest = item
+    if what == "steady":
+        return str(rest[0])
+    return f"{kind}, {rest[0]:g} deg after {100 * rest[1]:.0f} %" if what == "moves" else f"{kind}, {rest[0]}"
+
+
+def _counted(found: list[str]) -> dict[str, int]:
     return {name: found.count(name) for name in ("found", "refused", "accepted")}
 
 
@@ -141,16 +156,23 @@ class Options:
 
     captures: int = 10
     steady_captures: int = 300
+    address: str | None = None  #: running Ray cluster that does the captures; none = this machine
+    cores: int | None = None  #: of this machine; 1 = this process alone; none = all
     out: Path = RESULT  #: the tables in docs/benchmarks.md are rewritten with this one alone
 
 
 def main() -> None:
     """Measure, write, print."""
     options = tyro.cli(Options, description=__doc__)
-    torch.set_num_threads(1)
-    began, before = time.monotonic(), surroundings()
-    result = measure(options.captures, options.steady_captures)
+    began, before, kept = (
+        time.monotonic(),
+        surroundings(),
+        Kept(WORK / "honesty_moves", Path(__file__).read_text("utf-8")),
+    )
+    with workers(options.address, options.cores, kept) as mapped:
+        result = measure(options.captures, options.steady_captures, mapped)
     write_json(options.out, before | {"seconds": round(time.monotonic() - began)} | result)
+    kept.clear()
     tables = {
         "honesty steady": steady_table(result),
         "honesty moves": faults_table(result, "moves"),

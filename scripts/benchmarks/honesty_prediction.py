@@ -18,11 +18,12 @@ import tyro
 
 from imgcal import InputError, PipelineOptions, RefusedError, calibrate, load_object, load_rig, predicted_error
 from imgcal.evaluation.true_error import true_error
+from imgcal.fleet import Kept, Mapped, workers
 from imgcal.io import write_text
 from imgcal.synthesis import PoseRange, Truth, simulate_volume, true_detections
 from imgcal.synthesis.rigs import sample_rig_from_object
 from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
-from scripts.output import ROOT, command, markdown, read_json, replaced, surroundings, write_json
+from scripts.output import ROOT, WORK, command, markdown, read_json, replaced, surroundings, write_json
 
 RIGS = {"O10": "asymmetric8", "U7": "asymmetric8", "T4": "asymmetric8", "room10": "wand4"}
 SNAPSHOTS = (1, 5, 20)
@@ -108,17 +109,29 @@ def _ratio(squares: np.ndarray) -> dict[str, float]:
     return {"ratio": ratio, "ratio_std": float(squares.std() / np.sqrt(len(squares)) / (2 * ratio))}
 
 
+def _row(item: tuple[str, str, int, int, int]) -> dict[str, Any]:
+    rig, obj, snapshots, captures, seed = item
+    options = PipelineOptions(blind_cameras=True)  # a wand in one snapshot is not in view of every camera
+    return judge(Case(load_rig(rig), load_object(obj), snapshots), captures, seed, options)
+
+
 def measure(
-    captures: int = 200, snapshots: Sequence[int] = SNAPSHOTS, rigs: Mapping[str, str] = RIGS, seed: int = 1
+    captures: int = 200,
+    snapshots: Sequence[int] = SNAPSHOTS,
+    rigs: Mapping[str, str] = RIGS,
+    seed: int = 1,
+    mapped: Mapped = map,
 ) -> dict[str, Any]:
     """Run all rigs and numbers of snapshots: rig -> snapshots -> what `judge` returns."""
-    options = PipelineOptions(blind_cameras=True)  # a wand in one snapshot is not in view of every camera
+    items = [
+        (rig, obj, count, captures, seed + 1000 * number + count)
+        for number, (rig, obj) in enumerate(rigs.items())
+        for count in snapshots
+    ]
     rows: dict[str, Any] = {}
-    for number, (rig, obj) in enumerate(rigs.items()):
-        for count in snapshots:
-            case = Case(load_rig(rig), load_object(obj), count)
-            rows.setdefault(rig, {})[str(count)] = judge(case, captures, seed + 1000 * number + count, options)
-            print(rig, count, rows[rig][str(count)], file=sys.stderr, flush=True)
+    for (rig, _, count, *_), row in zip(items, mapped(_row, items), strict=True):
+        rows.setdefault(rig, {})[str(count)] = row
+        print(rig, count, row, file=sys.stderr, flush=True)
     return {"noise_px": NOISE, "held_out_points": HELD_OUT, "gate": list(GATE), "rigs": rows}
 
 
@@ -140,6 +153,8 @@ class Options:
     captures: int = 200
     snapshots: tuple[int, ...] = SNAPSHOTS
     rigs: tuple[str, ...] = tuple(RIGS)
+    address: str | None = None  #: running Ray cluster that does the rows; none = this machine
+    cores: int | None = None  #: of this machine; 1 = this process alone; none = all
     out: Path = RESULT  #: the table in docs/benchmarks.md is rewritten with this one alone
 
 
@@ -152,10 +167,16 @@ def main() -> None:
     options = tyro.cli(Options, description=__doc__)
     if unknown := [name for name in options.rigs if name not in RIGS]:
         raise InputError(f"--rigs: found {', '.join(unknown)}, expected some of {', '.join(RIGS)}")
-    torch.set_num_threads(1)
-    began, before = time.monotonic(), surroundings()
-    result = measure(options.captures, options.snapshots, {name: RIGS[name] for name in options.rigs})
+    began, before, kept = (
+        time.monotonic(),
+        surroundings(),
+        Kept(WORK / "honesty_prediction", Path(__file__).read_text("utf-8")),
+    )
+    with workers(options.address, options.cores, kept) as mapped:
+        chosen = {name: RIGS[name] for name in options.rigs}
+        result = measure(options.captures, options.snapshots, chosen, mapped=mapped)
     write_json(options.out, before | {"seconds": round(time.monotonic() - began)} | result)
+    kept.clear()
     if options.out == RESULT:
         page = replaced(PAGE.read_text("utf-8"), {"honesty prediction": table(read_json(RESULT))}, PAGE)
         write_text(PAGE, page)

@@ -31,6 +31,7 @@ from imgcal.evaluation import (
     load_models,
     sweep,
 )
+from imgcal.fleet import Mapped
 from imgcal.io import read_metrics, read_texts
 from imgcal.networks.checkpoint import FORMAT
 from imgcal.synthesis import Corruption, RelativeDrift
@@ -93,7 +94,9 @@ def find(runs: Path, models: Path) -> list[Source]:
     return list(found.values())
 
 
-def measure(source: Source, effort: Effort, device: str, trained_on: str) -> dict[str, Any]:
+def measure(
+    source: Source, effort: Effort, device: str, trained_on: str, mapped: Mapped = map, known: Mapping[str, Any] = {}
+) -> dict[str, Any]:
     """Evaluate one network.
 
     Args:
@@ -101,6 +104,8 @@ def measure(source: Source, effort: Effort, device: str, trained_on: str) -> dic
         effort: how many rigs.
         device: where it runs.
         trained_on: the machine of its training, in words.
+        mapped: who measures (`imgcal.fleet.workers`).
+        known: what was measured of the same weights before: times, training and its history stay as they are.
     """
     [model] = load_models([source.path], device=device)
     name, images = experiment_of(model.checkpoint.experiment).name, model.method.images is not None
@@ -119,22 +124,26 @@ def measure(source: Source, effort: Effort, device: str, trained_on: str) -> dic
         "shipped": source.shipped,
         "bytes": model.size,
         "parameters": model.parameters,
-        "training": training_of(model, trained_on),
+        "training": known.get("training") or training_of(model, trained_on),
         "surroundings": surroundings(device),
         "images": images,
         "rigs": effort.rigs(images),
-        "exact": columns(evaluated(methods, model.conditions, exact, f"{name}, exact"), methods),
+        "exact": columns(evaluated(methods, model.conditions, exact, f"{name}, exact", mapped), methods),
         "noise": columns(
-            evaluated({NETWORK: model.method}, replace(model.conditions, corruption=NOISE), few, f"{name}, noise"),
+            evaluated(
+                {NETWORK: model.method}, replace(model.conditions, corruption=NOISE), few, f"{name}, noise", mapped
+            ),
             {NETWORK: model.method},
         ),
-        "latency_ms": vars(latency(model.method, model.conditions)),
-        "history": history_of(read_metrics(source.log / "metrics.jsonl")),
+        "latency_ms": known.get("latency_ms") or vars(latency(model.method, model.conditions)),
+        "history": known.get("history") or history_of(read_metrics(source.log / "metrics.jsonl")),
     }
     if name.startswith("shipped"):
         all_methods = {NETWORK: model.method} | QUICK_BASELINES | {ROBUST: BASELINES[ROBUST]}
         conditions = replace(model.conditions, corruption=ROBUSTNESS)
-        result["robustness"] = columns(evaluated(all_methods, conditions, few, f"{name}, outliers"), all_methods)
+        result["robustness"] = columns(
+            evaluated(all_methods, conditions, few, f"{name}, outliers", mapped), all_methods
+        )
     return result
 
 
@@ -249,10 +258,12 @@ def _scores(scores: Scores) -> dict[str, Any]:
     return found
 
 
-def evaluated(methods: Mapping[str, Method], conditions: Conditions, protocol: Protocol, what: str) -> Evaluation:
+def evaluated(
+    methods: Mapping[str, Method], conditions: Conditions, protocol: Protocol, what: str, mapped: Mapped = map
+) -> Evaluation:
     """Evaluate, and say on standard error how far it is and how long it took."""
     began = monotonic()
-    found = evaluate(methods, conditions, protocol, _progress(what, protocol, len(methods)))
+    found = evaluate(methods, conditions, protocol, _progress(what, protocol, len(methods)), mapped)
     print(f"\r{what}: {protocol.trials} x {protocol.count} rigs, {monotonic() - began:.0f} s", file=sys.stderr)
     return found
 

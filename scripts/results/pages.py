@@ -81,6 +81,7 @@ def paper_table(experiments: Sequence[RigExperiment], results: Results) -> str:
         *STEPS[:2],
         "encoder",
         "seeds",
+        "rigs",
         "parameters",
         *TRAINING,
     )
@@ -88,18 +89,19 @@ def paper_table(experiments: Sequence[RigExperiment], results: Results) -> str:
     def cells(experiment: RigExperiment, runs: Runs) -> list[str]:
         row = [str(row_of(experiment)), _what(experiment, runs), _paper(experiment)]
         row += [mean(runs, name) for name in (NETWORK, REFINED, *STEPS[:2])]
-        return [*row, encoder(runs), seeds(runs), _millions(runs[0]["parameters"]), *training_cells(runs)]
+        row += [encoder(runs), seeds(runs), _rigs(runs)]
+        return [*row, _millions(runs[0]["parameters"]), *training_cells(runs)]
 
     return _of_trained(head, experiments, results, cells)
 
 
 def comparison_table(experiments: Sequence[RigExperiment], results: Results) -> str:
     """What single decisions are worth, in equal minutes from nothing."""
-    head = ("what", "network alone", "median", "seeds", "parameters", *TRAINING)
+    head = ("what", "network alone", "median", "seeds", "rigs", "parameters", *TRAINING)
 
     def cells(experiment: RigExperiment, runs: Runs) -> list[str]:
         row = [experiment.description.partition(":")[0], mean(runs, NETWORK), _px(_mean(runs, NETWORK, "median"))]
-        return [*row, seeds(runs), _millions(runs[0]["parameters"]), *training_cells(runs)]
+        return [*row, seeds(runs), _rigs(runs), _millions(runs[0]["parameters"]), *training_cells(runs)]
 
     return _of_trained(head, experiments, results, cells)
 
@@ -108,7 +110,8 @@ def shipped_table(experiments: Sequence[RigExperiment], results: Results) -> str
     """Accuracy, speed and size of the models that ship."""
     head = (
         "model", "one pass", "all passes", REFINED, *STEPS[:2], "RE < 1 px, one pass / all / refined", "encoder",
-        "rises by", "seeds", "alone, ms p50 / p99", "refined, ms p50 / p99", "parameters", "file, MB", *TRAINING,
+        "rises by", "seeds", "rigs", "alone, ms p50 / p99", "refined, ms p50 / p99", "parameters", "file, MB",
+        *TRAINING,
     )  # fmt: skip
     stages = (ONE_PASS, NETWORK, REFINED)
 
@@ -118,7 +121,7 @@ def shipped_table(experiments: Sequence[RigExperiment], results: Results) -> str
         name = experiment.name if shown["shipped"] else f"{experiment.name} (float32 run)"
         row = [name, *(mean(runs, stage) for stage in (*stages, *STEPS[:2]))]
         row += [_shares(runs, stages, "share_under_one_px"), encoder(runs)]
-        row += ["" if check is None else f"{check['rise']:.3g} x", seeds(runs)]
+        row += ["" if check is None else f"{check['rise']:.3g} x", seeds(runs), f"{shown['rigs']:,}"]
         row += [
             f"{took['alone_p50']:.1f} / {took['alone_p99']:.1f}",
             f"{took['refined_p50']:.1f} / {took['refined_p99']:.1f}",
@@ -178,6 +181,11 @@ def training_cells(runs: Runs) -> list[str]:
     training = runs[0]["training"]
     steps = f"{training['steps']:,} x {training['batch_size']}"
     return [f"{training['minutes']:.0f}", steps, training["started_from"] or "", training["machine"]]
+
+
+def _rigs(runs: Runs) -> str:
+    """Rigs that each seed was measured on: where they differ, the fewest."""
+    return f"{min(run['rigs'] for run in runs):,}"
 
 
 def row_of(experiment: RigExperiment) -> int:

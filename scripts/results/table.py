@@ -16,9 +16,10 @@ from typing import Annotated, Any
 import tyro
 
 from imgcal.errors import InputError
+from imgcal.fleet import Kept, workers
 from imgcal.io import shipped_names, write_text
 from imgcal.training import RigExperiment, load_experiment
-from scripts.output import RESULTS, ROOT, command, read_json, replaced, write_json
+from scripts.output import RESULTS, ROOT, WORK, command, read_json, replaced, write_json
 from scripts.results.charts import over_time, sweeps
 from scripts.results.headline import headline_tables, measure_headline, time_headline
 from scripts.results.measuring import Effort, Source, find, latency_of, measure, swept, without_network
@@ -55,6 +56,9 @@ class Options:
     sweep_count: int = 1000  #: rigs at each point of those curves
     machine: str = "2 CPU cores shared, 1 thread a training"  #: what new runs were trained on
     device: str = "cpu"  #: where networks run; refinement is always on the CPU
+    address: str | None = None  #: running Ray cluster that measures; none = this machine
+    cores: int = 1  #: of this machine; 1 = this process alone
+    work: Path = WORK / "table"  #: what a stopped call has done
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -75,7 +79,7 @@ def main(arguments: list[str] | None = None) -> None:
         if options.times:
             _time_anew(options, source, place)
         elif not _known(place, source, options.effort):
-            write_json(place, measure(source, options.effort, options.device, options.machine))
+            _measure(options, source, place)
         if source.experiment == options.sweep:
             _sweep(options, source)
         if source.path.stem == options.headline and not options.times:
@@ -119,6 +123,16 @@ def pictures(folder: Path) -> dict[str, str]:
 
 def _order(experiment: RigExperiment) -> tuple[int, str]:
     return (row_of(experiment), experiment.name)
+
+
+def _measure(options: Options, source: Source, place: Path) -> None:
+    """Evaluate a network; what a stopped call has done is kept beside the runs until all is."""
+    known = read_json(place) if place.is_file() else {}
+    same = known if known.get("sha256") == source.sha256 else {}
+    kept = Kept(options.work / source.sha256[:16], source.sha256)
+    with workers(options.address, options.cores, kept) as mapped:
+        write_json(place, measure(source, options.effort, options.device, options.machine, mapped, same))
+    kept.clear()
 
 
 def _known(place: Path, source: Source, effort: Effort) -> bool:

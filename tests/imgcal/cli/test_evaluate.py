@@ -1,13 +1,18 @@
 import json
+import signal
+import subprocess
+import sys
 
 import pytest
 import torch
 
 from imgcal.cli.main import main
 from imgcal.evaluation import QUICK_BASELINES
+from imgcal.fleet import Kept
 from imgcal.io import load_object, load_rig
 from imgcal.networks import Checkpoint, build_network, save_checkpoint
 from imgcal.training.experiment_file import load_experiment
+from tests.imgcal.fleet.conftest import engine  # noqa: F401  one Ray for all tests
 
 EXPERIMENT = """
 format: imgcal-experiment/1
@@ -84,6 +89,41 @@ def test_baselines_alone_need_rig_and_object(capsys):
     assert "--object" in capsys.readouterr().err
 
 
+KILLED = """
+import os, signal, sys
+from imgcal.cli.main import main
+from imgcal.fleet import Kept
+put, done = Kept.put, []
+def die(self, item, result):
+    put(self, item, result)
+    done.append(item)
+    if len(done) == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+Kept.put = die
+main(sys.argv[1:])
+"""
+
+
+@pytest.mark.usefixtures("engine")
+def test_a_killed_evaluation_goes_on_with_the_same_numbers(models, tmp_path, monkeypatch):
+    few = ["evaluate", str(models[0]), "--count", "4", "--trials", "5", "--no-baselines"]
+    out = ["--out", str(tmp_path / "killed")]
+    killed = subprocess.run([sys.executable, "-c", KILLED, *few, *out, "--cores", "1"], timeout=240)
+    assert killed.returncode == -signal.SIGKILL
+    kept = list((tmp_path / "killed" / ".work").iterdir())
+    assert len(kept) == 2 and not (tmp_path / "killed" / "evaluation.json").exists()
+    done, put = [], Kept.put
+    monkeypatch.setattr(Kept, "put", lambda self, item, result: (done.append(item), put(self, item, result)))
+    assert main([*few, *out, "--cores", "2"]) == 0
+    assert len(done) == 3 and not (tmp_path / "killed" / ".work").exists()
+    assert main([*few, "--out", str(tmp_path / "whole"), "--cores", "1"]) == 0
+    one, other = (json.loads((tmp_path / name / "evaluation.json").read_text()) for name in ("killed", "whole"))
+    for method in one["methods"]:
+        for stage in ("alone", "refined"):
+            assert one["methods"][method].get(stage) == other["methods"][method].get(stage)
+    assert one["reference"] == other["reference"]
+
+
 def test_sweeps_are_drawn(models, tmp_path):
     out = tmp_path / "result"
     arguments = ["evaluate", str(models[0]), "--count", "2", "--trials", "1", "--no-baselines", "--out", str(out)]
@@ -115,6 +155,7 @@ def test_compare_puts_networks_side_by_side(models, tmp_path, capsys):
         (["--missing", "2"], "missing"),
         (["--missing", "1"], "missing: found 1, expected a smaller share"),
         (["--count", "0"], "count"),
+        (["--cores", "0"], "--cores: found 0"),
         (["--phi", "20", "10"], "--phi"),
         (["--level", "5"], "--level: found 5, expected 0 to 4"),
         (["--level", "1", "--noise", "0.2"], "--level: found --noise"),

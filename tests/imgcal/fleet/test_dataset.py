@@ -36,6 +36,21 @@ def test_rows_by_day_and_the_last_word_counts(tmp_path: Path) -> None:
     assert len(dataset.keys()) == 3
 
 
+def test_files_of_an_older_version_lack_a_column(tmp_path: Path) -> None:
+    import pyarrow.parquet as pq
+
+    dataset = Dataset(tmp_path)
+    with dataset.written() as writer:
+        writer.add([row(1)])
+    (path,) = dataset.files()
+    pq.write_table(pq.ParquetFile(path).read().drop_columns(["cpu_seconds"]), path)
+    with dataset.written() as writer:
+        writer.add([row(2)])
+    for table in (dataset.latest(), dataset.latest(("device", "cpu_seconds"))):
+        rows = {one["device"]: one["cpu_seconds"] for one in table.to_pylist()}
+        assert rows == {"d1": None, "d2": 0.0}
+
+
 def test_what_may_go_better_next_time_is_not_done(tmp_path: Path) -> None:
     dataset = Dataset(tmp_path)
     with dataset.written() as writer:

@@ -2,8 +2,10 @@
 
 import os
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -11,6 +13,7 @@ from pathlib import Path
 import pytest
 import ray
 
+import imgcal
 from imgcal.fleet import Done, Engine, Lost
 
 
@@ -42,8 +45,8 @@ def test_only_the_item_that_kills_its_process_is_lost(engine: Engine) -> None:
 
 def test_what_does_not_end_is_stopped(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
     ray.cloudpickle.register_pickle_by_value(__import__(__name__, fromlist=["square"]))
-    monkeypatch.setattr("imgcal.fleet.engine.GRACE", 2.0)
-    outcomes = list(engine.run(misbehaving, [["a", "hang"]], seconds=1.0))
+    monkeypatch.setattr("imgcal.fleet.engine.GRACE", 20.0)  # a process must start within it
+    outcomes = list(engine.run(misbehaving, [["hang"], ["a"]], seconds=1.0))
     assert [(o.item, o.timed_out) for o in outcomes if isinstance(o, Lost)] == [("hang", True)]
     assert [o.results for o in outcomes if isinstance(o, Done)] == [["A"]]
 
@@ -67,6 +70,38 @@ def test_no_more_is_read_than_is_needed(engine: Engine) -> None:
 def test_an_error_of_the_function_is_raised(engine: Engine) -> None:
     with pytest.raises(TypeError):
         list(engine.mapped(len, [1]))
+
+
+def test_an_address_where_nobody_is_ends_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ray itself would wait for minutes."""
+    monkeypatch.setattr("imgcal.fleet.engine.PATIENCE", 0.5)
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        port = silent.getsockname()[1]
+        for address, expected in (
+            ("head", "found head"),
+            (f"127.0.0.1:{port}", "timed out"),
+            (f"ray://127.0.0.1:{port}", "timed out"),
+            ("127.0.0.1:99999", "found nobody"),
+        ):
+            with pytest.raises(imgcal.InputError, match=f"--address: .*{expected}.*HOST:PORT"), Engine(address):
+                pass
+    with pytest.raises(imgcal.InputError, match="found nobody at "), Engine(f"127.0.0.1:{port}"):
+        pass
+
+
+def test_something_else_that_listens_is_told_from_ray(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def answer() -> None:
+            connection, _ = server.accept()
+            with connection:
+                connection.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n")
+
+        threading.Thread(target=answer, daemon=True).start()
+        with pytest.raises(imgcal.InputError, match="not Ray"), Engine(f"127.0.0.1:{server.getsockname()[1]}"):
+            pass
 
 
 CLUSTER = """
@@ -99,6 +134,7 @@ def test_a_node_that_dies_costs_time_only(tmp_path: Path) -> None:
     """Machines are simulated by processes; the one that works is switched off."""
     (tmp_path / "cluster.py").write_text(CLUSTER)
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([*sys.path, str(tmp_path)])}
+    environment |= {"RAY_worker_niceness": "0"}  # else they starve on a machine that is busy
     done = subprocess.run(
         [sys.executable, "cluster.py"], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=240
     )

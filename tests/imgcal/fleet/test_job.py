@@ -23,6 +23,7 @@ def capture(tmp_path: Path) -> Path:
 def test_a_capture_becomes_a_row(capture: Path) -> None:
     row = processed(item(capture), Settings(keep_rig=True))
     assert row is not None and row["status"] == "ok" and row["snapshots"] == 2
+    assert row["cpu_seconds"] > 0
     assert len(row["offset"]) == 60 and len(row["information_factor"]) == 60 * 61 // 2
     assert row["rms_px"] < 0.2 and row["rig_file"].startswith("format: imgcal-rig/1")
     assert processed(item(capture), Settings(), frozenset({row["key"]})) is None

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 import imgcal
-from imgcal.fleet import DriftInformation, learn_prior, standardized_offsets
+from imgcal.fleet import DriftInformation, learn_prior, outlier_cameras, standardized_offsets
 from imgcal.types import RigPrior
 
 TRUE = RigPrior(focal_length=0.004, principal_point=3.0, distortion=0.01, rotation=0.003, position=1.5)
@@ -62,6 +62,7 @@ def test_bumped_cameras_are_named_and_do_not_widen_the_prior() -> None:
     learnt = learn_prior(seen_through(offset, 2))
     assert {(o.device, o.camera) for o in learnt.outliers} == bumped
     assert {o.kind for o in learnt.outliers} == {"rotation"}
+    assert {(o.device, o.camera) for o in outlier_cameras(seen_through(offset, 2), TRUE)} == bumped
     assert abs(learnt.spreads[0].value - TRUE.rotation) < 4 * learnt.spreads[0].sigma
 
 

@@ -1,0 +1,338 @@
+"""What does a fleet cost: captures a second, the engine's share, nodes that die, bytes, the driver's memory.
+
+Run as `python -m scripts.benchmarks.fleet_speed`; `--only overhead` measures one part anew, keeps the others. Work is
+told in CPU seconds, so that what else a machine does matters less; rates by the clock stand beside them with the load.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from ray import cloudpickle
+
+from imgcal.cli.main import main as imgcal_command
+from imgcal.fleet import Dataset, Done, Engine, Item, Manifest, Settings, recalibrate_fleet, write_manifest
+from imgcal.fleet import run as fleet_run
+from imgcal.fleet.job import failed_row, processed
+from imgcal.io import load_object, load_rig, save_detections, write_text
+from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
+from scripts.benchmarks.fleet_plan import PAGE as PLAN
+from scripts.benchmarks.fleet_plan import plan_tables
+from scripts.output import ROOT, command, markdown, read_json, replaced, surroundings, write_json
+
+RESULT, PAGE = ROOT / "docs" / "benchmarks" / "fleet_speed.json", ROOT / "docs" / "fleet.md"
+DRIFT = PhysicalDrift(0.17, 1.5, 0.004, 3.0, 0.005)
+KINDS = {"blobs, T4, 3 snapshots": ("T4", 3), "blobs, O10, 5 snapshots": ("O10", 5)}
+FRAMES = "frames, T4, 3 snapshots"
+SHARES = {"blobs, O10, 5 snapshots": 2, FRAMES: 4}
+"""Of the captures: these take longer."""
+TARGETS = {"blobs": 5.0, "frames": 1.0}  # % of the work
+
+
+@dataclass(frozen=True)
+class Options:
+    """Measure fleets."""
+
+    captures: int = 64  #: of blobs, in each measurement
+    rounds: int = 2
+    rows: int = 1_000_000  #: of the manifest that shows the driver's memory
+    only: tuple[str, ...] = ()  #: parts to measure anew: overhead, nodes, death, bytes, memory
+    out: Path = RESULT
+    again: bool = False  #: measure nothing: make the tables of the JSON that is there
+
+
+def write_blobs(path: Path, rig: str, snapshots: int, seed: int) -> None:
+    """A table of unlabelled blobs of a drifted rig."""
+    generator = torch.Generator().manual_seed(seed)
+    truth = simulate_truth(load_rig(rig), load_object("asymmetric8"), snapshots, generator, DRIFT)
+    seen = true_detections(truth)
+    noise = np.random.default_rng(seed).normal(0.0, 0.1, seen.uv.shape)
+    unlabelled = np.full(len(seen.uv), -1)
+    save_detections(replace(seen, uv=seen.uv + noise, sigma=np.full(len(seen.uv), 0.1), fiducial=unlabelled), path)
+
+
+def fleet_of(folder: Path, kind: str, captures: int) -> Manifest:
+    """A manifest of devices that share eight captures; every row is work of its own."""
+    rig, rows = "T4", []
+    if kind == FRAMES:
+        out = folder / "frames"
+        if not out.exists():
+            given = ["--rig", rig, "--object", "asymmetric8", "--snapshots", "3", "--out", str(out), "--seed", "1"]
+            assert imgcal_command(["simulate", *given]) == 0
+        paths = [out]
+    else:
+        rig, snapshots = KINDS[kind]
+        paths = [folder / f"{rig}-{snapshots}-{seed}.csv" for seed in range(8)]
+        for seed, path in enumerate(paths):
+            if not path.exists():
+                write_blobs(path, rig, snapshots, seed)
+    for number in range(captures):
+        rows.append({"capture": str(paths[number % len(paths)]), "device": f"d{number}"})
+    path = folder / f"{kind.replace(', ', '-').replace(' ', '_')}-{captures}.csv"
+    write_manifest(path, rows)
+    return Manifest(str(path), rig, "asymmetric8")
+
+
+def cpu_seconds() -> dict[str, float]:
+    """CPU time of this process and of all that descend from it, by what they are."""
+    processes: dict[int, tuple[int, str, float]] = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            name, rest = (folder / "stat").read_text().partition("(")[2].rsplit(")", 1)
+            title = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+        except OSError:
+            continue
+        fields = rest.split()
+        spent = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+        processes[int(folder.name)] = (int(fields[1]), title or name, spent)
+    found = dict.fromkeys(("driver", "workers", "engine", "around"), 0.0)
+    for pid, (_, title, spent) in processes.items():
+        ancestor = pid
+        while ancestor in processes and ancestor != os.getpid():
+            ancestor = processes[ancestor][0]
+        if ancestor == os.getpid():
+            what = "driver" if pid == os.getpid() else "workers" if title.startswith("ray::_p") else "around"
+            what = "engine" if "raylet/raylet " in title or "gcs_server " in title else what
+            found[what if not title.startswith("ray::IDLE") else "workers"] += spent
+    return found
+
+
+def overhead(folder: Path, options: Options) -> dict[str, Any]:
+    """What the engine adds to the work itself, by kind of capture: medians over rounds."""
+    found: dict[str, Any] = {}
+    with Engine(cores=1) as engine:
+        list(engine.mapped(abs, [1]))
+        idle, seconds = cpu_seconds()["engine"], 20.0
+        time.sleep(seconds)  # what Ray's own processes take of each second, work or no work
+        idle = (cpu_seconds()["engine"] - idle) / seconds
+        for kind in (*KINDS, FRAMES):
+            captures = max(8, options.captures // SHARES.get(kind, 1))
+            batch = 32 if kind != FRAMES else 8
+            manifest = fleet_of(folder, kind, captures)
+            rounds = []
+            for number in range(options.rounds + 1):  # the first one loads and compiles
+                dataset = Dataset(Path(tempfile.mkdtemp(dir=folder)))
+                began, before = time.perf_counter(), cpu_seconds()
+                count = recalibrate_fleet(manifest, dataset, engine, batch=batch)
+                seconds, after = time.perf_counter() - began, cpu_seconds()
+                spent = {name: after[name] - before[name] for name in after}
+                assert count.status["ok"] == captures, count.status
+                work = sum(dataset.latest(("cpu_seconds",))["cpu_seconds"].to_pylist())
+                plain = plain_loop(manifest)
+                size = sum(path.stat().st_size for path in dataset.files())
+                if number:
+                    rounds.append({
+                        "work": work / captures, "workers": spent["workers"] / captures, "seconds": seconds / captures,
+                        "driver": spent["driver"] / captures,
+                        "engine": max(0.0, spent["engine"] - idle * seconds) / captures, "idle_per_s": idle,
+                        "around_per_s": spent["around"] / seconds, "plain": plain, "stored": size / captures,
+                    })  # fmt: skip
+            row = {name: median(one[name] for one in rounds) for name in rounds[0]}
+            row["percent"] = 100 * median(
+                (one["workers"] + one["driver"] + one["engine"]) / one["work"] - 1 for one in rounds
+            )
+            row["percent_plain"] = 100 * median(
+                (one["workers"] + one["driver"] + one["engine"]) / one["plain"] - 1 for one in rounds
+            )
+            found[kind] = {"captures": captures, "batch": batch, **row}
+            print(kind, found[kind], flush=True)
+    return found
+
+
+def plain_loop(manifest: Manifest) -> float:
+    """CPU seconds of a capture in a loop of this process."""
+    items = [item for batch in manifest.batches(1000) for item in batch]
+    torch.set_num_threads(1)
+    processed(items[0], Settings())
+    before = time.process_time()
+    for item in items:
+        processed(item, Settings())
+    return (time.process_time() - before) / len(items)
+
+
+def bytes_moved(folder: Path) -> dict[str, Any]:
+    """Bytes of a capture: what is read, what goes to a worker by name, what comes back."""
+    found = {}
+    for kind in (*KINDS, FRAMES):
+        items = next(fleet_of(folder, kind, 32).batches(32))
+        path = Path(items[0].capture)
+        files = [file for file in path.rglob("*") if file.is_file() and "truth" not in file.parts]
+        read = sum(file.stat().st_size for file in files) if path.is_dir() else path.stat().st_size
+        row = processed(items[0], Settings())
+        found[kind] = {
+            "read": read,
+            "to_worker": len(cloudpickle.dumps(items)) / len(items),
+            "from_worker": len(cloudpickle.dumps([row] * 1)),
+        }
+    return found
+
+
+def rates(folder: Path, options: Options) -> dict[str, Any]:
+    """Captures a second by the clock, and CPU seconds of a capture, with cores and with simulated nodes."""
+    from ray.cluster_utils import Cluster
+
+    captures = max(8, options.captures // 2)
+    manifest = fleet_of(folder, next(iter(KINDS)), captures)
+
+    def run(engine: Engine) -> dict[str, Any]:
+        recalibrate_fleet(manifest, Dataset(Path(tempfile.mkdtemp(dir=folder))), engine, batch=8)  # loads, compiles
+        dataset = Dataset(Path(tempfile.mkdtemp(dir=folder)))
+        began, load = time.perf_counter(), os.getloadavg()[0]
+        recalibrate_fleet(manifest, dataset, engine, batch=8)
+        work = sum(dataset.latest(("cpu_seconds",))["cpu_seconds"].to_pylist())
+        rate = captures / (time.perf_counter() - began)
+        return {"rate": rate, "cpu_seconds": work / captures, "load": max(load, os.getloadavg()[0])}
+
+    found = {}
+    for cores in (1, 2):
+        with Engine(cores=cores) as engine:
+            found[f"{cores} core{'s'[: cores > 1]}"] = run(engine)
+    for nodes in (1, 2, 4):
+        cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+        try:
+            for _ in range(nodes):
+                cluster.add_node(num_cpus=1)
+            with Engine(cluster.address) as engine:
+                found[f"{nodes} node{'s'[: nodes > 1]}"] = run(engine)
+        finally:
+            cluster.shutdown()
+        print(found, flush=True)
+    return found
+
+
+def death(seconds: float = 0.5, batches: int = 60) -> dict[str, Any]:
+    """Node seconds that are lost when one of two nodes is switched off; work is sleep, so that load matters little."""
+    from ray.cluster_utils import Cluster
+
+    def sleeping(items: Sequence[int]) -> list[int]:
+        time.sleep(seconds)
+        return list(items)
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+    nodes = [cluster.add_node(num_cpus=1) for _ in range(2)]
+    done, died = 0, 0.0
+    try:
+        with Engine(cluster.address) as engine:
+            list(engine.run(sleeping, [[n] for n in range(8)]))  # processes have started
+            began = time.perf_counter()
+            for outcome in engine.run(sleeping, [[n] for n in range(batches)]):
+                assert isinstance(outcome, Done), outcome
+                done += 1
+                if done == batches // 3:
+                    died = time.perf_counter() - began
+                    cluster.remove_node(nodes[0], allow_graceful=False)
+            took = time.perf_counter() - began
+    finally:
+        cluster.shutdown()
+    lost = 2 * died + (took - died) - batches * seconds
+    return {"batch_seconds": seconds, "batches": batches, "done": done, "lost_node_seconds": lost}
+
+
+def stubbed(items: Sequence[Item], settings: Settings, known: Any) -> list[dict[str, Any]]:
+    """Rows without work: the driver's memory and time are what is looked at."""
+    return [failed_row(item, "refused", "stub") | {"key": _key(item.row)} for item in items]
+
+
+def _key(row: int) -> str:
+    return f"{row * 0x9E3779B97F4A7C15 % 2**64:016x}{row:016x}"
+
+
+def memory(folder: Path, rows: int) -> dict[str, Any]:
+    """The driver's own memory over a manifest of very many rows that point at the same few files; no work is done."""
+    path = folder / "many.csv"
+    with path.open("w", encoding="utf-8") as file:
+        file.write("capture,device,time\n")
+        for row in range(rows):
+            file.write(f"{folder}/T4-3-{row % 8}.csv,d{row},{1_700_000_000 + row // 12}\n")
+    curve: list[tuple[int, float]] = []
+
+    def tell(count: Any) -> None:
+        if not curve or count.read - curve[-1][0] >= rows // 20 or count.read == rows:
+            status = Path("/proc/self/status").read_text()
+            curve.append((count.read, int(status.partition("RssAnon:")[2].split()[0]) / 1024))
+
+    real, fleet_run._processed = fleet_run._processed, stubbed  # type: ignore[assignment]
+    try:
+        with Engine(cores=1) as engine:
+            dataset, manifest = Dataset(Path(tempfile.mkdtemp(dir=folder))), Manifest(str(path), "T4", "asymmetric8")
+            before = time.process_time()
+            count = recalibrate_fleet(manifest, dataset, engine, tell=tell, batch=512)
+            spent = time.process_time() - before
+    finally:
+        fleet_run._processed = real
+    assert count.read == rows and count.status["refused"] == rows and len(dataset.keys()) == rows
+    return {"rows": rows, "curve_mb": curve, "driver_cpu_us": 1e6 * spent / rows}
+
+
+PARTS: dict[str, Callable[[Path, Options], Any]] = {
+    "bytes": lambda folder, options: bytes_moved(folder),
+    "overhead": overhead,
+    "death": lambda folder, options: death(),
+    "nodes": rates,
+    "memory": lambda folder, options: memory(folder, options.rows),
+}
+
+
+def tables(result: dict[str, Any]) -> dict[str, str]:
+    """Markdown by the name of its markers."""
+    cost = [
+        [kind, *(f"{1e3 * row[name]:.3g}" for name in ("plain", "work", "driver")), f"{row['percent']:+.1f} %",
+         f"{row['percent_plain']:+.1f} %", f"{TARGETS[kind.partition(',')[0]]:g} %"]
+        for kind, row in result["overhead"].items()
+    ]  # fmt: skip
+    rate = [
+        [who, f"{row['rate']:.2g}", f"{1e3 * row['cpu_seconds']:.3g}", f"{row['load']:.0f}"]
+        for who, row in result["nodes"].items()
+    ]
+    moved = [
+        [kind, *(f"{row[name] / 1e3:.3g}" for name in ("read", "to_worker", "from_worker")),
+         f"{result['overhead'][kind]['stored'] / 1e3:.3g}"]
+        for kind, row in result["bytes"].items()
+    ]  # fmt: skip
+    curve = result["memory"]["curve_mb"]
+    step = max(1, len(curve) // 6)
+    shown = [*curve[:-1:step], curve[-1]]
+    return {
+        "fleet overhead": markdown(
+            ["capture", "plain loop, CPU ms", "work in a worker, CPU ms", "driver, CPU ms", "engine adds to the work",
+             "to the plain loop", "target"], cost,
+        ),
+        "fleet rates": markdown(["who", "captures a second", "CPU ms a capture", "load average"], rate),
+        "fleet bytes": markdown(["kB a capture", "read", "to a worker", "back", "kept (Parquet)"], moved),
+        "fleet memory": markdown(
+            ["rows done", *(f"{rows:,}" for rows, _ in shown)], [["driver, MB", *(f"{mb:.0f}" for _, mb in shown)]]
+        ),
+        "fleet death": f"{result['death']['lost_node_seconds']:.1f} node seconds, with batches of "
+        f"{result['death']['batch_seconds']:g} s; every one of {result['death']['done']} results came, once.",
+    }  # fmt: skip
+
+
+def main() -> None:
+    """Measure what is asked for, keep, and rewrite the pages."""
+    options = tyro.cli(Options, description=__doc__)
+    os.environ.setdefault("RAY_worker_niceness", "0")  # of simulated nodes, too
+    result = read_json(options.out) if options.out.is_file() else {}
+    if not options.again:
+        with tempfile.TemporaryDirectory() as folder:
+            for name, measure in PARTS.items():
+                if not options.only or name in options.only:
+                    result |= surroundings() | {name: measure(Path(folder), options)}
+                    write_json(options.out, result)
+    if options.out == RESULT and set(PARTS) <= set(result):
+        for page, sections in ((PAGE, tables(result)), (PLAN, plan_tables(result))):
+            write_text(page, replaced(page.read_text("utf-8"), sections, page))
+            print("\n\n".join(sections.values()))
+
+
+if __name__ == "__main__":
+    command(main)
