@@ -210,7 +210,7 @@ def half_degree(item: Item) -> dict[str, Any]:
     bump = Bump(bump.snapshot, bump.camera, "rotation", math.radians(0.5))
     stream = stream_of(item.seed, name, bumps=(bump,))
     followed, told = Followed(stream), RigFilter(stream.factory, stream.obj)
-    errors, sure, wrong = {}, 0, 0
+    errors, refused, sure, wrong = {}, 0, 0, 0
     for number in range(bump.snapshot + 241):
         observations = followed.step(number)
         if observations is None or followed.pose is None:
@@ -218,7 +218,10 @@ def half_degree(item: Item) -> dict[str, Any]:
         if number == bump.snapshot:
             spread = spread_of({bump.camera: bump.kind}, pixel_changes(told.belief.rig))
             told.belief = widened(told.belief, spread.square())
-        told.update(observations, followed.pose, 1 / 60)
+        try:
+            told.update(observations, followed.pose, 1 / 60)
+        except RefusedError:
+            refused += 1
         after = number - bump.snapshot
         if after in (30, 60, 120, 240):
             rigs = (followed.monitor.filter.belief.rig, told.belief.rig)
@@ -229,6 +232,7 @@ def half_degree(item: Item) -> dict[str, Any]:
     return {
         "rig": name,
         "held_out": errors,
+        "refused": refused,  # by the filter that was told
         "asked_ok": sure,
         "wrong_ok": wrong,
         **judged(followed.told, followed.numbers, (bump,)),
