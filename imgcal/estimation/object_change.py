@@ -18,6 +18,10 @@ BENT = 3.0
 """Millimetres, one standard deviation of each axis: how far a fiducial may be off that is."""
 SCALED = 0.1
 """The same of the object's scale, relative."""
+MOST_ASKED = 8
+"""Fiducials that are asked whether they are off: those whose residuals are the largest."""
+MANY = 64
+"""Fiducials of an object that is a print, from here on: none of them goes anywhere by itself."""
 
 
 @dataclass(frozen=True)
@@ -56,24 +60,26 @@ def changed_object(
     before: RigBelief,
     snapshots: Sequence[tuple[Observations, RigidTransform]],
     options: EstimationOptions,
-    cameras: float,
+    otherwise: Absorbed,
+    least: float = 0.0,
 ) -> tuple[ObjectChange, RigBelief] | None:
-    """Ask whether a change of the object explains some snapshots better than cameras that moved.
+    """Ask whether a change of the object explains some snapshots better than what is supposed else.
 
     Args:
         before: what was believed before them.
         snapshots: observations (1, C, N) and the object's pose (1,) of each.
         options: how to minimize.
-        cameras: evidence of the cameras' having moved; see `Absorbed`.
+        otherwise: the same snapshots absorbed where the object has not changed, cameras that moved being let free.
+        least: log odds against that from which the object has changed.
 
     Returns:
         The most probable change, its `since` being zero, and what was believed before with that let free; None =
-        cameras have moved.
+        the object has not changed.
     """
     given = joined(list(snapshots))
-    seen = given[0].seen.any(0).any(0)
+    cameras = otherwise.evidence + least
     best: tuple[float, int | None, Absorbed] | None = None
-    for fiducial in (None, *seen.nonzero()[:, 0].tolist()):
+    for fiducial in (None, *_doubtful(given[0], otherwise.residual)):
         try:
             result = absorbed(let_object_free(before, fiducial), *given, options)
         except RefusedError:
@@ -85,6 +91,17 @@ def changed_object(
     evidence, fiducial, result = best
     size, sigma = _size(before, result.belief, fiducial)
     return ObjectChange(fiducial, 0, size, sigma, evidence - cameras), result.before
+
+
+def _doubtful(observations: Observations, residual: Tensor) -> list[int]:
+    """Fiducials that may be off: each question takes as long as all that is known of the object."""
+    if observations.seen.shape[-1] > MANY:
+        return []
+    squared = torch.where(observations.seen, (residual.square().sum(-1) / observations.sigma.square()), 0.0)
+    count = observations.seen.sum((0, 1))
+    mean = squared.sum((0, 1)) / count.clamp_min(1)
+    found = [int(n) for n in mean.argsort(descending=True) if int(count[n])]
+    return sorted(found[:MOST_ASKED])
 
 
 def _size(before: RigBelief, after: RigBelief, fiducial: int | None) -> tuple[float, float]:

@@ -6,6 +6,7 @@ import contextlib
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import torch
 from torch import Tensor
@@ -60,6 +61,7 @@ class Change:
     size: float  # rad, mm or pixels; nan where the kind is not known
     sigma: float  # one standard deviation of it
     decided: bool = False  # the last that will be said of it
+    evidence: float = math.nan  # chi-squared of its having stood still; nan = it was told that it moved
 
 
 @dataclass
@@ -192,13 +194,20 @@ class RigMonitor:
                     found[camera] = result.evidence
         return max(found, key=lambda camera: found[camera], default=None)
 
-    def _begin(self, free: dict[int, str | None], result: Absorbed, before: RigBelief, seconds: float) -> list[Change]:
+    def _begin(
+        self,
+        free: dict[int, str | None],
+        result: Absorbed,
+        before: RigBelief,
+        seconds: float,
+        evidence: Mapping[int, float] = MappingProxyType({}),
+    ) -> list[Change]:
         """Open changes of cameras, and return those that are new."""
         told, nan = [], float("nan")
         for camera, kind in free.items():
             if kind is None and camera not in self.open:
                 number = self.filter.count - len(result.brought)
-                self.open[camera] = Change(camera, number, "unknown", nan, nan)
+                self.open[camera] = Change(camera, number, "unknown", nan, nan, evidence=evidence.get(camera, nan))
                 told.append(self.open[camera])
         self._since = _opened(result, before, seconds, free)
         return told
@@ -230,16 +239,18 @@ class RigMonitor:
         else:
             told = list(self._judged(last=True))
             before, seconds = self._recent.belief_before(age), self._recent.seconds(age)
-        test, known = self._recent.test(age), bool(free)
+        test, known, evidence = self._recent.test(age), bool(free), dict[int, float]()
         while not free or _worst(test.given(free), set(free)) >= SIGNIFICANT:
-            free[_surest(test.given(free), set(free))] = None
+            given = test.given(free)
+            camera = _surest(given, set(free))
+            free[camera], evidence[camera] = None, max(float(score[camera]) for score in given.scores().values())
         snapshots = self._recent.snapshots(age)
         moved = absorbed(_let_free(before, free), *joined(snapshots), self.filter.options)
-        if not known and (found := changed_object(before, snapshots, self.filter.options, moved.evidence)) is not None:
+        if not known and (found := changed_object(before, snapshots, self.filter.options, moved)) is not None:
             return self._learn_object(*found, snapshots), tuple(told)
         result = self.filter.restart(_let_free(before, free), snapshots)
         self._recent.restarted(result, age)
-        return result, (*told, *self._begin(free, result, before, seconds))
+        return result, (*told, *self._begin(free, result, before, seconds, evidence))
 
     def _misfitting(self, result: Absorbed) -> int:
         """Number of snapshots that fit worse than is usual; 0 = they fit."""
@@ -257,7 +268,7 @@ class RigMonitor:
             steady = absorbed(before, *joined(snapshots), self.filter.options)
         except RefusedError:
             return None
-        found = changed_object(before, snapshots, self.filter.options, steady.evidence + OBJECT_ODDS)
+        found = changed_object(before, snapshots, self.filter.options, steady, OBJECT_ODDS)
         return None if found is None else self._learn_object(*found, snapshots)
 
     def _learn_object(
@@ -317,7 +328,9 @@ class RigMonitor:
             else:
                 continue
             size = (float("nan"), float("nan")) if best is None else _size(test.given(others), camera, best)
-            told.append(Change(camera, change.since, best or "unknown", *size, decided=True))
+            scores = test.given(others).scores()
+            evidence = max(float(scores[kind][camera]) for kind in ([best] if best else CHANGES))
+            told.append(Change(camera, change.since, best or "unknown", *size, decided=True, evidence=evidence))
         since.kinds.update(kinds)
         if any(kind is not None for kind in kinds.values()):
             self._suppose(since, test)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from imgcal.detection import Frame
 from imgcal.estimation import Absorbed
+from imgcal.geometry import RigidTransform
 from imgcal.online.events import Event
 from imgcal.online.rig_state import RigState
 
@@ -22,6 +23,9 @@ SIGNIFICANT, LEAST = 40.0, 1e-3
 """Chi-squared (one degree of freedom, once in 10^9 independent looks by chance), and seconds, from which it is told."""
 LEAST_MEMORY = 1.0
 """Seconds of motion before anything is told."""
+LEAST_MOTION = 0.5
+"""Pixels (median) by which images must move from a snapshot to the next one: less is the noise of the pose, which goes
+with the residuals."""
 STEP, STEPS = 0.2, 3
 """Pixels by which a camera's image must be otherwise, and for how many snapshots, to begin it anew."""
 LEAST_DETERMINED = 1e-6
@@ -43,7 +47,7 @@ class ClockOffsets:
         """Begin with nothing known."""
         self._normal, self._right = np.zeros((cameras, 3, 3)), np.zeros((cameras, 3))
         self._other = np.zeros(cameras, dtype=np.int64)  # snapshots in a row that are otherwise
-        self._last: tuple[float, NDArray[np.float64]] | None = None
+        self._last: tuple[float, RigidTransform] | None = None
         self._seconds = 0.0  # of motion that has been seen
         self._told = np.zeros(cameras)  # s, what was told last
         self._period = math.nan
@@ -52,11 +56,16 @@ class ClockOffsets:
         self, state: RigState, frames: Mapping[str, Frame | None] | None, absorbed: Absorbed | None
     ) -> Iterable[Event]:
         """See `SequentialTest`."""
-        last, self._last = self._last, (state.time, state.predicted)
-        if last is None or state.rig_from_object is None or not 0 < state.time - last[0] <= LONGEST:
+        pose, last = state.rig_from_object, self._last
+        self._last = None if pose is None else (state.time, pose)
+        if last is None or pose is None or not 0 < state.time - last[0] <= LONGEST:
             return ()
         self._period = state.time - last[0]
-        self._add(state, (state.predicted - last[1]) / self._period)
+        # Both by the rig as it is now: what is learnt about cameras moves predictions, too.
+        moved = state.predicted - self._predicted(state, last[1])
+        if not np.nanmedian(np.linalg.norm(moved, axis=-1)) >= LEAST_MOTION:
+            return ()
+        self._add(state, moved / self._period)
         offset, sigma = self.offsets()
         changed = np.abs(offset - self._told)
         sure = changed > np.maximum(math.sqrt(SIGNIFICANT) * sigma, LEAST)
@@ -76,6 +85,14 @@ class ClockOffsets:
         offset = np.where(known, (inverse[:, 0] * self._right / scale).sum(1) / scale[:, 0], np.nan)
         sigma = np.where(known, np.sqrt(inverse[:, 0, 0]) / scale[:, 0], np.nan)
         return offset - (np.nanmedian(offset) if known.any() else 0.0), sigma
+
+    @staticmethod
+    def _predicted(state: RigState, rig_from_object: RigidTransform) -> NDArray[np.float64]:
+        """Where the rig puts the fiducials of an object elsewhere: (C, N, 2) pixels, nan out of view."""
+        belief = state.belief
+        points = rig_from_object.reshape(1).apply(belief.points_object)
+        image = belief.rig.expand(1).project_values(points, belief.obj.radius)
+        return np.where(image.visible[0].numpy()[..., None], image.uv[0].numpy(), np.nan)
 
     def _add(self, state: RigState, velocity: NDArray[np.float64]) -> None:
         """Add the residuals of a snapshot; `velocity` (C, N, 2) pixels a second."""
@@ -97,21 +114,27 @@ class ClockOffsets:
         for c in np.unique(camera[good]):
             pick = good & (camera == c)
             part, w = design[pick], weight[pick]
-            self._forget(c, part, residual[pick], float(np.median(blobs.sigma[rows[pick]])))
+            if self._is_other(c, part, residual[pick], float(np.median(blobs.sigma[rows[pick]]))):
+                continue
             self._normal[c] += np.einsum("nij,nik,n->jk", part, part, w)
             self._right[c] += np.einsum("nij,ni,n->j", part, residual[pick], w)
 
-    def _forget(self, camera: int, design: NDArray[np.float64], residual: NDArray[np.float64], sigma: float) -> None:
-        """Begin a camera anew that no longer does what it did: it was bumped, or its clock has slipped."""
+    def _is_other(self, camera: int, design: NDArray[np.float64], residual: NDArray[np.float64], sigma: float) -> bool:
+        """Tell whether a camera no longer does what it did, bumped, or its clock slipped; begin anew where it stays so.
+
+        The first such snapshots are left out: together with what was before they would be explained by any time.
+        """
         known = self._normal[camera]
         scale = np.sqrt(np.maximum(np.diag(known), 1e-30))
         if np.linalg.det(known / (scale[:, None] * scale)) <= LEAST_DETERMINED:
-            return
+            return False
         off = np.median(residual - design @ np.linalg.solve(known, self._right[camera]), axis=0)
         other = float(np.linalg.norm(off)) > max(STEP, 6 * sigma / math.sqrt(len(residual)))
         self._other[camera] = self._other[camera] + 1 if other else 0
-        if self._other[camera] >= STEPS:
-            self._normal[camera], self._right[camera], self._other[camera] = 0.0, 0.0, 0
+        if self._other[camera] < STEPS:
+            return other
+        self._normal[camera], self._right[camera], self._other[camera] = 0.0, 0.0, 0
+        return False
 
     def _event(self, state: RigState, camera: int, offset: float, sigma: float) -> Event:
         name = state.factory.camera_names[camera]

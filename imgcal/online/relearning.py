@@ -50,7 +50,8 @@ class Relearning:
         scale = math.degrees(1.0) if unit == "deg" else 1.0
         size, sigma = (None, None) if unit is None else (change.size * scale, change.sigma * scale)
         how = HOW[kind] if size is None else f"{HOW[kind]} {size:.3g} +- {sigma:.1g} {unit}"
-        event = Event(time, number, "moved", name, since, kind, size, sigma, unit, message=f"{name} {how}")
+        evidence = change.evidence if math.isfinite(change.evidence) else None
+        event = Event(time, number, "moved", name, since, kind, size, sigma, unit, evidence, f"{name} {how}")
         self.events[change.camera] = event
         if change.camera not in self.before:
             self.before[change.camera] = relative_std(before)[change.camera]

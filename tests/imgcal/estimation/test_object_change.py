@@ -6,9 +6,10 @@ import pytest
 import torch
 
 import imgcal
-from imgcal.estimation import RigFilter, RigMonitor
+from imgcal.estimation import EstimationOptions, RigBelief, RigFilter, RigMonitor, absorbed, object_change
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import Observations
+from renderers import palette
 
 NOISE = 0.1
 
@@ -38,3 +39,24 @@ def test_a_change_of_the_object_is_told_and_learnt(fiducial: int | None, toleran
     assert abs(found.size - (0.01 if fiducial is None else 0.985)) < 5 * found.sigma
     off = monitor.filter.belief.points_object - points
     assert float((off - off.mean(0)).norm(dim=-1).max()) < 0.1
+
+
+def test_few_questions_are_asked_of_a_print(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig, generator = imgcal.load_rig("T4"), torch.Generator().manual_seed(3)
+    across = torch.arange(12.0, dtype=torch.float64)
+    points = torch.stack(torch.meshgrid(across * 20, across * 15, indexing="ij"), -1).flatten(0, 1)
+    obj = imgcal.CalibrationObject(torch.nn.functional.pad(points, (0, 1)), palette(len(points)).double())
+    truth, asked = simulate_truth(rig, obj, 3, generator, PhysicalDrift()), []
+
+    def noted(belief: RigBelief, fiducial: int | None) -> RigBelief:
+        asked.append(fiducial)
+        return belief  # with more than 400 values of the object, an answer takes seconds
+
+    monkeypatch.setattr(object_change, "let_object_free", noted)
+    before = RigFilter(rig, obj).belief
+    seen = torch.ones(1, *truth.uv.shape[1:-1], dtype=torch.bool)
+    there = Observations(truth.uv[:1], torch.full(seen.shape, NOISE, dtype=torch.float64), seen)
+    pose = truth.rig_from_object[:1]
+    known = absorbed(before, there, pose)
+    object_change.changed_object(before, [(there, pose)], EstimationOptions(), known, 1.0)
+    assert asked == [None]

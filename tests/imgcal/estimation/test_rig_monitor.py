@@ -8,6 +8,7 @@ import torch
 import imgcal
 from imgcal.errors import RefusedError
 from imgcal.estimation import CHANGES, Change, RigFilter, RigMonitor
+from imgcal.estimation.rig_monitor import SIGNIFICANT
 from imgcal.geometry import RigidTransform
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import CameraRig, Observations
@@ -66,6 +67,8 @@ def test_a_bump_is_told_with_camera_kind_and_size(camera: int, kind: str) -> Non
     assert abs(alarm.since - 30) <= 3
     assert (change.camera, change.kind, change.decided) == (camera, kind, True)
     assert abs(change.size - SIZES[kind]) < 4 * change.sigma < 0.5 * SIZES[kind]
+    assert alarm.evidence >= SIGNIFICANT and change.evidence >= SIGNIFICANT
+    assert change.evidence < 1.01 * (change.size / change.sigma) ** 2  # less by what the camera model is never exact
     assert 0.5 < normalized_error(monitor, rig) < 1.8
     assert monitor.open == {}
 

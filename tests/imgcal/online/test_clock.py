@@ -1,7 +1,12 @@
 """A camera that exposes late is told; one that was bumped is not."""
 
-import numpy as np
+import math
+from dataclasses import replace
 
+import numpy as np
+import torch
+
+from imgcal.geometry import RigidTransform
 from imgcal.online import ClockOffsets
 from tests.imgcal.online.states import state_at
 
@@ -29,6 +34,36 @@ def test_a_late_camera_is_told_with_its_offset() -> None:
 def test_cameras_in_time_and_bumped_cameras_are_not_told() -> None:
     assert watched({})[1] == []
     assert watched({}, bump=2.0)[1] == []
+
+
+def test_an_object_that_stands_still_says_nothing_of_clocks() -> None:
+    test, random, events = ClockOffsets(4), np.random.default_rng(0), []
+    still = state_at(0, 0.0)
+    assert still.rig_from_object is not None
+    for number in range(80):  # the pose is off by noise, and residuals are off by as much the other way
+        shift = torch.from_numpy(0.05 * random.standard_normal(3))
+        pose = RigidTransform(still.rig_from_object.rotation, still.rig_from_object.translation + shift)
+        image = still.rig.expand(1).project_values(pose.apply(still.belief.obj.points)[None])
+        state = replace(still, time=number / 20, predicted=image.uv[0].numpy(), rig_from_object=pose)
+        events += test(state, None, None)
+    assert events == []
+    assert np.isnan(test.offsets()[0]).all()
+
+
+def test_a_rig_that_is_learnt_anew_is_no_motion_of_the_object() -> None:
+    test, events = ClockOffsets(4), []
+    for number in range(60):
+        state = state_at(number, number / 20)
+        step = torch.zeros(4, 15, dtype=torch.float64)
+        step[1, 0] = 2e-3 * math.sin(number)
+        rig, pose = state.rig.retract(step), state.rig_from_object
+        assert pose is not None
+        image = rig.expand(1).project_values(pose.apply(state.belief.obj.points)[None])
+        belief = replace(state.belief, rig=rig)
+        events += test(replace(state, belief=belief, predicted=image.uv[0].numpy()), None, None)
+    offset, sigma = test.offsets()
+    assert events == []
+    assert np.all((np.abs(offset) < 5 * sigma + 1e-3)[[0, 2, 3]])
 
 
 def test_what_was_told_is_kept() -> None:

@@ -16,9 +16,10 @@ def test_a_camera_is_known_again_when_it_is_known_as_well_as_before() -> None:
     relearning = Relearning(rig.camera_names)
     first = relearning.told(Change(1, 0, "unknown", math.nan, math.nan), 1.0, 1.1, 4, known)
     assert (first.camera, first.change, first.size, first.message) == ("cam02", "unknown", None, "cam02 moved")
-    change = Change(1, 0, "rotation", math.radians(0.3), math.radians(0.01))
+    assert first.evidence is None  # JSON knows no nan
+    change = Change(1, 0, "rotation", math.radians(0.3), math.radians(0.01), evidence=812.0)
     told = relearning.told(change, 1.0, 1.2, 8, known)
-    assert (told.change, told.unit) == ("rotation", "deg")
+    assert (told.change, told.unit, told.evidence) == ("rotation", "deg", 812.0)
     assert told.size == pytest.approx(0.3)
     assert told.message == "cam02 turned 0.3 +- 0.01 deg"
     variance = torch.zeros(4, 15, dtype=torch.float64)
