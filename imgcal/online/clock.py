@@ -23,9 +23,9 @@ SIGNIFICANT, LEAST = 40.0, 1e-3
 """Chi-squared (one degree of freedom, once in 10^9 independent looks by chance), and seconds, from which it is told."""
 LEAST_MEMORY = 1.0
 """Seconds of motion before anything is told."""
-LEAST_MOTION = 0.5
-"""Pixels (median) by which images must move from a snapshot to the next one: less is the noise of the pose, which goes
-with the residuals."""
+LEAST_MOTION, LEAST_SIGMAS = 0.5, 5.0
+"""Pixels, and standard deviations, by which blobs (their median) must move from a snapshot to the next one: less is the
+noise of the pose, which goes with the residuals. Not predictions: they move with what is learnt about the rig, too."""
 STEP, STEPS = 0.2, 3
 """Pixels by which a camera's image must be otherwise, and for how many snapshots, to begin it anew."""
 LEAST_DETERMINED = 1e-6
@@ -47,7 +47,7 @@ class ClockOffsets:
         """Begin with nothing known."""
         self._normal, self._right = np.zeros((cameras, 3, 3)), np.zeros((cameras, 3))
         self._other = np.zeros(cameras, dtype=np.int64)  # snapshots in a row that are otherwise
-        self._last: tuple[float, RigidTransform] | None = None
+        self._last: tuple[float, RigidTransform, NDArray[np.float64]] | None = None
         self._seconds = 0.0  # of motion that has been seen
         self._told = np.zeros(cameras)  # s, what was told last
         self._period = math.nan
@@ -57,15 +57,19 @@ class ClockOffsets:
     ) -> Iterable[Event]:
         """See `SequentialTest`."""
         pose, last = state.rig_from_object, self._last
-        self._last = None if pose is None else (state.time, pose)
+        places = self._places(state)
+        self._last = None if pose is None else (state.time, pose, places)
         if last is None or pose is None or not 0 < state.time - last[0] <= LONGEST:
             return ()
         self._period = state.time - last[0]
-        # Both by the rig as it is now: what is learnt about cameras moves predictions, too.
-        moved = state.predicted - self._predicted(state, last[1])
-        if not np.nanmedian(np.linalg.norm(moved, axis=-1)) >= LEAST_MOTION:
+        went = np.linalg.norm(places - last[2], axis=-1)
+        went = went[np.isfinite(went)]
+        if not len(went) or np.median(went) < max(
+            LEAST_MOTION, LEAST_SIGMAS * float(np.median(state.detections.sigma))
+        ):
             return ()
-        self._add(state, moved / self._period)
+        # Both by the rig as it is now: what is learnt about cameras is no motion.
+        self._add(state, (state.predicted - self._predicted(state, last[1])) / self._period)
         offset, sigma = self.offsets()
         changed = np.abs(offset - self._told)
         sure = changed > np.maximum(math.sqrt(SIGNIFICANT) * sigma, LEAST)
@@ -85,6 +89,14 @@ class ClockOffsets:
         offset = np.where(known, (inverse[:, 0] * self._right / scale).sum(1) / scale[:, 0], np.nan)
         sigma = np.where(known, np.sqrt(inverse[:, 0, 0]) / scale[:, 0], np.nan)
         return offset - (np.nanmedian(offset) if known.any() else 0.0), sigma
+
+    @staticmethod
+    def _places(state: RigState) -> NDArray[np.float64]:
+        """Blobs by camera and fiducial: (C, N, 2) pixels, nan where there is none."""
+        blobs, places = state.detections, np.full(state.predicted.shape, np.nan)
+        rows = np.flatnonzero(blobs.fiducial >= 0)
+        places[blobs.camera[rows], blobs.fiducial[rows]] = blobs.uv[rows]
+        return places
 
     @staticmethod
     def _predicted(state: RigState, rig_from_object: RigidTransform) -> NDArray[np.float64]:

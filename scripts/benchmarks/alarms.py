@@ -210,7 +210,7 @@ def half_degree(item: Item) -> dict[str, Any]:
     bump = Bump(bump.snapshot, bump.camera, "rotation", math.radians(0.5))
     stream = stream_of(item.seed, name, bumps=(bump,))
     followed, told = Followed(stream), RigFilter(stream.factory, stream.obj)
-    errors, refused, sure, wrong = {}, 0, 0, 0
+    errors, refused, sure, wrong, at_once = {}, 0, 0, 0, 0
     for number in range(bump.snapshot + 241):
         observations = followed.step(number)
         if observations is None or followed.pose is None:
@@ -227,14 +227,18 @@ def half_degree(item: Item) -> dict[str, Any]:
             rigs = (followed.monitor.filter.belief.rig, told.belief.rig)
             errors[str(after)] = [held_out(rig, followed.truth, stream) for rig in rigs]
         if after >= 0 and after % 5 == 0 and bump.camera not in followed.monitor.open:
-            sure += 1
-            wrong += int(distance(followed.monitor.filter.belief, followed.truth)[bump.camera] > SURELY)
+            far = bool(distance(followed.monitor.filter.belief, followed.truth)[bump.camera] > SURELY)
+            if after == 0:
+                at_once += int(far)
+            else:
+                sure, wrong = sure + 1, wrong + int(far)
     return {
         "rig": name,
         "held_out": errors,
         "refused": refused,  # by the filter that was told
         "asked_ok": sure,
         "wrong_ok": wrong,
+        "wrong_at_once": at_once,  # at the first snapshot after the bump: two must agree for an alarm
         **judged(followed.told, followed.numbers, (bump,)),
     }
 
@@ -383,7 +387,7 @@ def summarized(entries: list[dict[str, Any]]) -> dict[str, Any]:
         if not group:
             continue
         values: dict[str, Any] = {"items": len(group), "cpu_s": round(sum(e["cpu_s"] for e in group))}
-        for key in ("snapshots", "alarms", "refused", "asked_ok", "wrong_ok", "asked"):
+        for key in ("snapshots", "alarms", "refused", "asked_ok", "wrong_ok", "wrong_at_once", "asked"):
             if key in group[0]:
                 values[key] = sum(entry[key] for entry in group)
         if "delay" in group[0]:

@@ -8,8 +8,9 @@ does `RigKeeper.update` take from blobs, beside `Recalibrator.update` in the sam
 
 from __future__ import annotations
 
+import json
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,7 @@ class Options:
     runs: int = 200
     snapshots: int = 60  #: of each run
     updates: int = 400  #: that are timed
+    only: tuple[str, ...] = ("against batch", "normalized errors", "times")  #: the rest stays as it was
     out: Path | None = None  #: a result file; docs/benchmarks/rig_over_time.json rewrites its tables in the page
 
 
@@ -113,26 +115,40 @@ def held_out(rig: CameraRig, truth: CameraRig, obj: imgcal.CalibrationObject, po
     return float(np.sqrt(np.mean(squared)))
 
 
-def normalized_errors(options: Options, rate: DriftRate) -> list[float]:
-    """Squared error per degree of freedom at the end of each run; rigs are drawn from the prior."""
+def normalized_errors(options: Options, rate: DriftRate, share: float = 1.0) -> dict[str, list[float]]:
+    """Squared error per degree of freedom at the end of each run, of the filter and, of a steady rig, of the batch.
+
+    Rigs are drawn from a `share` of the default prior, which is told.
+    """
     factory, obj = imgcal.load_rig("T4").to(torch.float64), imgcal.load_object("asymmetric8")
-    factory = replace(factory, prior=RigPrior())
-    found = []
+    prior = RigPrior(**{name: share * value for name, value in vars(RigPrior()).items()})
+    factory = replace(factory, prior=prior)
+    found: dict[str, list[float]] = {"filter": []} | ({"batch": []} if rate == STEADY else {})
     for run in range(options.runs):
         generator = torch.Generator().manual_seed(1000 + run)
         truth = simulate_truth(factory, obj, options.snapshots, generator, PhysicalDrift())
         poses = carried(options.snapshots, generator, truth.rig_from_object)
         normal = torch.randn(factory.num_cameras, 15, generator=generator, dtype=torch.float64)
-        rig = factory.retract(RigPrior().std(factory) * normal)
-        follows = RigFilter(factory, obj, rate, SQUARED)
+        rig = factory.retract(prior.std(factory) * normal)
+        follows, seen = RigFilter(factory, obj, rate, SQUARED), []
         for s in range(options.snapshots):
             if s:
                 walk = rate.std(rig) * (BETWEEN / 3600) ** 0.5
                 rig = rig.retract(walk * torch.randn(walk.shape, generator=generator, dtype=torch.float64))
-            follows.update(seen_by(rig, obj, poses[s : s + 1], generator), poses[s : s + 1], BETWEEN)
-        error = follows.belief.rig.local(rig).flatten()
-        found.append(float(error @ torch.linalg.solve(follows.belief.covariance(), error)) / len(error))
+            seen.append(seen_by(rig, obj, poses[s : s + 1], generator))
+            follows.update(seen[-1], poses[s : s + 1], BETWEEN)
+        found["filter"].append(normalized(follows.belief.rig, rig, follows.belief.covariance()))
+        if "batch" in found:
+            parts = (torch.cat([getattr(one, name) for one in seen]) for name in ("uv", "sigma", "seen"))
+            fit = estimate(Observations(*parts), factory, obj, poses, options=SQUARED)
+            found["batch"].append(normalized(fit.rig, rig, camera_covariance(fit, curved=False)))
     return found
+
+
+def normalized(rig: CameraRig, truth: CameraRig, covariance: torch.Tensor) -> float:
+    """Squared error per degree of freedom."""
+    error = rig.local(truth).flatten()
+    return float(error @ torch.linalg.solve(covariance, error)) / len(error)
 
 
 def times(options: Options) -> dict[str, dict[str, float]]:
@@ -165,12 +181,13 @@ def tables(result: Mapping[str, Any]) -> dict[str, str]:
     ]
     errors = [
         (
-            name,
-            f"{np.mean(found):.3f}",
-            f"{np.quantile(found, 0.05):.2f} to {np.quantile(found, 0.95):.2f}",
-            f"{len(found)}",
+            f"{name}, {method}",
+            f"{np.mean(values):.3f}",
+            f"{np.quantile(values, 0.05):.2f} to {np.quantile(values, 0.95):.2f}",
+            f"{len(values)}",
         )
         for name, found in result["normalized errors"].items()
+        for method, values in found.items()
     ]
     rows = [(name, *(f"{ms[key]:.2f}" for key in ("p50", "p99", "best"))) for name, ms in result["times"].items()]
     return {
@@ -187,14 +204,17 @@ def main() -> None:
     """Measure, write, print."""
     options = tyro.cli(Options, description=__doc__)
     torch.set_num_threads(1)
-    result = surroundings() | {
-        "against batch": against_batch(options),
-        "normalized errors": {
+    questions: dict[str, Callable[[], Any]] = {
+        "against batch": lambda: against_batch(options),
+        "normalized errors": lambda: {
             "steady": normalized_errors(options, STEADY),
+            "steady, a tenth of the prior": normalized_errors(options, STEADY, 0.1),
             "drifting": normalized_errors(options, WARMING),
         },
-        "times": times(options),
+        "times": lambda: times(options),
     }
+    known = json.loads(RESULT.read_text("utf-8")) if RESULT.exists() else {}
+    result = known | surroundings() | {name: ask() for name, ask in questions.items() if name in options.only}
     if options.out is not None:
         write_json(options.out, result)
     texts = tables(result)
