@@ -279,12 +279,12 @@ class RigKeeper:
             found, fresh = values[name], getattr(self, name)
             if found is not None and fresh is not None and type(found) is not type(fresh):
                 raise ValueError(f"{name}: found {type(found).__name__}, expected {type(fresh).__name__}")
-            if type(fresh).__module__.startswith("imgcal."):
+            if type(fresh).__module__.startswith("imgcal.") and not isinstance(fresh, RigBelief):
                 require_alike(found, fresh, name)
         monitor = values["_monitor"]
         require_alike(monitor.filter, self._monitor.filter, "filter")
         for belief in (monitor.filter.belief, values["_before"]):
-            require_alike(belief, self.belief, "belief")
+            require_alike(belief, self._like(belief), "belief")
             require_alike(belief.rig, self._prior, "rig")
             check_rig(belief.rig)
             if not bool(belief.factor.isfinite().all() & (belief.factor.diagonal() > 0).all()):
@@ -293,6 +293,19 @@ class RigKeeper:
             raise ValueError("found other cameras")
         vars(self).update(values)
         self._monitor.filter.options = self.options.estimation
+
+    def _like(self, belief: RigBelief) -> RigBelief:
+        """A belief of the kind that one from a file must be of: where an exact object has changed, with its shape.
+
+        Raises:
+            ValueError: it is about another object.
+        """
+        if belief.obj.exact == self.obj.exact:
+            return self.belief
+        check_object(belief.obj)
+        if not self.obj.exact or belief.obj.num_fiducials != self.obj.num_fiducials:
+            raise ValueError("found a belief about another object")
+        return RigBelief.of_prior(self._prior, belief.obj)
 
     def accept_as_factory(self) -> Event:
         """Make the present rig the factory calibration that motion is told against; what is known stays known.
@@ -324,7 +337,8 @@ class RigKeeper:
         )
         pose = snapshot.rig_from_object
         if pose is None:
-            pose = initial_pose(to_observations(blobs, self._prior, self.obj), self.belief.rig, self.obj)[0]
+            obj = self._object
+            pose = initial_pose(to_observations(blobs, self._prior, obj), self.belief.rig, obj)[0]
         checked = self._checked(blobs, pose.reshape(1))
         if checked.usual > self._most_usual():
             self._in_vain += 1
@@ -373,7 +387,8 @@ class RigKeeper:
     @property
     def _object(self) -> CalibrationObject:
         """The object as it is known now."""
-        return self.obj if self.obj.exact else replace(self.obj.taken_as_exact(), points=self.belief.points_object)
+        known = self.belief.obj  # with tolerances, also where an exact one has changed
+        return self.obj if known.exact else replace(self.obj.taken_as_exact(), points=self.belief.points_object)
 
     def _known(self) -> tuple[CameraRig, Tensor] | None:
         """The rig, and with some reserve how well it is known; None = nothing but the factory calibration."""

@@ -1,14 +1,16 @@
 """A day of `imgcal watch`, accelerated: cameras fail, frames come late or are garbage, the process is killed.
 
-Usage: python -m scripts.benchmarks.endurance [--hours 24] [--rate 1] [--steady 20000] [--out FILE]
+Usage: python -m scripts.benchmarks.endurance [--hours 24] [--rate 1] [--steady 20000] [--seconds S] [--out FILE]
 
 Two parts, of blobs of a simulated rig: a day in which the process is killed (SIGKILL) every few simulated minutes and
 goes on from its files, and one process that is left alone, for its memory and its latency. Both have the same mishaps.
+With --seconds each part ends after so long, however far it is; how far is in the result.
 """
 
 from __future__ import annotations
 
 import argparse
+import copy
 import json
 import math
 import mmap
@@ -43,7 +45,8 @@ NOISE = 0.1  # px
 LATE, TWICE, GARBAGE, WRONG_TIME = 0.01, 0.005, 0.005, 0.002  # shares of exposures
 BUMP_DEG = 0.3
 RECORDED_EVERY = 20  # snapshots
-WARMING = 400  # snapshots before anything is measured
+TELLING = 120  # snapshots that a bump is given to be told
+WARMING = 300  # snapshots before anything is measured
 ALLOWED_PX = 0.5  # of a camera that is said to be ok, in the image, where the object is
 SEEN = 60  # snapshots of the object that a bumped camera has given before it is to be known
 
@@ -72,7 +75,7 @@ class World:
             for i in range(bumps)
         ]  # fmt: skip
         self.stream = Stream(self.factory, self.obj, seed, Conditions(noise=NOISE), steps)
-        self.bumps = steps
+        self.bumps = self.all_bumps = steps
         self._rigs = [self.stream.rig]
         for bump in steps:
             self.stream.rig = self.stream.changed(bump)
@@ -80,12 +83,20 @@ class World:
         self.absent = _stretches(draw, snapshots, 120 * rate, 120 * rate)
         self.out = [_stretches(draw, snapshots, 1200 * rate, 60 * rate) for _ in self.factory.camera_names]
 
+    def until(self, snapshots: int) -> World:
+        """The same, not as long; bumps shortly before its end could not be told any more, and are none of it."""
+        shorter = copy.copy(self)
+        shorter.snapshots = snapshots
+        told_by = snapshots - TELLING if snapshots < self.snapshots else snapshots
+        shorter.bumps = [bump for bump in self.bumps if bump.snapshot < told_by]
+        return shorter
+
     def rig(self, number: int) -> CameraRig:
-        return self._rigs[sum(bump.snapshot <= number for bump in self.bumps)]
+        return self._rigs[sum(bump.snapshot <= number for bump in self.all_bumps)]
 
     def has_shown(self, number: int, camera: int) -> bool:
         """Tell whether a camera has seen enough since its last bump for that to be known."""
-        last = max((b.snapshot for b in self.bumps if b.camera == camera and b.snapshot <= number), default=None)
+        last = max((b.snapshot for b in self.all_bumps if b.camera == camera and b.snapshot <= number), default=None)
         if last is None:
             return True
         out = self.out[camera]
@@ -211,8 +222,8 @@ def _resident() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * mmap.PAGESIZE
 
 
-def forked(world: World, folder: Path, first: int, last: int, kill_at: int | None) -> int:
-    """Watch in a process of its own; returns the snapshot that it came to."""
+def forked(world: World, folder: Path, first: int, last: int, kill_at: int | None, ends: float) -> int:
+    """Watch in a process of its own, killed at a snapshot or a moment; returns the snapshot that it came to."""
     place = mmap.mmap(-1, 8)
     place[:8] = struct.pack("q", first)
     process = os.fork()
@@ -232,7 +243,7 @@ def forked(world: World, folder: Path, first: int, last: int, kill_at: int | Non
             if status:
                 raise SystemExit(f"endurance: the watching process ended with {status} at snapshot {reached}")
             return reached
-        if kill_at is not None and reached >= kill_at:
+        if (kill_at is not None and reached >= kill_at) or time.perf_counter() > ends:
             os.kill(process, signal.SIGKILL)
             os.waitpid(process, 0)
             return int(struct.unpack("q", place[:8])[0])
@@ -268,14 +279,16 @@ def errors(world: World, step: Any, number: int) -> np.ndarray:
     return rms
 
 
-def killed_day(world: World, folder: Path, minutes: float) -> dict[str, Any]:
+def killed_day(world: World, folder: Path, minutes: float, seconds: float) -> dict[str, Any]:
     """Part one: SIGKILL every few simulated minutes."""
     draw, at, lives = random.Random(1), 0, 0
     started = time.perf_counter()
-    while at < world.snapshots:
+    while at < world.snapshots and time.perf_counter() < started + seconds:
         kill_at = at + max(int(draw.expovariate(1 / (60 * minutes * world.rate))), RECORDED_EVERY)
-        at = forked(world, folder, at, world.snapshots, kill_at if kill_at < world.snapshots else None)
+        kill = kill_at if kill_at < world.snapshots else None
+        at = forked(world, folder, at, world.snapshots, kill, started + seconds)
         lives += 1
+    world = world.until(at)
     found = records(folder)
     told = [json.loads(line) for line in (folder / "events.jsonl").read_text().split("\n")[:-1]]
     checked, wrong, worst, waited = 0, [], 0.0, 0
@@ -302,7 +315,7 @@ def killed_day(world: World, folder: Path, minutes: float) -> dict[str, Any]:
     ends = list(last.values())
     moved = [event for event in told if event["event"] == "moved"]
     named = sum(any(_is_of(event, bump, world) for event in moved) for bump in world.bumps)
-    false = [event for event in moved if not any(_is_of(event, bump, world) for bump in world.bumps)]
+    false = [event for event in moved if not any(_is_of(event, bump, world) for bump in world.all_bumps)]
     return {
         "simulated_hours": world.snapshots / world.rate / 3600, "snapshots_per_second": world.rate,
         "snapshots": world.snapshots, "kills": lives - 1, "seconds": time.perf_counter() - started,
@@ -327,10 +340,10 @@ def _is_of(event: dict[str, Any], bump: Bump, world: World) -> bool:
     return near and event["camera"] == world.factory.camera_names[bump.camera]
 
 
-def steady_life(world: World, folder: Path) -> dict[str, Any]:
+def steady_life(world: World, folder: Path, seconds: float) -> dict[str, Any]:
     """Part two: one process, its memory and its time."""
     started = time.perf_counter()
-    forked(world, folder, 0, world.snapshots, None)
+    forked(world, folder, 0, world.snapshots, None, started + seconds)
     found = records(folder)
     tenth = len(found) // 10
     parts = [found[i * tenth : (i + 1) * tenth] for i in range(10)]
@@ -376,6 +389,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=5.0, help="simulated, between two kills")
     parser.add_argument("--bumps", type=int, default=12)
     parser.add_argument("--steady", type=int, default=20_000, help="snapshots of the process that is left alone")
+    parser.add_argument("--seconds", type=float, default=math.inf, help="for each of the two parts, at most")
     parser.add_argument("--out", type=Path, default=RESULT)
     given = parser.parse_args()
     words = " ".join(f"--{name} {value:g}" for name, value in vars(given).items() if name != "out")
@@ -387,9 +401,9 @@ def main() -> None:
             (folder / name).mkdir()
         world = World(int(given.hours * 3600 * given.rate), given.rate, given.bumps)
         warm_up(World(WARMING, given.rate, 1), folder / "warming")
-        result["killed_day"] = killed_day(world, folder / "killed_day", given.minutes)
+        result["killed_day"] = killed_day(world, folder / "killed_day", given.minutes, given.seconds)
         world = World(given.steady, given.rate, max(given.bumps * given.steady // world.snapshots, 1), seed=1)
-        result["steady"] = steady_life(world, folder / "steady")
+        result["steady"] = steady_life(world, folder / "steady", given.seconds)
     finally:
         shutil.rmtree(folder)
     write_json(given.out, {**surroundings(), "command": f"python -m scripts.benchmarks.endurance {words}", **result})

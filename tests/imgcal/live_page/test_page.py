@@ -12,8 +12,10 @@ from dataclasses import replace
 
 import pytest
 
+from imgcal.io import load_rig
 from imgcal.live_page.address import Address
 from imgcal.live_page.commands import Command
+from imgcal.live_page.demonstration import Demonstration
 from imgcal.live_page.live_page import LivePage
 from imgcal.live_page.page import live_page, report_page
 from tests.imgcal.live_page.pages import ACTIONS, Client, alarm, dome, made_state
@@ -221,6 +223,34 @@ def test_a_report_opens_without_a_server(browser, calm, tmp_path):
         says(tab, "as of", "#link")
         assert tab.locator("#pause").is_hidden() and tab.locator("#actions").is_hidden()
         assert tab.wrong == [] and [url for url in asked if not url.startswith(("file:", "data:"))] == []
+
+
+def test_a_bump_at_the_press_of_a_button_is_told_with_its_camera(browser, asymmetric8):
+    """The whole chain: button, server, loop, simulated rig, keeper, server, page."""
+    with Demonstration(load_rig("T4"), asymmetric8, Address(port=0), seed=1) as shown:
+        seconds = (number / 15 for number in range(10**6))
+
+        def runs_until(done):
+            ends = time.monotonic() + 300
+            while not done():
+                assert time.monotonic() < ends
+                shown.step(next(seconds))
+
+        begun = [shown.step(next(seconds)).sentence for _ in range(20)]
+        assert begun[-1] == "all 4 cameras are calibrated"
+        with opened(browser, shown.page.url) as tab:
+            tab.set_default_timeout(120_000)
+            says(tab, "All 4 cameras are calibrated")
+            assert tab.locator("#alarm").is_hidden()
+            before = shown.simulated.rig
+            tab.select_option("#action-camera", "2")
+            tab.click("[data-action=bump]")
+            runs_until(lambda: shown.simulated.rig.local(before).abs().amax() > 1e-3)
+            runs_until(lambda: "cam03" in tab.inner_text("#alarm-text"))
+            says(tab, "cam03", "#events")
+            assert all(name not in tab.inner_text("#events") for name in ("cam01", "cam02", "cam04"))
+            runs_until(lambda: "turned" in tab.inner_text("#events"))
+            assert tab.wrong == []
 
 
 def test_the_page_comes_back_after_the_server(browser, calm, o10, asymmetric8):

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ import torch
 import imgcal
 from imgcal.errors import InputError
 from imgcal.online import RigKeeper, RigState
+from imgcal.types import CameraRig
 from scripts.benchmarks.rig_streams import Bump, Stream
 
 CHILD = """
@@ -162,3 +164,49 @@ def test_a_process_that_is_killed_leaves_a_file_to_go_on_from(tmp_path: Path) ->
     scale = float(expected.belief.factor.abs().max())
     torch.testing.assert_close(state.belief.factor, expected.belief.factor, rtol=0, atol=1e-9 * scale)
     torch.testing.assert_close(state.belief.rig.focal_length, expected.belief.rig.focal_length, rtol=1e-9, atol=0)
+
+
+def rational(rig: CameraRig) -> CameraRig:
+    """The same rig with lenses of eight coefficients."""
+    zeros = rig.distortion.new_zeros(rig.num_cameras, 3)
+    return replace(rig, distortion=torch.cat((rig.distortion, zeros), dim=-1), lens_model="rational")
+
+
+def of_kind(kind: str) -> Stream:
+    rig, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+    if kind == "tolerances":
+        obj = replace(obj, tolerance=torch.full((8,), 0.05, dtype=torch.float64), scale_tolerance=1e-3)
+    return Stream(rational(rig) if kind == "rational" else rig, obj, 5)
+
+
+@pytest.mark.parametrize("kind", ["tolerances", "rational", "bent"])
+def test_every_kind_of_rig_and_object_goes_on_from_its_file(kind: str, tmp_path: Path) -> None:
+    made, path = of_kind(kind), tmp_path / "state.json"
+    bent = made.obj.points.clone()
+    bent[2] += torch.tensor([0.6, -0.5, 0.6])
+    saved_at, shots, told = 12, [], []
+    with RigKeeper(made.factory, made.obj) as keeper:
+        for number in range(160):
+            if kind == "bent" and number == 36:
+                made.obj = replace(made.obj, points=bent)
+            blobs = made.snapshot(number)
+            state = keeper.update(blobs, number / 60)
+            told += [event.kind for event in state.events]
+            if kind == "bent" and number < saved_at + 4 and "object_bent" not in told:
+                saved_at = number + 2
+            if number == saved_at:
+                keeper.save(path)
+            if number > saved_at:
+                shots.append((number, blobs, state))
+            if number == saved_at + 4:
+                break
+    assert state.refused is None and all(health == "ok" for health in state.cameras.values())
+    assert float(np.nanmax(state.residual)) < 0.5
+    assert told == (["object_bent"] if kind == "bent" else [])
+    assert state.rig.num_parameters == (18 if kind == "rational" else 15)
+    if kind == "bent":
+        off = state.belief.points_object - bent
+        assert float((off - off.mean(0)).norm(dim=-1).max()) < 0.5
+    with RigKeeper.restore(path) as keeper:
+        for number, blobs, before in shots:
+            assert alike(keeper.update(blobs, number / 60), before)
