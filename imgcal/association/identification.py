@@ -346,9 +346,8 @@ def _guess_distance(scene: Scene) -> float:
     guesses = []
     for camera in np.flatnonzero(scene.blobs.count >= 4):
         uv = scene.blobs.ideal[camera, : scene.blobs.count[camera]]
-        guesses.append(
-            focal[camera] * scene.obj.size / max(float(np.linalg.norm(uv - np.median(uv, axis=0), axis=1).mean()), 1.0)
-        )
+        away = np.hypot(*(uv - np.median(uv, axis=0)).T)  # which a lens that is far from the truth may make huge
+        guesses.append(focal[camera] * scene.obj.size / max(float(away.mean()), 1.0))
     return float(np.median(guesses))
 
 

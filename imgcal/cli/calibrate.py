@@ -33,18 +33,16 @@ from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import Gauge
 from imgcal.extras import advice, missing
+from imgcal.formats import load_cameras
 from imgcal.io import (
     Capture,
     RigCovariance,
-    is_cameras_file,
-    load_cameras,
     load_object,
     open_input,
     publishing,
     save_detections,
     save_object,
     save_rig,
-    unplaced,
     write_text,
 )
 from imgcal.messages import listed
@@ -183,7 +181,7 @@ class Calibrate:
         for move in outcome.moved:
             print(f"{move}: only the snapshots since then are used")
         _print(result, found, self.out, draws)
-        if doubt := unit_doubt(rig, obj):
+        if doubt := unit_doubt(rig, obj, outcome.from_scratch):
             print(f"note: {doubt}", file=sys.stderr)
         for note in doubtful_cameras(outcome):
             print(f"note: {note}; see the report", file=sys.stderr)
@@ -218,7 +216,7 @@ class Calibrate:
             option = "--detector" if self.first_guess == "none" else "--first-guess"
             raise InputError(f"{option}: found it beside --cameras, expected it with a factory calibration (--rig)")
         assert self.cameras is not None
-        return load_cameras(self.cameras) if is_cameras_file(self.cameras) else unplaced(open_rig(str(self.cameras)))
+        return load_cameras(self.cameras)
 
     def _object(self) -> CalibrationObject:
         """The object with its tolerances."""

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import imgcal
 
-HINT = "compiling for this machine, once after installation; `imgcal warmup` does it ahead of time"
+HINT = "compiling for this machine, once for each kind of lens; `imgcal warmup --all-lenses` does it ahead of time"
 HELP = "from imgcal.online import warm_up_fits; warm_up_fits()"
 NEEDED_LAST = "lm_cpu.*"  # files of the cache that show that there is nothing to help with
 

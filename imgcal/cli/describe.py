@@ -18,7 +18,7 @@ from imgcal.geometry import RigidTransform
 from imgcal.io import Frame
 from imgcal.pipeline import Calibration, rms_length
 from imgcal.report import ReportContent, SnapshotSummary
-from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
+from imgcal.types import CalibrationObject, CameraRig, Detections
 
 Pictures = Mapping[str, Frame | None]
 
@@ -71,7 +71,7 @@ def describe(
     taken = np.bincount(detections.snapshot[used], minlength=len(labelled.snapshots))
     seen = calibration.observations.seen
     return ReportContent(
-        title=f"Recalibration of {rig.name}",
+        title=f"{'Calibration' if calibration.from_scratch else 'Recalibration'} of {rig.name}",
         status="ok",
         reason=_about_object(calibration),
         identity=calibration.identity,
@@ -87,7 +87,7 @@ def describe(
         predicted_after=after + detections.uv,
         sigma=sigma,
         std=found.motion.std.numpy(),
-        prior_std=gauge.prior_std(rig.to(torch.float64), (rig.prior or RigPrior()).std(rig)).numpy(),
+        prior_std=gauge.prior_std(rig.to(torch.float64), calibration.estimate.problem.prior_std[0]).numpy(),
         gauge=gauge,
         predicted=calibration.predicted_error,
         moves=tuple(map(str, calibration.moved)),
@@ -99,7 +99,8 @@ def describe(
         rig_from_object=_poses(calibration),
         frames=tuple(pictures.get(name) for name in rig.camera_names) if pictures else (),
         chi2_per_dof=float(calibration.chi2_per_dof),
-        rms_before=rms_length(calibration.before.residual, seen) or float("nan"),
+        rms_before=(not calibration.from_scratch and rms_length(calibration.before.residual, seen)) or float("nan"),
+        from_scratch=calibration.from_scratch,
         rms_after=rms_length(calibration.residual, seen) or float("nan"),
         seconds=seconds,
         command=_command(),

@@ -16,6 +16,7 @@ class Findings:
 
     motion: Motion
     knowledge: Knowledge
+    from_scratch: bool = False  # there was no factory calibration since which a camera could have moved
 
     @property
     def values(self) -> dict[str, Any]:
@@ -23,7 +24,9 @@ class Findings:
         motion, known = self.motion, self.knowledge
         reference = motion.gauge.reference
         return {
-            "motion": {
+            "motion": None
+            if self.from_scratch
+            else {
                 "relative_to": "most cameras" if reference is None else motion.camera_names[reference],
                 "cameras_moved": [motion.camera_names[c] for c in motion.moved],
                 "per_camera": {
@@ -41,7 +44,7 @@ class Findings:
     @property
     def lines(self) -> list[str]:
         """What is printed."""
-        lines = [self.motion.sentence] if self.motion.sentence else []
+        lines = [self.motion.sentence] if self.motion.sentence and not self.from_scratch else []
         if self.knowledge.sentences:
             lines.append("not known: " + " ".join(self.knowledge.sentences))
         if self.knowledge.advice:
@@ -55,4 +58,5 @@ UNKNOWN: dict[str, Any] = {"motion": None, "knowledge": None}
 
 def findings(calibration: Calibration, gauge: Gauge, covariance: RigCovariance) -> Findings:
     """Look at what was found."""
-    return Findings(motion_since_factory(calibration, gauge), knowledge_of(calibration, covariance.std))
+    motion, knowledge = motion_since_factory(calibration, gauge), knowledge_of(calibration, covariance.std)
+    return Findings(motion, knowledge, calibration.from_scratch)

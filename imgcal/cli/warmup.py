@@ -20,11 +20,14 @@ class Warmup:
     system that cannot be written: ENV NUMBA_CACHE_DIR=/opt/imgcal-cache, then RUN imgcal warmup
     """
 
+    all_lenses: bool = False
+    """compile also for rigs that have a camera with another lens than brown_conrady (rational, equidistant)"""
+
     def run(self) -> None:
         """Compile, and say where it is kept."""
         started = time.perf_counter()
         with tells_of_compiling("compiling, which takes a while") as compiled:
-            warm_up()
+            warm_up(self.all_lenses)
         what = f"{len(compiled)} functions compiled" if compiled else "all was compiled already"
         where = cache_folder() or "where Python keeps the compiled files of imgcal"
         print(f"{what} in {time.perf_counter() - started:.1f} s, kept in {where}", file=sys.stderr)

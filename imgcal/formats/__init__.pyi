@@ -3,7 +3,7 @@ from .fitting import Fit, Holds
 from .foreign_rig import ForeignCamera, ForeignRig
 from .format import Format
 from .lens import Lens
-from .loading import load_rig
+from .loading import load_cameras, load_rig
 from .registry import FORMATS, format_named, is_foreign, read_foreign_rig
 from .units import in_millimetres, millimetres
 from .verification import known_points, worst_difference
@@ -29,6 +29,7 @@ __all__ = [
     "in_millimetres",
     "is_foreign",
     "known_points",
+    "load_cameras",
     "load_rig",
     "millimetres",
     "read_foreign_rig",

@@ -8,7 +8,7 @@ from imgcal.formats.fitting import Holds
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig
 from imgcal.formats.format import Files, Format
 from imgcal.formats.source import Source
-from imgcal.formats.toml_cameras import cameras_of, tables_of, toml_text
+from imgcal.formats.toml_cameras import cameras_of, lenses_of, tables_of, toml_text
 from imgcal.formats.values import vector_of_rotation
 
 TITLE = "anipose calibration.toml"
@@ -24,6 +24,13 @@ def _read(source: Source) -> ForeignRig:
     notes: list[str] = []
     cameras = cameras_of(tables.cameras, notes)
     return ForeignRig(FORMAT.name, cameras, None, "the file's world (anipose: near the first camera)", tuple(notes))
+
+
+def read_lenses(source: Source) -> list[ForeignCamera]:
+    """Read the cameras of a file without their places."""
+    tables = tables_of(source)
+    assert tables is not None
+    return lenses_of(tables.cameras)
 
 
 def camera_table(camera: ForeignCamera, coefficients: int = 5) -> dict[str, Any]:
@@ -45,4 +52,6 @@ def _write(rig: ForeignRig) -> Files:
     return {"": toml_text({**tables, "metadata": {"adjusted": False, "error": 0.0}})}
 
 
-FORMAT = Format("anipose", TITLE, _recognizes, _read, _write, Holds((5,), fisheye=True), unit="mm")
+FORMAT = Format(
+    "anipose", TITLE, _recognizes, _read, _write, Holds((5,), fisheye=True), unit="mm", read_lenses=read_lenses
+)

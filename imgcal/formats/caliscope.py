@@ -9,10 +9,10 @@ from __future__ import annotations
 from typing import Any
 
 from imgcal.formats.fitting import Holds
-from imgcal.formats.foreign_rig import ForeignRig, FormatError
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
 from imgcal.formats.format import Files, Format
 from imgcal.formats.source import Source
-from imgcal.formats.toml_cameras import Table, cameras_of, has_tables, tables_of, toml_text
+from imgcal.formats.toml_cameras import Table, cameras_of, has_tables, lenses_of, tables_of, toml_text
 from imgcal.formats.values import named, number, text, vector_of_rotation
 
 TITLE = "caliscope camera array"
@@ -25,27 +25,40 @@ def _recognizes(source: Source) -> bool:
 
 
 def _read(source: Source) -> ForeignRig:
+    tables = _named_tables(source)
+    ignored = [name for name, table in tables.items() if table.get("ignore") is True]
+    notes = ["metres"]
+    cameras = cameras_of(tables, notes)
+    if kept := [name for name in ignored if name in [camera.name for camera in cameras]]:
+        notes.append(f"{named(kept)}: marked `ignore` in the file, and taken all the same, with the pose that it has")
+    return ForeignRig(FORMAT.name, cameras, "m", "the file's world (as set in caliscope)", tuple(notes))
+
+
+def _read_lenses(source: Source) -> list[ForeignCamera]:
+    return lenses_of(_named_tables(source))
+
+
+def _named_tables(source: Source) -> dict[str, Table]:
+    """The tables by the names of the cameras.
+
+    Raises:
+        FormatError: images were turned.
+    """
     tables = tables_of(source)
     assert tables is not None
     named_tables: dict[str, Table] = {}
-    turned, ignored = [], []
+    turned = []
     for key, table in tables.cameras.items():
         name = text(table.get("cam_id", table.get("port", key.removeprefix("cam_"))), key)
         named_tables[name] = {**table, "name": name}
         if number(table.get("rotation_count", 0), f"{name}: rotation_count") % 4:
             turned.append(name)
-        if table.get("ignore") is True:
-            ignored.append(name)
     if turned:
         raise FormatError(
             f"{named(turned)}: rotation_count is not 0: the images were turned before they were used, and the file "
             "does not say what K then refers to; turn the videos, and calibrate anew"
         )
-    notes = ["metres"]
-    cameras = cameras_of(named_tables, notes)
-    if kept := [name for name in ignored if name in [camera.name for camera in cameras]]:
-        notes.append(f"{named(kept)}: marked `ignore` in the file, and taken all the same, with the pose that it has")
-    return ForeignRig(FORMAT.name, cameras, "m", "the file's world (as set in caliscope)", tuple(notes))
+    return named_tables
 
 
 def _write(rig: ForeignRig) -> Files:
@@ -81,9 +94,11 @@ def _tables(rig: ForeignRig, matrix: bool) -> dict[int, dict[str, Any]]:
 
 
 FORMAT = Format(
-    "caliscope", TITLE, _recognizes, _read, _write, Holds((5,), fisheye=True), accepts=has_tables, states_unit=True
+    "caliscope", TITLE, _recognizes, _read, _write, Holds((5,), fisheye=True), accepts=has_tables, states_unit=True,
+    read_lenses=_read_lenses,
 )  # fmt: skip
 OLD_FORMAT = Format(
     OLD, "caliscope config.toml (older)", lambda source: False, _read, _write_old, Holds((5,), fisheye=True),
     accepts=has_tables, states_unit=True,
+    read_lenses=_read_lenses,
 )  # fmt: skip

@@ -40,6 +40,11 @@ class ForeignCamera:
         return -self.rotation.T @ self.translation
 
 
+def unplaced_camera(name: str, lens: Lens, image_size: tuple[int, int] | None) -> ForeignCamera:
+    """Make a camera of which nobody knows where it is: at the origin."""
+    return ForeignCamera(name, lens, image_size, np.eye(3), np.zeros(3))
+
+
 @dataclass(frozen=True)
 class ForeignRig:
     """Cameras in a common frame, as a file of another tool has them."""

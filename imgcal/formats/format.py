@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from imgcal.formats.fitting import Holds
-from imgcal.formats.foreign_rig import ForeignRig
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig
 from imgcal.formats.source import Source
 
 Files = dict[str, bytes]
@@ -28,3 +28,5 @@ class Format:
     states_unit: bool = False  # the file, or the tool's custom, says what its unit is
     from_first: bool = False  # its rig frame is its first camera's
     cameras: tuple[int, int] = (1, 256)  # how many it can hold
+    # Cameras alone, also those that have no pose; None = those of `read`.
+    read_lenses: Callable[[Source], list[ForeignCamera]] | None = None

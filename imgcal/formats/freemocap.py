@@ -5,7 +5,7 @@ FreeMoCap reads four coefficients and drops the fifth: what is written has none.
 
 from __future__ import annotations
 
-from imgcal.formats.anipose import camera_table
+from imgcal.formats.anipose import camera_table, read_lenses
 from imgcal.formats.fitting import Holds
 from imgcal.formats.foreign_rig import ForeignRig
 from imgcal.formats.format import Files, Format
@@ -50,5 +50,14 @@ def _write(rig: ForeignRig) -> Files:
 
 
 FORMAT = Format(
-    "freemocap", TITLE, _recognizes, _read, _write, Holds((4,)), unit="mm", accepts=has_tables, states_unit=True
+    "freemocap",
+    TITLE,
+    _recognizes,
+    _read,
+    _write,
+    Holds((4,)),
+    unit="mm",
+    accepts=has_tables,
+    states_unit=True,
+    read_lenses=read_lenses,
 )

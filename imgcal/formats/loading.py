@@ -8,7 +8,8 @@ from pathlib import Path
 from imgcal import io
 from imgcal.errors import InputError
 from imgcal.formats.conversion import LIMIT, NATIVE, held_by, to_camera_rig, with_image_sizes
-from imgcal.formats.registry import is_foreign, read_foreign_rig
+from imgcal.formats.foreign_rig import ForeignRig
+from imgcal.formats.registry import is_foreign, read_foreign_lenses, read_foreign_rig
 from imgcal.formats.units import in_millimetres
 from imgcal.types import CameraRig
 
@@ -54,8 +55,46 @@ def load_rig(
         return io.load_rig(path)
     if path.exists() and not is_foreign(path):
         raise InputError(f"{path}: a rig file of our own says its unit, image sizes and format itself")
-    where = str(path)
-    rig = in_millimetres(read_foreign_rig(path, format), where, unit)
+    return _held(in_millimetres(read_foreign_rig(path, format), str(path), unit), path, image_size, fit_limit)
+
+
+def load_cameras(
+    path: str | Path,
+    *,
+    image_size: Size | Mapping[str, Size] | None = None,
+    format: str | None = None,
+    fit_limit: float = LIMIT,
+) -> CameraRig:
+    """Read cameras for a start without a factory calibration: their images and, roughly, their lenses.
+
+    Args:
+        path: a file of the format imgcal-cameras/1, or whatever `load_rig` takes, whose places and unit are not looked
+            at. Cameras of anipose, caliscope, FreeMoCap, Pose2Sim and ROS need not have been placed.
+        image_size: as in `load_rig`.
+        format: as in `load_rig`.
+        fit_limit: as in `load_rig`.
+
+    Returns:
+        Cameras that are all in the origin, and a prior that says that nothing is known of it.
+
+    Raises:
+        InputError: one line with the file, the camera, what was found and what was expected.
+        RefusedError: no lens model of ours comes within `fit_limit`.
+
+    Examples:
+        >>> cameras = load_cameras("T4")
+        >>> cameras.num_cameras, float(cameras.positions.abs().max())
+        (4, 0.0)
+    """
+    path = Path(path)
+    stated = image_size is not None or format is not None
+    if not stated and not (path.exists() and is_foreign(path)):
+        return io.load_cameras(path)
+    return io.unplaced(_held(read_foreign_lenses(path, format), path, image_size, fit_limit))
+
+
+def _held(rig: ForeignRig, path: Path, image_size: Size | Mapping[str, Size] | None, fit_limit: float) -> CameraRig:
+    """Say a rig in lenses of ours, its image sizes filled in."""
     sizes = image_size if isinstance(image_size, Mapping) else {} if image_size is None else {"": image_size}
-    held = held_by(with_image_sizes(rig, where, sizes), NATIVE, "a rig of ours", fit_limit)
+    held = held_by(with_image_sizes(rig, str(path), sizes), NATIVE, "a rig of ours", fit_limit)
     return to_camera_rig(held.rig, io.title_of(path if path.is_file() else path.resolve()))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from imgcal.formats.anipose import camera_table
+from imgcal.formats.anipose import camera_table, read_lenses
 from imgcal.formats.fitting import Holds
 from imgcal.formats.foreign_rig import ForeignRig
 from imgcal.formats.format import Files, Format
@@ -37,5 +37,13 @@ def _write(rig: ForeignRig) -> Files:
 
 
 FORMAT = Format(
-    "pose2sim", TITLE, _recognizes, _read, _write, Holds((4,), fisheye=True), accepts=has_tables, states_unit=True
+    "pose2sim",
+    TITLE,
+    _recognizes,
+    _read,
+    _write,
+    Holds((4,), fisheye=True),
+    accepts=has_tables,
+    states_unit=True,
+    read_lenses=read_lenses,
 )

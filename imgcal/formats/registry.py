@@ -73,6 +73,27 @@ def read_foreign_rig(paths: str | Path | Sequence[str | Path], name: str | None 
     return _read(source, format_of(source) if name is None else _asked_for(source, format_named(name)))
 
 
+def read_foreign_lenses(path: str | Path, name: str | None = None) -> ForeignRig:
+    """Read the cameras of another tool's file without their places: it need not have any.
+
+    Args:
+        path: a file, or a folder.
+        name: of the format, as in `FORMATS`; None = by what stands in the files.
+
+    Returns:
+        The cameras, in unknown places; `unit` is none.
+
+    Raises:
+        InputError: one line with the file, what it is and what it lacks.
+    """
+    source = Source([Path(path)])
+    one = format_of(source) if name is None else _asked_for(source, format_named(name))
+    if one.read_lenses is None:
+        return _read(source, one)
+    read = one.read_lenses
+    return _read(source, replace(one, read=lambda found: ForeignRig(one.name, tuple(read(found)), None, "unknown")))
+
+
 def format_named(name: str) -> Format:
     """Find a format by its name.
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from imgcal.formats.documents import Document
 from imgcal.formats.fitting import Holds
-from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, unplaced_camera
 from imgcal.formats.format import Files, Format
 from imgcal.formats.lens import Array, Lens
 from imgcal.formats.source import Source
@@ -58,7 +58,7 @@ def _is_info(values: dict[str, Any]) -> bool:
 
 
 def _read(source: Source) -> ForeignRig:
-    infos = [_info(values, document) for document, values in source.mappings if _is_info(values)]
+    infos = _infos(source)
     if len(infos) > 2:
         raise FormatError(f"{len(infos)} files: ROS says in them where two cameras are, no more; the poses of more are "
                           "in /tf and in no file")  # fmt: skip
@@ -79,10 +79,18 @@ def _read(source: Source) -> ForeignRig:
     turned = nearest_rotation(right.rectified.T @ left.rectified, "R of the pair")
     translation = right.rectified.T @ (right.shift - left.shift)
     cameras = (
-        ForeignCamera(left.name, left.lens, left.image_size, np.eye(3), np.zeros(3)),
+        unplaced_camera(left.name, left.lens, left.image_size),
         ForeignCamera(right.name, right.lens, right.image_size, turned, translation),
     )
     return ForeignRig(FORMAT.name, cameras, "m", f"camera {left.name}", tuple(notes))
+
+
+def _read_lenses(source: Source) -> list[ForeignCamera]:
+    return [unplaced_camera(info.name, info.lens, info.image_size) for info in _infos(source)]
+
+
+def _infos(source: Source) -> list[_Info]:
+    return [_info(values, document) for document, values in source.mappings if _is_info(values)]
 
 
 def _single(info: _Info) -> ForeignRig:
@@ -90,7 +98,7 @@ def _single(info: _Info) -> ForeignRig:
     note = "one camera: its own frame is the rig's" + (
         "; R and P are those of a stereo pair: give both files, or their folder, for the pair" if pair else ""
     )
-    camera = ForeignCamera(info.name, info.lens, info.image_size, np.eye(3), np.zeros(3))
+    camera = unplaced_camera(info.name, info.lens, info.image_size)
     return ForeignRig(FORMAT.name, (camera,), "m", f"camera {info.name}", (note,))
 
 
@@ -185,6 +193,6 @@ def _info_text(
 
 
 FORMAT = Format(
-    "ros", TITLE, _recognizes, _read, _write, Holds((5, 8), fisheye=True), states_unit=True, from_first=True,
-    cameras=(1, 2),
+    "ros", TITLE, _recognizes, _read, _write, Holds((5, 8), fisheye=True), states_unit=True,
+    from_first=True, cameras=(1, 2), read_lenses=_read_lenses,
 )  # fmt: skip

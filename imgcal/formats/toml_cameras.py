@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from imgcal.formats.foreign_rig import ForeignCamera, FormatError
+from imgcal.formats.foreign_rig import ForeignCamera, FormatError, unplaced_camera
 from imgcal.formats.lens import Lens
 from imgcal.formats.source import Source
 from imgcal.formats.values import array, camera_matrix, coefficients, image_size, named, numbers, rotation, text
@@ -87,7 +87,31 @@ def camera_name(key: str, table: Table) -> str:
     return text(name, key)
 
 
+def lenses_of(tables: Mapping[str, Table]) -> list[ForeignCamera]:
+    """Read all cameras as if none had a pose: all are at the origin.
+
+    Raises:
+        FormatError: a camera has no lens.
+    """
+    cameras = []
+    for key, table in tables.items():
+        name = camera_name(key, table)
+        if is_missing(table.get("matrix")) or is_missing(table.get("distortions")):
+            raise FormatError(
+                f"{named([name])}: intrinsics are not calibrated: imgcal rig cameras writes a file with a field of view"
+            )
+        cameras.append(unplaced_camera(name, *_lens(name, table)))
+    return cameras
+
+
 def _camera(name: str, table: Table) -> ForeignCamera:
+    lens, size = _lens(name, table)
+    translation = array(table["translation"], (3,), f"{name}: translation")
+    return ForeignCamera(name, lens, size, rotation(table["rotation"], f"{name}: rotation"), translation)
+
+
+def _lens(name: str, table: Table) -> tuple[Lens, tuple[int, int] | None]:
+    """The lens, and the size of the images where the table says it."""
     focal, centre, skew = camera_matrix(table["matrix"], f"{name}: matrix")
     fisheye = table.get("fisheye", False)
     if not isinstance(fisheye, bool):
@@ -95,9 +119,7 @@ def _camera(name: str, table: Table) -> ForeignCamera:
     counts = (4,) if fisheye else (0, 1, 2, 4, 5, 8, 12, 14)
     ks = coefficients(table["distortions"], f"{name}: distortions", counts)
     lens = Lens(focal, centre, ks, "fisheye" if fisheye else "opencv", skew)
-    size = None if is_missing(table.get("size")) else image_size(table["size"], f"{name}: size")
-    translation = array(table["translation"], (3,), f"{name}: translation")
-    return ForeignCamera(name, lens, size, rotation(table["rotation"], f"{name}: rotation"), translation)
+    return lens, None if is_missing(table.get("size")) else image_size(table["size"], f"{name}: size")
 
 
 def toml_text(tables: Mapping[str, Mapping[str, Any]]) -> bytes:

@@ -48,7 +48,9 @@ def converted(rig: ForeignRig, to: str, name: str, limit: float = LIMIT, unit: s
         held = held_by(rig, NATIVE, "a rig file of ours", limit)
         text = rig_text(to_camera_rig(held.rig, name), name, _kept_covariance(held))
         back = from_camera_rig(rig_from_text(text, name))
-        return _compared(rig, held, back, {"": text.encode()}, [])
+        lost = rig.covariance is not None and _kept_covariance(held) is None
+        notes = ["standard deviations are left out: they are those of other lens parameters"] if lost else []
+        return _compared(rig, held, back, {"": text.encode()}, notes)
     target = format_named(to)
     if target.write is None:
         able = ", ".join(one.name for one in FORMATS if one.write is not None)
@@ -103,8 +105,6 @@ def _compared(rig: ForeignRig, held: Held, back: ForeignRig, files: Files, notes
                 f"camera {camera.name}: {describe_lens(camera.lens)} -> {describe_lens(fit.lens)}, fitted over the "
                 f"image: worst {fit.worst:.2g} px, RMS {fit.rms:.2g} px"
             )
-    if rig.covariance is not None and held.worst > 0:
-        notes.append("standard deviations are left out: they are those of other lens parameters")
     return Written(files, tuple(notes), exact, between, points)
 
 

@@ -1,5 +1,5 @@
 from .atomic import replacing, write_bytes, write_text
-from .cameras_yaml import is_cameras_file, load_cameras, save_cameras, unplaced
+from .cameras_yaml import load_cameras, save_cameras, unplaced
 from .capture import Capture, check_times, open_capture, open_input, save_capture_settings
 from .detections_csv import DEFAULT_SIGMA, MARGIN, load_detections, save_detections
 from .frames import IMAGE_SUFFIXES, VIDEO_SUFFIXES, Frame, Video, grey_frame, read_frame, write_frame, write_image
@@ -33,7 +33,6 @@ __all__ = [
     "data_path",
     "find_file",
     "grey_frame",
-    "is_cameras_file",
     "is_file_name",
     "keys_of",
     "load_cameras",

@@ -13,12 +13,11 @@ from pydantic import Field, model_validator
 
 from imgcal.geometry import RigidTransform
 from imgcal.io.atomic import write_text
-from imgcal.io.names import is_file_name, title_of
+from imgcal.io.names import title_of
 from imgcal.io.rig_yaml import FORMAT as RIG_FORMAT
-from imgcal.io.rig_yaml import Coefficient, Focal, Name, Pixel, Side, check_names, load_rig
+from imgcal.io.rig_yaml import CameraImages, Coefficient, Focal, Name, Pixel, check_names, load_rig
 from imgcal.io.validation import StrictModel, validated
 from imgcal.io.yaml_file import Flow, read_yaml, yaml_text
-from imgcal.messages import quoted
 from imgcal.types import CameraRig, RigPrior, limits
 
 FORMAT = "imgcal-cameras/1"
@@ -34,9 +33,7 @@ ANYWHERE = (1.0, 1e6)
 Degrees = Annotated[float, Field(gt=0, lt=180, allow_inf_nan=False)]
 
 
-class _Camera(StrictModel):
-    name: str
-    image_size: Annotated[list[Side], Field(min_length=2, max_length=2)]
+class _Camera(CameraImages):
     field_of_view: Degrees | None = None
     focal_length: Focal | Annotated[list[Focal], Field(min_length=2, max_length=2)] | None = None
     principal_point: Annotated[list[Pixel], Field(min_length=2, max_length=2)] | None = None
@@ -44,10 +41,6 @@ class _Camera(StrictModel):
 
     @model_validator(mode="after")
     def _sound(self) -> _Camera:
-        if not is_file_name(self.name):
-            raise ValueError(f"found the camera name {quoted(self.name)!r}, expected a name that can be a file name")
-        if math.prod(self.image_size) > limits.MOST_PIXELS:
-            raise ValueError(f"image_size: found {self.image_size}, expected at most {limits.MOST_PIXELS:,} pixels")
         if (self.field_of_view is None) == (self.focal_length is None):
             raise ValueError("expected either `field_of_view` (degrees, across the longer side) or `focal_length` (px)")
         return self
@@ -153,11 +146,6 @@ def save_cameras(image_size: Mapping[str, tuple[int, int]], field_of_view_deg: f
     }
     validated(content, _CamerasFile, f"{path}: not written", ENTRY_NAMES)
     write_text(path, yaml_text(content))
-
-
-def is_cameras_file(path: str | Path) -> bool:
-    """Tell whether a file is one for `load_cameras` alone: it calls itself one of cameras without places."""
-    return Path(path).is_file() and _starts_with(Path(path), FORMAT)
 
 
 def _starts_with(path: Path, file_format: str) -> bool:

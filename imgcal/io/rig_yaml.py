@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import torch
 from pydantic import Field, model_validator
@@ -94,9 +94,23 @@ class _Std(StrictModel):
     distortion: Annotated[list[Spread], Field(max_length=MOST_COEFFICIENTS)]
 
 
-class _Camera(StrictModel):
+class CameraImages(StrictModel):
+    """What is known of any camera: its name, and the size of its images."""
+
     name: str
     image_size: Annotated[list[Side], _exactly(2)]
+
+    @model_validator(mode="after")
+    def _has_images(self) -> Self:
+        # The name is also a file name in a capture and a cell of a CSV file.
+        if not is_file_name(self.name):
+            raise ValueError(f"found the camera name {quoted(self.name)!r}, expected a name that can be a file name")
+        if math.prod(self.image_size) > limits.MOST_PIXELS:
+            raise ValueError(f"image_size: found {self.image_size}, expected at most {limits.MOST_PIXELS:,} pixels")
+        return self
+
+
+class _Camera(CameraImages):
     focal_length: Annotated[list[Focal], _exactly(2)]
     principal_point: Annotated[list[Pixel], _exactly(2)]
     model: Name = "brown_conrady"
@@ -106,11 +120,6 @@ class _Camera(StrictModel):
 
     @model_validator(mode="after")
     def _sound(self) -> _Camera:
-        # The name is also a file name in a capture and a cell of a CSV file.
-        if not is_file_name(self.name):
-            raise ValueError(f"found the camera name {quoted(self.name)!r}, expected a name that can be a file name")
-        if math.prod(self.image_size) > limits.MOST_PIXELS:
-            raise ValueError(f"image_size: found {self.image_size}, expected at most {limits.MOST_PIXELS:,} pixels")
         self._check_lens()
         return self
 

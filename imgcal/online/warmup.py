@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -11,6 +12,7 @@ import torch
 from imgcal.detection import detect
 from imgcal.errors import RefusedError
 from imgcal.estimation import RecentSnapshots, RigFilter
+from imgcal.geometry import lens_width
 from imgcal.io import load_object, load_rig
 from imgcal.online.keeper import RigKeeper
 from imgcal.online.recalibrator import Recalibrator
@@ -34,15 +36,31 @@ SNAPSHOTS = 3
 DRIFT = RelativeDrift(0.01, 0.01)
 POSES = PoseRange(phi_deg=(0.0, 28.6), alpha_deg=(0.0, 0.0))
 A_SECOND = 66  # snapshots: more than a filter keeps
+RATIONAL = "rational"
 MANY = 12  # enough to ask for moves, for blocks, and for what is known in the way of long captures
 
 
-def warm_up() -> None:
+def warm_up(all_lenses: bool = False) -> None:
     """Recalibrate a small simulated rig in every way there is, so that all that is compiled for it is in the cache.
 
     Takes seconds where everything is there already. What is compiled holds for rigs, objects and frames of any size.
+
+    Args:
+        all_lenses: compile also what rigs need that have a camera of another lens than the usual one, whichever.
     """
-    rig, obj, generator = load_rig(RIG).resized(torch.tensor(SIZE)), load_object(OBJECT), _seeded()
+    usual = load_rig(RIG).resized(torch.tensor(SIZE))
+    for rig in (usual, with_another_lens(usual)) if all_lenses else (usual,):
+        _warm_up(rig)
+
+
+def with_another_lens(rig: CameraRig) -> CameraRig:
+    """The same cameras with the widest of the other lenses: what is compiled for one of these is compiled for all."""
+    wide = lens_width(RATIONAL) - rig.distortion.shape[-1]
+    return replace(rig, distortion=torch.nn.functional.pad(rig.distortion, (0, wide)), lens_model=RATIONAL)
+
+
+def _warm_up(rig: CameraRig) -> None:
+    obj, generator = load_object(OBJECT), _seeded()
     truth = simulate_truth(rig, obj, SNAPSHOTS, generator, DRIFT, POSES)
     for depth in (8, 16):
         _from_frames(truth, rig, obj, SensorModel(bit_depth=depth), generator)

@@ -1,5 +1,6 @@
-from .calibration import Calibration, calibrate, fit_labelled
+from .calibration import Calibration
 from .captured import detect_capture, masks_of, sight_of_capture
+from .fitting import fit_labelled
 from .from_scratch import calibrate_from_scratch
 from .initialization import load_initializer
 from .knowledge import FIELDS, UNDETERMINED, Knowledge, knowledge_of
@@ -7,6 +8,7 @@ from .lateness import LateCamera
 from .learned import LearnedProposer, load_proposer
 from .measuring import LearnedMeasurer
 from .motion import MOVED, Motion, motion_since_factory
+from .recalibration import calibrate
 from .scoring import RigScore, rms_length, score
 from .sources import DETECTORS, Detector, DetectorName, checked_detections, checked_frames, proposer_of
 from .tally import DOUBTFUL, Tally

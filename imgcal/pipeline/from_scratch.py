@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.association import (
+    Associations,
     PipelineOptions,
     Progress,
     associate,
@@ -27,7 +28,9 @@ from imgcal.detection import DetectionOptions
 from imgcal.errors import RefusedError
 from imgcal.estimation import K3, ColdStart, cold_start, ordinary_lens
 from imgcal.messages import listed
-from imgcal.pipeline.calibration import Calibration, fit_steady
+from imgcal.pipeline.calibration import Calibration
+from imgcal.pipeline.fitting import fit_steady
+from imgcal.pipeline.recalibration import late_cameras, require_same_moments, require_units
 from imgcal.pipeline.sources import Frames, blobs_of
 from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior, Volume
 
@@ -64,7 +67,7 @@ def calibrate_from_scratch(
 
     Args:
         source: blobs, labelled or not, or frames in memory.
-        cameras: from `imgcal.io.load_cameras`; a rig's places and its prior for them are not looked at.
+        cameras: from `imgcal.formats.load_cameras`; a rig's places and its prior for them are not looked at.
         obj: the calibration object.
         options: how sure the result must be.
         detection: how blobs are found in frames.
@@ -94,13 +97,20 @@ def calibrate_from_scratch(
     alone = detections if is_labelled else labels_of_images(detections, cameras, obj, options, progress)
     first = _first_rig(alone, cameras, obj)
     placed = replace(first.rig, prior=PLACED)
-    labelled = associate(detections, placed, obj, options, progress)
-    identified = time.perf_counter()
-    start = replace(first.rig, prior=_wide(first.rig, cameras), distortion=first.rig.distortion.clone())
-    start.distortion[:, K3 - 10] = cameras.distortion[:, K3 - 10]  # about which it has a prior that tells
-    std = ordinary_lens(_wide(first.rig, cameras).std(start))
-    fit = fit_steady(labelled, labelled.detections, start, obj, options, prior_std=std)
-    require_determined(fit)
+    labelled: Associations | None = None
+    try:
+        labelled = associate(detections, placed, obj, options, progress)
+        identified = time.perf_counter()
+        fit = _fit(labelled, first.rig, cameras, obj, options)
+    except np.linalg.LinAlgError as error:  # lengths of a size that nobody has thought of
+        require_units(RefusedError("nothing can be computed"), placed, obj, from_scratch=True)
+        raise RefusedError("estimation: the equations cannot be solved: the data say next to nothing") from error
+    except RefusedError as error:
+        require_units(error, placed, obj, from_scratch=True)
+        if labelled is not None:
+            require_same_moments(error, alone, labelled, placed, obj, options)
+        raise
+    late = late_cameras(alone, fit.tally, placed, obj, options)
     seconds = {
         "detection": found - started,
         "identity": identified - found,
@@ -110,7 +120,20 @@ def calibrate_from_scratch(
     box = Volume.box(_corner(volume.low), _corner(volume.high))
     # What was known before is no prior for what comes after; the defaults are.
     rig = replace(fit.rig, name=cameras.name, prior=None, volume=box)
-    return replace(fit, estimate=replace(fit.estimate, rig=rig), seconds=seconds, from_scratch=True)
+    return replace(fit, estimate=replace(fit.estimate, rig=rig), seconds=seconds, from_scratch=True, late=late)
+
+
+def _fit(
+    labelled: Associations, first: CameraRig, cameras: CameraRig, obj: CalibrationObject, options: PipelineOptions
+) -> Calibration:
+    """Estimate all from the first rig, which has been made from the same data, and from what is known of lenses."""
+    start = replace(first, prior=_wide(first, cameras), distortion=first.distortion.clone())
+    start.distortion[:, K3 - 10] = cameras.distortion[:, K3 - 10]  # about which it has a prior that tells
+    std = ordinary_lens(_wide(first, cameras).std(start))
+    std[0, :6] = 0.0  # whose frame is the rig's
+    fit = fit_steady(labelled, labelled.detections, start, obj, options, prior_std=std)
+    require_determined(fit)
+    return fit
 
 
 def labels_of_images(

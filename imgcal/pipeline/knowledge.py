@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from imgcal.pipeline.calibration import Calibration
-from imgcal.types import RigPrior
 
 FIELDS = 8
 """An image is divided into 8 x 8 fields to count how much of it was reached."""
@@ -47,6 +46,7 @@ class Knowledge:
     coverage: tuple[float, ...]  # C, share of each image's fields in which fiducials were used
     undetermined: dict[str, tuple[str, ...]]  # parameter of the lens or sensor -> cameras in which it is the factory's
     places: tuple[Place, ...]  # the one that shows most first
+    from_scratch: bool = False  # what stands where the data say nothing is no factory's
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -57,7 +57,8 @@ class Knowledge:
             for name, cameras in self.undetermined.items():
                 by_cameras.setdefault(cameras, []).append(name)
             parts = [f"{', '.join(names)} in {_cameras(cameras, count)}" for cameras, names in by_cameras.items()]
-            words.append(f"Not determined by these data, the factory's values stand: {'; '.join(parts)}.")
+            stands = "what was assumed stands" if self.from_scratch else "the factory's values stand"
+            words.append(f"Not determined by these data, {stands}: {'; '.join(parts)}.")
         low, high = (round(100 * f(self.coverage)) for f in (min, max))
         if low < 100 * LITTLE:
             share = f"{low}" if low == high else f"{low} to {high}"
@@ -91,7 +92,7 @@ def knowledge_of(calibration: Calibration, std: Tensor) -> Knowledge:
         (True, 3)
     """
     rig = calibration.rig
-    prior = (calibration.factory.prior or RigPrior()).std(calibration.factory)
+    prior = calibration.estimate.problem.prior_std[0]
     unknown = ((std > UNDETERMINED * prior) & (prior > 0))[:, 6:]
     undetermined = {
         name: tuple(rig.camera_names[c] for c in unknown[:, i].nonzero().flatten().tolist())
@@ -100,7 +101,8 @@ def knowledge_of(calibration: Calibration, std: Tensor) -> Knowledge:
     }
     reached = _fields(calibration.observations.uv, calibration.observations.seen, rig.image_size)
     shares = tuple(reached.double().mean(-1).tolist())
-    return Knowledge(rig.camera_names, shares, undetermined, _places(calibration, reached))
+    places = _places(calibration, reached)
+    return Knowledge(rig.camera_names, shares, undetermined, places, calibration.from_scratch)
 
 
 def _fields(uv: Tensor, seen: Tensor, image_size: Tensor) -> Tensor:

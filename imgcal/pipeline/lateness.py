@@ -164,13 +164,21 @@ def _slip(view: _View) -> tuple[int, int] | None:
 def _labelled_alone(
     blobs: Detections, single: CameraRig, obj: CalibrationObject, used: list[int], poses: RigidTransform
 ) -> tuple[Tensor, Tensor]:
-    """Label what one camera saw by itself, near where the others had the object: uv (U, N, 2), seen (U, N)."""
+    """Label what one camera saw by itself, near where the others had the object: uv (U, N, 2), seen (U, N).
+
+    Labels that the blobs have count where there are any.
+    """
     uv = torch.zeros(len(used), obj.num_fiducials, 2, dtype=torch.float64)
     seen = torch.zeros(len(used), obj.num_fiducials, dtype=torch.bool)
     std = (single.prior or RigPrior()).std(single)
     blobs = replace(blobs, camera=np.zeros_like(blobs.camera), camera_names=single.camera_names)
     for row, snapshot in enumerate(used):
         mine = blobs.select((blobs.snapshot == snapshot) & blobs.usable)
+        given = np.flatnonzero(mine.fiducial >= 0)
+        if len(given):
+            uv[row, mine.fiducial[given]] = torch.from_numpy(mine.uv[given])
+            seen[row, mine.fiducial[given]] = True
+            continue
         if len(mine) < 4:
             continue
         near = [row + slip for slip in (0, *SLIPS) if 0 <= row + slip < len(used)]

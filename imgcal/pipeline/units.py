@@ -13,10 +13,15 @@ LEAST_DISTANCE, LEAST_SIZE = 20.0, 2.0
 THOUSAND = 1000.0
 
 
-def unit_doubt(rig: CameraRig, obj: CalibrationObject) -> str:
+def unit_doubt(rig: CameraRig, obj: CalibrationObject, from_scratch: bool = False) -> str:
     """Say which of a rig and an object seems to be in metres; empty where nothing does.
 
     Nothing is made of it but words: images alone cannot tell.
+
+    Args:
+        rig: its places, or how far it is from the object, say what is plausible.
+        obj: the calibration object.
+        from_scratch: the rig's lengths are those of the object.
 
     Examples:
         >>> import imgcal
@@ -42,6 +47,8 @@ def unit_doubt(rig: CameraRig, obj: CalibrationObject) -> str:
     if not plausible(image) and image > LARGEST_IMAGE * width and plausible(image / THOUSAND):
         return f"the rig seems to be in metres, expected millimetres: the object is {seen.removeprefix('it is ')}"
     if distance < LEAST_DISTANCE and size < LEAST_SIZE:
+        if from_scratch:
+            return f"the object seems to be in metres, expected millimetres: {seen}"
         return f"rig and object seem to be in metres, expected millimetres: the object is {seen.removeprefix('it is ')}"
     return ""
 

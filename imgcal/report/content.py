@@ -51,6 +51,7 @@ class ReportContent:
     sigma: Array | None = None  # (M,) pixels, as weighted in the estimate; None = as detected
     std: Array | None = None  # (C, K) posterior standard deviation of the change
     prior_std: Array | None = None  # (C, K) standard deviation before the data
+    from_scratch: bool = False  # there was no factory calibration: `factory` is a first rig made from the same data
     gauge: Gauge | None = None  # which cameras are taken to have stood still; None = nothing is compared
     predicted: PredictedError | None = None  # over the working volume
     moves: tuple[str, ...] = ()  # cameras that moved during the capture, in words; earlier snapshots are rejected

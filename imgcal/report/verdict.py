@@ -73,11 +73,14 @@ def judge(content: ReportContent) -> Verdict:
             (*dict.fromkeys(step for _, step in reservations if step), *further, _CHECK), _figures(content),
         )  # fmt: skip
     where = " where the object was seen" if content.unknown else ""
-    headline = f"Recalibrated{where}: the result explains the images as well as the measurement noise allows"
-    return Verdict("good", headline, found, (), content.unknown, (*further, _CHECK, _KEEP), _figures(content))
+    done = "Calibrated" if content.from_scratch else "Recalibrated"
+    headline = f"{done}{where}: the result explains the images as well as the measurement noise allows"
+    keep = _FIRST if content.from_scratch else _KEEP
+    return Verdict("good", headline, found, (), content.unknown, (*further, _CHECK, keep), _figures(content))
 
 
 _CHECK = "Check the new rig on snapshots that took no part here: imgcal score CAPTURE --rig rig.yaml --object OBJECT."
+_FIRST = "Then use rig.yaml as the factory file from now on."
 _KEEP = "Then use rig.yaml in place of the factory file; keep the factory file for the next recalibration."
 
 
@@ -90,7 +93,7 @@ def _improvement(content: ReportContent) -> str:
 
 def _movement(content: ReportContent) -> tuple[str, ...]:
     """Say which cameras moved most."""
-    if content.change is None or content.std is None:
+    if content.change is None or content.std is None or content.from_scratch:
         return ()
     if len(content.cameras) == 1:
         return ("One camera: only its own lens and sensor values can have changed.",)
@@ -144,10 +147,11 @@ def _reservations(content: ReportContent) -> list[tuple[str, str]]:
             "Read the reasons under “Snapshots”; often reflections, blur or an object half out of view.",
         ))  # fmt: skip
     share = _undetermined_share(content)
+    given = "what was assumed" if content.from_scratch else "the factory's value"
     if share > 0.25:
         notes.append((
             f"{100 * share:.0f} % of the parameters are not determined by these data (see “How well known”): there, "
-            "the result is the factory's value.",
+            f"the result is {given}.",
             "Capture more snapshots, with the object near the image corners, tilted, and at several distances.",
         ))  # fmt: skip
     return notes
@@ -173,7 +177,7 @@ def _figures(content: ReportContent) -> tuple[KeyFigure, ...]:
     if predicted is not None and math.isfinite(predicted.median_mm):
         note = f"predicted; 95 %: {length(predicted.p95_mm)}"
         figures.insert(1, KeyFigure(length(predicted.median_mm), "error in the volume", note))
-    if len(content.cameras) > 1:
+    if len(content.cameras) > 1 and not content.from_scratch:
         figures.append(KeyFigure(f"{moved} / {count}", "cameras moved", f"beyond {MOVED:g} std"))
     if content.seconds and len(figures) < MOST_FIGURES:
         figures.append(KeyFigure(duration(sum(content.seconds.values())), "computing time"))

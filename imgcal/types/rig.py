@@ -156,20 +156,23 @@ class CameraRig:
         return f"CameraRig({self.name!r}{batch}: {cameras})"
 
     def __str__(self) -> str:
-        """List the cameras, with the unit of each value; a rig with batch axes is only named."""
+        """List the cameras, with the unit of each value and the lens by its model and its own coefficients.
+
+        A rig with batch axes is only named.
+        """
         if self.batch_shape:
             return repr(self)
-        width, names = max(6, *(len(name) for name in self.camera_names)), ", ".join(self.parameter_names[10:])
-        head = f"{'camera':<{width}}  image (px)   fx, fy (px)         cx, cy (px)         "
-        rows = [repr(self), f"{head}{names:<43}   position in the rig (mm)"]
+        width = max(6, *(len(name) for name in self.camera_names))
+        head = f"{'camera':<{width}}  image (px)   fx, fy (px)         cx, cy (px)"
+        rows = [repr(self), f"{head}          position in the rig (mm)       lens"]
         values = (self.focal_length, self.principal_point, self.distortion, self.positions.round(decimals=2) + 0.0)
         columns = zip(self.camera_names, self.image_size.tolist(), *(value.tolist() for value in values), strict=True)
-        for name, (w, h), focal, centre, lens, position in columns:
+        for model, (name, (w, h), focal, centre, lens, position) in zip(self.lens_models, columns, strict=True):
             pixels = "".join(f"{a:9.2f} {b:9.2f} " for a, b in (focal, centre))
-            coefficients = " ".join(f"{value:8.5f}" for value in lens)
-            rows.append(
-                f"{name:<{width}}  {w:>4} x {h:<4} {pixels} {coefficients} " + " ".join(f"{x:9.2f}" for x in position)
-            )
+            coefficients = zip(LENS_MODELS[model].coefficients, lens, strict=False)  # behind its own there are zeros
+            words = ", ".join(f"{coefficient} {value: .5f}" for coefficient, value in coefficients)
+            place = " ".join(f"{x:9.2f}" for x in position)
+            rows.append(f"{name:<{width}}  {w:>4} x {h:<4} {pixels} {place}  {model}: {words}")
         return "\n".join(rows)
 
     @property

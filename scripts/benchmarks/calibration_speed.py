@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ import tyro
 
 from imgcal import Detections, RigidTransform, load_object, load_rig
 from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.io import write_text
+from imgcal.io import save_rig, write_text
 from scripts.benchmarks.camera_faults import blobs, object_before_a_ring
 from scripts.output import ROOT, command, markdown, replaced, surroundings, write_json
 
@@ -61,9 +61,8 @@ def write_cases(folder: Path) -> None:
 
 
 def _write(folder: Path, name: str, case: tuple[str, str, int], columns: Mapping[str, np.ndarray]) -> None:
-    rig, obj = (
-        ROOT / "data" / kind / file for kind, file in (("rigs", f"{case[0]}.yaml"), ("objects", f"{case[1]}.csv"))
-    )
+    rig, obj = folder / f"{case[0]}.yaml", ROOT / "data" / "objects" / f"{case[1]}.csv"
+    save_rig(replace(load_rig(case[0]), volume=None), rig)  # which an older checkout does not know
     (folder / f"{name}.json").write_text(json.dumps({"rig": str(rig), "object": str(obj), "window": case[2]}))
     np.savez(folder / f"{name}.npz", **columns)  # type: ignore[arg-type]
 

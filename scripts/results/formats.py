@@ -141,7 +141,7 @@ def table(result: dict[str, Any]) -> str:
         if write is None:
             rows.append((row["title"], f"`{name}`", seen, "only read", "–"))
             continue
-        tool = write["reader"] or "none on PyPI or Debian"
+        tool = write["reader"] or ("not at hand" if name in READERS else "none on PyPI or Debian")
         worst = f"{write['worst_px']:.1e}" if write["worst_px"] is not None else "–"
         rows.append((row["title"], f"`{name}`", seen, f"{write['own_reader_px']:.1e}", f"{tool}: {worst}"))
     head = (

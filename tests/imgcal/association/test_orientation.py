@@ -12,7 +12,7 @@ from imgcal.errors import InputError
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.io import load_object
-from imgcal.pipeline.calibration import calibrate
+from imgcal.pipeline import calibrate
 from imgcal.synthesis.captures import Truth, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
 from imgcal.types.observations import Detections

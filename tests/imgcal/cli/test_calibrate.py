@@ -403,7 +403,9 @@ def test_without_a_factory_calibration(wand_capture, tmp_path, capsys):
     assert main([*arguments, "--cameras", str(wand_capture / "cameras.yaml")]) == 0
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     assert result["from_scratch"] and result["rms_px_before"] is None and result["rms_px_after"] < 0.05
-    assert "without a factory calibration" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "without a factory calibration" in printed and "since the factory" not in printed
+    assert result["motion"] is None and "k3" in result["knowledge"]["undetermined"]
     rig = load_rig(tmp_path / "out" / "rig.yaml")
     assert rig.volume is not None and rig.prior is None and load_rig_covariance(tmp_path / "out" / "rig.yaml")
     assert "There was no factory calibration" in (tmp_path / "out" / "report.html").read_text()

@@ -9,7 +9,7 @@ import torch
 from imgcal.errors import RefusedError
 from imgcal.estimation.pose_support import UndeterminedPosesError, require_poses
 from imgcal.io import load_object, load_rig
-from imgcal.pipeline.calibration import calibrate
+from imgcal.pipeline import calibrate
 from imgcal.synthesis import simulate_volume, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
 

@@ -10,8 +10,7 @@ from imgcal.association.series import associate
 from imgcal.errors import RefusedError
 from imgcal.estimation import variance_components
 from imgcal.io import load_object, load_rig
-from imgcal.pipeline import calibration
-from imgcal.pipeline.calibration import calibrate, fit_labelled
+from imgcal.pipeline import calibrate, calibration, fit_labelled
 from imgcal.synthesis.captures import simulate_truth, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
 

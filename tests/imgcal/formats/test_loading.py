@@ -6,8 +6,8 @@ import yaml
 
 import imgcal
 from imgcal.errors import InputError, RefusedError
-from imgcal.formats import converted, load_rig
-from imgcal.io import save_rig
+from imgcal.formats import converted, load_cameras, load_rig
+from imgcal.io import save_cameras, save_rig
 from imgcal.types import CameraRig
 from tests.imgcal.formats.rigs import brown, put, put_files, rig_of
 
@@ -46,6 +46,48 @@ def test_what_it_does_not_say_is_asked_for(tmp_path: Path) -> None:
     sizes = load_rig(folder, unit="mm", image_size={"1": (1280, 960), "2": (640, 480)}).image_size
     assert sizes.tolist() == [[1280, 960], [640, 480]]
     assert load_rig(folder, unit="mm", image_size=(1280, 960)).image_size.tolist() == [[1280, 960]] * 2
+
+
+def test_cameras_need_neither_places_nor_a_unit(tmp_path: Path) -> None:
+    lens = "size = [1280, 960]\nmatrix = [[900.0, 0, 640], [0, 901, 480], [0, 0, 1]]\ndistortions = [0.1, 0, 0, 0, 0]\n"
+    array = "".join(f"[cameras.{n}]\ncam_id = {n}\nrotation_count = 0\n{lens}" for n in range(3))
+    placed = "rotation = [0.1, 0, 0]\ntranslation = [1.0, 0, 2]\n"
+    file = put(tmp_path, array__toml=array + placed) / "array.toml"
+    assert load_rig(file).camera_names == ("2",)  # the only one that has a place
+    cameras = load_cameras(file)
+    assert cameras.camera_names == ("0", "1", "2") and not cameras.positions.any()
+    assert cameras.focal_length.tolist() == [[900.0, 901.0]] * 3 and cameras.prior is not None
+    anipose = put_files(tmp_path / "a", converted(rig_of(brown(-0.1), brown()), "anipose", "x").files)
+    with pytest.raises(InputError, match="unit"):
+        load_rig(anipose)
+    assert load_cameras(anipose).num_cameras == 2
+    text = array.replace("matrix = ", "matrices = ", 1)
+    with pytest.raises(InputError, match="camera 0: intrinsics are not calibrated"):
+        load_cameras(put(tmp_path / "b", array__toml=text) / "array.toml")
+
+
+def test_cameras_of_ros_are_files_of_one_camera_each(tmp_path: Path) -> None:
+    for number in range(3):
+        files = converted(rig_of(brown(0.1 * number), names=(f"cam{number}",)), "ros", "x").files
+        put_files(tmp_path / "ros", files)
+    with pytest.raises(InputError, match="3 files: ROS says in them where two cameras are"):
+        load_rig(tmp_path / "ros")
+    cameras = load_cameras(tmp_path / "ros")
+    assert cameras.camera_names == ("cam0", "cam1", "cam2")
+    assert cameras.distortion[:, 0].tolist() == [0.0, 0.1, 0.2]
+
+
+def test_cameras_of_our_own_as_ever(tmp_path: Path) -> None:
+    save_cameras({"left": (640, 480)}, 60, tmp_path / "cameras.yaml")
+    assert load_cameras(tmp_path / "cameras.yaml").camera_names == ("left",)
+    with pytest.raises(InputError, match="absent"):
+        load_cameras(tmp_path / "absent.yaml")
+    pair = put_files(tmp_path / "pair", converted(rig_of(brown(), brown()), "opencv-stereo", "x").files)
+    text = (pair / "intrinsics.yml").read_text().replace("image_width", "x").replace("image_height", "y")
+    (pair / "intrinsics.yml").write_text(text)
+    with pytest.raises(InputError, match=r"image_size=\(1280, 720\)"):
+        load_cameras(pair)
+    assert load_cameras(pair, image_size=(1280, 960)).num_cameras == 2
 
 
 def test_a_lens_that_is_not_ours(tmp_path: Path) -> None:

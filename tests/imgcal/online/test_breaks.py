@@ -8,7 +8,7 @@ from imgcal.association import to_observations
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.online.breaks import Series, _jacobians, find_breaks, information, series_of
-from imgcal.pipeline.calibration import calibrate
+from imgcal.pipeline import calibrate
 from imgcal.synthesis.captures import simulate_truth, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
 

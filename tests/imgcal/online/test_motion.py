@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from imgcal.online.motion import measured_move
-from imgcal.pipeline.calibration import calibrate
+from imgcal.pipeline import calibrate
 from tests.imgcal.streams import Stream
 
 CAMERA = 6

@@ -7,6 +7,10 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
+
+from imgcal.online.warmup import warm_up, with_another_lens
+from imgcal.types import CameraRig
 
 COUNT = """
 import json, sys
@@ -61,6 +65,17 @@ print(json.dumps(Compiled.names))
 
 UNUSED = {"_minimize_all", "_pair", "_gradients", "_through_profile"}  # many rigs at once, and training
 OTHER_LENSES = "_chosen.<locals>"  # compiled where a rig has one
+
+
+def test_other_lenses_are_warmed_up_where_that_is_asked_for(monkeypatch: pytest.MonkeyPatch, o10: CameraRig) -> None:
+    warmed: list[CameraRig] = []
+    monkeypatch.setattr("imgcal.online.warmup._warm_up", warmed.append)
+    warm_up()
+    warm_up(all_lenses=True)
+    assert [rig.lens_model for rig in warmed] == ["brown_conrady", "brown_conrady", "rational"]
+    points = torch.tensor([[10.0, 20.0, 860.0]], dtype=torch.float64)
+    images = [rig.project(points).uv for rig in (o10, with_another_lens(o10))]
+    torch.testing.assert_close(*images)  # the same lens in other words
 
 
 @pytest.fixture(scope="module")

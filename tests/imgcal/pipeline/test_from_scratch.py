@@ -6,7 +6,7 @@ import torch
 
 from imgcal.errors import RefusedError
 from imgcal.io import load_object
-from imgcal.pipeline import calibrate
+from imgcal.pipeline import calibrate, unit_doubt
 from imgcal.pipeline.from_scratch import calibrate_from_scratch
 from imgcal.synthesis import HandHeld, PhysicalDrift, arranged_rig, simulate_volume, true_detections
 from imgcal.types import RigPrior, Volume
@@ -51,6 +51,8 @@ def test_from_scratch_is_as_good_as_from_the_factory():
         assert found.from_scratch and found.rig.prior is None
         assert found.predicted_error.median_mm < 1.25 * factory.predicted_error.median_mm
         assert error(found.rig, truth) < 3 * error(factory.rig, truth) + 0.5
+        assert torch.equal(found.rig.cam_from_rig.rotation[0], torch.eye(3).double())
+        assert not found.rig.positions[0].abs().gt(1e-9).any()
         place = (found.rig.volume.low[2] + found.rig.volume.high[2]) / 2
         assert 1500 < place < 4500  # mm in front of the first camera
 
@@ -63,6 +65,30 @@ def test_what_the_data_do_not_say_is_refused():
     noise = np.random.default_rng(0).random(blobs.uv.shape) * 1000
     with pytest.raises(RefusedError, match=r"in none of 12 snapshots|cannot be placed|misses"):
         calibrate_from_scratch(replace(blobs, uv=noise), cameras, wand)
+
+
+def test_an_object_in_metres_is_said():
+    wand = load_object("wand4")
+    _, labelled, blobs, cameras = capture(wand, 40)
+    small = replace(wand, points=wand.points / 1000)
+    for source in (labelled, blobs):
+        try:
+            said = unit_doubt(calibrate_from_scratch(source, cameras, small).factory, small, from_scratch=True)
+        except RefusedError as refusal:
+            said = refusal.reason
+        assert said.startswith("the object seems to be in metres, expected millimetres: it is 0.18 mm large")
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # the first rig's lens of that camera fits nothing
+@pytest.mark.parametrize("labels", [True, False])
+def test_a_lost_frame_is_named(labels):
+    wand = load_object("wand4")
+    _, labelled, blobs, cameras = capture(wand, 40)
+    source = labelled if labels else blobs
+    late = (source.camera == 2) & (source.snapshot >= 20)
+    shifted = replace(source, snapshot=source.snapshot - late).select(np.flatnonzero(~late | (source.snapshot > 20)))
+    with pytest.raises(RefusedError, match="camera cam03: from snapshot 00020 on, its frames show what the other"):
+        calibrate_from_scratch(shifted.select(np.lexsort((shifted.camera, shifted.snapshot))), cameras, wand)
 
 
 def test_an_object_of_another_shape_is_refused():

@@ -1,5 +1,7 @@
 """`CameraRig`: packings, moves, resizing, selections."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -168,3 +170,8 @@ def test_a_rig_is_named_on_one_line_and_printed_as_a_table(o10: CameraRig) -> No
     rows = str(o10).splitlines()
     assert len(rows) == 12 and len({len(row) for row in rows[2:]}) == 1
     assert rows[2].split()[:6] == ["cam01", "2048", "x", "1088", "1620.00", "1621.00"]
+    wide = torch.nn.functional.pad(o10.distortion[:3], (0, 3))
+    mixed = replace(o10.select([0, 1, 2]), distortion=wide, lens_model=("brown_conrady", "equidistant", "rational"))
+    lenses = [row.rpartition(": ") for row in str(mixed).splitlines()[2:]]
+    assert [before.split()[-1] for before, _, _ in lenses] == ["brown_conrady", "equidistant", "rational"]
+    assert [len(after.split(", ")) for _, _, after in lenses] == [5, 4, 8]

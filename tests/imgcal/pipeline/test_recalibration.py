@@ -6,7 +6,7 @@ import torch
 
 from imgcal.errors import RefusedError
 from imgcal.estimation import relative_covariance
-from imgcal.pipeline.calibration import calibrate
+from imgcal.pipeline import calibrate
 from imgcal.synthesis.captures import simulate_truth, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
 

@@ -1,0 +1,227 @@
+"""One estimate over all snapshots whose blobs have labels, and the checks that it must pass."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from imgcal.association import Associations, PipelineOptions
+from imgcal.errors import RefusedError
+from imgcal.estimation import (
+    BlockScatter,
+    ObjectQuestion,
+    Solution,
+    Start,
+    UndeterminedPosesError,
+    block_scatter,
+    estimate_variance_components,
+    initial_state,
+    make_estimate,
+    make_loss,
+    make_problem,
+)
+from imgcal.pipeline.arrangement import Arranged, arrange
+from imgcal.pipeline.calibration import Calibration
+from imgcal.pipeline.checks import (
+    require_cameras,
+    require_fit,
+    require_most_labels,
+    require_near_prior,
+    require_same_residuals,
+    require_views,
+)
+from imgcal.pipeline.initialization import Initialization, Initializer, residual_of
+from imgcal.pipeline.object_checks import object_offsets
+from imgcal.pipeline.steadiness import steady_part
+from imgcal.pipeline.tally import tally
+from imgcal.types import (
+    CalibrationObject,
+    CameraRig,
+    Detections,
+    Observations,
+    Prediction,
+    RigPrior,
+)
+
+LEAST_KEPT = 0.8
+"""Share of the snapshots that must keep a pose when outliers have been left out."""
+
+
+def fit_steady(
+    labelled: Associations,
+    given: Detections,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    options: PipelineOptions,
+    initializer: Initializer | None = None,
+    prior_std: Tensor | None = None,
+) -> Calibration:
+    """Do what `calibrate` does once blobs have labels: steady snapshots, the fit, all checks.
+
+    Args:
+        labelled: all snapshots.
+        given: the same as they came in, with the labels of the input alone.
+        rig: what is known before, float64.
+        obj: the calibration object.
+        options: how sure the result must be.
+        initializer: network whose first guess the estimate starts from.
+        prior_std: (C, 15) how far values may be off, once cameras are known to be steady; None = as the rig says.
+
+    Raises:
+        RefusedError: the data cannot decide.
+    """
+    arranged = arrange(labelled, rig, obj)
+    _require_any_view(arranged, rig, obj)
+    steady = steady_part(arranged, given, rig, obj, options)
+    fits = steady.fits if prior_std is None else ()  # those have the rig's prior
+    fit = _fitted(steady.arranged, rig, obj, options, _Known(initializer, prior_std=prior_std, fits=fits))
+    fit = replace(fit, moved=steady.moved)  # before its tally, which is kept with it
+    require_views(fit.tally, rig)
+    return fit
+
+
+def fit_labelled(
+    labelled: Associations,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    options: PipelineOptions = PipelineOptions(),
+    initializer: Initializer | None = None,
+    *,
+    latest: Calibration | None = None,
+    prior_std: Tensor | None = None,
+) -> Calibration:
+    """Estimate the rig from all labelled snapshots, leaving out what does not fit, and check that the rest does.
+
+    Args:
+        labelled: from `label`.
+        rig: the factory calibration.
+        obj: the calibration object.
+        options: how sure the result must be.
+        initializer: network whose first guess is the start, where it is nearer to the images than the factory rig.
+        latest: what the snapshot before gave, from the same factory calibration: a start that saves time.
+        prior_std: (C, 15) how far the factory values may be off; None = as the rig says.
+
+    Raises:
+        RefusedError: a camera saw nothing, the estimate has no minimum, or the residuals do not fit.
+    """
+    rig = rig.to(torch.float64)
+    return _fitted(arrange(labelled, rig, obj), rig, obj, options, _Known(initializer, latest, prior_std))
+
+
+@dataclass(frozen=True)
+class _Known:
+    """What is known before a fit; see `fit_labelled`."""
+
+    initializer: Initializer | None = None
+    latest: Calibration | None = None
+    prior_std: Tensor | None = None
+    fits: tuple[Solution, ...] = ()  # of all labels, where they have been made already; see `SteadyPart`
+
+
+def _fitted(
+    given: Arranged, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions, known: _Known
+) -> Calibration:
+    """Do the work of `fit_labelled` for snapshots that all have a pose."""
+    arranged = given
+    while True:
+        try:
+            return _fitted_once(arranged, rig, obj, options, known)
+        except UndeterminedPosesError as error:
+            arranged, known = arranged.without(error.rows, rig, obj), replace(known, fits=())
+            left, count = len(arranged.labelled.used), len(given.labelled.used)
+            if left < LEAST_KEPT * count:
+                raise RefusedError(
+                    f"{error} (found {count - left} of {count} such snapshots): some fiducial is not where the object "
+                    "file says"
+                ) from error
+
+
+def _fitted_once(
+    arranged: Arranged, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions, known: _Known
+) -> Calibration:
+    """Fit, unless without outliers some snapshots do not say where the object is."""
+    labelled, observations, latest = arranged.labelled, arranged.observations, known.latest
+    variance, labels = observations.sigma.numpy() ** 2, observations.seen.numpy()
+    require_cameras(labels, rig, options)
+    alike = labelled.identity == "ambiguous" and len(labelled.used) > 1
+    if alike and obj.tolerance is not None and bool(obj.tolerance.any()):
+        raise RefusedError(
+            "object: it can be turned into itself, and each snapshot may have the labels of another turn: where its "
+            "fiducials are within their tolerances cannot be estimated",
+            python="give labels (Detections.fiducial), use an object without symmetry, or one without tolerances",
+            command="give labels (a column `fiducial`), use an object without symmetry, or one without tolerances",
+        )
+    prior = (rig.prior or RigPrior()).std(rig) if known.prior_std is None else known.prior_std
+    problem = make_problem(observations, rig, _with_learnt(obj, latest), prior)
+    guess = None if known.initializer is None else known.initializer.guess(observations, rig, obj)
+    guess_used = guess is not None and _nearer(guess, Prediction(rig, arranged.poses), observations, obj)
+    first = Start(initial_state(problem, arranged.poses, None), options.identity_error)
+    if known.fits:
+        first = replace(first, solution=known.fits[0], nearer=known.fits[-1].state)
+    if guess is not None and guess_used:
+        first = Start(initial_state(problem, guess.rig_from_object, guess.rig), options.identity_error)
+    starts = [first]
+    if latest is not None and not latest.prior_scale:
+        change = latest.estimate.problem.prior_std * latest.estimate.solution.state.offset
+        offset = torch.where(prior > 0, change / prior.clamp_min(1e-30), 0.0)
+        starts.insert(0, Start(replace(first.state, offset=offset), latest.additive_noise))
+    question = ObjectQuestion.NONE
+    if latest is None:
+        question = ObjectQuestion.SHAPE_OF_TURNS if alike else ObjectQuestion.SHAPE
+    found = estimate_variance_components(problem, starts, variance, labels, options, question)
+    fit = make_estimate(found.problem, found.solution, found.solution.state)
+    require_same_residuals(fit, observations, found.seen, obj)
+    shape = object_offsets(fit, found.shape, obj)
+    scatter = BlockScatter()
+    if latest is None:
+        scatter = block_scatter(found.problem, found.solution, make_loss(options.estimation))
+        fit = replace(fit, inflation=scatter.factor)
+    outliers = int(labels.sum() - found.seen.sum())
+    require_cameras(found.seen, rig, options)
+    require_near_prior(fit, prior, rig, found.prior_scale, options)
+    require_most_labels(labels, found.seen, rig)
+    require_fit(found.additive_noise, outliers / max(int(labels.sum()), 1), 2**0.5 * float(fit.rms), options)
+    return Calibration(
+        estimate=fit,
+        labelled=labelled,
+        observations=Observations(
+            observations.uv, torch.from_numpy(found.sigma).to(observations.sigma), torch.from_numpy(found.seen)
+        ),
+        additive_noise=found.additive_noise,
+        outliers=outliers,
+        prior_scale=found.prior_scale,
+        factory=rig,
+        obj=obj,
+        shape=shape,
+        scale_sigma=None if found.shape is None else finite(found.shape.scale_error[1]),
+        bent_sigma=None if found.shape is None else found.shape.bent_sigma(),
+        block_length=scatter.length,
+        initialization=guess,
+        guess_used=guess_used,
+    )
+
+
+def _with_learnt(obj: CalibrationObject, latest: Calibration | None) -> CalibrationObject:
+    """The object with the tolerances that the latest result has found necessary."""
+    learnt = None if latest is None else latest.estimate.problem.object_prior_std
+    return obj if learnt is None else replace(obj, tolerance=learnt[0, :-1:3])
+
+
+def _require_any_view(arranged: Arranged, rig: CameraRig, obj: CalibrationObject) -> None:
+    """Refuse where a camera sees the object, and identity could not label any of it: worse than seeing nothing."""
+    labels = arranged.observations.seen.numpy()
+    require_views(tally(arranged.labelled, labels, arranged.poses, rig, obj), rig, least_share=0.0)
+
+
+def _nearer(guess: Initialization, factory: Prediction, observations: Observations, obj: CalibrationObject) -> bool:
+    """Tell whether the start that a guess gives, its mean rig, is nearer to the images than the factory calibration."""
+    start = Prediction(guess.rig, guess.rig_from_object)
+    return bool(residual_of(start, observations, obj).norm() < residual_of(factory, observations, obj).norm())
+
+
+def finite(value: float) -> float | None:
+    """None for what is not known."""
+    return value if np.isfinite(value) else None

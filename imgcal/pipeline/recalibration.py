@@ -1,0 +1,169 @@
+"""From blobs to a recalibrated rig: labels, then one estimate over all snapshots, then the checks that it must pass.
+
+`calibrate` is what the command of the same name does, on values in memory: it neither reads nor writes files.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from imgcal.association import Associations, PipelineOptions, Progress, associate
+from imgcal.detection import DetectionOptions
+from imgcal.errors import RefusedError
+from imgcal.geometry import RigidTransform
+from imgcal.pipeline.arrangement import arrange
+from imgcal.pipeline.calibration import Calibration
+from imgcal.pipeline.fitting import fit_labelled, fit_steady
+from imgcal.pipeline.initialization import Initializer
+from imgcal.pipeline.lateness import LateCamera, late_camera, suspects
+from imgcal.pipeline.measuring import LearnedMeasurer
+from imgcal.pipeline.sources import Detector, Frames, blobs_of, checked_frames, sight_of
+from imgcal.pipeline.tally import Tally, tally
+from imgcal.pipeline.units import unit_doubt
+from imgcal.types import (
+    CalibrationObject,
+    CameraRig,
+    Detections,
+    MovedError,
+)
+
+
+def calibrate(
+    source: Detections | Frames,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    options: PipelineOptions = PipelineOptions(),
+    *,
+    detection: DetectionOptions = DetectionOptions(),
+    initializer: Initializer | None = None,
+    progress: Progress | None = None,
+    detector: Detector = "classical",
+    measurer: LearnedMeasurer | None = None,
+) -> Calibration:
+    """Recalibrate a rig from what its cameras saw.
+
+    Args:
+        source: blobs, labelled or not, or frames in memory (see `imgcal.detect`).
+        rig: the factory calibration, without batch axes.
+        obj: the calibration object.
+        options: how sure the result must be.
+        detection: how blobs are found in frames.
+        initializer: network whose first guess the estimate starts from (`load_initializer`).
+        progress: wraps the loop over snapshots, for a progress bar.
+        detector: who finds the fiducials in frames: `classical` (blobs), `matched` (a matched filter for frames in
+            which blobs fail), `auto` (the filter where blobs decide nothing), or a `Proposer`; a `Sight` brings frames
+            that are not in memory. Blobs that contradict count, and identity and all checks decide as ever.
+        measurer: measures the blobs of frames again (`LearnedMeasurer.load`): half-hidden and unevenly lit markers.
+
+    Raises:
+        RefusedError: the data cannot decide; the message says why.
+        InputError: the data do not belong to this rig or object: other cameras, frames of another size.
+
+    Examples:
+        >>> import torch, imgcal
+        >>> from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
+        >>> factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+        >>> truth = simulate_truth(factory, obj, 4, torch.Generator().manual_seed(1), PhysicalDrift())
+        >>> result = imgcal.calibrate(true_detections(truth), factory, obj)
+        >>> result.identity, result.rig.camera_names == factory.camera_names
+        ('coded', True)
+    """
+    started, rig = time.perf_counter(), rig.to(torch.float64)
+    source = source if isinstance(source, Detections) else checked_frames(source, rig)
+    detections = blobs_of(source, rig, obj, detection, measurer)
+    found = time.perf_counter()
+    sight = sight_of(detector, source, detection)
+    labelled: Associations | None = None
+    try:
+        labelled = associate(detections, rig, obj, options, progress, sight)
+        identified = time.perf_counter()
+        given = detections if sight is None else _as_given(labelled)
+        fit = fit_steady(labelled, given, rig, obj, options, initializer)
+    except RefusedError as error:
+        require_units(error, rig, obj)
+        if labelled is not None:
+            require_same_moments(error, detections, labelled, rig, obj, options)
+        raise
+    seconds = {
+        "detection": found - started,
+        "identity": identified - found,
+        "estimation": time.perf_counter() - identified,
+    }
+    late = late_cameras(detections, fit.tally, rig, obj, options)
+    return replace(fit, seconds=seconds, late=late)
+
+
+def require_units(error: RefusedError, rig: CameraRig, obj: CalibrationObject, from_scratch: bool = False) -> None:
+    """Raise a refusal anew with what lies behind it where lengths seem to be of another unit."""
+    if doubt := unit_doubt(rig, obj, from_scratch):
+        raise RefusedError(f"{doubt}; so {error.reason}") from error
+
+
+def require_same_moments(
+    error: RefusedError,
+    detections: Detections,
+    labelled: Associations,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    options: PipelineOptions,
+) -> None:
+    """Raise another refusal where a camera whose frames are of other moments is behind one.
+
+    Args:
+        error: the refusal.
+        detections: all blobs, with the labels of the input alone.
+        labelled: the same with all labels.
+        rig: as for `late_cameras`.
+        obj: the calibration object.
+        options: how sure a result must be.
+    """
+    arranged = arrange(labelled, rig, obj)
+    labels = arranged.observations.seen.numpy()
+    counts = tally(arranged.labelled, labels, arranged.poses, rig, obj)
+    moves = error.moved if isinstance(error, MovedError) else ()
+    moved = tuple((move.camera, detections.snapshot_names.index(move.snapshot)) for move in moves)
+    for slipped in late_cameras(detections, counts, rig, obj, options, moved):
+        raise RefusedError(
+            str(slipped),
+            python="give the frames of each moment, or leave the camera out (rig.select)",
+            command=f"export its frames anew, or leave it out: --without {slipped.camera}",
+        ) from error
+
+
+def late_cameras(
+    detections: Detections,
+    counts: Tally,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    options: PipelineOptions,
+    moved: tuple[tuple[str, int], ...] = (),
+) -> tuple[LateCamera, ...]:
+    """Find cameras that do not agree with the others because their frames are of other moments.
+
+    Args:
+        detections: all blobs, with the labels of the input alone.
+        counts: what is explained of them.
+        rig: what was known before, or nearly: its prior bounds how blobs are labelled.
+        obj: the calibration object.
+        options: how sure a result must be.
+        moved: cameras that are said to have moved, and the number of the snapshot from which on.
+    """
+
+    def others(blobs: Detections) -> tuple[list[int], RigidTransform]:
+        fit = fit_labelled(associate(blobs, rig, obj, options), rig, obj, replace(options, blind_cameras=True))
+        return fit.labelled.used, fit.rig_from_object
+
+    asked = suspects(counts, rig.camera_names, moved)
+    found = (late_camera(detections, rig, obj, camera, around, others) for camera, around in asked.items())
+    return tuple(late for late in found if late is not None)
+
+
+def _as_given(labelled: Associations) -> Detections:
+    """All blobs, also those that a proposer measured, with the labels of the input alone."""
+    coded = np.array([snapshot.status == "coded" for snapshot in labelled.snapshots])
+    detections = labelled.detections
+    return replace(detections, fiducial=np.where(coded[detections.snapshot], detections.fiducial, -1))
