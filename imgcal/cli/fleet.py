@@ -68,6 +68,11 @@ class Fleet:
         if self.object is not None:
             load_object(self.object)  # what is wrong for all is said at once
         manifest, dataset = Manifest(self.manifest, self.rig, self.object), Dataset(self.out)
+        if self.cores is not None and self.cores < 1:
+            raise InputError(f"--cores: found {self.cores}, expected at least 1")
+        manifest.check()
+        with dataset.written():
+            pass  # it can be, and nobody else is at it
         settings = Settings(self.blind_cameras, self.detector, self.seconds, self.memory_mb, self.keep_rigs)
         started = time.perf_counter()
         with Engine(self.address, self.cores) as engine, _told() as tell:

@@ -53,6 +53,15 @@ class Manifest:
             lines = sum(block.count(b"\n") for block in iter(lambda: file.read(1 << 20), b""))
         return max(lines - 1, 0)
 
+    def check(self) -> None:
+        """Look at the first rows: what is wrong with all of them is told before anything is started.
+
+        Raises:
+            InputError: the file cannot be read, lacks a column, or has no rows.
+        """
+        if next(self.batches(1), None) is None:
+            raise InputError(f"{self.url}: found no rows, expected captures")
+
     def batches(self, size: int) -> Iterator[list[Item]]:
         """Read items, some at a time.
 

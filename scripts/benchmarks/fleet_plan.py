@@ -42,7 +42,7 @@ def _captures(result: Mapping[str, Any]) -> str:
         moved = result["bytes"][kind]
         rows.append([
             kind, f"{1e3 * row['work']:.3g}", f"{cores:.2g}", f"{math.ceil(cores / CORES)}", f"{hours:,.0f}",
-            f"{CAPTURES / DAY * moved['read'] / 1e6:.2g}", f"{CAPTURES * row['stored'] / 1e9:.2g}",
+            f"{CAPTURES / DAY * moved['read'] / 1e6:.2g}", f"{CAPTURES * moved['stored'] / 1e9:.2g}",
         ])  # fmt: skip
     head = ["capture", "CPU ms", "cores", f"machines of {CORES}", "CPU hours a day", "read, MB/s", "kept, GB a day"]
     return markdown(head, rows)
@@ -72,7 +72,7 @@ def _stream(result: Mapping[str, Any]) -> str:
 def _limits(result: Mapping[str, Any]) -> str:
     rows = []
     for kind, row in result["overhead"].items():
-        most = 1 / row["driver"]
+        most = 1 / max(row["driver"], 1e-5)
         link = GIGABIT / result["bytes"][kind]["read"]
         rows.append([
             kind, f"{1e3 * row['driver']:.2g}", f"{most:,.0f}", f"{most * DAY / 1e6:,.0f} M",
@@ -86,12 +86,14 @@ def _limits(result: Mapping[str, Any]) -> str:
 
 
 def _growth(result: Mapping[str, Any]) -> str:
-    memory, lost = result["memory"], result["death"]["lost_node_seconds"]
-    curve = [mb for _, mb in memory["curve_mb"]]
-    rows = [
-        ["driver's memory", f"{curve[0]:.0f} MB at first, {curve[-1]:.0f} MB after {memory['rows']:,} rows"],
-        ["of it keys of what is done", f"{8 * memory['rows'] / 1e6:.0f} MB a million rows, on every machine"],
-        ["a machine that dies", f"{lost:.1f} node seconds"],
-        ["files of results", f"{DAY // 30:,} a day at most (one in 30 s), or one in 4,096 rows"],
-    ]
+    rows = []
+    if "memory" in result:
+        memory = result["memory"]
+        curve = [mb for _, mb in memory["curve_mb"]]
+        told = f"{curve[0]:.0f} MB at first, {curve[-1]:.0f} MB after {memory['rows']:,} rows"
+        rows += [["driver's memory", told]]
+    rows += [["keys of what is done", "8 MB a million captures, on every machine"]]
+    if "death" in result:
+        rows += [["a machine that dies", f"{result['death']['lost_node_seconds']:.1f} node seconds"]]
+    rows += [["files of results", f"{DAY // 30:,} a day at most (one in 30 s), or one in 4,096 rows"]]
     return markdown(["what", "how much"], rows)

@@ -5,7 +5,7 @@ import pytest
 import yaml
 
 from imgcal.cli.main import main
-from imgcal.fleet import write_manifest
+from imgcal.fleet import Dataset, Engine, write_manifest
 from tests.imgcal.fleet.conftest import engine  # noqa: F401  one Ray for all tests
 from tests.imgcal.fleet.small_captures import write_capture
 
@@ -38,13 +38,33 @@ def test_a_fleet_teaches_its_prior(tmp_path: Path, capsys: pytest.CaptureFixture
     assert main([*capture, "--out", str(tmp_path / "one"), "--no-report"]) == 0
 
 
-def test_hurried_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_hurried_input(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is wrong is said before processes are started, which takes seconds."""
+
+    def start(self: Engine) -> Engine:
+        raise AssertionError("started")
+
+    monkeypatch.setattr(Engine, "__enter__", start)
     (tmp_path / "m.csv").write_text("frames\na\n")
+    (tmp_path / "zero.csv").write_text("")
+    (tmp_path / "header.csv").write_text("capture,rig\n")
+    (tmp_path / "good.csv").write_text("capture\na.csv\n")
+    (tmp_path / "file").write_text("")
     out = ["--out", str(tmp_path / "o")]
     for arguments, expected in (
+        ([str(tmp_path / "m.csv"), *out], "found columns frames; expected capture among them"),
+        ([str(tmp_path / "zero.csv"), *out], "no CSV table"),
+        ([str(tmp_path / "header.csv"), *out], "header.csv: found no rows, expected captures"),
+        ([str(tmp_path / "good.csv"), "--out", str(tmp_path / "file" / "o")], "expected a folder to write to"),
+        ([str(tmp_path / "good.csv"), *out, "--cores", "0"], "--cores: found 0, expected at least 1"),
         ([str(tmp_path / "m.csv"), *out, "--rig", "nothing"], "nothing"),
         ([str(tmp_path / "m.csv"), *out, "--seconds", "0"], "--seconds: found 0"),
         ([str(tmp_path / "none.csv"), *out], "none.csv: cannot be read"),
     ):
         assert main(["fleet", *arguments]) == 2
-        assert expected in capsys.readouterr().err
+        said = capsys.readouterr().err
+        assert expected in said and said.count("\n") == 1
+    assert not (tmp_path / "o").exists()
+    with Dataset(tmp_path / "o").written():
+        assert main(["fleet", str(tmp_path / "good.csv"), *out]) == 2
+    assert "another run is writing to it" in capsys.readouterr().err
