@@ -114,14 +114,24 @@ def picture_message(state: RigState, camera: int, frames: Mapping[str, Frame | N
 
 def small_jpeg(frame: Frame) -> bytes:
     """Shrink a grey image (H, W) of 8 or 16 bit, brighten it so that markers are seen, and compress it."""
-    height, width = frame.shape
-    scale = min(1.0, PICTURE_WIDTH / width)
-    size = (max(round(width * scale), 1), max(round(height * scale), 1))
-    small = cv2.resize(frame, size, interpolation=cv2.INTER_AREA) if scale < 1 else frame
+    small = _shrunk(frame)
     brightest = int(small.max(initial=0))
     depth = 255 if frame.dtype == np.uint8 else next(d for d in DEPTHS if brightest <= d)
-    black = float(np.median(small))
-    white = max(float(np.quantile(small, BRIGHT)), black + depth * LEAST_RANGE)
+    ranks = (small.size // 2, int(BRIGHT * (small.size - 1)))
+    ordered = np.partition(small, ranks, axis=None)
+    black = float(ordered[ranks[0]])
+    white = max(float(ordered[ranks[1]]), black + depth * LEAST_RANGE)
     picture = np.clip((small - np.float32(black)) * (255.0 / (white - black)), 0, 255).astype(np.uint8)
     found, jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     return jpeg.tobytes() if found else b""
+
+
+def _shrunk(frame: Frame) -> Frame:
+    """Average down to the width of a picture: by a whole number first, where there is one: twice as quick."""
+    height, width = frame.shape
+    scale = min(1.0, PICTURE_WIDTH / width)
+    size = (max(round(width * scale), 1), max(round(height * scale), 1))
+    whole = min(width // size[0], height // size[1])
+    if whole > 1 and width % whole == height % whole == 0:
+        frame = cv2.resize(frame, (width // whole, height // whole), interpolation=cv2.INTER_AREA)
+    return frame if scale == 1.0 else cv2.resize(frame, size, interpolation=cv2.INTER_AREA)

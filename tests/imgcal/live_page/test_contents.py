@@ -31,6 +31,21 @@ def test_frames_are_shown_small_with_markers_white_and_noise_black(dtype, top):
     assert opened(small_jpeg(np.full((4, 5), 7, dtype=dtype))).max() < 20  # nothing is to be seen, and nothing fails
 
 
+@pytest.mark.parametrize(("width", "height"), [(2048, 1088), (1923, 1085), (961, 722), (700, 2001), (300, 200)])
+def test_what_a_frame_of_any_size_shows_stays_in_its_place(width, height):
+    frame = np.zeros((height, width), dtype=np.uint8)
+    u, v = round(0.7 * width), round(0.3 * height)
+    frame[v - 6 : v + 7, u - 6 : u + 7] = 255
+    picture = opened(small_jpeg(frame)).astype(np.float64)
+    shown = min(width, PICTURE_WIDTH)
+    assert picture.shape == (round(height * shown / width), shown)
+    picture[picture < 60] = 0.0
+    rows, columns = np.indices(picture.shape)
+    found = [(axis * picture).sum() / picture.sum() for axis in (columns, rows)]
+    scale = shown / width
+    assert found == pytest.approx([(u + 0.5) * scale - 0.5, (v + 0.5) * scale - 0.5], abs=0.6)
+
+
 def test_places_in_a_picture_are_shares_of_the_image(o10, asymmetric8):
     state = made_state(o10, asymmetric8)
     message = picture_message(state, 3, {})
