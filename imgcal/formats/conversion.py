@@ -63,7 +63,8 @@ def with_image_sizes(rig: ForeignRig, where: str, sizes: Mapping[str, tuple[int,
     if missing:
         raise InputError(
             f"{where}: {named(missing)}: the size of the images is not said in the file: state it with --image-size "
-            f"1280x720 for all, or --image-size {missing[0]}=1280x720; in Python load_rig(..., image_size=(1280, 720))"
+            f"1280x720 for all, or --image-size {missing[0]}=1280x720, to imgcal convert; in Python load_rig(..., "
+            "image_size=(1280, 720))"
         )
     return replace(rig, cameras=tuple(cameras))
 

@@ -15,6 +15,7 @@ from imgcal.formats.lens import Lens
 from imgcal.formats.source import Source
 from imgcal.formats.values import array, coefficients, focal_length, image_size, mapping, numbers, text
 from imgcal.io import Flow, yaml_text
+from imgcal.messages import listed
 
 TITLE = "Kalibr camchain"
 CAMERA = re.compile(r"cam(\d+)")
@@ -37,6 +38,9 @@ def _recognizes(source: Source) -> bool:
 
 def _read(source: Source) -> ForeignRig:
     values = source.merged()
+    twice = next((key for key in values if CAMERA.fullmatch(key) and len(_with(source, key)) > 1), None)
+    if twice is not None:
+        raise FormatError(f"{twice} stands in {listed(_with(source, twice))}: give one of these files")
     entries = {key: mapping(values[key], key) for key in values if CAMERA.fullmatch(key)}
     names = sorted(entries, key=lambda name: int(name[3:]))
     lenses = {name: _lens(name, entries[name]) for name in names}
@@ -54,6 +58,11 @@ def _read(source: Source) -> ForeignRig:
         for name in names
     )
     return ForeignRig(FORMAT.name, cameras, "m", f"camera {root}", tuple(notes))
+
+
+def _with(source: Source, key: str) -> list[str]:
+    """Names of the files with a key."""
+    return [document.path.name for document, values in source.mappings if key in values]
 
 
 def _lens(name: str, entry: dict[str, Any]) -> Lens:

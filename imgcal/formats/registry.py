@@ -129,7 +129,16 @@ def _asked_for(source: Source, one: Format) -> Format:
             return one
     except FormatError as error:
         raise InputError(f"{source.where}: {error}") from error
-    raise InputError(f"{source.where}: this is no {one.title}: {_instead(source)}")
+    raise InputError(f"{source.where}: this is no {one.title}: {_other(source) or _instead(source)}")
+
+
+def _other(source: Source) -> str:
+    """Which format it is instead, in words; empty where it is none."""
+    try:
+        found = format_of(source)
+    except InputError:
+        return ""
+    return f"it is a {found.title} ({found.name})"
 
 
 def is_foreign(path: Path) -> bool:

@@ -10,6 +10,7 @@ from imgcal.formats.foreign_rig import ForeignCamera, FormatError, unplaced_came
 from imgcal.formats.lens import Lens
 from imgcal.formats.source import Source
 from imgcal.formats.values import array, camera_matrix, coefficients, image_size, named, numbers, rotation, text
+from imgcal.messages import listed
 
 Table = dict[str, Any]
 
@@ -23,7 +24,12 @@ class Tables:
 
 
 def tables_of(source: Source) -> Tables | None:
-    """Find the tables that are cameras; None where there are none, or they do not come from one file."""
+    """Find the tables that are cameras; None where there are none.
+
+    Raises:
+        FormatError: more than one file has some.
+    """
+    found = []
     for document, values in source.mappings:
         if document.kind != "toml":
             continue
@@ -32,8 +38,10 @@ def tables_of(source: Source) -> Tables | None:
         cameras = {key: value for key, value in group.items() if is_camera(value)}
         if cameras:
             metadata = values.get("metadata")
-            return Tables(cameras, metadata if isinstance(metadata, dict) else {})
-    return None
+            found.append((document.path.name, Tables(cameras, metadata if isinstance(metadata, dict) else {})))
+    if len(found) > 1:
+        raise FormatError(f"{listed(name for name, _ in found)} have cameras in TOML each: give one of these files")
+    return found[0][1] if found else None
 
 
 def has_tables(source: Source) -> bool:
@@ -70,12 +78,16 @@ def cameras_of(tables: Mapping[str, Table], notes: list[str]) -> tuple[ForeignCa
         cameras.append(_camera(name, table))
         if not any(numbers(table["rotation"], name)) and not any(numbers(table["translation"], name)):
             at_origin.append(name)
+    own = len(notes)
     if without_lens:
         notes.append(f"{named(without_lens)}: left out, intrinsics are not calibrated")
     if without_pose:
         notes.append(f"{named(without_pose)}: left out, where they stand is not calibrated")
     if not cameras:
-        raise FormatError("no camera has both intrinsics and a pose: " + "; ".join(notes))
+        raise FormatError(
+            f"no camera has both intrinsics and a pose: {'; '.join(notes[own:])}; imgcal calibrate --cameras finds out "
+            "where they stand"
+        )
     if len(at_origin) > 1:
         raise FormatError(f"{named(at_origin)}: rotation and translation are zero: extrinsics were never calibrated")
     return tuple(cameras)

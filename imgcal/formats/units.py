@@ -57,8 +57,8 @@ def in_millimetres(
     if stated is None and len(rig.cameras) > 1:
         raise InputError(
             f"{where}: its unit of length is not said in the file: state it with --unit mm, cm, m, inch, or the length "
-            "of one unit (--unit 417.2mm), or give a known distance of two cameras (--distance NAME NAME MM); in "
-            'Python load_rig(..., unit="mm")'
+            "of one unit (--unit 417.2mm), or give a known distance of two cameras (--distance NAME NAME MM), to "
+            'imgcal convert; in Python load_rig(..., unit="mm")'
         )
     return rig.scaled(millimetres(stated or "mm"), "mm")
 

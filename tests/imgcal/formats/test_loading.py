@@ -90,6 +90,18 @@ def test_cameras_of_our_own_as_ever(tmp_path: Path) -> None:
     assert load_cameras(pair, image_size=(1280, 960)).num_cameras == 2
 
 
+def test_two_calibrations_in_one_folder_are_not_mixed(tmp_path: Path) -> None:
+    for to, name in (("kalibr", "yaml"), ("pose2sim", "toml")):
+        for number in (1, 2):
+            files = converted(rig_of(brown(-0.1 * number), brown(), names=("cam0", "cam1")), to, "x").files
+            put(tmp_path / to, **{f"calibration{number}__{name}": files[""]})
+        with pytest.raises(InputError, match=rf"calibration1.{name}, calibration2.{name}.*give one of these files"):
+            load_rig(tmp_path / to)
+        assert load_rig(tmp_path / to / f"calibration2.{name}").distortion[0, 0] == -0.2
+    with pytest.raises(InputError, match=r"this is no anipose calibration[.]toml: it is a Kalibr camchain"):
+        load_rig(tmp_path / "kalibr" / "calibration1.yaml", format="anipose")
+
+
 def test_a_lens_that_is_not_ours(tmp_path: Path) -> None:
     cameras = {f"cam{n}": {"camera_model": "omni", "intrinsics": [1, 2, 3, 4, 5]} for n in range(2)}
     with pytest.raises(InputError, match="this is a Kalibr camchain: cam0: an omnidirectional"):
