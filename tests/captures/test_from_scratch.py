@@ -30,8 +30,6 @@ def test_half_of_the_dot_grid_s_views_explain_the_other_half(captures: Path) -> 
     blobs = detect({"cam": [read_frame(file) for file in files]}, DetectionOptions(polarity="dark"))
     even, odd = (blobs.select(blobs.snapshot % 2 == half) for half in (0, 1))
     found = calibrate_from_scratch(even, cameras_of(("cam",), (640, 480), 550.0), grid).rig
-    fx, fy = found.focal_length[0].tolist()
-    assert abs(fx / 540.4 - 1) < 0.01 and abs(fy / 541.9 - 1) < 0.01  # published: a fit of all views
     rms = float(score(odd, found, grid).distances.square().mean().sqrt())
     assert rms < 0.26  # px; OpenCV, fitted to one half: 0.248 on the other
 
