@@ -2,11 +2,9 @@ import json
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from imgcal.cli.main import main
-from imgcal.io import load_detections, save_detections, save_object, save_rig
-from imgcal.synthesis import simulate_truth, true_detections
+from imgcal.io import load_detections, save_detections
 
 
 def score(workplace, source, rig, capsys):
@@ -60,24 +58,3 @@ def test_outliers_are_counted_and_do_not_decide(workplace, tmp_path, capsys):
 def test_frames_are_scored_too(workplace, capsys):
     found = score(workplace, workplace.capture, workplace.capture / "truth" / "rig.yaml", capsys)
     assert found["rms_px"] < 0.05
-
-
-def test_a_rig_of_several_lens_models(o10, asymmetric8, tmp_path, capsys):
-    t4 = o10.select(range(4))
-    lens = torch.nn.functional.pad(t4.distortion, (0, 3))
-    lens[1] = torch.tensor([0.02, -0.01, 0.003, -0.001, 0.0, 0.0, 0.0, 0.0])
-    lens[2, 5:] = torch.tensor([0.05, -0.02, 0.01])
-    models = ("brown_conrady", "equidistant", "rational", "brown_conrady")
-    rig = replace(t4, distortion=lens, lens_model=models)
-    truth = simulate_truth(rig, asymmetric8, 4, torch.Generator().manual_seed(0), None)
-    save_rig(rig, tmp_path / "rig.yaml")
-    save_object(asymmetric8, tmp_path / "object.csv")
-    save_detections(true_detections(truth), tmp_path / "seen.csv")
-    save_rig(t4, tmp_path / "other.yaml")
-    scores = []
-    for name in ("rig.yaml", "other.yaml"):
-        given = ["--rig", str(tmp_path / name), "--object", str(tmp_path / "object.csv")]
-        assert main(["score", str(tmp_path / "seen.csv"), *given]) == 0
-        scores.append(json.loads(capsys.readouterr().out))
-    assert scores[0]["rms_px"] < 1e-6 and scores[0]["snapshots_used"] == 4
-    assert scores[1]["rms_px_with_outliers"] > 1e-2  # the usual lens is another
