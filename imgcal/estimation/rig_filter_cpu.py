@@ -101,8 +101,8 @@ def absorb(
     (count, cameras, _, fiducials), free = uv.shape, unit.shape[1]
     size = len(own)
     wide = cameras * free + size
-    rigs = tuple(_two_rows(part) for part in rig.parts)
-    states = (np.zeros((cameras, free)), *(_two_rows(part) for part in (*poses, own)))
+    rigs = tuple(np.stack((part, part)) for part in rig.parts)
+    states = (np.zeros((cameras, free)), *(np.stack((part, part)) for part in (*poses, own)))
     blocks = (
         np.empty((2, count, cameras, free, free)), np.empty((2, count, 1, 6, wide)), np.empty((2, count, 1, 6, 6)),
         np.empty((2, count, size, wide)), np.empty((2, count, cameras, free)), np.empty((2, count, 1, 6)),
@@ -132,13 +132,6 @@ def absorb(
         from_rig=RigArrays(*(part[last] for part in rigs)),
         from_own=states[3][last],
     )
-
-
-def _two_rows(part: Array) -> Array:
-    """The first row is what is given; the other is written before it is read."""
-    rows = np.empty((2, *part.shape))
-    rows[0] = part
-    return rows
 
 
 @njit(cache=True, fastmath=kernels.FAST)

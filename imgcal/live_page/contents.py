@@ -126,12 +126,13 @@ def small_jpeg(frame: Frame) -> bytes:
     return jpeg.tobytes() if found else b""
 
 
-def _shrunk(frame: Frame) -> Frame:
+def _shrunk(frame: Frame) -> NDArray[Any]:
     """Average down to the width of a picture: by a whole number first, where there is one: twice as quick."""
     height, width = frame.shape
     scale = min(1.0, PICTURE_WIDTH / width)
     size = (max(round(width * scale), 1), max(round(height * scale), 1))
     whole = min(width // size[0], height // size[1])
+    smaller: NDArray[Any] = frame
     if whole > 1 and width % whole == height % whole == 0:
-        frame = cv2.resize(frame, (width // whole, height // whole), interpolation=cv2.INTER_AREA)
-    return frame if scale == 1.0 else cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
+        smaller = cv2.resize(smaller, (width // whole, height // whole), interpolation=cv2.INTER_AREA)
+    return smaller if scale == 1.0 else cv2.resize(smaller, size, interpolation=cv2.INTER_AREA)

@@ -123,7 +123,7 @@ def normalized_errors(options: Options, rate: DriftRate, share: float = 1.0) -> 
     factory, obj = imgcal.load_rig("T4").to(torch.float64), imgcal.load_object("asymmetric8")
     prior = RigPrior(**{name: share * value for name, value in vars(RigPrior()).items()})
     factory = replace(factory, prior=prior)
-    found: dict[str, list[float]] = {"filter": []} | ({"batch": []} if rate == STEADY else {})
+    found: dict[str, list[float]] = {name: [] for name in (("filter", "batch") if rate == STEADY else ("filter",))}
     for run in range(options.runs):
         generator = torch.Generator().manual_seed(1000 + run)
         truth = simulate_truth(factory, obj, options.snapshots, generator, PhysicalDrift())
