@@ -157,6 +157,10 @@ class Absorbed:
     before: RigBelief  # what they were absorbed into
     brought: Brought  # what they say by themselves
 
+    def of_last(self) -> Absorbed:
+        """The same, with pose and residual of the last snapshot alone: (1,) and (1, C, N, 2)."""
+        return replace(self, rig_from_object=self.rig_from_object[-1:], residual=self.residual[-1:])
+
 
 def absorbed(
     belief: RigBelief,
@@ -174,7 +178,11 @@ def absorbed(
 
     Raises:
         RefusedError: the observations do not determine the object's pose, or no minimum was found.
+        ValueError: there are not as many poses as snapshots.
     """
+    if rig_from_object.translation.shape[0] != observations.seen.shape[0]:
+        given = f"{rig_from_object.translation.shape[0]} poses of {observations.seen.shape[0]} snapshots"
+        raise ValueError(f"rig_from_object: found {given}, expected one of each")
     if belief.factor.device.type == "cpu":
         return _absorbed_compiled(belief, observations, rig_from_object, options)
     return absorbed_in_tensors(belief, observations, rig_from_object, options)
@@ -368,8 +376,7 @@ class RigFilter:
         """Absorb the first snapshots anew, all together; `rig_from_object` and `residual` are those of the last one."""
         result = absorbed(self._first, *joined(self._early), self.options)
         self.belief, self._waited = aged(result.belief, self._span, self.rate), 0.0
-        last = replace(result, rig_from_object=result.rig_from_object[-1:], residual=result.residual[-1:])
-        return replace(last, belief=self.belief)
+        return replace(result.of_last(), belief=self.belief)
 
     def restart(self, first: RigBelief, snapshots: Sequence[tuple[Observations, RigidTransform]]) -> Absorbed:
         """Begin anew: with what was believed before some snapshots, and these.

@@ -130,8 +130,8 @@ class RigMonitor:
             moved: cameras that are known to have moved before this snapshot, how far they may.
 
         Returns:
-            What was learnt, and the changes that became known with this snapshot: first that there is one, then, once
-            that is decided, of which kind it is.
+            What was learnt, with the pose and the residual of this snapshot, and the changes that became known with it:
+            first that there is one, then, once that is decided, of which kind it is.
 
         Raises:
             RefusedError: see `absorbed`. What no minimum is found for, but for one camera, is refused once; if the next
@@ -139,7 +139,15 @@ class RigMonitor:
         """
         self.object_change = None
         if moved:
-            return self._moved(moved, observations, rig_from_object, seconds)
+            result, changes = self._moved(moved, observations, rig_from_object, seconds)
+        else:
+            result, changes = self._followed(observations, rig_from_object, seconds)
+        return result.of_last(), changes
+
+    def _followed(
+        self, observations: Observations, rig_from_object: RigidTransform, seconds: float
+    ) -> tuple[Absorbed, tuple[Change, ...]]:
+        """Learn from a snapshot of which nobody knows that something has moved before it."""
         try:
             result = self.filter.follow(observations, rig_from_object, seconds)
         except RefusedError:

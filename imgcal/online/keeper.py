@@ -434,7 +434,6 @@ class RigKeeper:
         result, changes = self._monitor.update(observations, checked.rig_from_object, seconds, moved)
         self._looks += observations.seen[0].any(-1).numpy()
         self._looks[[change.camera for change in changes]] = 0
-        result = replace(result, rig_from_object=result.rig_from_object[-1:], residual=result.residual[-1:])
         self._off, self._learnt, self._in_vain = off, time, 0
         self._times.append((self._monitor.filter.count - 1, time))
         self._labelling.follow(result.rig_from_object[0])

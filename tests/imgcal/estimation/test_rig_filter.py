@@ -145,6 +145,12 @@ def test_a_snapshot_that_says_nothing_of_the_pose_is_refused_and_changes_nothing
     assert worst(follows.belief, batch(made, 2))[0] < 0.05
 
 
+def test_a_snapshot_has_one_pose(made) -> None:
+    factory, obj, truth, observations = made
+    with pytest.raises(ValueError, match="found 2 poses of 1 snapshots"):
+        absorbed(RigBelief.of_prior(factory, obj), part(observations, 0, 1), truth.rig_from_object[:2])
+
+
 def test_a_belief_may_be_moved_as_a_whole(made) -> None:
     factory, obj, _, _ = made
     belief = RigBelief.of_prior(factory, obj)
