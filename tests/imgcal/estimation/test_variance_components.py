@@ -10,7 +10,7 @@ from imgcal.association.series import associate
 from imgcal.errors import RefusedError
 from imgcal.estimation import variance_components
 from imgcal.io import load_object, load_rig
-from imgcal.pipeline import calibrate, calibration, fit_labelled
+from imgcal.pipeline import calibrate, fit_labelled, fitting
 from imgcal.synthesis.captures import simulate_truth, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
 
@@ -82,7 +82,7 @@ def test_a_calibration_reports_the_residuals_of_the_rig_that_it_returns(seed) ->
 def fits_made(monkeypatch) -> list[int]:
     """Number of fits of each calibration from now on, the latest last."""
     counts: list[int] = []
-    estimate_variance_components, fit = calibration.estimate_variance_components, variance_components._fit
+    estimate_variance_components, fit = fitting.estimate_variance_components, variance_components._fit
 
     def counted(*args, **kwargs):
         counts[-1] += 1
@@ -93,7 +93,7 @@ def fits_made(monkeypatch) -> list[int]:
         return estimate_variance_components(*args, **kwargs)
 
     monkeypatch.setattr(variance_components, "_fit", counted)
-    monkeypatch.setattr(calibration, "estimate_variance_components", started)
+    monkeypatch.setattr(fitting, "estimate_variance_components", started)
     return counts
 
 
@@ -125,12 +125,12 @@ def test_ordinary_captures_come_to_rest_in_a_few_fits(o10, asymmetric8, monkeypa
 def test_a_solution_of_another_problem_is_not_returned(o10, asymmetric8, monkeypatch) -> None:
     """The last check projects with the rig that is about to be returned."""
     table, _ = two_captures(o10, asymmetric8)
-    estimate_variance_components = calibration.estimate_variance_components
+    estimate_variance_components = fitting.estimate_variance_components
 
     def prior_scale(*args, **kwargs):
         found = estimate_variance_components(*args, **kwargs)
         return replace(found, problem=replace(found.problem, prior_std=2 * found.problem.prior_std))
 
-    monkeypatch.setattr(calibration, "estimate_variance_components", prior_scale)
+    monkeypatch.setattr(fitting, "estimate_variance_components", prior_scale)
     with pytest.raises(RefusedError, match="do not belong together"):
         calibrate(table, o10, asymmetric8)
