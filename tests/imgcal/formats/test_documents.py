@@ -65,7 +65,7 @@ def test_what_is_meant_badly_ends_in_one_line(content: bytes, said: str) -> None
     started = time.monotonic()
     with pytest.raises(InputError, match=said):
         parse_document(content, HERE)
-    assert time.monotonic() - started < 20  # a machine that is busy with other things
+    assert time.monotonic() - started < 120  # a machine that is busy with other things
 
 
 def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:

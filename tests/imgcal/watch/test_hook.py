@@ -18,7 +18,7 @@ def script(tmp_path, code):
     return f"{sys.executable} -S {path} {tmp_path}/out"
 
 
-def until(condition, seconds=20.0):
+def until(condition, seconds=90.0):
     ends = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < ends
@@ -45,10 +45,10 @@ def test_one_that_hangs_is_killed_with_what_it_started_and_never_waited_for(tmp_
         f"child = subprocess.Popen([{sys.executable!r}, '-S', '-c', 'import time; time.sleep(60)'])\n"
         "open(sys.argv[1], 'a').write(f'{child.pid}\\n'); time.sleep(60)"
     )
-    hook = Hook(script(tmp_path, code), timeout=1.0)
+    hook = Hook(script(tmp_path, code), timeout=4.0)
     started = time.monotonic()
     hook.tell(event())
-    assert time.monotonic() - started < 0.5
+    assert time.monotonic() - started < 3.0
     until(lambda: hook.failed == 1)
     (child,) = (tmp_path / "out").read_text().split()
     until(lambda: not _runs(child))

@@ -105,7 +105,7 @@ def test_incomplete_snapshots_do_not_wait_for_more_to_come():
     with Intake(Given(quiet(), live=True), PAIR, Timing(patience=0.1)) as intake:
         started = time.monotonic()
         assert set(intake.next(5.0).exposures) == {"cam01"}
-        assert 0.05 < time.monotonic() - started < 2.0
+        assert 0.05 < time.monotonic() - started < 4.5
         assert intake.next(0.01) is None and not intake.ended
         go_on.set()
 
