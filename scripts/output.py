@@ -117,6 +117,15 @@ def replaced(page: str, sections: Mapping[str, str], where: Path) -> str:
     return page
 
 
+def fill(page: Path, sections: Mapping[str, str]) -> None:
+    """Put sections between their markers in a page, in one step.
+
+    Raises:
+        InputError: a marker is missing; the page stays as it was.
+    """
+    write_text(page, replaced(page.read_text("utf-8"), sections, page))
+
+
 def command(main: Callable[[], object]) -> None:
     """Run as a command: what cannot be used or decided is one line on standard error, exit code 2 or 3."""
     try:

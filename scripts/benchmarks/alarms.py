@@ -37,10 +37,9 @@ from imgcal.estimation import (
     widened,
 )
 from imgcal.geometry import RigidTransform, rotation_from_vector
-from imgcal.io import write_text
 from imgcal.types import CameraRig, DriftRate, Observations
 from scripts.benchmarks.rig_streams import Bump, Conditions, Stream
-from scripts.output import BLUE, GREEN, GREY, RED, ROOT, command, figure, markdown, replaced, surroundings, write_json
+from scripts.output import BLUE, GREEN, GREY, RED, ROOT, command, figure, fill, markdown, surroundings, write_json
 
 RESULT = ROOT / "docs" / "benchmarks" / "alarms.json"
 PAGE = ROOT / "docs" / "benchmarks.md"
@@ -513,7 +512,7 @@ def main() -> None:
     written = tables(result)
     if options.out == RESULT:
         draw(result, PLOT)
-        write_text(PAGE, replaced(PAGE.read_text("utf-8"), written, PAGE))
+        fill(PAGE, written)
     print("\n\n".join(written.values()))
 
 

@@ -22,9 +22,9 @@ import tyro
 
 from imgcal import Detections, RigidTransform, load_object, load_rig
 from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.io import save_rig, write_text
+from imgcal.io import save_rig
 from scripts.benchmarks.camera_faults import blobs, object_before_a_ring
-from scripts.output import ROOT, command, markdown, replaced, surroundings, write_json
+from scripts.output import ROOT, command, fill, markdown, surroundings, write_json
 
 RESULT = ROOT / "docs" / "benchmarks" / "calibration_speed.json"
 PAGE = ROOT / "docs" / "benchmarks.md"
@@ -179,7 +179,7 @@ def main() -> None:
     if options.out is not None:
         write_json(options.out, result)
     if options.out is not None and options.out.resolve() == RESULT:
-        write_text(PAGE, replaced(PAGE.read_text("utf-8"), {"calibration speed": table(result)}, PAGE))
+        fill(PAGE, {"calibration speed": table(result)})
     print(table(result))
 
 

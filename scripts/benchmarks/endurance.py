@@ -31,12 +31,12 @@ import numpy as np
 import torch
 
 from imgcal.estimation import EstimationOptions, estimate
-from imgcal.io import load_object, load_rig, write_text
+from imgcal.io import load_object, load_rig
 from imgcal.online import RigKeeper  # imported here, for all that are forked
 from imgcal.types import CameraRig, Observations
 from imgcal.watch import STATE, CameraBlobs, Exposure, Intake, Item, Timing, Unreadable, Watch
 from scripts.benchmarks.rig_streams import Bump, Conditions, Stream
-from scripts.output import ROOT, replaced, surroundings, write_json
+from scripts.output import ROOT, fill, surroundings, write_json
 
 RESULT, PAGE = ROOT / "docs" / "benchmarks" / "endurance.json", ROOT / "docs" / "watch.md"
 EPOCH = 1.7e9  # s
@@ -409,7 +409,7 @@ def main() -> None:
     write_json(given.out, {**surroundings(), "command": f"python -m scripts.benchmarks.endurance {words}", **result})
     print(table(result))
     if given.out == RESULT:
-        write_text(PAGE, replaced(PAGE.read_text(), {"endurance": table(result)}, PAGE))
+        fill(PAGE, {"endurance": table(result)})
 
 
 if __name__ == "__main__":

@@ -20,10 +20,10 @@ from scipy import stats
 from torch import Tensor
 
 from imgcal.fleet import KINDS, DriftInformation, outlier_cameras
-from imgcal.io import load_object, load_rig, write_text
+from imgcal.io import load_object, load_rig
 from imgcal.types import RigPrior
 from scripts.benchmarks.fleet_prior import NOISE, SNAPSHOTS, TRUE, recalibrated, simulate
-from scripts.output import ROOT, command, markdown, read_json, replaced, surroundings, write_json
+from scripts.output import ROOT, command, fill, markdown, read_json, surroundings, write_json
 
 RESULT, PAGE = ROOT / "docs" / "benchmarks" / "fleet_bumps.json", ROOT / "docs" / "fleet.md"
 SIZES = (4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 12.0, 15.0)  # standard deviations of what can be seen
@@ -143,7 +143,7 @@ def main() -> None:
     sections = tables(result)
     print("\n\n".join(sections.values()))
     if options.out == RESULT:
-        write_text(options.page, replaced(options.page.read_text("utf-8"), sections, options.page))
+        fill(options.page, sections)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from imgcal.fleet import KINDS, DriftInformation, LearntPrior, learn_prior
 from imgcal.io import load_object, load_rig
 from imgcal.synthesis import PhysicalDrift, synthesize
 from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior
-from scripts.output import ROOT, command, markdown, read_json, replaced, surroundings, write_json
+from scripts.output import ROOT, command, fill, markdown, read_json, surroundings, write_json
 
 RESULT, PAGE = ROOT / "docs" / "benchmarks" / "fleet_prior.json", ROOT / "docs" / "fleet.md"
 TRUE = RigPrior(focal_length=0.004, principal_point=3.0, distortion=0.01, rotation=0.003, position=1.5)
@@ -185,7 +185,7 @@ def main() -> None:
     sections = tables(result)
     print("\n\n".join(sections.values()))
     if options.page.is_file():
-        options.page.write_text(replaced(options.page.read_text("utf-8"), sections, options.page), "utf-8")
+        fill(options.page, sections)
 
 
 if __name__ == "__main__":

@@ -24,11 +24,11 @@ from imgcal.cli.main import main as imgcal_command
 from imgcal.fleet import Dataset, Done, Engine, Item, Manifest, Settings, recalibrate_fleet, write_manifest
 from imgcal.fleet import run as fleet_run
 from imgcal.fleet.job import failed_row, processed
-from imgcal.io import load_object, load_rig, save_detections, write_text
+from imgcal.io import load_object, load_rig, save_detections
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
 from scripts.benchmarks.fleet_plan import PAGE as PLAN
 from scripts.benchmarks.fleet_plan import engine_share, plan_tables
-from scripts.output import ROOT, command, markdown, read_json, replaced, surroundings, write_json
+from scripts.output import ROOT, command, fill, markdown, read_json, surroundings, write_json
 
 RESULT, PAGE = ROOT / "docs" / "benchmarks" / "fleet_speed.json", ROOT / "docs" / "fleet.md"
 DRIFT = PhysicalDrift(0.17, 1.5, 0.004, 3.0, 0.005)
@@ -376,7 +376,7 @@ def main() -> None:
                     write_json(options.out, result)
     if options.out == RESULT:
         for page, sections in ((PAGE, tables(result)), (PLAN, plan_tables(result))):
-            write_text(page, replaced(page.read_text("utf-8"), sections, page))
+            fill(page, sections)
             print("\n\n".join(sections.values()))
 
 

@@ -23,14 +23,14 @@ from imgcal.association import to_observations
 from imgcal.detection import DetectionOptions, detect
 from imgcal.errors import InputError, RefusedError
 from imgcal.geometry import RigidTransform
-from imgcal.io import load_object, object_from_text, open_capture, read_frame, write_text
+from imgcal.io import load_object, object_from_text, open_capture, read_frame
 from imgcal.pipeline import calibrate, calibrate_from_scratch, score
 from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
 from scripts.benchmarks.from_scratch_cases import Case, make_case, point_errors
 from scripts.benchmarks.peer import peer
 from scripts.benchmarks.peers import colmap_from_scratch, opencv_multiview
 from scripts.benchmarks.peers.rig_task import RigAnswer
-from scripts.output import ROOT, command, markdown, read_json, replaced, surroundings, write_json
+from scripts.output import ROOT, command, fill, markdown, read_json, surroundings, write_json
 
 RESULT = ROOT / "docs" / "benchmarks" / "from_scratch.json"
 PAGE = ROOT / "docs" / "benchmarks.md"
@@ -259,7 +259,7 @@ def main() -> None:
         result["captures"] = on_captures(Path(os.environ["IMGCAL_CAPTURES"]))
     write_json(options.out, result | {"seconds": round(time.monotonic() - began)})
     if options.out == RESULT:
-        write_text(PAGE, replaced(PAGE.read_text("utf-8"), {"from scratch": tables(read_json(RESULT))}, PAGE))
+        fill(PAGE, {"from scratch": tables(read_json(RESULT))})
     print(tables(result))
 
 

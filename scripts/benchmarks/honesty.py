@@ -25,10 +25,9 @@ from imgcal.estimation import estimate, relative_difference
 from imgcal.estimation.variance_components import KINDS
 from imgcal.evaluation.true_error import true_error
 from imgcal.fleet import Kept, workers
-from imgcal.io import write_text
 from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
 from scripts.benchmarks.honesty_prediction import Case
-from scripts.output import ROOT, WORK, command, markdown, read_json, replaced, surroundings, write_json
+from scripts.output import ROOT, WORK, command, fill, markdown, read_json, surroundings, write_json
 
 RIGS = {"O10": "asymmetric8", "U7": "asymmetric8", "T4": "asymmetric8", "room10": "wand4"}
 SNAPSHOTS = (1, 5, 20, 100)
@@ -349,7 +348,7 @@ def main() -> None:
     write_json(options.out, result)
     kept.clear()
     if options.out == RESULT:
-        write_text(PAGE, replaced(PAGE.read_text("utf-8"), tables(read_json(RESULT)), PAGE))
+        fill(PAGE, tables(read_json(RESULT)))
     for text in tables(result).values():
         print(text)
 

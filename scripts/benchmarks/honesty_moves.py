@@ -18,11 +18,10 @@ import tyro
 from imgcal import PipelineOptions, RefusedError, calibrate
 from imgcal.association import associate
 from imgcal.fleet import Kept, Mapped, workers
-from imgcal.io import write_text
 from imgcal.pipeline.steadiness import moves_of
 from imgcal.types import Detections, MovedError
 from scripts.benchmarks import camera_faults as faults
-from scripts.output import ROOT, WORK, command, markdown, read_json, replaced, surroundings, write_json
+from scripts.output import ROOT, WORK, command, fill, markdown, read_json, surroundings, write_json
 
 RESULT = ROOT / "docs" / "benchmarks" / "honesty_moves.json"
 PAGE = ROOT / "docs" / "benchmarks.md"
@@ -180,7 +179,7 @@ def main() -> None:
     }
     if options.out == RESULT:
         read_json(RESULT)
-        write_text(PAGE, replaced(PAGE.read_text("utf-8"), tables, PAGE))
+        fill(PAGE, tables)
     print("\n\n".join(tables.values()))
 
 

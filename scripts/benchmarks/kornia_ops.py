@@ -23,11 +23,10 @@ from torch import Tensor
 
 from imgcal import load_object, load_rig
 from imgcal.geometry import project_components, project_kornia, rotation_from_vector, vector_from_rotation
-from imgcal.io import write_text
 from imgcal.networks import find_soft_positions
 from renderers import splat
 from scripts.benchmarks.effort import Effort
-from scripts.output import ROOT, command, markdown, replaced, surroundings, write_json
+from scripts.output import ROOT, command, fill, markdown, surroundings, write_json
 from scripts.timing import side_by_side
 
 RESULT = ROOT / "docs" / "benchmarks" / "kornia_ops.json"
@@ -199,7 +198,7 @@ def main() -> None:
     result = measure(Effort(options.smoke))
     if not options.smoke:
         write_json(RESULT, result)
-        write_text(PAGE, replaced(PAGE.read_text("utf-8"), {"kornia ops": table(result)}, PAGE))
+        fill(PAGE, {"kornia ops": table(result)})
     print(table(result))
 
 

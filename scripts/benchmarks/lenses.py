@@ -18,10 +18,9 @@ from torch import Tensor
 from imgcal import estimate, load_object, load_rig
 from imgcal.estimation import relative_covariance, relative_difference
 from imgcal.geometry import RigidTransform, lens_width, named_lenses, rotation_from_vector
-from imgcal.io import write_text
 from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior
 from scripts.benchmarks.effort import Effort
-from scripts.output import ROOT, command, markdown, replaced, surroundings, write_json
+from scripts.output import ROOT, command, fill, markdown, surroundings, write_json
 
 RESULT = ROOT / "docs" / "benchmarks" / "lenses.json"
 PAGE = ROOT / "docs" / "benchmarks.md"
@@ -135,7 +134,7 @@ def main() -> None:
     result = measure(Effort(options.smoke))
     if not options.smoke:
         write_json(RESULT, result)
-        write_text(PAGE, replaced(PAGE.read_text("utf-8"), {"lenses": table(result)}, PAGE))
+        fill(PAGE, {"lenses": table(result)})
     print(table(result))
 
 

@@ -22,11 +22,10 @@ import tyro
 import imgcal
 from imgcal.estimation import EstimationOptions, RigFilter, camera_covariance, estimate, fit_pose
 from imgcal.geometry import RigidTransform
-from imgcal.io import write_text
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import CameraRig, Detections, DriftRate, Observations, RigPrior
 from scripts.benchmarks.rig_streams import Conditions, Stream
-from scripts.output import ROOT, command, markdown, replaced, surroundings, write_json
+from scripts.output import ROOT, command, fill, markdown, surroundings, write_json
 
 RESULT = ROOT / "docs" / "benchmarks" / "rig_over_time.json"
 PAGE = ROOT / "docs" / "benchmarks.md"
@@ -219,7 +218,7 @@ def main() -> None:
         write_json(options.out, result)
     texts = tables(result)
     if options.out is not None and options.out.resolve() == RESULT:
-        write_text(PAGE, replaced(PAGE.read_text("utf-8"), texts, PAGE))
+        fill(PAGE, texts)
     for text in texts.values():
         print(text, end="\n\n")
 

@@ -23,9 +23,8 @@ from imgcal.association import PipelineOptions
 from imgcal.cli.compare_captures import contender
 from imgcal.detection import DetectionOptions
 from imgcal.evaluation import Contender, Outcome, Scene, compare_detectors, detector_tables
-from imgcal.io import write_text
 from imgcal.synthesis import DIFFICULTIES, FrameModel
-from scripts.output import RESULTS, ROOT, command, read_json, replaced, surroundings, write_json
+from scripts.output import RESULTS, ROOT, command, fill, read_json, surroundings, write_json
 
 TUNING, COMPARISON = "detectors-tuning.json", "detectors.json"
 PAGE = ROOT / "docs" / "results.md"
@@ -172,7 +171,7 @@ def write_page(results: Path) -> None:
         chosen = read_json(results / TUNING)["chosen"]
         variants = ", ".join(f"{difficulty}: {one['variant']}" for difficulty, one in chosen.items())
         texts.append(f"Settings of the tuned classical detector: {variants}.")
-    write_text(PAGE, replaced(PAGE.read_text("utf-8"), {"detectors": "\n\n".join(texts)}, PAGE))
+    fill(PAGE, {"detectors": "\n\n".join(texts)})
 
 
 if __name__ == "__main__":

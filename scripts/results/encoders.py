@@ -44,7 +44,7 @@ from imgcal.refinement import (
 )
 from imgcal.synthesis import LEVELS, Corrupted, ImageOptions, synthesize
 from imgcal.types import CalibrationObject, CameraRig, Prediction, Views
-from scripts.output import RESULTS, command, markdown, read_json, replaced, surroundings, write_json
+from scripts.output import RESULTS, command, fill, markdown, read_json, surroundings, write_json
 
 PAGE = RESULTS.parent / "results.md"
 MARKER = "encoders"
@@ -92,7 +92,7 @@ def main(arguments: list[str]) -> None:
         write_json(path, measured(options))
     text = table(read_json(path))
     print(text)
-    options.page.write_text(replaced(options.page.read_text("utf-8"), {MARKER: text}, options.page), "utf-8")
+    fill(options.page, {MARKER: text})
 
 
 @torch.no_grad()

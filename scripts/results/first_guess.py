@@ -20,11 +20,10 @@ import tyro
 
 from imgcal import PipelineOptions, RefusedError, calibrate, load_object, load_rig
 from imgcal.evaluation import judge
-from imgcal.io import write_text
 from imgcal.pipeline import load_initializer
 from imgcal.synthesis import RelativeDrift, simulate_truth, true_detections
 from imgcal.types import CameraRig, Detections
-from scripts.output import RESULTS, ROOT, command, markdown, read_json, replaced, surroundings, write_json
+from scripts.output import RESULTS, ROOT, command, fill, markdown, read_json, surroundings, write_json
 
 NOISE = 0.05  # px, each axis
 KAPPAS = (0.025, 0.05, 0.1, 0.2)
@@ -63,7 +62,7 @@ def main(arguments: list[str] | None = None) -> None:
     result = surroundings() | {"guess": network.name, "captures": options.captures, "noise_px": NOISE, "rows": rows}
     write_json(options.out, result | {"seconds": round(time.monotonic() - began)})
     if options.out.parent == RESULTS:
-        write_text(PAGE, replaced(PAGE.read_text("utf-8"), {"first guess": table(read_json(options.out))}, PAGE))
+        fill(PAGE, {"first guess": table(read_json(options.out))})
     print(table(result))
 
 

@@ -32,7 +32,7 @@ from imgcal.formats import (
     selected,
 )
 from imgcal.formats.values import rotation_of_vector
-from scripts.output import RESULTS, ROOT, command, markdown, read_json, replaced, surroundings, write_json
+from scripts.output import RESULTS, ROOT, command, fill, markdown, read_json, surroundings, write_json
 from scripts.results.format_readers import READERS
 
 RESULT, PAGE = RESULTS / "formats.json", ROOT / "docs" / "formats.md"
@@ -53,7 +53,7 @@ def main() -> None:
         result["formats"][one.name] = row
         print(one.name, json.dumps(row))
     write_json(RESULT, result)
-    PAGE.write_text(replaced(PAGE.read_text("utf-8"), {"verified": table(read_json(RESULT))}, PAGE), "utf-8")
+    fill(PAGE, {"verified": table(read_json(RESULT))})
 
 
 def reading(one: Format) -> dict[str, Any]:

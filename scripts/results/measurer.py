@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 from torch.utils.flop_counter import FlopCounterMode
 
 from imgcal.detection import Blobs, DetectionOptions, Frame, detect_snapshot
-from imgcal.io import load_object, load_rig, write_text
+from imgcal.io import load_object, load_rig
 from imgcal.networks import Measurer, load_measurer
 from imgcal.networks.measurer import PATCH
 from imgcal.pipeline import LearnedMeasurer
 from imgcal.synthesis import DIFFICULTIES, FrameModel, PhysicalDrift, Shot, simulate_shots, simulate_truth
 from imgcal.types import UNUSABLE, BlobKind
 from renderers import Spots, render_crops
-from scripts.output import markdown, read_json, replaced, surroundings, write_json
+from scripts.output import fill, markdown, read_json, surroundings, write_json
 
 RESULT, PAGE = Path("docs/results/measurer.json"), Path("docs/frames.md")
 SEED = 177  # rules of `LearnedMeasurer` were chosen on seed 77
@@ -264,7 +264,7 @@ def main() -> None:
     arguments = parser.parse_args()
     result = measured(arguments.runs, arguments.snapshots)
     write_json(RESULT, result)
-    write_text(PAGE, replaced(PAGE.read_text("utf-8"), {"measurer": tables(read_json(RESULT))}, PAGE))
+    fill(PAGE, {"measurer": tables(read_json(RESULT))})
 
 
 if __name__ == "__main__":
