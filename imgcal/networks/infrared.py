@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 import torch
 from pydantic import Field
@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from imgcal.io import StrictModel
-from imgcal.networks.infrared_encoders import STRIDE, CnnEncoder, VitEncoder
+from imgcal.networks.infrared_encoders import ENCODERS, STRIDE, EncoderName
 
 GEOMETRY = 6
 """Numbers of relative geometry a fiducial: `Queries.geometry`."""
@@ -28,7 +28,7 @@ GEOMETRY = 6
 class InfraredConfig(StrictModel):
     """Which query network."""
 
-    encoder: Literal["cnn", "vit"] = "cnn"  # family of the encoder
+    encoder: EncoderName = "cnn"  # CNN or ViT, in three sizes; vit-stem: a convolution before the tokens
     crop: Annotated[int, Field(ge=48, le=384, multiple_of=48)] = 96  # pixels, each way
     channels: Annotated[int, Field(ge=1, le=128)] = 16  # of the feature map and of the windows
     window: Annotated[int, Field(ge=4, le=64, multiple_of=2)] = 22  # cells, each way
@@ -75,7 +75,7 @@ class InfraredNetwork(nn.Module):
         super().__init__()
         self.config = config
         width = config.channels
-        self.encoder: nn.Module = CnnEncoder(width) if config.encoder == "cnn" else VitEncoder(width, config.crop)
+        self.encoder = ENCODERS[config.encoder](width, config.crop)
         self.blocks = nn.ModuleList(SetBlock(width, config.keys) for _ in range(config.blocks))
         self.head = nn.Sequential(nn.Conv2d(width, 2 * width, 3, padding=1), nn.GELU(), nn.Conv2d(2 * width, 4, 1))
         self.presence = nn.Sequential(nn.Linear(2 * width + 2, 2 * width), nn.GELU(), nn.Linear(2 * width, 1))

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Literal
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 STRIDE = 2
 """Crop pixels a cell of the feature map, of either encoder."""
+
+EncoderName = Literal["cnn-small", "cnn", "cnn-large", "vit-small", "vit", "vit-large", "vit-stem"]
+"""Encoders that an experiment file can name."""
 
 
 class CnnEncoder(nn.Module):
@@ -48,7 +54,9 @@ class CnnEncoder(nn.Module):
 class VitEncoder(nn.Module):
     """Patches of 6 pixels, blocks of attention over the whole crop, then each token draws its own 3 x 3 cells."""
 
-    def __init__(self, channels: int, size: int, width: int = 80, depth: int = 3, heads: int = 4) -> None:
+    def __init__(
+        self, channels: int, size: int, width: int = 80, depth: int = 3, heads: int = 4, stem: int = 0
+    ) -> None:
         """Make it for crops of one size.
 
         Args:
@@ -57,10 +65,15 @@ class VitEncoder(nn.Module):
             width: of the tokens.
             depth: blocks.
             heads: of the attention.
+            stem: channels of a convolution before the tokens (Xiao et al., Early Convolutions Help Transformers See
+                Better, 2021); 0: patches are embedded as they are.
         """
         super().__init__()
         patch = 3 * STRIDE
-        self.embed = nn.Conv2d(1, width, patch, stride=patch)
+        self.embed: nn.Module = nn.Conv2d(1, width, patch, stride=patch)
+        if stem:
+            fine, tokens = nn.Conv2d(1, stem, 3, stride=2, padding=1), nn.Conv2d(stem, width, 3, stride=3)
+            self.embed = nn.Sequential(fine, nn.GELU(), Residual(stem), tokens)
         self.position = nn.Parameter(0.02 * torch.randn(1, (size // patch) ** 2, width))
         self.blocks = nn.Sequential(*(AttentionBlock(width, heads) for _ in range(depth)))
         self.norm = nn.LayerNorm(width)
@@ -105,6 +118,18 @@ class AttentionBlock(nn.Module):
         weights = (q @ k.mT * q.shape[-1] ** -0.5).softmax(-1)
         x = x + self.from_heads((weights @ v).transpose(1, 2).flatten(2))
         return x + self.mlp(self.norm_mlp(x))
+
+
+ENCODERS: dict[EncoderName, Callable[[int, int], nn.Module]] = {
+    "cnn-small": lambda channels, size: CnnEncoder(channels, (17, 34, 62)),
+    "cnn": lambda channels, size: CnnEncoder(channels),
+    "cnn-large": lambda channels, size: CnnEncoder(channels, (34, 68, 124)),
+    "vit-small": lambda channels, size: VitEncoder(channels, size, width=64, depth=2),
+    "vit": lambda channels, size: VitEncoder(channels, size),
+    "vit-large": lambda channels, size: VitEncoder(channels, size, width=96, depth=4),
+    "vit-stem": lambda channels, size: VitEncoder(channels, size, width=72, stem=16),
+}
+"""Makers by name: channels of the feature map and pixels of the crop in, encoder out; of one size, one cost."""
 
 
 def _twice(x: Tensor) -> Tensor:

@@ -1,12 +1,16 @@
+import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from imgcal.networks.infrared_encoders import STRIDE, CnnEncoder, VitEncoder
+from imgcal.networks.infrared_encoders import ENCODERS, STRIDE, EncoderName, VitEncoder
 
 
-def test_same_stride_parameters_and_operations() -> None:
+@pytest.mark.parametrize(
+    "pair", [("cnn-small", "vit-small"), ("cnn", "vit"), ("cnn-large", "vit-large"), ("cnn", "vit-stem")]
+)
+def test_same_stride_parameters_and_operations(pair: tuple[EncoderName, EncoderName]) -> None:
     sizes, operations = [], []
-    for encoder in (CnnEncoder(16), VitEncoder(16, 96)):
+    for encoder in (ENCODERS[name](16, 96) for name in pair):
         with FlopCounterMode(display=False) as counter:
             assert encoder(torch.zeros(2, 1, 96, 96)).shape == (2, 16, 96 // STRIDE, 96 // STRIDE)
         sizes.append(sum(p.numel() for p in encoder.parameters()))
