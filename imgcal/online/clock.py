@@ -114,39 +114,49 @@ class ClockOffsets:
         self._seconds = self._seconds * keep + self._period
         blobs = state.detections
         rows = np.flatnonzero((blobs.fiducial >= 0) & blobs.usable)
-        camera, fiducial = blobs.camera[rows], blobs.fiducial[rows]
-        residual, motion = blobs.uv[rows] - state.predicted[camera, fiducial], velocity[camera, fiducial]
-        good = (
-            np.isfinite(residual).all(1) & np.isfinite(motion).all(1) & (np.linalg.norm(residual, axis=1) < MOST_PIXELS)
-        )
-        weight = 1 / np.square(blobs.sigma[rows])
-        design = np.zeros((len(rows), 2, 3))
-        design[:, :, 0] = motion
-        design[:, 0, 1] = design[:, 1, 2] = 1.0
-        for c in np.unique(camera[good]):
-            pick = good & (camera == c)
-            part, w = design[pick], weight[pick]
-            if self._is_other(c, part, residual[pick], float(np.median(blobs.sigma[rows[pick]]))):
-                continue
-            self._normal[c] += np.einsum("nij,nik,n->jk", part, part, w)
-            self._right[c] += np.einsum("nij,ni,n->j", part, residual[pick], w)
+        at = blobs.camera[rows], blobs.fiducial[rows]
+        residual, sigma = np.full(velocity.shape, np.nan), np.full(velocity.shape[:2], np.nan)
+        residual[at] = blobs.uv[rows] - state.predicted[at]
+        sigma[at] = blobs.sigma[rows]
+        with np.errstate(invalid="ignore"):
+            good = np.isfinite(velocity).all(-1) & (np.linalg.norm(residual, axis=-1) < MOST_PIXELS)
+        good &= ~self._others(velocity, residual, sigma, good)[:, None]
+        weight = np.where(good, 1 / np.square(sigma), 0.0)
+        motion, residual = np.where(good[..., None], velocity, 0.0), np.where(good[..., None], residual, 0.0)
+        total, shift = weight.sum(1), np.einsum("cn,cni->ci", weight, motion)
+        self._normal[:, 0, 0] += np.einsum("cn,cni,cni->c", weight, motion, motion)
+        self._normal[:, 0, 1:] += shift
+        self._normal[:, 1:, 0] += shift
+        self._normal[:, [1, 2], [1, 2]] += total[:, None]
+        self._right[:, 0] += np.einsum("cn,cni,cni->c", weight, motion, residual)
+        self._right[:, 1:] += np.einsum("cn,cni->ci", weight, residual)
 
-    def _is_other(self, camera: int, design: NDArray[np.float64], residual: NDArray[np.float64], sigma: float) -> bool:
-        """Tell whether a camera no longer does what it did, bumped, or its clock slipped; begin anew where it stays so.
+    def _others(
+        self,
+        velocity: NDArray[np.float64],
+        residual: NDArray[np.float64],
+        sigma: NDArray[np.float64],
+        good: NDArray[np.bool_],
+    ) -> NDArray[np.bool_]:
+        """Tell which cameras no longer do what they did, bumped, or their clock slipped; begin anew those that stay so.
 
         The first such snapshots are left out: together with what was before they would be explained by any time.
         """
-        known = self._normal[camera]
-        scale = np.sqrt(np.maximum(np.diag(known), 1e-30))
-        if np.linalg.det(known / (scale[:, None] * scale)) <= LEAST_DETERMINED:
-            return False
-        off = np.median(residual - design @ np.linalg.solve(known, self._right[camera]), axis=0)
-        other = float(np.linalg.norm(off)) > max(STEP, 6 * sigma / math.sqrt(len(residual)))
-        self._other[camera] = self._other[camera] + 1 if other else 0
-        if self._other[camera] < STEPS:
-            return other
-        self._normal[camera], self._right[camera], self._other[camera] = 0.0, 0.0, 0
-        return False
+        scale = np.sqrt(np.maximum(np.diagonal(self._normal, axis1=1, axis2=2), 1e-30))
+        scaled = self._normal / (scale[:, :, None] * scale[:, None])
+        known = good.any(1) & (np.linalg.det(scaled) > LEAST_DETERMINED)
+        solved = np.linalg.solve(np.where(known[:, None, None], scaled, np.eye(3)), (self._right / scale)[..., None])
+        explained = solved[..., 0] / scale  # (C, 3): seconds and a shift
+        off = residual - velocity * explained[:, None, :1] - explained[:, None, 1:]
+        count = np.maximum(good.sum(1), 1)
+        middle = _middle(np.where(good[..., None], off, np.inf), count)
+        usual = _middle(np.where(good, sigma, np.inf)[..., None], count)[:, 0]
+        with np.errstate(invalid="ignore"):
+            other = known & (np.linalg.norm(middle, axis=1) > np.maximum(STEP, 6 * usual / np.sqrt(count)))
+        self._other = np.where(other, self._other + 1, np.where(known, 0, self._other))
+        anew = self._other >= STEPS
+        self._normal[anew], self._right[anew], self._other[anew] = 0.0, 0.0, 0
+        return other & ~anew
 
     def _event(self, state: RigState, camera: int, offset: float, sigma: float) -> Event:
         name = state.factory.camera_names[camera]
@@ -168,3 +178,9 @@ class ClockOffsets:
         if told.shape != self._told.shape or not np.isfinite(told).all():
             raise ValueError(f"{self.name}: expected seconds of {len(self._told)} cameras")
         self._told = told
+
+
+def _middle(values: NDArray[np.float64], count: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Median of the first `count` (C,) of values (C, N, D) when they are sorted: (C, D)."""
+    ordered, rows = np.sort(values, axis=1), np.arange(len(values))
+    return (ordered[rows, (count - 1) // 2] + ordered[rows, count // 2]) / 2
