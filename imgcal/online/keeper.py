@@ -392,10 +392,14 @@ class RigKeeper:
 
     def _known(self) -> tuple[CameraRig, Tensor] | None:
         """The rig, and with some reserve how well it is known; None = nothing but the factory calibration."""
+        there = self._surroundings()
+        return None if there is None else (there.rig, there.std)
+
+    def _surroundings(self) -> Surroundings | None:
         if not self._monitor.filter.count:
             return None
         prior = (self._prior.prior or RigPrior()).std(self._prior)
-        return self.belief.rig, torch.minimum(2 * self.belief.std(), prior)
+        return Surroundings(self.belief, prior, self._object, self.options)
 
     def _predicted(self, pose: RigidTransform | None) -> NDArray[np.float64]:
         """Where the rig puts the fiducials: (C, N, 2) pixels."""
@@ -407,10 +411,9 @@ class RigKeeper:
 
     def _searched(self, checked: Checked) -> _Labelled:
         """Look for the object in cameras that do not see it where it should be."""
-        known = self._known()
-        if known is None:
+        there = self._surroundings()
+        if there is None:
             return _Labelled(checked, frozenset())
-        there = Surroundings(*known, self._object, self.options)
         doubted = self._sightings.doubted | self._sightings.lost.keys()
         return _Labelled(*self._search.take(checked, there, self._time, self._count - 1, doubted))
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.association import PipelineOptions
+from imgcal.estimation import RigBelief
 from imgcal.geometry import RigidTransform
 from imgcal.online.following import LEAST_BLOBS, LEAST_EXPLAINED, astray, found_again, spare_blobs
 from imgcal.online.label_checks import Checked
@@ -41,10 +43,20 @@ USUAL_OF = 15
 class Surroundings:
     """What is known where a camera is looked for."""
 
-    rig: CameraRig
-    std: Tensor  # (C, 15), with some reserve
+    belief: RigBelief
+    widest: Tensor  # (C, K) standard deviations that are not exceeded: the factory calibration's
     obj: CalibrationObject  # as it is known
     options: PipelineOptions
+
+    @property
+    def rig(self) -> CameraRig:
+        """The rig as it is known."""
+        return self.belief.rig
+
+    @cached_property
+    def std(self) -> Tensor:
+        """How well the rig is known, with some reserve: (C, K). Dear, and asked for only where a camera is searched."""
+        return torch.minimum(2 * self.belief.std(), self.widest)
 
 
 @dataclass

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from imgcal.association.options import PipelineOptions
+from imgcal.estimation import RigBelief
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.online import search
 from imgcal.online.label_checks import Checked
@@ -40,7 +41,7 @@ def tries(monkeypatch):
 
 def known(stream: Stream) -> Surroundings:
     std = 0.1 * stream.rig.prior.std(stream.rig)
-    return Surroundings(stream.true, std, stream.obj, PipelineOptions())
+    return Surroundings(RigBelief.of_prior(stream.true, stream.obj, std), std, stream.obj, PipelineOptions())
 
 
 def seen(stream: Stream, own: np.ndarray | None, fiducial: int = -1) -> Checked:
