@@ -1,11 +1,15 @@
+from pathlib import Path
+
 import numpy as np
 import torch
 
 import imgcal
 from imgcal.association import Snapshot
 from imgcal.geometry import RigidTransform, geodesic_angle
+from imgcal.networks import InfraredConfig, InfraredNetwork, drawing_from
 from imgcal.synthesis import simulate_truth, true_detections
 from imgcal.types import Detections, RigPrior
+from scripts.results import infrared_families
 from scripts.results.infrared import Case, Tally, tables
 
 
@@ -58,3 +62,30 @@ def test_tables_show_every_method_where_it_was_asked() -> None:
     assert "| net | 2 | 1 | 0 |" in made["infrared lost"]
     assert "0.20 / 1.10" in made["infrared accuracy"]
     assert "T4, cube8, clean" in made["infrared others"]
+
+
+def test_families_stand_with_their_spread_over_seeds(tmp_path: Path) -> None:
+    seeds = {
+        str(k): {"right": right, "wrong": 0.04, "nees": 1.0, "missed": 1.04 - right, "curve": [[0, 0.9], [1200, 0.3]]}
+        for k, right in enumerate((0.7, 0.8))
+    }
+    frames = {str(k): {"right_percent": 90.0 + 2 * k, "wrong_percent": 1.0} for k in range(2)}
+    result = {
+        "encoders": {name: {"parameters": 250_000, "flops": 178e6, "seeds": seeds} for name in ("cnn", "vit")},
+        "frames": {level: {"cnn": frames, "vit": frames} for level in ("clean", "combined")},
+    }
+    made = infrared_families.tables(result)
+    assert "| vit | 250 k | 178 M | 2 | 75.0 ± 7.1 | 4.0 ± 0.0 | 1.00 ± 0.00 |" in made["infrared families"]
+    assert "| combined | 91.0 ± 1.4 / 1.0 ± 0.0 |" in made["infrared families frames"]
+    infrared_families.draw(result, tmp_path / "families.png")
+    assert (tmp_path / "families.png").stat().st_size < 100_000
+
+
+def test_networks_are_compared_on_the_same_crops(tmp_path: Path) -> None:
+    with drawing_from(torch.Generator().manual_seed(0)):
+        network = InfraredNetwork(InfraredConfig(encoder="vit-small", channels=4, blocks=1)).eval()
+    once, again = (infrared_families.on_crops(network, 24) for _ in range(2))
+    assert once == again
+    assert 0 <= once["right"] <= 1
+    (tmp_path / "metrics.jsonl").write_text('{"step": 10, "validation_missed": 0.5}\n{"step": 11, "loss": 1.0}\n')
+    assert infrared_families.curve(tmp_path) == [(120, 0.5)]
