@@ -1,6 +1,6 @@
 """Can the alarms be trusted? Steady and drifting rigs without end, and rigs of which cameras are bumped.
 
-Work is cut into items, each with its own seed, which several processes take; what is done is kept in a file, a line an
+Work is cut into items, each with its own seed, which cores or a cluster take; what is done is kept in a file, a line an
 item, so that a run can be stopped and gone on with. `monitor` items feed labelled fiducials to `RigMonitor`, `keeper`
 items unlabelled blobs among false ones to `RigKeeper`.
 """
@@ -11,9 +11,8 @@ import json
 import math
 import sys
 import time
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +35,7 @@ from imgcal.estimation import (
     spread_of,
     widened,
 )
+from imgcal.fleet import Mapped, workers
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.types import CameraRig, DriftRate, Observations
 from scripts.benchmarks.rig_streams import Bump, Conditions, Stream
@@ -350,29 +350,18 @@ def done(path: Path) -> list[dict[str, Any]]:
     return list({entry["key"]: entry for entry in entries}.values())
 
 
-def go_on(path: Path, share: float, processes: int, minutes: float) -> None:
+def go_on(path: Path, share: float, minutes: float, mapped: Mapped = map) -> None:
     """Run what is not done yet."""
     known = {entry["key"] for entry in done(path)}
     left = [item for item in items(share) if item.key not in known]
     path.parent.mkdir(parents=True, exist_ok=True)
     until = time.monotonic() + 60 * minutes
-    with path.open("a", encoding="utf-8") as out, ProcessPoolExecutor(processes) as pool:
-        for found in _until(pool, left, until, processes):
+    in_time = takewhile(lambda item: time.monotonic() < until, left)
+    with path.open("a", encoding="utf-8") as out:
+        for found in mapped(run, in_time):
             out.write(json.dumps(found) + "\n")
             out.flush()
             print(found["key"], found["cpu_s"], "s", file=sys.stderr, flush=True)
-
-
-def _until(pool: ProcessPoolExecutor, left: list[Item], until: float, processes: int) -> Iterator[dict[str, Any]]:
-    running = []
-    for item in left:
-        running.append(pool.submit(run, item))
-        if len(running) > processes:
-            yield running.pop(0).result()
-        if time.monotonic() > until:
-            break
-    for future in running:
-        yield future.result()
 
 
 def summarized(entries: list[dict[str, Any]]) -> dict[str, Any]:
@@ -492,7 +481,8 @@ class Options:
 
     minutes: float = 60.0
     """Begin no item later than this; the next run goes on."""
-    processes: int = 1
+    address: str | None = None  #: running Ray cluster that does the items; none = this machine
+    cores: int | None = 1  #: of this machine; 1 = this process alone; none = all
     share: float = 1.0
     """Of the items of each experiment."""
     items: Path = ITEMS  #: a line for each that is done
@@ -502,7 +492,8 @@ class Options:
 def main() -> None:
     """Run, count, write, print."""
     options = tyro.cli(Options, description=__doc__)
-    go_on(options.items, options.share, options.processes, options.minutes)
+    with workers(options.address, options.cores) as mapped:
+        go_on(options.items, options.share, options.minutes, mapped)
     result: dict[str, Any] = {
         **surroundings(),
         "noise_px": Conditions().noise,
