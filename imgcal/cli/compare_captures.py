@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,13 +16,17 @@ from rich.console import Console
 
 from imgcal.cli.common import check_folder, counted, open_rig
 from imgcal.errors import InputError
-from imgcal.io import load_object, nearest, publishing, write_text
+from imgcal.fleet import Kept
+from imgcal.io import load_object, nearest, object_text, publishing, rig_text, write_text
 
 if TYPE_CHECKING:
     from imgcal.evaluation import Contender, Scene
+    from imgcal.fleet import Mapped
 
 RESULT, TABLES = "captures.json", "captures.md"
-LIMITS = {"captures": 100_000, "snapshots": 1000, "processes": 256}
+WORK = ".work"
+"""Folder beside results of what has been done, until all is."""
+LIMITS = {"captures": 100_000, "snapshots": 1000}
 SHIPPED_NETWORKS = ("learned", "both")
 """Detectors by name that are one training of a network."""
 SEED = re.compile(r"(.+)-seed(\d+)")
@@ -33,7 +39,6 @@ class Captures:
     captures: int = 0  #: so many a difficulty: compare detectors on captured frames instead of networks on points
     difficulty: tuple[str, ...] = ()  #: names as of `imgcal simulate --difficulty`; default: all
     snapshots: int = 4  #: of a capture
-    processes: int = 1  #: captures at the same time
 
     def check(self) -> None:
         """Raise InputError where a number is out of its limits, or a difficulty is not known."""
@@ -49,9 +54,24 @@ class Captures:
 
 
 def compare_captures(
-    detectors: Sequence[Path], chosen: Captures, rig: str, obj: str, seed: int, out: Path | None
+    detectors: Sequence[Path],
+    chosen: Captures,
+    rig: str,
+    obj: str,
+    seed: int,
+    out: Path | None,
+    workers: Callable[[int, Kept | None], AbstractContextManager[Mapped]],
 ) -> None:
     """Calibrate simulated captures with each detector; print tables, and write them where `out` says.
+
+    Args:
+        detectors: names, files, or folders of training runs.
+        chosen: what captures are simulated.
+        rig: file or name.
+        obj: file or name.
+        seed: the same seed gives the same captures.
+        out: folder to write; None = nothing is written.
+        workers: opens those who calibrate so many captures, and who keep what is done.
 
     Raises:
         InputError: a detector or a difficulty that there is not.
@@ -65,10 +85,11 @@ def compare_captures(
     names = chosen.difficulty or tuple(DIFFICULTIES)
     models = {name: FrameModel(difficulty=DIFFICULTIES[name]) for name in names}
     scene = Scene(open_rig(rig), load_object(obj), models, chosen.snapshots)
-    with counted("calibrating captures", len(models) * chosen.captures) as advance:
-        outcomes = compare_detectors(
-            [contender(path) for path in detectors], scene, chosen.captures, seed, chosen.processes, advance
-        )
+    contenders = [contender(path) for path in detectors]
+    total = len(models) * chosen.captures
+    kept = None if out is None else Kept(out / WORK, _scope(contenders, scene))
+    with workers(total, kept) as mapped, counted("calibrating captures", total) as advance:
+        outcomes = compare_detectors(contenders, scene, chosen.captures, seed, advance, mapped)
     tables = detector_tables(outcomes)
     text = f"{describe(scene, chosen.captures, seed)}\n\n" + "\n".join(table.markdown() for table in tables)
     if sys.stdout.isatty():
@@ -82,6 +103,18 @@ def compare_captures(
             write_text(folder / RESULT, json.dumps(values, indent=1, allow_nan=False) + "\n")
             write_text(folder / TABLES, text)
         print(f"wrote {out / RESULT}\nwrote {out / TABLES}", file=sys.stderr)
+    if kept is not None:
+        kept.clear()
+
+
+def _scope(contenders: Sequence[Contender], scene: Scene) -> str:
+    """What outcomes depend on beside captures: rig, object, difficulties, detectors, and what their files hold."""
+    said = [rig_text(scene.rig), object_text(scene.obj), scene.models, scene.snapshots, scene.drift, scene.pose_range]
+    for one in contenders:
+        path = Path(str(one.detector))
+        files = [file for file in (path, path / "model.safetensors") if file.is_file()]
+        said += [one, *(hashlib.sha256(file.read_bytes()).hexdigest() for file in files)]
+    return repr(said)
 
 
 def contender(path: Path) -> Contender:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -14,7 +15,7 @@ import tyro
 from rich.console import Console
 
 from imgcal.cli.common import check_folder, counted, open_rig
-from imgcal.cli.compare_captures import Captures, compare_captures
+from imgcal.cli.compare_captures import WORK, Captures, compare_captures
 from imgcal.errors import InputError
 from imgcal.extras import advice, missing
 from imgcal.fleet import Kept, workers
@@ -30,9 +31,7 @@ Axis = Literal["kappa", "phi", "noise", "missing", "swapped", "false"]
 CHECKED_RIGS = 32
 """On which encoders are checked."""
 FEW = 8
-"""Batches that are done before Ray has started."""
-WORK = ".work"
-"""Folder beside results of what has been done, until all is."""
+"""Batches, or captures, that are done before Ray has started."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +111,8 @@ class Compare:
         """Compare, print and write."""
         if self.captured.captures:
             rig, obj = self.setting.rig or "O10", self.setting.object or "asymmetric8"
-            compare_captures(self.models, self.captured, rig, obj, self.setting.seed, self.out)
+            who = partial(_workers, self.setting)
+            compare_captures(self.models, self.captured, rig, obj, self.setting.seed, self.out, who)
             return
         from imgcal.pipeline import DETECTORS
 
@@ -140,7 +140,7 @@ def _run(paths: tuple[Path, ...], setting: Setting, baselines: bool, out: Path |
     conditions = _conditions(models, setting)
     methods = {model.name: model.method for model in models} | (BASELINES if baselines else QUICK_BASELINES)
     kept = None if out is None else Kept(out / WORK, _scope(models))
-    with _workers(setting, models, protocol, kept) as mapped:
+    with _workers(setting, protocol.batches, kept, models) as mapped:
         summary = _measure(methods, conditions, protocol, setting, mapped)
     summary = replace(summary, facts={model.name: _checked(model, conditions, setting) for model in models})
     _print(summary)
@@ -159,7 +159,7 @@ def _scope(models: list[Model]) -> str:
 
 
 @contextmanager
-def _workers(setting: Setting, models: list[Model], protocol: Protocol, kept: Kept | None) -> Iterator[Mapped]:
+def _workers(setting: Setting, batches: int, kept: Kept | None, models: Sequence[Model] = ()) -> Iterator[Mapped]:
     """Processes for what is long enough to be worth their start; on a GPU this one alone."""
     cores = setting.cores
     if any(parameter.is_cuda for model in models for parameter in model.checkpoint.network.parameters()):
@@ -167,8 +167,8 @@ def _workers(setting: Setting, models: list[Model], protocol: Protocol, kept: Ke
             raise InputError("--address, --cores: found a GPU, on which one process does it all; expected --device cpu")
         yield map
         return
-    if setting.address is None and cores is None and (protocol.batches < FEW or missing("ray")):
-        if protocol.batches >= FEW:
+    if setting.address is None and cores is None and (batches < FEW or missing("ray")):
+        if batches >= FEW:
             print(f"note: on one core alone: --cores {advice('ray')}", file=sys.stderr)
         cores = 1
     with workers(setting.address, cores, kept) as mapped:

@@ -6,12 +6,9 @@ Every detector gets the same frames, the whole pipeline behind it, and no knowle
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from functools import partial
-from itertools import repeat
-from multiprocessing import get_context
 from typing import Any, Literal
 
 import numpy as np
@@ -87,8 +84,8 @@ def compare_detectors(
     scene: Scene,
     count: int,
     seed: int = 0,
-    processes: int = 1,
     progress: Callable[[int], None] = lambda captures: None,
+    mapped: Callable[..., Iterable[list[dict[str, Any]]]] = map,
 ) -> tuple[Outcome, ...]:
     """Calibrate simulated captures with every detector.
 
@@ -97,13 +94,14 @@ def compare_detectors(
         scene: what captures are drawn from; all its difficulties are tried.
         count: captures a difficulty.
         seed: the same seed gives the same captures, whoever takes part.
-        processes: captures at the same time; each takes one thread.
         progress: called with the number of captures that have been done.
+        mapped: called as `map` is, gives results in the order of captures, which depend on nobody: the numbers are the
+            same, whoever measures (`imgcal.fleet.workers`).
     """
     cases = [(difficulty, seed * 100_000 + number) for difficulty in scene.models for number in range(count)]
     found: list[Outcome] = []
-    for outcomes in _mapped(partial(_of_capture, tuple(contenders), scene), cases, processes):
-        found += outcomes
+    for outcomes in mapped(partial(_of_capture, tuple(contenders), scene), cases):
+        found += [Outcome(**one) for one in outcomes]
         progress(1)
     return tuple(found)
 
@@ -136,11 +134,12 @@ def draw_capture(scene: Scene, difficulty: str, seed: int) -> tuple[Truth, dict[
     return truth, {name: [frames[name] for frames in snapshots] for name in scene.rig.camera_names}
 
 
-def _of_capture(contenders: Sequence[Contender], scene: Scene, case: tuple[str, int]) -> list[Outcome]:
+def _of_capture(contenders: Sequence[Contender], scene: Scene, case: tuple[str, int]) -> list[dict[str, Any]]:
+    """Plain values of outcomes, which can be kept in a file."""
     difficulty, seed = case
     truth, frames = draw_capture(scene, difficulty, seed)
     ours = [contender for contender in contenders if not contender.only or difficulty in contender.only]
-    return [_of_contender(contender, scene, truth, frames, case) for contender in ours]
+    return [asdict(_of_contender(contender, scene, truth, frames, case)) for contender in ours]
 
 
 def _of_contender(
@@ -186,19 +185,3 @@ def _labels(result: Calibration, truth: Truth) -> tuple[int, int]:
     numbers = [int(name) for name in np.asarray(result.labelled.detections.snapshot_names)[list(result.labelled.used)]]
     off = (observations.uv - truth.uv[numbers].to(observations.uv)).norm(dim=-1).numpy()
     return int(seen.sum()), int((seen & (off < RIGHT_LABEL_PX)).sum())
-
-
-def _mapped(
-    function: Callable[[tuple[str, int]], list[Outcome]], cases: Sequence[tuple[str, int]], processes: int
-) -> Iterator[list[Outcome]]:
-    """Apply a function to all cases, in their order."""
-    if processes == 1:
-        yield from map(function, cases)
-        return
-    # A process that was forked would inherit the threads of torch, and may wait for them for ever.
-    with ProcessPoolExecutor(processes, get_context("spawn"), torch.set_num_threads, (1,)) as pool:
-        yield from pool.map(_called, repeat(function), cases)
-
-
-def _called(function: Callable[[tuple[str, int]], list[Outcome]], case: tuple[str, int]) -> list[Outcome]:
-    return function(case)

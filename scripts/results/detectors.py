@@ -23,6 +23,7 @@ from imgcal.association import PipelineOptions
 from imgcal.cli.compare_captures import contender
 from imgcal.detection import DetectionOptions
 from imgcal.evaluation import Contender, Outcome, Scene, compare_detectors, detector_tables
+from imgcal.fleet import workers
 from imgcal.synthesis import DIFFICULTIES, FrameModel
 from scripts.output import RESULTS, ROOT, command, fill, read_json, surroundings, write_json
 
@@ -61,7 +62,8 @@ class Options:
     difficulty: tuple[str, ...] = tuple(DIFFICULTIES)
     rig: str = "O10"
     object: str = "asymmetric8"
-    processes: int = 2
+    address: str | None = None  #: running Ray cluster that does the captures; none = this machine
+    cores: int | None = None  #: of this machine; 1 = this process alone; none = all
     classical: bool = True  #: measure the classical ones, too
     results: Path = RESULTS
 
@@ -147,7 +149,8 @@ def _measured(contenders: Sequence[Contender], scene: Scene, options: Options, s
         done[0] += count
         print(f"{done[0]} of {total} captures, {time.monotonic() - began:.0f} s", file=sys.stderr, flush=True)
 
-    return compare_detectors(contenders, scene, options.captures, seed, options.processes, show)
+    with workers(options.address, options.cores) as mapped:
+        return compare_detectors(contenders, scene, options.captures, seed, show, mapped)
 
 
 def _order(outcome: Outcome) -> tuple[int, int]:

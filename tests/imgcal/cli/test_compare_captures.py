@@ -7,6 +7,7 @@ import pytest
 
 from imgcal.cli.compare_captures import contender
 from imgcal.cli.main import main
+from imgcal.evaluation import detectors
 
 
 def test_detectors_are_compared_on_captures(tmp_path, capsys):
@@ -22,12 +23,31 @@ def test_detectors_are_compared_on_captures(tmp_path, capsys):
     assert "| classical |     – | 100 / 0 / 0 |" in printed and (out / "captures.md").read_text() == printed
 
 
+def test_captures_that_are_done_are_not_done_again(tmp_path, capsys, monkeypatch):
+    out, judged = tmp_path / "result", []
+    scene = ["--rig", "T4", "--difficulty", "clean", "--snapshots", "1", "--captures", "2", "--cores", "1"]
+    real = detectors.judge
+
+    def judge(*given):
+        judged.append(given[-1])
+        if len(judged) == 2:
+            raise KeyboardInterrupt
+        return real(*given)
+
+    monkeypatch.setattr(detectors, "judge", judge)
+    assert main(["compare", "classical", *scene, "--out", str(out)]) == 130
+    assert main(["compare", "classical", *scene, "--out", str(out)]) == 0
+    assert judged == [0, 1, 1]
+    assert [one["capture"] for one in json.loads((out / "captures.json").read_text())["outcomes"]] == [0, 1]
+    assert not (out / ".work").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
         (["--captures", "1", "--difficulty", "cleen"], "--difficulty: found 'cleen', expected some of clean, "),
         (["--captures", "-1"], "--captures: found -1, expected 1 to 100000"),
-        (["--captures", "1", "--processes", "0"], "--processes: found 0"),
+        (["--captures", "1", "--cores", "0"], "--cores: found 0"),
         (["--captures", "1", "--rig", "none.yaml"], "none.yaml"),
         (["matched"], "found classical, which is a detector, expected networks; detectors are compared on captured"),
     ],
