@@ -156,8 +156,11 @@ def _take_over(path: str | Path, network: nn.Module) -> tuple[str, ...]:
     """Do the work of `warm_start` for one file."""
     path = model_file(path)
     tensors, texts = read_tensors(path, FORMAT)
+    spec, _ = _read_records(path, texts)
     own = dict(network.named_parameters())
     fitting = [name for name in own if name in tensors and tensors[name].shape == own[name].shape]
+    if (spec.model_extra or {}).get("task") == "positions":
+        fitting = [name for name in fitting if name.startswith("positions.")]  # the rest has learnt nothing
     if not fitting:
         raise InputError(f"{path}: found no parameter that fits the network by name and shape, expected some")
     with torch.no_grad():
@@ -165,7 +168,6 @@ def _take_over(path: str | Path, network: nn.Module) -> tuple[str, ...]:
             own[name].copy_(tensors[name])
     trunk = getattr(network, "trunk", None)
     if isinstance(trunk, IterativeRefiner) and any(name.startswith("trunk.") for name in fitting):
-        spec, _ = _read_records(path, texts)
         trunk.rescale(spec.drift.std(_from_texts(path, texts)[0]))
     return tuple(name for name in own if name not in fitting)
 

@@ -47,9 +47,13 @@ def test_a_training_makes_a_file_that_image_networks_start_from(tmp_path):
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.zero_()
-    assert warm_start(tmp_path / "a.safetensors", network) == ()
+    left = warm_start(tmp_path / "a.safetensors", network)
     for one, other in zip(network.positions.parameters(), run.average.parameters(), strict=True):
         assert torch.equal(one, other)
+    # Its trunk has learnt nothing, and replaces none that has.
+    trunk = {name: parameter for name, parameter in network.named_parameters() if not name.startswith("positions.")}
+    assert set(left) == set(trunk)
+    assert all(not bool(parameter.any()) for parameter in trunk.values())
 
 
 def test_only_networks_with_a_locator_learn_positions():
