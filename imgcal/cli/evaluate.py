@@ -24,6 +24,7 @@ from imgcal.io import load_object, publishing
 if TYPE_CHECKING:
     from imgcal.evaluation import Conditions, Facts, Method, Model, Protocol, Summary
     from imgcal.fleet import Mapped
+    from imgcal.types import CameraRig
 
 Axis = Literal["kappa", "phi", "noise", "missing", "swapped", "false"]
 
@@ -138,7 +139,8 @@ def _run(paths: tuple[Path, ...], setting: Setting, baselines: bool, out: Path |
     protocol = Protocol(setting.count, setting.trials, setting.seed)
     models = _load(paths, setting)
     conditions = _conditions(models, setting)
-    methods = {model.name: model.method for model in models} | (BASELINES if baselines else QUICK_BASELINES)
+    methods = {model.name: model.method for model in models}
+    methods |= _suited(BASELINES if baselines else QUICK_BASELINES, conditions.rig)
     kept = None if out is None else Kept(out / WORK, _scope(models))
     with _workers(setting, protocol.batches, kept, models) as mapped:
         summary = _measure(methods, conditions, protocol, setting, mapped)
@@ -151,6 +153,15 @@ def _run(paths: tuple[Path, ...], setting: Setting, baselines: bool, out: Path |
             print(f"wrote {out / path.name}", file=sys.stderr)
     if kept is not None:
         kept.clear()
+
+
+def _suited(methods: Mapping[str, Method], rig: CameraRig) -> dict[str, Method]:
+    """Leave out, and say so, what does not know the rig's lenses."""
+    suited = {name: method for name, method in methods.items() if method.knows(rig)}
+    if left := [name for name in methods if name not in suited]:
+        lenses = ", ".join(dict.fromkeys(rig.lens_models))
+        print(f"note: without {' and '.join(left)}: found {lenses} lenses, which they do not know", file=sys.stderr)
+    return suited
 
 
 def _scope(models: list[Model]) -> str:

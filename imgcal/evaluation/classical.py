@@ -19,6 +19,7 @@ from imgcal.types import CalibrationObject, CameraRig, Observations, Prediction,
 Array = NDArray[np.float64]
 Intrinsics = tuple[Array, Array]  # camera matrix (3, 3), distortion (5,)
 
+LENS = "brown_conrady"  # what `pnp` and `calibrate_cameras` know
 LEAST_POINTS = 4
 STEP = 1e-6  # of numerical derivatives, whitened units
 MOST_EVALUATIONS = 60  # of least squares: outliers can keep it busy without end
@@ -137,9 +138,9 @@ def _array(values: Any) -> Array:
 
 
 def _intrinsics(rig: CameraRig, camera: int) -> Intrinsics:
-    if rig.lens_models[camera] != "brown_conrady":
+    if rig.lens_models[camera] != LENS:
         found = f"camera {rig.camera_names[camera]} with the lens model {rig.lens_models[camera]}"
-        raise InputError(f"OpenCV's methods: found {found}, expected brown_conrady lenses")
+        raise InputError(f"OpenCV's methods: found {found}, expected {LENS} lenses")
     fx, fy = rig.focal_length[camera].tolist()
     cx, cy = rig.principal_point[camera].tolist()
     matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
@@ -159,7 +160,7 @@ def bundle_adjustment(
         observations: (B, 1, C, N).
         factory: the factory rig, without batch axes; where the search starts, with a pose by PnP.
         obj: N fiducials.
-        prior_std: (C, 15) standard deviation of each factory value.
+        prior_std: (C, K) standard deviation of each factory value.
     """
     found = []
     for row in range(len(observations.uv)):
@@ -178,7 +179,7 @@ def _least_squares(problem: Problem, start: State) -> State:
     split = problem.prior_std[0].numel()
 
     def at(x: Tensor) -> State:
-        """States (R,) at steps (R, 15 C + 6)."""
+        """States (R,) at steps (R, K C + 6)."""
         return retract(problem, start, x[:, :split].unflatten(1, (cameras, -1)), x[:, None, split:])
 
     def residuals(x: Tensor) -> Tensor:

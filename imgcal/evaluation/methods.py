@@ -38,7 +38,7 @@ class Given:
     views: Views  # (B,) uv and seen
     factory: CameraRig  # without batch axes
     obj: CalibrationObject
-    prior_std: Tensor  # (C, 15) standard deviation of each factory value
+    prior_std: Tensor  # (C, K) standard deviation of each factory value
     sigma: float  # pixels, noise of the points
     degradation: Degradation = Degradation()  # what happens to images, beside what has happened to the points
     seed: int = 0  # of that
@@ -86,6 +86,11 @@ class Method:
     most: int | None = None  # rigs of a trial that it is given: it is slow
     batch: int | None = None  # rigs at once at most: it needs much memory
     images: ImageOptions | None = None  # what it looks at, when not at points
+    lens: str | None = None  # the one lens model that it knows; None = all
+
+    def knows(self, rig: CameraRig) -> bool:
+        """Tell whether it can calibrate cameras with these lenses."""
+        return self.lens is None or set(rig.lens_models) == {self.lens}
 
 
 def factory_alone(given: Given) -> Prediction:
@@ -159,12 +164,14 @@ QUICK_BASELINES: dict[str, Method] = {
 """What every network stands beside. All but the first begin with the same pose by PnP, whose time is in theirs."""
 
 BASELINES: dict[str, Method] = QUICK_BASELINES | {
-    "PnP per camera, factory intrinsics": Method(pnp, most=2000),
-    "OpenCV calibrateCamera per camera": Method(opencv_calibrate, most=200),
+    "PnP per camera, factory intrinsics": Method(pnp, most=2000, lens=classical.LENS),
+    "OpenCV calibrateCamera per camera": Method(opencv_calibrate, most=200, lens=classical.LENS),
     "scipy bundle adjustment": Method(scipy_bundle_adjustment, most=50),
     "PnP + robust bundle adjustment": Method(robust_from_pnp),
 }
-"""The competitors, by the name they have in tables. Slow ones get the first `most` rigs of every trial."""
+"""The competitors, by the name they have in tables. Slow ones get the first `most` rigs of every trial.
+
+OpenCV's know one lens model alone (`Method.knows`)."""
 
 
 def network_method(network: Network, batch: int | None = None) -> Method:

@@ -138,7 +138,7 @@ def _rms_of_pixels(predicted: CameraRig, truth: CameraRig, points: Tensor, radiu
 
 
 def _summed_up(squares: Tensor, re: Tensor, held_out: Tensor, focal_length: Tensor) -> Errors:
-    """Reduce squared errors or variances (B, C, 15), extrinsics relative to the first camera."""
+    """Reduce squared errors or variances (B, C, K), extrinsics relative to the first camera."""
     others = squares[..., 1:, :] if squares.shape[-2] > 1 else squares
     focal = squares[..., 6:8]
     return Errors(
@@ -167,7 +167,7 @@ def _re_bound(estimate: Estimate, problem: Problem) -> Tensor:
 
 
 def _dense(equations: NormalEquations) -> Tensor:
-    """Normal matrix of one snapshot a rig: (B, 15 C + 6, 15 C + 6)."""
+    """Normal matrix of one snapshot a rig: (B, K C + 6, K C + 6)."""
     batch, cameras = equations.camera.shape[:2]
     size = cameras * equations.camera.shape[-1]
     matrix = equations.camera.new_zeros(batch, size + POSE_PARAMETERS, size + POSE_PARAMETERS)

@@ -48,7 +48,7 @@ class Checkpoint:
 
     @property
     def drift_std(self) -> Tensor:
-        """Spread of the parameters that the network was trained for: (C, 15) float64, the prior of a refinement."""
+        """Spread of the parameters that the network was trained for: (C, K) float64, the prior of a refinement."""
         return self.experiment.drift.std(self.rig)
 
     def save(self, path: str | Path) -> None:

@@ -36,7 +36,7 @@ def build(
         config: which network.
         factory: the factory rig, float32, without batch axes.
         obj: the calibration object.
-        drift_std: (C, 15) prior standard deviation of the parameters (`Drift.std`), the unit of predicted offsets.
+        drift_std: (C, K) prior standard deviation of the parameters (`Drift.std`), the unit of predicted offsets.
         generator: of its weights, on the CPU; torch's default generators are left alone.
         images: how the images of image variants are drawn; None = as large as their encoder takes them.
 

@@ -15,14 +15,11 @@ POSE_SHIFT = 10.0  # mm that one unit of a head moves the object
 POSE_TURN = 0.05  # rad that one unit of a head turns it, after the first pass
 
 
-LENS = "brown_conrady"
-
-
 @dataclass(frozen=True)
 class RigState:
     """A rig near the factory's and the object's pose, as networks move them."""
 
-    offsets: Tensor  # (B, C, 15) parameters minus factory values, in units of their prior standard deviation
+    offsets: Tensor  # (B, C, K) parameters minus factory values, in units of their prior standard deviation
     rotation: Tensor  # (B, 3, 3) rig_from_object
     centre: Tensor  # (B, 3) mm, the object's centroid in the rig
 
@@ -36,11 +33,12 @@ class Parameterization(nn.Module):
 
     focal_length: Tensor  # (C, 2)
     principal_point: Tensor  # (C, 2)
-    distortion: Tensor  # (C, 5)
+    distortion: Tensor  # (C, D)
     rotation: Tensor  # (C, 3, 3)
     translation: Tensor  # (C, 3)
     image_size: Tensor  # (C, 2)
-    prior_std: Tensor  # (C, 15)
+    has_coefficient: Tensor  # (C, D) bool
+    prior_std: Tensor  # (C, K)
     points: Tensor  # (N, 3) mm
     colours: Tensor  # (N, 3)
     radius: Tensor | None  # (N,) mm
@@ -53,12 +51,6 @@ class Parameterization(nn.Module):
         super().__init__()
         if factory.working_distance is None:
             raise InputError(f"rig {factory.name}: found no working_distance, expected one (mm) to start from")
-        for camera, lens in zip(factory.camera_names, factory.lens_models, strict=True):
-            if lens != LENS:
-                raise InputError(
-                    f"rig {factory.name}: camera {camera}: found the lens model {lens}, expected {LENS}: networks know "
-                    "no other"
-                )
         self._factory, self._obj = factory, obj  # for what they hold beside tensors
         self.working_distance = factory.working_distance
         points = obj.points.to(factory.focal_length)
@@ -69,6 +61,7 @@ class Parameterization(nn.Module):
             "rotation": factory.cam_from_rig.rotation,
             "translation": factory.cam_from_rig.translation,
             "image_size": factory.image_size,
+            "has_coefficient": factory.has_coefficient,
             "prior_std": prior_std.to(factory.focal_length),
             "points": points,
             "colours": obj.colours.to(points),
@@ -83,6 +76,17 @@ class Parameterization(nn.Module):
             self.register_buffer(name, None if tensor is None else tensor.clone(), persistent=False)
         # Takes a fiducial's distance from the principal point, over f, to about one.
         self.unit = factory.working_distance / float(self.centred.norm(dim=-1).mean())
+
+    @property
+    def widths(self) -> dict[str, int]:
+        """Numbers of a camera of each kind, the paper's eighteen where the lens has five coefficients."""
+        lens = self.distortion.shape[-1]
+        return {"rotation": 6, "translation": 3, "focal_length": 2, "principal_point": 2, "distortion": lens}
+
+    @property
+    def num_parameters(self) -> int:
+        """Free parameters of a camera, K."""
+        return self.prior_std.shape[-1]
 
     @property
     def factory(self) -> CameraRig:
@@ -110,7 +114,7 @@ class Parameterization(nn.Module):
         """Place rigs from nothing.
 
         Args:
-            offsets: (B, C, 15) in units of `prior_std`.
+            offsets: (B, C, K) in units of `prior_std`.
             pose: (B, 9) 6D rotation less that of a level object, then a shift from the working distance.
         """
         identity = pose.new_tensor((1.0, 0.0, 0.0, 0.0, 1.0, 0.0))
@@ -119,7 +123,7 @@ class Parameterization(nn.Module):
         return RigState(offsets, rotation, centre)
 
     def move(self, state: RigState, offsets: Tensor, pose: Tensor) -> RigState:
-        """Correct rigs: offsets (B, C, 15) in units of `prior_std`, pose (B, 6) turn and shift."""
+        """Correct rigs: offsets (B, C, K) in units of `prior_std`, pose (B, 6) turn and shift."""
         rotation = rotation_from_vector(POSE_TURN * pose[:, :3]) @ state.rotation
         return RigState(state.offsets + offsets, rotation, state.centre + POSE_SHIFT * pose[:, 3:])
 
@@ -133,10 +137,11 @@ class Parameterization(nn.Module):
         return prediction.rig.project_values(prediction.rig_from_object.apply(self.centred + self.centroid))
 
     def absolute(self, numbers: Tensor) -> Prediction:
-        """Decode the paper's 18 numbers a camera: (B, C, 18), each camera on its own in the object's frame.
+        """Decode the paper's 13 + D numbers a camera: (B, C, 13 + D), each camera on its own in the object's frame.
 
         Scales are those of a rig, not of one camera: working distance for translations, mean focal length, mean
-        principal point; the 6D rotation and the distortion as they are.
+        principal point; the 6D rotation and the distortion as they are. Coefficients that a lens does not have stay
+        zero.
 
         Source: paper, supplementary section 1.
         """
@@ -147,7 +152,7 @@ class Parameterization(nn.Module):
                 numbers[..., 6:9] * self.working_distance,
                 numbers[..., 9:11] * self.focal_length.mean(),
                 numbers[..., 11:13] * self.principal_point.mean(0),
-                numbers[..., 13:],
+                numbers[..., 13:] * self.has_coefficient,
             ),
             dim=-1,
         )

@@ -16,9 +16,6 @@ from imgcal.types import Prediction, Views
 
 CIE_NOISE = 0.01  # standard deviation of the noise on the one-hot camera identities
 
-# Numbers of each head of the paper's networks, in the order of their output; each may have its own learning rate.
-PAPER_OUTPUTS = {"rotation": 6, "translation": 3, "focal_length": 2, "principal_point": 2, "distortion": 5}
-
 
 class CameraIdentity(nn.Module):
     """The paper's Camera Identity Encoding: one-hot over the embedding, plus fixed noise, so that more cameras than
@@ -42,21 +39,22 @@ class CameraIdentity(nn.Module):
 
 
 class PaperHeads(nn.Module):
-    """Separate heads for r6D, t, f, pp and dist."""
+    """Separate heads for r6D, t, f, pp and dist; each may have its own learning rate."""
 
-    def __init__(self, features: int, widths: tuple[int, ...]) -> None:
+    def __init__(self, features: int, widths: tuple[int, ...], outputs: Mapping[str, int]) -> None:
         super().__init__()
-        self.heads = nn.ModuleList(mlp((features, *widths, outputs)) for outputs in PAPER_OUTPUTS.values())
+        self.names = tuple(outputs)
+        self.heads = nn.ModuleList(mlp((features, *widths, count)) for count in outputs.values())
 
     def forward(self, features: Tensor) -> Tensor:
-        """(B, C, features) -> (B, C, 18), in float32 whatever autocast is on."""
+        """(B, C, features) -> (B, C, 13 + D), in float32 whatever autocast is on."""
         with torch.autocast(features.device.type, enabled=False):
             features = features.float()
             return torch.cat([head(features) for head in self.heads], dim=-1)
 
     def groups(self) -> dict[str, Iterable[nn.Parameter]]:
         """Parameters of each head by its name."""
-        return {name: head.parameters() for name, head in zip(PAPER_OUTPUTS, self.heads, strict=True)}
+        return {name: head.parameters() for name, head in zip(self.names, self.heads, strict=True)}
 
 
 class PaperPointNetwork(Network):
@@ -75,7 +73,7 @@ class PaperPointNetwork(Network):
             if config.encoder == "transformer"
             else conv1d(config.width, config.depth)
         )
-        self.heads = PaperHeads(config.width, config.head_widths)
+        self.heads = PaperHeads(config.width, config.head_widths, parameterization.widths)
 
     @property
     def encoder(self) -> nn.Module:

@@ -49,7 +49,7 @@ class PaperImageNetwork(_PooledNetwork):
     ) -> None:
         """Make the layers; see `_PooledNetwork`."""
         super().__init__(config, parameterization, images)
-        self.heads = PaperHeads(config.bottleneck, config.head_widths)
+        self.heads = PaperHeads(config.bottleneck, config.head_widths, parameterization.widths)
 
     def forward(self, views: Views) -> tuple[Prediction, ...]:
         """Predict the rig from `views.images`."""

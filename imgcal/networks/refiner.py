@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from imgcal.networks.layers import conv1d, mlp, transformer, zeroed
 from imgcal.networks.parameterization import Parameterization, RigState
-from imgcal.types import PARAMETERS, Prediction
+from imgcal.types import Prediction
 
 RESIDUAL_SCALES = (20.0, 4.0)  # pixels, where a residual saturates; a linear part (in 100 px) stands beside
 LIMIT = 5.0  # largest input of the linear parts
@@ -26,19 +26,28 @@ class UpdateBlock(nn.Module):
     """One pass: numbers of each camera in, parameters of each camera and of the pose out."""
 
     def __init__(
-        self, inputs: int, features: int, cameras: int, pose: int, encoder: str, width: int, depth: int, heads: int
+        self,
+        inputs: int,
+        features: int,
+        cameras: int,
+        outputs: tuple[int, int],
+        encoder: str,
+        width: int,
+        depth: int,
+        heads: int,
     ) -> None:
         super().__init__()
+        parameters, pose = outputs
         self.embed = mlp((inputs, 2 * width, width))
         self.embed_features = nn.Linear(features, width, bias=False) if features else None
         self.camera_identity = nn.Parameter(0.5 * torch.randn(cameras, width))
         self.rig_token = nn.Parameter(0.5 * torch.randn(width))
         self.encoder = transformer(width, depth, heads) if encoder == "transformer" else conv1d(width, depth)
-        self.camera_head = zeroed(mlp((width + inputs, 2 * width, PARAMETERS)))
+        self.camera_head = zeroed(mlp((width + inputs, 2 * width, parameters)))
         self.pose_head = zeroed(mlp((width, 2 * width, pose)))
 
     def forward(self, inputs: Tensor, features: Tensor | None) -> tuple[Tensor, Tensor]:
-        """(B, C, inputs), (B, C, features) -> (B, C, 15), (B, pose)."""
+        """(B, C, inputs), (B, C, features) -> (B, C, K), (B, pose)."""
         tokens = self.embed(inputs) + self.camera_identity
         if self.embed_features is not None and features is not None:
             tokens = tokens + self.embed_features(features)
@@ -69,12 +78,13 @@ class IterativeRefiner(nn.Module):
         super().__init__()
         self.parameterization, self.passes = parameterization, passes
         cameras, fiducials = len(parameterization.focal_length), len(parameterization.centred)
+        parameters = parameterization.num_parameters
         shape = (encoder, width, depth, heads)
-        self.first = UpdateBlock(3 * fiducials, features, cameras, 9, *shape)
+        self.first = UpdateBlock(3 * fiducials, features, cameras, (parameters, 9), *shape)
         parts = 2 * (len(RESIDUAL_SCALES) + 2) + 1
         later = (encoder, width, later_depth, heads)
-        inputs = parts * fiducials + PARAMETERS
-        self.later = UpdateBlock(inputs, features, cameras, 6, *later) if passes > 1 else None
+        inputs = parts * fiducials + parameters
+        self.later = UpdateBlock(inputs, features, cameras, (parameters, 6), *later) if passes > 1 else None
         self.trust_head = zeroed(mlp((inputs, width, fiducials))) if trust else None
 
     def forward(self, uv: Tensor, weight: Tensor, features: Tensor | None = None) -> tuple[Prediction, ...]:
@@ -117,18 +127,21 @@ class IterativeRefiner(nn.Module):
         """Make weights that were trained with offsets in other units say the same in those of this network.
 
         Args:
-            prior_std: (C', 15) of the other training; cameras may differ, their mean counts.
+            prior_std: (C', K') of the other training; cameras may differ, their mean counts. With lenses of another
+                width, what knows units has another shape, and nothing was taken over that could be rescaled.
         """
+        if prior_std.shape[-1] != self.parameterization.num_parameters:
+            return
         old, new = prior_std.to(self.parameterization.prior_std).mean(0), self.parameterization.prior_std.mean(0)
         ratio = torch.where((old > 0) & (new > 0), old / new.clamp_min(1e-30), 1.0)
         for stage in (self.first, self.later):
             if stage is not None:
-                for parameter in stage.camera_head[-1].parameters():  # (15, width) and (15,)
+                for parameter in stage.camera_head[-1].parameters():  # (K, width) and (K,)
                     parameter.mT.mul_(ratio) if parameter.ndim == 2 else parameter.mul_(ratio)
         # Some layers are also told the offsets: their last inputs.
         told = [] if self.later is None else [self.later.embed[0], self.later.camera_head[0]]
         for layer in [*told, *([] if self.trust_head is None else [self.trust_head[0]])]:
-            next(layer.parameters())[:, -PARAMETERS:] /= ratio
+            next(layer.parameters())[:, -self.parameterization.num_parameters :] /= ratio
 
     def _differences(self, state: RigState, prediction: Prediction, uv: Tensor, weight: Tensor) -> Tensor:
         """What a later pass sees: (B, C, inputs); its gradient is that of the positions, not of the rig so far."""

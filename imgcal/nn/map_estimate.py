@@ -52,8 +52,8 @@ class MapEstimate(nn.Module):
     Args:
         factory: the factory rig, (*B) or without batch axes; its prior says how far cameras may have drifted.
         obj: N fiducials (mm); where it has tolerances, its shape is estimated too.
-        prior_std: (*B, C, 15) standard deviation of each factory value in the order of `PARAMETER_NAMES`; zero keeps a
-            value fixed; None = the rig's own prior.
+        prior_std: (*B, C, K) standard deviation of each factory value in the order of `CameraRig.parameter_names`; zero
+            keeps a value fixed; None = the rig's own prior.
         options: how to minimize.
 
     Shape:

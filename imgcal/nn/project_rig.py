@@ -23,7 +23,7 @@ class ProjectRig(nn.Module):
         - rig_from_object: (*B) poses (mm); None = the rig is given in the object's frame.
         - Output: `Projection` of uv (*B, C, N, 2) pixels, depth (*B, C, N) mm and visible (*B, C, N).
 
-    Source: Brown-Conrady lens as in OpenCV; `imgcal.CameraRig.project`.
+    Source: each camera's own lens, as in OpenCV; `imgcal.CameraRig.project`.
 
     Example:
         >>> import imgcal

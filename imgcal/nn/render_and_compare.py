@@ -36,7 +36,7 @@ class RenderAndCompare(nn.Module):
     Args:
         factory: the factory rig, without batch axes; its prior says how far cameras may have drifted.
         obj: N fiducials (mm) in their colours, taken as exact.
-        prior_std: (C, 15) standard deviation of each factory value; None = the rig's own prior.
+        prior_std: (C, K) standard deviation of each factory value; None = the rig's own prior.
         options: how to compare; `options.image` says how large images and dots are.
 
     Shape:

@@ -24,7 +24,7 @@ def refined_loss(
         prediction: (B,) last pass, with `log_sigma`.
         batch: what the network saw, and the truth.
         source: the factory rig and the object.
-        prior_std: (C, 15) of the drift, the prior of the estimate.
+        prior_std: (C, K) of the drift, the prior of the estimate.
         config: weight and noise; a weight of zero costs nothing.
 
     Returns:

@@ -22,7 +22,8 @@ from imgcal.nn import project_fiducials, reprojection_re
 from imgcal.types import CalibrationObject, CameraRig, Prediction, pack21
 
 # Parameters of smaller spread (rad, mm, pixels, pixels, 1) are fixed: float32 cannot tell their offsets from rounding.
-LEAST_SPREAD = (1e-6,) * 3 + (1e-3,) * 3 + (1e-3,) * 2 + (1e-3,) * 2 + (1e-7,) * 5
+LEAST_SPREAD = (1e-6,) * 3 + (1e-3,) * 3 + (1e-3,) * 2 + (1e-3,) * 2
+LEAST_SPREAD_OF_LENS = 1e-7  # and each of its coefficients
 
 Weight = Annotated[float, Field(allow_inf_nan=False, ge=0, le=1e9)]
 Positive = Annotated[float, Field(allow_inf_nan=False, gt=0, le=1e9)]
@@ -52,7 +53,7 @@ class PaperLoss(StrictModel):
 class ExtraLoss(StrictModel):
     """Weights of what the paper tried as well and found less effective; 0 = off."""
 
-    log_cosh: Weight = 0.0  # of log cosh of the differences of a camera's 21 numbers
+    log_cosh: Weight = 0.0  # of log cosh of the differences of a camera's numbers
     distortion: Weight = 0.0  # of the absolute distortion coefficients
     focal_ratio: Weight = 0.0  # of the squared difference of fx and fy
     principal_point: Weight = 0.0  # of the squared distance of the principal point from the image's centre
@@ -103,7 +104,7 @@ def compound(
         obj: the object whose fiducials are projected.
         config: which terms, how heavy.
         step: steps already taken, for the paper's two stages.
-        prior_std: (C, 15) prior standard deviation of each parameter (`Drift.std`); without one they do not count.
+        prior_std: (C, K) prior standard deviation of each parameter (`Drift.std`); without one they do not count.
         weights: parameters of the network, for the L1 regularizer.
     """
     with torch.autocast(truth.rig.focal_length.device.type, enabled=False):
@@ -132,7 +133,7 @@ def reprojection_rmse(difference: Tensor) -> Tensor:
 
 
 def parameter_rmse(predicted: CameraRig, truth: CameraRig, lambda_scale: float = 1000.0) -> Tensor:
-    """L_diff: RMSE over the paper's 21 numbers a camera.
+    """L_diff: RMSE over the paper's 16 + D numbers a camera.
 
     Args:
         predicted: (B,) cameras in the object's frame.
@@ -153,20 +154,25 @@ def offsets_error(predicted: CameraRig, truth: CameraRig, prior_std: Tensor, lim
     Args:
         predicted: (*B) rigs.
         truth: (B,) rigs.
-        prior_std: (C, 15); parameters of a spread below `LEAST_SPREAD` do not count.
+        prior_std: (C, K); parameters of a spread below `least_spread` do not count.
         limit: in units of the spread: where an error stops to count.
 
     Returns:
         (*B); zero when no parameter has a spread.
     """
-    free = prior_std > prior_std.new_tensor(LEAST_SPREAD)
+    free = prior_std > least_spread(prior_std)
     scale = torch.where(free, prior_std, torch.ones_like(prior_std)).reciprocal() * free
     squared = (predicted.local(truth) * scale).clamp(-limit, limit).square()
     return squared.sum((-2, -1)) / free.sum().clamp_min(1)
 
 
+def least_spread(like: Tensor) -> Tensor:
+    """Spread (K,) that a parameter must have to count, of those (C, K) of a rig."""
+    return like.new_tensor((*LEAST_SPREAD, *(LEAST_SPREAD_OF_LENS,) * (like.shape[-1] - len(LEAST_SPREAD))))
+
+
 def log_cosh(predicted: CameraRig, truth: CameraRig, lambda_scale: float = 1000.0) -> Tensor:
-    """Mean of log cosh of the differences of the 21 numbers: a smooth absolute value."""
+    """Mean of log cosh of the differences of these numbers: a smooth absolute value."""
     size = _scaled_difference(predicted, truth, lambda_scale).abs()
     return (size + torch.nn.functional.softplus(-2 * size) - math.log(2)).mean()
 
@@ -251,9 +257,9 @@ def _stack(tensors: list[Tensor]) -> Tensor:
 
 
 def _scaled_difference(predicted: CameraRig, truth: CameraRig, lambda_scale: float) -> Tensor:
-    """Differences of the 21 numbers a camera, (*B, C, 21), rotation and distortion times `lambda_scale`."""
+    """Differences of the 16 + D numbers a camera, (*B, C, 16 + D), rotation and distortion times `lambda_scale`."""
     difference = pack21(predicted) - pack21(truth)
-    scale = difference.new_ones(21)
+    scale = difference.new_ones(difference.shape[-1])
     scale[:9] = scale[16:] = lambda_scale
     return difference * scale
 

@@ -97,7 +97,7 @@ class RigTask(Task[RigBatch, Passes]):
         )
         if device.type != "cpu":  # a batch must not wait for it; a CPU has no reason to draw more than it needs
             self.source = replace(self.source, good=self._share_of_good(device))
-        self.prior_std = experiment.drift.std(self.factory).to(device, torch.float32)  # (C, 15)
+        self.prior_std = experiment.drift.std(self.factory).to(device, torch.float32)  # (C, K)
         fixed = torch.Generator(device).manual_seed(VALIDATION_SEED)
         sizes = experiment.training.validation_sizes(batch_size)
         self.validation = [self.source.sample(size, fixed) for size in sizes]

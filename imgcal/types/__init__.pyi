@@ -8,6 +8,7 @@ from .prediction import Prediction, Views
 from .rig import (
     PARAMETER_NAMES,
     PARAMETERS,
+    PINHOLE,
     CameraRig,
     DriftRate,
     RigPrior,
@@ -24,6 +25,7 @@ __all__ = [
     "MOST_PIXELS",
     "PARAMETERS",
     "PARAMETER_NAMES",
+    "PINHOLE",
     "SIGMA",
     "UNUSABLE",
     "BlobFlag",

@@ -52,7 +52,7 @@ def parameter_names(lens_models: Sequence[str], width: int | None = None) -> tup
 
 
 PARAMETER_NAMES = parameter_names(["brown_conrady"])
-"""Of a camera with a Brown-Conrady lens, which is what networks know."""
+"""Of a camera with a Brown-Conrady lens."""
 PARAMETERS = len(PARAMETER_NAMES)
 
 
@@ -205,6 +205,10 @@ class CameraRig:
             ('fx', 'fy', 'cx', 'cy', 'k1', 'k2', 'p1', 'p2', 'k3')
         """
         return parameter_names(self.lens_models, self.distortion.shape[-1])
+
+    def parameter_names_of(self, camera: int) -> tuple[str, ...]:
+        """Names of the K parameters of one camera; "-" for coefficients that its lens does not have."""
+        return parameter_names([self.lens_models[camera]], self.distortion.shape[-1])
 
     @property
     def has_coefficient(self) -> Tensor:
@@ -399,8 +403,8 @@ def pack21(rig: CameraRig) -> Tensor:
         rig: a rig in the object's frame (`CameraRig.from_object`).
 
     Returns:
-        (*B, C, 21), for five coefficients. Convention: distortion in our order k1, k2, p1, p2, k3; the paper lists k1,
-        k2, k3, p1, p2.
+        (*B, C, 16 + D), 21 for five coefficients. Convention: distortion in our order k1, k2, p1, p2, k3; the paper
+        lists k1, k2, k3, p1, p2.
 
     Examples:
         >>> import imgcal

@@ -3,9 +3,10 @@ import signal
 import pytest
 
 from imgcal.cli.main import main
-from imgcal.io import load_object, load_rig, read_metrics
+from imgcal.io import load_object, load_rig, read_metrics, save_rig
 from imgcal.networks import load_network
 from imgcal.training import engine
+from tests.imgcal.lensed import lensed
 from tests.imgcal.training.toy import EXPERIMENT, Toy
 
 
@@ -34,6 +35,52 @@ def test_a_network_comes_out(experiment, tmp_path, capsys):
     assert train(out / "resolved.yaml", tmp_path / "again") == 0
     assert train(experiment, out) == 2
     assert "found a training there already, expected a new folder, or --resume" in capsys.readouterr().err
+
+
+LENSES = """
+format: imgcal-experiment/1
+name: lenses
+rig: {rig}
+object: asymmetric8
+poses: {{theta_deg: [0, 0], phi_deg: [0, 20]}}
+drift: {{kappa_intrinsics: 0.01, kappa_extrinsics: 0.01}}
+network: {network}
+training: {{steps: 2, batch_size: 8, validation_rigs: 8, device: cpu, threads: 1}}
+"""
+POINTS = "{preset: points, change: {trunk: {width: 16, depth: 1, later_depth: 1, heads: 2}}}"
+PAPER = "{preset: paper-points, change: {width: 16, depth: 1, heads: 2}}"
+IMAGES = "{preset: hue-centroids, change: {trunk: {width: 16, depth: 1, later_depth: 1, heads: 2}}}"
+
+
+def test_a_rig_of_other_lenses_is_trained_for_compared_and_calibrated(tmp_path, capsys):
+    """From an experiment file to a first guess; OpenCV's methods, which know one lens, are left out."""
+    rig = tmp_path / "rig.yaml"
+    save_rig(lensed(load_rig("T4"), "mixed"), rig)
+    runs = []
+    for number, network in enumerate((POINTS, PAPER, IMAGES)):
+        path = tmp_path / f"{number}.yaml"
+        path.write_text(LENSES.format(rig=rig, network=network))
+        runs.append(str(tmp_path / str(number)))
+        assert train(path, runs[-1]) == 0
+    few = ["--count", "4", "--trials", "1"]
+    capsys.readouterr()
+    assert main(["compare", *runs, *few, "--baselines"]) == 0
+    printed = capsys.readouterr()
+    assert (
+        "note: without PnP per camera, factory intrinsics and OpenCV calibrateCamera per camera: found" in printed.err
+    )
+    assert all(name in printed.out for name in ("| 0 ", "| 1 ", "| 2 ", "MAP from PnP", "scipy bundle adjustment"))
+    capture, known = tmp_path / "capture", ["--rig", str(rig), "--object", "asymmetric8"]
+    how = ["--snapshots", "3", "--seed", "2", "--kappa", "0.002", "--no-clutter"]
+    assert main(["simulate", *known, "--out", str(capture), *how]) == 0
+    blobs = str(capture / "truth" / "detections.csv")
+    assert main(["calibrate", blobs, *known, "--out", str(tmp_path / "out"), "--first-guess", runs[0]]) == 0
+    # Trained for these lenses, and for no others.
+    other = ["--rig", "T4", "--object", "asymmetric8"]
+    capsys.readouterr()
+    assert main(["calibrate", blobs, *other, "--out", str(tmp_path / "no"), "--first-guess", runs[0]]) == 2
+    found = capsys.readouterr().err
+    assert "lens model of cam01: found brown_conrady, expected" in found and found.count("\n") == 1
 
 
 def test_minutes_end_the_training(experiment, tmp_path):

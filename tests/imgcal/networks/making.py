@@ -7,13 +7,15 @@ from imgcal.networks import NetworkConfig, build
 from imgcal.synthesis.colour_coding import render_views
 from imgcal.synthesis.rigs import RelativeDrift, synthesize
 from imgcal.types import Views
+from tests.imgcal.lensed import lensed
 
 DRIFT = RelativeDrift(0.02, 0.02)
 SMALL = ["points", "points-one-pass", "points-cnn1d", "hue-centroids", "vit", "cnn", "vit-pooled", "cnn-pooled"]
 
 
-def make(preset, rig="T4", obj="asymmetric8", **change):
+def make(preset, rig="T4", obj="asymmetric8", lens=None, **change):
     factory, thing = load_rig(rig).to(torch.float32), load_object(obj)
+    factory = factory if lens is None else lensed(factory, lens)
     weights = torch.Generator().manual_seed(0)
     return build(NetworkConfig(preset=preset, change=change), factory, thing, DRIFT.std(factory), weights).eval()
 

@@ -10,6 +10,7 @@ from imgcal.networks.parameterization import POSE_SHIFT, Parameterization
 from imgcal.synthesis.rigs import RelativeDrift, synthesize
 from imgcal.types.prediction import Prediction
 from imgcal.types.rig import pack18, pack21
+from tests.imgcal.lensed import KINDS, lensed
 
 DRIFT = RelativeDrift(0.03, 0.03)
 B, C = 3, 4
@@ -38,6 +39,17 @@ def test_the_18_numbers_are_scaled_by_those_of_the_rig(parameterization, truth):
     numbers[..., 11:13] /= parameterization.principal_point.mean(0)
     found = parameterization.absolute(numbers).cameras_from_object
     torch.testing.assert_close(pack21(found), pack21(truth.cameras_from_object))
+
+
+@pytest.mark.parametrize("lens", KINDS)
+def test_coefficients_that_a_lens_does_not_have_stay_zero(lens):
+    rig = lensed(load_rig("T4"), lens)
+    parameterization = Parameterization(rig, load_object("asymmetric8"), DRIFT.std(rig)).double()
+    assert sum(parameterization.widths.values()) == 13 + rig.distortion.shape[-1]
+    numbers = torch.ones(B, C, 13 + rig.distortion.shape[-1], dtype=torch.float64)
+    found = parameterization.absolute(numbers).rig
+    assert torch.equal(found.distortion, rig.has_coefficient.double().expand(B, -1, -1))
+    assert found.lens_models == rig.lens_models
 
 
 def test_cameras_of_the_factory_rig_are_split_into_that_rig_and_the_pose(parameterization, truth):

@@ -62,7 +62,7 @@ def poses(rig: CameraRig) -> Callable[..., RigidTransform]:
 def drifted(rig: CameraRig) -> Callable[..., CameraRig]:
     """Draw (*B) rigs, a third of what is usual off, float64."""
 
-    def draw(*batch: int, seed: int = 0) -> CameraRig:
+    def draw(*batch: int, seed: int = 0, rig: CameraRig = rig) -> CameraRig:
         random = torch.Generator().manual_seed(seed)
         std = RigPrior().std(rig)
         return rig.expand(*batch).retract(

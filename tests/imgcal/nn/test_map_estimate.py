@@ -8,18 +8,19 @@ import torch
 from imgcal.estimation import EstimationOptions, estimate
 from imgcal.nn import MapEstimate, ProjectRig
 from imgcal.types import CameraRig, Observations
+from tests.imgcal.lensed import KINDS, lensed
 
 PRECISE = EstimationOptions(loss="squared", tolerance=1e-20)
 SNAPSHOTS = 2
 
 
 @pytest.fixture
-def observe(obj, poses, drifted):
+def observe(rig, obj, poses, drifted):
     """Draw (*B, S) observations of drifted rigs, with noise, one in five not seen."""
 
-    def draw(*batch: int) -> Observations:
+    def draw(*batch: int, rig: CameraRig = rig) -> Observations:
         random = torch.Generator().manual_seed(3)
-        truth = drifted(*batch).map_tensors(
+        truth = drifted(*batch, rig=rig).map_tensors(
             lambda x, axes: x.unsqueeze(-axes - 1).expand(*batch, SNAPSHOTS, *x.shape[-axes:])
         )
         uv = ProjectRig(obj)(truth, poses(*batch, SNAPSHOTS)).uv
@@ -48,6 +49,16 @@ def test_is_the_estimate(rig, obj, observe, batch, device, dtype):
         (found.dof, expected.dof),
     ):
         torch.testing.assert_close(one.cpu().double(), other.double().expand_as(one), **loose)
+
+
+@pytest.mark.parametrize("lens", KINDS)
+def test_takes_every_lens(rig, obj, observe, lens):
+    factory = lensed(rig, lens)
+    observations = observe(2, rig=factory)
+    found, expected = MapEstimate(factory, obj)(observations), estimate(observations, factory, obj)
+    assert found.converged.all() and found.rig.lens_models == factory.lens_models
+    torch.testing.assert_close(found.rig.distortion, expected.rig.distortion, rtol=0, atol=1e-6)
+    torch.testing.assert_close(found.rig.focal_length, expected.rig.focal_length, rtol=1e-7, atol=1e-6)
 
 
 def test_starts_where_it_is_told_and_takes_another_factory(rig, obj, observe, poses, drifted):

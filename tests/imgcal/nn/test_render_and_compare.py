@@ -9,6 +9,7 @@ from imgcal.nn import ProjectRig, RenderAndCompare, SplatRenderer
 from imgcal.refinement import ImageRefinementOptions, refine_images
 from imgcal.synthesis import ImageOptions
 from imgcal.types import Prediction
+from tests.imgcal.lensed import KINDS, lensed
 
 SIZE = 96
 OPTIONS = ImageRefinementOptions(image=ImageOptions(SIZE, 1.5), attempts=())
@@ -18,8 +19,8 @@ OPTIONS = ImageRefinementOptions(image=ImageOptions(SIZE, 1.5), attempts=())
 def scene(rig, obj, poses, drifted):
     """Draw (*B) predictions a little off, and images of the truth."""
 
-    def draw(*batch):
-        truth = Prediction(drifted(*batch), poses(*batch))
+    def draw(*batch, rig=rig):
+        truth = Prediction(drifted(*batch, rig=rig), poses(*batch))
         seen = ProjectRig(obj)(truth.rig.resized(torch.tensor([SIZE, SIZE])), truth.rig_from_object)
         images = SplatRenderer(obj.colours, (SIZE, SIZE))(seen).clamp(0, 1)
         shift = truth.rig_from_object.translation + 2.0
@@ -42,6 +43,19 @@ def test_is_the_refinement(rig, obj, scene, batch, device, dtype):
     focal_length = expected.rig.focal_length.reshape(found.rig.focal_length.shape)
     tolerance = 1e-6 if device.type == "cpu" and dtype == torch.float64 else 0.5
     torch.testing.assert_close(found.rig.focal_length.cpu().double(), focal_length, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("lens", KINDS)
+def test_takes_every_lens(rig, obj, scene, lens):
+    factory = lensed(rig, lens)
+    prediction, images = scene(2, rig=factory)
+    found = RenderAndCompare(factory, obj, options=OPTIONS)(prediction, images)
+    assert found.converged.all()
+    assert found.rig.lens_models == factory.lens_models
+    uv = found.rig.project(found.rig_from_object.apply(obj.points)).uv
+    shift = prediction.rig_from_object.translation - 2.0
+    truth = prediction.rig.project(replace(prediction.rig_from_object, translation=shift).apply(obj.points)).uv
+    assert (uv - truth).abs().max() < 0.05 * rig.image_size.max() / SIZE  # of a pixel of the images
 
 
 def test_gradients_against_differences(rig, obj, scene):

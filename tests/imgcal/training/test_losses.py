@@ -6,10 +6,10 @@ import torch
 
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
+from imgcal.io import load_rig
 from imgcal.nn import project_fiducials, reprojection_re
 from imgcal.synthesis.rigs import RelativeDrift, synthesize
 from imgcal.training.losses import (
-    LEAST_SPREAD,
     ExtraLoss,
     LossConfig,
     PaperLoss,
@@ -20,6 +20,7 @@ from imgcal.training.losses import (
     geodesic,
     inverse_focal,
     l1_norm,
+    least_spread,
     log_cosh,
     offsets_error,
     parameter_rmse,
@@ -28,6 +29,7 @@ from imgcal.training.losses import (
 )
 from imgcal.types.prediction import Prediction
 from imgcal.types.rig import PARAMETERS, pack21
+from tests.imgcal.lensed import KINDS, lensed
 
 B, C, N = 3, 10, 8
 DRIFT = RelativeDrift(0.02, 0.03)
@@ -52,10 +54,10 @@ def steps(prior_std, seed=2):
     return torch.randn(B, C, PARAMETERS, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * prior_std
 
 
-KINDS = [LossConfig(), LossConfig(kind="paper", paper=PaperLoss(reprojection_from=0))]
+KINDS_OF_LOSS = [LossConfig(), LossConfig(kind="paper", paper=PaperLoss(reprojection_from=0))]
 
 
-@pytest.mark.parametrize("config", KINDS, ids=["robust", "paper"])
+@pytest.mark.parametrize("config", KINDS_OF_LOSS, ids=["robust", "paper"])
 def test_the_truth_costs_nothing_and_has_a_finite_gradient(truth, prior_std, asymmetric8, config):
     step = torch.zeros(B, C, PARAMETERS, dtype=torch.float64, requires_grad=True)
     loss = compound([off_by(truth, step)], truth, asymmetric8, config, 0, prior_std)
@@ -65,7 +67,7 @@ def test_the_truth_costs_nothing_and_has_a_finite_gradient(truth, prior_std, asy
     assert step.grad.isfinite().all()
 
 
-@pytest.mark.parametrize("config", KINDS, ids=["robust", "paper"])
+@pytest.mark.parametrize("config", KINDS_OF_LOSS, ids=["robust", "paper"])
 def test_the_loss_compiles_into_one_graph_and_has_a_forward_derivative(truth, prior_std, asymmetric8, config):
     def loss(step):
         return compound([off_by(truth, step), truth], truth, asymmetric8, config, 0, prior_std).total
@@ -122,6 +124,22 @@ def test_re_is_the_mean_over_axes_cameras_and_fiducials():
     torch.testing.assert_close(reprojection_rmse(difference), expected.square().mean().sqrt())
 
 
+@pytest.mark.parametrize("lens", KINDS)
+@pytest.mark.parametrize("config", KINDS_OF_LOSS, ids=["robust", "paper"])
+def test_the_gradient_reaches_the_coefficients_that_each_lens_has(asymmetric8, lens, config):
+    factory = lensed(load_rig("T4"), lens)
+    made = synthesize(factory, asymmetric8, B, torch.Generator().manual_seed(1), drift=DRIFT)
+    rigs, spread = Prediction(made.rig, made.rig_from_object), DRIFT.std(factory)
+    seen = made.rig.project(made.rig_from_object.apply(asymmetric8.points)).uv
+    torch.testing.assert_close(project_fiducials(rigs.cameras_from_object, asymmetric8), seen)  # kornia's and ours
+    random = torch.Generator().manual_seed(2)
+    step = (torch.randn(B, *spread.shape, generator=random, dtype=torch.float64) * spread).requires_grad_()
+    loss = compound([off_by(rigs, step)], rigs, asymmetric8, config, 0, spread)
+    loss.total.backward()
+    assert torch.equal((step.grad[..., 10:] != 0).all(0), factory.has_coefficient)
+    assert compound([rigs], rigs, asymmetric8, config, 0, spread).total < 1e-5
+
+
 def test_gradcheck(truth, prior_std, asymmetric8):
     part = replace(truth, rig=truth.rig[:2], rig_from_object=truth.rig_from_object[:2])
 
@@ -129,7 +147,7 @@ def test_gradcheck(truth, prior_std, asymmetric8):
         return compound([off_by(part, step), off_by(part, 0.5 * step)], part, asymmetric8, config, 0, prior_std).total
 
     step = steps(prior_std)[:2].requires_grad_()
-    for config in KINDS:
+    for config in KINDS_OF_LOSS:
         assert torch.autograd.gradcheck(lambda s, c=config: total(s, c), step, eps=1e-7, atol=1e-3, rtol=1e-4)
 
 
@@ -164,7 +182,7 @@ def test_log_cosh_is_that(truth):
 
 
 def test_offsets_are_in_units_of_the_spread(truth, prior_std):
-    free = prior_std > prior_std.new_tensor(LEAST_SPREAD)
+    free = prior_std > least_spread(prior_std)
     assert not free.all() and free.any()  # the ring's cameras have positions of about zero along z: no drift there
     step = (2.0 * prior_std * free).expand(B, -1, -1)
     torch.testing.assert_close(
@@ -233,7 +251,7 @@ def test_later_passes_weigh_more(truth, prior_std, asymmetric8):
     assert total(bad, good).passes[0] == total(bad).re.mean()
 
 
-@pytest.mark.parametrize("config", KINDS, ids=["robust", "paper"])
+@pytest.mark.parametrize("config", KINDS_OF_LOSS, ids=["robust", "paper"])
 def test_wild_predictions_keep_loss_and_gradient_finite_in_float32(truth, prior_std, asymmetric8, config):
     single = Prediction(truth.rig.to(torch.float32), truth.rig_from_object.to(torch.float32))
     for scale in (1e2, 1e5):
