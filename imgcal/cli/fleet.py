@@ -118,10 +118,11 @@ def _lessons(kind: KindOfRig, learnt: LearntPrior) -> dict[str, Any]:
     outliers = [asdict(one) | {"device": kind.devices[one.device]} for one in learnt.outliers]
     return {
         "cameras": list(kind.cameras),
+        "lenses": list(kind.lenses),
         "devices": len(kind.devices),
         "spreads": [asdict(spread) for spread in learnt.spreads],
         "outliers": outliers,
-        "trends": [asdict(trend) for trend in learnt.trends],
+        "trends": [asdict(trend) | {"name": name} for trend in learnt.trends if (name := kind.name_of(trend)) != "-"],
     }
 
 

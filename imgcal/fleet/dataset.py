@@ -34,7 +34,7 @@ def schema() -> Any:
         ("item", text), ("key", text), ("device", text), ("time", pa.timestamp("us", "UTC")), ("capture", text),
         ("rig", text), ("object", text), ("given", pa.map_(text, pa.float64())), ("status", text), ("reason", text),
         ("seconds", pa.float64()), ("cpu_seconds", pa.float64()), ("written", pa.timestamp("us", "UTC")),
-        ("cameras", pa.list_(text)), ("identity", text),
+        ("cameras", pa.list_(text)), ("lenses", pa.list_(text)), ("parameters", pa.list_(text)), ("identity", text),
         ("offset", numbers), ("std", numbers), ("prior_std", numbers), ("unit", numbers),
         ("whitened_offset", numbers), ("information_factor", pa.list_(pa.float32())), ("inflation", pa.float64()),
         ("rms_px", pa.float64()), ("chi2_per_dof", pa.float64()), ("snapshots", pa.int32()), ("labels", pa.int32()),

@@ -10,14 +10,17 @@ from torch import Tensor
 
 from imgcal.errors import InputError
 from imgcal.estimation import Estimate, whitened_covariance
-from imgcal.types import PARAMETER_NAMES, CameraRig, RigPrior
+from imgcal.types import CameraRig, RigPrior
 
 KINDS = ("rotation", "position", "focal_length", "principal_point", "distortion")
 """Kinds of value as a rig file's `prior:` names them, and in the order in which a camera's parameters stand."""
 
 
 def unit_of(rig: CameraRig) -> Tensor:
-    """What a spread of one means for each parameter: (C, 15) rad, mm, the focal length in pixels, pixels, one."""
+    """What a spread of one means for each parameter: (C, K) rad, mm, the focal length in pixels, pixels, one.
+
+    Zero for coefficients that a camera's lens does not have.
+    """
     return RigPrior(1.0, 1.0, 1.0, 1.0, 1.0).std(rig)
 
 
@@ -50,12 +53,8 @@ class DriftInformation:
 
         Raises:
             RefusedError: the information of an estimate is singular.
-            InputError: lenses of another kind than the usual one.
         """
         problem, solution = estimate.problem, estimate.solution
-        if estimate.rig.parameter_names != PARAMETER_NAMES:
-            found = ", ".join(dict.fromkeys(estimate.rig.lens_models))
-            raise InputError(f"rig {estimate.rig.name}: found the lens models {found}, expected brown_conrady")
         return cls.whitened(
             estimate.rig.camera_names,
             torch.linalg.inv(whitened_covariance(solution)),
@@ -98,7 +97,8 @@ class DriftInformation:
         Raises:
             InputError: none, or of different cameras.
         """
-        if not parts or any(part.camera_names != parts[0].camera_names for part in parts):
+        kinds = {(part.camera_names, part.parameters) for part in parts}
+        if len(kinds) != 1:
             raise InputError("drift information: found parts of different rigs or none, expected the same cameras")
         information = torch.cat([part.information for part in parts])
         return cls(parts[0].camera_names, information, torch.cat([part.score for part in parts]))

@@ -224,9 +224,11 @@ def columns_of(result: Calibration) -> dict[str, Any]:
     whitened = torch.linalg.inv(whitened_covariance(solution))[0]
     factor = torch.linalg.cholesky(0.5 * (whitened + whitened.mT), upper=True)
     upper = torch.triu_indices(*factor.shape)
-    offset = result.rig.local(result.factory)
+    offset, cameras = result.rig.local(result.factory), result.rig.num_cameras
     return {
         "cameras": list(result.rig.camera_names),
+        "lenses": list(result.rig.lens_models),
+        "parameters": [name for camera in range(cameras) for name in result.rig.parameter_names_of(camera)],
         "identity": result.identity,
         "offset": offset.flatten().tolist(),
         "std": flat_std(estimate).flatten().tolist(),

@@ -60,7 +60,7 @@ class Trend:
 
     covariate: str
     camera: str
-    parameter: int  # of the camera, in the order of `PARAMETER_NAMES`
+    parameter: int  # of the camera, in the order of `CameraRig.parameter_names_of`
     slope: float  # rad, mm, relative, pixels or one, for each unit of the covariate
     sigma: float
 

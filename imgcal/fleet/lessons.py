@@ -15,25 +15,34 @@ from numpy.typing import NDArray
 from imgcal.errors import InputError, RefusedError
 from imgcal.fleet.dataset import Dataset
 from imgcal.fleet.drift_information import DriftInformation
-from imgcal.fleet.learnt_prior import LearntPrior, learn_prior
+from imgcal.fleet.learnt_prior import LearntPrior, Trend, learn_prior
 from imgcal.messages import listed
+from imgcal.types import PINHOLE, parameter_names
 
 HOURS = "hours"
 """Column of the manifest: since the factory calibration. With it, rates of drift are learnt."""
 COLUMNS = (
-    "device", "time", "status", "given", "cameras", "prior_std", "unit", "whitened_offset", "information_factor",
-    "inflation",
+    "device", "time", "status", "given", "cameras", "lenses", "prior_std", "unit", "whitened_offset",
+    "information_factor", "inflation",
 )  # fmt: skip
+LENS = "brown_conrady"
+"""Of all cameras in results from before lenses were written."""
 
 
 @dataclass(frozen=True)
 class KindOfRig:
-    """Devices whose rigs have the same cameras: the last calibration of each."""
+    """Devices whose rigs have the same cameras, with the same lens models: the last calibration of each."""
 
     cameras: tuple[str, ...]
+    lenses: tuple[str, ...]  # lens model of each camera
     devices: tuple[str, ...]  # D
     drift: DriftInformation  # (D)
     given: Mapping[str, NDArray[np.float64]]  # (D) numbers that every device has
+
+    def name_of(self, trend: Trend) -> str:
+        """Name of the value that a trend is of; "-" where the camera's lens has none."""
+        lens = self.lenses[self.cameras.index(trend.camera)]
+        return parameter_names([lens], self.drift.parameters - len(PINHOLE))[trend.parameter]
 
     def learn(self, covariates: Sequence[str] = (), *, by_camera: bool = False) -> LearntPrior:
         """Learn the prior; see `learn_prior`.
@@ -58,11 +67,12 @@ def kinds_of_rigs(dataset: Dataset) -> list[KindOfRig]:
         InputError: there are no results.
     """
     table = dataset.latest(COLUMNS)
-    rows: dict[tuple[str, ...], dict[str, dict[str, Any]]] = {}
+    rows: dict[tuple[tuple[str, str], ...], dict[str, dict[str, Any]]] = {}
     for number, row in enumerate(table.to_pylist()):
         if row["status"] != "ok":
             continue
-        devices = rows.setdefault(tuple(row["cameras"]), {})
+        lenses = row.get("lenses") or [LENS] * len(row["cameras"])
+        devices = rows.setdefault(tuple(zip(row["cameras"], lenses, strict=True)), {})
         name = row["device"] or f"row {number}"
         before = devices.get(name)
         if before is None or _moment(before) <= _moment(row):
@@ -84,12 +94,13 @@ def _moment(row: Mapping[str, Any]) -> datetime.datetime:
     return datetime.datetime.min.replace(tzinfo=datetime.UTC) if found is None else found
 
 
-def _kind(cameras: tuple[str, ...], devices: Mapping[str, Mapping[str, Any]]) -> KindOfRig:
+def _kind(named: Sequence[tuple[str, str]], devices: Mapping[str, Mapping[str, Any]]) -> KindOfRig:
+    cameras, lenses = tuple(name for name, _ in named), tuple(lens for _, lens in named)
     rows = list(devices.values())
     names = set.intersection(*({name for name, _ in row["given"] or ()} for row in rows))
     given = {name: np.array([dict(row["given"])[name] for row in rows]) for name in sorted(names)}
     parts = [_information(cameras, rows[first : first + 256]) for first in range(0, len(rows), 256)]
-    return KindOfRig(cameras, tuple(devices), DriftInformation.joined(parts), given)
+    return KindOfRig(cameras, lenses, tuple(devices), DriftInformation.joined(parts), given)
 
 
 def _information(cameras: tuple[str, ...], rows: Sequence[Mapping[str, Any]]) -> DriftInformation:

@@ -98,7 +98,7 @@ def require_same_residuals(
 def require_near_prior(
     fit: Estimate, prior: Tensor, rig: CameraRig, prior_scale: Mapping[str, float], options: PipelineOptions
 ) -> None:
-    """Refuse where a value, or a kind of values, is farther from the factory's than the `prior` (C, 15) can bear."""
+    """Refuse where a value, or a kind of values, is farther from the factory's than the `prior` (C, K) can bear."""
     offset, prior_std, std = (
         tensor.numpy() for tensor in (fit.solution.state.offset[0], fit.problem.prior_std[0], prior)
     )
@@ -107,7 +107,7 @@ def require_near_prior(
     camera, parameter = divmod(int(drift.argmax()), drift.shape[1])
     kind = max(prior_scale, key=lambda name: prior_scale[name], default="")
     if drift[camera, parameter] > options.largest_drift:
-        name = rig.parameter_names[parameter]
+        name = rig.parameter_names_of(camera)[parameter]
         found = (
             f"camera {rig.camera_names[camera]}: {name.replace('_', ' ')} would differ from its factory value by "
             f"{_with_unit(change[camera, parameter], name)}, with a tolerance (prior) of "

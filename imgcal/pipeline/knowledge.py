@@ -94,11 +94,10 @@ def knowledge_of(calibration: Calibration, std: Tensor) -> Knowledge:
     rig = calibration.rig
     prior = calibration.estimate.problem.prior_std[0]
     unknown = ((std > UNDETERMINED * prior) & (prior > 0))[:, 6:]
-    undetermined = {
-        name: tuple(rig.camera_names[c] for c in unknown[:, i].nonzero().flatten().tolist())
-        for i, name in enumerate(rig.parameter_names[6:])
-        if bool(unknown[:, i].any())
-    }
+    undetermined: dict[str, tuple[str, ...]] = {}
+    for number, camera in unknown.mT.nonzero().tolist():
+        name = rig.parameter_names_of(camera)[6 + number]  # lenses differ in what a number means
+        undetermined[name] = (*undetermined.get(name, ()), rig.camera_names[camera])
     reached = _fields(calibration.observations.uv, calibration.observations.seen, rig.image_size)
     shares = tuple(reached.double().mean(-1).tolist())
     places = _places(calibration, reached)

@@ -20,8 +20,8 @@ class Motion:
 
     gauge: Gauge
     camera_names: tuple[str, ...]  # C
-    change: Tensor  # (C, 15) recalibrated minus factory, in the order of `PARAMETER_NAMES`
-    std: Tensor  # (C, 15) one standard deviation of it; zero where nothing can have changed
+    change: Tensor  # (C, K) recalibrated minus factory, as `CameraRig.parameter_names`
+    std: Tensor  # (C, K) one standard deviation of it; zero where nothing can have changed
 
     @property
     def rotation_deg(self) -> Tensor:

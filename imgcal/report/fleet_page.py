@@ -20,7 +20,7 @@ from imgcal.fleet import refusals as reasons_of
 from imgcal.io import write_text
 from imgcal.report import svg
 from imgcal.report.svg import Axes
-from imgcal.types import PARAMETER_NAMES, RigPrior
+from imgcal.types import PINHOLE, RigPrior
 
 WORST = 50
 """Cameras that are listed."""
@@ -33,8 +33,6 @@ UNITS = {
     "principal_point": ("px", 1.0),
     "distortion": ("", 1.0),
 }
-NAMES = (*PARAMETER_NAMES, "k4", "k5", "k6")
-KIND_OF_PARAMETER = np.repeat(list(UNITS), (3, 3, 2, 2, len(NAMES) - 10))
 
 
 @dataclass(frozen=True)
@@ -92,7 +90,9 @@ def _kind(one: Taught, before: RigPrior) -> dict[str, Any]:
     shown: dict[str, Any] = {"cameras": one.kind.cameras, "devices": len(one.kind.devices), "reason": one.reason}
     if learnt is None:
         return shown | {"spreads": [], "outliers": [], "trends": [], "charts": []}
-    offsets = standardized_offsets(one.kind.drift, learnt).reshape(len(one.kind.devices), -1, one.kind.drift.parameters)
+    parameters = one.kind.drift.parameters
+    kind_of = np.repeat(list(UNITS), (3, 3, 2, 2, parameters - len(PINHOLE)))
+    offsets = standardized_offsets(one.kind.drift, learnt).reshape(len(one.kind.devices), -1, parameters)
     return shown | {
         "spreads": [
             {
@@ -110,17 +110,17 @@ def _kind(one: Taught, before: RigPrior) -> dict[str, Any]:
         ],
         "trends": [
             (
-                t.covariate, t.camera, NAMES[t.parameter],
+                t.covariate, t.camera, one.kind.name_of(t),
                 f"{factor * t.slope:.3g} ± {factor * t.sigma:.1g} {unit}",
             )
             for t in learnt.trends
-            for unit, factor in [UNITS[KIND_OF_PARAMETER[t.parameter]]]
+            for unit, factor in [UNITS[kind_of[t.parameter]]]
             if t.sigma > 0 and abs(t.slope) > SURE * t.sigma
         ],
         "charts": [
             _histogram(f"{kind.replace('_', ' ')}, in spreads", offsets[..., part].numpy().ravel(), normal=True)
             for kind in UNITS
-            for part in [kind == KIND_OF_PARAMETER[: offsets.shape[-1]]]
+            for part in [kind == kind_of]
         ],
     }  # fmt: skip
 

@@ -62,7 +62,7 @@ def render(content: ReportContent) -> str:
         rows=tables.camera_rows(content),
         groups=tables.GROUPS,
         knowledge=list(zip(content.cameras, tables.knowledge(content), strict=False)),
-        parameters=content.factory.parameter_names,
+        parameters=[content.factory.parameter_names[i] for i in tables.columns(content)],
         limits={"moved": MOVED, "undetermined": round(100 * UNDETERMINED)},
         times=charts.time_bars(content.seconds) if content.seconds else None,
         total=charts.duration(sum(content.seconds.values())),

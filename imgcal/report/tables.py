@@ -79,15 +79,26 @@ def camera_rows(content: ReportContent) -> list[CameraRow]:
     return rows
 
 
+def columns(content: ReportContent) -> list[int]:
+    """Parameters that some camera has."""
+    return [i for i, name in enumerate(content.factory.parameter_names) if name != "-"]
+
+
 def knowledge(content: ReportContent) -> list[list[Knowledge]]:
-    """Compare the standard deviations after and before the data: C rows of K cells; none when refused."""
+    """Compare the standard deviations after and before the data: C rows of `columns`; none when refused."""
     std, prior = content.std, content.prior_std
     if std is None or prior is None:
         return []
     rows = []
     for camera, name in enumerate(content.cameras):
         cells = []
-        for i, parameter in enumerate(content.factory.parameter_names):
+        own = content.factory.parameter_names_of(camera)
+        for i in columns(content):
+            parameter = own[i]
+            if parameter == "-":
+                tip = f"{name} {content.factory.parameter_names[i]}: not of its lens"
+                cells.append(Knowledge("·", 0, False, tip))
+                continue
             if content.fixed[camera, i]:
                 fixed = "reference" if camera == content.reference and i < 6 else "fixed"
                 cells.append(Knowledge("·", 0, False, f"{name} {parameter}: {fixed}"))

@@ -6,9 +6,10 @@ import pytest
 import torch
 
 import imgcal
-from imgcal.fleet import Dataset, DriftInformation, Item, Settings, kinds_of_rigs, refusals, unit_of
+from imgcal.fleet import Dataset, DriftInformation, Item, Settings, Trend, kinds_of_rigs, refusals, unit_of
 from imgcal.fleet.job import failed_row, processed
 from tests.imgcal.fleet.small_captures import write_capture
+from tests.imgcal.lensed import lensed
 
 
 @pytest.fixture
@@ -49,6 +50,44 @@ def test_what_a_row_keeps_is_what_the_estimate_said(dataset: Dataset, tmp_path: 
     apart = (direct.information - kept.information) / (scale[:, :, None] * scale[:, None, :])
     assert float(apart.abs().max()) < 1e-6
     np.testing.assert_allclose(kept.score / scale, direct.score / scale, rtol=1e-4, atol=1e-3)
+
+
+def test_rigs_of_other_lenses_are_another_kind_and_their_values_have_their_own_names(tmp_path: Path) -> None:
+    """Cameras of the same names, with mixed lenses here and the usual ones there, in one fleet."""
+    usual = imgcal.load_rig("T4")
+    mixed, dataset, rows = lensed(usual, "mixed"), Dataset(tmp_path / "out"), list[dict[str, Any] | None]()
+    imgcal.save_rig(mixed, tmp_path / "mixed.yaml")
+    for number in range(10):
+        rig, name = (usual, "T4") if number == 9 else (mixed, str(tmp_path / "mixed.yaml"))
+        write_capture(tmp_path / f"{number}.csv", number, rig)
+        item = Item(number, str(tmp_path / f"{number}.csv"), name, "asymmetric8", f"d{number}", None)
+        rows.append(processed(item, Settings()))
+    with dataset.written() as writer:
+        writer.add([row for row in rows if row is not None])
+    kept = dataset.latest(("cameras", "lenses", "parameters", "offset", "status")).to_pylist()
+    assert {row["status"] for row in kept} == {"ok"}
+    assert kept[0]["lenses"] == ["equidistant", "brown_conrady", "rational", "equidistant"]
+    assert kept[9]["lenses"] == ["brown_conrady"] * 4
+    assert len(kept[0]["parameters"]) == len(kept[0]["offset"]) == 4 * 18
+    assert kept[0]["parameters"][10:18] == ["k1", "k2", "k3", "k4", "-", "-", "-", "-"]
+    assert kept[0]["parameters"][46:54] == ["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"]
+    first, second = kinds_of_rigs(dataset)
+    assert (len(first.devices), len(second.devices)) == (9, 1)
+    assert first.lenses == mixed.lens_models
+    learnt = first.learn()
+    assert all(0 <= spread.value < 100 for spread in learnt.spreads)
+    names = [first.name_of(Trend("t", camera, 12, 0.0, 0.0)) for camera in first.cameras]
+    assert names == ["k3", "p1", "p1", "k3"]
+
+
+def test_results_from_before_lenses_were_written_are_of_the_usual_ones(dataset: Dataset, monkeypatch: Any) -> None:
+    import pyarrow as pa
+
+    latest = Dataset.latest
+    older: Any = lambda self, columns=None: pa.table(latest(self, columns)).drop_columns(["lenses"])  # noqa: E731
+    monkeypatch.setattr(Dataset, "latest", older)
+    (kind,) = kinds_of_rigs(dataset)
+    assert kind.lenses == ("brown_conrady",) * 4
 
 
 def test_reasons_are_counted(dataset: Dataset) -> None:

@@ -2,9 +2,11 @@ import pytest
 import torch
 
 from imgcal.association.options import PipelineOptions
+from imgcal.io import load_rig
 from imgcal.pipeline.scoring import rms_length, score
 from imgcal.synthesis.captures import simulate_truth, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
+from tests.imgcal.lensed import KINDS, lensed
 
 
 def test_a_score_needs_no_prior(o10, asymmetric8):
@@ -12,6 +14,15 @@ def test_a_score_needs_no_prior(o10, asymmetric8):
     table = true_detections(truth)
     assert score(table, truth.rig, asymmetric8).distances.max() < 1e-6
     assert score(table, o10, asymmetric8, PipelineOptions()).distances.mean() > 1
+
+
+@pytest.mark.parametrize("lens", KINDS)
+def test_rigs_of_other_lenses_are_scored(asymmetric8, lens):
+    factory = lensed(load_rig("T4"), lens)
+    truth = simulate_truth(factory, asymmetric8, 4, torch.Generator().manual_seed(1), PhysicalDrift())
+    table = true_detections(truth)
+    assert score(table, truth.rig, asymmetric8).distances.max() < 1e-6
+    assert score(table, factory, asymmetric8).distances.mean() > 5
 
 
 def test_the_rms_is_of_lengths_and_of_what_was_seen():

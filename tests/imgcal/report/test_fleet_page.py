@@ -29,7 +29,9 @@ def kind(bump: float) -> KindOfRig:
     information = torch.diag((10 / std).square()).expand(40, 15, 15)
     score = (information @ offset[..., None])[..., 0]
     names = tuple(f"<device {number}>" for number in range(40))
-    return KindOfRig(("cam",), names, DriftInformation(("cam",), information, score), {"t": np.arange(40.0)})
+    return KindOfRig(
+        ("cam",), ("brown_conrady",), names, DriftInformation(("cam",), information, score), {"t": np.arange(40.0)}
+    )
 
 
 def test_the_page_says_what_was_learnt_and_escapes_names(tmp_path: Path) -> None:
