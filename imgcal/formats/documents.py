@@ -15,7 +15,7 @@ from typing import Any
 from xml.parsers import expat
 
 from imgcal.errors import InputError
-from imgcal.io import parse_foreign_yaml, read_json
+from imgcal.io import is_prose, looks_like, parse_foreign_yaml, read_json
 from imgcal.messages import quoted
 
 MOST_BYTES = 2**26
@@ -85,6 +85,16 @@ def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
 def parse_document(content: bytes, path: Path) -> Document:
     """Do the work of `read_document` on what a file holds."""
     text = _decoded(content, path)
+    try:
+        return _parsed(text, path)
+    except InputError:
+        if not is_prose(text):
+            raise
+        expected = "`format: imgcal-rig/1`, or the calibration of another tool in YAML, TOML, JSON or XML"
+        raise InputError(f"{path}: found {looks_like(text)}, expected {expected}") from None
+
+
+def _parsed(text: str, path: Path) -> Document:
     first = next((line.strip() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), "")
     if first.startswith("<"):
         return Document(path, "xml", parse_xml(text, str(path)))

@@ -13,7 +13,16 @@ from .resources import data_path, shipped_names
 from .rig_yaml import RigCovariance, load_rig, load_rig_covariance, rig_from_text, rig_text, save_rig
 from .safetensors_file import read_tensors, read_texts, write_tensors
 from .validation import StrictModel, StrictRecord, validated
-from .yaml_file import Flow, parse_foreign_yaml, parse_yaml, read_yaml, read_yaml_mapping, yaml_text
+from .yaml_file import (
+    Flow,
+    is_prose,
+    looks_like,
+    parse_foreign_yaml,
+    parse_yaml,
+    read_yaml,
+    read_yaml_mapping,
+    yaml_text,
+)
 
 __all__ = [
     "DEFAULT_SIGMA",
@@ -34,12 +43,14 @@ __all__ = [
     "find_file",
     "grey_frame",
     "is_file_name",
+    "is_prose",
     "keys_of",
     "load_cameras",
     "load_detections",
     "load_object",
     "load_rig",
     "load_rig_covariance",
+    "looks_like",
     "model_file",
     "model_name",
     "natural_key",

@@ -14,8 +14,17 @@ from imgcal.errors import InputError
 from imgcal.io.names import check_regular
 from imgcal.io.validation import Model, validated
 from imgcal.io.yaml_values import read_values
+from imgcal.messages import shortened
 
 MOST_BYTES = 2**26
+INSTEAD = {
+    ("imgcal-rig/1", "imgcal-cameras/1"): ": these cameras have no places yet; imgcal calibrate finds them where the "
+    "file is given as --cameras instead of --rig (in Python: load_cameras, calibrate_from_scratch)",
+}
+"""What to do with a file of another format (the second) than the one that was expected."""
+SENTENCE = re.compile(r"(?:[^\W\d_]{2,}['\u2019\w]*[,.;:]? ){3}[^\W\d_]{2,}")
+SHARE_OF_PROSE = 0.2
+"""Of the lines of a text for people, at least, have four words in a row; few of a damaged file of values do."""
 _BaseDumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 
@@ -58,13 +67,41 @@ def read_yaml_mapping(path: Path, file_format: str) -> dict[str, Any]:
     return _formatted(_content(path), str(path), file_format)
 
 
+def is_prose(text: str) -> bool:
+    r"""Tell whether a text is sentences rather than values: a README, say.
+
+    Examples:
+        >>> is_prose("imgcal\n======\nThis tool recalibrates several cameras.\n")
+        True
+        >>> is_prose("format: imgcal-rig/1\nname: a rig of ours\ncameras: []\n")
+        False
+    """
+    lines = [line for line in text.splitlines() if line.strip()]
+    return SHARE_OF_PROSE * len(lines) < sum(SENTENCE.search(line) is not None for line in lines)
+
+
+def looks_like(text: str) -> str:
+    """Say what a text that cannot be read looks like, by its first line."""
+    first = next((line.strip() for line in text.splitlines() if line.strip()), "")
+    return f"text for people (it begins `{shortened(first)}`)"
+
+
 def _formatted(content: bytes, where: str, file_format: str) -> dict[str, Any]:
-    values = _parse(content, where)
+    try:
+        values = _parse(content, where)
+    except InputError:
+        text = content.decode(errors="replace")
+        if not is_prose(text):
+            raise
+        raise InputError(
+            f"{where}: found {looks_like(text)}, expected a file that starts with `format: {file_format}`"
+        ) from None
     if not isinstance(values, dict):
         raise InputError(f"{where}: found {_what(values)}, expected a mapping that starts with `format: {file_format}`")
     if values.get("format") != file_format:
         found = f"`format: {reprlib.repr(values['format'])}`" if "format" in values else "no key `format`"
-        raise InputError(f"{where}: found {found}, expected `format: {file_format}`")
+        instead = INSTEAD.get((file_format, str(values.get("format"))), "")
+        raise InputError(f"{where}: found {found}, expected `format: {file_format}`{instead}")
     return values
 
 

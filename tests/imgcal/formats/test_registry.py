@@ -84,6 +84,12 @@ def test_formats_by_name() -> None:
         ),
         ({"a__yaml": ""}, "found none of the keys"),
         ({"a__yaml": "a: [\n"}, "not valid YAML"),
+        ({"README__md": "# Rig\nThe cameras: these are where\n they have always been: there.\n"}, "begins `# Rig`"),
+        ({"README": "<p align=center>\nThis is the rig of the hall.\n"}, "people .it begins `<p align=center>`., exp"),
+        (
+            {"a__md": "[![x](y)]\nThis is the rig of the hall.\n"},
+            "begins .*expected `format: imgcal-rig/1`, or the cal",
+        ),
         (
             {"a__yml": storage_text({"camera_matrix": np.eye(3), "distortion_coefficients": np.zeros((1, 5))})},
             "one camera",

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from imgcal.errors import InputError
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
+from imgcal.io.cameras_yaml import save_cameras
 from imgcal.io.rig_yaml import RigCovariance, load_rig, load_rig_covariance, save_rig
 from imgcal.types.rig import CameraRig, DriftRate, RigPrior
 from imgcal.types.volume import Volume
@@ -322,3 +323,9 @@ def test_what_could_not_be_read_again_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected one rig"):
         save_rig(rig.expand(2), path)
     assert not path.exists()
+
+
+def test_cameras_without_places_are_no_rig_and_the_way_on_is_told(tmp_path: Path) -> None:
+    save_cameras({"left": (1280, 1024), "right": (1280, 1024)}, 65.0, tmp_path / "cameras.yaml")
+    with pytest.raises(InputError, match=r"found `format: 'imgcal-cameras/1'`.* given as --cameras instead of --rig"):
+        load_rig(tmp_path / "cameras.yaml")

@@ -80,6 +80,20 @@ def test_what_is_no_mapping(content: str, message: str, tmp_path: Path) -> None:
         read(tmp_path / "rig.yaml", content)
 
 
+README = """# Two cameras: a README
+It says: what this folder holds, and how it was made. See [the page](https://x.y/z).
+- `rig.yaml` is the rig that the factory has measured.
+"""
+
+
+def test_a_text_for_people_is_told_from_damaged_values(tmp_path: Path) -> None:
+    expected = "found text for people .it begins `# Two cameras: a README`., expected a file that starts with `format"
+    with pytest.raises(InputError, match=expected):
+        read(tmp_path / "README.md", README)
+    with pytest.raises(InputError, match="not valid YAML in line"):
+        read(tmp_path / "rig.yaml", GOOD.replace("weight: 4", "weight: [") + "# where the cameras were last year\n")
+
+
 def test_files_that_are_not_there_or_no_files(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be read: No such file"):
         read_yaml(tmp_path / "absent.yaml", Rig, "test/1")
