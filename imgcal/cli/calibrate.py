@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import math
 import sys
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 import tyro
@@ -26,9 +25,10 @@ from imgcal.cli.common import (
     start_pose,
     without_cameras,
 )
-from imgcal.cli.counts import blobs_by_camera, counts_by_camera, counts_by_snapshot, doubtful_cameras
+from imgcal.cli.counts import doubtful_cameras
 from imgcal.cli.describe import describe, describe_refusal
-from imgcal.cli.findings import UNKNOWN, Findings, findings
+from imgcal.cli.findings import findings
+from imgcal.cli.outcome import print_outcome, refused_summary, summary
 from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import Gauge
@@ -54,11 +54,10 @@ from imgcal.pipeline import (
     calibrate,
     calibrate_from_scratch,
     load_initializer,
-    rms_length,
     sight_of_capture,
     unit_doubt,
 )
-from imgcal.types import CalibrationObject, CameraRig, Detections, MovedError, limits
+from imgcal.types import CalibrationObject, CameraRig, Detections, limits
 
 WRITTEN = ("report.html", "rig.yaml", "object.csv", "result.json")
 
@@ -180,7 +179,7 @@ class Calibrate:
             save_detections(outcome.labelled_detections, self.labelled)
         for move in outcome.moved:
             print(f"{move}: only the snapshots since then are used")
-        _print(result, found, self.out, draws)
+        print_outcome(result, found, self.out, draws)
         if doubt := unit_doubt(rig, obj, outcome.from_scratch):
             print(f"note: {doubt}", file=sys.stderr)
         for note in doubtful_cameras(outcome):
@@ -277,161 +276,10 @@ def trusted_covariance(calibration: Calibration, reference: int) -> RigCovarianc
     bad = ~(covariance.std <= WORST_STD)
     if bool(bad.any()):
         camera, parameter = bad.nonzero()[0].tolist()
+        name = calibration.rig.parameter_names_of(camera)[parameter]
         raise RefusedError(
-            f"covariance: {calibration.rig.parameter_names[parameter]} of camera {names[camera]} is known to "
+            f"covariance: {name} of camera {names[camera]} is known to "
             f"{float(covariance.std[camera, parameter]):.2g} only: the blobs say next to nothing (their sigma may be "
             "too large, or all of them at one place)"
         )
     return covariance
-
-
-def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, Any]:
-    """Put a calibration into the form that scripts read."""
-    used, snapshots = calibration.labelled.used, calibration.labelled.snapshots
-    seen = calibration.observations.seen
-    per_camera = {}
-    for camera, name in enumerate(calibration.rig.camera_names):
-        points = int(seen[:, camera].sum())
-        per_camera[name] = {
-            "points": points,
-            "rms_px_before": rms_length(calibration.before.residual[:, camera], seen[:, camera]),
-            "rms_px_after": rms_length(calibration.residual[:, camera], seen[:, camera]),
-            **counts_by_camera(calibration.tally, camera),
-        }
-    alternatives = max(snapshots[s].alternatives for s in used)
-    return {
-        "status": "ok",
-        "reason": "",
-        "identity": calibration.identity,
-        "identity_alternatives": alternatives,
-        "detector": dict(calibration.detectors),
-        "from_scratch": calibration.from_scratch,
-        "rms_px_before": None if calibration.from_scratch else rms_length(calibration.before.residual, seen),
-        "rms_px_after": rms_length(calibration.residual, seen),
-        "first_guess": _guess_summary(calibration),
-        "chi2_per_dof": float(calibration.chi2_per_dof),
-        "model_error_px": calibration.additive_noise,
-        "outliers": calibration.outliers,
-        "prior_too_narrow": dict(calibration.prior_scale),
-        "snapshots_used": len(used),
-        "snapshots_rejected": len(snapshots) - len(used),
-        "rejected": {s.name: s.reason for s in snapshots if s.status == "refused"},
-        "moved": [move.as_values() for move in calibration.moved],
-        "late": [vars(late) for late in calibration.late],
-        "per_camera": per_camera,
-        "per_snapshot": counts_by_snapshot(calibration),
-        "object": [
-            {"fiducial": offset.fiducial, "offset_mm": offset.distance, "sigma_mm": offset.sigma}
-            for offset in calibration.shape
-        ],
-        "object_displaced": [offset.fiducial for offset in calibration.displaced],
-        "object_lost": list(calibration.lost),
-        "object_scale_sigma": calibration.scale_sigma,
-        "object_bent_sigma": calibration.bent_sigma,
-        "covariance": {
-            "from": "scatter between blocks of snapshots" if calibration.block_length else "noise of the blobs",
-            "block_length": calibration.block_length,
-            "inflation": calibration.estimate.inflation,
-        },
-        "predicted_error": calibration.predicted_error.summary(),
-        "seconds": seconds,
-    }
-
-
-def _guess_summary(calibration: Calibration) -> dict[str, Any] | None:
-    guess = calibration.initialization
-    if guess is None:
-        return None
-    rms = rms_length(guess.residual, calibration.observations.seen)
-    known = rms is not None and math.isfinite(rms)  # a network may say anything
-    return {"network": guess.name, "rms_px": rms if known else None, "used": calibration.guess_used}
-
-
-def refused_summary(
-    refusal: RefusedError, detections: Detections, rig: CameraRig, seconds: dict[str, float]
-) -> dict[str, Any]:
-    """Say why there is no result, with the same keys."""
-    moved = refusal.moved if isinstance(refusal, MovedError) else ()
-    return {
-        "status": "refused",
-        "reason": refusal.for_command,
-        "identity": None,
-        "identity_alternatives": None,
-        "detector": {},
-        "from_scratch": None,
-        "rms_px_before": None,
-        "rms_px_after": None,
-        "first_guess": None,
-        "chi2_per_dof": None,
-        "model_error_px": None,
-        "outliers": None,
-        "prior_too_narrow": {},
-        "snapshots_used": 0,
-        "snapshots_rejected": len(detections.snapshot_names),
-        "rejected": {},
-        "moved": [move.as_values() for move in moved],
-        "late": [],
-        "per_camera": blobs_by_camera(detections, rig),
-        "per_snapshot": {},
-        "object": [],
-        "object_displaced": [],
-        "object_lost": [],
-        "object_scale_sigma": None,
-        "object_bent_sigma": None,
-        "covariance": None,
-        "predicted_error": None,
-        **UNKNOWN,
-        "seconds": seconds,
-    }
-
-
-def predicted_line(predicted: dict[str, Any]) -> str:
-    """Say in one line how good the rig is where it is used."""
-    lengths = [
-        f"{value:.2g} {unit} (95 %: {p95:.2g})"
-        for unit in ("mm", "px")
-        if (value := predicted[f"median_{unit}"]) is not None and (p95 := predicted[f"p95_{unit}"]) is not None
-    ]
-    worst = predicted["worst_camera_px"]
-    words = f"predicted error in the working volume {', '.join(lengths) or 'unknown'}"
-    return words if worst is None else f"{words}, worst camera {predicted['worst_camera']} {worst:.2g} px"
-
-
-def _print(result: dict[str, Any], found: Findings, out: Path, report: bool) -> None:
-    guess = result["first_guess"]
-    alone = None if guess is None else guess["rms_px"]
-    network = "" if alone is None else f"network alone {alone:.3f} px, "
-    before, after = result["rms_px_before"], result["rms_px_after"]
-    earlier = "without a factory calibration " if before is None else f"before {before:.3f} px, {network}after "
-    print(f"reprojection error {earlier}{after:.4f} px (RMS)")
-    if guess is not None and not guess["used"]:
-        print("note: the network's guess was no better than the factory calibration: not used", file=sys.stderr)
-    print(predicted_line(result["predicted_error"]))
-    print(
-        f"identity {result['identity']}, {result['snapshots_used']} snapshots used, "
-        f"{result['snapshots_rejected']} rejected"
-    )
-    for line in found.lines:
-        print(line)
-    for kind, factor in result["prior_too_narrow"].items():
-        kind = kind.replace("_", " ")
-        print(f"note: {kind} drifted {factor:.1f} times as far as the rig's prior allows: widened", file=sys.stderr)
-    for offset in result["object"]:
-        if offset["fiducial"] in result["object_displaced"]:
-            print(
-                f"note: fiducial {offset['fiducial']} of the object is {offset['offset_mm']:.3g} +- "
-                f"{offset['sigma_mm']:.1g} mm off its place",
-                file=sys.stderr,
-            )
-    for fiducial in result["object_lost"]:
-        print(
-            f"note: fiducial {fiducial} of the object was hardly found where the others were: missing, hidden, or not "
-            "where the object file has it",
-            file=sys.stderr,
-        )
-    print(f"rig     {out / 'rig.yaml'}")
-    if result["object"]:
-        print(f"object  {out / 'object.csv'}")
-    print(f"result  {out / 'result.json'}")
-    if report:
-        print(f"report  {out / 'report.html'}")
