@@ -57,6 +57,15 @@ def test_from_scratch_is_as_good_as_from_the_factory():
         assert 1500 < place < 4500  # mm in front of the first camera
 
 
+def test_a_cube_will_do_though_each_image_takes_another_turn_of_it():
+    cube = load_object("cube8")
+    large = replace(cube, points=2 * cube.points)
+    truth, labelled, blobs, cameras = capture(large, 40)
+    by_labels, by_blobs = (calibrate_from_scratch(source, cameras, large) for source in (labelled, blobs))
+    assert (by_labels.identity, by_blobs.identity) == ("coded", "ambiguous")
+    assert error(by_blobs.rig, truth) < 1.5 * error(by_labels.rig, truth) < 3
+
+
 def test_what_the_data_do_not_say_is_refused():
     wand = load_object("wand4")
     _, labelled, blobs, cameras = capture(wand, 12, volume=Volume.box((0, 0, 900), (1, 1, 901)))
