@@ -63,8 +63,8 @@ def correlate(
     points = poses.apply(obj.points.to(rig.focal_length))
     projection = rig.expand(len(points)).project_values(points, obj.radius)
     # Far outside of the image nothing is said; at its edge the shift decides.
-    cells = np.nan_to_num((projection.uv.numpy() + 0.5) / maps.factor, nan=-1e6).clip(-1e6, 1e6)
-    cells, front = np.ascontiguousarray(cells), np.ascontiguousarray(projection.depth.numpy() > 1)
+    cells = np.ascontiguousarray(maps.cells(projection.uv.numpy()))
+    front = np.ascontiguousarray(projection.depth.numpy() > 1)
     score, shift = np.zeros(cells.shape[:2]), np.zeros((*cells.shape[:2], 2))
     steps = np.ceil(reach / maps.factor).astype(np.int64)
     most = int(steps.max(initial=0))

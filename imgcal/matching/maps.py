@@ -3,6 +3,7 @@
 A frame is reduced and filtered for spots of several sizes. What the filters say is replaced by its rank: minus the
 logarithm of the share of the frame in which they say as much. Without markers that is a standard exponential variable,
 whatever noise, contrast, background and clutter are; the more clutter a frame has, the less a bright spot is worth.
+Where the object's place is known, all this is done within a window of each frame.
 """
 
 from __future__ import annotations
@@ -28,11 +29,24 @@ MOST = 9.0
 
 @dataclass(frozen=True)
 class Maps:
-    """Surprise of all cameras at one scale."""
+    """Surprise of all cameras at one scale, of their frames or windows in these."""
 
     surprise: NDArray[np.float32]  # (C, H, W), 0 where a camera has no image
     factor: int  # pixels to a cell
     size: NDArray[np.int64]  # (C, 2) width and height in cells
+    corner: NDArray[np.int64]  # (C, 2) cells left of the first one, and above it
+
+    def cells(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Turn pixels (*K, C, N, 2) into cells: cell i reaches from i to i + 1; what is nowhere is far outside."""
+        return np.nan_to_num((uv + 0.5) / self.factor - self.corner[:, None], nan=-1e6).clip(-1e6, 1e6)
+
+    def pixels(self, cells: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Turn cells (*K, C, N, 2) into pixels."""
+        return (cells + self.corner[:, None]) * self.factor - 0.5
+
+    def select(self, cameras: list[int]) -> Maps:
+        """Keep the given cameras."""
+        return Maps(self.surprise[cameras], self.factor, self.size[cameras], self.corner[cameras])
 
     def pooled(self, factor: int) -> Maps:
         """Make larger cells, each as surprising as the most surprising one within it or next to it."""
@@ -44,17 +58,21 @@ class Maps:
         padded[:, :height, :width] = self.surprise
         most = padded.reshape(count, padded.shape[1] // step, step, -1, step).max((2, 4))
         size = -(-self.size // step)
-        return Maps(_ranked(most, size), self.factor * step, size)
+        return Maps(_ranked(most, size), self.factor * step, size, self.corner // step)
 
     def dilated(self) -> Maps:
         """Let every cell be as surprising as its most surprising neighbour."""
         kernel = np.ones((3, 3), np.uint8)
         most = np.stack([cv2.dilate(one, kernel) for one in self.surprise])
-        return Maps(_ranked(most, self.size), self.factor, self.size)
+        return Maps(_ranked(most, self.size), self.factor, self.size, self.corner)
 
 
 def surprise_maps(
-    frames: list[Frame | None], factor: int, dark: bool, masks: list[NDArray[np.bool_] | None]
+    frames: list[Frame | None],
+    factor: int,
+    dark: bool,
+    masks: list[NDArray[np.bool_] | None],
+    windows: NDArray[np.int64] | None = None,
 ) -> tuple[Maps, NDArray[np.float32]]:
     """Filter the frames of all cameras.
 
@@ -63,23 +81,30 @@ def surprise_maps(
         factor: pixels to a cell.
         dark: markers are darker than their surroundings.
         masks: (H, W) of each camera, True where not to look.
+        windows: (C, 4) first and last column and row of what is looked at, in pixels, the last ones excluded; a
+            multiple of `factor`, and of that of whatever `pooled` makes of it; None = all of each frame.
 
     Returns:
         Maps, and the response to each size of spots in standard deviations of the noise: (C, sizes, H, W).
     """
-    size = np.array([(0, 0) if frame is None else _cells(frame, factor) for frame in frames], dtype=np.int64)
+    if windows is None:
+        windows = np.array([(0, 0, 0, 0) if f is None else (0, f.shape[1], 0, f.shape[0]) for f in frames])
+    there = np.array([frame is not None for frame in frames])
+    size = np.where(there[:, None], np.maximum(windows[:, 1::2] - windows[:, ::2], 0) // factor, 0)
     shape = (len(frames), int(max(size[:, 1].max(), 1)), int(max(size[:, 0].max(), 1)))
     surprise = np.zeros(shape, np.float32)
     response = np.zeros((shape[0], len(SIZES), *shape[1:]), np.float32)
 
     def fill(camera: int) -> None:
-        frame, mask = frames[camera], masks[camera]
-        if frame is None:
+        frame, mask, (width, height) = frames[camera], masks[camera], size[camera].tolist()
+        if frame is None or width * height == 0:
             return
-        width, height = size[camera]
-        values = _spots(_reduced(frame, factor, dark))
+        left, top = windows[camera, ::2].tolist()
+        # What is left over at the right and at the bottom is not seen.
+        area = slice(top, top + height * factor), slice(left, left + width * factor)
+        values = _spots(_reduced(frame[area], factor, dark))
         if mask is not None:
-            covered = cv2.resize(mask.astype(np.uint8), (int(width), int(height)), interpolation=cv2.INTER_AREA) > 0
+            covered = cv2.resize(mask[area].astype(np.uint8), (width, height), interpolation=cv2.INTER_AREA) > 0
             values[:, covered] = 0.0
         ranks = np.stack([rank(value) for value in values]) - np.float32(np.log(len(values)))
         surprise[camera, :height, :width] = np.clip(ranks.max(0), 0, MOST)
@@ -87,7 +112,7 @@ def surprise_maps(
 
     with ThreadPoolExecutor(max(1, min(len(frames), os.cpu_count() or 1))) as pool:
         list(pool.map(fill, range(len(frames))))
-    return Maps(surprise, factor, size), response
+    return Maps(surprise, factor, size, windows[:, ::2] // factor), response
 
 
 def rank(values: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -114,16 +139,12 @@ def _ranked(values: NDArray[Any], size: NDArray[np.int64]) -> NDArray[np.float32
     return ranked
 
 
-def _cells(frame: Frame, factor: int) -> tuple[int, int]:
-    return frame.shape[1] // factor, frame.shape[0] // factor
-
-
-def _reduced(frame: Frame, factor: int, dark: bool) -> NDArray[np.float32]:
-    """Mean of each cell; what is left over at the right and at the bottom is not seen."""
-    width, height = _cells(frame, factor)
-    values = np.ascontiguousarray(frame[: height * factor, : width * factor]).astype(np.float32)
+def _reduced(part: Frame, factor: int, dark: bool) -> NDArray[np.float32]:
+    """Mean of each cell."""
+    values = part.astype(np.float32)
     if factor > 1:
-        values = np.asarray(cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA))
+        size = (part.shape[1] // factor, part.shape[0] // factor)
+        values = np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_AREA))
     return -values if dark else values
 
 

@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from imgcal.association import Proposal, Snapshot, lattice_shifts, near_turns, rows_of
+from imgcal.detection import Frame
 from imgcal.geometry import RigidTransform
 from imgcal.matching.maps import Maps, surprise_maps
 from imgcal.matching.poses import Matcher, Ranked, Scene, anywhere, around, distinct_turns
@@ -28,6 +29,7 @@ FINE_CLIMBS = (0.03, 0.012)
 """Radians: steps on the finest maps."""
 MOST_RIVALS = 2  # that are fitted, too, where the best pose does not stand out by far
 PARALLAX = 60.0  # px: what a pose from one camera may be off in the others
+WORTHWHILE = 0.6  # of the frames, above which these are looked at as a whole
 
 
 @dataclass(frozen=True)
@@ -37,42 +39,70 @@ class MatchedFilter:
     name: str = "matched"
 
     def propose(self, snapshot: Snapshot) -> Proposal:
-        """Look at one snapshot: near the known poses first, then anywhere."""
-        names = snapshot.rig.camera_names
-        frames = [snapshot.frames.get(name) for name in names]
-        dark = snapshot.detection.polarity == "dark"
+        """Look at one snapshot: around the known poses first, then at the whole frames, and anywhere in these."""
         scene = Scene(snapshot.rig, snapshot.obj, snapshot.prior_std, _distance(snapshot))
-        gap = _gap(snapshot.obj) * scene.pixels_per_mm
-        fine, response = surprise_maps(frames, FINEST, dark, [snapshot.masks.get(name) for name in names])
-        coarse = fine.pooled(max(FINEST, 2 ** int(np.log2(max(gap / CELLS_A_GAP, 1)))))
-        close = Matcher.on(scene, fine.dilated(), 4 * scene.drift + PARALLAX / 3)
-        found = self._known(close, coarse, snapshot)
-        if found is None and not _searchable(scene.obj):
-            return Proposal.declined(snapshot, "its fiducials are too many and too close to search for it anywhere")
+        windows = _windows(scene, snapshot)
+        if windows is not None:
+            view = View.of(scene, snapshot, windows)
+            found = view.known(snapshot)
+            proposal = None if found is None else view.proposal(found, snapshot)
+            if proposal is not None and proposal.margin > CLEAR:
+                return proposal
+        view = View.of(scene, snapshot)
+        found = view.known(snapshot)
         if found is None:
-            found = self._searched(close, coarse)
-        margin, rivals = margin_of(found, close)
+            if not _searchable(scene.obj):
+                return Proposal.declined(snapshot, "its fiducials are too many and too close to search for it anywhere")
+            found = view.searched()
+        return view.proposal(found, snapshot)
 
-        def fit(pose: Ranked) -> Fitted | None:
-            return fitted(scene, pose, fine, response, frames, dark)
 
-        result = fit(found.best(1)) if margin > 0 else None
+@dataclass(frozen=True)
+class View:
+    """The frames of a snapshot, or windows in them, as maps at the scales of the search."""
+
+    scene: Scene
+    frames: list[Frame | None]
+    dark: bool
+    fine: Maps
+    response: NDArray[np.float32]  # (C, sizes, H, W), see `surprise_maps`
+    coarse: Maps
+    close: Matcher  # on the fine maps
+
+    @classmethod
+    def of(cls, scene: Scene, snapshot: Snapshot, windows: NDArray[np.int64] | None = None) -> View:
+        """Look at frames, or at windows (C, 4) of them: first and last columns and rows."""
+        names, dark = snapshot.rig.camera_names, snapshot.detection.polarity == "dark"
+        frames, masks = [snapshot.frames.get(name) for name in names], [snapshot.masks.get(name) for name in names]
+        fine, response = surprise_maps(frames, FINEST, dark, masks, windows)
+        close = Matcher.on(scene, fine.dilated(), _reach(scene))
+        return cls(scene, frames, dark, fine, response, fine.pooled(_coarsest(scene)), close)
+
+    def proposal(self, found: Ranked, snapshot: Snapshot) -> Proposal:
+        """Fit and measure the best pose, and its rivals where it does not stand out by far."""
+        scene = self.scene
+        margin, rivals = margin_of(found, self.close)
+        result = self._fitted(found.best(1)) if margin > 0 else None
         if result is None:
             return Proposal.declined(snapshot, "no pose of the object stands out in the images", margin)
         if margin < CLEAR:
             # With rig and pose fitted, places are compared to a cell: chance agreements gain nothing from that.
             against = rivals.scores.total.tolist()
             for k in range(min(MOST_RIVALS, len(against))):
-                rival = fit(rivals.select(np.array([k])))
+                rival = self._fitted(rivals.select(np.array([k])))
                 if rival is not None and differs(rival.predicted[None], result.predicted, scene.obj)[0]:
-                    against[k] = max(against[k], rival.log_odds(scene, fine))
-            margin = max(margin, result.log_odds(scene, fine) - max([0.0, *against]))
-        return _proposal(result, snapshot, margin)
+                    against[k] = max(against[k], rival.log_odds(scene, self.fine))
+            margin = max(margin, result.log_odds(scene, self.fine) - max([0.0, *against]))
+        rows = rows_of(result.uv, result.sigma, result.seen, result.radius, snapshot.blobs)
+        return Proposal(rows, result.rig_from_object, margin)
 
-    def _known(self, close: Matcher, coarse: Maps, snapshot: Snapshot) -> Ranked | None:
+    def _fitted(self, pose: Ranked) -> Fitted | None:
+        return fitted(self.scene, pose, self.fine, self.response, self.frames, self.dark)
+
+    def known(self, snapshot: Snapshot) -> Ranked | None:
         """Look at the known poses, or the origin, and around them; None = the object is not there for sure."""
-        scene, found = close.scene, None
-        matcher = Matcher.on(scene, coarse, close.reach)
+        scene, close, found = self.scene, self.close, None
+        matcher = Matcher.on(scene, self.coarse, close.reach)
         known = [pose for pose in _known_poses(snapshot) if _in_view(pose, snapshot)]
         for turns_too in (False, True):
             for pose in known:
@@ -86,9 +116,9 @@ class MatchedFilter:
                     return found
         return None if _searchable(scene.obj) else found
 
-    def _searched(self, close: Matcher, coarse: Maps) -> Ranked:
+    def searched(self) -> Ranked:
         """Look anywhere: from the image of one camera after the other, until a pose stands out."""
-        scene = close.scene
+        scene, close, coarse = self.scene, self.close, self.coarse
         turns = distinct_turns(scene.obj, TURNS)
         reach = 4 * 2**0.5 * scene.drift + PARALLAX
         alone = Matcher.on(scene, coarse.pooled(2 * coarse.factor), reach)
@@ -148,9 +178,39 @@ def _places(found: Ranked, scene: Scene) -> NDArray[np.float64]:
     return uv + found.scores.shift[:, :, None]
 
 
-def _proposal(result: Fitted, snapshot: Snapshot, margin: float) -> Proposal:
-    rows = rows_of(result.uv, result.sigma, result.seen, result.radius, snapshot.blobs)
-    return Proposal(rows, result.rig_from_object, margin)
+def _reach(scene: Scene) -> NDArray[np.float64]:
+    """How far the images of a known pose may be shifted: (C,) pixels."""
+    return 4 * scene.drift + PARALLAX / 3
+
+
+def _coarsest(scene: Scene) -> int:
+    """Pixels to a cell with which the search begins."""
+    gap = _gap(scene.obj) * scene.pixels_per_mm
+    return int(max(FINEST, 2 ** int(np.log2(max(gap / CELLS_A_GAP, 1)))))
+
+
+def _windows(scene: Scene, snapshot: Snapshot) -> NDArray[np.int64] | None:
+    """Where the known poses, and turns around them, put the object: (C, 4), see `View.of`.
+
+    Returns:
+        None where nothing is known, or where it is known too vaguely for windows to be much smaller than frames.
+    """
+    known = [pose for pose in snapshot.candidates if _in_view(pose, snapshot)]
+    if not known:
+        return None
+    poses = RigidTransform.cat([around(pose, scene.obj) if _searchable(scene.obj) else pose[None] for pose in known])
+    points = poses.apply(scene.obj.points.to(scene.rig.focal_length))
+    projection = scene.rig.expand(len(points)).project_values(points, scene.obj.radius)
+    size, reach = scene.rig.image_size.numpy(), _reach(scene)[:, None]
+    uv, ahead = projection.uv.numpy(), projection.depth.numpy()[..., None] > 1
+    low = np.where(ahead, uv, np.inf).min((0, 2)) - reach  # (C, 2)
+    high = np.where(ahead, uv, -np.inf).max((0, 2)) + reach
+    step = 2 * _coarsest(scene)
+    low = np.clip(np.floor(low / step) * step, 0, size)
+    high = np.maximum(np.clip(np.ceil(high / step) * step, 0, size), low)
+    if (high - low).prod(1).sum() > WORTHWHILE * size.prod(1).sum():
+        return None
+    return np.stack((low, high), -1).reshape(-1, 4).astype(np.int64)
 
 
 def _promise(maps: Maps) -> NDArray[np.float64]:

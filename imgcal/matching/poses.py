@@ -174,7 +174,7 @@ def anywhere(matcher: Matcher, camera: int, turns: NDArray[np.float64], count: i
     scene = matcher.scene
     alone = Matcher(
         Scene(scene.rig.select([camera]), scene.obj, scene.std[[camera]], scene.distance),
-        Maps(matcher.maps.surprise[[camera]], matcher.maps.factor, matcher.maps.size[[camera]]),
+        matcher.maps.select([camera]),
         matcher.gain[[camera]],
         np.full(1, matcher.maps.factor * matcher.maps.size[camera].max() / 2),
     )

@@ -27,6 +27,7 @@ LEAST_IN_CAMERA = 3  # fiducials that fit, below which a camera says nothing
 OUTLIER = 5.0  # standard deviations from which a measured marker is something else
 SHAPE_ERROR = 0.3  # px: what a measured place may be off beyond its own sigma
 LEAST_FITTED = 6  # fiducials of all cameras
+GATES = (8.0, 2.5)  # px that a measured place may be off the fitted rig, once and again
 
 
 @dataclass(frozen=True)
@@ -46,8 +47,8 @@ class Fitted:
 
         No image is shifted any more; what the fit of each has cost is that its place was known by the prior only.
         """
-        cells = np.rint(np.nan_to_num((self.predicted + 0.5) / maps.factor - 0.5, nan=-1.0).clip(-1, 1e6)).astype(int)
-        inside = ((cells >= 0) & (cells < maps.size[:, None])).all(-1)
+        cells = np.floor(maps.cells(self.predicted)).astype(int)
+        inside = np.asarray(((cells >= 0) & (cells < maps.size[:, None])).all(-1))
         cells = np.where(inside[..., None], cells, 0)
         gain = gains(maps)[np.arange(len(cells))[:, None], cells[..., 1], cells[..., 0]]
         cost = np.log(np.maximum(2 * np.pi * (scene.drift / maps.factor) ** 2, 1.0))
@@ -77,11 +78,11 @@ def fitted(
     sure = (found.scores.log_odds[0] > SURE)[:, None]
     reach = max(2, round(0.15 * spacing(predicted) / maps.factor))
     fit = _fit_peaks(scene, pose, maps, predicted, (reach, 2), sure)
-    for gate in (2.0 * maps.factor, 2.5):
+    for gate in GATES:
         if fit is None:
             return None
         pose, predicted = fit.rig_from_object[0], predictions(fit.rig, scene, fit.rig_from_object[0])
-        markers = _measured(scene, fit, predicted, response, maps.factor, frames, dark)
+        markers = _measured(scene, fit, predicted, maps, response, frames, dark)
         uv, sigma = np.stack([m.uv for m in markers]), np.stack([m.sigma for m in markers])
         off = np.linalg.norm(np.nan_to_num(uv) - predicted, axis=-1)
         near = off < np.hypot(gate, OUTLIER * np.minimum(sigma, 3.0))
@@ -117,8 +118,7 @@ def _enough(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _peaks(maps: Maps, predicted: NDArray[np.float64], cells: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Find the most surprising place within so many cells of each prediction (C, N, 2), to a part of a cell."""
     count, height, width = maps.surprise.shape
-    at = np.nan_to_num((predicted + 0.5) / maps.factor - 0.5, nan=-1e6).clip(-1e6, 1e6)
-    middle = np.rint(at).astype(np.int64)
+    middle = np.floor(maps.cells(predicted)).astype(np.int64)
     inside = ((middle >= 0) & (middle < maps.size[:, None])).all(-1)
     steps = np.arange(-cells, cells + 1)
     dv, du = (x.ravel() for x in np.meshgrid(steps, steps, indexing="ij"))
@@ -131,7 +131,7 @@ def _peaks(maps: Maps, predicted: NDArray[np.float64], cells: int) -> tuple[NDAr
     peak = values.max(-1, keepdims=True)
     weight = np.exp(4 * (values - peak)) * np.exp(-(du**2 + dv**2) / (2 * cells**2))
     place = np.stack(((weight * columns).sum(-1), (weight * rows).sum(-1)), -1) / weight.sum(-1, keepdims=True)
-    return (place + 0.5) * maps.factor - 0.5, inside & (peak[..., 0] > SURPRISED)
+    return maps.pixels(place + 0.5), inside & (peak[..., 0] > SURPRISED)
 
 
 def _fit_peaks(
@@ -173,8 +173,8 @@ def _measured(
     scene: Scene,
     fit: Estimate,
     predicted: NDArray[np.float64],
+    maps: Maps,
     response: NDArray[np.float32],
-    factor: int,
     frames: Sequence[Frame | None],
     dark: bool,
 ) -> list[Measured]:
@@ -184,9 +184,8 @@ def _measured(
     focal = scene.rig.focal_length.mean(-1).numpy()[:, None]
     per_mm = focal / np.maximum(depth, 1.0)
     given = scene.obj.radius
-    cells = np.rint((predicted + 0.5) / factor - 0.5)
     high = np.array(response.shape[-1:-3:-1]) - 1
-    cells = np.nan_to_num(cells, nan=-1).clip(0, high).astype(np.int64)
+    cells = np.floor(maps.cells(predicted)).clip(0, high).astype(np.int64)
 
     def measured(camera: int) -> Measured:
         frame, radius = frames[camera], per_mm[camera] * (1.0 if given is None else given.numpy())
@@ -195,7 +194,7 @@ def _measured(
             return Measured(np.full((len(radius), 2), np.nan), none + np.inf, none, none, 1.0, none)
         # As the images show them: blurred, they are larger than they are.
         seen = response[camera][:, cells[camera, :, 1], cells[camera, :, 0]]
-        size = max(0.5, 1.6 * SIZES[int(np.median(seen, axis=1).argmax())]) * factor
+        size = max(0.5, 1.6 * SIZES[int(np.median(seen, axis=1).argmax())]) * maps.factor
         if given is None or size > np.median(radius):
             radius = radius * (size / np.median(radius))
         sure = np.ones(len(radius), dtype=bool)

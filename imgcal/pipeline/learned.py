@@ -9,7 +9,9 @@ identity and the most probable rig judge them like blobs.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -227,14 +229,18 @@ class _View:
     def _fitted(self, uv: Tensor, radius: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Fit the markers of each camera together; the same."""
         place, sigma, good = uv.clone(), torch.full_like(radius, torch.inf), torch.zeros_like(seen)
-        for camera, name in enumerate(self.snapshot.rig.camera_names):
-            frame = self.frames.get(name)
-            if frame is None or not bool(seen[camera].any()):
-                continue
+
+        def fit(camera: int) -> None:
+            frame = self.frames.get(self.snapshot.rig.camera_names[camera])
+            if frame is None:
+                return
             sizes, sure = radius[camera].numpy(), seen[camera].numpy()
             found = measure_markers(frame, uv[camera].numpy(), sizes, self._dark, sure)
             place[camera] = torch.from_numpy(np.nan_to_num(found.uv))
             sigma[camera], good[camera] = torch.from_numpy(found.sigma), torch.from_numpy(found.seen)
+
+        with ThreadPoolExecutor(max(1, os.cpu_count() or 1)) as pool:
+            list(pool.map(fit, seen.any(1).nonzero()[:, 0].tolist()))
         return place, sigma, good
 
     @property

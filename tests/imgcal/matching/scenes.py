@@ -9,9 +9,9 @@ from renderers import ClutterModel, SensorModel
 DIM = FrameModel(SensorModel(contrast=0.016, read_noise=3.0, blur=1.5), ClutterModel(), marker_radius=10.0)
 
 
-def dim_frames(obj="asymmetric8", snapshots=1, seed=0, model=DIM):
+def dim_frames(obj="asymmetric8", snapshots=1, seed=0, model=DIM, size=(640, 340)):
     """Factory rig, object, truth and frames of each snapshot: markers hardly brighter than the noise."""
-    rig, obj = load_rig("T4").resized(torch.tensor([640, 340])), load_object(obj)
+    rig, obj = load_rig("T4").resized(torch.tensor(size)), load_object(obj)
     generator = torch.Generator().manual_seed(seed)
     truth = simulate_truth(rig, obj, snapshots, generator, PhysicalDrift())
     return rig, obj, truth, list(simulate_frames(truth, obj, model, generator))

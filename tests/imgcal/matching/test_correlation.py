@@ -47,7 +47,7 @@ def test_scores_are_those_of_every_shift_tried_alone():
 def test_gains_are_log_odds():
     """Under the null, surprise is exponential: the mean odds are one. A marker's surprise is larger."""
     surprise = np.random.default_rng(0).exponential(size=(1, 400, 500)).astype(np.float32)
-    gain = gains(Maps(surprise, 1, np.array([[500, 400]])))
+    gain = gains(Maps(surprise, 1, np.array([[500, 400]]), np.zeros((1, 2), int)))
     assert abs(np.exp(gain).mean() - 1) < 0.15
     marker = -np.log(np.random.default_rng(1).uniform(size=100_000)) / EVEN  # ranks to the power of 1 / EVEN
     odds = np.log(HIDDEN + (1 - HIDDEN) * EVEN * np.exp((1 - EVEN) * marker))

@@ -53,8 +53,25 @@ def test_larger_cells_keep_what_is_most_surprising_and_stay_exponential():
 
 
 def test_nothing_counts_more_than_the_most():
-    maps = Maps(np.zeros((1, 64, 64), np.float32), 4, np.array([[64, 64]]))
+    maps = Maps(np.zeros((1, 64, 64), np.float32), 4, np.array([[64, 64]]), np.zeros((1, 2), int))
     frame = noise(size=(512, 512))
     frame[200:220, 200:220] = 255
     found, _ = surprise_maps([as_frame(frame)], 4, False, [None])
     assert found.surprise.max() <= MOST and maps.surprise.max() == 0
+
+
+def test_a_window_shows_what_the_frame_shows_there():
+    frame = noise()
+    frame[84:92, 124:132] += 60
+    windows = np.array([[64, 224, 32, 192], [32, 32, 0, 0]])
+    maps, response = surprise_maps([as_frame(frame)] * 2, 4, False, [None, np.zeros(frame.shape, bool)], windows)
+    assert maps.size.tolist() == [[40, 40], [0, 0]] and maps.corner[0].tolist() == [16, 8]
+    peak = np.unravel_index(maps.surprise[0].argmax(), maps.surprise[0].shape)
+    place = maps.pixels(np.array(peak[::-1])[None, None] + 0.5)[0, 0]
+    assert np.abs(place - (127.5, 87.5)).max() < 3
+    assert (np.floor(maps.cells(place[None, None]))[0, 0] == peak[::-1]).all()
+    whole, _ = surprise_maps([as_frame(frame)], 4, False, [None])
+    there = np.unravel_index(whole.surprise[0].argmax(), whole.surprise[0].shape)
+    assert (np.array(there) - maps.corner[0, ::-1] == peak).all()
+    pooled = maps.pooled(16)
+    assert pooled.corner[0].tolist() == [4, 2] and pooled.size[0].tolist() == [10, 10] and response[1].max() == 0

@@ -1,6 +1,7 @@
 import numpy as np
 
-from imgcal.matching.marker_fit import RINGS, fit_markers
+from imgcal.matching.marker_fit import MISFIT, fit_markers
+from imgcal.matching.marker_shape import RINGS
 
 
 def profile():
@@ -18,11 +19,9 @@ def image(places, amplitudes, side=61):
 
 
 def fitted(frame, start, close):
-    count, half = len(start), 12
-    corner = np.rint(start).astype(np.int64) - half
-    windows = np.stack([frame[v : v + 25, u : u + 25] for u, v in corner])
-    uv, found = start.copy(), np.zeros((count, 5))
-    fit_markers(windows, windows > -1, corner, np.ones(count), close, (np.eye(2), profile()), uv, found)
+    uv, found, every = start.copy(), np.zeros((len(start), 5)), np.ones(len(start), bool)
+    shape = (np.eye(2), profile())
+    fit_markers(frame.astype(np.float32), every, 12, np.ones(len(start)), close, shape, len(MISFIT), uv, found)
     return uv, found
 
 

@@ -83,3 +83,24 @@ def test_of_a_cube_every_turn_is_the_same_pose():
     assert distinct(others, Ranked(pose, scores), scene).tolist() == [False, False, True]
     result = calibrate(frames, rig, obj, detector="matched")
     assert result.identity == "ambiguous" and result.labelled.snapshots[0].alternatives == 24
+
+
+def test_around_a_known_pose_nothing_else_is_looked_at():
+    rig, obj, truth, (frames,) = dim_frames(size=(1280, 680))
+    start = turned(truth.rig_from_object[0], torch.tensor([0.01, -0.02, 0.01], dtype=torch.float64), obj)
+    prior = 0.2 * rig.prior.std(rig)
+    given = replace(snapshot_of(frames, rig, obj, [start]), prior_std=prior)
+    first = MatchedFilter().propose(given)
+    v, u = np.mgrid[:680, :1280]
+    noise = np.random.default_rng(0).integers(0, 255, (680, 1280)).astype(np.uint8)
+    painted, count = {}, 0
+    for name, uv in zip(rig.camera_names, truth.uv[0].numpy(), strict=True):
+        (left, top), (right, bottom) = uv.min(0) - 180, uv.max(0) + 180
+        far = (u < left) | (u > right) | (v < top) | (v > bottom)
+        painted[name], count = np.where(far, noise, frames[name]), count + far.sum()
+    assert count > 500_000
+    second = MatchedFilter().propose(replace(given, frames=painted))
+    assert first.margin > 40 and second.margin == first.margin
+    assert np.array_equal(first.detections.uv, second.detections.uv)
+    lost = MatchedFilter().propose(replace(given, frames=painted, candidates=()))
+    assert lost.margin != first.margin

@@ -58,3 +58,26 @@ def test_a_half_hidden_marker_has_a_large_sigma():
     found = measure_markers(seen, uv + 0.5, np.full(9, 8.0), False, np.ones(9, bool))
     off = np.linalg.norm(found.uv - uv, axis=1)
     assert off[4] > 1 and found.sigma[4] > off[4] / 4 and found.sigma[4] > 10 * np.median(found.sigma)
+
+
+def uneven(uv, rng, radius=9.0):
+    """Bright discs, each with a dark spot somewhere on it and a neighbour that touches it."""
+    v, u = np.mgrid[:200, :260].astype(float)
+    total = np.full(u.shape, 12.0)
+    for x, y in uv:
+        spot = rng.uniform(-0.7, 0.7, 2) * radius + (x, y)
+        dark = 1 - 0.7 * np.exp(-((u - spot[0]) ** 2 + (v - spot[1]) ** 2) / (2 * (0.3 * radius) ** 2))
+        total += 150 * dark / (1 + np.exp(np.hypot(u - x, v - y) - radius))
+        angle = rng.uniform(0, 2 * np.pi)
+        other = (x, y) + 1.9 * radius * np.array([np.cos(angle), np.sin(angle)])
+        total += 60 * rng.uniform() / (1 + np.exp(np.hypot(u - other[0], v - other[1]) - 0.8 * radius))
+    return np.clip(np.rint(total + rng.normal(0, 1.0, u.shape)), 0, 255).astype(np.uint8)
+
+
+def test_the_sigma_of_dirty_markers_that_others_touch_is_honest():
+    rng, normalized = np.random.default_rng(0), []
+    for seed in range(8):
+        uv = places(seed=seed)
+        found = measure_markers(uneven(uv, rng), uv + 0.7, np.full(9, 9.0), False, np.ones(9, bool))
+        normalized.append(((found.uv - uv) ** 2).sum(1) / 2 / found.sigma**2)
+    assert 0.2 < np.median(normalized) < 2 and np.mean(normalized) < 4

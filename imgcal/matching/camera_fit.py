@@ -1,0 +1,93 @@
+"""All markers of a camera: their common shape and their places, each found from the other in turns, compiled."""
+
+# Compiled functions take their types from their arguments.
+# ruff: noqa: ANN001, ANN201
+# mypy: allow-untyped-defs
+
+from __future__ import annotations
+
+import numpy as np
+
+from imgcal.matching.marker_fit import MISFIT, NEAR, fit_markers
+from imgcal.matching.marker_shape import RINGS, common_shape, median
+from renderers.compiling import njit
+
+USUAL_MISFIT = 0.1  # RMS of the amplitude: what whole markers differ by in their shapes, at least
+LEAST_HALF = 4  # px, of a window
+
+
+@njit(cache=True, nogil=True)
+def cut(grey, uv, scale, half, patches):
+    """Fill windows (K, P, P) about places (K, 2), resampled so that these are in the middle, at the markers' scales."""
+    height, width = grey.shape
+    for k in range(len(uv)):
+        for i in range(2 * half + 1):
+            v = min(max(uv[k, 1] + scale[k] * (i - half), 0.0), height - 1.0)
+            top = min(int(v), height - 2)
+            down = v - top
+            for j in range(2 * half + 1):
+                u = min(max(uv[k, 0] + scale[k] * (j - half), 0.0), width - 1.0)
+                left = min(int(u), width - 2)
+                right = u - left
+                upper = grey[top, left] + right * (grey[top, left + 1] - grey[top, left])
+                lower = grey[top + 1, left] + right * (grey[top + 1, left + 1] - grey[top + 1, left])
+                patches[k, i, j] = upper + down * (lower - upper)
+
+
+@njit(cache=True, nogil=True)
+def fit_camera(grey, start, inside, sure, scale, half, passes, uv, found, misfit):
+    """Fit the markers (N) of one camera.
+
+    Args:
+        grey: (H, W) grey values, brighter where markers are, two rows and columns at least.
+        start: (N, 2) pixels, where markers are expected.
+        inside: (N,) those that are in the image; one at least.
+        sure: (N,) those from which the common shape is taken.
+        scale: (N,) size of each marker in parts of the usual one.
+        half: px, half of the first windows.
+        passes: how often shape and places are found, each from the other.
+        uv: (N, 2) filled with the places.
+        found: (N, 5) zeros, filled as by `fit_markers`.
+        misfit: (N,) filled with the RMS difference from the common shape beyond noise, in parts of the amplitude.
+
+    Returns:
+        Radius (px) of the disc as large as the shape; 0 = there are no markers.
+    """
+    count, side = len(start), 2 * half + 1
+    place, sure = start.copy(), sure & inside
+    whitening, profile = np.empty((2, 2)), np.empty(side + 2)
+    close, some = np.zeros((count, count), np.bool_), np.empty(count)
+    radius = 0.0
+    for number in range(passes):
+        chosen = np.flatnonzero(sure if sure.any() else inside)
+        patches = np.empty((len(chosen), 2 * half + 1, 2 * half + 1), np.float32)
+        cut(grey, place[chosen], scale[chosen], half, patches)
+        values, longer = common_shape(patches, whitening, profile)
+        if values == 0:
+            return 0.0
+        reach = min(max(int(np.ceil((values - 1) * RINGS * longer)), LEAST_HALF), half)
+        window = int(np.ceil(reach * scale.max()))
+        for n in range(count):
+            for m in range(count):
+                apart = max(abs(place[n, 0] - place[m, 0]), abs(place[n, 1] - place[m, 1]))
+                close[n, m] = n != m and inside[n] and inside[m] and apart < 2 * window
+        uv[:] = place
+        iterations = len(MISFIT) if number == 0 else NEAR
+        fit_markers(grey, inside, window, scale, close, (whitening, profile[:values]), iterations, uv, found)
+        for n in range(count):
+            misfit[n] = np.sqrt(max(found[n, 3] - 1.5 * found[n, 4], 0.0)) / max(found[n, 0], 1e-9)
+        for k in range(len(chosen)):
+            some[k] = misfit[chosen[k]]
+        # Those that look like most others say better what a whole marker looks like.
+        usual = max(USUAL_MISFIT, median(some, len(chosen)))
+        for n in range(count):
+            sure[n] = sure[n] and misfit[n] <= usual
+            if np.hypot(uv[n, 0] - start[n, 0], uv[n, 1] - start[n, 1]) < half:
+                place[n] = uv[n]
+        total = 0.0
+        for ring in range(values):
+            total += profile[ring] * ring
+        stretch = whitening[0, 0] * whitening[1, 1] - whitening[0, 1] * whitening[1, 0]
+        radius = RINGS * np.sqrt(2 * total / stretch)
+        half = min(half, reach + LEAST_HALF)
+    return radius
