@@ -50,18 +50,20 @@ def main(arguments: list[str]) -> None:
 
 
 def portable(experiment: RigExperiment) -> RigExperiment:
-    """Say where a warm start came from by the name of that experiment, not by a path of this machine."""
+    """Say where a warm start came from by the name of that experiment or network, not by a path of this machine."""
     start = experiment.training.init_from
     if start is None:
         return experiment
     names = [_name(path) for path in ([start] if isinstance(start, str) else start)]
-    return changed(experiment, f"training.init_from=[{', '.join(f'out/runs/{name}' for name in names)}]")
+    return changed(experiment, f"training.init_from=[{', '.join(names)}]")
 
 
 def _name(path: str) -> str:
-    """Folder of the run that made a file, or the file's own name."""
+    """Folder of the run that made a file; a shipped network's own name."""
+    if "/" not in path and not path.endswith(".safetensors"):
+        return path
     file = Path(path)
-    return file.parent.name if file.stem == "model" else file.stem
+    return f"out/runs/{file.parent.name if file.stem == 'model' else file.stem}"
 
 
 @torch.no_grad()
