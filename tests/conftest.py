@@ -45,6 +45,15 @@ def captures() -> Path:
 
 
 @pytest.fixture(scope="session")
+def formats() -> Path:
+    """Folder of real calibration files; tests that need it are skipped, visibly, without IMGCAL_FORMATS."""
+    folder = os.environ.get("IMGCAL_FORMATS")
+    if not folder:
+        pytest.skip("IMGCAL_FORMATS is not set: real calibration files are not at hand")
+    return Path(folder)
+
+
+@pytest.fixture(scope="session")
 def o10() -> CameraRig:
     """The reference rig of ten cameras, float64."""
     return load_rig("O10")

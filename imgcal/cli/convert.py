@@ -105,7 +105,8 @@ class Convert:
             title = format_named(found.format).title
             rig = in_millimetres(found, where, self.unit, self.distance)
         if self.cameras:
-            rig = selected(rig, self.cameras)
+            left_out = {*rig.names} - {*self.cameras}
+            rig, sizes = selected(rig, self.cameras), {name: sizes[name] for name in sizes if name not in left_out}
         return with_image_sizes(rig, where, sizes), title
 
     def _written(self, made: Written) -> list[Path]:

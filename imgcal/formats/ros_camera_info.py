@@ -144,7 +144,10 @@ def _write(rig: ForeignRig) -> Files:
     turned_round = x[0] < 0
     x = -x if turned_round else x
     if abs(x[0]) < 0.5:
-        raise FormatError("one camera stands behind or above the other: a stereo pair of ROS stands side by side")
+        raise FormatError(
+            f"camera {right.name} stands above, below, before or behind camera {left.name}, expected a stereo pair, "
+            "side by side: choose another with --cameras"
+        )
     ahead = np.array([0.0, 0.0, 1.0]) + right.rotation.T @ np.array([0.0, 0.0, 1.0])
     y = np.cross(ahead, x)
     y /= np.linalg.norm(y)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from imgcal.errors import InputError
 from imgcal.formats.conversion import LIMIT, NATIVE, Held, describe_lens, from_camera_rig, held_by, to_camera_rig
-from imgcal.formats.foreign_rig import ForeignRig
+from imgcal.formats.foreign_rig import ForeignRig, FormatError
 from imgcal.formats.format import Files, Format
 from imgcal.formats.registry import FORMATS, format_named, read_foreign_rig
 from imgcal.formats.units import in_millimetres, millimetres
@@ -71,7 +71,10 @@ def converted(rig: ForeignRig, to: str, name: str, limit: float = LIMIT, unit: s
         notes.append(f"the frame of the files is that of camera {rig.names[0]}")
     length = millimetres(files_unit)
     notes.append(f"lengths in the files: {files_unit}")
-    files = target.write(placed.scaled(1.0 / length, files_unit))
+    try:
+        files = target.write(placed.scaled(1.0 / length, files_unit))
+    except FormatError as error:
+        raise InputError(f"--to {to}: {error}") from error
     back = _read_back(files, target, files_unit)
     if sorted(back.names) == sorted(rig.names):  # files of a folder come in the order of their names
         back = selected(back, tuple(rig.names))

@@ -123,3 +123,14 @@ def test_one_s_file_to_another_s(camchain: Path, tmp_path: Path, capsys: pytest.
     assert one["cam3"]["intrinsics"] == two["cam3"]["intrinsics"]
     for row, same in zip(one["cam3"]["T_cn_cnm1"], two["cam3"]["T_cn_cnm1"], strict=True):
         assert row == pytest.approx(same, abs=1e-9)
+
+
+def test_sizes_may_be_stated_of_cameras_that_are_not_kept(
+    camchain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sizes = [f"cam{number}=2048x1088" for number in range(4)]
+    out = ["--out", tmp_path / "rig.yaml", "--cameras", "cam2", "cam0"]
+    assert run(capsys, camchain, *out, "--image-size", *sizes)[0] == 0
+    assert load_rig(tmp_path / "rig.yaml").camera_names == ("cam2", "cam0")
+    code, _, err = run(capsys, camchain, *out, "--image-size", "cam7=2048x1088")
+    assert code == 2 and "found camera cam7, expected" in err
