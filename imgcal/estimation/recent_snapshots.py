@@ -8,6 +8,7 @@ such base begins.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +24,7 @@ from imgcal.estimation.rig_error import displaced
 from imgcal.estimation.rig_filter import Absorbed, RigBelief, error_covariance
 from imgcal.estimation.rig_filter_cpu import RigArrays
 from imgcal.geometry import RigidTransform
-from imgcal.types import CameraRig, DriftRate, Observations
+from imgcal.types import CameraRig, Observations
 
 OLDEST = 64
 """Snapshots within which a change must show: one second at 60 a second."""
@@ -54,15 +55,15 @@ class _Seen:
 class RecentSnapshots:
     """A ring of the latest `OLDEST` snapshots."""
 
-    def __init__(self, belief: RigBelief, rate: DriftRate) -> None:
+    def __init__(self, belief: RigBelief, walk: Tensor) -> None:
         """Begin with none.
 
         Args:
             belief: of the filter.
-            rate: at which it ages.
+            walk: (C, K) standard deviation of every value after an hour, at which it ages.
         """
         (cameras, free), wide = belief.unit.shape, len(belief.factor)
-        self._rate, self._belief = rate, belief
+        self.walk, self._belief = walk, belief
         self._unit = belief.unit.numpy()
         self._carried = np.zeros((OLDEST, 6, wide))
         self._border = np.zeros((OLDEST, wide - cameras * free, wide))
@@ -135,12 +136,19 @@ class RecentSnapshots:
 
     def began(self, result: Absorbed, observations: Observations, seconds: float) -> None:
         """Forget all snapshots, and take one that another belief than the last one has absorbed."""
-        self._seen = deque((_Seen(observations, result.rig_from_object, seconds),))
-        self.relinearized(result)
+        self.took([(observations, result.rig_from_object)], [seconds], result)
 
-    def took(self, other: RecentSnapshots, result: Absorbed) -> None:
-        """Take over the last snapshots of another ring, which were absorbed together."""
-        self._seen = deque(list(other._seen)[-len(result.brought) :])
+    def took(
+        self, snapshots: Sequence[tuple[Observations, RigidTransform]], pauses: Sequence[float], result: Absorbed
+    ) -> None:
+        """Forget all snapshots, and take some that were absorbed together.
+
+        Args:
+            snapshots: observations (1, C, N) and poses (1,).
+            pauses: s before each of them.
+            result: what they taught.
+        """
+        self._seen = deque(_Seen(*snapshot, pause) for snapshot, pause in zip(snapshots, pauses, strict=True))
         self.relinearized(result)
 
     def rebased(self, belief: RigBelief, information: Tensor) -> None:
@@ -161,7 +169,11 @@ class RecentSnapshots:
 
     def seconds(self, age: int) -> float:
         """How long ago the snapshot before the latest `age` ones was."""
-        return sum(entry.seconds for entry in list(self._seen)[-age:])
+        return sum(self.pauses(age))
+
+    def pauses(self, age: int) -> list[float]:
+        """Seconds before each of the latest `age` snapshots."""
+        return [entry.seconds for entry in list(self._seen)[-age:]]
 
     def screened(self) -> NDArray[np.float64]:
         """Score each camera since each of `SCREENED`: (ages, C); see `screen`."""
@@ -184,7 +196,7 @@ class RecentSnapshots:
         information, at = self._known(number)
         brought, weighted = self._sums(number, self._next)
         pull = weighted - brought @ at
-        variance = self._rate.std(self._belief.rig).square() * (self.seconds(age) / 3600)
+        variance = self.walk.square() * (self.seconds(age) / 3600)
         if aged and bool(variance.any()):
             covariance = torch.cholesky_inverse(_cholesky(information))
             add_blocks(covariance, error_covariance(self._belief, variance))
@@ -218,6 +230,11 @@ class RecentSnapshots:
         error = (at - torch.from_numpy(self._at))[:wide].view(self._unit.shape)
         rig = displaced(self._belief.rig, error * self._belief.unit)
         return replace(self._belief, rig=rig, object_offset=at[wide:], factor=_cholesky(information))
+
+    def brought(self, count: int) -> tuple[Tensor, Tensor]:
+        """Information (D, D) of the latest snapshots, and their pull (D,) at what is believed now."""
+        information, weighted = self._sums(self._next - count, self._next)
+        return information, weighted - information @ torch.from_numpy(self._at)
 
     def _known(self, number: int) -> tuple[Tensor, Tensor]:
         """Information (D, D) before a snapshot, and what was most probable (D,)."""

@@ -44,6 +44,8 @@ DISTORTED = 2e-4
 """Standard deviation of the distortion for each such pixel, where the kind of change is not known."""
 LEAST_LEARNT = 1e-6
 """Directions of which less was learnt than this share of the most of their kind do not take part."""
+LEAST_VARIANCE = 1e-3
+"""Share of a variance that is left where one is taken away: rounding."""
 MODEL_ERROR = 0.02
 """Pixels, one standard deviation of each axis: by how much a camera's image may be off in a way that changes slowly."""
 SLOPE = 0.25
@@ -129,9 +131,24 @@ class ChangeTest:
         learnt = self.learnt.unflatten(0, (cameras, -1)).unflatten(-1, (cameras, -1))
         own = learnt.diagonal(dim1=0, dim2=2).movedim(-1, 0)  # (C, K, K)
         return {
-            kind: _score(pull[:, part], own[:, part, part], MODEL_ERROR * self.pixels[:, part])
+            kind: _Own.of(pull[:, part], own[:, part, part]).score((MODEL_ERROR * self.pixels[:, part]).square())
             for kind, part in CHANGES.items()
         }
+
+    def change(self, kind: str, variance: Tensor) -> tuple[Tensor, Tensor]:
+        """What is learnt of a change of each camera of a kind with k numbers, where these wander besides.
+
+        Args:
+            kind: of `CHANGES`.
+            variance: (C, k) by which they do, beyond what was taken for granted; less than nothing is possible.
+
+        Returns:
+            Its information (C, k, k), and its pull (C, k).
+        """
+        cameras, part = len(self.pixels), CHANGES[kind]
+        pull = self.pull.unflatten(0, (cameras, -1))[:, part]
+        learnt = self.learnt.unflatten(0, (cameras, -1)).unflatten(-1, (cameras, -1))
+        return _Own.of(pull, learnt.diagonal(dim1=0, dim2=2).movedim(-1, 0)[:, part, part]).change(variance)
 
     def odds(self, changes: Mapping[int, str | None]) -> float:
         """Log odds that cameras have changed in some ways, None = in any, against that nothing has."""
@@ -170,13 +187,36 @@ class ChangeTest:
         return scaled, factor, pull
 
 
-def _score(pull: Tensor, learnt: Tensor, model_error: Tensor) -> Tensor:
-    """Squares (C,) of (C, K) in units of their covariance (C, K, K) and of what model errors (C, K) add to it."""
-    scale = learnt.diagonal(dim1=-2, dim2=-1).clamp_min(1e-30).sqrt()
-    values, vectors = torch.linalg.eigh(learnt / (scale[:, :, None] * scale[:, None, :]))
-    known = values > LEAST_LEARNT
-    root = torch.where(known, values, 1.0).sqrt()
-    along = torch.where(known, (vectors.mT @ (pull / scale)[..., None])[..., 0] / root, 0.0)
-    moved = (scale * model_error)[:, :, None] * vectors * torch.where(known, root, 0.0)[:, None, :]
-    covariance = torch.eye(pull.shape[-1], dtype=pull.dtype) + moved.mT @ moved
-    return (along * torch.linalg.solve(covariance, along[..., None])[..., 0]).sum(-1)
+@dataclass(frozen=True)
+class _Own:
+    """What is left of the pull on a few parameters of each camera, along directions of which something was learnt."""
+
+    along: Tensor  # (C, k) in standard deviations where nothing has changed; zero where nothing was learnt
+    spread: Tensor  # (C, k, k) by which a change of each parameter moves it
+
+    @classmethod
+    def of(cls, pull: Tensor, learnt: Tensor) -> _Own:
+        """Take pulls (C, k) and their covariance (C, k, k)."""
+        scale = learnt.diagonal(dim1=-2, dim2=-1).clamp_min(1e-30).sqrt()
+        values, vectors = torch.linalg.eigh(learnt / (scale[:, :, None] * scale[:, None, :]))
+        known = values > LEAST_LEARNT
+        root = torch.where(known, values, 1.0).sqrt()
+        along = torch.where(known, (vectors.mT @ (pull / scale)[..., None])[..., 0] / root, 0.0)
+        return cls(along, scale[:, :, None] * vectors * torch.where(known, root, 0.0)[:, None, :])
+
+    def score(self, variance: Tensor) -> Tensor:
+        """Squares (C,) in units of the covariance, to which changes of a variance (C, k) are added."""
+        values, vectors = self._with(variance)
+        return ((vectors.mT @ self.along[..., None])[..., 0].square() / values).sum(-1)
+
+    def change(self, variance: Tensor) -> tuple[Tensor, Tensor]:
+        """Information (C, k, k) and pull (C, k) of a change, besides changes of a variance (C, k)."""
+        values, vectors = self._with(variance)
+        spread = self.spread @ vectors / values.sqrt()[:, None, :]
+        along = (vectors.mT @ self.along[..., None])[..., 0] / values.sqrt()
+        return spread @ spread.mT, (spread @ along[..., None])[..., 0]
+
+    def _with(self, variance: Tensor) -> tuple[Tensor, Tensor]:
+        """Variances (C, k) where changes are added, and their directions (C, k, k)."""
+        values, vectors = torch.linalg.eigh(self.spread.mT @ (variance[:, :, None] * self.spread))
+        return (1 + values).clamp_min(LEAST_VARIANCE), vectors

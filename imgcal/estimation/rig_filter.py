@@ -267,17 +267,18 @@ def absorbed_in_tensors(
     raise RefusedError(f"estimation: {WHY_NOT[rig_filter_cpu.NO_MINIMUM]}")
 
 
-def aged(belief: RigBelief, seconds: float, rate: DriftRate) -> RigBelief:
+def aged(belief: RigBelief, seconds: float, rate: DriftRate | Tensor) -> RigBelief:
     """Know less of a rig after some time, over which every value took a random walk on its own.
 
     Args:
         belief: what was known.
         seconds: how long ago.
-        rate: of the walks.
+        rate: of the walks; or the standard deviation (C, K) of each after an hour.
     """
     if seconds <= 0:
         return belief
-    variance = rate.std(belief.rig).square() * (seconds / 3600)
+    walk = rate.std(belief.rig) if isinstance(rate, DriftRate) else rate
+    variance = walk.square() * (seconds / 3600)
     return widened(belief, variance) if variance.any() else belief
 
 
@@ -334,9 +335,25 @@ class RigFilter:
         self.belief = RigBelief.of_prior(rig, obj, prior_std)
         self.count = 0  # snapshots absorbed
         self._young = True  # the first snapshots are still kept
+        self.pace = torch.ones_like(self.belief.unit)  # (C, K) times the rate at which values are believed to wander
         self._first = self.belief
         self._early: list[tuple[Observations, RigidTransform]] = []
         self._span = self._waited = 0.0  # s, since the first snapshot; of it, what the belief has not aged by
+
+    @property
+    def walk(self) -> Tensor:
+        """How far every value is believed to wander in an hour, one standard deviation: (C, K)."""
+        return self.rate.std(self.belief.rig) * self.pace
+
+    @property
+    def young(self) -> bool:
+        """Tell whether the first snapshots are still kept, to be absorbed again."""
+        return self._young
+
+    @property
+    def waited(self) -> float:
+        """Time (s) by which the belief has not aged yet."""
+        return self._waited
 
     def update(self, observations: Observations, rig_from_object: RigidTransform, seconds: float = 0.0) -> Absorbed:
         """Learn from a snapshot; where it is refused, nothing is learnt, and its time counts for the next one.
@@ -357,7 +374,7 @@ class RigFilter:
         passed = max(seconds, 0.0) if self.count else 0.0
         self._span, self._waited = self._span + passed, self._waited + passed
         due = self._waited if self._waited >= LEAST_SECONDS else 0.0
-        result = absorbed(aged(self.belief, due, self.rate), observations, rig_from_object, self.options)
+        result = absorbed(aged(self.belief, due, self.walk), observations, rig_from_object, self.options)
         self.belief, self._waited, self.count = result.belief, self._waited - due, self.count + 1
         still = self._span <= YOUNG_SECONDS or not any(vars(self.rate).values())  # a steady rig stands still for ever
         self._young = self._young and len(self._early) < MEMORY and still
@@ -375,7 +392,7 @@ class RigFilter:
     def relinearize(self) -> Absorbed:
         """Absorb the first snapshots anew, all together; `rig_from_object` and `residual` are those of the last one."""
         result = absorbed(self._first, *joined(self._early), self.options)
-        self.belief, self._waited = aged(result.belief, self._span, self.rate), 0.0
+        self.belief, self._waited = aged(result.belief, self._span, self.walk), 0.0
         return replace(result.of_last(), belief=self.belief)
 
     def restart(self, first: RigBelief, snapshots: Sequence[tuple[Observations, RigidTransform]]) -> Absorbed:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from imgcal.errors import RefusedError
 from imgcal.estimation.cusum import Cusum, RunningMedian
+from imgcal.estimation.drift_pace import SECONDS, DriftPaces, Stretch
 from imgcal.estimation.object_change import ObjectChange, changed_object
 from imgcal.estimation.recent_snapshots import SCREENED, RecentSnapshots
 from imgcal.estimation.rig_changes import CHANGES, JUMPS, LARGE, ChangeTest, change_of_errors, pixel_changes, spread_of
@@ -41,12 +42,22 @@ LEAST_USUAL = 30
 """Snapshots from which it is known how well they usually fit."""
 OBJECT_ODDS = 30.0
 """Log odds from which the object has changed where no camera has."""
+OBJECT_ASKED, MOST_FIRST = (8, 16, 32), 2.0
+"""Numbers of first snapshots, and the standard deviations that chi-squared must be more than is expected, from which it
+is asked whether the object never was as its file says."""
 DECIDED = 5.0
 """Log odds of a kind of change against every other, from which it is told ..."""
 ALONE, MIXED = 3.0, 15.0
 """... against a change of all kinds at once, and of that against each: what is believed wrongly does no harm then."""
 MOST_EXCESS = 4.0
 """Chi-squared per degree of freedom up to which a snapshot fits that is else refused."""
+FEW = 16
+"""Snapshots up to which what was known before a change is too little to go by: it bends, within what it leaves open, by
+more than it says, and others would be blamed. What came before is then forgotten ..."""
+UNSURE = 8
+"""... and of the object nothing is asked before so many have been learnt."""
+TOLD_AT_ONCE = 32
+"""Snapshots whose information is added up at once."""
 JUDGED = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
 """Numbers of snapshots since a change at which its kind is asked for."""
 
@@ -110,8 +121,14 @@ class RigMonitor:
         self.open: dict[int, Change] = {}  # changes whose kind is not decided yet, by camera
         self.object_change: ObjectChange | None = None  # that became known with the latest snapshot
         self._misfit, self._usual = Cusum(1, 1.0, FALSE_ALARMS), RunningMedian(256)
-        self._recent = RecentSnapshots(rig_filter.belief, rig_filter.rate)
+        self._recent = RecentSnapshots(rig_filter.belief, rig_filter.walk)
+        self._paces = DriftPaces(rig_filter.belief.rig.num_cameras)
+        self._stretch: Stretch | None = None  # of snapshots that may say how fast cameras drift ...
+        self._untold = 0  # ... and the latest of them, which it does not know of yet
         self._since: _Open | None = None
+        self._prior = rig_filter.belief
+        self.first = 0  # number of the first snapshot of which something is known
+        self._moved_early: set[int] = set()  # cameras of which the factory knows nothing more
         self._suspect: int | None = None  # the camera without which the last snapshot would not have been refused
 
     def update(
@@ -171,8 +188,11 @@ class RigMonitor:
         if self.filter.due:
             result = self.filter.relinearize()
             self._recent.relinearized(result)
+            if (anew := self._learnt_first_object(result)) is not None:
+                return anew, ()
             if self._since is not None:
                 self._since = _opened(result, self._since.before, self._since.seconds, self._since.kinds)
+        self._learn_paces(seconds)
         if self._since is not None and (self._since.late or self._since.count in JUDGED):
             return result, self._judged(self._since.late)
         return result, ()
@@ -182,8 +202,11 @@ class RigMonitor:
     ) -> tuple[Absorbed, tuple[Change, ...]]:
         """Learn from a snapshot before which cameras have moved, it does not matter how far."""
         told = list(self._judged(last=True))
-        before = aged(self.filter.belief, seconds, self.filter.rate)
         free: dict[int, str | None] = dict.fromkeys(sorted(cameras))
+        if self.filter.count - self.first < FEW:
+            self.filter.count += 1
+            return self._begin_again(free, [(observations, rig_from_object)], [seconds], {}, told)
+        before = aged(self.filter.belief, seconds, self.filter.walk)
         first = _let_free(before, free, JUMPS[-1])
         result = self.filter.restart(first, [(observations, rig_from_object)])
         self.filter.count += 1
@@ -201,6 +224,31 @@ class RigMonitor:
                 if result.chi2 <= MOST_EXCESS * max(result.dof, 1):
                     found[camera] = result.evidence
         return max(found, key=lambda camera: found[camera], default=None)
+
+    def _begin_again(
+        self,
+        free: Mapping[int, str | None],
+        snapshots: Sequence[tuple[Observations, RigidTransform]],
+        pauses: Sequence[float],
+        evidence: Mapping[int, float],
+        told: Sequence[Change],
+    ) -> tuple[Absorbed, tuple[Change, ...]]:
+        """Learn from the snapshots since a change alone: before it, hardly anything had been learnt.
+
+        Raises:
+            RefusedError: see `absorbed`; the monitor stays as it was.
+        """
+        self._moved_early |= free.keys()
+        prior = _let_free(self._prior, dict.fromkeys(sorted(self._moved_early)), JUMPS[-1])
+        result = self.filter.restart(prior, snapshots)
+        self._recent = RecentSnapshots(result.belief, self.filter.walk)
+        self._recent.took(snapshots, pauses, result)
+        self.first = self.filter.count - len(snapshots)
+        nan, number = float("nan"), self.first
+        since = {camera: self.open[camera].since if camera in self.open else number for camera in free}
+        new = [Change(c, since[c], "unknown", nan, nan, True, evidence.get(c, nan)) for c in free]
+        self.open, self._since, self._suspect = {}, None, None
+        return result, (*told, *new)
 
     def _begin(
         self,
@@ -253,9 +301,11 @@ class RigMonitor:
             camera = _surest(given, set(free))
             free[camera], evidence[camera] = None, max(float(score[camera]) for score in given.scores().values())
         snapshots = self._recent.snapshots(age)
+        if self.filter.count - age - self.first < FEW:
+            return self._begin_again(free, snapshots, self._recent.pauses(age), evidence, told)
         moved = absorbed(_let_free(before, free), *joined(snapshots), self.filter.options)
         if not known and (found := changed_object(before, snapshots, self.filter.options, moved)) is not None:
-            return self._learn_object(*found, snapshots), tuple(told)
+            return self._learn_object(*found, snapshots, self._recent.pauses(age)), tuple(told)
         result = self.filter.restart(_let_free(before, free), snapshots)
         self._recent.restarted(result, age)
         return result, (*told, *self._begin(free, result, before, seconds, evidence))
@@ -271,24 +321,101 @@ class RigMonitor:
     def _learnt_object(self, age: int) -> Absorbed | None:
         """Learn the object anew where snapshots fit worse because it has changed."""
         age = min(age, len(self._recent))
-        try:
-            before, snapshots = self._recent.belief_before(age), self._recent.snapshots(age)
-            steady = absorbed(before, *joined(snapshots), self.filter.options)
-        except RefusedError:
+        if self.filter.count - age - self.first < UNSURE:
             return None
+        snapshots, pauses = self._recent.snapshots(age), self._recent.pauses(age)
+        with contextlib.suppress(RefusedError):
+            return self._asked_object(self._recent.belief_before(age), snapshots, pauses)
+        return None
+
+    def _learnt_first_object(self, result: Absorbed) -> Absorbed | None:
+        """Learn the object anew where it never was as its file says, and so the first snapshots do not fit."""
+        count, excess = self.filter.count, result.chi2 - result.dof
+        asked = count in OBJECT_ASKED and not self.first and self._since is None and len(self._recent) == count
+        if not asked or excess < MOST_FIRST * math.sqrt(2 * result.dof):
+            return None
+        with contextlib.suppress(RefusedError):
+            return self._asked_object(self._prior, self._recent.snapshots(count), self._recent.pauses(count))
+        return None
+
+    def ask_object(
+        self, snapshots: Sequence[tuple[Observations, RigidTransform]], pauses: Sequence[float], learnt: bool
+    ) -> Absorbed | None:
+        """Ask whether it is the object that has changed where labels do not fit; `object_change` says how.
+
+        Args:
+            snapshots: observations (1, C, N), with those labels, and poses (1,): the latest ones.
+            pauses: s before each of them.
+            learnt: they have been learnt without those labels; else not at all.
+
+        Returns:
+            What they taught, with pose and residual of the last one; None = the object is as it was.
+        """
+        self.object_change = None
+        if self._since is not None or (learnt and len(self._recent) < len(snapshots)):
+            return None
+        unlearnt, found = 0 if learnt else len(snapshots), None
+        self.filter.count += unlearnt
+        with contextlib.suppress(RefusedError):
+            if learnt:
+                before = self._recent.belief_before(len(snapshots))
+            else:
+                before = aged(self.filter.belief, self.filter.waited + pauses[0], self.filter.walk)
+            found = self._asked_object(before, snapshots, pauses)
+        if found is None:
+            self.filter.count -= unlearnt
+        return None if found is None else found.of_last()
+
+    def _asked_object(
+        self,
+        before: RigBelief,
+        snapshots: Sequence[tuple[Observations, RigidTransform]],
+        pauses: Sequence[float],
+    ) -> Absorbed | None:
+        """Learn the object anew where that explains some snapshots.
+
+        Raises:
+            RefusedError: see `absorbed`.
+        """
+        steady = absorbed(before, *joined(snapshots), self.filter.options)
         found = changed_object(before, snapshots, self.filter.options, steady, OBJECT_ODDS)
-        return None if found is None else self._learn_object(*found, snapshots)
+        return None if found is None else self._learn_object(*found, snapshots, pauses)
 
     def _learn_object(
-        self, change: ObjectChange, before: RigBelief, snapshots: list[tuple[Observations, RigidTransform]]
+        self,
+        change: ObjectChange,
+        before: RigBelief,
+        snapshots: Sequence[tuple[Observations, RigidTransform]],
+        pauses: Sequence[float],
     ) -> Absorbed:
         """Go on with an object that is not as it was; its shape is learnt from now on."""
         result = self.filter.restart(before, snapshots)
         self.object_change = replace(change, since=self.filter.count - len(snapshots))
-        recent = RecentSnapshots(result.belief, self.filter.rate)
-        recent.took(self._recent, result)
-        self._recent = recent
+        self._recent = RecentSnapshots(result.belief, self.filter.walk)
+        self._recent.took(snapshots, pauses, result)
         return result
+
+    def _learn_paces(self, seconds: float) -> None:
+        """Learn how fast cameras drift while nothing else is the matter, and know as much less of those that do."""
+        follows, stretch = self.filter, self._stretch
+        if follows.young or self._since is not None:
+            self._stretch = None
+            return
+        if stretch is None:
+            self._stretch, self._untold = Stretch.after(follows.belief, follows.waited), 0
+            return
+        stretch.seconds, self._untold = stretch.seconds + seconds, self._untold + 1
+        done = stretch.seconds >= SECONDS
+        if done or self._untold == TOLD_AT_ONCE:
+            stretch.add(follows.belief, *self._recent.brought(self._untold))
+            self._untold = 0
+        if done:
+            lacking = self._paces.take(stretch, follows.rate.std(follows.belief.rig))
+            follows.pace = self._paces.of_parameters(follows.pace.shape[1])
+            self._recent.walk = follows.walk
+            if bool(lacking.any()):
+                follows.belief = widened(follows.belief, lacking)
+            self._stretch = Stretch.after(follows.belief, follows.waited)
 
     def _age(self, camera: int, age: int) -> int:
         """Number of snapshots since a camera changed, by how probable that is."""
@@ -350,7 +477,7 @@ class RigMonitor:
     def _tested(self, since: _Open) -> ChangeTest:
         """What the snapshots since the change say against what was believed before it."""
         before = since.before
-        known = aged(before, since.seconds, self.filter.rate).information
+        known = aged(before, since.seconds, self.filter.walk).information
         pull = since.weighted - since.brought @ since.distance(before)
         change = change_of_errors(before.rig, before.unit)
         return ChangeTest.of(known, since.brought, pull, change, pixel_changes(before.rig))
@@ -373,7 +500,7 @@ class RigMonitor:
         origin, wide = since.origin, first.unit.numel()
         rig = displaced(origin.rig, error[:wide].view(first.unit.shape) * first.unit)
         belief = replace(first, rig=rig, object_offset=origin.object_offset + error[wide:], factor=factor)
-        self.filter.suppose(first, aged(belief, since.seconds, self.filter.rate))
+        self.filter.suppose(first, aged(belief, since.seconds, self.filter.walk))
         self._recent.rebased(belief, information)
 
 

@@ -15,14 +15,23 @@ from imgcal.online.rig_state import RigState
 
 BLOCK = 1.0
 """Seconds that are put together: neighbouring snapshots say the same."""
-LEAST_VALUES = 10
-"""Blobs in such a block from which its median counts."""
+LEAST_VALUES = np.array((10, 10, 20))
+"""Blobs in such a block from which its median counts, and fiducials from which the share of those that are missing is
+nearly normal; where there are fewer, the next block is put to it."""
+LEAST_SNAPSHOTS = 10
+"""Snapshots of it: a few cameras a second make a block of many seconds."""
+LONGEST = 60.0
+"""Seconds after which what has been put together is forgotten: the object was away."""
 LEARNT = 30
 """Blocks that say what is usual."""
 RUN_LENGTH = 1e6
 """Blocks for one false alarm of a camera and value: eleven days in which it sees the object."""
 LEAST_SPREAD = np.array((0.03, 0.15, 0.05))
 """Standard deviations of a block at least: size (3 %), uncertainty (15 %), share that is missing (5 %)."""
+MOST_SPREADS = 4.0
+"""Standard deviations by which one block counts at most: shares are not normal."""
+MOST_SPREADS = 4.0
+"""Standard deviations by which one block counts at most."""
 CLEAN, CLEAN_BLOCKS = 1.5, 5
 """Standard deviations within which a value is as usual again, and for how many blocks it must be."""
 MARGIN = 0.05
@@ -46,24 +55,30 @@ class ImageQuality:
     def __init__(self, cameras: int) -> None:
         """Begin with cameras whose images are good."""
         self._cameras = cameras
-        self._values: list[list[list[float]]] = [[[] for _ in range(cameras)] for _ in SAID]
-        self._began: float | None = None  # s, of the block
+        self._values = self._none()
+        self._began: float | None = None  # s, of the block ...
+        self._snapshots = 0  # ... and how many there are in it
         self._count = np.zeros((3, cameras), dtype=np.int64)  # blocks that have been learnt
         self._sum, self._squares = np.zeros((3, cameras)), np.zeros((3, cameras))
         self._usual = np.zeros((3, cameras), dtype=np.int64)  # blocks in a row that are as usual
         self._bad = np.zeros((3, cameras), dtype=bool)
+        self._good = np.zeros((3, cameras))  # s, until when nothing spoke for worse
         self._test = Cusum(3 * cameras, 1.0, RUN_LENGTH)
 
     def __call__(
         self, state: RigState, frames: Mapping[str, Frame | None] | None, absorbed: Absorbed | None
     ) -> Iterable[Event]:
         """See `SequentialTest`."""
-        if self._began is None or not 0 <= state.time - self._began < 10 * BLOCK:
-            self._began, self._values = state.time, [[[] for _ in range(self._cameras)] for _ in SAID]
+        if self._began is None or not 0 <= state.time - self._began < LONGEST:
+            self._began, self._values = state.time, self._none()
         events = self._judged(state) if state.time - self._began >= BLOCK else []
         if state.rig_from_object is not None:
             self._collect(state)
         return events
+
+    def _none(self) -> list[list[list[float]]]:
+        """No values yet, of each thing that is watched and each camera."""
+        return [[[] for _ in range(self._cameras)] for _ in SAID]
 
     def _collect(self, state: RigState) -> None:
         """Add the blobs of a snapshot."""
@@ -85,13 +100,15 @@ class ImageQuality:
         image = rig.image_size.numpy()[:, None]
         with np.errstate(invalid="ignore"):
             inside = ((state.predicted > MARGIN * image) & (state.predicted < (1 - MARGIN) * image)).all(-1)
-        expected = inside & (seen.sum(0) - seen >= 2)
+        expected = (
+            inside & (seen.sum(0) - seen >= 2) & seen.any(axis=1, keepdims=True)
+        )  # of a camera that is out, others tell
         for c in range(self._cameras):
             self._values[2][c].extend((~seen[c, expected[c]]).astype(float).tolist())
 
     def _judged(self, state: RigState) -> list[Event]:
         """Compare a block with those before, and begin the next one."""
-        enough = [[len(v) >= LEAST_VALUES for v in values] for values in self._values]
+        enough = [[len(v) >= least for v in values] for values, least in zip(self._values, LEAST_VALUES, strict=True)]
         middle = (np.median, np.median, np.mean)
         block = np.array(
             [
@@ -99,7 +116,9 @@ class ImageQuality:
                 for n in range(3)
             ]
         )
-        self._began, self._values = state.time, [[[] for _ in range(self._cameras)] for _ in SAID]
+        self._began = state.time
+        for row, oks in zip(self._values, enough, strict=True):
+            row[:] = [[] if ok else values for values, ok in zip(row, oks, strict=True)]
         learning = np.isfinite(block) & (self._count < LEARNT)
         self._count += learning
         self._sum += np.where(learning, block, 0.0)
@@ -108,19 +127,20 @@ class ImageQuality:
         spread = np.sqrt(np.maximum(self._squares / np.maximum(self._count, 1) - mean**2, 0.0))
         z = (block - mean) / np.maximum(spread, LEAST_SPREAD[:, None])
         z[(self._count < LEARNT) | learning] = np.nan
-        risen = self._test.update(z.ravel()).reshape(z.shape)
+        risen = self._test.update(np.minimum(z, MOST_SPREADS).ravel()).reshape(z.shape)
         self._usual = np.where(np.isnan(z), self._usual, np.where(z < CLEAN, self._usual + 1, 0))
-        return self._told(state, risen & ~self._bad, self._bad & (self._usual >= CLEAN_BLOCKS), z)
+        events = self._told(state, risen & ~self._bad, self._bad & (self._usual >= CLEAN_BLOCKS), z)
+        self._good = np.where(self._test.age.reshape(z.shape) == 0, state.time, self._good)
+        return events
 
     def _told(
         self, state: RigState, worse: NDArray[np.bool_], better: NDArray[np.bool_], z: NDArray[Any]
     ) -> list[Event]:
         events, names = [], state.factory.camera_names
         was = self._bad.any(0)
-        age = self._test.found.reshape(z.shape)
         for number, camera in zip(*np.nonzero(worse), strict=True):
             kind, message = SAID[number]
-            since = state.time - BLOCK * float(age[number, camera])
+            since = float(self._good[number, camera])
             events.append(
                 Event(
                     state.time, state.snapshot, kind, names[camera], since, evidence=float(z[number, camera]),

@@ -30,6 +30,7 @@ from imgcal.online.label_checks import Checked, check_labels
 from imgcal.online.labelling import LEAST_FOLLOWED, Labelling
 from imgcal.online.memory import Frozen, require_alike
 from imgcal.online.noise_level import NoiseLevel
+from imgcal.online.object_doubts import ObjectDoubts
 from imgcal.online.relearning import Relearning
 from imgcal.online.rig_state import CameraHealth, RigState
 from imgcal.online.search import Search, Surroundings
@@ -56,9 +57,9 @@ PATIENCE = 64
 GREATEST_TIME = 2.0**37
 
 REMEMBERED_VALUES = (
-    "factory", "obj", "drift", "_prior", "_monitor", "_noise", "_sightings", "_relearning", "_drift_watch", "_count",
-    "_learnt", "_times", "_poses", "_labels", "_search", "_usual", "_off", "_looks", "_in_vain", "_told_health",
-    "_before", "_pending", "_time",
+    "factory", "obj", "drift", "_prior", "_monitor", "_noise", "_sightings", "_relearning", "_drift_watch", "_doubts",
+    "_count", "_learnt", "_times", "_poses", "_labels", "_search", "_usual", "_off", "_looks", "_in_vain",
+    "_told_health", "_before", "_pending", "_time",
 )  # fmt: skip
 """Attributes of a keeper that are saved."""
 
@@ -119,6 +120,7 @@ class RigKeeper:
         self._sightings = Sightings(rig.camera_names)
         self._relearning = Relearning(rig.camera_names)
         self._drift_watch = DriftWatch(rig.camera_names)
+        self._doubts = ObjectDoubts(obj.num_fiducials)
         self._count = 0
         self._learnt: float | None = None  # s, time of the last snapshot that was learnt
         self._times: deque[tuple[int, float]] = deque(maxlen=512)  # number in the filter and time of snapshots
@@ -177,12 +179,12 @@ class RigKeeper:
         rows = np.flatnonzero(detections.usable)
         labelled, result, refused = None, None, None
         shown = replace(detections, fiducial=np.full(len(detections), -1, dtype=np.int64))
-        events, self._pending = self._pending, []
         try:
             labelled = self._labelled(detections.select(rows), detections.snapshot_names[0], frames)
             result, changes = self._learn(labelled, time)
         except RefusedError as reason:
             self._labelling.follows, refused = False, str(reason)
+        events, self._pending = self._pending, []
         if labelled is not None and result is not None:
             events += self._told(changes, time)
             if self._monitor.object_change is not None:
@@ -340,7 +342,12 @@ class RigKeeper:
             obj = self._object
             pose = initial_pose(to_observations(blobs, self._prior, obj), self.belief.rig, obj)[0]
         checked = self._checked(blobs, pose.reshape(1))
+        if checked.usual > self._most_usual() and self._doubts.due and self._asked_object(learnt=False) is not None:
+            assert self._monitor.object_change is not None
+            self._pending.append(self._told_object(self._monitor.object_change, self._time))
+            checked = self._checked(blobs, pose.reshape(1))
         if checked.usual > self._most_usual():
+            self._doubts.take_refused(checked, self._time if self._learnt is None else self._learnt, self._time)
             self._in_vain += 1
             if self._in_vain >= PATIENCE:
                 self._begin_anew()
@@ -434,11 +441,19 @@ class RigKeeper:
         observations = self._observations(blobs)
         if not off and not still_open:
             self._before = self.belief
+        first = self._monitor.first
         result, changes = self._monitor.update(observations, checked.rig_from_object, seconds, moved)
+        if self._monitor.first != first:  # nothing that was known before counts any more
+            self._drift_watch = DriftWatch(self._prior.camera_names)
+            self._looks[:] = 0
+        self._times.append((self._monitor.filter.count - 1, time))
+        if changes or self._monitor.open or self._monitor.object_change is not None:
+            self._doubts = ObjectDoubts(self.obj.num_fiducials)
+        elif self._doubts.take(checked, blobs, seconds, time):
+            result = self._asked_object(learnt=True) or result
         self._looks += observations.seen[0].any(-1).numpy()
         self._looks[[change.camera for change in changes]] = 0
         self._off, self._learnt, self._in_vain = off, time, 0
-        self._times.append((self._monitor.filter.count - 1, time))
         self._labelling.follow(result.rig_from_object[0])
         self._poses.append((time, result.rig_from_object))
         self._labels = checked.labels
@@ -448,6 +463,18 @@ class RigKeeper:
         if self._noise.take(blobs, observations, result, steady, self._monitor.filter.count):
             result = self._again(result)
         return result, changes
+
+    def _asked_object(self, learnt: bool) -> Absorbed | None:
+        """Ask whether labels do not fit because the object is not as its file says; what was learnt then."""
+        doubted = self._doubts.learnt if learnt else self._doubts.refused
+        snapshots = [(self._observations(one.blobs), one.rig_from_object) for one in doubted]
+        first = self._monitor.filter.count
+        result = self._monitor.ask_object(snapshots, [one.seconds for one in doubted], learnt)
+        if result is not None and not learnt:
+            self._times.extend((first + n, one.time) for n, one in enumerate(doubted))
+            self._learnt = doubted[-1].time
+        self._doubts.asked(result is not None)
+        return result
 
     def _observations(self, blobs: Detections) -> Observations:
         seen = to_observations(blobs, self._prior, self.obj)
@@ -459,6 +486,7 @@ class RigKeeper:
         for blobs, pose in self._noise.first:
             result, _ = monitor.update(self._observations(blobs), pose)
         self._monitor = monitor
+        self._doubts = ObjectDoubts(self.obj.num_fiducials)
         return result
 
     def _begin_anew(self) -> None:
@@ -467,6 +495,7 @@ class RigKeeper:
         self._noise.restart()
         self._usual.clear()
         self._times.clear()
+        self._doubts = ObjectDoubts(self.obj.num_fiducials)
         self._off, self._search = {}, Search(self._prior.num_cameras)
         self._looks[:] = 0
         self._relearning = Relearning(self._prior.camera_names)

@@ -38,6 +38,7 @@ class Checked:
     """Labels of a snapshot, and how they go with a rig."""
 
     blobs: Detections  # strays have lost their labels
+    given: Detections  # the same, with all labels
     rig_from_object: RigidTransform  # (1,) most probable for the rig as it is known
     off: NDArray[np.bool_]  # (C,) the labels agree with each other, and lie elsewhere
     usual: float  # px, how far off the image of a camera is: the median of all cameras
@@ -88,7 +89,7 @@ def check_labels(
     fiducial = named.fiducial.copy()
     fiducial[rows] = np.where(lost, -1, fiducial[rows])
     blobs = replace(named, fiducial=fiducial)
-    return Checked(blobs, fit.rig_from_object, off, usual, int((fiducial >= 0).sum()))
+    return Checked(blobs, named, fit.rig_from_object, off, usual, int((fiducial >= 0).sum()))
 
 
 @njit(cache=True, fastmath=kernels.FAST)

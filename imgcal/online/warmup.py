@@ -128,7 +128,7 @@ def _of_many_snapshots(truth: Truth, rig: CameraRig, obj: CalibrationObject) -> 
     seen = torch.ones(1, *truth.uv.shape[1:-1], dtype=torch.bool)
     there = Observations(truth.uv[:1], torch.full(seen.shape, 0.1, dtype=torch.float64), seen)
     follows = RigFilter(rig, obj)
-    recent = RecentSnapshots(follows.belief, follows.rate)
+    recent = RecentSnapshots(follows.belief, follows.walk)
     with _whatever_comes():
         for _ in range(A_SECOND):
             recent.append(follows.follow(there, truth.rig_from_object[:1]), there, 0.0)

@@ -330,9 +330,9 @@ def run(item: Item) -> dict[str, Any]:
     return {"key": item.key, "name": item.name, **found, "cpu_s": round(time.process_time() - began, 2)}
 
 
-def items(share: float) -> list[Item]:
+def items(share: float, only: tuple[str, ...] = tuple(COUNTS)) -> list[Item]:
     """All of them, or a share; in an order in which all experiments go on together, each at its `PACE`."""
-    wanted = {name: max(1, round(share * count)) for name, count in COUNTS.items()}
+    wanted = {name: max(1, round(share * count)) for name, count in COUNTS.items() if name in only}
     every = [
         (seed / count * PACE.get(name, OTHERS), Item(name, seed))
         for name, count in wanted.items()
@@ -350,12 +350,13 @@ def done(path: Path) -> list[dict[str, Any]]:
     return list({entry["key"]: entry for entry in entries}.values())
 
 
-def go_on(path: Path, share: float, minutes: float, mapped: Mapped = map) -> None:
+def go_on(options: Options, mapped: Mapped = map) -> None:
     """Run what is not done yet."""
+    path = options.items
     known = {entry["key"] for entry in done(path)}
-    left = [item for item in items(share) if item.key not in known]
+    left = [item for item in items(options.share, options.only) if item.key not in known]
     path.parent.mkdir(parents=True, exist_ok=True)
-    until = time.monotonic() + 60 * minutes
+    until = time.monotonic() + 60 * options.minutes
     in_time = takewhile(lambda item: time.monotonic() < until, left)
     with path.open("a", encoding="utf-8") as out:
         for found in mapped(run, in_time):
@@ -485,6 +486,7 @@ class Options:
     cores: int | None = 1  #: of this machine; 1 = this process alone; none = all
     share: float = 1.0
     """Of the items of each experiment."""
+    only: tuple[str, ...] = tuple(COUNTS)  #: experiments; the others stay as they were
     items: Path = ITEMS  #: a line for each that is done
     out: Path = RESULT  #: the page and the plot are rewritten with this one alone
 
@@ -493,11 +495,13 @@ def main() -> None:
     """Run, count, write, print."""
     options = tyro.cli(Options, description=__doc__)
     with workers(options.address, options.cores) as mapped:
-        go_on(options.items, options.share, options.minutes, mapped)
+        go_on(options, mapped)
+    known = json.loads(RESULT.read_text("utf-8"))["found"] if options.out == RESULT and RESULT.exists() else {}
+    anew = summarized([entry for entry in done(options.items) if entry["name"] in options.only])
     result: dict[str, Any] = {
         **surroundings(),
         "noise_px": Conditions().noise,
-        "found": summarized(done(options.items)),
+        "found": {name: (known | anew)[name] for name in COUNTS if name in known | anew},
     }
     write_json(options.out, result)
     written = tables(result)

@@ -1,7 +1,7 @@
 from pathlib import Path
 
 from scripts.benchmarks import alarms
-from scripts.benchmarks.alarms import Item, done, go_on, items, run, summarized, tables
+from scripts.benchmarks.alarms import Item, Options, done, go_on, items, run, summarized, tables
 
 
 def test_a_bump_is_found_and_counted(tmp_path: Path) -> None:
@@ -17,6 +17,7 @@ def test_what_is_done_is_not_done_again(tmp_path: Path) -> None:
     path.write_text('{"key": "monitor bump 0"}\n{"key": "monitor bump 0"}\n{"key": "cut o', "utf-8")
     assert [entry["key"] for entry in done(path)] == ["monitor bump 0"]
     assert len({item.key for item in items(1.0)}) == sum(alarms.COUNTS.values())
+    assert {item.name for item in items(1.0, ("monitor creep",))} == {"monitor creep"}
 
 
 def test_only_what_is_left_is_run_and_none_after_the_time_is_over(tmp_path: Path) -> None:
@@ -28,8 +29,8 @@ def test_only_what_is_left_is_run_and_none_after_the_time_is_over(tmp_path: Path
             yield {"key": item.key, "cpu_s": 0.0}
 
     path.write_text(f'{{"key": "{every[0].key}"}}\n', "utf-8")
-    go_on(path, 0.001, 0.0, mapped)
+    go_on(Options(minutes=0.0, share=0.001, items=path), mapped)
     assert not asked
-    go_on(path, 0.001, 1.0, mapped)
+    go_on(Options(minutes=1.0, share=0.001, items=path), mapped)
     assert asked == every[1:]
     assert {entry["key"] for entry in done(path)} == {item.key for item in every}

@@ -41,6 +41,22 @@ def test_a_change_of_the_object_is_told_and_learnt(fiducial: int | None, toleran
     assert float((off - off.mean(0)).norm(dim=-1).max()) < 0.1
 
 
+def test_a_fiducial_that_never_was_where_the_file_says_is_told() -> None:
+    factory, obj, generator = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), torch.Generator().manual_seed(8)
+    truth, points = simulate_truth(factory, obj, 16, generator, PhysicalDrift()), obj.points.clone()
+    points[5] += torch.tensor([0.6, -0.5, 0.6])
+    monitor, found, told = RigMonitor(RigFilter(factory, obj)), [], []
+    for s in range(16):
+        image = truth.rig.expand(1).project(truth.rig_from_object[s : s + 1].apply(points))
+        uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
+        there = Observations(uv, torch.full(uv.shape[:-1], NOISE, dtype=torch.float64), image.visible)
+        told += monitor.update(there, truth.rig_from_object[s : s + 1], 1 / 60)[1]
+        found += [] if monitor.object_change is None else [monitor.object_change]
+    assert told == []
+    assert [(change.fiducial, change.since) for change in found] == [(5, 0)]
+    assert abs(found[0].size - 0.985) < 5 * found[0].sigma
+
+
 def test_few_questions_are_asked_of_a_print(monkeypatch: pytest.MonkeyPatch) -> None:
     rig, generator = imgcal.load_rig("T4"), torch.Generator().manual_seed(3)
     across = torch.arange(12.0, dtype=torch.float64)

@@ -28,7 +28,7 @@ def test_what_was_believed_before_is_found_again(tolerance: float | None) -> Non
         torch.ones(truth.uv.shape[:-1], dtype=torch.bool),
     )
     follows.belief = absorbed(follows.belief, first, truth.rig_from_object).belief
-    recent, believed = RecentSnapshots(follows.belief, follows.rate), [follows.belief]
+    recent, believed = RecentSnapshots(follows.belief, follows.walk), [follows.belief]
     for s in range(OLDEST + 10):
         pick = s % 12
         there = Observations(first.uv[[pick]], first.sigma[[pick]], first.seen[[pick]])

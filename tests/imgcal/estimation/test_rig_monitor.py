@@ -12,6 +12,7 @@ from imgcal.estimation.rig_monitor import SIGNIFICANT
 from imgcal.geometry import RigidTransform
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import CameraRig, Observations
+from scripts.benchmarks.rig_streams import Bump, Conditions, Stream
 
 NOISE = 0.1
 SIZES = {"rotation": math.radians(0.1), "position": 1.0, "focal_length": 3.0, "principal_point": 1.0}
@@ -113,3 +114,31 @@ def test_a_large_turn_is_learnt_whether_it_was_announced_or_not(told_before: boo
     assert {change.camera for change in told} == {2}
     assert told[0].since == 20
     assert 0.3 < normalized_error(monitor, rig) < 1.8
+
+
+@pytest.mark.parametrize(
+    ("seed", "at", "camera", "kind", "size"),
+    [
+        (12, 5, 0, "rotation", 0.0095),
+        (20, 5, 2, "position", 9.17),
+        (26, 7, 2, "position", 7.55),
+        (23, 14, 2, "rotation", 0.005),
+    ],
+)
+def test_of_a_camera_that_moves_within_the_first_snapshots_no_other_and_no_object_is_blamed(
+    seed: int, at: int, camera: int, kind: str, size: float
+) -> None:
+    seen = Conditions(rate=60.0 if seed == 23 else 1.0, labelled=True)
+    made = Stream(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), seed, seen, [Bump(at, camera, kind, size)])
+    times = torch.arange(50, dtype=torch.float64) / seen.rate
+    made.frequency = made.frequency * seen.rate / 60
+    poses, (observations, rigs) = made.poses_at(times), made.labelled(0, 50)
+    monitor, told = RigMonitor(RigFilter(made.factory, made.obj)), []
+    for s in range(50):
+        one = Observations(*(x[s : s + 1] for x in vars(observations).values()))
+        _, changes = monitor.update(one, poses[s : s + 1], 1 / seen.rate)
+        told += changes
+        assert monitor.object_change is None
+    assert {change.camera for change in told} == {camera}
+    assert monitor.first == at
+    assert 0.5 < normalized_error(monitor, rigs[-1]) < 1.8

@@ -43,3 +43,21 @@ def test_good_cameras_are_left_alone_and_a_clean_one_is_told() -> None:
     assert again.saved() == test.saved()
     with pytest.raises(ValueError, match="4 cameras"):
         again.restored({name: [[1.0]] for name in test.saved()})
+
+
+def test_a_camera_that_sends_nothing_is_not_dirty() -> None:
+    test, events = ImageQuality(4), []
+    for number in range(200):
+        state = state_at(number, number / 3)
+        out = state.detections.select(state.detections.camera != 2)
+        events += test(state if number < 120 else replace(state, detections=out), None, None)
+    assert events == []
+
+
+def test_a_snapshot_a_second_of_which_a_tenth_is_hidden_is_clean() -> None:
+    test, events, luck = ImageQuality(4), [], np.random.default_rng(1)
+    state = state_at(0, 0.0)
+    for number in range(3000):
+        shown = state.detections.select(luck.random(32) > 0.1)
+        events += test(replace(state, detections=shown, time=1.7e9 + number), None, None)
+    assert events == []
