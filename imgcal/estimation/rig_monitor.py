@@ -8,19 +8,16 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-import torch
-from torch import Tensor
-
 from imgcal.errors import RefusedError
 from imgcal.estimation.cusum import Cusum, RunningMedian
 from imgcal.estimation.drift_pace import SECONDS, DriftPaces, Stretch
 from imgcal.estimation.object_change import ObjectChange, changed_object
+from imgcal.estimation.open_change import OpenChange, let_free
 from imgcal.estimation.recent_snapshots import SCREENED, RecentSnapshots
-from imgcal.estimation.rig_changes import CHANGES, JUMPS, LARGE, ChangeTest, change_of_errors, pixel_changes, spread_of
-from imgcal.estimation.rig_error import displaced, error_between
-from imgcal.estimation.rig_filter import YOUNG_SECONDS, Absorbed, RigBelief, RigFilter, absorbed, aged, joined, widened
+from imgcal.estimation.rig_changes import CHANGES, JUMPS, ChangeTest
+from imgcal.estimation.rig_filter import Absorbed, RigBelief, RigFilter, absorbed, aged, joined, widened
 from imgcal.geometry import RigidTransform
-from imgcal.types import CameraRig, Observations
+from imgcal.types import Observations
 
 SIGNIFICANT = 60.0
 """Chi-squared (two or three degrees of freedom) that a camera which stands still exceeds once in 10^12 tests."""
@@ -45,10 +42,6 @@ OBJECT_ODDS = 30.0
 OBJECT_ASKED, MOST_FIRST = (8, 16, 32), 2.0
 """Numbers of first snapshots, and the standard deviations that chi-squared must be more than is expected, from which it
 is asked whether the object never was as its file says."""
-DECIDED = 5.0
-"""Log odds of a kind of change against every other, from which it is told ..."""
-ALONE, MIXED = 3.0, 15.0
-"""... against a change of all kinds at once, and of that against each: what is believed wrongly does no harm then."""
 MOST_EXCESS = 4.0
 """Chi-squared per degree of freedom up to which a snapshot fits that is else refused."""
 FEW = 16
@@ -58,8 +51,6 @@ UNSURE = 8
 """... and of the object nothing is asked before so many have been learnt."""
 TOLD_AT_ONCE = 32
 """Snapshots whose information is added up at once."""
-JUDGED = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
-"""Numbers of snapshots since a change at which its kind is asked for."""
 
 
 @dataclass(frozen=True)
@@ -73,36 +64,6 @@ class Change:
     sigma: float  # one standard deviation of it
     decided: bool = False  # the last that will be said of it
     evidence: float = math.nan  # chi-squared of its having stood still; nan = it was told that it moved
-
-
-@dataclass
-class _Open:
-    """What was believed before some cameras changed, and what has been seen since, in one chart."""
-
-    before: RigBelief
-    origin: RigBelief  # of the chart: rig and object where the later snapshots led, when they were last linearized
-    brought: Tensor  # (D, D)
-    weighted: Tensor  # (D,) pull at the origin
-    count: int  # snapshots
-    seconds: float
-    kinds: dict[int, str | None]  # of the cameras that changed; None = not decided
-
-    @property
-    def late(self) -> bool:
-        """Tell whether more snapshots are not worth waiting for."""
-        return self.count >= JUDGED[-1] or self.seconds > YOUNG_SECONDS
-
-    def distance(self, belief: RigBelief) -> Tensor:
-        """Error (D,) in the chart of what was believed at some time.
-
-        Cameras that changed are compared by their own parameters, so that a large change of one kind is of no other.
-        """
-        at = _distance(belief.rig, belief.object_offset, self.origin)
-        change, step = change_of_errors(belief.rig, belief.unit), self.origin.rig.local(belief.rig)
-        width = belief.rig.num_parameters
-        for camera in self.kinds:
-            at[camera * width : (camera + 1) * width] = -(change[camera] @ step[camera])
-        return at
 
 
 class RigMonitor:
@@ -125,7 +86,7 @@ class RigMonitor:
         self._paces = DriftPaces(rig_filter.belief.rig.num_cameras)
         self._stretch: Stretch | None = None  # of snapshots that may say how fast cameras drift ...
         self._untold = 0  # ... and the latest of them, which it does not know of yet
-        self._since: _Open | None = None
+        self._since: OpenChange | None = None
         self._prior = rig_filter.belief
         self.first = 0  # number of the first snapshot of which something is known
         self._moved_early: set[int] = set()  # cameras of which the factory knows nothing more
@@ -175,7 +136,7 @@ class RigMonitor:
         self._suspect = None
         self._recent.append(result, observations, seconds)
         if self._since is not None:
-            self._took(self._since, result, seconds)
+            self._since.take(result, seconds)
         found = self._found()
         misfit = self._misfitting(result)
         if found is None and misfit and self._since is None:
@@ -191,9 +152,9 @@ class RigMonitor:
             if (anew := self._learnt_first_object(result)) is not None:
                 return anew, ()
             if self._since is not None:
-                self._since = _opened(result, self._since.before, self._since.seconds, self._since.kinds)
+                self._since = OpenChange.of(result, self._since.before, self._since.seconds, self._since.kinds)
         self._learn_paces(seconds)
-        if self._since is not None and (self._since.late or self._since.count in JUDGED):
+        if self._since is not None and self._since.due:
             return result, self._judged(self._since.late)
         return result, ()
 
@@ -207,7 +168,7 @@ class RigMonitor:
             self.filter.count += 1
             return self._begin_again(free, [(observations, rig_from_object)], [seconds], {}, told)
         before = aged(self.filter.belief, seconds, self.filter.walk)
-        first = _let_free(before, free, JUMPS[-1])
+        first = let_free(before, free, JUMPS[-1])
         result = self.filter.restart(first, [(observations, rig_from_object)])
         self.filter.count += 1
         self._recent.began(result, observations, seconds)
@@ -218,7 +179,7 @@ class RigMonitor:
         """The camera that may have moved where a snapshot is refused; None = no single one."""
         found: dict[int, float] = {}
         for camera in observations.seen[0].any(-1).nonzero()[:, 0].tolist():
-            free = _let_free(self.filter.belief, {camera: None}, JUMPS[-1])
+            free = let_free(self.filter.belief, {camera: None}, JUMPS[-1])
             with contextlib.suppress(RefusedError):
                 result = absorbed(free, observations, rig_from_object, self.filter.options)
                 if result.chi2 <= MOST_EXCESS * max(result.dof, 1):
@@ -239,7 +200,7 @@ class RigMonitor:
             RefusedError: see `absorbed`; the monitor stays as it was.
         """
         self._moved_early |= free.keys()
-        prior = _let_free(self._prior, dict.fromkeys(sorted(self._moved_early)), JUMPS[-1])
+        prior = let_free(self._prior, dict.fromkeys(sorted(self._moved_early)), JUMPS[-1])
         result = self.filter.restart(prior, snapshots)
         self._recent = RecentSnapshots(result.belief, self.filter.walk)
         self._recent.took(snapshots, pauses, result)
@@ -265,7 +226,7 @@ class RigMonitor:
                 number = self.filter.count - len(result.brought)
                 self.open[camera] = Change(camera, number, "unknown", nan, nan, evidence=evidence.get(camera, nan))
                 told.append(self.open[camera])
-        self._since = _opened(result, before, seconds, free)
+        self._since = OpenChange.of(result, before, seconds, free)
         return told
 
     def _found(self) -> int | None:
@@ -303,10 +264,10 @@ class RigMonitor:
         snapshots = self._recent.snapshots(age)
         if self.filter.count - age - self.first < FEW:
             return self._begin_again(free, snapshots, self._recent.pauses(age), evidence, told)
-        moved = absorbed(_let_free(before, free), *joined(snapshots), self.filter.options)
+        moved = absorbed(let_free(before, free), *joined(snapshots), self.filter.options)
         if not known and (found := changed_object(before, snapshots, self.filter.options, moved)) is not None:
             return self._learn_object(*found, snapshots, self._recent.pauses(age)), tuple(told)
-        result = self.filter.restart(_let_free(before, free), snapshots)
+        result = self.filter.restart(let_free(before, free), snapshots)
         self._recent.restarted(result, age)
         return result, (*told, *self._begin(free, result, before, seconds, evidence))
 
@@ -435,86 +396,31 @@ class RigMonitor:
             best = nearest
         return best
 
-    def _took(self, since: _Open, result: Absorbed, seconds: float) -> None:
-        """Add what a snapshot has brought since a change."""
-        brought = result.brought
-        information = brought.information()
-        at = _distance(brought.rig, brought.object_offset, since.origin)
-        since.brought, since.weighted = since.brought + information, since.weighted + brought.pull[0] + information @ at
-        since.count, since.seconds = since.count + 1, since.seconds + seconds
-
     def _judged(self, last: bool) -> tuple[Change, ...]:
         """Decide what kind of change each open one is, where the snapshots since can tell, or it is time."""
         since = self._since
         if since is None:
             return ()
-        test = self._tested(since)
+        test = since.test(self.filter.walk)
         told, kinds = [], dict[int, str | None]()
         for camera, change in self.open.items():
-            others = {other: kind for other, kind in since.kinds.items() if other != camera}
-            odds = {kind: test.odds({**others, camera: kind}) for kind in (*CHANGES, None)}
-            best, second = sorted(odds, key=lambda kind: -odds[kind])[:2]
-            least = MIXED if best is None else ALONE if second is None else DECIDED
-            if odds[best] - odds[second] >= least:
-                kinds[camera] = best
-            elif last:
-                kinds[camera] = None  # told as what it most probably is, and believed to be anything
-                best = max(CHANGES, key=lambda kind: odds[kind]) if since.late else None
-            else:
+            decided = since.decided(test, camera, last)
+            if decided is None:
                 continue
-            size = (float("nan"), float("nan")) if best is None else _size(test.given(others), camera, best)
-            scores = test.given(others).scores()
-            evidence = max(float(scores[kind][camera]) for kind in ([best] if best else CHANGES))
-            told.append(Change(camera, change.since, best or "unknown", *size, decided=True, evidence=evidence))
+            kinds[camera], kind = decided
+            size = (float("nan"), float("nan")) if kind is None else since.size(test, camera, kind)
+            scores = test.given(since.others(camera)).scores()
+            evidence = max(float(scores[name][camera]) for name in ([kind] if kind else CHANGES))
+            told.append(Change(camera, change.since, kind or "unknown", *size, decided=True, evidence=evidence))
         since.kinds.update(kinds)
         if any(kind is not None for kind in kinds.values()):
-            self._suppose(since, test)
+            first, belief, information = since.supposed(test)
+            self.filter.suppose(first, aged(belief, since.seconds, self.filter.walk))
+            self._recent.rebased(belief, information)
         self.open = {camera: change for camera, change in self.open.items() if camera not in kinds}
         if not self.open:
             self._since = None
         return tuple(told)
-
-    def _tested(self, since: _Open) -> ChangeTest:
-        """What the snapshots since the change say against what was believed before it."""
-        before = since.before
-        known = aged(before, since.seconds, self.filter.walk).information
-        pull = since.weighted - since.brought @ since.distance(before)
-        change = change_of_errors(before.rig, before.unit)
-        return ChangeTest.of(known, since.brought, pull, change, pixel_changes(before.rig))
-
-    def _suppose(self, since: _Open, test: ChangeTest) -> None:
-        """Believe that cameras have changed in some ways only.
-
-        What was believed is moved along with them first: a large turn is no small one times a number.
-        """
-        step = torch.zeros_like(since.before.unit)
-        for camera, kind in since.kinds.items():
-            if kind is not None:
-                others = {other: known for other, known in since.kinds.items() if other != camera}
-                step[camera, CHANGES[kind]] = test.given(others).jump(camera, kind)[0]
-        first = _let_free(replace(since.before, rig=since.before.rig.retract(step)), since.kinds)
-        information = first.information + since.brought
-        factor = torch.linalg.cholesky(information)
-        pull = first.information @ since.distance(first) + since.weighted
-        error = torch.cholesky_solve(pull[:, None], factor)[:, 0]
-        origin, wide = since.origin, first.unit.numel()
-        rig = displaced(origin.rig, error[:wide].view(first.unit.shape) * first.unit)
-        belief = replace(first, rig=rig, object_offset=origin.object_offset + error[wide:], factor=factor)
-        self.filter.suppose(first, aged(belief, since.seconds, self.filter.walk))
-        self._recent.rebased(belief, information)
-
-
-def _opened(result: Absorbed, before: RigBelief, seconds: float, kinds: dict[int, str | None]) -> _Open:
-    """Begin to collect what is seen after a change, with the snapshots that were absorbed together."""
-    brought = result.brought
-    origin = replace(result.belief, rig=brought.rig, object_offset=brought.object_offset)
-    return _Open(before, origin, brought.information(), brought.pull.sum(0), len(brought), seconds, kinds)
-
-
-def _distance(rig: CameraRig, object_offset: Tensor, origin: RigBelief) -> Tensor:
-    """Error (D,) of a rig and an object in a chart."""
-    cameras = (error_between(rig, origin.rig) / origin.unit).flatten()
-    return torch.cat((cameras, object_offset - origin.object_offset))
 
 
 def _worst(test: ChangeTest, known: set[int]) -> float:
@@ -535,16 +441,3 @@ def _surest(test: ChangeTest, known: set[int]) -> int:
     """The camera whose change, of any kind, is most probable; of those that are not known to have changed."""
     odds = {camera: test.odds({camera: None}) for camera in range(len(test.pixels)) if camera not in known}
     return max(odds, key=lambda camera: odds[camera])
-
-
-def _size(test: ChangeTest, camera: int, kind: str) -> tuple[float, float]:
-    """How far a camera went, were it of this kind alone, and the standard deviation of that."""
-    change, covariance = test.jump(camera, kind)
-    size = float(change.norm())
-    along = change / max(size, 1e-30)
-    return size, float((along @ covariance @ along).clamp_min(0).sqrt())
-
-
-def _let_free(belief: RigBelief, changes: Mapping[int, str | None], jump: float = LARGE) -> RigBelief:
-    """Let cameras have changed in some way, None = in all ways, by so many pixels."""
-    return widened(belief, spread_of(changes, pixel_changes(belief.rig), jump).square())

@@ -28,6 +28,7 @@ MODULES = frozenset(
         "estimation.drift_pace",
         "estimation.map_estimate",
         "estimation.object_change",
+        "estimation.open_change",
         "estimation.recent_snapshots",
         "estimation.rig_changes",
         "estimation.rig_filter",

@@ -21,7 +21,8 @@ def watched(change: float | tuple[float, float, float], count: int) -> tuple[Rig
     """Change the object while it is watched: its scale, or the place (mm) of its third fiducial."""
     obj = imgcal.load_object("asymmetric8")
     made = Stream(imgcal.load_rig("T4"), obj, 5, Conditions(labelled=True))
-    points, events, refused = obj.points.clone(), [], 0
+    points, refused = obj.points.clone(), 0
+    events: list[Event] = []
     if isinstance(change, float):
         points = points.mean(0) + change * (points - points.mean(0))
     else:
