@@ -22,6 +22,9 @@ LEAST_FOUND, LEAST_SHARE = 4, 0.4
 """Labels of one camera that fit, and their share of the fiducials in view, from which on the pattern was found: so
 many do not fit a rig and each other by chance, whatever else the frame shows."""
 
+WHOLE = 0.7
+"""Share of the fiducials in view with a label that fits, from which on what else a frame shows is not the object."""
+
 Counts = NDArray[np.int64]
 
 
@@ -35,7 +38,7 @@ class Tally:
     kept: Counts  # (S, C) labels that fit
     expected: Counts  # (S, C) fiducials in view of the factory camera, given where the rest of the rig sees the object
     found: NDArray[np.bool_]  # (S, C) the pattern was looked for in the frame itself, and is there
-    crowd: Counts  # (S, 1) false blobs that frames have which were looked at: as many are no witness; else 0
+    crowd: Counts  # (S, C) false blobs as usual: as many are no witness
 
     @property
     def outliers(self) -> Counts:
@@ -49,7 +52,9 @@ class Tally:
         False blobs beside fiducials that were all found are no witness against a camera, nor are fiducials in view that
         are hidden: each counts as far as there is something of the other. Where the pattern was found in the frame
         itself, fiducials are missing because they are hidden: false blobs elsewhere are not what they would be. Where
-        it was looked for in vain, only blobs beyond the usual number of false ones may be the object.
+        it was looked for in vain, only blobs beyond the usual number of false ones may be the object. The same where
+        blobs alone decide, if that camera has shown the object in another snapshot: what it showed besides, it shows
+        where the object is hidden.
         """
         spare = np.maximum(self.usable - self.crowd, 0)
         return np.where(self.found, 0, np.maximum(np.minimum(self.expected, spare) - self.kept, 0))
@@ -82,6 +87,8 @@ def tally(
     fitting, expected = np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=np.int64)
     fitting[used], expected[used] = kept.sum(-1), inside.sum(-1)
     usable = count(detections.usable)
+    spare = np.maximum(usable - fitting, 0)
+    whole = (fitting >= LEAST_FOUND) & (fitting >= WHOLE * np.minimum(expected, usable))
     looked = np.array([snapshot.found_by != "classical" for snapshot in labelled.snapshots], dtype=bool)
     return Tally(
         blobs=count(np.ones(len(detections), dtype=bool)),
@@ -90,11 +97,19 @@ def tally(
         kept=fitting,
         expected=expected,
         found=looked[:, None] & (fitting >= np.maximum(LEAST_FOUND, LEAST_SHARE * expected)),
-        crowd=np.where(looked[:, None], _crowd(usable - fitting), 0),
+        crowd=np.where(looked[:, None], _crowd(spare), _besides(spare, whole)),
     )
 
 
 def _crowd(false: Counts) -> Counts:
     """How many false blobs (S, C) a frame of a snapshot may well have: (S, 1)."""
-    usual = np.median(np.maximum(false, 0), axis=1, keepdims=True)
+    usual = np.median(false, axis=1, keepdims=True)
     return np.floor(usual + 2 * np.sqrt(usual)).astype(np.int64)
+
+
+def _besides(false: Counts, whole: NDArray[np.bool_]) -> Counts:
+    """How many blobs (S, C) each camera usually has besides the `whole` object (S, C): (C,); 0 = it never was."""
+    usual = np.nanmedian(np.where(whole, false, np.nan)[:, whole.any(0)], axis=0)
+    counts = np.zeros(whole.shape[1], dtype=np.int64)
+    counts[whole.any(0)] = np.floor(usual)
+    return counts

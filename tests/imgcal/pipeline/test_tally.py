@@ -50,14 +50,25 @@ def test_false_blobs_do_not_count_against_a_camera(kind, crowd):
     assert found.unexplained.sum() < 0.05 * found.kept.sum()
 
 
+@pytest.mark.parametrize("shown", [2, 1])
 @pytest.mark.parametrize("kind", MAKE)
-def test_a_camera_that_is_hidden_a_third_of_the_time_among_reflections_is_accepted(kind):
+def test_a_camera_that_is_hidden_again_and_again_among_reflections_is_accepted(kind, shown):
     rig, obj, truth = MAKE[kind](9)
     table = damage.blobs(truth, labelled=True, crowded=(CAMERA, 6))
-    hidden = (table.camera == CAMERA) & (table.snapshot % 3 == 0) & (table.fiducial >= 0)
+    hidden = (table.camera == CAMERA) & (table.snapshot % 3 >= shown) & (table.fiducial >= 0)
     table = table.select(~hidden)
     table.fiducial[:] = -1
-    assert calibrate(table, rig, obj).tally.kept[1::3, CAMERA].sum() > 0
+    assert calibrate(table, rig, obj).tally.kept[::3, CAMERA].sum() > 0
+
+
+@pytest.mark.parametrize("kind", MAKE)
+def test_a_camera_whose_frames_are_mostly_of_other_moments_is_refused(kind):
+    rig, obj, truth = MAKE[kind](9)
+    table = damage.blobs(truth, crowded=(CAMERA, 6))
+    late, wrong = damage.late(table, CAMERA), (table.camera == CAMERA) & (table.snapshot % 3 > 0)
+    table = damage.joined(table.select(~wrong), late.select((late.camera == CAMERA) & (late.snapshot % 3 > 0)))
+    with pytest.raises(RefusedError, match="cam04"):
+        calibrate(table, rig, obj)
 
 
 def test_counts_add_up():
