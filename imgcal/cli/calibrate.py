@@ -93,7 +93,8 @@ class Calibrate:
     blurred or cluttered for blobs; slower), auto (blobs, and the pattern where these decide nothing), learned (a
     network for any rig and object), both (blobs, and the network where these decide nothing), or the network's file or
     run"""
-    measurer: str | None = None  #: network that measures blobs again: a file, the folder of a run, or a shipped name
+    measurer: str | None = None
+    """network that measures blobs again, and what learned finds: a file, the folder of a run, or a shipped name"""
     first_guess: str = "none"  #: where to start: none (factory rig), points, vit, cnn (shipped), a file or run
     without: tuple[str, ...] = ()  #: cameras to leave out
     blind_cameras: bool = False  #: accept cameras that see nothing; they keep their factory values
@@ -131,10 +132,10 @@ class Calibrate:
         )
         source = open_input(self.input, complete, obj.num_fiducials, self.videos_differ)
         self._require_frames(source, rig)
-        detector = self._detector(source)
+        measurer = None if self.measurer is None else LearnedMeasurer.load(self.measurer)
+        detector = self._detector(source, measurer)
         initializer = None if self.first_guess == "none" else load_initializer(self.first_guess, rig, obj)
         loaded = time.perf_counter()
-        measurer = None if self.measurer is None else LearnedMeasurer.load(self.measurer)
         detections, frames = read_detections(source, self.snapshots, self.detection, measurer)
         detections = only_cameras(detections, rig)
         seconds = {"loading": loaded - started, "reading and detection": time.perf_counter() - loaded}
@@ -242,13 +243,14 @@ class Calibrate:
                 f"rig {rig.name}; --without {without[0]} leaves a camera out, --blind-cameras keeps its factory values"
             )
 
-    def _detector(self, source: Capture | Detections) -> Detector:
+    def _detector(self, source: Capture | Detections, measurer: LearnedMeasurer | None) -> Detector:
         """Who finds the fiducials, with the frames of the chosen snapshots."""
         if self.detector == "classical":
             return self.detector
         if isinstance(source, Detections):
             raise InputError(f"--detector {self.detector}: found blobs in {self.input}, expected a capture with frames")
-        return sight_of_capture(source, self.detector, self.detection, parse_range(self.snapshots)[0])
+        first = parse_range(self.snapshots)[0]
+        return sight_of_capture(source, self.detector, self.detection, first, measurer)
 
     def _reference(self, rig: CameraRig) -> int:
         if self.reference is None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from imgcal.association import Proposal, Snapshot, lattice_shifts, near_turns, rows_of
 from imgcal.detection import Frame
-from imgcal.geometry import RigidTransform
+from imgcal.geometry import RigidTransform, geodesic_angle
 from imgcal.matching.maps import Maps, surprise_maps
 from imgcal.matching.poses import Matcher, Ranked, Scene, anywhere, around, distinct_turns
 from imgcal.matching.refinement import Fitted, fitted
@@ -29,6 +29,7 @@ FINE_CLIMBS = (0.03, 0.012)
 """Radians: steps on the finest maps."""
 MOST_RIVALS = 2  # that are fitted, too, where the best pose does not stand out by far
 PARALLAX = 60.0  # px: what a pose from one camera may be off in the others
+NEARLY = 0.07  # rad that a pose may be turned against the known one before windows are placed anew
 WORTHWHILE = 0.6  # of the frames, above which these are looked at as a whole
 
 
@@ -41,13 +42,13 @@ class MatchedFilter:
     def propose(self, snapshot: Snapshot) -> Proposal:
         """Look at one snapshot: around the known poses first, then at the whole frames, and anywhere in these."""
         scene = Scene(snapshot.rig, snapshot.obj, snapshot.prior_std, _distance(snapshot))
-        windows = _windows(scene, snapshot)
-        if windows is not None:
-            view = View.of(scene, snapshot, windows)
-            found = view.known(snapshot)
-            proposal = None if found is None else view.proposal(found, snapshot)
-            if proposal is not None and proposal.margin > CLEAR:
-                return proposal
+        near = _around(scene, snapshot)
+        if near is not None and near.rig_from_object is not None and not _known_pose(near.rig_from_object, snapshot):
+            # Windows were placed for another pose: what lies at their edges is seen from the one that was found.
+            again = replace(snapshot, candidates=(near.rig_from_object,))
+            near = _around(replace(scene, distance=_distance(again)), again) or near
+        if near is not None:
+            return near
         view = View.of(scene, snapshot)
         found = view.known(snapshot)
         if found is None:
@@ -187,6 +188,22 @@ def _coarsest(scene: Scene) -> int:
     """Pixels to a cell with which the search begins."""
     gap = _gap(scene.obj) * scene.pixels_per_mm
     return int(max(FINEST, 2 ** int(np.log2(max(gap / CELLS_A_GAP, 1)))))
+
+
+def _around(scene: Scene, snapshot: Snapshot) -> Proposal | None:
+    """Look at windows around the known poses; None = there are none, or nothing stands out in them."""
+    windows = _windows(scene, snapshot)
+    if windows is None:
+        return None
+    view = View.of(scene, snapshot, windows)
+    found = view.known(snapshot)
+    proposal = None if found is None else view.proposal(found, snapshot)
+    return proposal if proposal is not None and proposal.margin > CLEAR else None
+
+
+def _known_pose(pose: RigidTransform, snapshot: Snapshot) -> bool:
+    """Tell whether a pose is nearly one of those that were known."""
+    return any(float(geodesic_angle(pose.rotation, known.rotation)) < NEARLY for known in snapshot.candidates)
 
 
 def _windows(scene: Scene, snapshot: Snapshot) -> NDArray[np.int64] | None:

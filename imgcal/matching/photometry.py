@@ -13,6 +13,10 @@ from imgcal.matching.camera_fit import USUAL_MISFIT, fit_camera
 LEAST_SIGMA = 0.02  # px: what no fit is better than
 LEAST_SIGNIFICANCE = 5.0  # amplitude over its standard deviation
 HALF_HIDDEN = 0.7  # of the radius: how far the centre may be off per misfit
+UNEVEN, EVEN = (
+    0.2,
+    0.03,
+)  # of the radius: standard deviation of a whole marker's centre, per misfit beyond that of pixels
 LARGEST = 40  # px, half of a window
 
 
@@ -68,7 +72,9 @@ def measure_markers(
     # Where the middle of a marker does not look like the common shape, part of it may be hidden.
     least = max(USUAL_MISFIT, 2 * float(np.quantile(misfit[inside], 0.25)))
     doubt = HALF_HIDDEN * np.maximum(misfit - least, 0) * size * scale
-    sigma = np.sqrt(place + LEAST_SIGMA**2 + doubt**2)
+    # What makes it uneven pulls it to one side, too: the fit follows, and no residual shows that.
+    uneven = UNEVEN * np.maximum(misfit - EVEN, 0) * size * scale
+    sigma = np.sqrt(place + LEAST_SIGMA**2 + doubt**2 + uneven**2)
     significance = np.where(inside & (amplitude > 0), amplitude / np.sqrt(np.maximum(spread, 1e-12)), 0.0)
     return Measured(uv + corner, sigma, amplitude, significance, size, misfit)
 

@@ -60,7 +60,11 @@ def masks_of(capture: Capture) -> dict[str, NDArray[np.bool_]]:
 
 
 def sight_of_capture(
-    capture: Capture, detector: DetectorName, options: DetectionOptions = DetectionOptions(), first: int = 0
+    capture: Capture,
+    detector: DetectorName,
+    options: DetectionOptions = DetectionOptions(),
+    first: int = 0,
+    measurer: LearnedMeasurer | None = None,
 ) -> Sight:
     """Let a detector other than blobs look at the frames of a capture.
 
@@ -69,9 +73,10 @@ def sight_of_capture(
         detector: its name or file.
         options: how blobs are found beside it.
         first: number of the first snapshot.
+        measurer: reads the markers that a network finds.
 
     Raises:
         InputError: no such detector.
     """
-    proposer, where_blobs_fail = proposer_of(detector)
+    proposer, where_blobs_fail = proposer_of(detector, measurer)
     return Sight(proposer, lambda s: capture.frames_of(first + s), where_blobs_fail, options, masks_of(capture))

@@ -97,7 +97,7 @@ class LearnedProposer:
     """Proposes what a query network sees."""
 
     network: InfraredNetwork
-    measurer: Measurer | None = None  # None = markers are fitted: all of a camera share one shape
+    measurer: Measurer | None = None  # reads markers, too; None = all are fitted: those of a camera share one shape
     finder: Proposer | None = None  # asked for a pose where none is known, or the known ones show too little
     name: str = "learned"
 
@@ -137,13 +137,13 @@ class LearnedProposer:
 
 
 def load_proposer(
-    network: str | Path = "ir-cnn", measurer: str | Path | None = None, finder: Proposer | None = None
+    network: str | Path = "ir-cnn", measurer: str | Path | None = "measurer-cnn", finder: Proposer | None = None
 ) -> LearnedProposer:
     """Read networks for the frames of any rig and any object.
 
     Args:
         network: name of a shipped query network, its file, or the folder of the run that trained it.
-        measurer: the same of a measurer; None = markers are fitted.
+        measurer: the same of a measurer, for markers that it says it knows better; None = all markers are fitted.
         finder: asked for a pose where none is known.
 
     Raises:
@@ -204,8 +204,8 @@ class _View:
         """
         claimed = self.observations(looks)
         shown = looks.asked[0] & (looks.evidence.present.sigmoid() > LEAST_PRESENT)
-        look = self._fitted if self.measurer is None else self._by_network
-        place, sigma, good = look(expected.uv[0], expected.radius[0], claimed.seen[0] & shown)
+        surely, last = claimed.seen[0] & shown, gate == GATES[-1]
+        place, sigma, good = self._read(expected.uv[0], expected.radius[0], surely, last)
         good &= shown
         uv = torch.where(good[..., None], place, claimed.uv[0])
         sigma = torch.where(good, sigma, claimed.sigma[0])
@@ -215,8 +215,20 @@ class _View:
         seen &= seen.sum(-1, keepdim=True) >= LEAST_IN_CAMERA
         return Observations(uv[None], sigma[None], seen[None])
 
-    def _by_network(self, uv: Tensor, radius: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Ask the measurer: places (C, N, 2), sigmas and whether they are any good (C, N)."""
+    def _read(self, uv: Tensor, radius: Tensor, seen: Tensor, last: bool) -> tuple[Tensor, Tensor, Tensor]:
+        """Places (C, N, 2), sigmas and whether they are any good (C, N); in the end each by who knows it better."""
+        if self.measurer is None:
+            return self._fitted(uv, radius, seen)
+        read = self._by_network(uv, radius)
+        if not last:
+            return read
+        place, sigma, good = self._fitted(uv, radius, seen)
+        better = read[2] & (~good | (read[1] < sigma))
+        place, sigma = torch.where(better[..., None], read[0], place), torch.where(better, read[1], sigma)
+        return place, sigma, read[2] | good
+
+    def _by_network(self, uv: Tensor, radius: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Ask the measurer; the same."""
         assert self.measurer is not None
         names, shape = self.snapshot.rig.camera_names, radius.shape
         patches, placement = cut_patches(self.frames, names, uv, radius, inverted=self._dark)
@@ -224,7 +236,8 @@ class _View:
         said = self.measurer(normalized(patches.flatten(0, 1)), size)
         offset = (said.offset.to(uv) + (placement.size - 1) / 2).view(*shape, 1, 2)
         sigma = (said.log_sigma.exp().to(uv).view(shape).square() + LEAST_MEASURED**2).sqrt() * placement.scale
-        return placement.to_image(offset)[..., 0, :], sigma, (said.valid > 0).view(shape)
+        good = (said.valid > 0).view(shape) & (sigma < LARGEST_REACH)
+        return placement.to_image(offset)[..., 0, :], sigma, good
 
     def _fitted(self, uv: Tensor, radius: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Fit the markers of each camera together; the same."""

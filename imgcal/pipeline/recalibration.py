@@ -57,7 +57,8 @@ def calibrate(
         detector: who finds the fiducials in frames: `classical` (blobs), `matched` (a matched filter for frames in
             which blobs fail), `auto` (the filter where blobs decide nothing), or a `Proposer`; a `Sight` brings frames
             that are not in memory. Blobs that contradict count, and identity and all checks decide as ever.
-        measurer: measures the blobs of frames again (`LearnedMeasurer.load`): half-hidden and unevenly lit markers.
+        measurer: measures the blobs of frames again (`LearnedMeasurer.load`): half-hidden and unevenly lit markers;
+            also those that `learned` finds.
 
     Raises:
         RefusedError: the data cannot decide; the message says why.
@@ -76,7 +77,7 @@ def calibrate(
     source = source if isinstance(source, Detections) else checked_frames(source, rig)
     detections = blobs_of(source, rig, obj, detection, measurer)
     found = time.perf_counter()
-    sight = sight_of(detector, source, detection)
+    sight = sight_of(detector, source, detection, measurer)
     labelled: Associations | None = None
     try:
         labelled = associate(detections, rig, obj, options, progress, sight)

@@ -6,7 +6,7 @@ Files are checked where they are read, line by line; this is the same for values
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from imgcal.detection import DetectionOptions, Frame, detect
 from imgcal.errors import InputError
 from imgcal.io import MARGIN, grey_frame, model_file, nearest
 from imgcal.matching import MatchedFilter
-from imgcal.pipeline.learned import load_proposer
+from imgcal.pipeline.learned import LearnedProposer, load_proposer
 from imgcal.pipeline.measuring import LearnedMeasurer
 from imgcal.types import BLOB_RADIUS, SIGMA, CalibrationObject, CameraRig, Detections
 
@@ -56,22 +56,37 @@ def blobs_of(
     return matched_to_rig(blobs, rig)
 
 
-def sight_of(detector: Detector, source: Detections | Frames, detection: DetectionOptions) -> Sight | None:
+def sight_of(
+    detector: Detector,
+    source: Detections | Frames,
+    detection: DetectionOptions,
+    measurer: LearnedMeasurer | None = None,
+) -> Sight | None:
     """Say who looks at frames in memory, and at which; None = blobs alone decide.
+
+    Args:
+        detector: who it is.
+        source: the frames.
+        detection: how blobs are found beside it.
+        measurer: reads the markers that a network finds.
 
     Raises:
         InputError: no such detector, or no frames to look at.
     """
     if isinstance(detector, Sight) or detector == "classical":
         return None if isinstance(detector, str) else detector
-    proposer, where_blobs_fail = proposer_of(detector)
+    proposer, where_blobs_fail = proposer_of(detector, measurer)
     if isinstance(source, Detections):
         raise InputError(f"detector {proposer.name}: found blobs without frames, expected frames to look at")
     return Sight(proposer, _in_memory(source), where_blobs_fail, detection)
 
 
-def proposer_of(detector: DetectorName | Proposer) -> tuple[Proposer, bool]:
+def proposer_of(detector: DetectorName | Proposer, measurer: LearnedMeasurer | None = None) -> tuple[Proposer, bool]:
     """Give who looks, and whether only where blobs decide nothing.
+
+    Args:
+        detector: its name, or itself.
+        measurer: reads the markers that a network finds, where it is named here.
 
     Raises:
         InputError: no such detector.
@@ -81,11 +96,15 @@ def proposer_of(detector: DetectorName | Proposer) -> tuple[Proposer, bool]:
     if detector in ("matched", "auto"):
         return MatchedFilter(), detector == "auto"
     if detector in ("learned", "both"):
-        return load_proposer(finder=MatchedFilter()), detector == "both"
+        return _reading(load_proposer(finder=MatchedFilter()), measurer), detector == "both"
     if not model_file(detector).is_file():
         expected = f"{', '.join(DETECTORS)}, or a network for frames: a file or the folder of a run"
         raise InputError(f"detector: found {detector!r:.80}{nearest(detector, DETECTORS)}, expected {expected}")
-    return load_proposer(detector, finder=MatchedFilter()), False
+    return _reading(load_proposer(detector, finder=MatchedFilter()), measurer), False
+
+
+def _reading(proposer: LearnedProposer, measurer: LearnedMeasurer | None) -> LearnedProposer:
+    return proposer if measurer is None else replace(proposer, measurer=measurer.network)
 
 
 def _in_memory(source: Frames) -> Callable[[int], Mapping[str, Frame | None]]:

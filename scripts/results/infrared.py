@@ -1,6 +1,6 @@
 """Which fiducial is where in single snapshots of captured frames: networks beside blobs, level by level.
 
-`python -m scripts.results.infrared --models ir-cnn=out/ir-cnn/model.safetensors --measurer ...` rewrites
+`python -m scripts.results.infrared --models ir-cnn=out/ir-cnn/model.safetensors` rewrites
 `docs/results/infrared.json` and the tables of `docs/infrared.md`. All methods look at the same frames.
 """
 
@@ -283,7 +283,7 @@ def tables(result: dict[str, Any]) -> dict[str, str]:
 
 def main(
     models: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ("ir-cnn=data/models/ir-cnn.safetensors",),
-    measurer: Path | None = None,
+    measurer: Path | None = Path("data/models/measurer-cnn.safetensors"),
     count: int = 6,
     turned: float = 12.0,
     part: Literal["all", "harder", "tables"] = "all",
@@ -292,7 +292,7 @@ def main(
 
     Args:
         models: NAME=FILE of query networks.
-        measurer: file of a measurer; markers are fitted without one.
+        measurer: file of a measurer, which reads markers that it knows better than a fit; all are fitted without one.
         count: snapshots a level.
         turned: degrees that the believed pose is off the second time.
         part: what to do; the rest stays as the JSON has it.

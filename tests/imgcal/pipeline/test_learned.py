@@ -14,6 +14,7 @@ from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import data_path
 from imgcal.networks import Evidence, Expectation, InfraredNetwork, Measured, Measurer, Queries
 from imgcal.pipeline.learned import LearnedProposer, load_proposer
+from imgcal.pipeline.measuring import LearnedMeasurer
 from imgcal.synthesis import DIFFICULTIES, FrameModel, PhysicalDrift, Truth, simulate_frames, simulate_truth
 from imgcal.types import Detections, RigPrior
 
@@ -197,3 +198,32 @@ def test_calibrate_takes_it_by_name_and_by_file(dim: tuple[Truth, Snapshot]) -> 
     assert float((uv - truth.uv).square().mean().sqrt()) < 1.0
     with pytest.raises(InputError, match=r"lerned.*nearest: learned"):
         imgcal.calibrate(snapshot.frames, RIG, OBJ, options, detector="lerned")
+
+
+class Vague(Measurer):
+    """Says that each marker is in the middle of its patch, or anywhere."""
+
+    def forward(self, patches: Tensor, radius: Tensor) -> Measured:
+        kind = torch.tensor([9.0, 0.0, 0.0, 0.0]).expand(len(patches), 4)
+        return Measured(torch.zeros(len(patches), 2), torch.full((len(patches),), 3.0), kind)
+
+
+def test_what_the_measurer_does_not_know_well_is_fitted(dim: tuple[Truth, Snapshot]) -> None:
+    _, snapshot = dim
+    fitted = load_proposer(measurer=None)
+    alone = fitted.propose(snapshot).detections
+    both = replace(fitted, measurer=Vague()).propose(snapshot).detections
+    assert len(both) >= 0.9 * len(alone)
+    assert np.median(both.sigma) < 1.2 * np.median(alone.sigma) < 2
+
+
+def test_a_measurer_is_told_to_calibrate_by_name(dim: tuple[Truth, Snapshot]) -> None:
+    truth, snapshot = dim
+    options = PipelineOptions(start_pose=snapshot.candidates[0])
+    given = LearnedMeasurer.load("measurer-cnn")
+    read = imgcal.calibrate(snapshot.frames, RIG, OBJ, options, detector="learned", measurer=given)
+    other = LearnedMeasurer(Vague())
+    fitted = imgcal.calibrate(snapshot.frames, RIG, OBJ, options, detector="learned", measurer=other)
+    assert not torch.equal(fitted.rig.focal_length, read.rig.focal_length)
+    uv = read.rig.expand(1).project(read.rig_from_object.apply(OBJ.points)).uv
+    assert float((uv - truth.uv).square().mean().sqrt()) < 1.5
