@@ -68,7 +68,9 @@ def coefficients(value: Any, what: str, counts: Sequence[int] = (0, 4, 5, 8, 12,
 def camera_matrix(value: Any, what: str) -> tuple[tuple[float, float], tuple[float, float], float]:
     """Read K: focal lengths, principal point and skew."""
     k = array(value, (3, 3), what)
-    if k[2, 2] == 0 or not np.allclose(k / k[2, 2] * np.array([[0, 0, 0], [1, 0, 0], [1, 1, 1]]), np.diag([0, 0, 1])):
+    if abs(k[2, 2]) < 1e-9 or not np.allclose(
+        k / k[2, 2] * np.array([[0, 0, 0], [1, 0, 0], [1, 1, 1]]), np.diag([0, 0, 1])
+    ):
         raise FormatError(
             f"{what}: found {np.round(k, 6).tolist()}, expected a camera matrix [fx 0 cx; 0 fy cy; 0 0 1]"
         )
