@@ -213,11 +213,12 @@ def draw(result: dict[str, Any], path: Path) -> None:
                           color=_style(name)["color"])  # fmt: skip
             cost.annotate(name, (row["flops"] / 1e6, _mean(missed_last)), fontsize=7, xytext=(4, 4),
                           textcoords="offset points")  # fmt: skip
-        learning.set(xlabel="crops seen in training", ylabel="missed + wrong (%), validation")
+        learning.set(xlabel="crops seen in training", ylabel="missed + wrong (%)")
         learning.legend(fontsize=7)
-        cost.set(xlabel="operations a crop (M)", ylabel="missed + wrong (%), held-out crops")
-        hard.set(ylabel="right (% of visible), whole frames")
-        hard.set_xticks(range(len(frames)), list(frames), rotation=60, ha="right", fontsize=6)
+        cost.set(xlabel="operations a crop (M)", ylabel="missed + wrong (%)", xlim=(0, 420))
+        hard.set(ylabel="right (%), whole frames")
+        short = [level if level in DIFFICULTIES else f"{level.partition(',')[0]} +" for level in frames]
+        hard.set_xticks(range(len(frames)), short, rotation=60, ha="right", fontsize=6)
 
 
 def _style(name: str) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from imgcal.geometry import RigidTransform, geodesic_angle
 from imgcal.networks import InfraredConfig, InfraredNetwork, drawing_from
 from imgcal.synthesis import simulate_truth, true_detections
 from imgcal.types import Detections, RigPrior
-from scripts.results import infrared_families
+from scripts.results import infrared_families, saliency
 from scripts.results.infrared import Case, Tally, tables
 
 
@@ -89,3 +89,21 @@ def test_networks_are_compared_on_the_same_crops(tmp_path: Path) -> None:
     assert 0 <= once["right"] <= 1
     (tmp_path / "metrics.jsonl").write_text('{"step": 10, "validation_missed": 0.5}\n{"step": 11, "loss": 1.0}\n')
     assert infrared_families.curve(tmp_path) == [(120, 0.5)]
+
+
+def test_what_is_looked_at_lies_within_a_distance() -> None:
+    maps = torch.zeros(2, 9, 9)
+    maps[0, 4, 4], maps[0, 4, 7] = 1.0, 1.0  # half at the place itself, half three pixels beside it
+    maps[1, 0, 0] = 1.0
+    half, most = saliency.reaches(maps, torch.tensor([[4.0, 4.0], [3.0, 4.0]]))
+    assert half.tolist() == [0.0, 5.0]
+    assert most.tolist() == [3.0, 5.0]
+
+
+def test_only_pixels_that_a_network_sees_count() -> None:
+    with drawing_from(torch.Generator().manual_seed(0)):
+        network = InfraredNetwork(InfraredConfig(encoder="cnn-small", channels=4, blocks=1)).eval()
+    batch = saliency.crops_of(network, 4)
+    found = saliency.saliency(network, batch, torch.zeros(4, dtype=torch.long))
+    assert found.shape == batch.crops.shape
+    assert bool((found.flatten(1).amax(1) > 0).all())
