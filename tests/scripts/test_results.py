@@ -210,7 +210,7 @@ def test_detectors_are_tuned_on_other_captures_than_they_are_compared_on(tmp_pat
     module = script("detectors")
     tried = {"blind to all": (module.DetectionOptions(threshold=60_000), module.BLIND)}
     monkeypatch.setattr(module, "VARIANTS", tried | {"default": module.VARIANTS["default"]})
-    few = ["--captures", "1", "--snapshots", "2", "--difficulty", "clean", "--rig", "T4", "--processes", "1"]
+    few = ["--captures", "1", "--snapshots", "2", "--difficulty", "clean", "--rig", "T4", "--cores", "1"]
     for step in ("tune", "compare"):
         module.main([step, *few, "--results", str(tmp_path)])
     assert json.loads((tmp_path / "detectors-tuning.json").read_text())["chosen"]["clean"]["variant"] == "default"

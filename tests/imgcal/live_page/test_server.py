@@ -40,6 +40,7 @@ def test_commands_come_through_once_they_are_what_they_must_be(served, client, s
     assert fetched(served, 3) == [Command("pause"), Command("bump", "cam07"), Command("factory")]
     assert stream.wait("controls", lambda content: content["paused"])
     assert client.command({"name": "warm"})[0] == 200
+    assert fetched(served) == [Command("warm")]  # or the next test finds it
     assert stream.wait("controls", lambda content: content["on"])["on"] == ["warm"]
 
 

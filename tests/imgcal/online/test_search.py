@@ -61,7 +61,7 @@ def seen(stream: Stream, own: np.ndarray | None, fiducial: int = -1) -> Checked:
     )  # fmt: skip
     off = np.zeros(len(parts), dtype=bool)
     return Checked(
-        blobs, RigidTransform(pose.rotation[None], pose.translation[None]), off, 0.1, int((labels >= 0).sum())
+        blobs, blobs, RigidTransform(pose.rotation[None], pose.translation[None]), off, 0.1, int((labels >= 0).sum())
     )
 
 
