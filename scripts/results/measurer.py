@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import statistics
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -219,12 +220,23 @@ def tables(result: dict[str, Any]) -> str:
         value = row.get(name, {}).get(key)
         return "-" if value is None else f"{value:.3g}"
 
+    families: dict[str, list[str]] = {name.rpartition("-")[0]: [] for name in networks}
+    for name in networks:
+        families[name.rpartition("-")[0]].append(name)
+
+    def over(row: dict[str, Any], family: str, ending: str = "", key: str = "rms_px") -> str:
+        """Mean over the seeds of a family, and from the lowest to the highest."""
+        values = [row[f"{name}{ending}"][key] for name in families[family]]
+        spread = f" ({min(values):.2g} to {max(values):.2g})" if len(values) > 1 else ""
+        return f"{statistics.fmean(values):.3g}{spread}"
+
+    endings = ("", " alone", " shuffled")
     head = ["level", "markers found", "bound", "ellipse"]
-    head += [part for name in networks for part in (name, f"{name} alone", f"{name} shuffled")]
+    head += [f"{family}{ending}" for family in families for ending in endings]
     errors = [
         [level, f"{row['found']} of {row['markers']}", "-" if row["bound_px"] is None else f"{row['bound_px']:.3g}"]
         + [of(row, "ellipse")]
-        + [of(row, part) for name in networks for part in (name, f"{name} alone", f"{name} shuffled")]
+        + [over(row, family, ending) for family in families for ending in endings]
         for level, row in result["levels"].items()
     ]
     kinds = [
@@ -236,7 +248,7 @@ def tables(result: dict[str, Any]) -> str:
     ]  # fmt: skip
     sizes_of = [[name, f"{s['parameters']:,}", f"{s['flops'] / 1e6:.1f} M"] for name, s in result["sizes"].items()]
     medians = [
-        [level, of(row, "ellipse", "median_px")] + [of(row, name, "median_px") for name in networks]
+        [level, of(row, "ellipse", "median_px")] + [over(row, family, key="median_px") for family in families]
         for level, row in result["levels"].items()
     ]
     return "\n\n".join(
@@ -244,10 +256,11 @@ def tables(result: dict[str, Any]) -> str:
             f"RMS error of one axis in pixels, of usable blobs that show a marker; {result['snapshots']} snapshots of"
             " O10 a level, markers of some 11 px radius. *Bound*: Cramer-Rao, who knows all but centre, brightness and"
             " ground; whole markers only. *Alone*: the network's centre for every blob; *shuffled*: the same with the"
-            " encoder's features exchanged between blobs.",
+            " encoder's features exchanged between blobs. Mean over training seeds"
+            f" ({', '.join(f'{family}: {len(names)}' for family, names in families.items())}), lowest to highest.",
             markdown(head, errors),
             "Median distance in pixels:",
-            markdown(("level", "ellipse", *networks), medians),
+            markdown(("level", "ellipse", *families), medians),
             f"What {networks[0]} says of itself: NEES (1 = sigmas are right; median and, alone, mean), shares of"
             " markers and of other blobs that end up flagged, and what it took the markers for.",
             markdown(("level", "NEES, median", "NEES, alone", "flagged markers", "flagged others", "kinds"), kinds),
