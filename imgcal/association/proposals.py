@@ -27,6 +27,8 @@ SAME_BLOB = 1.5
 FARTHEST = 6.0  # px: the same at most, so that no proposal hides blobs that contradict it
 DOUBTED = 1.0
 """Pixels: as large a proposed sigma says that part of the marker may be hidden, which a blob of the rest cannot say."""
+AGREED = 0.1
+"""Pixels by which blob and proposal may differ, and the blob is as well measured as it says."""
 LEAST_SHARE = 0.3
 """Explained part of what could be seen: less than of blobs alone, since false blobs stand for those that are hidden,
 and the proposal's margin has told the object from chance already."""
@@ -136,7 +138,11 @@ def together(proposed: Detections, blobs: Detections) -> tuple[Detections, NDArr
     Returns:
         Blobs (M,) of one snapshot without labels, and the fiducial that was proposed for each (M,), -1 = none.
     """
-    keep_blob, keep_ours = np.ones(len(blobs), dtype=bool), np.ones(len(proposed), dtype=bool)
+    keep_blob, keep_ours, sigma = (
+        np.ones(len(blobs), dtype=bool),
+        np.ones(len(proposed), dtype=bool),
+        blobs.sigma.copy(),
+    )
     fiducial = np.full(len(blobs), -1, dtype=np.int64)
     for camera in np.unique(proposed.camera).tolist():
         theirs, ours = np.flatnonzero(blobs.camera == camera), np.flatnonzero(proposed.camera == camera)
@@ -150,10 +156,13 @@ def together(proposed: Detections, blobs: Detections) -> tuple[Detections, NDArr
         # A merged blob near two fiducials is neither of them.
         alone = np.bincount(rows[one], minlength=len(blobs))[rows] == 1
         taken = one & better & alone
+        # Where the two disagree, part of the marker may be hidden: neither is known better than by what they differ.
+        apart = taken & (distance > AGREED)
+        sigma[rows[apart]] = np.hypot(sigma[rows[apart]], distance[apart])
         keep_ours[ours[taken]] = False
         fiducial[rows[taken]] = proposed.fiducial[ours[taken]]
         keep_blob[rows[one & ~taken]] = False
-    first, second = blobs.select(keep_blob), proposed.select(keep_ours)
+    first, second = replace(blobs, sigma=sigma).select(keep_blob), proposed.select(keep_ours)
     labels = np.concatenate((fiducial[keep_blob], second.fiducial))
     columns = ("uv", "sigma", "camera", "snapshot", "radius", "flags")
     values: dict[str, Any] = {name: np.concatenate((getattr(first, name), getattr(second, name))) for name in columns}
