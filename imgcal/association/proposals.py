@@ -28,7 +28,7 @@ FARTHEST = 6.0  # px: the same at most, so that no proposal hides blobs that con
 DOUBTED = 1.0
 """Pixels: as large a proposed sigma says that part of the marker may be hidden, which a blob of the rest cannot say."""
 AGREED = 0.1
-"""Pixels by which blob and proposal may differ, and the blob is as well measured as it says."""
+"""Pixels, beyond its own three sigma, by which a blob may differ from a proposal and be as well measured as it says."""
 LEAST_SHARE = 0.3
 """Explained part of what could be seen: less than of blobs alone, since false blobs stand for those that are hidden,
 and the proposal's margin has told the object from chance already."""
@@ -138,11 +138,8 @@ def together(proposed: Detections, blobs: Detections) -> tuple[Detections, NDArr
     Returns:
         Blobs (M,) of one snapshot without labels, and the fiducial that was proposed for each (M,), -1 = none.
     """
-    keep_blob, keep_ours, sigma = (
-        np.ones(len(blobs), dtype=bool),
-        np.ones(len(proposed), dtype=bool),
-        blobs.sigma.copy(),
-    )
+    keep_blob, keep_ours = np.ones(len(blobs), dtype=bool), np.ones(len(proposed), dtype=bool)
+    sigma = blobs.sigma.copy()
     fiducial = np.full(len(blobs), -1, dtype=np.int64)
     for camera in np.unique(proposed.camera).tolist():
         theirs, ours = np.flatnonzero(blobs.camera == camera), np.flatnonzero(proposed.camera == camera)
@@ -157,7 +154,7 @@ def together(proposed: Detections, blobs: Detections) -> tuple[Detections, NDArr
         alone = np.bincount(rows[one], minlength=len(blobs))[rows] == 1
         taken = one & better & alone
         # Where the two disagree, part of the marker may be hidden: neither is known better than by what they differ.
-        apart = taken & (distance > AGREED)
+        apart = taken & (distance > AGREED + 3 * blobs.sigma[rows])
         sigma[rows[apart]] = np.hypot(sigma[rows[apart]], distance[apart])
         keep_ours[ours[taken]] = False
         fiducial[rows[taken]] = proposed.fiducial[ours[taken]]

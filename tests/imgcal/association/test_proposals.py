@@ -92,7 +92,7 @@ def test_where_both_see_one_thing_the_better_measured_stays(truth, o10, asymmetr
     assert len(dull) == 80 and np.allclose(dull.sigma, 0.1) and (np.sort(labels) == np.sort(proposed.fiducial)).all()
     doubted, _ = together(replace(proposed, sigma=proposed.sigma * 20), blobs)  # half hidden, says who looked
     assert len(doubted) == 80 and np.allclose(doubted.sigma, 2.0)
-    differing, _ = together(replace(proposed, uv=proposed.uv + (0.6, 0.8), sigma=np.full(80, 0.9)), blobs)
+    differing, _ = together(replace(proposed, uv=proposed.uv + np.array([0.6, 0.8]), sigma=np.full(80, 0.9)), blobs)
     assert len(differing) == 80 and (differing.sigma > 0.5).all()  # one of the two is wrong, whatever blobs claim
     apart = replace(proposed, uv=proposed.uv + 12, sigma=np.full(80, 30.0))
     assert len(together(apart, blobs)[0]) > 150  # a large sigma hides no blobs that contradict
