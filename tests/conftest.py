@@ -1,6 +1,7 @@
 """Fixtures for all tests, and which tests run by default."""
 
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,11 @@ from imgcal.types.calibration_object import CalibrationObject
 from imgcal.types.rig import CameraRig
 
 LEFT_OUT = pytest.StashKey[int]()
+CHROMIUM = shutil.which("chromium")
+ARGUMENTS = [
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+]  # fmt: skip
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -63,3 +69,18 @@ def o10() -> CameraRig:
 def asymmetric8() -> CalibrationObject:
     """The default object, float64."""
     return load_object("asymmetric8")
+
+
+@pytest.fixture(scope="module")  # no longer than that: while it lives, this thread has a running loop
+def browser(tmp_path_factory):
+    """Headless Chromium; tests that need it are skipped, visibly, where there is none."""
+    if CHROMIUM is None:
+        pytest.skip("chromium is not installed: pages are not tried in a browser")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        context = playwright.chromium.launch_persistent_context(
+            tmp_path_factory.mktemp("browser"), executable_path=CHROMIUM, args=ARGUMENTS
+        )
+        yield context
+        context.close()

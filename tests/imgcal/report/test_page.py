@@ -10,6 +10,7 @@ from collections import Counter
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -17,6 +18,9 @@ import pytest
 from imgcal.errors import InputError
 from imgcal.report import ReportContent, SnapshotSummary, overlay, render, write_report
 from tests.imgcal.report.browser import measured
+
+if TYPE_CHECKING:
+    from playwright.sync_api import BrowserContext
 
 KINDS = ("content", "refused_content", "single_content", "plain_content", "empty_content")
 SECTIONS = ["status", "residuals", "coverage", "accuracy", "rig", "overlays", "cameras", "knowledge", "run"]
@@ -191,7 +195,7 @@ LOOK = """
   const overlay = page.querySelector(".overlay");
   const whole = overlay.getAttribute("viewBox");
   overlay.dispatchEvent(new view.MouseEvent("click", {clientX: mark.x + 6, clientY: mark.y + 6}));
-  await pause();
+  await turn();
   const closer = page.querySelector(".overlay use").getBoundingClientRect();
   const cells = [...page.querySelectorAll(".cameras td")].map((cell) => cell.scrollWidth - cell.clientWidth);
   return {
@@ -205,10 +209,10 @@ LOOK = """
 
 
 @pytest.mark.parametrize("width", [390, 1400])
-def test_in_a_browser(content: ReportContent, width: int, tmp_path: Path) -> None:
+def test_in_a_browser(browser: BrowserContext, content: ReportContent, width: int, tmp_path: Path) -> None:
     page = tmp_path / "report.html"
     write_report(content, page)
-    found = measured(page, width, LOOK)
+    found = measured(browser, page, width, LOOK)
     assert found["complaints"] == []
     assert found["header"] < 60
     assert found["sideways"] <= 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -15,6 +16,9 @@ from imgcal.io import load_rig
 from imgcal.report import DrawnRig, rig_scene, rig_view_script
 from imgcal.report.rig_view import frustum_length, frustums, up_axis
 from tests.imgcal.report.browser import measured
+
+if TYPE_CHECKING:
+    from playwright.sync_api import BrowserContext
 
 
 def test_frustums_start_at_the_camera_and_end_at_the_border_of_its_image() -> None:
@@ -100,7 +104,7 @@ LOOK = """
 
 
 @pytest.mark.parametrize("width", [390, 1200])
-def test_every_view_shows_the_whole_rig_with_names_apart(width: int, tmp_path: Path) -> None:
+def test_every_view_shows_the_whole_rig_with_names_apart(browser: BrowserContext, width: int, tmp_path: Path) -> None:
     points = np.random.default_rng(0).normal(0, 100, (3, 8, 3))
     scene = rig_scene([DrawnRig("factory", "--after", (load_rig("room10"),), filled=True)], points)
     page = tmp_path / "view.html"
@@ -109,7 +113,7 @@ def test_every_view_shows_the_whole_rig_with_names_apart(width: int, tmp_path: P
         f"<script>{rig_view_script()}</script><script>window.painter = new RigView(document.querySelector('canvas'));"
         f"painter.set({json.dumps(scene)});</script>"
     )
-    found = measured(page, width, LOOK)
+    found = measured(browser, page, width, LOOK)
     assert found["complaints"] == []
     for name, end in found["ends"].items():
         assert end["left"] >= 0 and end["right"] <= found["width"], name
