@@ -20,7 +20,7 @@ from imgcal.association import PipelineOptions
 from imgcal.estimation import RigBelief
 from imgcal.geometry import RigidTransform
 from imgcal.online.following import LEAST_BLOBS, LEAST_EXPLAINED, astray, found_again, spare_blobs
-from imgcal.online.label_checks import Checked
+from imgcal.online.label_checks import LEAST_AGREEING, Checked, check_labels
 from imgcal.online.resection import labels_at, resected
 from imgcal.online.sightings import least_back
 from imgcal.types import CalibrationObject, CameraRig, Detections
@@ -113,15 +113,15 @@ class Search:
             doubted: cameras that have not seen the object where it should be for some time.
 
         Returns:
-            The snapshot with the labels of those that were found (`off`: they have moved), and the cameras that were
-            not found: whatever labels they had by chance are gone, as are those of cameras in doubt.
+            The snapshot with the labels of those that were found (`off`: elsewhere, so they have moved), and the
+            cameras that were not found: whatever labels they had by chance are gone, as are those of cameras in doubt.
         """
         pose = checked.rig_from_object[0]
         checked = self._without_chance(checked, known, doubted)
         suspects = self._suspects(checked.blobs, known, pose)
         if not suspects:
             return checked, frozenset()
-        blobs, off, missed = checked.blobs, checked.off.copy(), set()
+        blobs, found, missed = checked.blobs, [], set()
         points = pose.apply(known.obj.points)
         for camera in suspects:
             rows = np.flatnonzero(blobs.camera == camera)
@@ -137,9 +137,25 @@ class Search:
                 continue
             named = blobs.fiducial.copy()
             named[rows] = labels
-            blobs, off[camera], sought.found = replace(blobs, fiducial=named), True, number
-        labels_left = int((blobs.fiducial >= 0).sum())
-        return replace(checked, blobs=blobs, off=off, labels=labels_left), frozenset(missed)
+            blobs, sought.found = replace(blobs, fiducial=named), number
+            found.append(camera)
+        checked = replace(checked, blobs=blobs, labels=int((blobs.fiducial >= 0).sum()))
+        return self._weighed(checked, found, known) if found else checked, frozenset(missed)
+
+    def _weighed(self, checked: Checked, found: list[int], known: Surroundings) -> Checked:
+        """Tell cameras that were found where they stood, and had but lost their labels, from those that moved."""
+        again = check_labels(checked.blobs, known.rig, known.obj, checked.rig_from_object, known.options)
+        before, kept = _labelled(checked.blobs, self.num_cameras), _labelled(again.blobs, self.num_cameras)
+        stands = ~again.off & (kept >= np.maximum(LEAST_AGREEING * before, LEAST_BLOBS))
+        fiducial, off = checked.blobs.fiducial.copy(), checked.off.copy()
+        for camera in found:
+            off[camera] = not stands[camera]
+            if stands[camera]:
+                rows = checked.blobs.camera == camera
+                fiducial[rows] = again.blobs.fiducial[rows]
+                del self.sought[camera]
+        blobs = replace(checked.blobs, fiducial=fiducial)
+        return replace(checked, blobs=blobs, off=off, labels=int((fiducial >= 0).sum()))
 
     def _without_chance(self, checked: Checked, known: Surroundings, doubted: frozenset[int]) -> Checked:
         """Take away labels of cameras in doubt that are too few to say that they are back."""

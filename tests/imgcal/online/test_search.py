@@ -109,6 +109,18 @@ def test_few_blobs_are_looked_into_once_they_have_come_again(stream, tries) -> N
     assert told == [False] * SUSPICIOUS + [True]
 
 
+def test_a_camera_that_only_lost_its_labels_has_not_moved(stream) -> None:
+    """Blobs that following left without labels, all at their places: they get them, and nothing is off."""
+    pose = stream.poses[0]
+    uv = stream.true.project(pose.apply(stream.obj.points), stream.obj.radius).uv[CAMERA].numpy()
+    own = uv + np.random.default_rng(1).normal(0, 0.1, uv.shape)
+    looks = Search(4)
+    checked, missed = looks.take(seen(stream, own), known(stream), 0.0, 0)
+    assert not missed and not checked.off.any() and not looks.sought
+    labels = checked.blobs.fiducial[checked.blobs.camera == CAMERA]
+    assert labels.tolist() == list(range(len(own))) and checked.labels == 32
+
+
 def test_where_a_camera_was_found_it_is_found_again_without_a_search(stream, monkeypatch) -> None:
     turned = stream.bumped([CAMERA], 20.0)
     pose = stream.poses[0]
