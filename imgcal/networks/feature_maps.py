@@ -40,7 +40,8 @@ def make_encoder(config: Images, size: int | None) -> tuple[nn.Module, int, int]
             return _counted(name, lambda: CnnEncoder(config.width, **options)), config.width, drawn
         if name == "vit":
             return _counted(name, lambda: VitEncoder(config.width, drawn, **options)), config.width, drawn
-        encoder = _counted(name, lambda: _imported(name)(**options))
+        encoder_class = _imported(name)
+        encoder = _counted(name, lambda: encoder_class(**options))
         return encoder, _checked_width(encoder, name, drawn), drawn
     from imgcal.networks.timm_encoder import TimmEncoder  # timm takes seconds to import: only for those who need it
 
@@ -57,10 +58,8 @@ def _imported(path: str) -> Callable[..., nn.Module]:
     module, _, name = path.partition(":")
     try:
         found = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
-        raise InputError(
-            f"backbone: found `{shortened(path)}`, which cannot be imported: {quoted(str(error))}"
-        ) from error
+    except Exception as error:  # the module's own code runs
+        raise InputError(f"backbone: found `{shortened(path)}`, which cannot be imported: {_said(error)}") from error
     if not (isinstance(found, type) and issubclass(found, nn.Module)):
         raise InputError(f"backbone: found `{shortened(path)}`, expected a subclass of torch.nn.Module")
     return found
@@ -74,9 +73,10 @@ def _counted(name: str, make: Callable[[], nn.Module]) -> nn.Module:
         if weights > MOST_WEIGHTS:
             raise InputError(f"backbone {name}: found {weights:,} weights, expected at most {MOST_WEIGHTS:,}")
         return make()
-    except (TypeError, ValueError, RuntimeError) as error:
-        first = quoted((str(error).splitlines() or [""])[0])
-        raise InputError(f"backbone {shortened(name)}: cannot be made of its options: {first}") from error
+    except InputError:
+        raise
+    except Exception as error:  # a class of the user's does what it likes with what the options give it
+        raise InputError(f"backbone {shortened(name)}: cannot be made of its options: {_said(error)}") from error
 
 
 @torch.no_grad()
@@ -84,10 +84,15 @@ def _checked_width(encoder: nn.Module, name: str, size: int) -> int:
     """Features of an encoder's map, found by looking at one image.
 
     Raises:
-        InputError: it gives no map at a stride of 4.
+        InputError: it takes no such image, or gives no map at a stride of 4.
     """
     was_training = encoder.training
-    features = encoder.eval()(torch.zeros(1, 3, size, size))
+    try:
+        features = encoder.eval()(torch.zeros(1, 3, size, size))
+    except Exception as error:
+        raise InputError(
+            f"backbone {shortened(name)}: fails on images of shape (1, 3, {size}, {size}): {_said(error)}"
+        ) from error
     encoder.train(was_training)
     cells = -(-size // STRIDE)
     if not isinstance(features, Tensor) or features.ndim != 4 or features.shape[2:] != (cells, cells):
@@ -97,3 +102,8 @@ def _checked_width(encoder: nn.Module, name: str, size: int) -> int:
             f"expected features of shape (1, F, {cells}, {cells}): a stride of {STRIDE}"
         )
     return int(features.shape[1])
+
+
+def _said(error: Exception) -> str:
+    """The first line of what somebody's class raised, with the name of the error."""
+    return quoted(f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}")

@@ -33,6 +33,20 @@ class Coarse(Mine):
         return self.layer(images)[..., ::2, ::2]
 
 
+class OfGrey(Mine):
+    """Fails on an image of three colours."""
+
+    def forward(self, images):
+        return self.layer(images[:, :1])
+
+
+class Particular(Mine):
+    """Wants an option that nobody gives it."""
+
+    def __init__(self, **options):
+        super().__init__(options["features"])
+
+
 class NoModule:
     """Something else."""
 
@@ -49,8 +63,10 @@ def test_an_encoder_of_somebodys_is_used():
     [
         (f"{HERE}:Coarse", {}, "expected features of shape (1, F, 56, 56): a stride of 4"),
         (f"{HERE}:NoModule", {}, "expected a subclass of torch.nn.Module"),
-        (f"{HERE}:Nothing", {}, "cannot be imported"),
-        ("no.such.module:Mine", {}, "cannot be imported"),
+        (f"{HERE}:OfGrey", {}, ": fails on images of shape (1, 3, 224, 224): RuntimeError: Given groups=1"),
+        (f"{HERE}:Particular", {}, ": cannot be made of its options: KeyError: 'features'"),
+        (f"{HERE}:Nothing", {}, ", which cannot be imported: AttributeError"),
+        ("no.such.module:Mine", {}, "backbone: found `no.such.module:Mine`, which cannot be imported"),
         (f"{HERE}:Mine", {"depth": 3}, "cannot be made of its options"),
         ("cnn", {"embed_dim": 16}, "cannot be made of its options"),
         ("vit", {"embed_dim": 8192, "depth": 100}, "weights, expected at most"),
@@ -60,7 +76,8 @@ def test_an_encoder_of_somebodys_is_used():
 def test_what_does_not_fit_is_one_line(backbone, options, message):
     with pytest.raises(InputError, match=re.escape(message)) as caught:
         make_encoder(Images(backbone=backbone, options=options), None)
-    assert "\n" not in str(caught.value) and len(str(caught.value)) < 500
+    said = str(caught.value)
+    assert "\n" not in said and len(said) < 500 and said.count("backbone") == 1
 
 
 def test_only_models_of_timm_have_published_weights():
