@@ -219,19 +219,25 @@ def validate(run: Run, told: Callbacks, extra: bool) -> None:
     if run.accelerator.is_main_process and (found := validation(run, run.candidate)):
         row = {"step": run.step, **found}
         _tell(run, told, row, extra)
-    if run.experiment.training.patience is not None and not extra:
-        _keep_best(run, row)
+    if run.experiment.training.patience is not None:
+        _keep_best(run, row, extra)
 
 
-def _keep_best(run: Run, row: dict[str, Any]) -> None:
-    """Remember the weights if they are the best so far; all processes must call this together, the main one decides."""
+def _keep_best(run: Run, row: dict[str, Any], extra: bool) -> None:
+    """Remember the weights if they are the best so far; all processes must call this together, the main one decides.
+
+    An `extra` validation decides about the result alone, so that a continuation goes on as if nobody had stopped.
+    """
     judged = run.task.judged
-    if run.accelerator.is_main_process and judged not in row:
+    if run.accelerator.is_main_process and judged not in row and not extra:
         raise InputError(f"training: patience: found no {judged} to go by, expected validation_rigs to be 1 or more")
-    error = row.get(judged, 0.0)
+    error = row.get(judged, math.inf)
     if run.accelerator.num_processes > 1:
         error = float(broadcast(torch.tensor(error, dtype=torch.float64, device=run.accelerator.device)))
-    if run.best is None:
+    if extra:
+        so_far = math.inf if run.best is None else run.best.error
+        run.closing = Best(run.candidate, row, error) if error < so_far else None
+    elif run.best is None:
         run.best = Best(make_average(run.candidate), row, error)
     elif error < run.best.error:
         run.best.network.load_state_dict(run.candidate.state_dict())
@@ -246,9 +252,9 @@ def save(run: Run, told: Callbacks) -> None:
     state = state_of(run)
     if run.accelerator.is_main_process:
         metrics = {name: value for name, value in run.latest.items() if name != "lr"} | {"seconds": run.seconds}
-        if run.best is not None:
-            metrics |= run.best.metrics
-        told.on_checkpoint(run, state, run.task.result(run.best_weights, metrics))
+        best = run.closing or run.best
+        network, found = (run.candidate, {}) if best is None else (best.network, best.metrics)
+        told.on_checkpoint(run, state, run.task.result(network, metrics | found))
 
 
 def progress(run: Run, seconds: float) -> float:

@@ -81,6 +81,8 @@ class TrainingConfig(StrictModel):
     def _ends(self) -> TrainingConfig:
         if self.steps is None and self.minutes is None:
             raise ValueError("found neither `steps` nor `minutes`, expected one of them")
+        if self.patience is not None and not self.validation_rigs:
+            raise ValueError(f"found patience {self.patience} and validation_rigs 0, expected some to go by")
         return self
 
     @property

@@ -59,7 +59,8 @@ class Run:
     metrics: dict[str, Any] = field(default_factory=dict)  # the latest of each name that were due
     latest: dict[str, Any] = field(default_factory=dict)  # the latest of each name
     pending: list[Pending] = field(default_factory=list)
-    best: Best | None = None
+    best: Best | None = None  # of the validations that were due
+    closing: Best | None = None  # as the run ends, where that is better still
 
     @property
     def seconds(self) -> float:
@@ -70,8 +71,3 @@ class Run:
     def candidate(self) -> nn.Module:
         """The network as it is judged: the running mean where there is one."""
         return self.plain if self.average is None else self.average
-
-    @property
-    def best_weights(self) -> nn.Module:
-        """The network that is the result: the candidate, or the best one so far."""
-        return self.candidate if self.best is None else self.best.network

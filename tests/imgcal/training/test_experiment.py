@@ -104,6 +104,27 @@ def test_a_run_that_gets_no_better_ends_with_the_best_weights(line, monkeypatch)
         engine.train(setup)
 
 
+def test_weights_that_are_best_when_the_run_ends_are_the_result(line):
+    """The last steps lie behind the last validation that was due, and count nonetheless; a continuation is the same."""
+    often = ("training.patience=4", "training.validate_every=15", "optimizer={lr: 0.05, ema: null}")
+    told, longer, parts, rest = Watching(), Watching(), Watching(), Watching()
+    engine.train(line("training.steps=40", "schedule.kind=constant", *often), told)
+    errors = {row["step"]: row["validation_slope"] for row in told.rows if "validation_slope" in row}
+    assert list(errors) == [15, 30, 40] and errors[40] < errors[30]
+    assert told.metrics["step"] == 40 and told.metrics["validation_slope"] == errors[40]
+    assert abs(float(told.result["weight"]) - 3.0) == pytest.approx(errors[40], abs=1e-5)
+    engine.train(line("training.steps=50", "schedule.kind=constant", *often), longer)
+    engine.train(line("training.steps=50", "schedule.kind=constant", *often), parts, should_stop=stopping_at(40))
+    assert parts.state.values["best"]["metrics"]["step"] == 30
+    engine.train(line("training.steps=50", "schedule.kind=constant", *often), rest, parts.state)
+    assert all(torch.equal(longer.result[name], rest.result[name]) for name in longer.result)
+
+
+def test_patience_needs_validations(line):
+    with pytest.raises(InputError, match="training: found patience 3 and validation_rigs 0, expected some to go by"):
+        line("training.patience=3", "training.validation_rigs=0")
+
+
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor")  # Dynamo's own
 def test_a_compiled_network_trains_as_a_plain_one_and_is_saved_alike(line, monkeypatch):
     def compiled_call(network, mode):
