@@ -14,7 +14,7 @@ from imgcal.evaluation.methods import Method, network_method
 from imgcal.evaluation.protocol import Conditions
 from imgcal.evaluation.summary import Facts
 from imgcal.io import MODEL, model_file, read_metrics
-from imgcal.networks import Checkpoint, load_checkpoint
+from imgcal.networks import Checkpoint, check_says_rigs, load_checkpoint
 from imgcal.types import CalibrationObject, CameraRig
 
 METRICS = "metrics.jsonl"
@@ -69,7 +69,7 @@ def load_models(
         device: where they run.
 
     Raises:
-        InputError: a file that cannot be used, or a network for another rig or object.
+        InputError: a file that cannot be used, a training of positions, or a network for another rig or object.
     """
     models: list[Model] = []
     if not paths:
@@ -77,6 +77,7 @@ def load_models(
     files = [model_file(path) for path in paths]
     for path, name in zip(files, _names(files), strict=True):
         checkpoint = load_checkpoint(path, rig, obj)
+        check_says_rigs(path, checkpoint.experiment)
         rig, obj = rig or checkpoint.rig, obj or checkpoint.obj
         network = checkpoint.network.to(device)
         models.append(Model(name, path, checkpoint, network_method(network), _history(path.parent / METRICS)))

@@ -31,7 +31,7 @@ from .points import PaperPointNetwork, PointNetwork
 from .pooled_images import PaperImageNetwork, PooledImageNetwork
 from .randomness import drawing_from
 from .soft_positions import find_soft_positions
-from .subject import check_object, check_rig
+from .subject import check_object, check_rig, check_says_rigs
 
 __all__ = [
     "PRESETS",
@@ -69,6 +69,7 @@ __all__ = [
     "build_network",
     "check_object",
     "check_rig",
+    "check_says_rigs",
     "claim",
     "cut_crops",
     "cut_patches",

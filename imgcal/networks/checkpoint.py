@@ -28,12 +28,16 @@ from imgcal.io import (
 from imgcal.messages import shortened
 from imgcal.networks.config import NetworkSpec, is_import_path, without_pretrained
 from imgcal.networks.factory import build_network
+from imgcal.networks.infrared import InfraredNetwork
+from imgcal.networks.infrared_checkpoint import INFRARED, MEASURER
+from imgcal.networks.measurer import Measurer
 from imgcal.networks.network import Network
 from imgcal.networks.refiner import IterativeRefiner
-from imgcal.networks.subject import check_object, check_rig
+from imgcal.networks.subject import check_object, check_rig, of_positions
 from imgcal.types import CalibrationObject, CameraRig
 
 FORMAT = "imgcal-network/1"
+FORMATS_OF_FRAMES: dict[type[nn.Module], str] = {InfraredNetwork: INFRARED, Measurer: MEASURER}
 
 
 @dataclass(frozen=True)
@@ -155,11 +159,11 @@ def warm_start(start: str | Path | Sequence[str | Path], network: nn.Module) -> 
 def _take_over(path: str | Path, network: nn.Module) -> tuple[str, ...]:
     """Do the work of `warm_start` for one file."""
     path = model_file(path)
-    tensors, texts = read_tensors(path, FORMAT)
-    spec, _ = _read_records(path, texts)
+    tensors, texts = read_tensors(path, FORMATS_OF_FRAMES.get(type(network), FORMAT))
     own = dict(network.named_parameters())
     fitting = [name for name in own if name in tensors and tensors[name].shape == own[name].shape]
-    if (spec.model_extra or {}).get("task") == "positions":
+    spec = None if type(network) in FORMATS_OF_FRAMES else _read_records(path, texts)[0]
+    if spec is not None and of_positions(spec):
         fitting = [name for name in fitting if name.startswith("positions.")]  # the rest has learnt nothing
     if not fitting:
         raise InputError(f"{path}: found no parameter that fits the network by name and shape, expected some")
@@ -167,7 +171,7 @@ def _take_over(path: str | Path, network: nn.Module) -> tuple[str, ...]:
         for name in fitting:
             own[name].copy_(tensors[name])
     trunk = getattr(network, "trunk", None)
-    if isinstance(trunk, IterativeRefiner) and any(name.startswith("trunk.") for name in fitting):
+    if spec is not None and isinstance(trunk, IterativeRefiner) and any(name.startswith("trunk.") for name in fitting):
         trunk.rescale(spec.drift.std(_from_texts(path, texts)[0]))
     return tuple(name for name in own if name not in fitting)
 

@@ -1,4 +1,4 @@
-"""Whether a rig and an object are those that a network was trained for."""
+"""Whether a network was trained for what it is to say, and the rig and the object that are there."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from imgcal.errors import InputError
+from imgcal.networks.config import NetworkSpec
 from imgcal.types import CalibrationObject, CameraRig
 
 # Two factory values that agree to this (relative; mm, pixels and rad alike) are the same: both came through text.
@@ -45,6 +46,24 @@ def check_rig(path: str | Path, trained: CameraRig, rig: CameraRig) -> None:
         for camera in apart.any(-1).nonzero().flatten().tolist():
             place = f"{what} of {rig.camera_names[camera]}"
             refuse(place, _numbers(found[camera]), _numbers(expected[camera]))
+
+
+def of_positions(experiment: NetworkSpec) -> bool:
+    """Tell whether a training was one of positions, in which the trunk has learnt nothing."""
+    return getattr(experiment, "task", None) == "positions"
+
+
+def check_says_rigs(path: str | Path, experiment: NetworkSpec) -> None:
+    """Refuse a network that finds positions and has not learnt what a rig is.
+
+    Raises:
+        InputError: it was trained by the task of positions.
+    """
+    if of_positions(experiment):
+        raise InputError(
+            f"{path}: found a training of positions, whose trunk has learnt nothing; expected one of rigs, which takes "
+            "it by `training.init_from`"
+        )
 
 
 def check_object(path: str | Path, trained: CalibrationObject, obj: CalibrationObject) -> None:

@@ -15,7 +15,7 @@ from torch import Tensor
 from imgcal.errors import InputError
 from imgcal.geometry import RigidTransform, resized_pixels
 from imgcal.io import data_path, model_file, model_name, nearest, shipped_names
-from imgcal.networks import Network, check_object, check_rig, load_checkpoint, read_subject
+from imgcal.networks import Network, check_object, check_rig, check_says_rigs, load_checkpoint, read_subject
 from imgcal.synthesis import render_views
 from imgcal.types import CalibrationObject, CameraRig, Observations, Prediction, Symmetry, Views
 
@@ -148,4 +148,6 @@ def _load(path: Path, rig: CameraRig, obj: CalibrationObject) -> Initializer:
     there = trained.select(cameras) if len(cameras) == rig.num_cameras else trained
     check_rig(path, there, rig.resized(there.image_size) if rig.num_cameras == there.num_cameras else rig)
     check_object(path, replace(trained_obj, radius=None), replace(obj, radius=None))
-    return Initializer(model_name(path), load_checkpoint(path).network, trained, cameras)
+    checkpoint = load_checkpoint(path)
+    check_says_rigs(path, checkpoint.experiment)
+    return Initializer(model_name(path), checkpoint.network, trained, cameras)

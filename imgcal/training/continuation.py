@@ -22,6 +22,7 @@ def state_of(run: Run) -> TrainingState:
         "step": run.step,
         "elapsed": run.seconds,
         "processes": run.accelerator.num_processes,
+        "files": dict(run.task.files),
         "optimizer": optimizer_settings(run.optimizer),
         "schedule": run.schedule.state(),
         "judged": None if run.judged is None else run.judged.tolist(),
@@ -46,12 +47,15 @@ def restore(run: Run, state: TrainingState) -> None:
     """Go on where a state was made.
 
     Raises:
-        InputError: it is that of another number of processes.
+        InputError: it is that of another number of processes, or of another rig or object in a file of that name.
     """
     values, tensors, index = state.values, state.tensors, run.accelerator.process_index
     if values["processes"] != run.accelerator.num_processes:
         expected = values["processes"]
         raise InputError(f"training: found {run.accelerator.num_processes} processes, expected {expected} as before")
+    for key, text in run.task.files.items():
+        if values.get("files", {}).get(key, text) != text:
+            raise InputError(f"{key}: found another one in its file than the training began with, expected the same")
     run.plain.load_state_dict(tensors["network"])
     if run.average is not None:
         run.average.load_state_dict(tensors["average"])

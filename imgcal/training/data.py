@@ -18,6 +18,7 @@ from imgcal.synthesis import (
     ImageOptions,
     PoseRange,
     Snapshots,
+    host_generator,
     render_views,
     synthesize,
     synthesize_at_once,
@@ -113,10 +114,15 @@ def draw_levels(
 ) -> tuple[Tensor, Views]:
     """Draw images of points, (B, C, N, 2), in equal shares of the batch by the numbers of `LEVELS`.
 
+    Where a batch cannot be shared out evenly, chance says whose turn it is: over many batches, shares are equal.
+
     Returns:
         Images (B, C, 3, size, size), and the views as they are drawn.
     """
     assert views.uv is not None and views.seen is not None
+    if len(views.uv) % len(levels):
+        first = int(torch.randint(len(levels), (), generator=host_generator(generator)))
+        levels = (*levels[first:], *levels[:first])
     shares = zip(levels, views.uv.tensor_split(len(levels)), views.seen.tensor_split(len(levels)), strict=True)
     parts = [
         LEVELS[level].draw(Views(uv, seen), image_size, obj, options, generator)

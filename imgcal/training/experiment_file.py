@@ -52,7 +52,8 @@ def load_experiment(
     """Read an experiment.
 
     Args:
-        path: a YAML file, or the bare name of a shipped experiment when there is no such file.
+        path: a YAML file, or the bare name of a shipped experiment when there is no such file. Files that it names are
+            looked for in the current folder, then beside it.
         changes: `key.key=value`, values in YAML; the last one wins.
         kind: which it must be; `Experiment` = any.
 
@@ -65,7 +66,9 @@ def load_experiment(
         ('rig', 'vit', 8)
     """
     path = find_file(path, "experiments", ".yaml")
-    experiment = changed(experiment_from(read_yaml_mapping(path, FORMAT), str(path)), *changes)
+    content = read_yaml_mapping(path, FORMAT)
+    content |= {key: _found(content[key], path.parent) for key in ("rig", "object") if key in content}
+    experiment = changed(experiment_from(content, str(path)), *changes)
     if not isinstance(experiment, kind):
         names = ", ".join(name for name, one in KINDS.items() if issubclass(one, kind))
         raise InputError(f"{path}: task: found {experiment.task}, expected {names}")
@@ -109,6 +112,13 @@ def resolved_text(experiment: Experiment) -> str:
 def save_experiment(experiment: Experiment, path: str | Path) -> None:
     """Write an experiment with all its values, so that it stays the same when a default changes."""
     write_text(path, resolved_text(experiment))
+
+
+def _found(name: Any, folder: Path) -> Any:
+    """The path of a file that an experiment in `folder` names; the name as it is where no file lies there."""
+    if not isinstance(name, str) or Path(name).exists() or not (folder / name).is_file():
+        return name
+    return str(folder / name)
 
 
 def _resolved(model: StrictModel) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
+from imgcal.errors import InputError
 from imgcal.networks import (
     Evidence,
     InfraredCheckpoint,
@@ -16,8 +17,8 @@ from imgcal.networks import (
     InfraredNetwork,
     Queries,
     drawing_from,
-    load_infrared,
     normalized,
+    warm_start,
 )
 from imgcal.synthesis import host_generator, render_crops, sample_scenes, second_look
 from imgcal.training.experiment import Experiment
@@ -78,11 +79,20 @@ class InfraredTask(Task[CropBatch, Evidence]):
         weights: torch.Generator,
         fresh: bool,
     ) -> None:
-        """Build it; see `Experiment.make_task`."""
+        """Build it; see `Experiment.make_task`.
+
+        Raises:
+            InputError: a batch that is no whole number of rigs, or weights to begin with that cannot be used.
+        """
+        if batch_size % CAMERAS:
+            raise InputError(
+                f"training: batch_size: found {batch_size} crops at once, expected a multiple of the {CAMERAS} cameras "
+                "of a rig"
+            )
         with drawing_from(weights):
             network = InfraredNetwork(experiment.network)
-        for path in experiment.training.starts if fresh else ():
-            network.load_state_dict(load_infrared(path).network.state_dict())
+        starts = experiment.training.starts
+        self.untrained = warm_start(starts, network) if fresh and starts else ()
         self.network = network.to(device)
         self.device = device
         self.sizes = experiment.training.validation_sizes(batch_size)

@@ -18,8 +18,8 @@ from imgcal.networks import (
     MeasurerCheckpoint,
     MeasurerConfig,
     drawing_from,
-    load_measurer,
     normalized,
+    warm_start,
 )
 from imgcal.synthesis import Patches, expose_patches, render_patches
 from imgcal.training.experiment import Experiment
@@ -79,8 +79,8 @@ class MeasurerTask(Task[PatchBatch, Measured]):
         """Build it; see `Experiment.make_task`."""
         with drawing_from(weights):
             network = Measurer(experiment.network)
-        for path in experiment.training.starts if fresh else ():
-            network.load_state_dict(load_measurer(path).network.state_dict())
+        starts = experiment.training.starts
+        self.untrained = warm_start(starts, network) if fresh and starts else ()
         self.network = network.to(device)
         self.device = device
         self.sizes = experiment.training.validation_sizes(batch_size)

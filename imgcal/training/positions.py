@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from imgcal.errors import InputError
 from imgcal.formats import load_rig
-from imgcal.io import load_object
+from imgcal.io import load_object, object_text, rig_text
 from imgcal.networks import (
     Checkpoint,
     ImageNetwork,
@@ -90,6 +90,7 @@ class PositionsTask(Task[PositionBatch, Located]):
         """Build it; see `Experiment.make_task`."""
         self.experiment, self.batch_size = experiment, batch_size
         self.rig, obj = load_rig(experiment.rig), load_object(experiment.object)
+        self.files = {"rig": rig_text(self.rig, experiment.rig), "object": object_text(obj, experiment.object)}
         spec, starts = experiment if fresh else without_pretrained(experiment), experiment.training.starts
         whole = build_network(spec, self.rig, obj, weights)
         if not isinstance(whole, ImageNetwork):

@@ -10,8 +10,9 @@ import torch
 from pydantic import ConfigDict, Field
 from torch import Tensor, nn
 
+from imgcal.errors import InputError
 from imgcal.formats import load_rig
-from imgcal.io import load_object, validated
+from imgcal.io import load_object, object_text, rig_text, validated
 from imgcal.networks import Checkpoint, Network, NetworkSpec, build_network, warm_start, without_pretrained
 from imgcal.nn import project_fiducials, reprojection_re
 from imgcal.synthesis import Corruption, share_of_good_rigs
@@ -85,7 +86,9 @@ class RigTask(Task[RigBatch, Passes]):
         spec = experiment if fresh else without_pretrained(experiment)
         network, starts = build_network(spec, self.factory, self.obj, weights), experiment.training.starts
         self.untrained = warm_start(starts, network) if fresh and starts else ()
+        self.files = {"rig": rig_text(self.factory, experiment.rig), "object": object_text(self.obj, experiment.object)}
         self.network = network.to(device)
+        _check_difficulty(experiment, network)
         self.source = Source(
             self.factory.to(torch.float32, device),
             object_to(self.obj, device),
@@ -146,3 +149,15 @@ class RigTask(Task[RigBatch, Passes]):
         """Weights with their rig, object and experiment."""
         assert isinstance(network, Network)  # `self.network`, or the mean of what it was
         return Checkpoint(network, self.factory, self.obj, self.experiment, metrics)
+
+
+def _check_difficulty(experiment: RigExperiment, network: Network) -> None:
+    """Refuse what would have no effect.
+
+    Raises:
+        InputError: levels of images for a network that takes points, or beside `corruption`.
+    """
+    if experiment.levels and network.image_options is None:
+        raise InputError(f"levels: found {experiment.levels}, but the network {experiment.network.preset} takes points")
+    if experiment.levels and not experiment.corruption.nothing:
+        raise InputError("levels: found them beside `corruption`, expected one of the two: levels corrupt points, too")

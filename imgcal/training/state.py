@@ -29,7 +29,9 @@ class TrainingState:
     """Everything that the rest of a run depends on."""
 
     tensors: dict[str, dict[str, Tensor]]  # by part: network, average, best, optimizer, random, window
-    values: dict[str, Any]  # plain: step, elapsed, processes, optimizer's settings, schedule, judged, metrics, best
+    values: dict[
+        str, Any
+    ]  # plain: step, elapsed, processes, files, optimizer's settings, schedule, judged, metrics, best
     experiment: Experiment
 
 
@@ -59,7 +61,8 @@ def load_state(path: str | Path, experiment: Experiment) -> TrainingState:
         saved = type(experiment).model_validate(saved, strict=False).model_dump(mode="json")
     except (KeyError, ValueError) as error:
         raise InputError(f"{path}: found no readable state in it: the file is damaged") from error
-    difference = first_difference(saved, experiment.model_dump(mode="json"))
+    named = {name: saved.get(name) for name in values.get("files", {})}  # their content is compared, not their place
+    difference = first_difference(saved, experiment.model_dump(mode="json") | named)
     if difference:
         key, was, now = difference
         raise InputError(

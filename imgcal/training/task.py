@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import torch
@@ -55,6 +56,7 @@ class Task(ABC, Generic[SomeBatch, Answer]):
     headline: ClassVar[Mapping[str, str]] = {}  # what a line of progress shows, and how: {"re_px": "RE {:.3g} px"}
     network: nn.Module  # on its device, in training mode
     untrained: tuple[str, ...] = ()  # parameters that a warm start did not find
+    files: Mapping[str, str] = MappingProxyType({})  # by key, content of files that a continuation must find unchanged
 
     @abstractmethod
     def batch(self, count: int, generator: torch.Generator) -> SomeBatch:

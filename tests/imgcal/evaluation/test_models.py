@@ -1,12 +1,15 @@
 """Networks from files, as they are evaluated."""
 
 import shutil
+from dataclasses import replace
 
 import pytest
 
 from imgcal.errors import InputError
 from imgcal.evaluation.models import _names, load_models
 from imgcal.io import data_path, load_object, load_rig
+from imgcal.networks import load_checkpoint
+from imgcal.pipeline.initialization import load_initializer
 
 POINTS = data_path("models", "points-O10-asymmetric8.safetensors")
 
@@ -27,6 +30,16 @@ def test_a_folder_of_a_run_has_its_name_and_its_history(tmp_path) -> None:
     models = load_models([folder, POINTS])
     assert [model.name for model in models] == ["my-run", POINTS.stem]
     assert [row["step"] for row in models[0].history] == [1, 2]
+
+
+def test_a_training_of_positions_says_no_rig(tmp_path) -> None:
+    trained = load_checkpoint(POINTS)
+    file = tmp_path / "positions.safetensors"
+    replace(trained, experiment=trained.experiment.model_copy(update={"task": "positions"})).save(file)
+    with pytest.raises(InputError, match=r"positions\.safetensors: found a training of positions, whose trunk has"):
+        load_models([file])
+    with pytest.raises(InputError, match=r"positions\.safetensors: found a training of positions"):
+        load_initializer(str(file), load_rig("O10"), load_object("asymmetric8"))
 
 
 def test_networks_must_be_for_the_same_rig_and_object() -> None:

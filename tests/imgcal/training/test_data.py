@@ -5,7 +5,9 @@ import torch
 
 from imgcal.synthesis.colour_coding import ImageOptions
 from imgcal.synthesis.corruption import Corruption
-from imgcal.training.data import Source, object_to
+from imgcal.synthesis.levels import LEVELS
+from imgcal.training.data import Source, draw_levels, object_to
+from imgcal.types import Views
 
 
 @pytest.fixture
@@ -37,6 +39,36 @@ def test_the_generator_decides(source):
     one, same, other = batch(source), batch(source), batch(source, seed=2)
     assert torch.equal(one.views.uv, same.views.uv)
     assert not torch.equal(one.views.uv, other.views.uv)
+
+
+@pytest.mark.parametrize("count", [1, 3, 6])
+def test_levels_have_equal_shares_where_a_batch_has_fewer_rigs(source, monkeypatch, count):
+    drawn = []
+    for level in range(4):
+        draw = LEVELS[level].draw
+        monkeypatch.setitem(
+            vars(LEVELS[level]),
+            "draw",
+            lambda *given, level=level, draw=draw: drawn.append((level, len(given[0].uv))) or draw(*given),
+        )
+    made, generator = batch(source, count), torch.Generator().manual_seed(5)
+    views, size = made.views, source.factory.image_size
+    for _ in range(80):
+        draw_levels(views, size, source.obj, ImageOptions(size=16), (0, 1, 2, 3), generator)
+    shares = [sum(n for level, n in drawn if level == wanted) for wanted in range(4)]
+    assert sum(shares) == 80 * count and min(shares) > 10 * count
+
+
+def test_an_even_batch_is_shared_out_as_ever(source):
+    """What trainings have drawn before stays what they draw."""
+    views, size, seed = batch(source, 4).views, source.factory.image_size, torch.Generator().manual_seed
+    images, _ = draw_levels(views, size, source.obj, ImageOptions(size=16), (0, 3), one := seed(5))
+    two = seed(5)
+    parts = [
+        LEVELS[level].draw(Views(uv, seen), size, source.obj, ImageOptions(size=16), two)[0]
+        for level, uv, seen in zip((0, 3), views.uv.split(2), views.seen.split(2), strict=True)
+    ]
+    assert torch.equal(images, torch.cat(parts)) and torch.equal(one.get_state(), two.get_state())
 
 
 def test_views_are_corrupted_and_the_truth_is_not(source):

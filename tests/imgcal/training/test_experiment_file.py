@@ -3,6 +3,7 @@ import math
 import pytest
 
 from imgcal.errors import InputError
+from imgcal.io import load_rig, save_rig
 from imgcal.synthesis import ImageOptions
 from imgcal.synthesis.rigs import PhysicalDrift, PoseRange, RelativeDrift, drift_of
 from imgcal.training.experiment_file import changed, load_experiment, save_experiment
@@ -29,6 +30,18 @@ def test_a_resolved_experiment_is_the_same(experiment, tmp_path):
     assert made.optimizer.clip is None
     assert made.optimizer.learning_rates == {"trunk": 1e-4}
     assert made.corruption.false == 0.2
+
+
+def test_files_are_looked_for_beside_the_experiment(experiment, tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    save_rig(load_rig("O6"), tmp_path / "mine.yaml")
+    (tmp_path / "T4").mkdir()  # no file: the shipped rig is meant
+    (tmp_path / "toy2.yaml").write_text(EXPERIMENT.replace("rig: T4", "rig: mine.yaml"))
+    made = load_experiment(tmp_path / "toy2.yaml")
+    assert made.load_rig().num_cameras == 6 and experiment().load_rig().num_cameras == 4
+    save_rig(load_rig("U7"), tmp_path / "here" / "mine.yaml")  # the current folder comes first, as ever
+    assert load_experiment(tmp_path / "toy2.yaml").load_rig().num_cameras == 7
 
 
 def test_physical_drift(experiment):

@@ -1,7 +1,10 @@
 from pathlib import Path
 
+import pytest
 import torch
 
+from imgcal.errors import InputError
+from imgcal.io import model_file, read_tensors
 from imgcal.networks import load_infrared
 from imgcal.training import Callbacks, InfraredExperiment, Result, Run, TrainingState, load_experiment, train
 
@@ -41,10 +44,29 @@ def test_it_trains_and_its_file_is_read(tmp_path: Path) -> None:
     assert kept.result is not None
     kept.result.save(tmp_path / "model.safetensors")
     read = load_infrared(tmp_path / "model.safetensors").network
-    again = load_experiment("ir-cnn", (*TINY, f"training.init_from={tmp_path}/model.safetensors"))
-    task = again.make_task(torch.device("cpu"), 4, torch.Generator(), True)
-    for name, tensor in task.network.state_dict().items():
-        assert torch.equal(tensor, read.state_dict()[name])
+    for start in (tmp_path / "model.safetensors", tmp_path):  # a file, or the folder of a run
+        again = load_experiment("ir-cnn", (*TINY, f"training.init_from={start}"))
+        task = again.make_task(torch.device("cpu"), 4, torch.Generator(), True)
+        assert task.untrained == ()
+        for name, tensor in task.network.state_dict().items():
+            assert torch.equal(tensor, read.state_dict()[name])
+
+
+@pytest.mark.parametrize("kind", ["ir", "measurer"])
+def test_a_warm_start_takes_what_fits_of_a_shipped_network_and_says_what_does_not(kind: str) -> None:
+    small = "training={steps: 3, batch_size: 4, validation_rigs: 2, init_from: " + kind + "-cnn}"
+    pool = ("pool=2",) if kind == "measurer" else ()
+    task = load_experiment(f"{kind}-vit", (small, *pool)).make_task(torch.device("cpu"), 4, torch.Generator(), True)
+    named = dict(task.network.named_parameters())
+    assert task.untrained and all(name.startswith("encoder.") for name in task.untrained)
+    tensors, _ = read_tensors(model_file(f"{kind}-cnn"), {"ir": "imgcal-infrared/1"}.get(kind, "imgcal-measurer/1"))
+    taken = [name for name in named if name not in task.untrained]
+    assert taken and all(torch.equal(named[name], tensors[name].float()) for name in taken)
+
+
+def test_a_rig_has_as_many_crops_as_cameras() -> None:
+    with pytest.raises(InputError, match="batch_size: found 3 crops at once, expected a multiple of the 2 cameras"):
+        load_experiment("ir-cnn", TINY).make_task(torch.device("cpu"), 3, torch.Generator(), True)
 
 
 def test_a_batch_depends_on_the_generator_alone() -> None:

@@ -4,10 +4,12 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from imgcal.errors import InputError
 from imgcal.networks import Checkpoint, NetworkSpec, load_checkpoint
 from imgcal.training import data
 from imgcal.training.rigs import RigTask, experiment_of
 from imgcal.types import CameraRig
+from tests.imgcal.training.toy import ToyOfImages
 
 
 def task_of(experiment, **how):
@@ -38,6 +40,15 @@ def test_validation_shows_the_same_rigs_in_parts(experiment):
         factory = task.validate(lambda batch: task.predict(task.network.eval(), batch))
     assert factory[RigTask.judged] > 10
     assert not task_of(experiment("training.validation_rigs=0")).validate(truth)
+
+
+def test_levels_that_would_have_no_effect_are_refused(experiment, monkeypatch):
+    with pytest.raises(InputError, match=r"levels: found \[0, 1\], but the network points takes points"):
+        task_of(experiment("levels=[0, 1]"))
+    monkeypatch.setattr("imgcal.networks.factory.build", ToyOfImages)
+    task_of(experiment("levels=[0, 1]"))
+    with pytest.raises(InputError, match="levels: found them beside `corruption`, expected one of the two"):
+        task_of(experiment("levels=[0, 1]", "corruption.noise=1"))
 
 
 def test_the_loss_is_told_pass_by_pass(experiment):
