@@ -19,9 +19,9 @@ from imgcal.networks.soft_positions import find_soft_positions
 from imgcal.synthesis import ImageOptions
 from imgcal.types import Prediction, Views
 
-TRUSTED = 3.0  # pixels of the sensor: a position of this error counts half
-DOUBTFUL, STEEP = 0.7, 20.0  # confidence at which a position counts half, and how fast it comes to count with it
-FOUND = 0.5  # confidence from which on a refinement is told of a position: it finds out itself which are wrong
+FOUND = 0.5  # confidence from which on a fiducial is taken to be there
+TRUSTED = 3.0  # pixels of the sensor: positions of larger errors do not count for the trunk; a refinement weighs them
+FAINT = 1e-3  # weight of what does not count: enough for a gradient to reach it
 
 
 @dataclass(frozen=True)
@@ -34,8 +34,13 @@ class Sightings:
 
     @property
     def weight(self) -> Tensor:
-        """How much each counts: (B, C, N) in [0, 1]."""
-        return (STEEP * (self.confidence - DOUBTFUL)).sigmoid() / (1 + (self.sigma / TRUSTED).square())
+        """How much each counts: (B, C, N), 1 or next to nothing, as points are there or not where the trunk learns.
+
+        The gradient is that of a smooth weight (a straight-through estimator, Bengio et al. 2013).
+        """
+        smooth = self.confidence / (1 + (self.sigma / TRUSTED).square())
+        counts = (self.confidence > FOUND) & (self.sigma < TRUSTED)
+        return torch.where(counts, 1 + (smooth - smooth.detach()), FAINT * smooth)
 
     @property
     def views(self) -> Views:

@@ -119,12 +119,19 @@ def test_positions_by_hue_need_no_encoder():
     assert torch.equal(found.views.seen, found.confidence > 0.5)
 
 
-def test_what_is_unsure_weighs_less():
-    uv, sigma = torch.zeros(1, 1, 3, 2), torch.tensor([[[0.0, 3.0, 30.0]]])
-    weight = Sightings(uv, sigma, torch.ones(1, 1, 3)).weight[0, 0]
-    torch.testing.assert_close(weight, torch.tensor([1.0, 0.5, 1 / 101]), rtol=0.01, atol=0)
-    doubtful = Sightings(uv, 0 * sigma, torch.tensor([[[0.3, 0.7, 0.95]]])).weight[0, 0]
-    assert doubtful[0] < 1e-3 and doubtful[1] == 0.5 and doubtful[2] > 0.99
+def test_a_position_counts_whole_or_next_to_nothing():
+    """As positions do where the trunk learns: a weight of 0.99 would move a point by a hundredth of the image."""
+    uv, sigma = torch.zeros(1, 1, 4, 2), torch.tensor([[[0.3, 2.9, 3.1, 0.1]]])
+    confidence = torch.tensor([[[0.8, 0.6, 0.9, 0.4]]])
+    weight = Sightings(uv, sigma, confidence).weight[0, 0]
+    assert weight[:2].tolist() == [1.0, 1.0] and ((weight[2:] > 0) & (weight[2:] < 1e-3)).all()
+
+
+def test_the_gradient_passes_through_how_much_a_position_counts():
+    uv, sigma = torch.zeros(1, 1, 2, 2), torch.tensor([[[0.3, 3.1]]], requires_grad=True)
+    confidence = torch.tensor([[[0.8, 0.6]]], requires_grad=True)
+    Sightings(uv, sigma, confidence).weight.sum().backward()
+    assert (confidence.grad > 0).all() and (sigma.grad < 0).all()
 
 
 def test_groups_that_may_be_frozen_are_all_parameters():
