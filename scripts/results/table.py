@@ -101,7 +101,7 @@ def sections(experiments: list[RigExperiment], results: dict[str, list[dict[str,
     ours = sorted((e for e in table1 if "-paper" not in e.name), key=_order)
     theirs = sorted((e for e in table1 if "-paper" in e.name), key=_order)
     ablation = sorted((e for e in experiments if e.paper is not None and e.paper.table == "ablation"), key=_order)
-    shipped = [e for e in experiments if e.name.startswith("shipped-") and "-trunk-" not in e.name]
+    shipped = [e for e in experiments if e.name.startswith("shipped-")]
     return {
         "table 1": accuracy_table(ours, results),
         "table 1 parameters": parameters_table(ours, results),
