@@ -50,6 +50,15 @@ from imgcal.watch import Watch as Loop
 
 USUAL_RATE = 30.0  # snapshots a second of a table of blobs
 
+# What kind of input an option is for.
+ONLY_FOR = {
+    "rate": "a table of blobs",
+    "topic": "a recording",
+    "videos-differ": "a folder of videos",
+    "until-idle": "a folder of frames",
+    "remove": "a folder of frames",
+}
+
 
 @dataclass(frozen=True)
 class Watch:
@@ -118,7 +127,7 @@ class Watch:
                 loop.tell(Event(time.time(), 0, "restart", message="started again from what was known"))
             loop.run(intake, stopped, display.draw)
         tally = loop.tally
-        said = f"{tally.snapshots:,} snapshots, {sum(tally.events.values()):,} events: {self.out / CURRENT}"
+        said = display.result(self.out / CURRENT)
         if stopped.interrupted:
             raise KeyboardInterrupt(f"interrupted after {said}; the same command goes on from there")
         if tally.latest is None or tally.learnt == 0:
@@ -128,25 +137,42 @@ class Watch:
     def _source(self, rig: CameraRig, obj: CalibrationObject, progress: Progress | None) -> Source:
         """Find out what INPUT is."""
         if self.input == "-":
+            self._check_options("standard input")
             return JsonLines(sys.stdin.fileno())
         if "://" in self.input:
+            self._check_options("an address")
             self._require("zmq", "an address")
             return ZeroMQ((self.input,))
         path = Path(self.input)
         if path.suffix.lower() == ".mcap" or (path / "metadata.yaml").is_file():
+            self._check_options("a recording")
             self._require("rosbags", "a recording")
             return Bag(path, rig, _topics(self.topic))
         if path.is_dir() and not holds_videos(path):
+            self._check_options("a folder of frames")
             name = None if progress is None else progress.name
             return Folder(path, rig, self.remove, name, self.until_idle)
         if path.is_dir():
+            self._check_options("a folder of videos")
             return Videos(path, rig, self.videos_differ)
+        self._check_options("a table of blobs")
         rate = USUAL_RATE if self.rate is None else self.rate
         if not 0 < rate < 1e6:
             raise InputError(f"--rate: found {rate:g}, expected snapshots a second")
         source = open_input(path, rig, obj.num_fiducials)
         assert isinstance(source, Detections)  # folders are seen to above
         return BlobTable(source, rate)
+
+    def _check_options(self, kind: str) -> None:
+        """Refuse options that have no effect on this kind of input.
+
+        Raises:
+            InputError: names the first of them, and what it is for.
+        """
+        for option, meant in ONLY_FOR.items():
+            given = getattr(self, option.replace("-", "_"))
+            if meant != kind and not (given is None or given is False or given == ()):
+                raise InputError(f"--{option}: found it with {kind} ({shortened(self.input)}), expected {meant}")
 
     def _keeper(self, folder: Path, rig: CameraRig, obj: CalibrationObject) -> tuple[RigKeeper, bool]:
         """Begin, or go on with what an earlier run knew; says whether it did."""

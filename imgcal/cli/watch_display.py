@@ -6,6 +6,7 @@ import contextlib
 import time
 from collections.abc import Iterator
 from datetime import datetime
+from pathlib import Path
 
 from rich.console import Console
 from rich.live import Live
@@ -70,17 +71,26 @@ class Display:
 
     def line(self) -> str:
         """Say in one line how it goes."""
-        tally, intake = self._tally, self._intake
-        state = tally.latest
+        tally, state = self._tally, self._tally.latest
         parts = [self._waiting() if state is None else state.sentence]
         if state is not None and state.refused is not None:
             parts.append("nothing learnt now")
         parts.append(f"{tally.snapshots:,} snapshots, {self._rate:.3g}/s")
+        return " | ".join([*parts, *self._counts(), *self._clocks()])
+
+    def result(self, rig: Path) -> str:
+        """Say in one line what came of it, and what did not: `rig` is the file."""
+        tally, reasons = self._tally, self._intake.reasons
+        said = f"{tally.snapshots:,} snapshots, {sum(tally.events.values()):,} events: {rig}"
+        latest = [f"the latest that could not be read: {reasons[-1]}"] if reasons else []
+        return " | ".join([said, *self._counts(), *latest])
+
+    def _counts(self) -> list[str]:
+        """Name what did not go as it should, with its number."""
+        tally, intake = self._tally, self._intake
         counts = {"refused": tally.refused, "dropped": intake.dropped, "unreadable": intake.unreadable.total()}
         counts |= {kind: intake.synchronizer.counts[kind].total() for kind in SHOWN}
-        parts += [f"{count:,} {kind}" for kind, count in counts.items() if count]
-        parts += self._clocks()
-        return " | ".join(parts)
+        return [f"{count:,} {kind}" for kind, count in counts.items() if count]
 
     def _waiting(self) -> str:
         """Say that nothing has come, and what did not look like anything that could."""

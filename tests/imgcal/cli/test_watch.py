@@ -81,7 +81,10 @@ def test_lines_on_standard_input_and_garbage_among_them(blobs, tmp_path, monkeyp
     with open(tmp_path / "lines") as file:
         monkeypatch.setattr(sys, "stdin", file)
         assert watch("-", tmp_path / "out") == 0
-    assert "20 snapshots" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert (
+        "20 snapshots" in said and " | 2 unreadable | the latest that could not be read: " in said and "cam09" in said
+    )
     assert json.loads((tmp_path / "out" / "progress.json").read_text())["time"] == pytest.approx(19 / 60)
 
 
@@ -138,6 +141,15 @@ def test_a_killed_process_goes_on_and_ctrl_c_ends_it_cleanly(blobs, tmp_path):
         (["-", "--hook", "no-such-program"], 2, "--hook: found 'no-such-program'"),
         (["-", "--metrics", "nowhere"], 2, "found 'nowhere', expected [HOST:]PORT"),
         (["bag.mcap", "--topic", "cam01"], 2, "--topic: found 'cam01', expected CAMERA=TOPIC"),
+        (["empty", "--rate", "0"], 2, "--rate: found it with a folder of frames (empty), expected a table of blobs"),
+        (["empty", "--topic", "a=b"], 2, "--topic: found it with a folder of frames (empty), expected a recording"),
+        (["-", "--until-idle", "3"], 2, "--until-idle: found it with standard input (-), expected a folder of frames"),
+        (
+            ["absent.csv", "--remove"],
+            2,
+            "--remove: found it with a table of blobs (absent.csv), expected a folder of f",
+        ),
+        (["tcp://a:1", "--videos-differ"], 2, "--videos-differ: found it with an address (tcp://a:1), expected a fold"),
         (["empty", "--until-idle", "0.1"], 3, "watch: no snapshot came: empty: found no folder frames in it"),
         (["typing", "--until-idle", "0.1"], 3, "nearest: cam01"),
     ],

@@ -1,5 +1,6 @@
 import io
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from rich.console import Console
@@ -40,6 +41,15 @@ def test_plain_lines_where_nobody_looks(monkeypatch):
     assert first.startswith("waiting for the first snapshot: junk | 0 snapshots, 0/s | 1 unreadable")
     assert second.endswith(" camera lost: cam02 [red]is lost[/red]") and third == "note: state.json: disk full"
     assert last.startswith("all 4 cameras are calibrated | 5 snapshots") and "2 refused" in last and "\x1b" not in last
+
+
+def test_what_did_not_go_as_it_should_is_told_at_the_end(monkeypatch):
+    shown, _, tally = display(monkeypatch, False)
+    with shown.of(tally):
+        tally.snapshots, tally.refused = 5, 2
+        shown._intake.dropped = 3
+    wrong = "2 refused | 3 dropped | 1 unreadable | the latest that could not be read: junk"
+    assert shown.result(Path("out/rig.yaml")) == f"5 snapshots, 0 events: out/rig.yaml | {wrong}"
 
 
 def test_one_line_that_changes_in_a_terminal(monkeypatch):
