@@ -3,6 +3,7 @@ from .accuracy import MAP_DEPTHS, MAP_SIZE, PredictedError, WorkingVolume, predi
 from .blocks import BlockScatter, block_scatter
 from .brought import Brought
 from .change_points import CLIP, LEAST_SNAPSHOTS
+from .clock_slip import ClockSlip, image_of
 from .covariance import (
     camera_covariance,
     camera_std,
@@ -45,6 +46,7 @@ from .map_estimate import (
 from .map_operator import encoded, map_state, with_lenses, without_lenses
 from .moves import find_moves
 from .object_change import ObjectChange, changed_object
+from .object_motion import ObjectMotion
 from .object_shape import SNAPSHOTS_TO_BEND, FiducialOffset, ShapeEvidence, offsets
 from .pose_initialization import initial_pose
 from .pose_support import ON_A_LINE, UndeterminedPosesError, require_poses
@@ -75,6 +77,7 @@ __all__ = [
     "Brought",
     "Change",
     "ChangeTest",
+    "ClockSlip",
     "ColdStart",
     "Cusum",
     "Estimate",
@@ -84,6 +87,7 @@ __all__ = [
     "HeldRigFit",
     "NormalEquations",
     "ObjectChange",
+    "ObjectMotion",
     "ObjectQuestion",
     "PredictedError",
     "Problem",
@@ -118,6 +122,7 @@ __all__ = [
     "find_moves",
     "fit_pose",
     "flat_std",
+    "image_of",
     "initial_pose",
     "initial_state",
     "inverse_or_zero",

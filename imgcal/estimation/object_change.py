@@ -20,6 +20,8 @@ SCALED = 0.1
 """The same of the object's scale, relative."""
 MOST_ASKED = 8
 """Fiducials that are asked whether they are off: those whose residuals are the largest."""
+LEAST_SIGMAS = 3.0
+"""Standard deviations by which it must have changed."""
 MANY = 64
 """Fiducials of an object that is a print, from here on: none of them goes anywhere by itself."""
 
@@ -90,6 +92,8 @@ def changed_object(
         return None
     evidence, fiducial, result = best
     size, sigma = _size(before, result.belief, fiducial)
+    if not abs(size) > LEAST_SIGMAS * sigma:
+        return None
     return ObjectChange(fiducial, 0, size, sigma, evidence - cameras), result.before
 
 

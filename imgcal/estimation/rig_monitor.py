@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from imgcal.errors import RefusedError
+from imgcal.estimation.clock_slip import ClockSlip, Slipped, Suspicion
 from imgcal.estimation.cusum import Cusum, RunningMedian
 from imgcal.estimation.drift_pace import SECONDS, DriftPaces, Stretch
 from imgcal.estimation.object_change import ObjectChange, changed_object
@@ -49,6 +50,10 @@ FEW = 16
 more than it says, and others would be blamed. What came before is then forgotten ..."""
 UNSURE = 8
 """... and of the object nothing is asked before so many have been learnt."""
+SLIP_ODDS = 5.0
+"""Log odds from which it is a clock that has slipped, not a camera that has moved, or the other way round ..."""
+SLIP_PATIENCE = 16
+"""... and the snapshots for which that is waited for, before it is what is more probable."""
 TOLD_AT_ONCE = 32
 """Snapshots whose information is added up at once."""
 
@@ -81,6 +86,8 @@ class RigMonitor:
         self.filter = rig_filter
         self.open: dict[int, Change] = {}  # changes whose kind is not decided yet, by camera
         self.object_change: ObjectChange | None = None  # that became known with the latest snapshot
+        self.slips: tuple[ClockSlip, ...] = ()  # that became known with the latest snapshot
+        self._unsure = 0  # snapshots in a row that might tell of a slip or of a move
         self._misfit, self._usual = Cusum(1, 1.0, FALSE_ALARMS), RunningMedian(256)
         self._recent = RecentSnapshots(rig_filter.belief, rig_filter.walk)
         self._paces = DriftPaces(rig_filter.belief.rig.num_cameras)
@@ -115,7 +122,7 @@ class RigMonitor:
             RefusedError: see `absorbed`. What no minimum is found for, but for one camera, is refused once; if the next
                 snapshot says the same, that camera has moved.
         """
-        self.object_change = None
+        self.object_change, self.slips = None, ()
         if moved:
             result, changes = self._moved(moved, observations, rig_from_object, seconds)
         else:
@@ -144,7 +151,7 @@ class RigMonitor:
             if anew is not None:
                 return anew, ()
         if found is not None:
-            with contextlib.suppress(RefusedError):  # what cannot be learnt anew is tested again with the next snapshot
+            with contextlib.suppress(RefusedError):  # what cannot be told or learnt is tested with the next snapshot
                 return self._alarmed(found)
         if self.filter.due:
             result = self.filter.relinearize()
@@ -161,9 +168,20 @@ class RigMonitor:
     def _moved(
         self, cameras: Collection[int], observations: Observations, rig_from_object: RigidTransform, seconds: float
     ) -> tuple[Absorbed, tuple[Change, ...]]:
-        """Learn from a snapshot before which cameras have moved, it does not matter how far."""
-        told = list(self._judged(last=True))
+        """Learn from a snapshot before which cameras have moved, however far, or their clocks slipped."""
         free: dict[int, str | None] = dict.fromkeys(sorted(cameras))
+        earlier, before = len(self._recent), aged(self.filter.belief, seconds, self.filter.walk)
+        snapshots = [*self._recent.snapshots(earlier), (observations, rig_from_object)]
+        try:
+            pauses = [*self._recent.pauses(earlier), seconds]
+            slipped = self._slipped(Suspicion(before, snapshots, pauses, 1, free), self.filter.count)
+        except RefusedError:  # not yet
+            seen = observations.seen.clone()
+            seen[:, list(cameras)] = False
+            return self._followed(replace(observations, seen=seen), rig_from_object, seconds)
+        if slipped is not None:
+            return self._followed(*slipped.snapshots[-1], seconds)
+        told = list(self._judged(last=True))
         if self.filter.count - self.first < FEW:
             self.filter.count += 1
             return self._begin_again(free, [(observations, rig_from_object)], [seconds], {}, told)
@@ -256,12 +274,14 @@ class RigMonitor:
         else:
             told = list(self._judged(last=True))
             before, seconds = self._recent.belief_before(age), self._recent.seconds(age)
-        test, known, evidence = self._recent.test(age), bool(free), dict[int, float]()
+        test, known, evidence = self._recent.test(age), since is not None and bool(free), dict[int, float]()
         while not free or _worst(test.given(free), set(free)) >= SIGNIFICANT:
             given = test.given(free)
             camera = _surest(given, set(free))
             free[camera], evidence[camera] = None, max(float(score[camera]) for score in given.scores().values())
         snapshots = self._recent.snapshots(age)
+        if (slipped := self._slipped_since(before, age, free)) is not None:
+            return slipped, tuple(told)
         if self.filter.count - age - self.first < FEW:
             return self._begin_again(free, snapshots, self._recent.pauses(age), evidence, told)
         moved = absorbed(let_free(before, free), *joined(snapshots), self.filter.options)
@@ -270,6 +290,45 @@ class RigMonitor:
         result = self.filter.restart(let_free(before, free), snapshots)
         self._recent.restarted(result, age)
         return result, (*told, *self._begin(free, result, before, seconds, evidence))
+
+    def _slipped_since(self, before: RigBelief, age: int, cameras: Mapping[int, str | None]) -> Absorbed | None:
+        """Learn the latest snapshots anew as cameras had seen them in time; None = it is not their clocks.
+
+        Raises:
+            RefusedError: it cannot be told yet.
+        """
+        count = len(self._recent)
+        snapshots, pauses = self._recent.snapshots(count), self._recent.pauses(count)
+        everything = self.filter.count - self.first == count
+        first = let_free(self._prior, dict.fromkeys(sorted(self._moved_early)), JUMPS[-1]) if everything else None
+        slipped = self._slipped(Suspicion(before, snapshots, pauses, age, cameras, first), self.filter.count - age)
+        if slipped is None:
+            return None
+        result = self.filter.restart(slipped.before, slipped.snapshots)
+        self._recent = RecentSnapshots(result.belief, self.filter.walk)
+        self._recent.took(slipped.snapshots, pauses[-len(slipped.snapshots) :], result)
+        self.open, self._since = {}, None
+        return result
+
+    def _slipped(self, suspicion: Suspicion, since: int) -> Slipped | None:
+        """Ask whether clocks have slipped of cameras that seem to have moved, since a snapshot of this number.
+
+        Returns:
+            None = they have moved.
+
+        Raises:
+            RefusedError: it cannot be told yet.
+        """
+        odds, slipped = suspicion.clocks(self.filter.options)
+        self._unsure = self._unsure + 1 if abs(odds) < SLIP_ODDS else 0
+        if 0 < self._unsure <= SLIP_PATIENCE and self._since is None:
+            raise RefusedError("estimation: it cannot be told yet whether a camera has moved, or its clock slipped")
+        self._unsure = 0
+        if slipped is None or odds < 0:
+            return None
+        since -= len(slipped.snapshots) - suspicion.count
+        self.slips = tuple(replace(slip, since=since, odds=odds) for slip in slipped.slips)
+        return slipped
 
     def _misfitting(self, result: Absorbed) -> int:
         """Number of snapshots that fit worse than is usual; 0 = they fit."""

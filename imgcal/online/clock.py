@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.detection import Frame
-from imgcal.estimation import Absorbed
+from imgcal.estimation import Absorbed, ClockSlip
 from imgcal.geometry import RigidTransform
 from imgcal.online.events import Event
 from imgcal.online.rig_state import RigState
@@ -20,7 +20,11 @@ MEMORY = 5.0
 LONGEST = 0.2
 """Seconds between snapshots up to which the difference of predictions is a velocity."""
 SIGNIFICANT, LEAST = 40.0, 1e-3
-"""Chi-squared (one degree of freedom, once in 10^9 independent looks by chance), and seconds, from which it is told."""
+"""Chi-squared (one degree of freedom, once in 10^9 independent looks by chance), and seconds, to tell an offset ..."""
+LEAST_KNOWN = 1e-4
+"""... and seconds from which it is reckoned with."""
+INEXACT = 0.05
+"""Share of an offset by which it must be otherwise to be told again."""
 LEAST_MEMORY = 1.0
 """Seconds of motion before anything is told."""
 LEAST_MOTION, LEAST_SIGMAS = 0.5, 5.0
@@ -35,7 +39,7 @@ MOST_PIXELS = 50.0
 
 
 class ClockOffsets:
-    """Estimates when each camera exposes, against the median camera.
+    """Estimates when each camera exposes, against the median camera, and tells it.
 
     Residuals are explained by a time (the object's velocity in the image times it) and a constant shift of the image
     together: a camera that was bumped shifts its image the same way wherever the object goes.
@@ -48,8 +52,9 @@ class ClockOffsets:
         self._normal, self._right = np.zeros((cameras, 3, 3)), np.zeros((cameras, 3))
         self._other = np.zeros(cameras, dtype=np.int64)  # snapshots in a row that are otherwise
         self._last: tuple[float, RigidTransform, NDArray[np.float64]] | None = None
-        self._seconds = 0.0  # of motion that has been seen
+        self._seconds = np.zeros(cameras)  # of motion that each has seen
         self._told = np.zeros(cameras)  # s, what was told last
+        self.late = np.zeros(cameras)  # s by which cameras are known to expose later: blobs come as if in time
         self._period = math.nan
 
     def __call__(
@@ -71,13 +76,35 @@ class ClockOffsets:
         # Both by the rig as it is now: what is learnt about cameras is no motion.
         self._add(state, (state.predicted - self._predicted(state, last[1])) / self._period)
         offset, sigma = self.offsets()
-        changed = np.abs(offset - self._told)
-        sure = changed > np.maximum(math.sqrt(SIGNIFICANT) * sigma, LEAST)
-        if self._seconds < LEAST_MEMORY or not sure.any():
+        changed = np.abs(offset - self.late)
+        sure = changed > np.maximum(math.sqrt(SIGNIFICANT) * sigma, LEAST_KNOWN)
+        sure &= self._seconds >= LEAST_MEMORY
+        if not sure.any():
             return ()
         camera = int(np.argmax(np.where(sure, changed / sigma, 0.0)))  # one at a time: the others may lean on it
-        self._told[camera] = offset[camera]
-        return (self._event(state, camera, float(offset[camera]), float(sigma[camera])),)
+        evidence = float(changed[camera] / sigma[camera]) ** 2
+        return self._found(state, camera, float(offset[camera]), float(sigma[camera]), evidence)
+
+    def slipped(self, state: RigState, slip: ClockSlip, since: float) -> Iterable[Event]:
+        """Take over a slip that was seen at once."""
+        late = float(self.late[slip.camera] + slip.seconds)
+        return self._found(state, slip.camera, late, slip.sigma, slip.odds, since)
+
+    def _found(
+        self, state: RigState, camera: int, late: float, sigma: float, evidence: float, since: float | None = None
+    ) -> Iterable[Event]:
+        """Reckon with an offset (s) from now on, and tell it if that is worth it."""
+        self.late[camera] = late
+        self._begin(camera)
+        if abs(late - self._told[camera]) < LEAST + INEXACT * abs(late):
+            return ()
+        self._told[camera] = late
+        return (self._event(state, camera, late, sigma, evidence, since),)
+
+    def _begin(self, cameras: int | NDArray[np.bool_]) -> None:
+        """Forget what cameras have shown."""
+        self._normal[cameras], self._right[cameras] = 0.0, 0.0
+        self._other[cameras], self._seconds[cameras] = 0, 0.0
 
     def offsets(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """By how much each camera exposes after the median one, and its standard deviation: (C,) s; nan = unknown."""
@@ -88,6 +115,7 @@ class ClockOffsets:
         inverse = np.linalg.inv(np.where(known[:, None, None], scaled, np.eye(3)))
         offset = np.where(known, (inverse[:, 0] * self._right / scale).sum(1) / scale[:, 0], np.nan)
         sigma = np.where(known, np.sqrt(inverse[:, 0, 0]) / scale[:, 0], np.nan)
+        offset += self.late
         return offset - (np.nanmedian(offset) if known.any() else 0.0), sigma
 
     @staticmethod
@@ -116,7 +144,7 @@ class ClockOffsets:
         rows = np.flatnonzero((blobs.fiducial >= 0) & blobs.usable)
         at = blobs.camera[rows], blobs.fiducial[rows]
         residual, sigma = np.full(velocity.shape, np.nan), np.full(velocity.shape[:2], np.nan)
-        residual[at] = blobs.uv[rows] - state.predicted[at]
+        residual[at] = (blobs.uv + state.lag)[rows] - state.predicted[at]
         sigma[at] = blobs.sigma[rows]
         with np.errstate(invalid="ignore"):
             good = np.isfinite(velocity).all(-1) & (np.linalg.norm(residual, axis=-1) < MOST_PIXELS)
@@ -155,29 +183,30 @@ class ClockOffsets:
             other = known & (np.linalg.norm(middle, axis=1) > np.maximum(STEP, 6 * usual / np.sqrt(count)))
         self._other = np.where(other, self._other + 1, np.where(known, 0, self._other))
         anew = self._other >= STEPS
-        self._normal[anew], self._right[anew], self._other[anew] = 0.0, 0.0, 0
+        self._begin(anew)
         return other & ~anew
 
-    def _event(self, state: RigState, camera: int, offset: float, sigma: float) -> Event:
+    def _event(
+        self, state: RigState, camera: int, offset: float, sigma: float, evidence: float, since: float | None = None
+    ) -> Event:
         name = state.factory.camera_names[camera]
         how = "later" if offset > 0 else "earlier"
         message = f"{name} exposes {1e3 * abs(offset):.3g} +- {1e3 * sigma:.1g} ms {how} than the other cameras"
+        if abs(offset) < max(LEAST, 3 * sigma):
+            message = f"{name} exposes at the same time as the other cameras again"
         frames = (offset / self._period, sigma / self._period)
-        evidence = (offset / sigma) ** 2
-        return Event(
-            state.time, state.snapshot, "clock_slip", name, None, None, *frames, "frames", evidence, message=message
-        )
+        return Event(state.time, state.snapshot, "clock_slip", name, since, None, *frames, "frames", evidence, message)
 
     def saved(self) -> dict[str, Any]:
         """See `SequentialTest`."""
-        return {"told": self._told.tolist()}
+        return {"told": self._told.tolist(), "late": self.late.tolist()}
 
     def restored(self, values: dict[str, Any]) -> None:
         """See `SequentialTest`."""
-        told = np.array(values["told"], dtype=np.float64)
-        if told.shape != self._told.shape or not np.isfinite(told).all():
+        told, late = (np.array(values[name], dtype=np.float64) for name in ("told", "late"))
+        if not all(each.shape == self._told.shape and np.isfinite(each).all() for each in (told, late)):
             raise ValueError(f"{self.name}: expected seconds of {len(self._told)} cameras")
-        self._told = told
+        self._told, self.late = told, late
 
 
 def _middle(values: NDArray[np.float64], count: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -28,6 +28,7 @@ from imgcal.online.following import near_prediction
 from imgcal.online.keeper_file import KeeperFile, read_memory, unusable
 from imgcal.online.label_checks import Checked, check_labels
 from imgcal.online.labelling import LEAST_FOLLOWED, Labelling
+from imgcal.online.late_cameras import POSES, in_time, shifted
 from imgcal.online.memory import Frozen, require_alike
 from imgcal.online.noise_level import NoiseLevel
 from imgcal.online.object_doubts import ObjectDoubts
@@ -113,6 +114,9 @@ class RigKeeper:
         rig = rig.to(torch.float64)
         self.factory, self.obj, self.options, self.drift = rig, obj, replace(options, blind_cameras=True), drift
         self.tests = tuple(default_tests(rig.num_cameras) if tests is None else tests)
+        self._clock = next(
+            (test for test in self.tests if isinstance(test, ClockOffsets)), ClockOffsets(rig.num_cameras)
+        )
         self._prior = rig  # what the filter began with
         self._labelling = Labelling(rig, obj, self.options, detection, detector)
         self._monitor = self._begun()
@@ -124,7 +128,7 @@ class RigKeeper:
         self._count = 0
         self._learnt: float | None = None  # s, time of the last snapshot that was learnt
         self._times: deque[tuple[int, float]] = deque(maxlen=512)  # number in the filter and time of snapshots
-        self._poses: deque[tuple[float, RigidTransform]] = deque(maxlen=2)  # (1,) of the last snapshots
+        self._poses: deque[tuple[float, RigidTransform]] = deque(maxlen=POSES)  # (1,) of the last snapshots
         self._labels = 0  # of the last snapshot
         self._search = Search(rig.num_cameras)
         self._usual: deque[float] = deque(maxlen=64)  # px
@@ -176,11 +180,24 @@ class RigKeeper:
         detections = self._labelling.blobs(source, snapshot_name(self._count))
         frames = None if isinstance(source, Detections) else source
         self._count, self._time = self._count + 1, time
-        rows = np.flatnonzero(detections.usable)
+        lag = self._lag(detections)
+        rows = np.flatnonzero(detections.usable & np.isfinite(lag).all(1))
         labelled, result, refused = None, None, None
         shown = replace(detections, fiducial=np.full(len(detections), -1, dtype=np.int64))
         try:
-            labelled = self._labelled(detections.select(rows), detections.snapshot_names[0], frames)
+            usable = detections.select(rows)
+            labelled = self._labelled(
+                shifted(usable, lag[rows], self._clock.late), detections.snapshot_names[0], frames
+            )
+            found = labelled.checked.blobs
+            if len(found) != len(rows):  # those of a proposer
+                shown, lag = found, np.zeros((len(found), 2))
+            else:
+                shown.fiducial[rows] = found.fiducial
+                if self._clock.late.any():  # the object's pose is known now
+                    lag = self._lag(shown, (time, labelled.checked.rig_from_object))
+                    found = shifted(shown.select(rows), lag[rows], self._clock.late)
+                    labelled = replace(labelled, checked=replace(labelled.checked, blobs=found))
             result, changes = self._learn(labelled, time)
         except RefusedError as reason:
             self._labelling.follows, refused = False, str(reason)
@@ -189,16 +206,15 @@ class RigKeeper:
             events += self._told(changes, time)
             if self._monitor.object_change is not None:
                 events.append(self._told_object(self._monitor.object_change, time))
-            found = labelled.checked.blobs
-            if len(found) != len(rows):  # those of a proposer
-                shown = found
-            else:
-                shown.fiducial[rows] = found.fiducial
-        state = self._state(shown, labelled, result, refused)
+        state = self._state(shown, lag, result, refused)
         return self._concluded(state, frames, labelled, result, events)
 
-    def saved(self) -> KeeperFile:
-        """Take down all that is known, within milliseconds; the result can be written while the keeper goes on."""
+    def saved(self, progress: dict[str, Any] | None = None) -> KeeperFile:
+        """Take down all that is known, within milliseconds; the result can be written while the keeper goes on.
+
+        Args:
+            progress: what else is to be found in the file, in the same step: how far a source has been worked on.
+        """
         memory = {
             "values": {name: getattr(self, name) for name in REMEMBERED_VALUES},
             "labelling": self._labelling.saved(),
@@ -215,6 +231,7 @@ class RigKeeper:
             factory=self.factory,
             obj=self.obj,
             memory=Frozen(memory),
+            progress=progress,
         )
 
     def save(self, path: str | Path) -> None:
@@ -373,10 +390,14 @@ class RigKeeper:
         few = found.checked.labels < LEAST_FOLLOWED * self._labels
         return None if few or found.astray - sought or found.checked.usual > self._most_usual() else found
 
+    def _lag(self, blobs: Detections, *now: tuple[float, RigidTransform]) -> NDArray[np.float64]:
+        """By how much blobs are off where they would have been in time: (M, 2) pixels."""
+        return in_time(blobs, self._clock.late, self.belief, [*self._poses, *now], self._time)
+
     def _extrapolated(self) -> RigidTransform:
         """Where the object should be now: (1,)."""
         last_time, last = self._poses[-1]
-        first_time, first = self._poses[0]
+        first_time, first = self._poses[-min(2, len(self._poses))]
         share = 0.0 if last_time <= first_time else (self._time - last_time) / (last_time - first_time)
         if not 0.5 < share < 2.0:
             return last
@@ -455,11 +476,13 @@ class RigKeeper:
         self._looks[[change.camera for change in changes]] = 0
         self._off, self._learnt, self._in_vain = off, time, 0
         self._labelling.follow(result.rig_from_object[0])
+        if self._monitor.slips:  # poses were off that have been found with blobs of another time
+            self._poses.clear()
         self._poses.append((time, result.rig_from_object))
         self._labels = checked.labels
         self._search.learnt(checked.blobs, self._count - 1)
         self._usual.append(checked.usual)
-        steady = not (off or changes or self._monitor.open)
+        steady = not (off or changes or self._monitor.open or self._monitor.slips)
         if self._noise.take(blobs, observations, result, steady, self._monitor.filter.count):
             result = self._again(result)
         return result, changes
@@ -507,13 +530,17 @@ class RigKeeper:
         """Say what the monitor found."""
         events = []
         for change in changes:
-            since = next((t for number, t in self._times if number >= change.since), time)
-            since = self._search.since(change.camera, min(since, self._off.get(change.camera, since)))
+            since = self._since(change.camera, change.since, time)
             told = self._relearning.events.get(change.camera)
             if told is not None and told.change == "unknown" and told.since is not None:  # the same, told again
                 since = told.since
             events.append(self._relearning.told(change, since, time, self._count - 1, self._before))
         return events
+
+    def _since(self, camera: int, number: int, time: float) -> float:
+        """When it happened to a camera what the monitor found since a snapshot of this number."""
+        since = next((t for learnt, t in self._times if learnt >= number), time)
+        return self._search.since(camera, min(since, self._off.get(camera, since)))
 
     def _told_object(self, change: ObjectChange, time: float) -> Event:
         """Say that it is the object that is not as it was."""
@@ -532,7 +559,7 @@ class RigKeeper:
         return Event(time, self._count - 1, "object_bent", None, since, None, *size, "mm", change.odds, message)
 
     def _state(
-        self, shown: Detections, labelled: _Labelled | None, result: Absorbed | None, refused: str | None
+        self, shown: Detections, lag: NDArray[np.float64], result: Absorbed | None, refused: str | None
     ) -> RigState:
         """What is known now, without health and events."""
         pose = None if result is None else result.rig_from_object
@@ -540,12 +567,11 @@ class RigKeeper:
         residual = np.full(cameras, np.nan)
         rows = np.flatnonzero(shown.fiducial >= 0)
         if len(rows) and pose is not None:
-            squared = np.square(predicted[shown.camera[rows], shown.fiducial[rows]] - shown.uv[rows]).mean(1)
+            squared = np.square(predicted[shown.camera[rows], shown.fiducial[rows]] - (shown.uv + lag)[rows]).mean(1)
             count = np.bincount(shown.camera[rows], minlength=cameras)
             total = np.bincount(shown.camera[rows], squared, minlength=cameras)
             residual = np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)
-        clock = next((test for test in self.tests if isinstance(test, ClockOffsets)), None)
-        offset, sigma = clock.offsets() if clock else (np.full(cameras, np.nan), np.full(cameras, np.nan))
+        offset, sigma = self._clock.offsets()
         return RigState(
             time=self._time,
             snapshot=self._count - 1,
@@ -555,6 +581,7 @@ class RigKeeper:
             sentence="",
             refused=refused,
             detections=shown,
+            lag=lag,
             predicted=predicted,
             residual=residual,
             rig_from_object=None if pose is None else pose[0],
@@ -574,6 +601,10 @@ class RigKeeper:
         """Add what became known of cameras, and what is said of them."""
         time, number = state.time, state.snapshot
         names = self._prior.camera_names
+        for slip in self._monitor.slips if result is not None else ():
+            since = self._since(slip.camera, slip.since, time)
+            events += self._clock.slipped(state, slip, since)
+            state = replace(state, lag=self._lag(state.detections))
         silent = () if frames is None else (c for c, name in enumerate(names) if frames.get(name) is None)
         astray_ = frozenset() if labelled is None else labelled.astray
         look = Look(time, number, state.detections, state.predicted, astray_, frozenset(silent))

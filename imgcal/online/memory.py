@@ -24,6 +24,7 @@ MODULES = frozenset(
         "association.result",
         "association.tracker",
         "estimation.brought",
+        "estimation.clock_slip",
         "estimation.cusum",
         "estimation.drift_pace",
         "estimation.map_estimate",

@@ -47,6 +47,7 @@ class RigState:
     sentence: str  # of state, for people
     refused: str | None  # why this snapshot taught nothing
     detections: Detections  # blobs of this snapshot, labelled where identified
+    lag: NDArray[np.float64]  # (M, 2) pixels to be added to these, where cameras expose later and the object moves
     predicted: NDArray[np.float64]  # (C, N, 2) pixels where the rig puts the fiducials; nan where that is not known
     residual: NDArray[np.float64]  # (C,) RMS pixels of this snapshot; nan where nothing was seen
     rig_from_object: RigidTransform | None

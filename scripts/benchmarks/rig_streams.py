@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 import imgcal
@@ -40,6 +41,15 @@ class Bump:
     size: float  # rad, mm, px
 
 
+@dataclass(frozen=True)
+class Slip:
+    """A camera exposes later than the others from a snapshot on."""
+
+    snapshot: int
+    camera: int
+    seconds: float
+
+
 @dataclass
 class Stream:
     """Snapshots of a rig; iterate over it once."""
@@ -52,6 +62,7 @@ class Stream:
     absent: Sequence[tuple[int, int]] = ()  # snapshots (first, last excluded) without the object
     out: Mapping[int, tuple[int, int]] = field(default_factory=dict)  # camera -> snapshots without its frames
     creep: Tensor | None = None  # (C, K) what cameras change with every snapshot of `labelled`
+    slips: Sequence[Slip] = ()
 
     def __post_init__(self) -> None:
         self.generator = torch.Generator().manual_seed(self.seed)
@@ -90,9 +101,8 @@ class Stream:
         for bump in self.bumps:
             if bump.snapshot == number:
                 self.rig = self.changed(bump)
-        there = self.pose_at(number / given.rate)
-        image = self.rig.expand(1).project_values(there.apply(self.obj.points), self.obj.radius)
-        uv, seen = image.uv[0].numpy(), image.visible[0].numpy()
+        uv, visible = self._images(torch.tensor([number]), self.rig.expand(1))
+        uv, seen = uv[0], visible[0]
         uv = uv + given.noise * noise.standard_normal(uv.shape)
         seen = seen & (noise.random(seen.shape) >= given.hidden)
         if any(first <= number < last for first, last in self.absent):
@@ -124,17 +134,27 @@ class Stream:
         """
         given, noise, count = self.conditions, self.noise, last - first
         rigs = self._rigs(first, last)
-        there = self.poses_at(torch.arange(first, last, dtype=torch.float64) / given.rate)
-        image = rigs.project_values(there.apply(self.obj.points), self.obj.radius)
-        uv = image.uv.numpy()
+        uv, visible = self._images(torch.arange(first, last), rigs)
         uv = uv + given.noise * noise.standard_normal(uv.shape)
-        seen = image.visible.numpy() & (noise.random(uv.shape[:-1]) >= given.hidden)
+        seen = visible & (noise.random(uv.shape[:-1]) >= given.hidden)
         for begin, end in self.absent:
             seen[max(begin - first, 0) : max(end - first, 0)] = False
         for camera, (begin, end) in self.out.items():
             seen[max(begin - first, 0) : max(end - first, 0), camera] = False
         sigma = torch.full((count, *uv.shape[1:-1]), given.noise, dtype=torch.float64)
         return Observations(torch.from_numpy(uv), sigma, torch.from_numpy(seen)), rigs
+
+    def _images(self, numbers: Tensor, rigs: CameraRig) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Fiducials (S, C, N, 2) of some snapshots by their rigs (S,), each camera at the time of its own clock."""
+        seconds = numbers.double() / self.conditions.rate
+        image = rigs.project_values(self.poses_at(seconds).apply(self.obj.points), self.obj.radius)
+        uv, visible = image.uv.numpy(), image.visible.numpy()
+        for slip in self.slips:
+            rows = (numbers >= slip.snapshot).numpy()
+            late = rigs.project_values(self.poses_at(seconds + slip.seconds).apply(self.obj.points), self.obj.radius)
+            uv[rows, slip.camera] = late.uv.numpy()[rows, slip.camera]
+            visible[rows, slip.camera] = late.visible.numpy()[rows, slip.camera]
+        return uv, visible
 
     def _rigs(self, first: int, last: int) -> CameraRig:
         """True rigs (S,) of some snapshots; `self.rig` is the last one then."""

@@ -55,6 +55,7 @@ def made_state(rig, obj, snapshot=0, now=None, health=None, events=(), place=Non
         sentence=changes.pop("sentence", f"all {rig.num_cameras} cameras as calibrated"),
         refused=None,
         detections=true_detections(Truth(rig, pose.reshape(1), uv[None])),
+        lag=np.zeros((uv.shape[:-1].numel(), 2)),
         predicted=uv.numpy(),
         residual=np.full(rig.num_cameras, 0.07),
         rig_from_object=pose,

@@ -53,6 +53,7 @@ def state_at(
     blobs = Detections(**{**vars(blobs), "radius": radius})
     return RigState(
         time=seconds, snapshot=number, belief=RigBelief.of_prior(rig, obj), factory=rig, cameras={}, sentence="",
-        refused=None, detections=blobs, predicted=seen(seconds), residual=np.zeros(4), rig_from_object=pose_at(seconds),
+        refused=None, detections=blobs, lag=np.zeros((32, 2)), predicted=seen(seconds), residual=np.zeros(4),
+        rig_from_object=pose_at(seconds),
         events=(), clock_offset=np.full(4, np.nan), clock_offset_sigma=np.full(4, np.nan),
     )  # fmt: skip

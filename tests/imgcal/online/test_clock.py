@@ -16,7 +16,8 @@ def watched(late: dict[int, float], bump: float = 0.0) -> tuple[ClockOffsets, li
     test, events = ClockOffsets(4), []
     for number in range(60):
         begun = number >= 20
-        state = state_at(number, number / 20, lambda c, b=begun: late.get(c, 0.0) if b else 0.0, bump if begun else 0.0)
+        left = (np.array([late.get(camera, 0.0) for camera in range(4)]) if begun else 0.0) - test.late
+        state = state_at(number, number / 20, lambda camera, left=left: left[camera], bump if begun else 0.0)
         events += test(state, None, None)
     return test, events
 
@@ -29,6 +30,13 @@ def test_a_late_camera_is_told_with_its_offset() -> None:
     offset, sigma = test.offsets()
     assert np.all(np.abs(offset[[0, 1, 3]]) < 5 * sigma[[0, 1, 3]] + 1e-4)
     assert 0.0095 < offset[2] < 0.0105
+
+
+def test_a_small_offset_is_reckoned_with_and_not_told() -> None:
+    test, events = watched({2: 5e-4})
+    assert events == []
+    assert 4e-4 < test.late[2] < 6e-4
+    assert (test.late[[0, 1, 3]] == 0).all()
 
 
 def test_cameras_in_time_and_bumped_cameras_are_not_told() -> None:
@@ -71,3 +79,4 @@ def test_what_was_told_is_kept() -> None:
     again = ClockOffsets(4)
     again.restored(test.saved())
     assert again.saved() == test.saved()
+    assert again.late[2] != 0

@@ -11,7 +11,7 @@ import imgcal
 from imgcal.errors import InputError
 from imgcal.online import Event, RigKeeper, RigState
 from imgcal.types import CameraRig, Detections
-from scripts.benchmarks.rig_streams import Bump, Conditions, Stream
+from scripts.benchmarks.rig_streams import Bump, Conditions, Slip, Stream
 
 
 def kept(stream: Stream, count: int) -> list[RigState]:
@@ -57,6 +57,37 @@ def test_a_bump_is_told_and_learnt_again() -> None:
         if state.cameras["cam02"] == "ok":
             error = state.gauge.difference(state.rig, made.rig) / state.std
             assert error[1].square().mean().sqrt() < 3
+
+
+@pytest.mark.parametrize(("seed", "late"), [(0, 0.002), (1, 0.0167), (2, -0.05)])
+def test_a_clock_that_slips_is_told_as_that_alone(seed: int, late: float) -> None:
+    made = stream(seed, slips=[Slip(60, 1, late)])
+    states = kept(made, 150)
+    (event,) = (event for state in states for event in state.events)
+    assert (event.kind, event.camera) == ("clock_slip", "cam02")
+    assert event.snapshot <= 64
+    assert event.since is not None
+    assert abs(event.since * 60 - 60) <= 3
+    assert states[-1].clock_offset[1] == pytest.approx(late, rel=0.05)
+    assert states[-1].residual[1] < 0.5
+    assert states[-1].cameras["cam02"] == "ok"
+    assert normalized(states[-1], made.rig) < 3
+
+
+def test_a_bump_of_a_camera_whose_clock_has_slipped_is_told_as_fast() -> None:
+    made = stream(3, slips=[Slip(30, 1, 0.0167)], bumps=[Bump(90, 1, "rotation", math.radians(0.3))])
+    events = [event for state in kept(made, 110) for event in state.events]
+    assert [event.kind for event in events[:2]] == ["clock_slip", "moved"]
+    assert 90 <= events[1].snapshot <= 93
+    assert {event.kind for event in events[1:]} <= {"moved", "relearnt"}
+
+
+def test_a_clock_that_was_set_right_is_told_again() -> None:
+    events = [
+        event for state in kept(stream(4, slips=[Slip(40, 1, 0.01), Slip(90, 1, 0.0)]), 110) for event in state.events
+    ]
+    assert [event.kind for event in events] == ["clock_slip", "clock_slip"]
+    assert "same time" in events[1].message
 
 
 def test_a_snapshot_without_the_object_teaches_nothing_and_the_next_one_is_tried_afresh() -> None:

@@ -16,7 +16,8 @@ def state(rig: imgcal.CameraRig, belief: RigBelief) -> RigState:
         np.zeros((0, 2)), np.zeros(0), none, none, none, np.zeros(0), np.zeros(0, np.uint8), rig.camera_names, ("0",)
     )  # fmt: skip
     empty = np.full((rig.num_cameras, 8, 2), np.nan)
-    return RigState(0.0, 0, belief, rig, {}, "", None, blobs, empty, empty[:, 0, 0], None, (), *2 * (empty[:, 0, 0],))
+    values = belief, rig, {}, "", None, blobs, np.zeros((len(blobs), 2)), empty, empty[:, 0, 0], None, ()
+    return RigState(0.0, 0, *values, *2 * (empty[:, 0, 0],))
 
 
 def test_a_motion_of_the_whole_rig_is_none() -> None:
