@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
@@ -88,7 +88,7 @@ class Watch:
     topic: tuple[str, ...] = ()  #: CAMERA=TOPIC of a recording, where the topic does not name the camera
     videos_differ: bool = False  #: accept videos whose lengths or time stamps differ: frames go together by time
     until_idle: float | None = None  #: end when a folder has got no new frame for so many seconds
-    remove: bool = False  #: delete the frames of a folder once they are read
+    remove: bool = False  #: delete the frames of a folder once what they taught is saved
     metrics: str | None = None  #: [HOST:]PORT for Prometheus; the host is 127.0.0.1 if not given
     serve: str | None = None  #: [HOST:]PORT of the live page; the host is 127.0.0.1 if not given
     hook: str | None = None
@@ -102,8 +102,9 @@ class Watch:
         folder = make_folder(self.out)
         with _going_on():
             progress = None if self.fresh else Progress.load(folder)
+        source = self._source(rig, obj, progress)
         intake = Intake(
-            self._source(rig, obj, progress), rig, Timing(self.tolerance, self.patience), self.keep_all,
+            source, rig, Timing(self.tolerance, self.patience), self.keep_all,
             after=None if progress is None else progress.time,
         )  # fmt: skip
         hook = None if self.hook is None else Hook(self.hook)
@@ -111,17 +112,17 @@ class Watch:
         with contextlib.ExitStack() as stack:
             keeper, restored = self._keeper(folder, rig, obj)
             stack.enter_context(keeper)
+            stack.enter_context(intake).opened()  # before anything is written
             page = None
             if self.serve is not None:
                 from imgcal.live_page import LivePage, parse_address  # brings a server along, which is not in the core
 
                 page = stack.enter_context(LivePage(rig, obj, parse_address(self.serve)))
                 print(page.notice)
-            loop = stack.enter_context(Loop(keeper, folder, hook, page, display.tell, display.warn))
+            loop = stack.enter_context(Loop(keeper, folder, hook, page, display.tell, display.warn, _removing(source)))
             if self.metrics is not None:
                 stack.enter_context(Metrics(loop.tally, intake, hook, metrics_address(self.metrics)))
             stopped = stack.enter_context(_stopping())
-            stack.enter_context(intake)
             stack.enter_context(display.of(loop.tally))
             if restored:
                 loop.tell(Event(time.time(), 0, "restart", message="started again from what was known"))
@@ -200,6 +201,13 @@ class Watch:
         if progress is not None and intake.known_before:
             return f"watch: all {intake.known_before:,} snapshots were known; --fresh begins from the factory rig"
         return "watch: no snapshot came"
+
+
+def _removing(source: Source) -> Callable[[Progress], None]:
+    """What deletes frames that have been learnt from."""
+    if not isinstance(source, Folder):
+        return lambda progress: None
+    return lambda progress: None if progress.name is None else source.saved(progress.name)
 
 
 @contextlib.contextmanager

@@ -30,6 +30,7 @@ class KeeperFile:
     factory: CameraRig
     obj: CalibrationObject
     memory: Frozen
+    progress: dict[str, Any] | None = None  # of whoever saves it
 
     def text(self) -> str:
         """What the file holds: JSON, the part for people first."""
@@ -39,6 +40,7 @@ class KeeperFile:
             "snapshot": snapshot_name(max(self.snapshot, 0)),
             "sentence": self.sentence,
             "cameras": self.cameras,
+            "progress": self.progress,
             "rig": rig_text(self.rig).splitlines(),
             "factory": rig_text(self.factory).splitlines(),
             "object": object_text(self.obj).splitlines(),

@@ -5,7 +5,7 @@ from .folder import Folder
 from .hook import Hook
 from .intake import Intake
 from .json_lines import JsonLines
-from .loop import PROGRESS, STATE, Keeper, Page, Progress, Watch
+from .loop import STATE, Keeper, Page, Progress, Watch
 from .metrics import Metrics, Tally
 from .recordings import BlobTable, Videos, holds_videos
 from .rig_files import CURRENT, RigFiles
@@ -15,7 +15,6 @@ from .zeromq import ZeroMQ
 __all__ = [
     "COUNTS",
     "CURRENT",
-    "PROGRESS",
     "STATE",
     "Bag",
     "BlobTable",

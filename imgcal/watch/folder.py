@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 import time
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from imgcal.errors import InputError
@@ -30,10 +30,20 @@ class Folder:
 
     folder: Path  # holds frames/<camera name>/
     rig: CameraRig
-    remove: bool = False  # frames that have been read are deleted
+    remove: bool = False  # frames are deleted, once what they have taught is `saved`
     after: str | None = None  # snapshots up to this one have been seen before
     until_idle: float | None = None  # s without a new file after which it is complete; None = never
     live: bool = True
+    _read_files: deque[Path] = field(default_factory=deque, repr=False)  # that are to be deleted
+
+    def saved(self, name: str) -> None:
+        """Delete frames that have been read of the snapshots up to one: they will not be needed again."""
+        for _ in range(len(self._read_files)):
+            path = self._read_files.popleft()
+            if natural_key(path.stem) <= natural_key(name):
+                path.unlink(missing_ok=True)
+            else:
+                self._read_files.append(path)
 
     def items(self) -> Iterator[Item]:
         """Give frames snapshot by snapshot, those that are there first, then as they come."""
@@ -79,7 +89,7 @@ class Folder:
             return Unreadable(str(error), name)
         camera.done(path)
         if self.remove:
-            path.unlink(missing_ok=True)
+            self._read_files.append(path)
         return Exposure(name, changed, frame, path.stem)
 
 

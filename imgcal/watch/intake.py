@@ -20,6 +20,7 @@ MOST_BYTES = 2**30
 """Memory of their frames; more, and the oldest go as well."""
 LATELY = 3  # reasons that are kept
 WOKEN = 0.2  # s
+LONGEST_OPENING = 10.0  # s
 
 
 class Intake:
@@ -62,7 +63,7 @@ class Intake:
         self._snapshots: deque[TimedSnapshot] = deque()
         self._bytes = 0
         self._changed = threading.Condition()
-        self._closing = self._ended = False
+        self._closing = self._ended = self._begun = False
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._read, name="intake", daemon=True)  # a read may hang in a driver
 
@@ -91,6 +92,18 @@ class Intake:
         with self._changed:
             return self._ended and not self._snapshots
 
+    def opened(self, timeout: float = LONGEST_OPENING) -> Intake:
+        """Wait until the source has been opened, so long at most; returns itself.
+
+        Raises:
+            InputError: it cannot be.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._begun or self._ended, timeout)
+            if self._error is not None and not self._begun:
+                raise self._error
+        return self
+
     def next(self, timeout: float) -> TimedSnapshot | None:
         """Take the oldest snapshot that waits; None = none came within so many seconds.
 
@@ -115,6 +128,10 @@ class Intake:
                 for item in items:
                     if self._closing:
                         return
+                    if not self._begun:
+                        with self._changed:
+                            self._begun = True
+                            self._changed.notify_all()
                     self._take(item)
             for snapshot in self.synchronizer.flush():
                 self._put(snapshot)

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol
 
 from imgcal.errors import InputError
-from imgcal.io import Frame, read_json, write_text
+from imgcal.io import Frame, read_json
 from imgcal.online import Event, RigState
 from imgcal.types import CameraRig, Detections
 from imgcal.watch.event_log import EventLog
@@ -22,7 +21,7 @@ from imgcal.watch.metrics import Tally
 from imgcal.watch.rig_files import RigFiles
 from imgcal.watch.synchronization import TimedSnapshot
 
-STATE, PROGRESS, EVENTS = "state.json", "progress.json", "events.jsonl"
+STATE, EVENTS = "state.json", "events.jsonl"
 SAVED_EVERY = 1.0  # s between two savings of what is known
 LOOKED_EVERY = 0.1  # s that is waited for a snapshot before other things are seen to
 KEPT_EVERY = 3600.0  # s between two rigs of the history, where nothing happens
@@ -45,8 +44,8 @@ class Keeper(Protocol):
     def update(self, source: Mapping[str, Frame | None] | Detections, time: float) -> RigState:
         """Learn from a snapshot."""
 
-    def saved(self) -> Writable:
-        """Take down what is known, within milliseconds."""
+    def saved(self, progress: dict[str, Any]) -> Writable:
+        """Take down what is known, within milliseconds, and beside it how far its source has been worked on."""
 
     def accept_as_factory(self) -> Event:
         """Make the present rig the factory calibration."""
@@ -72,22 +71,20 @@ class Progress:
     time: float  # s, of the last snapshot
     name: str | None = None  # of it, where its source names snapshots
 
-    def save(self, folder: Path) -> None:
-        """Write it in one step."""
-        write_text(folder / PROGRESS, json.dumps({"time": self.time, "name": self.name}) + "\n")
-
     @classmethod
     def load(cls, folder: Path) -> Progress | None:
-        """Read it; None = there is none.
+        """Read it: it stands in the state, so that both are of the same moment; None = there is none.
 
         Raises:
             InputError: the file is none of ours.
         """
-        path = folder / PROGRESS
+        path = folder / STATE
         if not path.is_file():
             return None
         try:
-            entry = read_json(path.read_text())
+            entry = read_json(path.read_text())["progress"]
+            if entry is None:
+                return None
             time, name = float(entry["time"]), entry["name"]
             if not (name is None or isinstance(name, str)):
                 raise ValueError("the name is no text")
@@ -110,6 +107,7 @@ class Watch:
         page: Page | None = None,
         told: Callable[[Event], None] = lambda event: None,
         problem: Callable[[str], None] = lambda message: None,
+        saved: Callable[[Progress], None] = lambda progress: None,
     ) -> None:
         """Open the outputs.
 
@@ -120,6 +118,7 @@ class Watch:
             page: shows what is known.
             told: gets every event.
             problem: gets what could not be written, once.
+            saved: gets how far the source has been worked on, once what it taught until then has been written.
 
         Raises:
             InputError: events.jsonl cannot be written.
@@ -127,6 +126,7 @@ class Watch:
         self.keeper, self.folder, self.tally = keeper, folder, Tally()
         self.paused = False
         self._hook, self._page, self._told, self._problem = hook, page, told, problem
+        self._when_saved = saved
         self._log, self._files = EventLog(folder / EVENTS), RigFiles(folder)
         self._saved = time.monotonic()
         self._progress: Progress | None = None
@@ -221,12 +221,12 @@ class Watch:
             return
         if self._files.problem is not None:
             self._failed("files", self._files.problem)
-        memory, progress = self.keeper.saved(), self._progress
+        progress = self._progress
+        memory = self.keeper.saved(asdict(progress))
 
         def write() -> None:
-            # In this order: a snapshot may be lost between the two, but is never learnt twice.
-            progress.save(self.folder)
             memory.write(self.folder / STATE)
+            self._when_saved(progress)
 
         self._files.write(state, also=write)
         self._unsaved = False

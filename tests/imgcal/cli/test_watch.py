@@ -16,6 +16,7 @@ from imgcal.cli.watch import metrics_address
 from imgcal.errors import InputError
 from imgcal.io import load_object, load_rig, save_detections, save_rig
 from imgcal.types.observations import Detections
+from imgcal.watch import Progress
 from tests.imgcal.streams import Stream
 
 SNAPSHOTS, BUMPED_AT = 60, 30
@@ -85,7 +86,7 @@ def test_lines_on_standard_input_and_garbage_among_them(blobs, tmp_path, monkeyp
     assert (
         "20 snapshots" in said and " | 2 unreadable | the latest that could not be read: " in said and "cam09" in said
     )
-    assert json.loads((tmp_path / "out" / "progress.json").read_text())["time"] == pytest.approx(19 / 60)
+    assert json.loads((tmp_path / "out" / "state.json").read_text())["progress"]["time"] == pytest.approx(19 / 60)
 
 
 def test_a_killed_process_goes_on_and_ctrl_c_ends_it_cleanly(blobs, tmp_path):
@@ -118,9 +119,9 @@ def test_a_killed_process_goes_on_and_ctrl_c_ends_it_cleanly(blobs, tmp_path):
         sent_until(lambda: (out / "state.json").is_file())
         process.kill()
         process.communicate()
-        saved = (out / "progress.json").read_text()
+        saved = Progress.load(out)
         process = started()
-        sent_until(lambda: (out / "progress.json").read_text() != saved)
+        sent_until(lambda: Progress.load(out) != saved)
         process.send_signal(signal.SIGINT)
         said, complaint = process.communicate(timeout=30)
     assert process.returncode == 130
@@ -179,8 +180,8 @@ def test_what_is_known_of_another_rig_is_not_gone_on_with(blobs, tmp_path, capsy
     assert load_object("cube8").num_fiducials == 8
 
 
-@pytest.mark.parametrize("name", ["state.json", "progress.json"])
-def test_what_was_left_and_cannot_be_used_is_told_with_the_way_out(name, tmp_path, monkeypatch, capsys):
+def test_what_was_left_and_cannot_be_used_is_told_with_the_way_out(tmp_path, monkeypatch, capsys):
+    name = "state.json"
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / name).write_text("[]")
     with open(tmp_path / "out" / name) as file:
@@ -188,6 +189,22 @@ def test_what_was_left_and_cannot_be_used_is_told_with_the_way_out(name, tmp_pat
         assert watch("-", tmp_path / "out") == 2
     error = capsys.readouterr().err
     assert name in error and error.endswith("; --fresh begins anew\n") and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [("tcp://127.0.0.1:99999", "expected an address"), ("absent.mcap", "no such file"), ("absent", "no such file")],
+)
+def test_a_source_that_cannot_be_opened_leaves_what_is_there_as_it_was(given, message, blobs, tmp_path, capsys):
+    save_detections(blobs.of_snapshots(0, 5), tmp_path / "blobs.csv")
+    out = tmp_path / "out"
+    assert watch(tmp_path / "blobs.csv", out) == 0
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    assert watch(given, out) == 2
+    assert message in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+    assert watch(given, tmp_path / "fresh") == 2
+    assert not any((tmp_path / "fresh").iterdir())
 
 
 @pytest.mark.parametrize("option", ["--serve", "--metrics"])

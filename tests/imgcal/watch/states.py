@@ -23,11 +23,13 @@ def some_state(events=(), time=1.0):
 
 
 class Saved:
-    def __init__(self, number):
-        self.number = number
+    def __init__(self, number, progress, fails):
+        self.number, self.progress, self.fails = number, progress, fails
 
     def write(self, path):
-        write_text(path, json.dumps(self.number))
+        if self.fails:
+            raise OSError("no space left")
+        write_text(path, json.dumps({"number": self.number, "progress": self.progress}))
 
 
 class KeeperOfStates:
@@ -35,7 +37,7 @@ class KeeperOfStates:
 
     def __init__(self, fails=()):
         self.factory, self.obj = RIG, OBJECT
-        self.sources, self.saves, self.fails = [], [], set(fails)
+        self.sources, self.saves, self.fails, self.disk_full = [], [], set(fails), False
         self.events = {}  # number of the update -> events
         self._state = replace(some_state(), clock_offset=np.zeros(4), clock_offset_sigma=np.ones(4))
 
@@ -46,9 +48,9 @@ class KeeperOfStates:
             raise InputError("frames of two rigs")
         return replace(self._state, time=time, snapshot=number, events=tuple(self.events.get(number, ())))
 
-    def saved(self):
+    def saved(self, progress):
         self.saves.append(len(self.sources))
-        return Saved(len(self.sources))
+        return Saved(len(self.sources), progress, self.disk_full)
 
     def accept_as_factory(self):
         return event(0, "factory", None, "the factory")

@@ -106,11 +106,15 @@ def test_other_files_and_hidden_ones_are_not_looked_at(tmp_path, rig):
     assert [e.snapshot for e in items if e is not None] == ["1"]
 
 
-def test_snapshots_before_a_restart_are_not_read_again_and_read_ones_are_removed(tmp_path, rig):
+def test_snapshots_before_a_restart_are_not_read_again_and_what_is_saved_is_removed(tmp_path, rig):
     for name in ("8", "9", "10", "11"):
         put(tmp_path, "cam01", name)
-    items = Folder(tmp_path, rig, remove=True, after="9", until_idle=0.3).items()
-    assert [e.snapshot for e in items if e is not None] == ["10", "11"]
+    folder = Folder(tmp_path, rig, remove=True, after="9", until_idle=0.3)
+    assert [e.snapshot for e in folder.items() if e is not None] == ["10", "11"]
+    assert len(list(tmp_path.glob("frames/cam01/*"))) == 4  # 11 may still wait to be worked on
+    folder.saved("10")
+    assert sorted(path.name for path in tmp_path.glob("frames/cam01/*")) == ["11.png", "8.png", "9.png"]
+    folder.saved("11")
     assert sorted(path.name for path in tmp_path.glob("frames/cam01/*")) == ["8.png", "9.png"]
 
 

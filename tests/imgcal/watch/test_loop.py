@@ -65,10 +65,10 @@ def test_events_go_to_all_who_want_to_know_and_rigs_are_kept(tmp_path):
     assert [e.kind for e in page.told] == ["restart"]
     assert page.published == [(n, set(RIG.camera_names)) for n in range(3)]
     assert [path.name for path in tmp_path.glob("history/*/*")] == ["221321.000.yaml"]
-    assert (tmp_path / "rig.yaml").is_file() and json.loads((tmp_path / "state.json").read_text()) == 3
+    assert (tmp_path / "rig.yaml").is_file() and json.loads((tmp_path / "state.json").read_text())["number"] == 3
 
 
-def test_the_state_is_saved_once_a_second_after_how_far_the_source_is(tmp_path, monkeypatch):
+def test_the_state_is_saved_once_a_second_with_how_far_the_source_is(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "SAVED_EVERY", 0.05)
     keeper = KeeperOfStates()
 
@@ -84,6 +84,20 @@ def test_the_state_is_saved_once_a_second_after_how_far_the_source_is(tmp_path, 
         loop.run(intake, threading.Event())
     assert 3 <= len(keeper.saves) <= 10 and keeper.saves[-1] == 10
     assert Progress.load(tmp_path) == Progress(0.9)
+
+
+def test_a_start_goes_on_after_the_last_snapshot_that_the_state_knows(tmp_path):
+    keeper, saved = KeeperOfStates(), []
+    with Watch(keeper, tmp_path, saved=saved.append) as loop:
+        for number in range(2):
+            loop.take(snapshot(float(number), str(number)))
+        loop.save()
+    assert Progress.load(tmp_path) == Progress(1.0, "1") == saved[-1]
+    keeper.disk_full = True  # as where the process is killed before the state is written
+    with Watch(keeper, tmp_path, saved=saved.append) as loop:
+        loop.take(snapshot(2.0, "2"))
+    assert Progress.load(tmp_path) == Progress(1.0, "1") == saved[-1]
+    assert json.loads((tmp_path / "state.json").read_text())["number"] == 2
 
 
 def test_nothing_is_written_where_nothing_is_known(tmp_path):
@@ -110,7 +124,7 @@ def test_what_cannot_be_written_is_counted_said_once_and_written_later(tmp_path)
         loop.save()
         assert loop.tally.problems["files"] >= 2 and len(told) == 1 and "state.json" in told[0]
         shutil.rmtree(tmp_path / "state.json")
-    assert json.loads((tmp_path / "state.json").read_text()) == 3
+    assert json.loads((tmp_path / "state.json").read_text())["number"] == 3
 
 
 def test_people_pause_go_on_and_accept_the_rig(tmp_path):
@@ -147,8 +161,11 @@ def test_time_stamps_of_cameras_are_compared_with_their_snapshots(tmp_path):
     assert loop.tally.stamps == pytest.approx({"cam01": 0, "cam02": 0.004, "cam03": 0, "cam04": 0})
 
 
-@pytest.mark.parametrize("text", ["", "{}", "[1]", '{"time": "x", "name": null}', '{"time": 1, "name": 2}', "[" * 5000])
+@pytest.mark.parametrize(
+    "text",
+    ["", "{}", "[1]", '{"progress": {"time": "x", "name": null}}', '{"progress": {"time": 1, "name": 2}}', "[" * 5000],
+)
 def test_progress_that_is_none_of_ours(text, tmp_path):
-    (tmp_path / "progress.json").write_text(text)
-    with pytest.raises(InputError, match=r"progress\.json: found"):
+    (tmp_path / "state.json").write_text(text)
+    with pytest.raises(InputError, match=r"state\.json: found"):
         Progress.load(tmp_path)
