@@ -104,7 +104,7 @@ def pattern_prior(std: Tensor, rig: CameraRig, distance: float) -> PatternPrior:
     """Boil the prior down.
 
     Args:
-        std: (C, 15) prior standard deviation of each camera's parameters.
+        std: (C, K) prior standard deviation of each camera's parameters.
         rig: factory rig.
         distance: mm, from the cameras to the object, roughly.
     """

@@ -67,7 +67,7 @@ def identify(
         detections: blobs of one snapshot; only usable ones count.
         rig: factory rig without batch axes, float64.
         obj: the calibration object.
-        std: (C, 15) prior standard deviation of each camera's parameters: how far the factory values may be off.
+        std: (C, K) prior standard deviation of each camera's parameters: how far the factory values may be off.
         candidates: rig_from_object that may hold, the likeliest first: last snapshot's, or one known from the set-up.
         options: how sure to be.
         guesses: rig_from_object that nobody knows anything of, but that are worth a look: what is found there must

@@ -44,7 +44,7 @@ class Snapshot:
     blobs: Detections  # what the detector found, cameras as in the rig; may be empty
     rig: CameraRig  # the best that is known, float64, without batch axes
     obj: CalibrationObject
-    prior_std: Tensor  # (C, 15) how far the rig's values may be off
+    prior_std: Tensor  # (C, K) how far the rig's values may be off
     candidates: tuple[RigidTransform, ...] = ()  # rig_from_object that may hold, roughly, the likeliest first
     detection: DetectionOptions = DetectionOptions()  # polarity, bit depth
     masks: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)  # camera -> (H, W), where not to look

@@ -41,7 +41,7 @@ class Scene:
     blobs: PaddedBlobs
     obj: CalibrationObject
     rig: CameraRig
-    std: Tensor  # (C, 15)
+    std: Tensor  # (C, K)
 
     @cached_property
     def problem(self) -> Problem:

@@ -79,7 +79,7 @@ class TrainingFolder(Callbacks):
         save_experiment(run.experiment, self.folder / RESOLVED)
         kept = [row for row in read_metrics(self.metrics) if row["step"] <= run.step and not row.get(EXTRA)]
         write_text(self.metrics, "".join(json.dumps(row) + "\n" for row in (kept if run.step else [])))
-        self.board = SummaryWriter(str(self.folder / "tensorboard"), purge_step=run.step + 1 if run.step else None)
+        self.board = SummaryWriter(str(self.folder / "tensorboard"), purge_step=run.step + 1)
         self.console = Console(file=sys.stderr)
         words, times = TextColumn("{task.description}"), (TimeElapsedColumn(), TimeRemainingColumn())
         columns = (words, BarColumn(), TaskProgressColumn(), *times)

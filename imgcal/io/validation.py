@@ -114,6 +114,8 @@ def _summary(error: ValidationError, content: Any, model: type, entry_names: Map
             return f"{place}found {context['actual_length']} values, expected {context['min_length']} or more{more}"
         case "too_long":
             return f"{place}found more than {context['max_length']} values, expected {context['max_length']}{more}"
+        case "model_type" | "dataclass_type":
+            return f"{place}found {found}, expected a group of keys: {', '.join(_keys(model, location))}{more}"
         case "value_error":
             return f"{place}{context['error']}{more}"
     return f"{place}found {found}, expected {first['msg'].removeprefix('Input should be ')}{more}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -50,6 +50,11 @@ class CnnEncoder(nn.Module):
         middle = middle + _twice(self.up_middle(coarse))
         return self.out(functional.gelu(fine + _twice(self.up_fine(middle))))
 
+    def group_matcher(self, coarse: bool = False) -> dict[str, Any]:
+        """Layers by depth, as timm's models tell them: for rates that fall towards the crops."""
+        blocks = [(r"^(?:down_)?middle", (0,)), (r"^(?:down_)?coarse", (1,)), (r"^(?:up_|out)", (99999,))]
+        return {"stem": "^(?:stem|fine)", "blocks": blocks}
+
 
 class VitEncoder(nn.Module):
     """Patches of 6 pixels, blocks of attention over the whole crop, then each token draws its own 3 x 3 cells."""
@@ -85,6 +90,10 @@ class VitEncoder(nn.Module):
         tokens = self.blocks(patches.flatten(2).mT + self.position)
         cells = self.out(self.norm(tokens)).mT.unflatten(-1, patches.shape[-2:])
         return functional.pixel_shuffle(cells, 3)
+
+    def group_matcher(self, coarse: bool = False) -> dict[str, Any]:
+        """Layers by depth, as timm's models tell them: for rates that fall towards the crops."""
+        return {"stem": "^(?:embed|position)", "blocks": [(r"^blocks\.(\d+)", None), (r"^(?:norm|out)", (99999,))]}
 
 
 class Residual(nn.Module):

@@ -68,7 +68,7 @@ def fit_steady(
         obj: the calibration object.
         options: how sure the result must be.
         initializer: network whose first guess the estimate starts from.
-        prior_std: (C, 15) how far values may be off, once cameras are known to be steady; None = as the rig says.
+        prior_std: (C, K) how far values may be off, once cameras are known to be steady; None = as the rig says.
 
     Raises:
         RefusedError: the data cannot decide.
@@ -102,7 +102,7 @@ def fit_labelled(
         options: how sure the result must be.
         initializer: network whose first guess is the start, where it is nearer to the images than the factory rig.
         latest: what the snapshot before gave, from the same factory calibration: a start that saves time.
-        prior_std: (C, 15) how far the factory values may be off; None = as the rig says.
+        prior_std: (C, K) how far the factory values may be off; None = as the rig says.
 
     Raises:
         RefusedError: a camera saw nothing, the estimate has no minimum, or the residuals do not fit.

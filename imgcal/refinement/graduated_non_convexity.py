@@ -45,7 +45,7 @@ class Target:
     seen: Tensor  # (B, C, N) bool
     factory: CameraRig  # without batch axes
     obj: CalibrationObject
-    prior_std: Tensor  # (C, 15) standard deviations of the factory values
+    prior_std: Tensor  # (C, K) standard deviations of the factory values
     sigma: float  # pixels, noise of the points
     factor: Tensor | None = None  # (B, C, N) on the sigma of each fiducial, as a network may say
 
@@ -83,7 +83,7 @@ def refine_robustly(
         views: (B,) uv and seen.
         factory: the factory rig, without batch axes.
         obj: N fiducials.
-        prior_std: (C, 15) standard deviation of each factory value (`Drift.std`).
+        prior_std: (C, K) standard deviation of each factory value (`Drift.std`).
         sigma: noise of the points, pixels.
         options: what counts as an outlier.
 

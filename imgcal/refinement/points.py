@@ -31,7 +31,7 @@ def refine_points(
         views: (B, C, N) points in pixels; `seen` None = all.
         factory: the factory rig, the centre of the prior.
         obj: N fiducials.
-        prior_std: (C, 15) or (B, C, 15) standard deviation of each factory value.
+        prior_std: (C, K) or (B, C, K) standard deviation of each factory value.
         sigma: pixels, a number or broadcastable to (B, C, N): one standard deviation of each axis.
         options: how to minimize.
 

@@ -71,7 +71,7 @@ def refine_images(
         images: (B, C, 3, size, size) in [0, 1] as `render_views` draws them.
         factory: the factory rig, the centre of the prior.
         obj: N fiducials in their colours.
-        prior_std: (C, 15) or (B, C, 15) standard deviation of each factory value.
+        prior_std: (C, K) or (B, C, K) standard deviation of each factory value.
         options: how to compare.
 
     Returns:

@@ -42,7 +42,7 @@ def refine_images_anywhere(
         images: (B, C, 3, size, size) in [0, 1].
         factory: (B,) the centre of the prior.
         obj: N fiducials in their colours, exact.
-        prior_std: (B, C, 15) standard deviation of each factory value.
+        prior_std: (B, C, K) standard deviation of each factory value.
         options: how to compare, as `encoded_image_options` returns it.
 
     Returns:

@@ -2,7 +2,9 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
+from imgcal.networks import InfraredConfig, InfraredNetwork
 from imgcal.networks.infrared_encoders import ENCODERS, STRIDE, EncoderName, VitEncoder
+from imgcal.training.optimization import layer_scales
 
 
 @pytest.mark.parametrize(
@@ -30,3 +32,13 @@ def test_vit_cells_lie_where_their_pixels_are() -> None:
     row, column = divmod(int(change.argmax()), 24)
     assert 15 <= row < 18
     assert 3 <= column < 6
+
+
+@pytest.mark.parametrize(("encoder", "layers"), [("cnn", 3), ("vit", 4), ("vit-stem", 4)])
+def test_layers_near_the_crops_learn_more_slowly(encoder: EncoderName, layers: int) -> None:
+    network = InfraredNetwork(InfraredConfig(encoder=encoder))
+    scales = layer_scales(network, 0.5)
+    assert scales.keys() == set(network.encoder.parameters())
+    assert set(scales.values()) == {0.5**n for n in range(layers)}
+    first = network.encoder.stem.weight if encoder == "cnn" else network.encoder.position
+    assert scales[first] == 0.5 ** (layers - 1) and scales[network.encoder.out.weight] == 1

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from tensorboard.backend.event_processing import event_accumulator
 
 from imgcal.cli.training_folder import BAD_BATCH, RESULT, STATE
 from imgcal.errors import InputError, RefusedError
@@ -113,6 +114,14 @@ def test_a_run_that_is_killed_and_resumed_logs_what_a_whole_one_logs(experiment,
     assert {row["step"] for row in logged(tmp_path / "parts")} == {*range(4, 41, 4), *range(6, 41, 6)}
     found = [load_checkpoint(tmp_path / name / RESULT).metrics for name in ("whole", "parts")]
     assert timeless(found[0]) == timeless(found[1])
+
+
+def test_curves_of_a_run_that_was_killed_before_its_first_state_are_not_drawn_again(experiment, tmp_path):
+    train(experiment("training.steps=40"), tmp_path)
+    (tmp_path / STATE).unlink()
+    train(experiment("training.steps=20"), tmp_path)
+    board = event_accumulator.EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    assert [event.step for event in board.Scalars("loss")] == [10, 20]
 
 
 def test_a_cut_off_log_is_repaired(experiment, tmp_path):

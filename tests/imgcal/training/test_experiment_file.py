@@ -44,6 +44,16 @@ def test_files_are_looked_for_beside_the_experiment(experiment, tmp_path, monkey
     assert load_experiment(tmp_path / "toy2.yaml").load_rig().num_cameras == 7
 
 
+def test_a_group_that_is_none_is_told_its_keys(experiment):
+    for change in ("corruption=null", "corruption=3"):
+        with pytest.raises(
+            InputError, match=r"corruption: found .*, expected a group of keys: noise, missing, swapped"
+        ):
+            experiment(change)
+    with pytest.raises(InputError, match="training: found 1, expected a group of keys: steps, minutes, batch_size"):
+        experiment("training=1")
+
+
 def test_physical_drift(experiment):
     made = experiment("drift={rotation_deg: 0.5, position: 2}")
     assert made.drift == PhysicalDrift(0.5, 2.0, 0.0, 0.0, 0.0)
