@@ -16,21 +16,24 @@ USUAL_MISFIT = 0.1  # RMS of the amplitude: what whole markers differ by in thei
 LEAST_HALF = 4  # px, of a window
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=True)
 def cut(grey, uv, scale, half, patches):
     """Fill windows (K, P, P) about places (K, 2), resampled so that these are in the middle, at the markers' scales."""
     height, width = grey.shape
+    left, right = np.empty(2 * half + 1, np.int64), np.empty(2 * half + 1, np.float32)
     for k in range(len(uv)):
+        for j in range(2 * half + 1):
+            u = min(max(uv[k, 0] + scale[k] * (j - half), 0.0), width - 1.0)
+            left[j] = min(int(u), width - 2)
+            right[j] = u - left[j]
         for i in range(2 * half + 1):
             v = min(max(uv[k, 1] + scale[k] * (i - half), 0.0), height - 1.0)
             top = min(int(v), height - 2)
-            down = v - top
+            down = np.float32(v - top)
             for j in range(2 * half + 1):
-                u = min(max(uv[k, 0] + scale[k] * (j - half), 0.0), width - 1.0)
-                left = min(int(u), width - 2)
-                right = u - left
-                upper = grey[top, left] + right * (grey[top, left + 1] - grey[top, left])
-                lower = grey[top + 1, left] + right * (grey[top + 1, left + 1] - grey[top + 1, left])
+                u = left[j]
+                upper = grey[top, u] + right[j] * (grey[top, u + 1] - grey[top, u])
+                lower = grey[top + 1, u] + right[j] * (grey[top + 1, u + 1] - grey[top + 1, u])
                 patches[k, i, j] = upper + down * (lower - upper)
 
 

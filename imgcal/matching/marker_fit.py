@@ -22,133 +22,174 @@ ROBUST = 3.0  # standard deviations from which a pixel counts less and less
 LEAST_NOISE = 0.3  # grey levels: that of rounding
 FARTHEST = 2.0  # px of one step
 CORE = 0.3  # of the peak: the part of a marker that must look like the shape
-BINS = 256  # of the histogram that gives the median of residuals
+HALVINGS = 12  # of the interval in which the median of residuals lies
 OCTANTS = 8  # around a marker, whose residuals are taken together
 FEW = OCTANTS / (OCTANTS - 4)
 """By how much they scatter less than independent ones would: the fit of four values has made their sums zero."""
 
 
-@njit(inline="always", fastmath=True)
-def _shape(du, dv, size, whitening, profile):
-    """Brightness at a place relative to the middle of a marker, and its slope by u and v; see `photometry.Shape`."""
-    a, b, c = whitening[0, 0], whitening[0, 1], whitening[1, 1]
-    x, y = (a * du + b * dv) / size, (b * du + c * dv) / size
-    radius = np.sqrt(x * x + y * y)
-    place = radius * (1 / RINGS)
-    low = min(int(place), len(profile) - 2)
-    step = profile[low + 1] - profile[low]
-    value = profile[low] + step * min(place - low, 1.0)
-    slope = step / (RINGS * size * max(radius, 1e-9)) if place - low <= 1.0 else 0.0
-    return value, slope * (a * x + b * y), slope * (b * x + c * y)
-
-
-@njit(cache=True, nogil=True, fastmath=True)
-def _median(values, count, histogram):
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _median(values, count):
     """Median of the first `count` absolute values, to a part of the largest."""
-    most = 0.0
+    low, high = np.float32(0), np.float32(0)
     for i in range(count):
-        most = max(most, abs(values[i]))
-    if not most > 0:
-        return 0.0
-    histogram[:] = 0
-    factor = (BINS - 1) / most
-    for i in range(count):
-        histogram[int(abs(values[i]) * factor)] += 1
-    below = 0
-    for place in range(BINS):
-        if 2 * (below + histogram[place]) >= count:
-            return (place + (0.5 * count - below) / max(histogram[place], 1)) / factor
-        below += histogram[place]
-    return most
+        high = max(high, abs(values[i]))
+    for _ in range(HALVINGS):
+        middle, below = np.float32(0.5) * (low + high), np.int32(0)
+        for i in range(count):
+            below += np.int32(abs(values[i]) < middle)
+        if 2 * below < count:
+            low = middle
+        else:
+            high = middle
+    return np.float32(0.5) * (low + high)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
-def _linear(values, shapes, weight, count):
-    """Background and amplitude of a shape."""
-    ss, s1, s11, sv, s1v = 0.0, 0.0, 0.0, 0.0, 0.0
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _linear(values, shapes, residual, doubt, count):
+    """Background and amplitude of a shape, where pixels weigh less by `doubt` times their squared residuals."""
+    one, zero = np.float32(1), np.float32(0)
+    ss, s1, s11, sv, s1v = zero, zero, zero, zero, zero
     for i in range(count):
-        w, t, value = weight[i], shapes[i], values[i]
+        w, t, value = one / (one + doubt * residual[i] * residual[i]), shapes[i], values[i]
         ss += w
         s1 += w * t
         s11 += w * t * t
         sv += w * value
         s1v += w * t * value
     determinant = ss * s11 - s1 * s1
-    if not determinant > 1e-9 * ss * s11:
-        return 0.0, 0.0
+    if not determinant > np.float32(1e-6) * ss * s11:
+        return zero, zero
     return (s11 * sv - s1 * s1v) / determinant, (ss * s1v - s1 * sv) / determinant
 
 
-@njit(cache=True, nogil=True, fastmath=True)
-def _gathered(grey, n, half, scale, members, neighbours, shape, uv, found, pixels):
-    """List the pixels around marker n: value without its neighbours, shape, slopes, and place from its middle.
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _gathered(grey, n, half, uv, pixels):
+    """List the pixels around marker n: their values, and their places from its middle.
 
     Returns:
-        How many there are.
+        First and last column and row, the last ones excluded.
     """
-    whitening, profile = shape
     height, width = grey.shape
+    values, along_u, along_v = pixels[0], pixels[1], pixels[2]
     left, top = int(np.rint(uv[n, 0])) - half, int(np.rint(uv[n, 1])) - half
-    values, brightness, slope_u, slope_v, along_u, along_v = pixels
-    count = 0
-    for i in range(max(top, 0), min(top + 2 * half + 1, height)):
-        dv = i - uv[n, 1]
-        for j in range(max(left, 0), min(left + 2 * half + 1, width)):
-            du = j - uv[n, 0]
-            values[count] = grey[i, j]
-            brightness[count], slope_u[count], slope_v[count] = _shape(du, dv, scale[n], whitening, profile)
-            along_u[count], along_v[count] = du, dv
-            count += 1
-    for near in range(neighbours):
-        m = members[near]
-        du, dv = uv[n, 0] - uv[m, 0], uv[n, 1] - uv[m, 1]
-        for k in range(count):
-            other, _, _ = _shape(along_u[k] + du, along_v[k] + dv, scale[m], whitening, profile)
-            values[k] -= found[m, 0] * other
-    return count
+    right, bottom = min(left + 2 * half + 1, width), min(top + 2 * half + 1, height)
+    left, top = max(left, 0), max(top, 0)
+    for i in range(top, bottom):
+        start, du, dv = (i - top) * (right - left), np.float32(left - uv[n, 0]), np.float32(i - uv[n, 1])
+        for j in range(right - left):
+            values[start + j] = grey[i, left + j]
+            along_u[start + j] = du + np.float32(j)
+            along_v[start + j] = dv
+    return left, right, top, bottom
 
 
-@njit(cache=True, nogil=True, fastmath=True)
-def _summed(pixels, weight, count, ground, amplitude, normal, right, pulls):
-    """Fill the normal equations of (ground, amplitude, u, v) and what each octant contributes to their right side.
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _take_away(box, m, half, size, amplitude, whitening, profile, uv, values):
+    """Take marker m away from the values in a box, as far as it reaches."""
+    left, right, top, bottom = box
+    ring = 1 / (RINGS * size)
+    a, b, c = ring * whitening[0, 0], ring * whitening[0, 1], ring * whitening[1, 1]
+    first, last = max(int(np.floor(uv[m, 0])) - half, left), min(int(np.ceil(uv[m, 0])) + half + 1, right)
+    for i in range(max(int(np.floor(uv[m, 1])) - half, top), min(int(np.ceil(uv[m, 1])) + half + 1, bottom)):
+        for j in range(first, last):
+            k, du, dv = (i - top) * (right - left) + j - left, j - uv[m, 0], i - uv[m, 1]
+            place = np.sqrt((a * du + b * dv) ** 2 + (b * du + c * dv) ** 2)
+            low = int(place)
+            if low < len(profile) - 1:
+                values[k] -= amplitude * (profile[low] + (place - low) * (profile[low + 1] - profile[low]))
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _shaped(size, whitening, profile, pixels, count):
+    """Fill rings and brightness of pixels, and how much the brightness grows from one ring to the next."""
+    along_u, along_v, place, brightness, step = pixels[1], pixels[2], pixels[3], pixels[4], pixels[5]
+    ring = 1 / (RINGS * size)
+    a, b, c = np.float32(ring * whitening[0, 0]), np.float32(ring * whitening[0, 1]), np.float32(ring * whitening[1, 1])
+    for k in range(count):
+        x, y = a * along_u[k] + b * along_v[k], b * along_u[k] + c * along_v[k]
+        place[k] = np.sqrt(x * x + y * y)
+    # The last two values are zero, and so is what follows.
+    beyond = np.float32(len(profile) - 2)
+    for k in range(count):
+        low = int(min(place[k], beyond))
+        grown = profile[low + 1] - profile[low]
+        brightness[k] = profile[low] + grown * (place[k] - np.float32(low))
+        step[k] = grown
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _summed(pixels, count, size, whitening, ground, amplitude, doubt, normal, right):
+    """Fill the normal equations of (ground, amplitude, u, v).
 
     Returns:
         Sum of the weights, weighted squares, and squares and number of pixels in the middle of the marker.
     """
-    values, brightness, slope_u, slope_v, along_u, along_v = pixels
-    normal[:], right[:], pulls[:] = 0.0, 0.0, 0.0
-    total, squares, core, middle = 0.0, 0.0, 0, 0.0
+    values, along_u, along_v, place = pixels[0], pixels[1], pixels[2], pixels[3]
+    brightness, step, residual = pixels[4], pixels[5], pixels[6]
+    ring = 1 / (RINGS * size)
+    p, q, s = np.float32(ring * whitening[0, 0]), np.float32(ring * whitening[0, 1]), np.float32(ring * whitening[1, 1])
+    zero, one = np.float32(0), np.float32(1)
+    w0, wt, wx, wy, wtt, wtx, wty = zero, zero, zero, zero, zero, zero, zero
+    wxx, wxy, wyy, wr, wrt, wrx, wry, squares, middle, core = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
     for k in range(count):
-        w, t = weight[k], brightness[k]
-        r = values[k] - ground - amplitude * t
-        a, b, x, y = t, -amplitude * slope_u[k], along_u[k], along_v[k]
-        c = -amplitude * slope_v[k]
-        octant = (1 if x > 0 else 0) + (2 if y > 0 else 0) + (4 if abs(x) > abs(y) else 0)
-        wr, wa, wb = w * r, w * a, w * b
+        t, r = brightness[k], values[k] - ground - amplitude * brightness[k]
+        w = one / (one + doubt * residual[k] * residual[k])
+        # Slopes along the whitened axes: those by u and v follow from their sums.
+        slope = step[k] / max(place[k], np.float32(1e-6))
+        x, y = slope * (p * along_u[k] + q * along_v[k]), slope * (q * along_u[k] + s * along_v[k])
+        wa, wb, wc, wd = w * t, w * x, w * y, w * r
+        w0 += w
+        wt += wa
+        wx += wb
+        wy += wc
+        wtt += wa * t
+        wtx += wa * x
+        wty += wa * y
+        wxx += wb * x
+        wxy += wb * y
+        wyy += wc * y
+        wr += wd
+        wrt += wd * t
+        wrx += wd * x
+        wry += wd * y
+        squares += wd * r
+        inner = one if t > np.float32(CORE) else zero
+        core += inner
+        middle += inner * r * r
+    # By a move of the marker its brightness changes by minus the slope.
+    a, b, c = -amplitude * p, -amplitude * q, -amplitude * s
+    normal[0, 0], normal[1, 0], normal[1, 1] = w0, wt, wtt
+    normal[2, 0], normal[3, 0] = a * wx + b * wy, b * wx + c * wy
+    normal[2, 1], normal[3, 1] = a * wtx + b * wty, b * wtx + c * wty
+    normal[2, 2] = a * a * wxx + 2 * a * b * wxy + b * b * wyy
+    normal[3, 2] = a * b * wxx + (a * c + b * b) * wxy + b * c * wyy
+    normal[3, 3] = b * b * wxx + 2 * b * c * wxy + c * c * wyy
+    right[0], right[1], right[2], right[3] = wr, wrt, a * wrx + b * wry, b * wrx + c * wry
+    for k in range(4):
+        normal[k, k] += 1e-6 * normal[k, k] + 1e-9
+    return w0, squares, core, middle
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _pulled(pixels, count, size, whitening, ground, amplitude, doubt, pulls):
+    """Fill what each octant contributes to the right side of the normal equations."""
+    values, along_u, along_v, place = pixels[0], pixels[1], pixels[2], pixels[3]
+    brightness, step, residual = pixels[4], pixels[5], pixels[6]
+    ring = 1 / (RINGS * size)
+    p, q, s = np.float32(ring * whitening[0, 0]), np.float32(ring * whitening[0, 1]), np.float32(ring * whitening[1, 1])
+    pulls[:] = 0.0
+    for k in range(count):
+        du, dv, t = along_u[k], along_v[k], brightness[k]
+        octant = (1 if du > 0 else 0) + (2 if dv > 0 else 0) + (4 if abs(du) > abs(dv) else 0)
+        wr = (values[k] - ground - amplitude * t) / (np.float32(1) + doubt * residual[k] * residual[k])
         pulls[octant, 0] += wr
-        pulls[octant, 1] += wr * a
-        pulls[octant, 2] += wr * b
-        pulls[octant, 3] += wr * c
-        total += w
-        squares += wr * r
-        normal[1, 0] += wa
-        normal[2, 0] += wb
-        normal[3, 0] += w * c
-        normal[1, 1] += wa * a
-        normal[2, 1] += wa * b
-        normal[3, 1] += wa * c
-        normal[2, 2] += wb * b
-        normal[3, 2] += wb * c
-        normal[3, 3] += w * c * c
-        if t > CORE:
-            core += 1
-            middle += r * r
-    normal[0, 0] = total
-    for a in range(4):
-        normal[a, a] += 1e-6 * normal[a, a] + 1e-9
-        for octant in range(OCTANTS):
-            right[a] += pulls[octant, a]
-    return total, squares, core, middle
+        pulls[octant, 1] += wr * t
+        if step[k] != 0:
+            x, y = p * du + q * dv, q * du + s * dv
+            slope = -amplitude * wr * step[k] / max(place[k], np.float32(1e-6))
+            pulls[octant, 2] += slope * (p * x + q * y)
+            pulls[octant, 3] += slope * (q * x + s * y)
 
 
 @njit(cache=True, nogil=True)
@@ -164,6 +205,40 @@ def _variance(normal, pulls, variance, axis, row):
             pull += row[a] * pulls[octant, a]
         scatter += pull * pull
     return max(variance * row[axis], FEW * scatter)
+
+
+@njit(cache=True, nogil=True)
+def _improved(size, shape, misfit, last, count, pixels, place, told, work):
+    """Move a marker (2,) to where its pixels fit better; fill what is told of it (5,), see `fit_markers`."""
+    whitening, profile = shape
+    values, brightness, residual = pixels[0], pixels[4], pixels[6]
+    normal, right, row, pulls = work
+    _shaped(size, whitening, profile, pixels, count)
+    nothing = np.float32(0)
+    ground, amplitude = _linear(values, brightness, residual, nothing, count)
+    for k in range(count):
+        residual[k] = values[k] - ground - amplitude * brightness[k]
+    spread = max(1.4826 * _median(residual, count), LEAST_NOISE)
+    allowed = ROBUST * max(spread, misfit * amplitude)
+    doubt = np.float32(1 / (allowed * allowed))
+    ground, amplitude = _linear(values, brightness, residual, doubt, count)
+    amplitude = max(amplitude, nothing)
+    total, squares, core, middle = _summed(pixels, count, size, whitening, ground, amplitude, doubt, normal, right)
+    told[0], told[3], told[4] = amplitude, middle / max(core, 1), spread * spread
+    told[1], told[2] = np.inf, np.inf
+    if not kernels.cholesky(normal):
+        return
+    kernels.cholesky_solve(normal, right)
+    place[0] += min(max(right[2], -FARTHEST), FARTHEST)
+    place[1] += min(max(right[3], -FARTHEST), FARTHEST)
+    if last:
+        variance = max(squares / max(total - 4, 1.0), LEAST_NOISE * LEAST_NOISE)
+        _pulled(pixels, count, size, whitening, ground, amplitude, doubt, pulls)
+        told[2] = 0.5 * (_variance(normal, pulls, variance, 2, row) + _variance(normal, pulls, variance, 3, row))
+        row[:] = 0.0
+        row[1] = 1.0
+        kernels.cholesky_solve(normal, row)
+        told[1] = variance * row[1]
 
 
 @njit(cache=True, nogil=True)
@@ -186,49 +261,21 @@ def fit_markers(grey, inside, half, scale, close, shape, iterations, uv, found):
         found: (N, 5) amplitudes, of neighbours that were fitted before; filled with amplitude, its variance, the
             variance of the place along an axis, the mean squared residual within the marker, and the squared noise.
     """
-    side = 2 * half + 1
-    pixels = np.empty((6, side * side))
-    weight, residual, histogram = np.empty(side * side), np.empty(side * side), np.empty(BINS, np.int64)
-    members = np.empty(len(uv), np.int64)
-    normal, right, row, pulls = np.empty((4, 4)), np.empty(4), np.empty(4), np.empty((OCTANTS, 4))
+    whitening, profile = shape
+    pixels = np.zeros((7, (2 * half + 1) ** 2), np.float32)
+    work = np.empty((4, 4)), np.empty(4), np.empty(4), np.empty((OCTANTS, 4))
+    shape = whitening, np.append(profile, profile[-1:]).astype(np.float32)
     for iteration in range(len(MISFIT) - iterations, len(MISFIT)):
         for n in range(len(uv)):
             if not inside[n]:
                 continue
-            neighbours = 0
-            for m in range(len(uv)):
-                if close[n, m] and found[m, 0] > 0:
-                    members[neighbours] = m
-                    neighbours += 1
-            count = _gathered(grey, n, half, scale, members, neighbours, shape, uv, found, pixels)
+            box = _gathered(grey, n, half, uv, pixels)
+            count = max(box[1] - box[0], 0) * max(box[3] - box[2], 0)
             if count < 8:
                 found[n, 0] = 0.0
                 continue
-            values, brightness = pixels[0], pixels[1]
-            for k in range(count):
-                weight[k] = 1.0
-            ground, amplitude = _linear(values, brightness, weight, count)
-            for k in range(count):
-                residual[k] = values[k] - ground - amplitude * brightness[k]
-            spread = max(1.4826 * _median(residual, count, histogram), LEAST_NOISE)
-            allowed = ROBUST * max(spread, MISFIT[iteration] * amplitude)
-            for k in range(count):
-                weight[k] = 1 / (1 + (residual[k] / allowed) ** 2)
-            ground, amplitude = _linear(values, brightness, weight, count)
-            amplitude = max(amplitude, 0.0)
-            total, squares, core, middle = _summed(pixels, weight, count, ground, amplitude, normal, right, pulls)
-            variance = max(squares / max(total - 4, 1.0), LEAST_NOISE * LEAST_NOISE)
-            found[n, 0], found[n, 3], found[n, 4] = amplitude, middle / max(core, 1), spread * spread
-            found[n, 1], found[n, 2] = np.inf, np.inf
-            if not kernels.cholesky(normal):
-                continue
-            kernels.cholesky_solve(normal, right)
-            uv[n, 0] += min(max(right[2], -FARTHEST), FARTHEST)
-            uv[n, 1] += min(max(right[3], -FARTHEST), FARTHEST)
-            found[n, 2] = 0.5 * (
-                _variance(normal, pulls, variance, 2, row) + _variance(normal, pulls, variance, 3, row)
-            )
-            row[:] = 0.0
-            row[1] = 1.0
-            kernels.cholesky_solve(normal, row)
-            found[n, 1] = variance * row[1]
+            for m in range(len(uv)):
+                if close[n, m] and found[m, 0] > 0:
+                    _take_away(box, m, half, scale[m], found[m, 0], whitening, profile, uv, pixels[0])
+            last = iteration == len(MISFIT) - 1
+            _improved(scale[n], shape, MISFIT[iteration], last, count, pixels, uv[n], found[n], work)

@@ -52,7 +52,7 @@ def _ranked(values, count, rank):
     return values[rank]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _blurred(line, blurred):
     """Blur a row of values with a standard deviation of one; the outer ones continue."""
     weights = np.empty(2 * TAPS + 1)
@@ -60,14 +60,57 @@ def _blurred(line, blurred):
     for k in range(2 * TAPS + 1):
         weights[k] = np.exp(-0.5 * (k - TAPS) ** 2)
         total += weights[k]
-    last = len(line) - 1
-    for i in range(len(line)):
+    size = len(line)
+    wide = np.empty(size + 2 * TAPS)
+    for i in range(size + 2 * TAPS):
+        wide[i] = line[min(max(i - TAPS, 0), size - 1)]
+    for i in range(size):
         blurred[i] = 0.0
-        for k in range(2 * TAPS + 1):
-            blurred[i] += weights[k] / total * line[min(max(i + k - TAPS, 0), last)]
+    for k in range(2 * TAPS + 1):
+        weight = weights[k] / total
+        for i in range(size):
+            blurred[i] += weight * wide[i + k]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _medians(stack, count):
+    """Let the first row of (K, P) be the medians of its columns' first `count` values, which are reordered."""
+    middle = count // 2
+    for rank in range(middle + 1):  # of what has no rank yet, the smallest comes to the front
+        for other in range(rank + 1, count):
+            for j in range(stack.shape[1]):
+                one, two = stack[rank, j], stack[other, j]
+                stack[rank, j], stack[other, j] = min(one, two), max(one, two)
+    before = middle - 1 + count % 2
+    for j in range(stack.shape[1]):
+        stack[0, j] = np.float32(0.5) * (stack[before, j] + stack[middle, j])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _levels(patch, held):
+    """Give the medians of the rim, two pixels wide, and of the middle of a window (P, P)."""
+    side = len(patch)
+    half = side // 2
+    reach = max(1.5, 0.25 * half)
+    rim, inner, near = 0, 0, int(reach)
+    for i in (0, 1, side - 2, side - 1):
+        for j in range(side):
+            held[rim] = patch[i, j]
+            rim += 1
+    for i in range(2, side - 2):
+        for j in (0, 1, side - 2, side - 1):
+            held[rim] = patch[i, j]
+            rim += 1
+    level = median(held, rim)
+    for i in range(-near, near + 1):
+        for j in range(-near, near + 1):
+            if i * i + j * j <= reach * reach:
+                held[inner] = patch[half + i, half + j]
+                inner += 1
+    return level, median(held, inner)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def usual_window(patches, mean):
     """Fill `mean` (P, P) with the median of windows (K, P, P), each less its rim and over its middle, made symmetric.
 
@@ -75,73 +118,65 @@ def usual_window(patches, mean):
         Whether there is any window that is brighter in the middle.
     """
     count, side = len(patches), patches.shape[1]
-    half, held = side // 2, np.empty(side * side)
-    level, peak, bright = np.empty(count), np.empty(count), np.empty(count, np.int64)
-    core = max(1.5, 0.25 * half) ** 2
+    held, stack = np.empty(side * side, np.float32), np.empty((count, side), np.float32)
+    level, factor, bright = np.empty(count, np.float32), np.empty(count, np.float32), np.empty(count, np.int64)
     number = 0
     for n in range(count):
-        rim = 0
-        for i in range(side):
-            for j in range(side):
-                if max(abs(i - half), abs(j - half)) >= half - 1:
-                    held[rim] = patches[n, i, j]
-                    rim += 1
-        level[n] = median(held, rim)
-        inner = 0
-        for i in range(side):
-            for j in range(side):
-                if (i - half) ** 2 + (j - half) ** 2 <= core:
-                    held[inner] = patches[n, i, j]
-                    inner += 1
-        peak[n] = median(held, inner) - level[n]
-        if peak[n] > 0:
-            bright[number] = n
+        low, high = _levels(patches[n], held)
+        if high > low:
+            level[number], factor[number], bright[number] = low, 1 / (high - low), n
             number += 1
     if number == 0:
         return False
     for i in range(side):
+        for k in range(number):
+            for j in range(side):
+                stack[k, j] = (patches[bright[k], i, j] - level[k]) * factor[k]
+        _medians(stack, number)
         for j in range(side):
-            for k in range(number):
-                n = bright[k]
-                held[k] = (patches[n, i, j] - level[n]) / peak[n]
-            mean[i, j] = median(held, number)
-    for i in range(half + 1):  # of a symmetric shape: the middle stays the middle
+            mean[i, j] = stack[0, j]
+    for i in range(side // 2 + 1):  # of a symmetric shape: the middle stays the middle
         for j in range(side):
             both = (mean[i, j] + mean[side - 1 - i, side - 1 - j]) / 2
             mean[i, j], mean[side - 1 - i, side - 1 - j] = both, both
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _moments(mean, covariance):
     """Fill (a, b, c) with the covariance [[a, b], [b, c]] of what is connected to the middle; False = nothing is."""
     side = len(mean)
     half = side // 2
-    smooth, rows = np.empty((side, side)), np.empty((side, side))
+    smooth, columns = np.empty((side, side)), np.empty((side, side))  # column by column
     for i in range(side):
-        _blurred(mean[i], rows[i])
+        _blurred(mean[i], smooth[i])
     for j in range(side):
-        _blurred(rows[:, j], smooth[:, j])
+        for i in range(side):
+            columns[j, i] = smooth[i, j]
+    for j in range(side):
+        _blurred(columns[j], smooth[j])
     top = 0.0
     core = max(1.5, 0.25 * half) ** 2
-    for i in range(side):
-        for j in range(side):
+    for j in range(side):
+        for i in range(side):
             if (i - half) ** 2 + (j - half) ** 2 <= core:
-                top = max(top, smooth[i, j])
+                top = max(top, smooth[j, i])
     if not top > 0:
         return False
     a, b, c = (0.3 * half) ** 2, 0.0, (0.3 * half) ** 2
     for _ in range(MOMENTS):  # in a window that follows them
-        determinant = a * c - b * b
+        limit = 9 * (a * c - b * b)
         total, uu, uv, vv = 0.0, 0.0, 0.0, 0.0
-        for i in range(side):
-            v = i - half
-            for j in range(side):
-                u = j - half
-                if (c * u * u - 2 * b * u * v + a * v * v) < 9 * determinant:
-                    weight = max(smooth[i, j] - FAINT * top, 0.0)
-                    total += weight
-                    uu, uv, vv = uu + weight * u * u, uv + weight * u * v, vv + weight * v * v
+        for j in range(side):
+            u = float(j - half)
+            for i in range(side):
+                v = float(i - half)
+                near = c * u * u - 2 * b * u * v + a * v * v < limit
+                weight = max(smooth[j, i] - FAINT * top, 0.0) if near else 0.0
+                total += weight
+                uu += weight * u * u
+                uv += weight * u * v
+                vv += weight * v * v
         if not total > 0:
             return False
         a, b, c = uu / total + 0.1, uv / total, vv / total + 0.1
@@ -149,7 +184,7 @@ def _moments(mean, covariance):
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def common_shape(patches, whitening, profile):
     """Boil windows (K, P, P) with a marker in the middle of each down to what these have in common.
 
