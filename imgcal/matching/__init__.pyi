@@ -1,4 +1,5 @@
+from .cameras import each_camera
 from .matched_filter import MatchedFilter
 from .photometry import Measured, measure_markers
 
-__all__ = ["MatchedFilter", "Measured", "measure_markers"]
+__all__ = ["MatchedFilter", "Measured", "each_camera", "measure_markers"]

@@ -8,8 +8,6 @@ Where the object's place is known, all this is done within a window of each fram
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.detection import Frame
+from imgcal.matching.cameras import each_camera
 
 SIZES = (0.0, 1.2, 2.4)  # cells, standard deviations of the spots that are looked for; 0 = as reduced
 SURROUND = 2.0  # of the ring around a spot, in parts of the spot's
@@ -110,8 +109,7 @@ def surprise_maps(
         surprise[camera, :height, :width] = np.clip(ranks.max(0), 0, MOST)
         response[camera, :, :height, :width] = values
 
-    with ThreadPoolExecutor(max(1, min(len(frames), os.cpu_count() or 1))) as pool:
-        list(pool.map(fill, range(len(frames))))
+    each_camera(fill, range(len(frames)))
     return Maps(surprise, factor, size, windows[:, ::2] // factor), response
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +12,7 @@ from numpy.typing import NDArray
 from imgcal.detection import Frame
 from imgcal.estimation import Estimate, EstimationOptions, estimate
 from imgcal.geometry import RigidTransform
+from imgcal.matching.cameras import each_camera
 from imgcal.matching.correlation import BLIND, gains
 from imgcal.matching.maps import SIZES, Maps
 from imgcal.matching.photometry import Measured, measure_markers
@@ -200,5 +199,4 @@ def _measured(
         sure = np.ones(len(radius), dtype=bool)
         return measure_markers(frame, predicted[camera], radius, dark, sure)
 
-    with ThreadPoolExecutor(max(1, min(len(frames), os.cpu_count() or 1))) as pool:
-        return list(pool.map(measured, range(len(frames))))
+    return each_camera(measured, range(len(frames)))

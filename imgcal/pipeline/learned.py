@@ -9,9 +9,7 @@ identity and the most probable rig judge them like blobs.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -26,7 +24,7 @@ from imgcal.detection import Frame
 from imgcal.estimation import EstimationOptions, estimate
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import model_file
-from imgcal.matching import measure_markers
+from imgcal.matching import each_camera, measure_markers
 from imgcal.networks import (
     Claims,
     Evidence,
@@ -252,8 +250,7 @@ class _View:
             place[camera] = torch.from_numpy(np.nan_to_num(found.uv))
             sigma[camera], good[camera] = torch.from_numpy(found.sigma), torch.from_numpy(found.seen)
 
-        with ThreadPoolExecutor(max(1, os.cpu_count() or 1)) as pool:
-            list(pool.map(fit, seen.any(1).nonzero()[:, 0].tolist()))
+        each_camera(fit, seen.any(1).nonzero()[:, 0].tolist())
         return place, sigma, good
 
     @property
