@@ -28,6 +28,7 @@ from imgcal.cli.common import (
 from imgcal.cli.counts import doubtful_cameras
 from imgcal.cli.describe import describe, describe_refusal
 from imgcal.cli.findings import findings
+from imgcal.cli.memory import keep_memory
 from imgcal.cli.outcome import print_outcome, refused_summary, summary
 from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError, RefusedError
@@ -249,6 +250,7 @@ class Calibrate:
             return self.detector
         if isinstance(source, Detections):
             raise InputError(f"--detector {self.detector}: found blobs in {self.input}, expected a capture with frames")
+        keep_memory()
         first = parse_range(self.snapshots)[0]
         return sight_of_capture(source, self.detector, self.detection, first, measurer)
 

@@ -135,15 +135,21 @@ class SetBlock(nn.Module):
             asked: (P, N) bool, fiducials that count.
         """
         count = asked.shape[1]
+        windows = windows.contiguous()
         seen = self.spatial(windows.flatten(0, 1)).unflatten(0, (-1, count))
         seen = functional.gelu(seen + self.geometry(geometry)[..., None, None])
         weight = asked.to(seen.dtype) / asked.sum(1, keepdim=True).clamp(min=1)
-        mean = torch.einsum("pn,pndij->pdij", weight, seen)[:, None].expand_as(seen)
+        rows = seen.flatten(2)
+        mean = (weight[:, None] @ rows).view(len(rows), *seen.shape[2:])
         # Turned or stretched constellations: what fiducials see in proportion to where they lie, and back.
         keys, queries = self.key(geometry) * weight[..., None], self.query(geometry)
-        related = torch.einsum("pmn,pndij->pmdij", queries @ keys.mT, seen)
-        mixed = self.mix(torch.cat((seen, mean, related), dim=2).flatten(0, 1))
-        return windows + self.out(functional.gelu(mixed)).unflatten(0, (-1, count))
+        related = ((queries @ keys.mT) @ rows).view_as(seen)
+        # A convolution is a sum: what all fiducials share goes through it once.
+        own, shared, others = self.mix.weight.chunk(3, dim=1)
+        mixed = functional.conv2d(seen.flatten(0, 1), own) + functional.conv2d(related.flatten(0, 1), others)
+        common = functional.conv2d(mean, shared, self.mix.bias)
+        mixed = mixed.unflatten(0, (-1, count)) + common[:, None]
+        return windows + self.out(functional.gelu(mixed).flatten(0, 1)).unflatten(0, (-1, count))
 
 
 def aligned_windows(features: Tensor, place: Tensor, window: int) -> tuple[Tensor, Tensor]:

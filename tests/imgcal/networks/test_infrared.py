@@ -1,8 +1,9 @@
 import pytest
 import torch
+from torch.nn import functional
 
 from imgcal.networks import InfraredConfig, InfraredNetwork, Queries, normalized
-from imgcal.networks.infrared import aligned_windows
+from imgcal.networks.infrared import SetBlock, aligned_windows
 
 SMALL = {"crop": 48, "channels": 4, "window": 6, "blocks": 2}
 
@@ -37,6 +38,22 @@ def test_what_is_not_asked_for_says_nothing_to_the_others() -> None:
     two = network(crops, Queries(all_of_them.place, all_of_them.radius, all_of_them.depth, asked))
     alone = network(crops, picked(all_of_them, [0, 1]))
     torch.testing.assert_close(two.logits[:, :2], alone.logits)
+
+
+def test_a_set_block_is_the_plain_one() -> None:
+    torch.manual_seed(0)
+    block, windows, geometry = SetBlock(4, 3), torch.randn(2, 5, 4, 7, 7), torch.randn(2, 5, 6)
+    asked = torch.tensor([[True] * 5, [True, False, True, True, False]])
+    expected = []
+    for one, how, counts in zip(windows, geometry, asked, strict=True):
+        seen = functional.gelu(block.spatial(one) + block.geometry(how)[..., None, None])
+        share = counts / counts.sum()
+        mean = (share[:, None, None, None] * seen).sum(0)
+        relation = block.query(how) @ (block.key(how) * share[:, None]).T
+        related = torch.einsum("mn,ndij->mdij", relation, seen)
+        mixed = block.mix(torch.cat((seen, mean.expand_as(seen), related), dim=1))
+        expected.append(one + block.out(functional.gelu(mixed)))
+    assert torch.allclose(block(windows, geometry, asked), torch.stack(expected), atol=1e-5)
 
 
 def test_windows_are_centred_and_bilinear() -> None:
