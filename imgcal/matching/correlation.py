@@ -73,7 +73,7 @@ def correlate(
     return Scores(np.log(BLIND + (1 - BLIND) * np.exp(score)), shift * maps.factor)
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def _correlate(cells, front, gain, size, steps, window, score, shift):
     for k in range(len(cells)):
         for c in range(cells.shape[1]):

@@ -130,10 +130,14 @@ def rank(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def _ranked(values: NDArray[Any], size: NDArray[np.int64]) -> NDArray[np.float32]:
     ranked = np.zeros(values.shape, np.float32)
-    for camera, (width, height) in enumerate(size.tolist()):
+
+    def fill(camera: int) -> None:
+        width, height = size[camera].tolist()
         if width:
             part = rank(values[camera, :height, :width])
             ranked[camera, :height, :width] = np.clip(part, 0, MOST)
+
+    each_camera(fill, range(len(values)))
     return ranked
 
 

@@ -30,14 +30,14 @@ FEW = OCTANTS / (OCTANTS - 4)
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _median(values, count):
-    """Median of the first `count` absolute values, to a part of the largest."""
+    """Median of the first `count` values, none of which is negative, to a part of the largest."""
     low, high = np.float32(0), np.float32(0)
     for i in range(count):
-        high = max(high, abs(values[i]))
+        high = max(high, values[i])
     for _ in range(HALVINGS):
         middle, below = np.float32(0.5) * (low + high), np.int32(0)
         for i in range(count):
-            below += np.int32(abs(values[i]) < middle)
+            below += np.int32(values[i] < middle)
         if 2 * below < count:
             low = middle
         else:
@@ -217,7 +217,7 @@ def _improved(size, shape, misfit, last, count, pixels, place, told, work):
     nothing = np.float32(0)
     ground, amplitude = _linear(values, brightness, residual, nothing, count)
     for k in range(count):
-        residual[k] = values[k] - ground - amplitude * brightness[k]
+        residual[k] = abs(values[k] - ground - amplitude * brightness[k])
     spread = max(1.4826 * _median(residual, count), LEAST_NOISE)
     allowed = ROBUST * max(spread, misfit * amplitude)
     doubt = np.float32(1 / (allowed * allowed))

@@ -182,4 +182,7 @@ def normalized(crops: Tensor) -> Tensor:
     change = (crops[:, :, 2:] - crops[:, :, :-2]).abs().flatten(1).nanmedian(1).values[:, None, None].nan_to_num()
     largest = (crops - level).abs().nan_to_num().amax((1, 2), keepdim=True)
     noise = (change * 1.05).maximum(largest / 1000).clamp(min=1e-6)  # a median of |a - b| is 0.954 sigma
-    return torch.asinh((crops - level) / (2 * noise)).nan_to_num() / 2
+    relative = ((crops - level) / (2 * noise)).nan_to_num()
+    # The inverse hyperbolic sine, of which torch's takes ten times as long on a CPU.
+    size = relative.abs()
+    return (size + (size.square() + 1).sqrt()).log().copysign(relative) / 2

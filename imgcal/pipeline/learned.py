@@ -148,7 +148,9 @@ def load_proposer(
         InputError: no such file, or something else in it.
     """
     reader = None if measurer is None else load_measurer(model_file(measurer)).network
-    return LearnedProposer(load_infrared(model_file(network)).network, reader, finder)
+    read = load_infrared(model_file(network)).network
+    read.encoder.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # faster by a quarter on a CPU
+    return LearnedProposer(read, reader, finder)
 
 
 @dataclass(frozen=True)
@@ -169,7 +171,8 @@ class _View:
         placement = Expectation.of(rig, snapshot.obj, poses).placement(rig, size)
         frames = {name: _masked(frame, snapshot.masks.get(name)) for name, frame in snapshot.frames.items()}
         crops = cut_crops(frames, rig.camera_names, placement, inverted=snapshot.detection.polarity == "dark")
-        return cls(network, measurer, snapshot, frames, placement, network.encoder(normalized(crops)[:, None]))
+        features = network.encoder(normalized(crops)[:, None]).contiguous()
+        return cls(network, measurer, snapshot, frames, placement, features)
 
     def look(self, rig: CameraRig, poses: RigidTransform, window: int | None = None) -> Sighting:
         """Ask for all fiducials at poses (H,)."""
