@@ -2,7 +2,8 @@
 
 Run as `python -m scripts.benchmarks.detector_speed [--threads 1 2]`: full frames (O10, asymmetric8) with a pose that is
 a degree off, as `imgcal calibrate` has them: blobs, the detector, identity. CPU time is that of all threads together,
-which other processes disturb least; by the clock two threads are worth something on idle cores only.
+which other processes disturb least. Two threads are worth something on idle cores only: elsewhere torch's wait for each
+other, and that takes CPU time, too.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ Clocks = dict[str, tuple[float, float]]  # ms of CPU and by the clock, by stage
 class Options:
     """Time the detectors."""
 
-    threads: tuple[int, ...] = (1, 2)  #: cores that may be used: measured one after the other
+    threads: tuple[int, ...] = (1,)  #: cores that may be used: measured one after the other; idle ones, if several
     levels: tuple[str, ...] = ("clean", "combined")  #: of difficulty
     snapshots: int = 2  #: of each level
     rounds: int = 5
