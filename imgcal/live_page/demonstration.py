@@ -25,6 +25,8 @@ ACTIONS = (
 AGED = PhysicalDrift(rotation_deg=0.01, position=0.1, focal_length=2e-4, principal_point=0.3, distortion=2e-4)
 """How a rig differs from its factory calibration on a good day."""
 BUMP_DEG = 0.3
+SETTLED = 20
+"""Snapshots that are learnt before a camera is bumped: with fewer before, nobody can say how it moved, only that."""
 PICTURE_WIDTH = 320  # pixels
 PICTURE_SECONDS = 0.5
 
@@ -68,6 +70,7 @@ class Demonstration:
         self.page = LivePage(rig, obj, address, token=token, actions=ACTIONS, title="imgcal demo")
         self.keeper = RigKeeper(rig, obj)
         self.paused = False
+        self._learnt, self._bumps = 0, list[str]()  # snapshots, and cameras that are to be bumped
         self._drawn = -1.0
 
     def __enter__(self) -> Demonstration:
@@ -91,10 +94,15 @@ class Demonstration:
         """Do what people have asked for, and take a snapshot; None while paused."""
         for command in self.page.commands():
             self._obey(command)
+        if self._learnt >= SETTLED:
+            for name in self._bumps:
+                self.simulated.bump(self.simulated.rig.camera_names.index(name), BUMP_DEG)
+            self._bumps.clear()
         blobs = self.simulated.snapshot(seconds)
         if self.paused:
             return None
         state = self.keeper.update(blobs, time.time())
+        self._learnt += state.refused is None
         due = seconds - self._drawn >= PICTURE_SECONDS or self._drawn < 0
         self._drawn = seconds if due else self._drawn
         self.page.publish(state, self.simulated.frames(PICTURE_WIDTH) if due else None)
@@ -104,7 +112,7 @@ class Demonstration:
         names = list(self.simulated.rig.camera_names)
         match command.name, command.camera:
             case "bump", str(name):
-                self.simulated.bump(names.index(name), BUMP_DEG)
+                self._bumps.append(name)
             case "cover", str(name):
                 self.simulated.covered.add(names.index(name))
             case "uncover", _:

@@ -328,6 +328,8 @@ def killed_day(world: World, folder: Path, minutes: float, seconds: float) -> di
         "error_px_p99": float(np.quantile(off, 0.99)), "wrong_while_ok": len(wrong), "wrong": wrong[:20],
         "worst_px": worst, "longest_without_learning": longest,
         "bumps": len(world.bumps), "bumps_told": named, "moved_events_of_nothing": len(false),
+        "image_events_of_nothing": sum(event["event"] in ("dirty", "defocused") for event in told),
+        "clock_slips_of_nothing": sum(event["event"] == "clock_slip" for event in told),
         "restart_events": sum(event["event"] == "restart" for event in told),
     }  # fmt: skip
 
@@ -369,6 +371,8 @@ def table(result: dict[str, Any]) -> str:
          f"{day['late']:,}, {day['duplicate']:,}, {day['astray']:,}, {day['unreadable']:,}"),
         ("bumps of 0.3 degrees, told with the right camera", f"{day['bumps']}, {day['bumps_told']}"),
         ("moves told of cameras that stood still", f"{day['moved_events_of_nothing']}"),
+        ("dirty or defocused cameras told, and slipped clocks, of which there are none",
+         f"{day['image_events_of_nothing']}, {day['clock_slips_of_nothing']}"),
         ("cameras said to be ok, and more than 0.5 px wrong",
          f"{day['wrong_while_ok']} of {day['cameras_checked_while_ok']:,}"),
         ("error of cameras said to be ok, median, 99 %",

@@ -2,7 +2,7 @@ import time
 
 from imgcal.io import load_rig
 from imgcal.live_page.address import Address
-from imgcal.live_page.demonstration import Demonstration
+from imgcal.live_page.demonstration import SETTLED, Demonstration
 from tests.imgcal.live_page.pages import Client
 
 
@@ -20,7 +20,11 @@ def test_buttons_do_what_they_say(asymmetric8):
         state = shown.step(next(seconds) / 15)
         assert state.refused is None and set(state.cameras.values()) == {"ok"}
         before = shown.simulated.rig
-        pressed("bump", camera=2)
+        told = list(pressed("bump", camera=2).events)  # with the second snapshot
+        for _ in range(SETTLED + 4):
+            told += shown.step(next(seconds) / 15).events
+        assert [(event.kind, event.camera) for event in told[:2]] == [("moved", "cam03")] * 2
+        assert told[1].change == "rotation"
         moved = shown.simulated.rig.local(before).abs().amax(1)
         assert moved[2] > 1e-3 and moved[[0, 1, 3]].max() < 1e-9
         pressed("cover", camera=1)
