@@ -103,10 +103,9 @@ class Watch:
         with _going_on():
             progress = None if self.fresh else Progress.load(folder)
         source = self._source(rig, obj, progress)
-        intake = Intake(
-            source, rig, Timing(self.tolerance, self.patience), self.keep_all,
-            after=None if progress is None else progress.time,
-        )  # fmt: skip
+        goes_on = source.live or isinstance(source, Folder)  # a folder knows which files have been read
+        after = None if progress is None or goes_on else progress.time
+        intake = Intake(source, rig, Timing(self.tolerance, self.patience), self.keep_all, after=after)
         hook = None if self.hook is None else Hook(self.hook)
         display = Display(Console(file=sys.stdout, soft_wrap=True), intake)
         with contextlib.ExitStack() as stack:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
 from collections import OrderedDict, deque
 from collections.abc import Iterator
@@ -33,8 +34,13 @@ class Folder:
     remove: bool = False  # frames are deleted, once what they have taught is `saved`
     after: str | None = None  # snapshots up to this one have been seen before
     until_idle: float | None = None  # s without a new file after which it is complete; None = never
-    live: bool = True
+    _caught_up: threading.Event = field(default_factory=threading.Event, repr=False)
     _read_files: deque[Path] = field(default_factory=deque, repr=False)  # that are to be deleted
+
+    @property
+    def live(self) -> bool:
+        """Whether all has been read that was there at the beginning: that is a recording, which waits."""
+        return self._caught_up.is_set()
 
     def saved(self, name: str) -> None:
         """Delete frames that have been read of the snapshots up to one: they will not be needed again."""
@@ -50,15 +56,18 @@ class Folder:
         frames = self.folder / "frames"
         yield from self._checked(frames)
         cameras = {name: _Camera(frames / name, self.after) for name in self.rig.camera_names}
-        heard = time.monotonic()
+        heard, looks = time.monotonic(), 0
         while self.until_idle is None or time.monotonic() - heard < self.until_idle:
             now = time.monotonic()
             ready = [(path, name) for name, camera in cameras.items() for path in camera.ready(now)]
             for path, name in sorted(ready, key=lambda pair: (natural_key(pair[0].stem), pair[1])):
                 item = self._read(cameras[name], name, path, now)
                 if item is not None:
-                    heard = time.monotonic()
                     yield item
+                    heard = time.monotonic()
+            looks += 1
+            if ready or looks > 1:  # no file is steady at the first look
+                self._caught_up.set()
             yield None
             time.sleep(TICK)
 

@@ -48,7 +48,6 @@ class Intake:
             waiting: most snapshots that wait.
             after: s, time of the last snapshot of a recording that an earlier run has worked on; None = none.
         """
-        self.live = source.live and not keep_all
         self.synchronizer = Synchronizer(rig.camera_names, timing)
         self.dropped = 0
         """Snapshots that were complete and not worked on in time."""
@@ -58,8 +57,8 @@ class Intake:
         """Why the latest ones could not be read."""
         self.known_before = 0
         """Snapshots of a recording that an earlier run has worked on."""
-        self._source, self._rig, self._most = source, rig, waiting
-        self._after = None if source.live else after
+        self._source, self._rig, self._most, self._keep_all = source, rig, waiting, keep_all
+        self._after = after
         self._snapshots: deque[TimedSnapshot] = deque()
         self._bytes = 0
         self._changed = threading.Condition()
@@ -80,6 +79,11 @@ class Intake:
             self._closing = True
             self._changed.notify_all()
         self._thread.join(timeout=2.0)
+
+    @property
+    def live(self) -> bool:
+        """Whether what is not worked on in time is dropped."""
+        return self._source.live and not self._keep_all
 
     @property
     def waiting(self) -> int:

@@ -12,6 +12,7 @@ from imgcal.io.frames import write_frame
 from imgcal.watch import folder as module
 from imgcal.watch.exposures import Exposure, Unreadable
 from imgcal.watch.folder import Folder
+from imgcal.watch.intake import Intake
 
 RIG = load_rig("T4")
 HEIGHT, WIDTH = 1088, 2048
@@ -56,6 +57,37 @@ def test_what_is_there_and_what_comes_in_the_order_of_names(tmp_path, rig):
     (exposure,) = until(items, 1)
     assert (exposure.camera, exposure.snapshot) == ("cam03", "11")
     assert exposure.time == pytest.approx(time.time(), abs=5)
+
+
+def test_what_was_there_before_is_a_recording_of_which_nothing_is_dropped(tmp_path, rig):
+    names = [str(k) for k in range(30)]
+    for name in names:
+        for camera in rig.camera_names:
+            put(tmp_path, camera, name)
+    found = []
+    with Intake(Folder(tmp_path, rig, until_idle=1.0), rig) as intake:
+        time.sleep(0.5)  # nobody takes anything
+        while not intake.ended:
+            snapshot = intake.next(0.2)
+            found += [] if snapshot is None else [snapshot]
+    assert [s.name for s in found] == names and intake.dropped == 0
+    assert all(len(s.exposures) == rig.num_cameras for s in found)
+
+
+def test_what_comes_later_is_live(tmp_path, rig):
+    put(tmp_path, "cam01", "1")
+    source = Folder(tmp_path, rig)
+    items = source.items()
+    until(items, 1)
+    assert not source.live
+    next(items)
+    assert source.live
+    empty = Folder(tmp_path / "later", rig)
+    (tmp_path / "later" / "frames").mkdir(parents=True)
+    looks = empty.items()
+    for _ in range(2):
+        assert next(looks) is None
+    assert empty.live
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".bmp", ".pgm", ".jpg"])
