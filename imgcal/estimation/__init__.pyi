@@ -56,7 +56,7 @@ from .rig_error import displaced, error_between, step_by_error
 from .rig_filter import Absorbed, RigBelief, RigFilter, absorbed, aged, widened
 from .rig_initialization import K3, ColdStart, cold_start, ordinary_lens
 from .rig_monitor import Change, RigMonitor
-from .rig_uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian, uncertainty_over
+from .rig_uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian, rigid_motion, uncertainty_over
 from .robust_losses import squared
 from .steady_cameras import Gauge
 from .variance_components import BENT, ObjectQuestion, Start, estimate_variance_components
@@ -150,6 +150,7 @@ __all__ = [
     "require_poses",
     "retract",
     "rig_at",
+    "rigid_motion",
     "spread_of",
     "squared",
     "step_by_error",

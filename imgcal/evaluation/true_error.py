@@ -1,12 +1,14 @@
-"""The true errors of a rig whose true counterpart is known, as `predicted_error` defines them, not linearized."""
+"""The errors of a rig whose true counterpart is known, not linearized: in px and mm, and in units of its covariance."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from imgcal.estimation import RigUncertainty, inverse_or_zero, pixel_jacobian
-from imgcal.geometry import RigidTransform, rotation_from_vector
+from imgcal.estimation import RigUncertainty, inverse_or_zero, pixel_jacobian, rigid_motion
+from imgcal.geometry import RigidTransform, rotation_from_vector, vector_from_rotation
 from imgcal.types import CameraRig
 
 STEPS = 6
@@ -38,6 +40,29 @@ def true_error(uncertainty: RigUncertainty, truth: CameraRig, points: Tensor) ->
         torch.where(projection.visible, pixels.norm(dim=-1), torch.nan),
         torch.where(twice, distance, torch.nan),
     )
+
+
+def normalized_error(uncertainty: RigUncertainty, truth: CameraRig) -> float:
+    """Squared error of a rig per degree of freedom, in units of its covariance: 1 on average for an honest one.
+
+    The motion of the whole rig, which no image shows and the prior alone limits, is no straight line in the parameters:
+    a turn by w takes a camera at distance d off its tangent by d w^2 / 2, more than the cameras' places relative to
+    each other are uncertain by. It is therefore told apart as the rigid motion that it is, and counts as its own
+    coordinates; what is left is the difference of the parameters as usual.
+
+    Args:
+        uncertainty: the estimated rig, its covariance, and the points by which rigs are laid upon one another.
+        truth: the true rig, in the frame of the estimated one.
+
+    Source: errors on the group of motions are what makes a filter's covariance consistent, Barrau and Bonnabel, "The
+    invariant extended Kalman filter as a stable observer" (IEEE TAC 2017).
+    """
+    rig, centre = uncertainty.rig, uncertainty.points.mean(0)
+    true_from_rig = _aligned(uncertainty, truth)
+    laid_upon = replace(truth, cam_from_rig=truth.cam_from_rig @ true_from_rig[None])
+    turn, shift = vector_from_rotation(true_from_rig.rotation), true_from_rig.apply(centre[None])[0] - centre
+    error = rig.local(laid_upon).flatten() - rigid_motion(rig, centre) @ torch.cat((turn, shift))
+    return float(error @ torch.linalg.solve(uncertainty.covariance, error)) / len(error)
 
 
 def _aligned(uncertainty: RigUncertainty, truth: CameraRig) -> RigidTransform:

@@ -20,7 +20,8 @@ import torch
 import tyro
 
 import imgcal
-from imgcal.estimation import Estimate, EstimationOptions, RigFilter, camera_covariance, estimate, fit_pose
+from imgcal.estimation import EstimationOptions, RigFilter, camera_covariance, estimate, fit_pose, uncertainty_over
+from imgcal.evaluation.true_error import normalized_error
 from imgcal.geometry import RigidTransform
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import CameraRig, Detections, DriftRate, Observations, RigPrior
@@ -48,12 +49,7 @@ class Options:
     runs: int = 200
     snapshots: int = 60  #: of each run
     updates: int = 400  #: that are timed
-    only: tuple[str, ...] = (
-        "against batch",
-        "normalized errors",
-        "errors by class",
-        "times",
-    )  #: the rest stays as it was
+    only: tuple[str, ...] = ("against batch", "normalized errors", "times")  #: the rest stays as it was
     out: Path | None = None  #: a result file; docs/benchmarks/rig_over_time.json rewrites its tables in the page
 
 
@@ -119,21 +115,20 @@ def held_out(rig: CameraRig, truth: CameraRig, obj: imgcal.CalibrationObject, po
     return float(np.sqrt(np.mean(squared)))
 
 
-def normalized_errors(options: Options, rate: DriftRate, share: float = 1.0) -> dict[str, list[float]]:
+def normalized_errors(options: Options, rate: DriftRate) -> dict[str, list[float]]:
     """Squared error per degree of freedom at the end of each run, of the filter and, of a steady rig, of the batch.
 
-    Rigs are drawn from a `share` of the default prior, which is told.
+    "Value by value" takes the motion of the whole rig, which no image shows, as so much of each value, too.
     """
     factory, obj = imgcal.load_rig("T4").to(torch.float64), imgcal.load_object("asymmetric8")
-    prior = RigPrior(**{name: share * value for name, value in vars(RigPrior()).items()})
-    factory = replace(factory, prior=prior)
-    found: dict[str, list[float]] = {name: [] for name in (("filter", "batch") if rate == STEADY else ("filter",))}
+    factory = replace(factory, prior=RigPrior())
+    found: dict[str, list[float]] = {}
     for run in range(options.runs):
         generator = torch.Generator().manual_seed(1000 + run)
         truth = simulate_truth(factory, obj, options.snapshots, generator, PhysicalDrift())
         poses = carried(options.snapshots, generator, truth.rig_from_object)
         normal = torch.randn(factory.num_cameras, 15, generator=generator, dtype=torch.float64)
-        rig = factory.retract(prior.std(factory) * normal)
+        rig = factory.retract(RigPrior().std(factory) * normal)
         follows, seen = RigFilter(factory, obj, rate, SQUARED), []
         for s in range(options.snapshots):
             if s:
@@ -141,64 +136,18 @@ def normalized_errors(options: Options, rate: DriftRate, share: float = 1.0) -> 
                 rig = rig.retract(walk * torch.randn(walk.shape, generator=generator, dtype=torch.float64))
             seen.append(seen_by(rig, obj, poses[s : s + 1], generator))
             follows.update(seen[-1], poses[s : s + 1], BETWEEN)
-        found["filter"].append(normalized(follows.belief.rig, rig, follows.belief.covariance()))
-        if "batch" in found:
+        believed = {"filter": (follows.belief.rig, follows.belief.covariance())}
+        if rate == STEADY:
             parts = (torch.cat([getattr(one, name) for one in seen]) for name in ("uv", "sigma", "seen"))
             fit = estimate(Observations(*parts), factory, obj, poses, options=SQUARED)
-            found["batch"].append(normalized(fit.rig, rig, camera_covariance(fit, curved=False)))
+            believed["batch"] = (fit.rig, camera_covariance(fit, curved=False))
+        points = poses.apply(obj.points).flatten(0, 1)
+        for name, (estimated, covariance) in believed.items():
+            error = estimated.local(rig).flatten()
+            by_value = float(error @ torch.linalg.solve(covariance, error)) / len(error)
+            found.setdefault(name, []).append(normalized_error(uncertainty_over(estimated, covariance, points), rig))
+            found.setdefault(f"{name}, value by value", []).append(by_value)
     return found
-
-
-def normalized(rig: CameraRig, truth: CameraRig, covariance: torch.Tensor) -> float:
-    """Squared error per degree of freedom."""
-    error = rig.local(truth).flatten()
-    return float(error @ torch.linalg.solve(covariance, error)) / len(error)
-
-
-CLASSES = {
-    "rotation": (0, 3), "position": (3, 6), "focal length": (6, 8), "principal point": (8, 10), "k1": (10, 11),
-    "k2": (11, 12), "p1": (12, 13), "p2": (13, 14), "k3": (14, 15), "all": (0, 15),
-}  # fmt: skip
-SIXTHS = 6
-
-
-def errors_by_class(options: Options) -> dict[str, dict[str, list[float]]]:
-    """Squared errors per degree of freedom of the batch estimates of the steady runs.
-
-    Of each class of values by itself, of all, and of the sixths of the directions (whitened by the prior) from the best
-    known to the least; flat, and with the covariance's second order.
-    """
-    found: dict[str, dict[str, list[float]]] = {"flat": {}, "second order": {}}
-    for run in range(options.runs):
-        fit, truth = batch_of(options, run)
-        error, cameras = fit.rig.local(truth).flatten(), truth.num_cameras
-        unit = fit.problem.prior_std.flatten()
-        for name, covariance in (
-            ("flat", camera_covariance(fit, curved=False)),
-            ("second order", camera_covariance(fit)),
-        ):
-            for kind, (first, last) in CLASSES.items():
-                rows = (15 * torch.arange(cameras)[:, None] + torch.arange(first, last)).flatten()
-                own = float(error[rows] @ torch.linalg.solve(covariance[rows[:, None], rows], error[rows])) / len(rows)
-                found[name].setdefault(kind, []).append(own)
-            values, vectors = torch.linalg.eigh(covariance / unit / unit[:, None])
-            squared = ((error / unit) @ vectors).square() / values
-            for sixth, part in enumerate(squared.view(SIXTHS, -1).mean(1).tolist()):
-                found[name].setdefault(f"sixth {sixth + 1}", []).append(part)
-    return found
-
-
-def batch_of(options: Options, run: int) -> tuple[Estimate, CameraRig]:
-    """The batch estimate of a steady run of `normalized_errors`, and the truth."""
-    factory, obj = imgcal.load_rig("T4").to(torch.float64), imgcal.load_object("asymmetric8")
-    factory, generator = replace(factory, prior=RigPrior()), torch.Generator().manual_seed(1000 + run)
-    truth = simulate_truth(factory, obj, options.snapshots, generator, PhysicalDrift())
-    poses = carried(options.snapshots, generator, truth.rig_from_object)
-    normal = torch.randn(factory.num_cameras, 15, generator=generator, dtype=torch.float64)
-    rig = factory.retract(RigPrior().std(factory) * normal)
-    seen = [seen_by(rig, obj, poses[s : s + 1], generator) for s in range(options.snapshots)]
-    together = Observations(*(torch.cat([getattr(one, name) for one in seen]) for name in ("uv", "sigma", "seen")))
-    return estimate(together, factory, obj, poses, options=SQUARED), rig
 
 
 def times(options: Options) -> dict[str, dict[str, float]]:
@@ -239,11 +188,6 @@ def tables(result: Mapping[str, Any]) -> dict[str, str]:
         for name, found in result["normalized errors"].items()
         for method, values in found.items()
     ]
-    classes = result["errors by class"]
-    by_class = [
-        (kind, *(f"{np.mean(classes[name][kind]):.2f}" for name in classes), f"{len(classes['flat'][kind])}")
-        for kind in classes["flat"]
-    ]
     rows = [(name, *(f"{ms[key]:.2f}" for key in ("p50", "p99", "best"))) for name, ms in result["times"].items()]
     return {
         "rig filter against batch": markdown(
@@ -251,7 +195,6 @@ def tables(result: Mapping[str, Any]) -> dict[str, str]:
             batch,
         ),
         "rig filter errors": markdown(("rig", "squared error per dof", "5 % to 95 %", "runs"), errors),
-        "rig filter classes": markdown(("squared error per dof, batch", "flat", "second order", "runs"), by_class),
         "keeper speed": markdown(("update from blobs, CPU ms", "p50", "p99", "best"), rows),
     }
 
@@ -264,13 +207,12 @@ def main() -> None:
         "against batch": lambda: against_batch(options),
         "normalized errors": lambda: {
             "steady": normalized_errors(options, STEADY),
-            "steady, a tenth of the prior": normalized_errors(options, STEADY, 0.1),
             "drifting": normalized_errors(options, WARMING),
         },
-        "errors by class": lambda: errors_by_class(options),
         "times": lambda: times(options),
     }
     known = json.loads(RESULT.read_text("utf-8")) if RESULT.exists() else {}
+    known.pop("errors by class", None)
     result = known | surroundings() | {name: ask() for name, ask in questions.items() if name in options.only}
     if options.out is not None:
         write_json(options.out, result)
