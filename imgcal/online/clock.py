@@ -69,9 +69,8 @@ class ClockOffsets:
         self._period = state.time - last[0]
         went = np.linalg.norm(places - last[2], axis=-1)
         went = went[np.isfinite(went)]
-        if not len(went) or np.median(went) < max(
-            LEAST_MOTION, LEAST_SIGMAS * float(np.median(state.detections.sigma))
-        ):
+        least = max(LEAST_MOTION, LEAST_SIGMAS * float(np.median(state.detections.sigma)))
+        if not len(went) or np.median(went) < least:
             return ()
         # Both by the rig as it is now: what is learnt about cameras is no motion.
         self._add(state, (state.predicted - self._predicted(state, last[1])) / self._period)

@@ -15,6 +15,8 @@ from imgcal.online.rig_state import RigState
 
 BLOCK = 1.0
 """Seconds that are put together: neighbouring snapshots say the same."""
+MISSING = 2
+"""Number of the share of fiducials that are missing, after size and uncertainty of blobs."""
 LEAST_VALUES = np.array((10, 10, 20))
 """Blobs in such a block from which its median counts, and fiducials from which the share of those that are missing is
 nearly normal; where there are fewer, the next block is put to it."""
@@ -30,8 +32,6 @@ LEAST_SPREAD = np.array((0.03, 0.15, 0.05))
 """Standard deviations of a block at least: size (3 %), uncertainty (15 %), share that is missing (5 %)."""
 MOST_SPREADS = 4.0
 """Standard deviations by which one block counts at most: shares are not normal."""
-MOST_SPREADS = 4.0
-"""Standard deviations by which one block counts at most."""
 CLEAN, CLEAN_BLOCKS = 1.5, 5
 """Standard deviations within which a value is as usual again, and for how many blocks it must be."""
 MARGIN = 0.05
@@ -55,7 +55,7 @@ class ImageQuality:
     def __init__(self, cameras: int) -> None:
         """Begin with cameras whose images are good."""
         self._cameras = cameras
-        self._values = self._none()
+        self._values = _nothing()  # of each thing that is watched: camera (M,), value (M,) of every snapshot
         self._began: float | None = None  # s, of the block ...
         self._snapshots = 0  # ... and how many there are in it
         self._count = np.zeros((3, cameras), dtype=np.int64)  # blocks that have been learnt
@@ -70,15 +70,11 @@ class ImageQuality:
     ) -> Iterable[Event]:
         """See `SequentialTest`."""
         if self._began is None or not 0 <= state.time - self._began < LONGEST:
-            self._began, self._values = state.time, self._none()
+            self._began, self._values = state.time, _nothing()
         events = self._judged(state) if state.time - self._began >= BLOCK else []
         if state.rig_from_object is not None:
             self._collect(state)
         return events
-
-    def _none(self) -> list[list[list[float]]]:
-        """No values yet, of each thing that is watched and each camera."""
-        return [[[] for _ in range(self._cameras)] for _ in SAID]
 
     def _collect(self, state: RigState) -> None:
         """Add the blobs of a snapshot."""
@@ -87,38 +83,41 @@ class ImageQuality:
         rows = np.flatnonzero((blobs.fiducial >= 0) & blobs.usable)
         camera, fiducial = blobs.camera[rows], blobs.fiducial[rows]
         points = state.rig_from_object.apply(state.belief.points_object)
-        depth = rig.expand(1).project_values(points[None], None).depth[0].numpy()[camera, fiducial]
+        depth = rig.cam_from_rig.apply(points)[..., 2].numpy()[camera, fiducial]
         with np.errstate(invalid="ignore", divide="ignore"):
             size = np.log(blobs.radius[rows] * depth / rig.focal_length.mean(-1).numpy()[camera])
             sigma = np.log(blobs.sigma[rows] / depth)  # a lamp is as bright as it is near
-        for number, values in enumerate((size, sigma)):
-            for c, value in zip(camera.tolist(), values.tolist(), strict=True):
-                if np.isfinite(value):
-                    self._values[number][c].append(value)
         seen = np.zeros(state.predicted.shape[:2], dtype=bool)
         seen[camera, fiducial] = True
         image = rig.image_size.numpy()[:, None]
         with np.errstate(invalid="ignore"):
             inside = ((state.predicted > MARGIN * image) & (state.predicted < (1 - MARGIN) * image)).all(-1)
-        expected = (
-            inside & (seen.sum(0) - seen >= 2) & seen.any(axis=1, keepdims=True)
-        )  # of a camera that is out, others tell
-        for c in range(self._cameras):
-            self._values[2][c].extend((~seen[c, expected[c]]).astype(float).tolist())
+        others_tell = (seen.sum(0) - seen >= 2) & seen.any(axis=1, keepdims=True)  # of a camera that is not out
+        at = np.nonzero(inside & others_tell)
+        missing = (~seen[at]).astype(np.float64)
+        for kept, cameras, values in zip(self._values, (camera, camera, at[0]), (size, sigma, missing), strict=True):
+            finite = np.isfinite(values)
+            kept.append((cameras[finite], values[finite]))
+
+    def _block(self) -> NDArray[np.float64]:
+        """Put together what was collected, where it is enough, and keep the rest: (3, C), nan where it is not."""
+        block = np.full((3, self._cameras), np.nan)
+        for number, least in enumerate(LEAST_VALUES):
+            if not self._values[number]:
+                continue
+            cameras, values = (np.concatenate(parts) for parts in zip(*self._values[number], strict=True))
+            enough = np.bincount(cameras, minlength=self._cameras) >= least
+            for camera in np.flatnonzero(enough):
+                own = values[cameras == camera]
+                block[number, camera] = own.mean() if number == MISSING else np.median(own)
+            rest = ~enough[cameras]
+            self._values[number] = [(cameras[rest], values[rest])]
+        return block
 
     def _judged(self, state: RigState) -> list[Event]:
         """Compare a block with those before, and begin the next one."""
-        enough = [[len(v) >= least for v in values] for values, least in zip(self._values, LEAST_VALUES, strict=True)]
-        middle = (np.median, np.median, np.mean)
-        block = np.array(
-            [
-                [middle[n](v) if ok else np.nan for v, ok in zip(self._values[n], enough[n], strict=True)]
-                for n in range(3)
-            ]
-        )
+        block = self._block()
         self._began = state.time
-        for row, oks in zip(self._values, enough, strict=True):
-            row[:] = [[] if ok else values for values, ok in zip(row, oks, strict=True)]
         learning = np.isfinite(block) & (self._count < LEARNT)
         self._count += learning
         self._sum += np.where(learning, block, 0.0)
@@ -169,3 +168,7 @@ class ImageQuality:
             raise ValueError(f"{self.name}: expected numbers of {shape[1]} cameras")
         self._count, self._usual = kept["count"].astype(np.int64), kept["usual"].astype(np.int64)
         self._sum, self._squares, self._bad = kept["sum"], kept["squares"], kept["bad"] > 0
+
+
+def _nothing() -> list[list[tuple[NDArray[np.int64], NDArray[np.float64]]]]:
+    return [[] for _ in SAID]

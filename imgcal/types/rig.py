@@ -305,7 +305,7 @@ class CameraRig:
             self.principal_point - reference.principal_point,
             self.distortion - reference.distortion,
         )
-        batch = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
+        batch = torch.broadcast_tensors(*(part[..., 0] for part in parts))[0].shape  # broadcast_shapes loads sympy
         return torch.cat([part.expand(*batch, -1) for part in parts], dim=-1)
 
     def resized(self, image_size: Tensor) -> CameraRig:
