@@ -18,12 +18,12 @@ import torch
 import tyro
 from rich.console import Console
 
-from imgcal.cli.common import make_folder, open_rig
+from imgcal.cli.common import check_folder, open_rig
 from imgcal.cli.watch_display import Display
 from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError, RefusedError
 from imgcal.extras import advice, missing
-from imgcal.io import load_object, open_input
+from imgcal.io import holding, load_object, open_input
 from imgcal.messages import shortened
 from imgcal.online import Event, RigKeeper
 from imgcal.pipeline import DetectorName
@@ -99,7 +99,11 @@ class Watch:
     def run(self) -> None:
         """Watch until the end."""
         rig, obj = open_rig(self.rig), load_object(self.object)
-        folder = make_folder(self.out)
+        check_folder(self.out)
+        with holding(self.out) as folder:
+            self._watch(rig, obj, folder)
+
+    def _watch(self, rig: CameraRig, obj: CalibrationObject, folder: Path) -> None:
         with _going_on():
             progress = None if self.fresh else Progress.load(folder)
         source = self._source(rig, obj, progress)
@@ -118,9 +122,10 @@ class Watch:
 
                 page = stack.enter_context(LivePage(rig, obj, parse_address(self.serve)))
                 print(page.notice)
-            loop = stack.enter_context(Loop(keeper, folder, hook, page, display.tell, display.warn, _removing(source)))
+            loop = Loop(keeper, folder, hook, page, display.tell, display.warn, _removing(source))
             if self.metrics is not None:
                 stack.enter_context(Metrics(loop.tally, intake, hook, metrics_address(self.metrics)))
+            stack.enter_context(loop)
             stopped = stack.enter_context(_stopping())
             stack.enter_context(display.of(loop.tally))
             if restored:
@@ -130,8 +135,12 @@ class Watch:
         said = display.result(self.out / CURRENT)
         if stopped.interrupted:
             raise KeyboardInterrupt(f"interrupted after {said}; the same command goes on from there")
-        if tally.latest is None or tally.learnt == 0:
-            raise RefusedError(self._nothing(tally, intake, progress))
+        known = intake.known_before + (source.known_before() if isinstance(source, Folder) else 0)
+        if tally.snapshots == 0 and known:
+            read = f"all {known:,} snapshots of {self.input} had been read before"
+            said = f"{read}; --fresh begins from the factory rig | {said}"
+        elif tally.latest is None or tally.learnt == 0:
+            raise RefusedError(_nothing(tally, intake))
         print(said)
 
     def _source(self, rig: CameraRig, obj: CalibrationObject, progress: Progress | None) -> Source:
@@ -191,15 +200,14 @@ class Watch:
         if missing(library):
             raise InputError(f"{shortened(self.input)}: {what} {advice(library)}")
 
-    def _nothing(self, tally: Tally, intake: Intake, progress: Progress | None) -> str:
-        """Say why nothing was learnt."""
-        if tally.latest is not None:
-            return f"watch: no snapshot taught anything: {tally.latest.refused}"
-        if intake.reasons:
-            return f"watch: no snapshot came: {intake.reasons[-1]}"
-        if progress is not None and intake.known_before:
-            return f"watch: all {intake.known_before:,} snapshots were known; --fresh begins from the factory rig"
-        return "watch: no snapshot came"
+
+def _nothing(tally: Tally, intake: Intake) -> str:
+    """Say why nothing was learnt."""
+    if tally.latest is not None:
+        return f"watch: no snapshot taught anything: {tally.latest.refused}"
+    if intake.reasons:
+        return f"watch: no snapshot came: {intake.reasons[-1]}"
+    return "watch: no snapshot came"
 
 
 def _removing(source: Source) -> Callable[[Progress], None]:

@@ -8,6 +8,7 @@ from .key_table import Key, keys_of
 from .metrics import read_metrics
 from .names import MODEL, find_file, is_file_name, model_file, model_name, natural_key, nearest, title_of
 from .object_csv import load_object, object_from_text, object_text, save_object
+from .own_folder import holding
 from .publication import publishing
 from .resources import data_path, shipped_names
 from .rig_yaml import RigCovariance, load_rig, load_rig_covariance, rig_from_text, rig_text, save_rig
@@ -42,6 +43,7 @@ __all__ = [
     "data_path",
     "find_file",
     "grey_frame",
+    "holding",
     "is_file_name",
     "is_prose",
     "keys_of",

@@ -42,6 +42,14 @@ class Folder:
         """Whether all has been read that was there at the beginning: that is a recording, which waits."""
         return self._caught_up.is_set()
 
+    def known_before(self) -> int:
+        """Count the snapshots that are there and have been seen before."""
+        if self.after is None:
+            return 0
+        files = (path for name in self.rig.camera_names for path in (self.folder / "frames" / name).glob("*"))
+        stems = {path.stem for path in files if path.suffix.lower() in IMAGE_SUFFIXES and is_file_name(path.stem)}
+        return sum(natural_key(stem) <= natural_key(self.after) for stem in stems)
+
     def saved(self, name: str) -> None:
         """Delete frames that have been read of the snapshots up to one: they will not be needed again."""
         for _ in range(len(self._read_files)):

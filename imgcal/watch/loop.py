@@ -109,7 +109,7 @@ class Watch:
         problem: Callable[[str], None] = lambda message: None,
         saved: Callable[[Progress], None] = lambda progress: None,
     ) -> None:
-        """Open the outputs.
+        """Prepare; nothing is written before it is entered.
 
         Args:
             keeper: what keeps the rig; not closed here.
@@ -119,22 +119,23 @@ class Watch:
             told: gets every event.
             problem: gets what could not be written, once.
             saved: gets how far the source has been worked on, once what it taught until then has been written.
-
-        Raises:
-            InputError: events.jsonl cannot be written.
         """
         self.keeper, self.folder, self.tally = keeper, folder, Tally()
         self.paused = False
         self._hook, self._page, self._told, self._problem = hook, page, told, problem
         self._when_saved = saved
-        self._log, self._files = EventLog(folder / EVENTS), RigFiles(folder)
         self._saved = time.monotonic()
         self._progress: Progress | None = None
         self._unsaved = False
         self._kept: float | None = None  # s, time of the snapshot whose rig went into the history last
 
     def __enter__(self) -> Watch:
-        """Return itself."""
+        """Open the outputs.
+
+        Raises:
+            InputError: events.jsonl cannot be written.
+        """
+        self._log, self._files = EventLog(self.folder / EVENTS), RigFiles(self.folder)
         return self
 
     def __exit__(

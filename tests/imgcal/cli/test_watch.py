@@ -15,6 +15,8 @@ from imgcal.cli.main import main
 from imgcal.cli.watch import metrics_address
 from imgcal.errors import InputError
 from imgcal.io import load_object, load_rig, save_detections, save_rig
+from imgcal.io.frames import write_frame
+from imgcal.online import RigKeeper
 from imgcal.types.observations import Detections
 from imgcal.watch import Progress
 from tests.imgcal.streams import Stream
@@ -70,8 +72,12 @@ def test_a_table_of_blobs_is_watched_once(blobs, stream, tmp_path, capsys):
     truth = stream.bumped([1])  # of no size
     off = torch.rad2deg(found.local(truth)[:, :3].norm(dim=1))
     assert off.max() < 1.0 and (out / "state.json").is_file() and list(out.glob("history/*/*.yaml"))
-    assert watch(tmp_path / "blobs.csv.gz", out, "--rate", "60") == 3
-    assert "all 60 snapshots were known; --fresh begins from the factory rig" in capsys.readouterr().err
+    known = (out / "rig.yaml").read_bytes()
+    assert watch(tmp_path / "blobs.csv.gz", out, "--rate", "60") == 0
+    said = capsys.readouterr()
+    read = f"all 60 snapshots of {tmp_path}/blobs.csv.gz had been read before; --fresh begins from the factory rig"
+    assert said.out.endswith(f"{read} | 0 snapshots, 1 events: {out}/rig.yaml\n")
+    assert not said.err and (out / "rig.yaml").read_bytes() == known
     assert watch(tmp_path / "blobs.csv.gz", out, "--rate", "60", "--fresh") == 0
 
 
@@ -167,6 +173,22 @@ def test_mistakes(arguments, code, message, tmp_path, monkeypatch, capsys):
     assert message in error and error.count("\n") == 1
 
 
+def test_a_folder_that_has_been_read_to_its_end_is_said_to_be_known(stream, tmp_path, capsys):
+    frames = tmp_path / "capture" / "frames"
+    for camera, (width, height) in zip(stream.rig.camera_names, stream.rig.image_size.tolist(), strict=True):
+        (frames / camera).mkdir(parents=True)
+        for name in ("8", "9", "10"):
+            write_frame(frames / camera / f"{name}.png", np.zeros((height, width), np.uint8))
+    out = tmp_path / "out"
+    out.mkdir()
+    with RigKeeper(stream.rig, stream.obj) as keeper:
+        keeper.update(stream.blobs(0)[0], 9.0)
+        keeper.saved({"time": 9.0, "name": "10"}).write(out / "state.json")
+    assert watch(tmp_path / "capture", out, "--until-idle", "0.3") == 0
+    said = capsys.readouterr()
+    assert "all 3 snapshots of" in said.out and not said.err
+
+
 def test_what_is_known_of_another_rig_is_not_gone_on_with(blobs, tmp_path, capsys):
     save_detections(blobs.of_snapshots(0, 5), tmp_path / "blobs.csv")
     assert watch(tmp_path / "blobs.csv", tmp_path / "out") == 0
@@ -204,7 +226,7 @@ def test_a_source_that_cannot_be_opened_leaves_what_is_there_as_it_was(given, me
     assert message in capsys.readouterr().err
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
     assert watch(given, tmp_path / "fresh") == 2
-    assert not any((tmp_path / "fresh").iterdir())
+    assert not (tmp_path / "fresh").exists()
 
 
 @pytest.mark.parametrize("option", ["--serve", "--metrics"])
@@ -213,6 +235,7 @@ def test_a_port_that_is_taken_is_told_in_one_line(option, tmp_path, monkeypatch,
         monkeypatch.setattr(sys, "stdin", nothing)
         port = taken.getsockname()[1]
         assert watch("-", tmp_path / "out", option, str(port)) == 2
+        assert not (tmp_path / "out").exists()
     error = capsys.readouterr().err
     assert f"127.0.0.1:{port}" in error and "Errno" not in error and error.count("\n") == 1
 
