@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from torch.utils.tensorboard import SummaryWriter
 
 from imgcal.errors import InputError, RefusedError
-from imgcal.io import MODEL, read_metrics, write_tensors, write_text
+from imgcal.io import MODEL, holding, read_metrics, write_tensors, write_text
 from imgcal.training import (
     Callbacks,
     DivergedError,
@@ -71,11 +72,13 @@ class TrainingFolder(Callbacks):
         self.metrics = folder / METRICS
 
     def on_start(self, run: Run) -> None:
-        """Make the folder and open the logs; what a run would not have logged without a stop is dropped."""
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"{self.folder}: cannot be made: {error.strerror or error}") from error
+        """Take the folder and open the logs; what a run would not have logged without a stop is dropped."""
+        with ExitStack() as stack:
+            stack.enter_context(holding(self.folder))
+            self._open(run)
+            self._held = stack.pop_all()
+
+    def _open(self, run: Run) -> None:
         save_experiment(run.experiment, self.folder / RESOLVED)
         kept = [row for row in read_metrics(self.metrics) if row["step"] <= run.step and not row.get(EXTRA)]
         write_text(self.metrics, "".join(json.dumps(row) + "\n" for row in (kept if run.step else [])))
@@ -124,6 +127,7 @@ class TrainingFolder(Callbacks):
         if not self.console.is_terminal:
             self._say(_summary(run))
         self.board.close()
+        self._held.close()
 
     def _announce(self, run: Run) -> None:
         count = sum(parameter.numel() for parameter in run.plain.parameters())

@@ -3,7 +3,7 @@ import signal
 import pytest
 
 from imgcal.cli.main import main
-from imgcal.io import load_object, load_rig, read_metrics, save_rig
+from imgcal.io import holding, load_object, load_rig, read_metrics, save_rig
 from imgcal.networks import load_network
 from imgcal.training import engine
 from tests.imgcal.lensed import lensed
@@ -108,6 +108,19 @@ def test_an_interrupted_training_is_saved_and_says_how_to_resume(experiment, tmp
     load_network(tmp_path / "out" / "model.safetensors")
     assert train(experiment, tmp_path / "out", "--resume") == 0
     assert "from step 7 on" in capsys.readouterr().err
+
+
+def test_a_second_training_in_a_folder_is_refused_and_harms_nothing(experiment, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert train(experiment, out) == 0
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    capsys.readouterr()
+    with holding(out):
+        assert train(experiment, out, "--resume", "--set", "training.steps=40") == 2
+    error = capsys.readouterr().err
+    assert f"{out}: found another imgcal at work there" in error and error.count("\n") == 1
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+    assert train(experiment, out, "--resume", "--set", "training.steps=40") == 0
 
 
 @pytest.mark.parametrize(
