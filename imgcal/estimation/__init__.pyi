@@ -1,4 +1,5 @@
 from . import lm_cpu
+from .absorption import absorbed
 from .accuracy import MAP_DEPTHS, MAP_SIZE, PredictedError, WorkingVolume, predicted_error
 from .blocks import BlockScatter, block_scatter
 from .brought import Brought
@@ -51,9 +52,10 @@ from .object_shape import SNAPSHOTS_TO_BEND, FiducialOffset, ShapeEvidence, offs
 from .pose_initialization import initial_pose
 from .pose_support import ON_A_LINE, UndeterminedPosesError, require_poses
 from .recent_snapshots import RecentSnapshots
+from .rig_belief import Absorbed, RigBelief, aged, widened
 from .rig_changes import CHANGES, ChangeTest, change_of_errors, pixel_changes, spread_of
 from .rig_error import displaced, error_between, step_by_error
-from .rig_filter import Absorbed, RigBelief, RigFilter, absorbed, aged, widened
+from .rig_filter import RigFilter
 from .rig_initialization import K3, ColdStart, cold_start, ordinary_lens
 from .rig_monitor import Change, RigMonitor
 from .rig_uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian, rigid_motion, uncertainty_over

@@ -12,8 +12,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from imgcal.estimation.rig_arrays import RigArrays
 from imgcal.estimation.rig_error import error_between
-from imgcal.estimation.rig_filter_cpu import RigArrays
 from imgcal.types import CameraRig
 
 

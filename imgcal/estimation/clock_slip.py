@@ -16,11 +16,12 @@ import torch
 from torch import Tensor
 
 from imgcal.errors import RefusedError
+from imgcal.estimation.absorption import absorbed, joined
 from imgcal.estimation.map_estimate import EstimationOptions
 from imgcal.estimation.object_motion import ObjectMotion
 from imgcal.estimation.open_change import let_free
+from imgcal.estimation.rig_belief import Absorbed, RigBelief
 from imgcal.estimation.rig_changes import JUMPS
-from imgcal.estimation.rig_filter import Absorbed, RigBelief, absorbed, joined
 from imgcal.geometry import RigidTransform
 from imgcal.types import Observations
 

@@ -19,9 +19,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from imgcal.estimation.rig_belief import RigBelief, aged
 from imgcal.estimation.rig_changes import CHANGES, MODEL_ERROR, ChangeTest, change_of_errors, pixel_changes
 from imgcal.estimation.rig_error import error_between
-from imgcal.estimation.rig_filter import RigBelief, aged
 from imgcal.types import DriftRate
 
 SECONDS = 20.0

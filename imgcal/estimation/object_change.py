@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from imgcal.errors import RefusedError
+from imgcal.estimation.absorption import absorbed, joined
 from imgcal.estimation.map_estimate import EstimationOptions, object_prior_std
-from imgcal.estimation.rig_filter import Absorbed, RigBelief, absorbed, joined
+from imgcal.estimation.rig_belief import Absorbed, RigBelief
 from imgcal.geometry import RigidTransform
 from imgcal.types import Observations
 

@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from imgcal.estimation.rig_belief import Absorbed, RigBelief, aged, widened
 from imgcal.estimation.rig_changes import CHANGES, LARGE, ChangeTest, change_of_errors, pixel_changes, spread_of
 from imgcal.estimation.rig_error import displaced, error_between
-from imgcal.estimation.rig_filter import YOUNG_SECONDS, Absorbed, RigBelief, aged, widened
+from imgcal.estimation.rig_filter import YOUNG_SECONDS
 from imgcal.types import CameraRig
 
 DECIDED = 5.0

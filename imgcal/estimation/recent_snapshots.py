@@ -19,10 +19,10 @@ from torch import Tensor
 from imgcal.errors import RefusedError
 from imgcal.estimation.brought import Brought, add_blocks
 from imgcal.estimation.recent_screening import add_error, add_row, put, screen
+from imgcal.estimation.rig_arrays import RigArrays
+from imgcal.estimation.rig_belief import Absorbed, RigBelief, error_covariance
 from imgcal.estimation.rig_changes import CHANGES, ChangeTest, change_of_errors, pixel_changes
 from imgcal.estimation.rig_error import displaced
-from imgcal.estimation.rig_filter import Absorbed, RigBelief, error_covariance
-from imgcal.estimation.rig_filter_cpu import RigArrays
 from imgcal.geometry import RigidTransform
 from imgcal.types import CameraRig, Observations
 

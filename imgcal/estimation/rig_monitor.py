@@ -9,14 +9,16 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from imgcal.errors import RefusedError
+from imgcal.estimation.absorption import absorbed, joined
 from imgcal.estimation.clock_slip import ClockSlip, Slipped, Suspicion
 from imgcal.estimation.cusum import Cusum, RunningMedian
 from imgcal.estimation.drift_pace import SECONDS, DriftPaces, Stretch
 from imgcal.estimation.object_change import ObjectChange, changed_object
 from imgcal.estimation.open_change import OpenChange, let_free
 from imgcal.estimation.recent_snapshots import SCREENED, RecentSnapshots
+from imgcal.estimation.rig_belief import Absorbed, RigBelief, aged, widened
 from imgcal.estimation.rig_changes import CHANGES, JUMPS, ChangeTest
-from imgcal.estimation.rig_filter import Absorbed, RigBelief, RigFilter, absorbed, aged, joined, widened
+from imgcal.estimation.rig_filter import RigFilter
 from imgcal.geometry import RigidTransform
 from imgcal.types import Observations
 

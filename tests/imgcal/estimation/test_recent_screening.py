@@ -7,7 +7,7 @@ import torch
 import imgcal
 from imgcal.estimation import change_of_errors, error_between
 from imgcal.estimation.recent_screening import add_error, add_row, put, screen
-from imgcal.estimation.rig_filter_cpu import RigArrays
+from imgcal.estimation.rig_arrays import RigArrays
 
 SNAPSHOTS, CAMERAS, OWN = 5, 3, 2
 

@@ -8,7 +8,7 @@ import torch
 import imgcal
 from imgcal.errors import RefusedError
 from imgcal.estimation import Absorbed, EstimationOptions, RigBelief, absorbed, error_between
-from imgcal.estimation.rig_filter import absorbed_in_tensors
+from imgcal.estimation.absorption_in_tensors import absorbed_in_tensors
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import Observations
 

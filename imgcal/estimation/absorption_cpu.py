@@ -1,6 +1,6 @@
-"""`rig_filter.absorbed` compiled for CPUs: one call a snapshot, without temporaries.
+"""`absorption.absorbed` compiled for CPUs: one call a snapshot, without temporaries.
 
-`rig_filter.absorbed_in_tensors` says the same in tensors, and is what this is tested against. K parameters a camera, M
+`absorption_in_tensors` says the same in tensors, and is what this is tested against. K parameters a camera, M
 of the object, D = K C + M; S snapshots, each linearized as a rig of its own (`linearization_cpu.linearize_rig`). All
 states and equations have two rows: the best so far, and the one that is tried.
 """
@@ -18,8 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.estimation.linearization_cpu import blocks_of, linearize_rig
+from imgcal.estimation.rig_arrays import RigArrays
+from imgcal.estimation.rig_error_cpu import times_basis, write_basis, write_error
 from imgcal.geometry import kernels
-from imgcal.types import CameraRig
 from renderers.compiling import njit
 
 Array = NDArray[np.float64]
@@ -27,34 +28,21 @@ Array = NDArray[np.float64]
 FOUND, NO_POSE, NOTHING_KNOWN, NO_MINIMUM = 0, 1, 2, 3
 """How it ended: with a minimum; a snapshot does not determine its pose; a factorization failed; no minimum."""
 
+WHY_NOT = {
+    NO_POSE: "the observations do not determine the object's pose in every snapshot",
+    NOTHING_KNOWN: "these observations leave a rig that nothing is known of: labels may be wrong",
+    NO_MINIMUM: "found no minimum for these observations, expected one: labels may be wrong",
+}
+MOST_DAMPING = 1e8
+SLACK = 1e-6
+"""By how much the cost may rise in a step, relative: rounding."""
+DAMPED, STALLED = 1e-3, 10.0
+"""Damping up to which a step that is as short as the tolerance shows that this is the minimum; the second where lightly
+damped steps have failed: their direction is approximate where the belief is far away."""
+
 PATIENCE, LOOSER = 12, 1.5
 """Iterations after which, and factor by which in each, the tolerance grows: where snapshots contradict a belief, steps
 are slow to become small."""
-
-
-@dataclass(frozen=True)
-class RigArrays:
-    """A rig's values, or two rows of them."""
-
-    rotation: Array  # (C, 3, 3) of cam_from_rig
-    position: Array  # (C, 3) mm
-    focal_length: Array  # (C, 2)
-    principal_point: Array  # (C, 2)
-    distortion: Array  # (C, K - 10)
-
-    @classmethod
-    def of(cls, rig: CameraRig) -> RigArrays:
-        """Take the values of a rig without batch axes."""
-        rotation = rig.cam_from_rig.rotation.contiguous().numpy()
-        position = -(rotation.swapaxes(-1, -2) @ rig.cam_from_rig.translation.numpy()[..., None])[..., 0]
-        position = np.ascontiguousarray(position)
-        lens = (rig.focal_length, rig.principal_point, rig.distortion)
-        return cls(rotation, position, *(part.contiguous().numpy() for part in lens))
-
-    @property
-    def parts(self) -> tuple[Array, ...]:
-        """In the order of the compiled loops."""
-        return (self.rotation, self.position, self.focal_length, self.principal_point, self.distortion)
 
 
 @dataclass(frozen=True)
@@ -136,7 +124,7 @@ def absorb(
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _absorb(shared, seen, known_rig, known, rigs, states, blocks, matrices, brought, options):
-    """Newton's method with damping where a step fails; see `rig_filter.absorbed_in_tensors`."""
+    """Newton's method with damping where a step fails; see `absorption_in_tensors.absorbed_in_tensors`."""
     loss, threshold, most, tolerance, slack, light, stalled, most_damping = options
     unit, _, _, prior = known
     factor, gathered = matrices
@@ -161,11 +149,7 @@ def _absorb(shared, seen, known_rig, known, rigs, states, blocks, matrices, brou
             for j in range(wide):
                 value -= prior[i, j] * distance[b, j]
             right[i] = step[i] = value
-        for i in range(wide):
-            for j in range(i + 1):
-                factor[i, j] = gathered[i, j]
-            factor[i, i] *= 1 + damping
-        if not kernels.cholesky(factor):
+        if not _factorized(gathered, damping, factor):
             return best, 2, cost
         kernels.cholesky_solve(factor, step)
         gain = 0.0
@@ -180,12 +164,8 @@ def _absorb(shared, seen, known_rig, known, rigs, states, blocks, matrices, brou
             done = gain <= enough and damping <= light
             best, cost, fresh = t, trial, True
             if done:
-                if damping > 0:
-                    for i in range(wide):
-                        for j in range(i + 1):
-                            factor[i, j] = gathered[i, j]
-                    if not kernels.cholesky(factor):
-                        return best, 2, cost
+                if damping > 0 and not _factorized(gathered, 0.0, factor):
+                    return best, 2, cost
                 for i in range(wide):
                     for j in range(i):
                         gathered[j, i] = gathered[i, j]
@@ -197,6 +177,16 @@ def _absorb(shared, seen, known_rig, known, rigs, states, blocks, matrices, brou
             if damping > most_damping:
                 break
     return best, 3, cost
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _factorized(matrix, damping, factor):
+    """Write the lower Cholesky factor of a matrix (D, D) whose diagonal grows by a share; False where there is none."""
+    for i in range(len(matrix)):
+        for j in range(i + 1):
+            factor[i, j] = matrix[i, j]
+        factor[i, i] *= 1 + damping
+    return kernels.cholesky(factor)
 
 
 @njit(cache=True, fastmath=kernels.FAST)
@@ -220,7 +210,7 @@ def _evaluate(shared, seen, known_rig, known, rigs, states, blocks, distance, b,
         cost += linearize_rig(given, state, blocks_of(row, s), False, loss, threshold)
         for i in range(len(own0)):
             cost -= 0.5 * own[b, i] ** 2
-    _error(rotation[b], position[b], focal[b], principal[b], distortion[b], known_rig, unit, distance[b])
+    write_error(rotation[b], position[b], focal[b], principal[b], distortion[b], known_rig, unit, distance[b])
     first = unit.size
     for i in range(len(own0)):
         distance[b, first + i] = own[b, i] - own0[i]
@@ -230,61 +220,6 @@ def _evaluate(shared, seen, known_rig, known, rigs, states, blocks, distance, b,
             value += prior[i, j] * distance[b, j]
         cost += 0.5 * value * distance[b, i]
     return cost
-
-
-@njit(cache=True, fastmath=kernels.FAST)
-def _error(rotation, position, focal, principal, distortion, known_rig, unit, distance):
-    """Write the error in units that takes the known rig to this one, like `rig_error.error_between`."""
-    rotation0, position0, focal0, principal0, distortion0 = known_rig
-    turn, vector = np.empty((3, 3)), np.empty(3)
-    cameras, free = unit.shape
-    for c in range(cameras):
-        first = c * free
-        for i in range(3):
-            for j in range(3):
-                turn[i, j] = (
-                    rotation[c, 0, i] * rotation0[c, 0, j]
-                    + rotation[c, 1, i] * rotation0[c, 1, j]
-                    + rotation[c, 2, i] * rotation0[c, 2, j]
-                )
-        _logarithm(turn, vector)
-        for i in range(3):
-            there = turn[i, 0] * position0[c, 0] + turn[i, 1] * position0[c, 1] + turn[i, 2] * position0[c, 2]
-            distance[first + i] = vector[i] / unit[c, i]
-            distance[first + 3 + i] = (position[c, i] - there) / unit[c, 3 + i]
-        for i in range(2):
-            distance[first + 6 + i] = (focal[c, i] - focal0[c, i]) / unit[c, 6 + i]
-            distance[first + 8 + i] = (principal[c, i] - principal0[c, i]) / unit[c, 8 + i]
-        for i in range(free - 10):
-            distance[first + 10 + i] = (distortion[c, i] - distortion0[c, i]) / unit[c, 10 + i]
-
-
-@njit(cache=True, fastmath=kernels.FAST)
-def _logarithm(rotation, vector):
-    """Write the rotation vector (3,) of a rotation (3, 3), like `rotations.vector_from_rotation`."""
-    # The quaternion's largest part first: exact near no rotation, and near half a turn.
-    trace = rotation[0, 0] + rotation[1, 1] + rotation[2, 2]
-    if trace >= 0:
-        w = 1 + trace
-        x, y, z = rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]
-    else:
-        i = 0
-        if rotation[1, 1] > rotation[0, 0]:
-            i = 1
-        if rotation[2, 2] > rotation[i, i]:
-            i = 2
-        j, k = (i + 1) % 3, (i + 2) % 3
-        parts = np.empty(3)
-        parts[i] = 1 + rotation[i, i] - rotation[j, j] - rotation[k, k]
-        parts[j] = rotation[j, i] + rotation[i, j]
-        parts[k] = rotation[k, i] + rotation[i, k]
-        w = rotation[k, j] - rotation[j, k]
-        x, y, z = parts[0], parts[1], parts[2]
-        if w < 0:
-            w, x, y, z = -w, -x, -y, -z
-    length = np.sqrt(x * x + y * y + z * z)
-    scale = 2 / w if length < 1e-9 * w else 2 * np.arctan2(length, w) / length
-    vector[0], vector[1], vector[2] = scale * x, scale * y, scale * z
 
 
 @njit(cache=True, fastmath=kernels.FAST)
@@ -305,14 +240,14 @@ def _gather(unit, known, rigs, states, blocks, gathered, half, pull, b):
             gathered[i, j] = prior[i, j]
     basis = np.empty((cameras, 6, 3))
     for c in range(cameras):
-        _basis(rotation[b, c], position[b, c], unit[c], basis[c])
+        write_basis(rotation[b, c], position[b, c], unit[c], basis[c])
     for s in range(len(pull)):
         for c in range(cameras):
             block = camera[b, s, c]
             for i in range(free):
                 block[i, i] -= 1.0
             for i in range(free):
-                _times_basis(block[i], basis[c])
+                times_basis(block[i], basis[c])
             for j in range(free):
                 x, y, z = 0.0, 0.0, 0.0
                 for i in range(6):
@@ -320,16 +255,16 @@ def _gather(unit, known, rigs, states, blocks, gathered, half, pull, b):
                     y += block[i, j] * basis[c, i, 1]
                     z += block[i, j] * basis[c, i, 2]
                 block[0, j], block[1, j], block[2, j] = x, y, z
-            _times_basis(camera_gradient[b, s, c], basis[c])
+            times_basis(camera_gradient[b, s, c], basis[c])
             at = c * free
             for i in range(free):
                 pull[s, at + i] = -camera_gradient[b, s, c, i]
                 for j in range(i + 1):
                     gathered[at + i, at + j] += block[i, j]
             for i in range(6):
-                _times_basis(coupling[b, s, 0, i, at : at + free], basis[c])
+                times_basis(coupling[b, s, 0, i, at : at + free], basis[c])
             for i in range(size):
-                _times_basis(border[b, s, i, at : at + free], basis[c])
+                times_basis(border[b, s, i, at : at + free], basis[c])
         for i in range(size):
             border[b, s, i, first_own + i] -= 1.0
             pull[s, first_own + i] = own[b, i] - own_gradient[b, s, i]
@@ -337,45 +272,26 @@ def _gather(unit, known, rigs, states, blocks, gathered, half, pull, b):
                 gathered[first_own + i, j] += border[b, s, i, j]
             for j in range(i):
                 border[b, s, j, first_own + i] = border[b, s, i, first_own + j]
-        lower, carried = pose[b, s, 0], coupling[b, s, 0]
-        if not kernels.cholesky(lower):
+        if not kernels.cholesky(pose[b, s, 0]):
             return 1
-        for i in range(6):
-            value, inverse = pose_gradient[b, s, 0, i], 1 / lower[i, i]
-            for k in range(i):
-                value -= lower[i, k] * half[s, k]
-                for j in range(wide):
-                    carried[i, j] -= lower[i, k] * carried[k, j]
-            half[s, i] = value * inverse
-            for j in range(wide):
-                carried[i, j] *= inverse
-                pull[s, j] += carried[i, j] * half[s, i]
-        kernels.subtract_gram(gathered, carried)
+        _take_pose_out(pose[b, s, 0], pose_gradient[b, s, 0], coupling[b, s, 0], half[s], pull[s])
+        kernels.subtract_gram(gathered, coupling[b, s, 0])
     return 0
 
 
 @njit(cache=True, fastmath=kernels.FAST)
-def _basis(rotation, position, unit, basis):
-    """Write the first three columns of a camera's steps by its errors, whitened, like `rig_error.step_by_error`."""
-    for j in range(3):
-        for i in range(3):
-            basis[i, j] = -rotation[i, j] * unit[j] / unit[i]
-            basis[3 + i, j] = 0.0
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        basis[3 + j, k] = position[i] * unit[k] / unit[3 + j]
-        basis[3 + k, j] = -position[i] * unit[j] / unit[3 + k]
-
-
-@njit(cache=True, fastmath=kernels.FAST)
-def _times_basis(row, basis):
-    """Multiply a row (K,) by the steps by errors; columns from the fourth on are those of the unit matrix."""
-    x, y, z = 0.0, 0.0, 0.0
+def _take_pose_out(lower, gradient, carried, half, pull):
+    """Solve by the factor (6, 6) of a pose for its gradient (6,) and its coupling (6, D); add what that pulls (D,)."""
     for i in range(6):
-        x += row[i] * basis[i, 0]
-        y += row[i] * basis[i, 1]
-        z += row[i] * basis[i, 2]
-    row[0], row[1], row[2] = x, y, z
+        value, inverse = gradient[i], 1 / lower[i, i]
+        for k in range(i):
+            value -= lower[i, k] * half[k]
+            for j in range(len(pull)):
+                carried[i, j] -= lower[i, k] * carried[k, j]
+        half[i] = value * inverse
+        for j in range(len(pull)):
+            carried[i, j] *= inverse
+            pull[j] += carried[i, j] * half[i]
 
 
 @njit(cache=True, fastmath=kernels.FAST)
