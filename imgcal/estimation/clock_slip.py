@@ -6,22 +6,17 @@ shifts the image alike wherever the object goes, a slip along its motion, and no
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from imgcal.errors import RefusedError
 from imgcal.estimation.absorption import absorbed, joined
 from imgcal.estimation.map_estimate import EstimationOptions
 from imgcal.estimation.object_motion import ObjectMotion
-from imgcal.estimation.open_change import let_free
 from imgcal.estimation.rig_belief import Absorbed, RigBelief
-from imgcal.estimation.rig_changes import JUMPS
 from imgcal.geometry import RigidTransform
 from imgcal.types import Observations
 
@@ -114,50 +109,6 @@ def slipped(
     spreads = {camera: math.hypot(sigma[camera], INEXACT * late[camera]) for camera in cameras}
     slips = tuple(ClockSlip(camera, 0, late[camera], spreads[camera], math.nan) for camera in cameras)
     return Slipped(before, slips, corrected, evidence)
-
-
-@dataclass(frozen=True)
-class Suspicion:
-    """Cameras that seem to have moved before some snapshots."""
-
-    before: RigBelief  # what was believed before them
-    snapshots: list[tuple[Observations, RigidTransform]]  # and earlier ones, which say how the object moves
-    pauses: list[float]  # s before each
-    count: int  # of those since then
-    cameras: Mapping[int, str | None]  # the surest first
-    first: RigBelief | None = None  # what was believed before all of them, where that is what the factory says
-
-    def clocks(self, options: EstimationOptions) -> tuple[float, Slipped | None]:
-        """Suppose that it is the clocks of all these cameras that have slipped, or of the first alone.
-
-        Returns:
-            Log odds of slips against moves, and the slips, where there is an earlier belief also of ones before
-            everything; -inf and None = no slips explain what was seen.
-        """
-        some = [tuple(self.cameras)[:1], tuple(self.cameras)]
-        moved, found = self._moved(options), list[tuple[float, Slipped]]()
-        for cameras in dict.fromkeys(some):
-            with contextlib.suppress(RefusedError):
-                late = slipped(self.before, self.snapshots, self.pauses, self.count, cameras, options)
-                if late is not None:
-                    found.append((late.evidence - moved, late))
-        if self.first is not None and self.count < len(self.snapshots):
-            count = len(self.snapshots)
-            with contextlib.suppress(RefusedError):
-                earlier = absorbed(self.first, *joined(self.snapshots[: -self.count]), options).evidence
-                late = slipped(self.first, self.snapshots, self.pauses, count, some[0], options, wide=True)
-                if late is not None:
-                    found.append((late.evidence - earlier - moved, late))
-        return max(found, key=lambda one: one[0], default=(-math.inf, None))
-
-    def _moved(self, options: EstimationOptions) -> float:
-        """Log probability of the snapshots since, the cameras having moved."""
-        found = []
-        for jump in JUMPS:
-            with contextlib.suppress(RefusedError):
-                free = let_free(self.before, self.cameras, jump)
-                found.append(absorbed(free, *joined(self.snapshots[-self.count :]), options).evidence)
-        return float(np.logaddexp.reduce(found)) - math.log(len(JUMPS)) if found else -math.inf
 
 
 def image_of(belief: RigBelief, rig_from_object: RigidTransform, camera: int) -> Tensor:

@@ -10,41 +10,21 @@ from types import MappingProxyType
 
 from imgcal.errors import RefusedError
 from imgcal.estimation.absorption import absorbed, joined
-from imgcal.estimation.clock_slip import ClockSlip, Slipped, Suspicion
-from imgcal.estimation.cusum import Cusum, RunningMedian
-from imgcal.estimation.drift_pace import SECONDS, DriftPaces, Stretch
+from imgcal.estimation.change_search import NEARBY, changed_before, changed_cameras, likeliest_age, surest
+from imgcal.estimation.clock_slip import ClockSlip
+from imgcal.estimation.drift_learning import DriftLearning
+from imgcal.estimation.drift_pace import DriftPaces
 from imgcal.estimation.object_change import ObjectChange, changed_object
+from imgcal.estimation.object_question import Misfit, never_fitted, object_explains
 from imgcal.estimation.open_change import OpenChange, let_free
-from imgcal.estimation.recent_snapshots import SCREENED, RecentSnapshots
-from imgcal.estimation.rig_belief import Absorbed, RigBelief, aged, widened
-from imgcal.estimation.rig_changes import CHANGES, JUMPS, ChangeTest
+from imgcal.estimation.recent_snapshots import RecentSnapshots
+from imgcal.estimation.rig_belief import Absorbed, RigBelief, aged
+from imgcal.estimation.rig_changes import CHANGES, JUMPS
 from imgcal.estimation.rig_filter import RigFilter
+from imgcal.estimation.slip_question import SlipQuestion, Suspicion
 from imgcal.geometry import RigidTransform
 from imgcal.types import Observations
 
-SIGNIFICANT = 60.0
-"""Chi-squared (two or three degrees of freedom) that a camera which stands still exceeds once in 10^12 tests."""
-SUSPECTED = 20.0
-"""The same of the quick test, from which the other one is asked: a third of it where half of what is known is new."""
-SLOW = {16: 16, 64: 32}
-"""Numbers of snapshots that are tested without a suspicion, and after how many each: where little was known before."""
-REMAINING = 20.0
-"""What is left of the significance without the snapshot that speaks most for a change: one wrong label is none."""
-LEAST_AGE = 2
-"""Snapshots that must agree that something has changed."""
-NEARBY = 4
-"""Snapshots around the most significant one among which the first one after a change is looked for."""
-FALSE_ALARMS = 1e9
-"""Snapshots for one false alarm of misfit, which is then asked whether the object has changed."""
-MOST_MISFIT = 4.0
-"""Standard deviations by which one snapshot counts at most."""
-LEAST_USUAL = 30
-"""Snapshots from which it is known how well they usually fit."""
-OBJECT_ODDS = 30.0
-"""Log odds from which the object has changed where no camera has."""
-OBJECT_ASKED, MOST_FIRST = (8, 16, 32), 2.0
-"""Numbers of first snapshots, and the standard deviations that chi-squared must be more than is expected, from which it
-is asked whether the object never was as its file says."""
 MOST_EXCESS = 4.0
 """Chi-squared per degree of freedom up to which a snapshot fits that is else refused."""
 FEW = 16
@@ -52,12 +32,6 @@ FEW = 16
 more than it says, and others would be blamed. What came before is then forgotten ..."""
 UNSURE = 8
 """... and of the object nothing is asked before so many have been learnt."""
-SLIP_ODDS = 5.0
-"""Log odds from which it is a clock that has slipped, not a camera that has moved, or the other way round ..."""
-SLIP_PATIENCE = 16
-"""... and the snapshots for which that is waited for, before it is what is more probable."""
-TOLD_AT_ONCE = 32
-"""Snapshots whose information is added up at once."""
 
 
 @dataclass(frozen=True)
@@ -89,12 +63,10 @@ class RigMonitor:
         self.open: dict[int, Change] = {}  # changes whose kind is not decided yet, by camera
         self.object_change: ObjectChange | None = None  # that became known with the latest snapshot
         self.slips: tuple[ClockSlip, ...] = ()  # that became known with the latest snapshot
-        self._unsure = 0  # snapshots in a row that might tell of a slip or of a move
-        self._misfit, self._usual = Cusum(1, 1.0, FALSE_ALARMS), RunningMedian(256)
+        self._clocks = SlipQuestion()
+        self._misfit = Misfit()
         self._recent = RecentSnapshots(rig_filter.belief, rig_filter.walk)
-        self._paces = DriftPaces(rig_filter.belief.rig.num_cameras)
-        self._stretch: Stretch | None = None  # of snapshots that may say how fast cameras drift ...
-        self._untold = 0  # ... and the latest of them, which it does not know of yet
+        self._drifting = DriftLearning(DriftPaces(rig_filter.belief.rig.num_cameras))
         self._since: OpenChange | None = None
         self._prior = rig_filter.belief
         self.first = 0  # number of the first snapshot of which something is known
@@ -146,8 +118,8 @@ class RigMonitor:
         self._recent.append(result, observations, seconds)
         if self._since is not None:
             self._since.take(result, seconds)
-        found = self._found()
-        misfit = self._misfitting(result)
+        found = changed_before(self._recent, self.filter.count)
+        misfit = self._misfit.take(result.chi2, result.dof)
         if found is None and misfit and self._since is None:
             anew = self._learnt_object(misfit)
             if anew is not None:
@@ -162,7 +134,7 @@ class RigMonitor:
                 return anew, ()
             if self._since is not None:
                 self._since = OpenChange.of(result, self._since.before, self._since.seconds, self._since.kinds)
-        self._learn_paces(seconds)
+        self._drifting.take(self.filter, self._recent, seconds, quiet=self._since is None)
         if self._since is not None and self._since.due:
             return result, self._judged(self._since.late)
         return result, ()
@@ -176,12 +148,14 @@ class RigMonitor:
         snapshots = [*self._recent.snapshots(earlier), (observations, rig_from_object)]
         try:
             pauses = [*self._recent.pauses(earlier), seconds]
-            slipped = self._slipped(Suspicion(before, snapshots, pauses, 1, free), self.filter.count)
+            suspicion = Suspicion(before, snapshots, pauses, 1, free)
+            slipped = self._clocks.ask(suspicion, self.filter.count, self.filter.options, self._since is None)
         except RefusedError:  # not yet
             seen = observations.seen.clone()
             seen[:, list(cameras)] = False
             return self._followed(replace(observations, seen=seen), rig_from_object, seconds)
         if slipped is not None:
+            self.slips = slipped.slips
             return self._followed(*slipped.snapshots[-1], seconds)
         told = list(self._judged(last=True))
         if self.filter.count - self.first < FEW:
@@ -249,38 +223,21 @@ class RigMonitor:
         self._since = OpenChange.of(result, before, seconds, free)
         return told
 
-    def _found(self) -> int | None:
-        """Before how many snapshots some camera has surely changed; None = none has."""
-        ages = {age for age, every in SLOW.items() if age <= len(self._recent) and self.filter.count % every == 0}
-        screened = self._recent.screened()
-        if screened.max() >= SUSPECTED:
-            ages.add(int(SCREENED[int(screened.max(1).argmax())]))
-        for age in sorted(ages):
-            scores = self._recent.test(age).scores()
-            kind = max(scores, key=lambda name: float(scores[name].max()))
-            camera = int(scores[kind].argmax())
-            if float(scores[kind][camera]) >= SIGNIFICANT and self._recent.steady(age, camera, kind) >= REMAINING:
-                return age
-        return None
-
     def _alarmed(self, age: int) -> tuple[Absorbed, tuple[Change, ...]]:
         """Let cameras free that have changed, the surest first, until what has been seen since then is explained."""
         told: list[Change] = []
         free: dict[int, str | None] = {}
         since, test = self._since, self._recent.test(age)
-        age = self._age(_surest(test, set()), age)
+        age = likeliest_age(self._recent, surest(test), age)
         if since is not None and age >= since.count - NEARBY:  # it was then that the open ones changed
-            again = _surest(self._recent.test(age), set()) in since.kinds
+            again = surest(self._recent.test(age)) in since.kinds
             age = age if again else since.count  # again: the first snapshots were from the old place
             before, seconds, free = since.before, since.seconds, dict(since.kinds)
         else:
             told = list(self._judged(last=True))
             before, seconds = self._recent.belief_before(age), self._recent.seconds(age)
-        test, known, evidence = self._recent.test(age), since is not None and bool(free), dict[int, float]()
-        while not free or _worst(test.given(free), set(free)) >= SIGNIFICANT:
-            given = test.given(free)
-            camera = _surest(given, set(free))
-            free[camera], evidence[camera] = None, max(float(score[camera]) for score in given.scores().values())
+        known = since is not None and bool(free)
+        free, evidence = changed_cameras(self._recent.test(age), free)
         snapshots = self._recent.snapshots(age)
         if (slipped := self._slipped_since(before, age, free)) is not None:
             return slipped, tuple(told)
@@ -303,42 +260,16 @@ class RigMonitor:
         snapshots, pauses = self._recent.snapshots(count), self._recent.pauses(count)
         everything = self.filter.count - self.first == count
         first = let_free(self._prior, dict.fromkeys(sorted(self._moved_early)), JUMPS[-1]) if everything else None
-        slipped = self._slipped(Suspicion(before, snapshots, pauses, age, cameras, first), self.filter.count - age)
+        suspicion = Suspicion(before, snapshots, pauses, age, cameras, first)
+        slipped = self._clocks.ask(suspicion, self.filter.count - age, self.filter.options, self._since is None)
         if slipped is None:
             return None
+        self.slips = slipped.slips
         result = self.filter.restart(slipped.before, slipped.snapshots)
         self._recent = RecentSnapshots(result.belief, self.filter.walk)
         self._recent.took(slipped.snapshots, pauses[-len(slipped.snapshots) :], result)
         self.open, self._since = {}, None
         return result
-
-    def _slipped(self, suspicion: Suspicion, since: int) -> Slipped | None:
-        """Ask whether clocks have slipped of cameras that seem to have moved, since a snapshot of this number.
-
-        Returns:
-            None = they have moved.
-
-        Raises:
-            RefusedError: it cannot be told yet.
-        """
-        odds, slipped = suspicion.clocks(self.filter.options)
-        self._unsure = self._unsure + 1 if abs(odds) < SLIP_ODDS else 0
-        if 0 < self._unsure <= SLIP_PATIENCE and self._since is None:
-            raise RefusedError("estimation: it cannot be told yet whether a camera has moved, or its clock slipped")
-        self._unsure = 0
-        if slipped is None or odds < 0:
-            return None
-        since -= len(slipped.snapshots) - suspicion.count
-        self.slips = tuple(replace(slip, since=since, odds=odds) for slip in slipped.slips)
-        return slipped
-
-    def _misfitting(self, result: Absorbed) -> int:
-        """Number of snapshots that fit worse than is usual; 0 = they fit."""
-        ratio = result.chi2 / max(result.dof, 1)
-        self._usual.append(ratio)
-        step = (ratio / self._usual.value - 1) * math.sqrt(max(result.dof, 1) / 2)
-        risen = self._misfit.update([min(step, MOST_MISFIT)])
-        return int(self._misfit.found[0]) if risen[0] and len(self._usual) >= LEAST_USUAL else 0
 
     def _learnt_object(self, age: int) -> Absorbed | None:
         """Learn the object anew where snapshots fit worse because it has changed."""
@@ -352,9 +283,9 @@ class RigMonitor:
 
     def _learnt_first_object(self, result: Absorbed) -> Absorbed | None:
         """Learn the object anew where it never was as its file says, and so the first snapshots do not fit."""
-        count, excess = self.filter.count, result.chi2 - result.dof
-        asked = count in OBJECT_ASKED and not self.first and self._since is None and len(self._recent) == count
-        if not asked or excess < MOST_FIRST * math.sqrt(2 * result.dof):
+        count = self.filter.count
+        asked = not self.first and self._since is None and len(self._recent) == count
+        if not asked or not never_fitted(result, count):
             return None
         with contextlib.suppress(RefusedError):
             return self._asked_object(self._prior, self._recent.snapshots(count), self._recent.pauses(count))
@@ -399,8 +330,7 @@ class RigMonitor:
         Raises:
             RefusedError: see `absorbed`.
         """
-        steady = absorbed(before, *joined(snapshots), self.filter.options)
-        found = changed_object(before, snapshots, self.filter.options, steady, OBJECT_ODDS)
+        found = object_explains(before, snapshots, self.filter.options)
         return None if found is None else self._learn_object(*found, snapshots, pauses)
 
     def _learn_object(
@@ -416,46 +346,6 @@ class RigMonitor:
         self._recent = RecentSnapshots(result.belief, self.filter.walk)
         self._recent.took(snapshots, pauses, result)
         return result
-
-    def _learn_paces(self, seconds: float) -> None:
-        """Learn how fast cameras drift while nothing else is the matter, and know as much less of those that do."""
-        follows, stretch = self.filter, self._stretch
-        if follows.young or self._since is not None:
-            self._stretch = None
-            return
-        if stretch is None:
-            self._stretch, self._untold = Stretch.after(follows.belief, follows.waited), 0
-            return
-        stretch.seconds, self._untold = stretch.seconds + seconds, self._untold + 1
-        done = stretch.seconds >= SECONDS
-        if done or self._untold == TOLD_AT_ONCE:
-            stretch.add(follows.belief, *self._recent.brought(self._untold))
-            self._untold = 0
-        if done:
-            lacking = self._paces.take(stretch, follows.rate.std(follows.belief.rig))
-            follows.pace = self._paces.of_parameters(follows.pace.shape[1])
-            self._recent.walk = follows.walk
-            if bool(lacking.any()):
-                follows.belief = widened(follows.belief, lacking)
-            self._stretch = Stretch.after(follows.belief, follows.waited)
-
-    def _age(self, camera: int, age: int) -> int:
-        """Number of snapshots since a camera changed, by how probable that is."""
-        found: dict[int, float] = {}
-
-        def ask(candidates: set[int]) -> int:
-            for candidate in candidates - found.keys():
-                if 1 <= candidate <= len(self._recent):
-                    found[candidate] = self._recent.test(candidate, aged=False).odds({camera: None})
-            return max(found, key=lambda candidate: found[candidate])
-
-        best = ask({int(n) for n in SCREENED} | {age, 1})
-        for _ in range(NEARBY):
-            nearest = ask(set(range(best - NEARBY, best + NEARBY + 1)))
-            if nearest == best:
-                break
-            best = nearest
-        return best
 
     def _judged(self, last: bool) -> tuple[Change, ...]:
         """Decide what kind of change each open one is, where the snapshots since can tell, or it is time."""
@@ -482,23 +372,3 @@ class RigMonitor:
         if not self.open:
             self._since = None
         return tuple(told)
-
-
-def _worst(test: ChangeTest, known: set[int]) -> float:
-    """Largest score of any kind of a camera that is not known to have changed."""
-    return (
-        max(
-            float(scores[camera])
-            for scores in test.scores().values()
-            for camera in range(len(scores))
-            if camera not in known
-        )
-        if len(known) < len(test.pixels)
-        else 0.0
-    )
-
-
-def _surest(test: ChangeTest, known: set[int]) -> int:
-    """The camera whose change, of any kind, is most probable; of those that are not known to have changed."""
-    odds = {camera: test.odds({camera: None}) for camera in range(len(test.pixels)) if camera not in known}
-    return max(odds, key=lambda camera: odds[camera])

@@ -8,7 +8,7 @@ import torch
 import imgcal
 from imgcal.errors import RefusedError
 from imgcal.estimation import CHANGES, Change, RigFilter, RigMonitor
-from imgcal.estimation.rig_monitor import SIGNIFICANT
+from imgcal.estimation.change_search import SIGNIFICANT
 from imgcal.geometry import RigidTransform
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import CameraRig, Observations
