@@ -11,7 +11,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from imgcal.estimation import ObjectChange
 from imgcal.geometry import RigidTransform
+from imgcal.online.events import Event
 from imgcal.online.label_checks import Checked
 from imgcal.types import Detections
 
@@ -87,3 +89,22 @@ class ObjectDoubts:
         elsewhere = np.bincount(given.fiducial[named & lost], minlength=self.fiducials)
         fits = np.bincount(given.fiducial[named & ~lost], minlength=self.fiducials)
         return elsewhere, fits
+
+
+def object_event(change: ObjectChange, since: float, time: float, snapshot: int) -> Event:
+    """Say that it is the object that is not as it was.
+
+    Args:
+        change: how.
+        since: s since the epoch.
+        time: s since the epoch, now.
+        snapshot: number of the update.
+    """
+    if change.fiducial is None:
+        how = "larger" if change.size > 0 else "smaller"
+        message = f"the object is {100 * abs(change.size):.3g} % {how} than its file says: another one"
+        values = (100 * change.size, 100 * change.sigma)
+        return Event(time, snapshot, "object_exchanged", None, since, None, *values, None, change.odds, message)
+    message = f"fiducial {change.fiducial} of the object is {change.size:.3g} +- {change.sigma:.1g} mm from its place"
+    size = (change.size, change.sigma)
+    return Event(time, snapshot, "object_bent", None, since, None, *size, "mm", change.odds, message)

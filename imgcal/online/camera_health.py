@@ -1,0 +1,66 @@
+"""How each camera of a running rig is, in a word, and the rig in a sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from imgcal.online.events import Event
+from imgcal.online.keeper_memory import KeeperMemory
+from imgcal.online.rig_state import CameraHealth
+
+SAID: Mapping[CameraHealth, str] = {
+    "lost": "lost",
+    "blind": "blind",
+    "relearning": "moved, being learnt again",
+    "doubtful": "in doubt",
+    "dirty": "dirty",
+    "defocused": "out of focus",
+    "unseen": "not looked at yet",
+}
+
+
+def health_of(memory: KeeperMemory) -> dict[str, CameraHealth]:
+    """How each camera is, by name."""
+    found: dict[str, CameraHealth] = {}
+    for camera, name in enumerate(memory.prior.camera_names):
+        if camera in memory.sightings.lost:
+            found[name] = "lost"
+        elif camera not in memory.sightings.seen:
+            found[name] = "unseen"
+        elif camera in memory.relearning.events:
+            found[name] = "relearning"
+        elif camera in memory.off or camera in memory.sightings.doubted:
+            found[name] = "doubtful"
+        else:
+            found[name] = memory.told_health.get(camera, "ok")
+    return found
+
+
+def take_health(memory: KeeperMemory, event: Event) -> None:
+    """Remember what a test says of a camera."""
+    if event.camera is None:
+        return
+    camera = memory.prior.camera_names.index(event.camera)
+    if event.kind in ("dirty", "defocused"):
+        memory.told_health[camera] = event.kind
+    elif event.kind == "camera_lost":
+        memory.told_health[camera] = "blind"
+    elif event.kind in ("clean", "camera_back"):
+        memory.told_health.pop(camera, None)
+
+
+def sentence_of(health: Mapping[str, CameraHealth], learnt: int) -> str:
+    """Say how a rig is, of which so many snapshots have been learnt.
+
+    Examples:
+        >>> sentence_of({"cam01": "ok", "cam02": "lost", "cam03": "lost"}, 9)
+        'cam02, cam03 lost'
+    """
+    if not learnt:
+        return "the object has not been seen yet"
+    parts = []
+    for state, words in SAID.items():
+        names = [name for name, found in health.items() if found == state]
+        if names:
+            parts.append(f"{', '.join(names)} {words}")
+    return "; ".join(parts) if parts else f"all {len(health)} cameras are calibrated"

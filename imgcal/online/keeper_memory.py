@@ -1,0 +1,195 @@
+"""All that a keeper knows from snapshot to snapshot: what is saved, and what a file must hold to be gone on with."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from imgcal.association import PipelineOptions, to_observations
+from imgcal.estimation import RigBelief, RigFilter, RigMonitor
+from imgcal.geometry import RigidTransform
+from imgcal.online.drift_watch import DriftWatch
+from imgcal.online.events import Event
+from imgcal.online.late_cameras import POSES
+from imgcal.online.memory import require_alike
+from imgcal.online.noise_level import NoiseLevel
+from imgcal.online.object_doubts import ObjectDoubts
+from imgcal.online.relearning import Relearning
+from imgcal.online.rig_state import CameraHealth
+from imgcal.online.search import Search, Surroundings
+from imgcal.online.sightings import Sightings
+from imgcal.types import (
+    CalibrationObject,
+    CameraRig,
+    Detections,
+    DriftRate,
+    Observations,
+    RigPrior,
+    check_object,
+    check_rig,
+)
+
+UNUSUAL = 5.0
+"""Times as far off as most cameras usually are, from which it is not the cameras but labels or pose that are wrong."""
+LEAST_USUAL = 8
+"""Snapshots that say how far off most cameras usually are."""
+
+
+@dataclass
+class KeeperMemory:
+    """What is known of a rig, of its object and of what is going on; changed in place."""
+
+    options: PipelineOptions  # not saved: whoever goes on has their own
+    factory: CameraRig
+    obj: CalibrationObject  # as its file says
+    drift: DriftRate | None
+    prior: CameraRig  # what the filter began with
+    monitor: RigMonitor
+    noise: NoiseLevel
+    sightings: Sightings
+    relearning: Relearning
+    drift_watch: DriftWatch
+    doubts: ObjectDoubts
+    search: Search
+    looks: NDArray[np.int64]  # (C,) snapshots learnt from each camera where it stands
+    before: RigBelief  # from before what is being decided
+    count: int = 0
+    learnt: float | None = None  # s, time of the last snapshot that was learnt
+    times: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=512))  # number in the filter, time
+    poses: deque[tuple[float, RigidTransform]] = field(default_factory=lambda: deque(maxlen=POSES))  # (1,), the latest
+    labels: int = 0  # of the last snapshot
+    usual: deque[float] = field(default_factory=lambda: deque(maxlen=64))  # px
+    off: dict[int, float] = field(default_factory=dict)  # cameras that did not fit in the last snapshot -> since when
+    in_vain: int = 0  # snapshots in a row in which no camera fits
+    told_health: dict[int, CameraHealth] = field(default_factory=dict)  # by tests
+    pending: list[Event] = field(default_factory=list)
+    time: float = 0.0
+
+    @classmethod
+    def of(
+        cls, rig: CameraRig, obj: CalibrationObject, drift: DriftRate | None, options: PipelineOptions
+    ) -> KeeperMemory:
+        """Begin with a factory calibration."""
+        rig = rig.to(torch.float64)
+        monitor = RigMonitor(RigFilter(rig, obj, drift, options.estimation))
+        return cls(
+            options=options, factory=rig, obj=obj, drift=drift, prior=rig, monitor=monitor,
+            noise=NoiseLevel(rig, obj, options), sightings=Sightings(rig.camera_names),
+            relearning=Relearning(rig.camera_names), drift_watch=DriftWatch(rig.camera_names),
+            doubts=ObjectDoubts(obj.num_fiducials), search=Search(rig.num_cameras),
+            looks=np.zeros(rig.num_cameras, dtype=np.int64), before=monitor.filter.belief,
+        )  # fmt: skip
+
+    def begin_anew(self) -> None:
+        """Forget everything but the factory calibration."""
+        fresh = KeeperMemory.of(self.prior, self.obj, self.drift, self.options)
+        for name in ("monitor", "doubts", "search", "relearning", "drift_watch", "looks", "off", "in_vain"):
+            setattr(self, name, getattr(fresh, name))
+        self.noise.restart()
+        self.usual.clear()
+        self.times.clear()
+        message = "no camera is where it was: learning begins again with the factory calibration"
+        self.pending.append(Event(self.time, self.count - 1, "restart", message=message))
+
+    @property
+    def belief(self) -> RigBelief:
+        """What is known of the rig now."""
+        return self.monitor.filter.belief
+
+    @property
+    def obj_now(self) -> CalibrationObject:
+        """The object as it is known now."""
+        known = self.belief.obj  # with tolerances, also where an exact one has changed
+        return self.obj if known.exact else replace(self.obj.taken_as_exact(), points=self.belief.points_object)
+
+    @property
+    def surroundings(self) -> Surroundings | None:
+        """The rig, and with some reserve how well it is known; None = nothing but the factory calibration."""
+        if not self.monitor.filter.count:
+            return None
+        return Surroundings(self.belief, (self.prior.prior or RigPrior()).std(self.prior), self.obj_now, self.options)
+
+    @property
+    def most_usual(self) -> float:
+        """How far off most cameras may be, px."""
+        if len(self.usual) < LEAST_USUAL:
+            return math.inf
+        return self.options.identity_error + UNUSUAL * max(float(np.median(self.usual)), self.noise.additive)
+
+    def predicted(self, pose: RigidTransform | None) -> NDArray[np.float64]:
+        """Where the rig puts the fiducials of an object in a pose (1,): (C, N, 2) pixels; None = nan."""
+        if pose is None:
+            return np.full((self.prior.num_cameras, self.obj.num_fiducials, 2), np.nan)
+        points = pose.apply(self.belief.points_object)
+        uv: NDArray[np.float64] = self.belief.rig.expand(1).project_values(points, self.obj.radius).uv[0].numpy()
+        return uv
+
+    def observed(self, blobs: Detections) -> Observations:
+        """Labelled blobs of a snapshot with the noise that they have shown: (1, C, N)."""
+        seen = to_observations(blobs, self.prior, self.obj)
+        return replace(seen, sigma=(seen.sigma.square() + self.noise.additive**2).sqrt())
+
+    def since(self, number: int, camera: int | None = None) -> float:
+        """When it happened what the filter found since a snapshot of this number, to a camera or the object: s."""
+        since = next((time for learnt, time in self.times if learnt >= number), self.time)
+        return since if camera is None else self.search.since(camera, min(since, self.off.get(camera, since)))
+
+    def values(self) -> dict[str, Any]:
+        """What is saved."""
+        return {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name != "options"}
+
+    @classmethod
+    def restored(cls, found: Mapping[str, Any], options: PipelineOptions) -> KeeperMemory:
+        """Take over what `values` gave, out of a file.
+
+        Raises:
+            ValueError: it is not that, or belongs to another rig and object.
+            InputError: a rig or an object in it is none.
+        """
+        for rig in (found["prior"], found["factory"]):
+            check_rig(rig)
+        check_object(found["obj"])
+        fresh = cls.of(found["prior"], found["obj"], found["drift"], options)
+        expected = fresh.values()
+        if set(found) != set(expected):
+            raise ValueError("other values than are written here")
+        for name, new in expected.items():
+            if found[name] is not None and new is not None and type(found[name]) is not type(new):
+                raise ValueError(f"{name}: found {type(found[name]).__name__}, expected {type(new).__name__}")
+            if type(new).__module__.startswith("imgcal.") and not isinstance(new, RigBelief):
+                require_alike(found[name], new, name)
+        require_alike(found["monitor"].filter, fresh.monitor.filter, "filter")
+        for belief in (found["monitor"].filter.belief, found["before"]):
+            _check_belief(belief, fresh)
+        if found["looks"].shape != fresh.looks.shape:
+            raise ValueError("found other cameras")
+        memory = cls(options=options, **found)
+        memory.monitor.filter.options = options.estimation
+        return memory
+
+
+def _check_belief(belief: RigBelief, fresh: KeeperMemory) -> None:
+    """Check a belief out of a file; where an exact object has changed, it is about that with its shape.
+
+    Raises:
+        ValueError: it is about another rig or object, or none.
+        InputError: its rig or object is none.
+    """
+    like = fresh.belief
+    if belief.obj.exact != fresh.obj.exact:
+        check_object(belief.obj)
+        if not fresh.obj.exact or belief.obj.num_fiducials != fresh.obj.num_fiducials:
+            raise ValueError("found a belief about another object")
+        like = RigBelief.of_prior(fresh.prior, belief.obj)
+    require_alike(belief, like, "belief")
+    require_alike(belief.rig, fresh.prior, "rig")
+    check_rig(belief.rig)
+    if not bool(belief.factor.isfinite().all() & (belief.factor.diagonal() > 0).all()):
+        raise ValueError("found a belief that is none")

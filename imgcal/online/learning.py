@@ -1,0 +1,95 @@
+"""Learn a labelled snapshot: what fits, what waits for the next one, what is asked again with another noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from imgcal.estimation import Absorbed, Change, RigFilter, RigMonitor
+from imgcal.online.drift_watch import DriftWatch
+from imgcal.online.keeper_memory import KeeperMemory
+from imgcal.online.label_checks import Checked
+from imgcal.online.object_doubts import ObjectDoubts
+
+LEAST_LOOKS = 8
+"""Snapshots of a camera, from where it stands, from which its values say where its labels must be."""
+
+
+def learnt_from(memory: KeeperMemory, checked: Checked) -> tuple[Absorbed, tuple[Change, ...]]:
+    """Absorb a snapshot; what a camera sees that does not fit for the first time waits for the next one.
+
+    Args:
+        memory: what is known, which changes.
+        checked: the snapshot of `memory.time`, with its labels.
+
+    Returns:
+        What it taught, and the changes of cameras that became known.
+
+    Raises:
+        RefusedError: see `RigMonitor.update`.
+    """
+    monitor, still_open, time = memory.monitor, memory.monitor.open, memory.time
+    off = {
+        camera: memory.off.get(camera, time)
+        for camera in np.flatnonzero(checked.off & (memory.looks >= LEAST_LOOKS)).tolist()
+    }
+    waiting = [camera for camera in off if camera not in memory.off and camera not in still_open]
+    moved = [camera for camera in off if camera in memory.off and camera not in still_open]
+    fiducial = np.where(np.isin(checked.blobs.camera, waiting), -1, checked.blobs.fiducial)
+    blobs = replace(checked.blobs, fiducial=fiducial)
+    seconds = 0.0 if memory.learnt is None else max(time - memory.learnt, 0.0)
+    observations = memory.observed(blobs)
+    if not off and not still_open:
+        memory.before = memory.belief
+    first = monitor.first
+    result, changes = monitor.update(observations, checked.rig_from_object, seconds, moved)
+    if monitor.first != first:  # nothing that was known before counts any more
+        memory.drift_watch = DriftWatch(memory.prior.camera_names)
+        memory.looks[:] = 0
+    memory.times.append((monitor.filter.count - 1, time))
+    if changes or monitor.open or monitor.object_change is not None:
+        memory.doubts = ObjectDoubts(memory.obj.num_fiducials)
+    elif memory.doubts.take(checked, blobs, seconds, time):
+        result = ask_object(memory, learnt=True) or result
+    memory.looks += observations.seen[0].any(-1).numpy()
+    memory.looks[[change.camera for change in changes]] = 0
+    memory.off, memory.learnt, memory.in_vain = off, time, 0
+    if monitor.slips:  # poses were off that have been found with blobs of another time
+        memory.poses.clear()
+    memory.poses.append((time, result.rig_from_object))
+    memory.labels = checked.labels
+    memory.search.learnt(checked.blobs, memory.count - 1)
+    memory.usual.append(checked.usual)
+    steady = not (off or changes or monitor.open or monitor.slips)
+    if memory.noise.take(blobs, observations, result, steady, monitor.filter.count):
+        result = _again(memory, result)
+    return result, changes
+
+
+def ask_object(memory: KeeperMemory, learnt: bool) -> Absorbed | None:
+    """Ask whether labels do not fit because the object is not as its file says; what was learnt then.
+
+    Args:
+        memory: what is known, which changes.
+        learnt: of the snapshots that have been learnt without those labels; else of those that were refused.
+    """
+    doubted = memory.doubts.learnt if learnt else memory.doubts.refused
+    snapshots = [(memory.observed(one.blobs), one.rig_from_object) for one in doubted]
+    first = memory.monitor.filter.count
+    result = memory.monitor.ask_object(snapshots, [one.seconds for one in doubted], learnt)
+    if result is not None and not learnt:
+        memory.times.extend((first + n, one.time) for n, one in enumerate(doubted))
+        memory.learnt = doubted[-1].time
+    memory.doubts.asked(result is not None)
+    return result
+
+
+def _again(memory: KeeperMemory, result: Absorbed) -> Absorbed:
+    """Learn the first snapshots again, with the noise that they have shown."""
+    monitor = RigMonitor(RigFilter(memory.prior, memory.obj, memory.drift, memory.options.estimation))
+    for blobs, pose in memory.noise.first:
+        result, _ = monitor.update(memory.observed(blobs), pose)
+    memory.monitor = monitor
+    memory.doubts = ObjectDoubts(memory.obj.num_fiducials)
+    return result

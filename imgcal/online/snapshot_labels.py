@@ -1,0 +1,118 @@
+"""Which blob is which, in a snapshot of a rig that is kept calibrated: by the last pose, or by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from imgcal.association import to_observations
+from imgcal.detection import Frame
+from imgcal.errors import RefusedError
+from imgcal.estimation import initial_pose
+from imgcal.geometry import RigidTransform
+from imgcal.online.following import near_prediction
+from imgcal.online.keeper_memory import KeeperMemory
+from imgcal.online.label_checks import Checked, check_labels
+from imgcal.online.labelling import LEAST_FOLLOWED, Labelling
+from imgcal.online.learning import ask_object
+from imgcal.online.object_doubts import object_event
+from imgcal.types import Detections
+
+PATIENCE = 64
+"""Snapshots in a row in which no camera fits: the rig is not the one that is known, and is learnt anew."""
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """A snapshot with labels."""
+
+    checked: Checked
+    astray: frozenset[int]  # cameras that see what may be the object, and cannot tell what
+
+
+def labelled_snapshot(
+    memory: KeeperMemory,
+    labelling: Labelling,
+    usable: Detections,
+    name: str,
+    frames: Mapping[str, Frame | None] | None,
+) -> Labelled:
+    """Label a snapshot.
+
+    Args:
+        memory: what is known.
+        labelling: what labels snapshots by themselves.
+        usable: its blobs.
+        name: its name.
+        frames: those that the blobs were found in; None = there are none.
+
+    Raises:
+        RefusedError: it cannot be told which blob is which, or labels fit in no camera.
+    """
+    coded = usable.fiducial.copy() if (usable.fiducial >= 0).any() else None
+    followed = None if coded is not None else _followed(memory, labelling, usable)
+    if followed is not None:
+        return followed
+    there = memory.surroundings
+    known = None if there is None else (there.rig, there.std)
+    blobs, snapshot = labelling.decided(usable, name, coded, None if coded is not None else frames, known)
+    pose = snapshot.rig_from_object
+    if pose is None:
+        obj = memory.obj_now
+        pose = initial_pose(to_observations(blobs, memory.prior, obj), memory.belief.rig, obj)[0]
+    checked = _checked(memory, blobs, pose.reshape(1))
+    if checked.usual > memory.most_usual and memory.doubts.due and ask_object(memory, learnt=False) is not None:
+        change = memory.monitor.object_change
+        assert change is not None
+        memory.pending.append(object_event(change, memory.since(change.since), memory.time, memory.count - 1))
+        checked = _checked(memory, blobs, pose.reshape(1))
+    if checked.usual > memory.most_usual:
+        memory.doubts.take_refused(checked, memory.time if memory.learnt is None else memory.learnt, memory.time)
+        memory.in_vain += 1
+        if memory.in_vain >= PATIENCE:
+            memory.begin_anew()
+        raise RefusedError(
+            f"estimation: labels are {checked.usual:.1f} px off in most cameras: labels are wrong, or the whole "
+            "rig is another"
+        )
+    return _searched(memory, checked)
+
+
+def _followed(memory: KeeperMemory, labelling: Labelling, usable: Detections) -> Labelled | None:
+    """Label a snapshot by the last one's pose; None = it cannot be followed."""
+    if not labelling.follows or labelling.slips or not memory.poses:
+        return None
+    pose = _extrapolated(memory)
+    named = replace(usable, fiducial=near_prediction(usable, memory.predicted(pose)))
+    if (named.fiducial >= 0).sum() < LEAST_FOLLOWED * memory.labels:
+        return None
+    sought = frozenset(memory.search.sought)
+    try:
+        found = _searched(memory, _checked(memory, named, pose))
+    except RefusedError:
+        return None
+    few = found.checked.labels < LEAST_FOLLOWED * memory.labels
+    return None if few or found.astray - sought or found.checked.usual > memory.most_usual else found
+
+
+def _extrapolated(memory: KeeperMemory) -> RigidTransform:
+    """Where the object should be now: (1,)."""
+    last_time, last = memory.poses[-1]
+    first_time, first = memory.poses[-min(2, len(memory.poses))]
+    share = 0.0 if last_time <= first_time else (memory.time - last_time) / (last_time - first_time)
+    if not 0.5 < share < 2.0:
+        return last
+    return RigidTransform(last.rotation, last.translation + share * (last.translation - first.translation))
+
+
+def _checked(memory: KeeperMemory, named: Detections, pose: RigidTransform) -> Checked:
+    return check_labels(named, memory.belief.rig, memory.obj_now, pose, memory.options)
+
+
+def _searched(memory: KeeperMemory, checked: Checked) -> Labelled:
+    """Look for the object in cameras that do not see it where it should be."""
+    there = memory.surroundings
+    if there is None:
+        return Labelled(checked, frozenset())
+    doubted = memory.sightings.doubted | memory.sightings.lost.keys()
+    return Labelled(*memory.search.take(checked, there, memory.time, memory.count - 1, doubted))

@@ -1,0 +1,28 @@
+"""How each camera is, the worst first, and the sentence that says so."""
+
+from imgcal.online import Event
+from imgcal.online.camera_health import health_of, sentence_of, take_health
+from tests.imgcal.online.memories import Remembered
+
+
+def test_the_worst_is_said_of_a_camera() -> None:
+    memory = Remembered().learn(2)
+    memory.sightings.seen |= {0, 1, 2}
+    assert health_of(memory) == {"cam01": "ok", "cam02": "ok", "cam03": "ok", "cam04": "unseen"}
+    take_health(memory, Event(0.0, 1, "dirty", "cam02"))
+    take_health(memory, Event(0.0, 1, "object_bent"))
+    assert health_of(memory)["cam02"] == "dirty"
+    memory.off[1] = 0.0
+    assert health_of(memory)["cam02"] == "doubtful"
+    memory.relearning.events[1] = Event(0.0, 1, "moved", "cam02")
+    assert health_of(memory)["cam02"] == "relearning"
+    memory.relearning.events.clear()
+    memory.off.clear()
+    take_health(memory, Event(0.0, 2, "clean", "cam02"))
+    assert health_of(memory)["cam02"] == "ok"
+
+
+def test_the_rig_is_said_in_a_sentence() -> None:
+    assert sentence_of({"a": "ok"}, 0) == "the object has not been seen yet"
+    assert sentence_of({"a": "ok", "b": "ok"}, 5) == "all 2 cameras are calibrated"
+    assert sentence_of({"a": "dirty", "b": "relearning"}, 5) == "b moved, being learnt again; a dirty"

@@ -1,0 +1,52 @@
+"""What a keeper remembers: begun, forgotten, and taken over from values that belong to it alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import imgcal
+from imgcal.online.keeper_memory import LEAST_USUAL, KeeperMemory
+from tests.imgcal.online.memories import OPTIONS, Remembered
+
+
+def test_nothing_is_known_at_the_beginning_but_what_the_factory_says() -> None:
+    rig, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+    memory = KeeperMemory.of(rig, obj, None, OPTIONS)
+    assert memory.surroundings is None and memory.most_usual == np.inf
+    assert memory.obj_now is obj
+    assert np.isnan(memory.predicted(None)).all() and memory.predicted(None).shape == (4, 8, 2)
+
+
+def test_what_has_been_learnt_is_forgotten_but_for_the_factory() -> None:
+    made = Remembered()
+    memory = made.learn(LEAST_USUAL)
+    assert memory.most_usual < 2.0
+    known = memory.surroundings
+    assert known is not None and bool((known.std[:, 6] < known.widest[:, 6]).all())
+    factory = memory.factory
+    memory.begin_anew()
+    assert memory.factory is factory and memory.surroundings is None and memory.most_usual == np.inf
+    assert not memory.looks.any() and not memory.times
+    assert [event.kind for event in memory.pending] == ["restart"]
+
+
+def test_moments_are_those_of_the_snapshots_or_since_when_it_was_in_doubt() -> None:
+    memory = Remembered().learn(3)
+    assert memory.since(1) == memory.since(1, 2) == pytest.approx(1 / 60)
+    assert memory.since(99) == memory.time
+    memory.off[2] = 0.001
+    assert memory.since(1, 2) == 0.001
+
+
+def test_values_are_taken_over_and_those_of_another_rig_are_not() -> None:
+    memory = Remembered().learn(2)
+    again = KeeperMemory.restored(memory.values(), OPTIONS)
+    assert again.belief is memory.belief and again.count == 2
+    other = KeeperMemory.of(imgcal.load_rig("U7"), memory.obj, None, OPTIONS).values()
+    bare = replace(memory.belief, factor=torch.zeros_like(memory.belief.factor))
+    looks = np.zeros(7, dtype=np.int64)
+    for change in ({"looks": looks}, {"monitor": other["monitor"]}, {"before": bare}, {"usual": []}, {"more": 1}):
+        with pytest.raises(ValueError, match=r"found|other values"):
+            KeeperMemory.restored({**memory.values(), **change}, OPTIONS)

@@ -1,0 +1,51 @@
+"""Snapshots are labelled by the last pose, else by themselves; those that fit nowhere are refused, and at last the rig."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from imgcal.errors import RefusedError
+from imgcal.online.snapshot_labels import PATIENCE
+from scripts.benchmarks.rig_streams import Conditions
+from tests.imgcal.online.memories import Remembered
+
+
+def test_a_snapshot_is_followed_by_the_last_pose_and_else_decided_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    made, decided = Remembered(), []
+    own = made.labelling.decided
+    monkeypatch.setattr(made.labelling, "decided", lambda *given: (decided.append(made.memory.count), own(*given))[1])
+    made.learn(5)
+    assert decided == [1]
+    made.labelling.follows = False
+    made.learn(1)
+    assert decided == [1, 6]
+
+
+def test_labels_are_the_true_ones() -> None:
+    made = Remembered()
+    made.learn(4)
+    given = replace(made.stream.conditions, labelled=True)
+    twin = Remembered(conditions=given)
+    for _ in range(4):
+        twin.blobs()
+    found, true = made.labelled(made.blobs()).checked.blobs, twin.blobs()
+    np.testing.assert_array_equal(found.uv, true.uv)
+    named = found.fiducial >= 0
+    assert named.sum() >= 20
+    np.testing.assert_array_equal(found.fiducial[named], true.fiducial[named])
+
+
+def test_labels_that_fit_nowhere_are_refused_until_the_rig_is_given_up() -> None:
+    made = Remembered(conditions=Conditions(labelled=True, clutter=0.0, hidden=0.0))
+    memory = made.learn(10)
+    wrong = replace(made.blobs())
+    wrong.fiducial[:] = np.roll(np.arange(8), 3)[wrong.fiducial]
+    memory.in_vain = PATIENCE - 2
+    with pytest.raises(RefusedError, match="off in most cameras"):
+        made.labelled(wrong)
+    assert memory.monitor.filter.count == 10 and not memory.pending
+    with pytest.raises(RefusedError, match="off in most cameras"):
+        made.labelled(wrong)
+    assert memory.monitor.filter.count == 0
+    assert [event.kind for event in memory.pending] == ["restart"]
