@@ -1,7 +1,9 @@
 from pathlib import Path
 
 from scripts.benchmarks import alarms
-from scripts.benchmarks.alarms import Item, Options, done, go_on, items, run, summarized, tables
+from scripts.benchmarks.alarms import Options, done, go_on, items
+from scripts.benchmarks.alarms_runs import Item, run
+from scripts.benchmarks.alarms_tables import summarized, tables
 
 
 def test_a_bump_is_found_and_counted(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Snapshots are labelled by the last pose, else by themselves; those that fit nowhere are refused, and at last the rig."""
+"""Snapshots are labelled by the last pose, else by themselves; what fits nowhere is refused, and at last the rig."""
 
 from dataclasses import replace
 
