@@ -234,7 +234,7 @@ def ordinary_lens(std: Tensor) -> Tensor:
     """Narrow the spread of k3: views of a carried object say little of it, and it ruins the image's corners.
 
     Args:
-        std: (C, 15) of the parameters.
+        std: (C, K) of the parameters.
     """
     narrow = std.clone()
     narrow[:, K3] = std[:, K3].clamp_max(ORDINARY_K3)

@@ -52,7 +52,7 @@ class RigUncertainty:
             points: (P, 3) mm in the rig frame, or (C, P, 3), own points for each camera. What a camera does not see has
                 an error, too, which means nothing.
         """
-        rows = pixel_jacobian(self.rig, points).flatten(1, 2)  # (C, 2 P, 15)
+        rows = pixel_jacobian(self.rig, points).flatten(1, 2)  # (C, 2 P, K)
         cameras = self.rig.num_cameras
         blocks = self.px_covariance.unflatten(0, (cameras, -1)).unflatten(-1, (cameras, -1))
         own = blocks.diagonal(dim1=0, dim2=2).permute(2, 0, 1)  # (C, K, K)

@@ -34,7 +34,7 @@ class DriftWatch:
     names: tuple[str, ...]
     looked: float | None = None  # s since the epoch
     reference: CameraRig | None = None
-    std: Tensor | None = None  # (C, 15) of the reference
+    std: Tensor | None = None  # (C, K) of the reference
     since: dict[int, float] = field(default_factory=dict)  # camera -> time of its reference
     unsettled: frozenset[int] = frozenset()  # at any time since the last look
 

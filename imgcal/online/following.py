@@ -123,7 +123,7 @@ def found_again(
         rig: as last known.
         obj: the calibration object.
         pose: rig_from_object by the other cameras.
-        std: (C, 15) how well the rig is known.
+        std: (C, K) how well the rig is known.
         options: how sure labels must be.
     """
     rows = np.flatnonzero(blobs.camera == camera)
@@ -148,7 +148,7 @@ def found_again(
 def widened(
     std: Tensor, rig: CameraRig, cameras: list[int], pose: RigidTransform, obj: CalibrationObject, turn: float
 ) -> Tensor:
-    """Let cameras be anywhere within a turn (rad), and as far off as moves the image of the object as much: (C, 15)."""
+    """Let cameras be anywhere within a turn (rad), and as far off as moves the image of the object as much: (C, K)."""
     std = std.clone()
     centre = pose.apply(obj.points).mean(0)
     for camera in cameras:

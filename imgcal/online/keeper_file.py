@@ -14,7 +14,8 @@ from imgcal.online.events import iso_time, snapshot_name
 from imgcal.online.memory import Frozen, Thawed
 from imgcal.types import CalibrationObject, CameraRig
 
-FORMAT = "imgcal-keeper/1"
+FORMAT = "imgcal-keeper/2"
+"""Another number whenever what is remembered is laid out anew: nobody can go on from a state of another version."""
 MOST_BYTES = 2**28
 
 
@@ -77,6 +78,11 @@ def read_memory(path: str | Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not valid JSON: {shortened(str(error))}") from error
     found = values.get("format") if isinstance(values, dict) else None
+    if found != FORMAT and isinstance(found, str) and found.startswith(FORMAT[: FORMAT.index("/") + 1]):
+        raise InputError(
+            f"{path}: found the state of another version of imgcal ({shortened(found)}), expected {FORMAT}: it "
+            'cannot be gone on with; the rig that it knew stands in it as "rig"'
+        )
     if found != FORMAT:
         raise InputError(f'{path}: found format {shortened(repr(found))}, expected "{FORMAT}"')
     try:

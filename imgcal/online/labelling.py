@@ -109,7 +109,7 @@ class Labelling:
             name: its name.
             coded: (M,) labels that came with them; None = none did.
             frames: those that the blobs were found in, for a proposer; None = there are none.
-            known: the rig, and how well it is known (C, 15); None = as the factory says.
+            known: the rig, and how well it is known (C, K); None = as the factory says.
 
         Raises:
             RefusedError: it cannot be told which blob is which.

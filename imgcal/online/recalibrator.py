@@ -62,7 +62,7 @@ class _Last:
     """What was known of a camera when it was last seen."""
 
     rig: CameraRig
-    std: Tensor  # (15,)
+    std: Tensor  # (K,)
     seen: frozenset[int]  # cameras in the window of that time
 
 

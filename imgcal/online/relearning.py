@@ -33,7 +33,7 @@ class Relearning:
 
     names: tuple[str, ...]
     events: dict[int, Event] = field(default_factory=dict)  # camera -> what was told of it last
-    before: dict[int, Tensor] = field(default_factory=dict)  # camera -> (15,) std before it moved
+    before: dict[int, Tensor] = field(default_factory=dict)  # camera -> (K,) std before it moved
 
     def told(self, change: Change, since: float, time: float, number: int, before: RigBelief) -> Event:
         """Tell of a change.
@@ -84,7 +84,7 @@ class Relearning:
 
 
 def relative_std(belief: RigBelief) -> Tensor:
-    """One standard deviation of every parameter against the mean of all cameras: (C, 15)."""
+    """One standard deviation of every parameter against the mean of all cameras: (C, K)."""
     count = belief.rig.num_cameras
     jacobian = Gauge(torch.full((count,), 1 / count, dtype=torch.float64)).jacobian(belief.rig)
     spread = (jacobian @ belief.covariance() * jacobian).sum(1)
@@ -92,7 +92,7 @@ def relative_std(belief: RigBelief) -> Tensor:
 
 
 def sigma_of(std: Tensor, change: ChangeKind | None) -> float | None:
-    """Standard deviation of the worst direction of a kind of change, of a camera's (15,), in the unit of its event."""
+    """Standard deviation of the worst direction of a kind of change, of a camera's (K,), in the unit of its event."""
     if change is None or change not in CHANGES:
         return None
     return float(std[CHANGES[change]].max()) * (math.degrees(1.0) if change == "rotation" else 1.0)

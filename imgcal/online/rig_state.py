@@ -67,12 +67,12 @@ class RigState:
 
     @cached_property
     def moved(self) -> Tensor:
-        """Change of every parameter against the factory rig, a motion of the whole rig taken out: (C, 15)."""
+        """Change of every parameter against the factory rig, a motion of the whole rig taken out: (C, K)."""
         return self.gauge.difference(self.rig, self.factory)
 
     @cached_property
     def std(self) -> Tensor:
-        """One standard deviation of `moved`, and so of the cameras against most of the others: (C, 15)."""
+        """One standard deviation of `moved`, and so of the cameras against most of the others: (C, K)."""
         jacobian = self.gauge.jacobian(self.rig)
         spread = (jacobian @ self.belief.covariance() * jacobian).sum(1)
         return spread.clamp_min(0).sqrt().unflatten(0, (-1, self.rig.num_parameters))

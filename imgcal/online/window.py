@@ -49,7 +49,7 @@ class Window:
     """Snapshots, the newest last, and how far the factory values may be off."""
 
     kept: tuple[Kept, ...]
-    prior_std: Tensor  # (C, 15)
+    prior_std: Tensor  # (C, K)
     moved: Mapping[int, str] = field(default_factory=dict)  # camera -> first snapshot from its new place; "" = none yet
     restarted: bool = False  # the older snapshots were given up
 
@@ -59,7 +59,7 @@ class Window:
         Args:
             camera: its number.
             first: number of the first snapshot that counts.
-            wide: (C, 15) standard deviations that such a camera starts afresh from.
+            wide: (C, K) standard deviations that such a camera starts afresh from.
         """
         kept = tuple(k.without(camera) if i < first else k for i, k in enumerate(self.kept))
         prior_std = self.prior_std.clone()

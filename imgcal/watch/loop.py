@@ -39,7 +39,9 @@ class Writable(Protocol):
 class Keeper(Protocol):
     """What keeps the rig calibrated: a `RigKeeper`."""
 
-    factory: CameraRig
+    @property
+    def factory(self) -> CameraRig:
+        """The factory calibration."""
 
     def update(self, source: Mapping[str, Frame | None] | Detections, time: float) -> RigState:
         """Learn from a snapshot."""

@@ -213,6 +213,21 @@ def test_what_was_left_and_cannot_be_used_is_told_with_the_way_out(tmp_path, mon
     assert name in error and error.endswith("; --fresh begins anew\n") and error.count("\n") == 1
 
 
+def test_the_state_of_another_version_is_told_and_nothing_is_lost(blobs, tmp_path, capsys):
+    save_detections(blobs.of_snapshots(0, 5), tmp_path / "blobs.csv")
+    out = tmp_path / "out"
+    assert watch(tmp_path / "blobs.csv", out) == 0
+    state = out / "state.json"
+    state.write_text(state.read_text().replace("imgcal-keeper/2", "imgcal-keeper/1", 1))
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    capsys.readouterr()
+    assert watch(tmp_path / "blobs.csv", out) == 2
+    error = capsys.readouterr().err
+    assert "another version of imgcal" in error and error.endswith("; --fresh begins anew\n") and error.count("\n") == 1
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+    assert watch(tmp_path / "blobs.csv", out, "--fresh") == 0
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [("tcp://127.0.0.1:99999", "expected an address"), ("absent.mcap", "no such file"), ("absent", "no such file")],

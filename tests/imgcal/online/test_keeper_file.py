@@ -77,7 +77,7 @@ def test_the_same_snapshots_give_the_same_states(saved, tmp_path: Path) -> None:
 
 def test_people_can_read_it(saved) -> None:
     content = json.loads(saved[0].read_text())
-    assert content["format"] == "imgcal-keeper/1"
+    assert content["format"] == "imgcal-keeper/2"
     assert content["sentence"].startswith("cam02 moved")
     assert content["snapshot"] == "00015"
     assert content["cameras"]["cam01"] == "ok"
@@ -116,6 +116,15 @@ def test_files_that_were_changed_are_refused_in_one_line(saved, tmp_path: Path, 
     with pytest.raises(InputError) as told:
         RigKeeper.restore(path)
     assert str(told.value).startswith(str(path))
+    assert "\n" not in str(told.value)
+
+
+def test_the_state_of_another_version_is_refused_with_what_can_be_done(saved, tmp_path: Path) -> None:
+    path, content = tmp_path / "state.json", json.loads(saved[0].read_text())
+    content["format"] = "imgcal-keeper/1"
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"another version of imgcal \(imgcal-keeper/1\)") as told:
+        RigKeeper.restore(path)
     assert "\n" not in str(told.value)
 
 
