@@ -20,10 +20,10 @@ EDGES = 4  # of a drape
 class BlobRange:
     """How many blobs a frame, and the intervals that they are drawn from, uniformly."""
 
-    count: int
+    count: int  # blobs in each frame
     radius: tuple[float, float]  # px, semi-major axis
     aspect: tuple[float, float]  # semi-major over semi-minor axis
-    intensity: tuple[float, float]
+    intensity: tuple[float, float]  # of the light, in units of a marker's
     fewest: int | None = None  # the number is drawn from this one up to `count` in each frame; None = always `count`
 
     def __post_init__(self) -> None:
@@ -51,7 +51,7 @@ class ClutterModel:
     occluded_diameter: tuple[float, float] = (0.1, 0.7)  # share of the marker's diameter that it covers
     streaks: BlobRange = NO_BLOBS  # specular lines of tools and edges: long and thin
     textures: BlobRange = NO_BLOBS  # extended bright regions, each with `speckles` in it
-    speckles: int = 20
+    speckles: int = 20  # small bright blobs on each of the textured regions
     neighbours: float = 0.0  # probability that a false blob of about the same size touches a marker
     neighbour_distance: tuple[float, float] = (0.8, 2.2)  # of the two centres, in radii of the marker
     drapes: int = 0  # dark sheets with straight edges that hide what lies behind

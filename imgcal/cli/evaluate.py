@@ -47,9 +47,8 @@ class Setting:
     missing: float = 0.0  #: share of fiducials that are not seen
     swapped: float = 0.0  #: share of labels exchanged within a camera
     false: float = 0.0  #: share of fiducials found somewhere else in the image
-    level: int | None = (
-        None  #: instead of these, points and images as hard as a level of `imgcal.synthesis.LEVELS`: 0-4
-    )
+    level: int | None = None
+    """instead of these, points and images as hard as a level of `imgcal.synthesis.LEVELS`: 0 to 4"""
     count: int = 20_000  #: rigs a trial
     trials: int = 3  #: each with other rigs
     seed: int = 0  #: same seed, same rigs
