@@ -82,12 +82,14 @@ class InfraredTask(Task[CropBatch, Evidence]):
         """Build it; see `Experiment.make_task`.
 
         Raises:
-            InputError: a batch that is no whole number of rigs, or weights to begin with that cannot be used.
+            InputError: a batch, or a validation, that is no whole number of rigs, or weights to begin with that cannot
+                be used.
         """
-        if batch_size % CAMERAS:
+        counts = {"batch_size": batch_size, "validation_rigs": experiment.training.validation_rigs}
+        if wrong := [name for name, count in counts.items() if count % CAMERAS]:
+            found = f"{counts[wrong[0]]} crops{' at once' if wrong[0] == 'batch_size' else ''}"
             raise InputError(
-                f"training: batch_size: found {batch_size} crops at once, expected a multiple of the {CAMERAS} cameras "
-                "of a rig"
+                f"training: {wrong[0]}: found {found}, expected a multiple of the {CAMERAS} cameras of a rig"
             )
         with drawing_from(weights):
             network = InfraredNetwork(experiment.network)
@@ -116,7 +118,7 @@ class InfraredTask(Task[CropBatch, Evidence]):
     def loss(self, answer: Evidence, batch: CropBatch, step: int) -> Loss:
         """Compare the evidence with the truth."""
         parts = query_losses(answer, batch.queries.asked, batch.place, batch.seen)
-        right, wrong, _ = _counts(answer, batch)
+        right, wrong, _ = _shares(_counts(answer, batch))
         means = {
             "cell": parts.cell,
             "offset_px": parts.offset,
@@ -131,11 +133,9 @@ class InfraredTask(Task[CropBatch, Evidence]):
         if not self.sizes:
             return {}
         generator = torch.Generator(self.device).manual_seed(VALIDATION_SEED)
-        rows = []
-        for size in self.sizes:
-            batch = self.batch(size, generator)
-            rows.append(torch.stack(_counts(predict(batch), batch)))
-        right, wrong, nees = torch.stack(rows).mean(0).tolist()
+        batches = (self.batch(size, generator) for size in self.sizes)
+        counts = torch.stack([_counts(predict(batch), batch) for batch in batches]).sum(0)
+        right, wrong, nees = torch.stack(_shares(counts)).tolist()
         return {
             "validation_missed": 1 - right + wrong,
             "validation_right": right,
@@ -149,12 +149,20 @@ class InfraredTask(Task[CropBatch, Evidence]):
         return InfraredCheckpoint(network, metrics)
 
 
-def _counts(answer: Evidence, batch: CropBatch) -> tuple[Tensor, Tensor, Tensor]:
-    """Share of right among the visible, of wrong among the claimed, and the mean NEES of the right ones: () each."""
+def _counts(answer: Evidence, batch: CropBatch) -> Tensor:
+    """Count fiducials that are found right, visible, claimed wrongly and claimed, and sum the NEES of the right: (5,).
+
+    Sums, so that those of several batches can be added.
+    """
     place, sigma, probability = evidence_at_best(answer)
     squared = (place - batch.place).square().sum(-1)
     visible, claimed = batch.queries.asked & batch.seen, batch.queries.asked & (probability > 0.5)
     right = claimed & visible & (squared < NEAR**2)
-    share = right.sum() / visible.sum().clamp(min=1)
-    nees = torch.where(right, squared / sigma.square(), 0.0).sum() / (2 * right.sum()).clamp(min=1)
-    return share, (claimed & ~right).sum() / claimed.sum().clamp(min=1), nees
+    nees = torch.where(right, squared / sigma.square(), 0.0)
+    return torch.stack([part.sum().to(nees.dtype) for part in (right, visible, claimed & ~right, claimed, nees)])
+
+
+def _shares(counts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Share of right among the visible, of wrong among the claimed, and the mean NEES of the right ones: () each."""
+    right, visible, wrong, claimed, nees = counts.unbind()
+    return right / visible.clamp(min=1), wrong / claimed.clamp(min=1), nees / (2 * right).clamp(min=1)

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -5,8 +6,9 @@ import torch
 
 from imgcal.errors import InputError
 from imgcal.io import model_file, read_tensors
-from imgcal.networks import load_infrared
+from imgcal.networks import Evidence, load_infrared
 from imgcal.training import Callbacks, InfraredExperiment, Result, Run, TrainingState, load_experiment, train
+from imgcal.training.infrared_task import CropBatch
 
 TINY = (
     "network={crop: 96, channels: 4, window: 12, blocks: 1}",
@@ -67,6 +69,35 @@ def test_a_warm_start_takes_what_fits_of_a_shipped_network_and_says_what_does_no
 def test_a_rig_has_as_many_crops_as_cameras() -> None:
     with pytest.raises(InputError, match="batch_size: found 3 crops at once, expected a multiple of the 2 cameras"):
         load_experiment("ir-cnn", TINY).make_task(torch.device("cpu"), 3, torch.Generator(), True)
+
+
+def test_every_crop_of_a_validation_counts_once_however_it_is_split() -> None:
+    """Of five crops in batches of four and two, the two count half as much as the four."""
+    task = load_experiment("ir-cnn", TINY).make_task(torch.device("cpu"), 4, torch.Generator(), True)
+    assert task.sizes == [4, 2]
+    told: list[tuple[float, float]] = []
+
+    def predict(batch: CropBatch) -> Evidence:
+        answer = task.predict(task.network, batch)
+        right = (torch.arange(len(batch.crops)) < (4 if len(batch.crops) == 4 else 0))[:, None]
+        # Sure of the right cell, exactly there, in the first batch; nothing is claimed in the second.
+        apart = batch.place[:, :, None, None] - answer.cells
+        nearest = apart.square().sum(-1) == apart.square().sum(-1).flatten(2).amin(-1)[..., None, None]
+        told.append((float((batch.queries.asked & batch.seen).sum()), float(right.all())))
+        logits = torch.where(nearest, 1e3, -1e3)
+        return replace(answer, logits=logits, offset=apart, present=torch.where(right, 1e3, -1e3).expand_as(batch.seen))
+
+    with torch.no_grad():
+        found = task.validate(predict)
+    visible = sum(count for count, _ in told)
+    assert found["validation_right"] == pytest.approx(sum(count * right for count, right in told) / visible, rel=1e-6)
+    assert 0 < found["validation_right"] < 1
+
+
+def test_a_validation_is_of_whole_rigs() -> None:
+    odd = (*TINY, "training.validation_rigs=7")
+    with pytest.raises(InputError, match="validation_rigs: found 7 crops, expected a multiple of the 2 cameras"):
+        load_experiment("ir-cnn", odd).make_task(torch.device("cpu"), 4, torch.Generator(), True)
 
 
 def test_a_batch_depends_on_the_generator_alone() -> None:
