@@ -49,7 +49,7 @@ def train_in(
 
     Raises:
         InputError: unusable experiment, state or folder.
-        RefusedError: the loss or its gradient is not finite; the batch is saved.
+        RefusedError: the loss or its gradient is not finite, and the batch is saved; or the result is of no use.
     """
     folder = Path(folder)
     state = load_state(folder / STATE, experiment) if resume else None
@@ -62,6 +62,8 @@ def train_in(
             f"{folder}: {error}; the batch is in {name}; {STATE}, if there, is from before: go on from it with "
             "--resume after changing the experiment, or start again"
         ) from error
+    except RefusedError as error:
+        raise RefusedError(f"{folder}: {error}; what is there, if anything, is from before") from error
 
 
 class TrainingFolder(Callbacks):

@@ -11,12 +11,13 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from typing import Any
 
+import numpy as np
 import torch
 from accelerate import Accelerator
 from accelerate.utils import broadcast
 from torch import Tensor, nn
 
-from imgcal.errors import InputError
+from imgcal.errors import InputError, RefusedError
 from imgcal.networks import drawing_from
 from imgcal.training.callbacks import Callbacks, DivergedError
 from imgcal.training.continuation import restore, state_of
@@ -49,6 +50,7 @@ def train(
     Raises:
         InputError: unusable experiment, or a state that does not belong to it.
         DivergedError: the loss or its gradient is not finite.
+        RefusedError: as the run ends, the error of its result in validation is not finite, or its weights are not.
     """
     run = prepare(experiment, state)
     told = callbacks if callbacks is not None and run.accelerator.is_main_process else Callbacks()
@@ -78,6 +80,8 @@ def _take_steps(run: Run, told: Callbacks, should_stop: Callable[[], bool]) -> N
         if last or not extra:
             validate(run, told, extra)
         last = last or finished(run, seconds)
+        if last and not stop:
+            _check_result(run)
         if last or run.step % due.save_every == 0:
             save(run, told)
 
@@ -95,7 +99,7 @@ def prepare(experiment: Experiment, state: TrainingState | None = None) -> Run:
     learning(task.network)
     if settings.channels_last:
         task.network.to(memory_format=torch.channels_last)
-    seed = settings.seed * 4096 + accelerator.process_index
+    data, layers = stream_seeds(settings.seed, accelerator.process_index)
     optimizer = make_optimizer(task.network, experiment.optimizer)
     average = None if experiment.optimizer.ema is None else make_average(task.network)
     judge = task.loss
@@ -113,13 +117,24 @@ def prepare(experiment: Experiment, state: TrainingState | None = None) -> Run:
         optimizer=optimizer,
         schedule=Schedule(optimizer, experiment.schedule),
         average=average,
-        generator=torch.Generator(device).manual_seed(seed),
-        dropout=tuple(torch.Generator(kind).manual_seed(seed) for kind in {"cpu": 0, str(device): 0}),
+        generator=torch.Generator(device).manual_seed(data),
+        dropout=tuple(torch.Generator(kind).manual_seed(layers) for kind in {"cpu": 0, str(device): 0}),
         batch_size=batch_size,
     )
     if state is not None:
         restore(run, state)
     return run
+
+
+def stream_seeds(seed: int, process: int) -> tuple[int, int]:
+    """Seeds of a process's two streams of random numbers, which know nothing of each other: data, and its layers'.
+
+    Examples:
+        >>> stream_seeds(1, 2)
+        (4098, 15529898885419721899)
+    """
+    (layers,) = np.random.SeedSequence((seed, process)).generate_state(1, np.uint64)
+    return seed * 4096 + process, int(layers)
 
 
 def _at_once(settings: TrainingConfig, processes: int) -> int:
@@ -232,6 +247,7 @@ def _keep_best(run: Run, row: dict[str, Any], extra: bool) -> None:
     if run.accelerator.is_main_process and judged not in row and not extra:
         raise InputError(f"training: patience: found no {judged} to go by, expected validation_rigs to be 1 or more")
     error = row.get(judged, math.inf)
+    error = error if math.isfinite(error) else math.inf  # any number is better
     if run.accelerator.num_processes > 1:
         error = float(broadcast(torch.tensor(error, dtype=torch.float64, device=run.accelerator.device)))
     if extra:
@@ -244,6 +260,22 @@ def _keep_best(run: Run, row: dict[str, Any], extra: bool) -> None:
         run.best.metrics, run.best.error, run.best.since = row, error, 0
     else:
         run.best.since += 1
+
+
+def _check_result(run: Run) -> None:
+    """Refuse to end with a network that is of no use.
+
+    Raises:
+        RefusedError: the validation of what would be the result is not finite, or its weights are not.
+    """
+    best, judged = run.closing or run.best, run.task.judged
+    network, found = (run.candidate, run.latest) if best is None else (best.network, best.metrics)
+    value = found.get(judged, 0.0)
+    if not math.isfinite(value):
+        raise RefusedError(f"step {run.step}: {judged} is {value:g}, expected a number: the network is of no use")
+    wrong = [name for name, tensor in network.state_dict().items() if not bool(tensor.isfinite().all())]
+    if wrong:
+        raise RefusedError(f"step {run.step}: found weights that are not finite ({wrong[0]}): the network is of no use")
 
 
 def save(run: Run, told: Callbacks) -> None:

@@ -128,7 +128,7 @@ class PositionsTask(Task[PositionBatch, Located]):
             found = torch.cat([predict(PositionBatch(*part)).uv for part in zip(*parts, strict=True)])
             error = (found - batch.uv).norm(dim=-1)[batch.seen]
             medians[f"validation_level{level}_px"] = float(error.median())
-            lost[f"validation_level{level}_lost"] = float((error > FOUND).float().mean())
+            lost[f"validation_level{level}_lost"] = float((~(error <= FOUND)).float().mean())
         means = {"validation_px": sum(medians.values()), "validation_lost": sum(lost.values())}
         return medians | lost | {name: value / len(lost) for name, value in means.items()}
 

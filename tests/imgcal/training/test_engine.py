@@ -1,5 +1,6 @@
 import copy
 import json
+import math
 import re
 import resource
 from dataclasses import replace
@@ -15,7 +16,7 @@ from imgcal.io.safetensors_file import read_tensors
 from imgcal.networks import load_checkpoint
 from imgcal.training import engine, rigs
 from imgcal.training.callbacks import Callbacks, DivergedError
-from imgcal.training.engine import finished, progress
+from imgcal.training.engine import finished, progress, stream_seeds
 from imgcal.training.experiment_file import load_experiment
 from tests.imgcal.training.toy import Toy, ToyOfImages, train
 
@@ -320,3 +321,67 @@ def test_a_training_that_fails_says_that_it_ends(experiment, monkeypatch):
         engine.train(experiment(), recorder)
     assert recorder.told == [("start", 0), ("end", 6)]
     assert caught.value.batch.views.uv.shape == (12, 4, 8, 2) and caught.value.process is None
+
+
+@pytest.fixture
+def saying(monkeypatch):
+    """Let validations find these errors, the last one again and again."""
+
+    def say(*errors):
+        left = list(errors)
+        monkeypatch.setattr(
+            rigs.RigTask, "validate", lambda self, predict: {self.judged: left.pop(0) if left[1:] else left[0]}
+        )
+
+    return say
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf])
+def test_an_error_that_is_no_number_is_never_the_best(experiment, saying, wrong, tmp_path):
+    setup = experiment("training.validate_every=10", "training.patience=3", "training.steps=60")
+    saying(wrong, wrong, 2.0, wrong, 1.0, 3.0)
+    run = train(setup, tmp_path)
+    assert run.best.metrics["step"] == 50
+    assert load_checkpoint(tmp_path / RESULT).metrics["validation_re_px"] == 1.0
+
+
+def test_it_counts_as_no_better_and_goes_on_from_a_state(experiment, saying, tmp_path):
+    setup = experiment("training.validate_every=10", "training.patience=2", "training.steps=60")
+    saying(math.nan)
+    with pytest.raises(RefusedError, match="validation_re_px is nan"):
+        train(setup, tmp_path / "whole")
+    run = train(setup, tmp_path / "parts", should_stop=stopping_at(15))
+    assert run.best.error == math.inf
+    saying(4.0)
+    run = train(setup, tmp_path / "parts", resume=True)
+    assert run.best.error == 4.0
+
+
+def test_a_training_whose_result_is_of_no_use_says_so(experiment, saying, tmp_path):
+    saying(1.0, math.nan)
+    with pytest.raises(RefusedError, match=f"{tmp_path}: step 60: validation_re_px is nan, expected a number"):
+        train(experiment(), tmp_path)
+    assert load_checkpoint(tmp_path / RESULT).metrics["step"] == 40  # from before
+
+
+def test_weights_that_are_not_finite_are_no_result(experiment, tmp_path, monkeypatch):
+    step = engine.train_step
+
+    def broken(run):
+        step(run)
+        if run.step == 60:
+            run.average.head.bias.data[0] = math.inf
+
+    monkeypatch.setattr(engine, "train_step", broken)
+    with pytest.raises(RefusedError, match=r"found weights that are not finite \(head.bias\)"):
+        train(experiment("training.validation_rigs=0"), tmp_path)
+
+
+def test_data_and_dropout_are_independent_streams(experiment):
+    drawn = []
+    for process in (0, 1):
+        drawn += [torch.rand(8, generator=torch.Generator().manual_seed(s)) for s in stream_seeds(0, process)]
+    run = engine.prepare(experiment("training.seed=0"))
+    assert torch.equal(torch.rand(8, generator=run.generator), drawn[0])
+    assert torch.equal(torch.rand(8, generator=run.dropout[0]), drawn[1])
+    assert (torch.corrcoef(torch.stack(drawn)) - torch.eye(4)).abs().max() < 0.95
