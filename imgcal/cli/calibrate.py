@@ -46,7 +46,7 @@ from imgcal.io import (
     save_rig,
     write_text,
 )
-from imgcal.messages import listed
+from imgcal.messages import listed, shortened
 from imgcal.pipeline import (
     Calibration,
     Detector,
@@ -97,6 +97,7 @@ class Calibrate:
     measurer: str | None = None
     """network that measures blobs again, and what learned finds: a file, the folder of a run, or a shipped name"""
     first_guess: str = "none"  #: where to start: none (factory rig), points, vit, cnn (shipped), a file or run
+    trust: tuple[str, ...] = ()  #: encoders of yours, package.module:Class, that its file may name: their code runs
     without: tuple[str, ...] = ()  #: cameras to leave out
     blind_cameras: bool = False  #: accept cameras that see nothing; they keep their factory values
     after_last_move: bool = False  #: where a camera moved during the capture, use the snapshots since then
@@ -135,7 +136,10 @@ class Calibrate:
         self._require_frames(source, rig)
         measurer = None if self.measurer is None else LearnedMeasurer.load(self.measurer)
         detector = self._detector(source, measurer)
-        initializer = None if self.first_guess == "none" else load_initializer(self.first_guess, rig, obj)
+        if self.trust and self.first_guess == "none":
+            raise InputError(f"--trust: found {shortened(self.trust[0])} without --first-guess, which it is for")
+        named, trusted = self.first_guess, self.trust
+        initializer = None if named == "none" else load_initializer(named, rig, obj, trusted=trusted)
         loaded = time.perf_counter()
         detections, frames = read_detections(source, self.snapshots, self.detection, measurer)
         detections = only_cameras(detections, rig)

@@ -54,6 +54,7 @@ class Setting:
     seed: int = 0  #: same seed, same rigs
     sweep: tuple[Axis, ...] = ()  #: draw the error against these, without the slow baselines
     sweep_count: int = 1000  #: rigs at every point of a sweep
+    trust: tuple[str, ...] = ()  #: encoders of yours, package.module:Class, that models may name: their code runs
     device: Literal["auto", "cpu"] = "auto"  #: where networks run; "auto" = on a GPU if there is one
     address: str | None = None  #: running Ray cluster that does the work, on its cores; none = this machine
     cores: int | None = None  #: of this machine; 1 = this process alone; none = all, if that is worth a start of Ray
@@ -195,7 +196,7 @@ def _load(paths: tuple[Path, ...], setting: Setting) -> list[Model]:
     rig = None if setting.rig is None else open_rig(setting.rig)
     obj = None if setting.object is None else load_object(setting.object)
     device = "cuda" if setting.device == "auto" and torch.cuda.is_available() else "cpu"
-    return load_models(paths, rig, obj, device)
+    return load_models(paths, rig, obj, device, setting.trust)
 
 
 def _conditions(models: list[Model], setting: Setting) -> Conditions:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -59,6 +59,7 @@ def load_models(
     rig: CameraRig | None = None,
     obj: CalibrationObject | None = None,
     device: torch.device | str = "cpu",
+    trusted: Collection[str] = (),
 ) -> list[Model]:
     """Read networks that are to be evaluated on the same rigs.
 
@@ -67,6 +68,7 @@ def load_models(
         rig: what they must be for; None = what the first one is for.
         obj: likewise.
         device: where they run.
+        trusted: encoders of yours whose code may run; see `load_checkpoint`.
 
     Raises:
         InputError: a file that cannot be used, a training of positions, or a network for another rig or object.
@@ -76,7 +78,7 @@ def load_models(
         return []
     files = [model_file(path) for path in paths]
     for path, name in zip(files, _names(files), strict=True):
-        checkpoint = load_checkpoint(path, rig, obj)
+        checkpoint = load_checkpoint(path, rig, obj, trusted=trusted)
         check_says_rigs(path, checkpoint.experiment)
         rig, obj = rig or checkpoint.rig, obj or checkpoint.obj
         network = checkpoint.network.to(device)

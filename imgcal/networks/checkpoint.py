@@ -25,7 +25,7 @@ from imgcal.io import (
     validated,
     write_tensors,
 )
-from imgcal.messages import shortened
+from imgcal.messages import quoted, shortened
 from imgcal.networks.config import NetworkSpec, is_import_path, without_pretrained
 from imgcal.networks.factory import build_network
 from imgcal.networks.infrared import InfraredNetwork
@@ -87,9 +87,15 @@ def save_checkpoint(path: str | Path, checkpoint: Checkpoint, dtype: torch.dtype
     write_tensors(path, tensors, FORMAT, texts)
 
 
-def load_network(path: str | Path, rig: CameraRig | None = None, obj: CalibrationObject | None = None) -> Network:
+def load_network(
+    path: str | Path,
+    rig: CameraRig | None = None,
+    obj: CalibrationObject | None = None,
+    *,
+    trusted: Collection[str] = (),
+) -> Network:
     """Read a network: `load_checkpoint` without what stands beside it."""
-    return load_checkpoint(path, rig, obj).network
+    return load_checkpoint(path, rig, obj, trusted=trusted).network
 
 
 def load_checkpoint(
@@ -113,8 +119,10 @@ def load_checkpoint(
 
     Raises:
         InputError: not such a file, damaged, another version, a pickle, trained for another rig or object, or with an
-            encoder of somebody's that is not trusted.
+            encoder of somebody's that is not trusted; a trusted name that is no `package.module:Class`.
     """
+    if wrong := [name for name in trusted if not is_import_path(name)]:
+        raise InputError(f"trusted: found {shortened(wrong[0])!r}, expected a class as package.module:Class")
     texts = read_texts(path, FORMAT)
     spec, metrics = _read_records(path, texts)
     _check_code(path, spec, trusted)
@@ -185,8 +193,8 @@ def _check_code(path: str | Path, spec: NetworkSpec, trusted: Collection[str]) -
     backbone = getattr(spec.network.variant(), "backbone", "")
     if is_import_path(backbone) and backbone not in trusted:
         raise InputError(
-            f"{path}: found the encoder {shortened(backbone)}, whose code would run; expected one of ours or of timm, "
-            "or that it is named in load_checkpoint(..., trusted=(...,))"
+            f"{path}: found the encoder {quoted(backbone)}, whose code would run; expected one of ours or of timm, or "
+            f"that you trust it: --trust {quoted(backbone)}, in Python load_checkpoint(..., trusted=(...,))"
         )
 
 

@@ -5,6 +5,7 @@ Image networks never see a grey frame: the labelled fiducials are drawn anew, ea
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -104,13 +105,16 @@ def residual_of(prediction: Prediction, observations: Observations, obj: Calibra
     return torch.where(observations.seen[..., None], uv - observations.uv, 0.0)
 
 
-def load_initializer(name: str, rig: CameraRig, obj: CalibrationObject) -> Initializer:
+def load_initializer(
+    name: str, rig: CameraRig, obj: CalibrationObject, *, trusted: Collection[str] = ()
+) -> Initializer:
     """Find the network for a rig and an object.
 
     Args:
         name: one of `KINDS`, for the shipped networks, or a file that `imgcal train` wrote, or its folder.
         rig: the factory rig: all cameras of the training or some of them; its images may be smaller or larger.
         obj: the object; the radius of its fiducials does not matter to a first guess.
+        trusted: encoders of yours that a file may name, whose code then runs; see `load_checkpoint`.
 
     Raises:
         InputError: no such file, or no network for this rig and object.
@@ -127,7 +131,7 @@ def load_initializer(name: str, rig: CameraRig, obj: CalibrationObject) -> Initi
                 f"first guess: found `{name}`, expected none, {', '.join(KINDS)}, or what `imgcal train` wrote: a file "
                 f"or its folder{nearest(name, KINDS)}"
             )
-        return _load(path, rig, obj)
+        return _load(path, rig, obj, trusted)
     shipped = [stem for stem in shipped_names("models", ".safetensors") if stem.startswith(f"{name}-")]
     reasons = []
     for stem in shipped:
@@ -142,12 +146,12 @@ def load_initializer(name: str, rig: CameraRig, obj: CalibrationObject) -> Initi
     )
 
 
-def _load(path: Path, rig: CameraRig, obj: CalibrationObject) -> Initializer:
+def _load(path: Path, rig: CameraRig, obj: CalibrationObject, trusted: Collection[str] = ()) -> Initializer:
     trained, trained_obj = read_subject(path)
     cameras = tuple(trained.camera_names.index(name) for name in rig.camera_names if name in trained.camera_names)
     there = trained.select(cameras) if len(cameras) == rig.num_cameras else trained
     check_rig(path, there, rig.resized(there.image_size) if rig.num_cameras == there.num_cameras else rig)
     check_object(path, replace(trained_obj, radius=None), replace(obj, radius=None))
-    checkpoint = load_checkpoint(path)
+    checkpoint = load_checkpoint(path, trusted=trusted)
     check_says_rigs(path, checkpoint.experiment)
     return Initializer(model_name(path), checkpoint.network, trained, cameras)

@@ -31,6 +31,7 @@ class Options:
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]  #: folders of training runs of shipped-*
     out: Path = MODELS  #: folder of the shipped networks
+    trust: tuple[str, ...] = ()  #: encoders of yours, package.module:Class, that runs may name: their code runs
 
 
 def main(arguments: list[str]) -> None:
@@ -40,12 +41,12 @@ def main(arguments: list[str]) -> None:
         raise InputError("found no folder of a training run, expected at least one")
     make_folder(options.out)
     for run in options.runs:
-        trained = load_checkpoint(run / "model.safetensors")
+        trained = load_checkpoint(run / "model.safetensors", trusted=options.trust)
         experiment = portable(experiment_of(trained.experiment))
         kind = experiment.name.split("-")[1]
         path = options.out / f"{kind}-{experiment.rig}-{experiment.object}.safetensors"
         save_checkpoint(path, replace(trained, experiment=experiment), torch.bfloat16)
-        before, after = error(trained), error(load_checkpoint(path))
+        before, after = error(trained), error(load_checkpoint(path, trusted=options.trust))
         print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, RE {before:.3f} px, in bf16 {after:.3f} px")
 
 
