@@ -11,6 +11,7 @@ import tyro
 
 from imgcal.errors import InputError
 from imgcal.io import open_capture, save_cameras, save_rig
+from imgcal.messages import listed
 from imgcal.synthesis import Lens, Shape, arranged_rig
 from imgcal.types import Volume
 
@@ -73,6 +74,10 @@ class Cameras:
             sizes = {**found, **sizes}
             if len(sizes) == len(capture.camera_names):
                 break
+        if without := [name for name in capture.camera_names if name not in sizes]:
+            raise InputError(
+                f"{self.capture}: found no readable frame of {listed(without)}, expected some of each camera"
+            )
         save_cameras({name: sizes[name] for name in capture.camera_names}, self.field_of_view_deg, self.out)
         print(f"{len(sizes)} cameras written to {self.out}", file=sys.stderr)
 

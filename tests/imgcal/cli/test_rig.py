@@ -1,3 +1,5 @@
+import shutil
+
 from imgcal.cli.main import main
 from imgcal.io import load_cameras, load_rig
 
@@ -21,3 +23,16 @@ def test_cameras_of_a_capture(workplace, tmp_path):
     cameras = load_cameras(out)
     assert cameras.camera_names == load_rig(workplace.rig).camera_names
     assert cameras.image_size.tolist() == [[512, 272]] * 4
+
+
+def test_cameras_without_frames_are_named(workplace, tmp_path, capsys):
+    capture, out = tmp_path / "capture", tmp_path / "cameras.yaml"
+    shutil.copytree(workplace.capture, capture)
+    empty = load_rig(workplace.rig).camera_names[1:3]
+    for name in empty:
+        for frame in (capture / "frames" / name).iterdir():
+            frame.unlink()
+    assert main(["rig", "cameras", str(capture), "--field-of-view-deg", "60", "--out", str(out)]) == 2
+    told = capsys.readouterr().err
+    assert f"{capture}: found no readable frame of {empty[0]}, {empty[1]}, expected some of each camera" in told
+    assert not out.exists()
