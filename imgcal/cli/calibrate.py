@@ -179,10 +179,10 @@ class Calibrate:
 
                 write_report(content, out / "report.html")
             write_text(out / "result.json", json.dumps(result, indent=2) + "\n")
+            if self.labelled is not None and not isinstance(outcome, RefusedError):
+                save_detections(outcome.labelled_detections, self.labelled)
         if isinstance(outcome, RefusedError):
             raise outcome
-        if self.labelled is not None:
-            save_detections(outcome.labelled_detections, self.labelled)
         for move in outcome.moved:
             print(f"{move}: only the snapshots since then are used")
         print_outcome(result, found, self.out, draws)
@@ -200,6 +200,8 @@ class Calibrate:
             for option, given in self._inputs():
                 if self.labelled.exists() and given.exists() and self.labelled.samefile(given):
                     raise InputError(f"--labelled: {self.labelled} is what {option} reads, expected another file")
+            if any(self.labelled.resolve() == (self.out / name).resolve() for name in WRITTEN):
+                raise InputError(f"--labelled: {self.labelled} is written to --out, expected another file")
         for name in WRITTEN:
             for option, given in self._inputs():
                 if (self.out / name).exists() and given.exists() and (self.out / name).samefile(given):

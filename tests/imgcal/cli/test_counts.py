@@ -74,13 +74,40 @@ def test_outliers_are_marked_in_the_table(room):
     assert found.usable.all()
 
 
-@pytest.mark.parametrize(("file", "expected"), [("nowhere/x.csv", "an existing folder"), ("blobs.csv", "another file")])
+@pytest.mark.parametrize(
+    ("file", "expected"),
+    [
+        ("nowhere/x.csv", "an existing folder"),
+        ("blobs.csv", "another file"),
+        ("out/rig.yaml", "rig.yaml is written to --out"),
+        ("out/object.csv", "object.csv is written to --out"),  # which is not there now, and may be
+    ],
+)
 def test_a_table_that_cannot_be_written_is_said_before_any_work(room, file, expected, capsys):
     folder, run, truth, _ = room
     run(damage.blobs(truth), "--no-report")
+    before = content(folder / "out")
     capsys.readouterr()
     assert run(damage.blobs(truth), "--no-report", "--labelled", str(folder / file))[0] == 2
     assert expected in capsys.readouterr().err
+    assert content(folder / "out") == before
+
+
+def test_a_result_is_not_replaced_where_the_table_cannot_be_written(room, capsys):
+    folder, run, truth, _ = room
+    table = damage.blobs(truth)
+    assert run(table, "--no-report")[0] == 0
+    before = content(folder / "out")
+    capsys.readouterr()
+    long = folder / f"{'x' * 245}.csv"  # as long as names may be: the file beside it that would replace it is longer
+    assert run(table, "--no-report", "--labelled", str(long))[0] == 2
+    assert f"{long}: cannot be written" in capsys.readouterr().err
+    assert content(folder / "out") == before
+
+
+def content(folder):
+    """Every file below a folder, as it is."""
+    return {path.name: path.read_bytes() for path in folder.rglob("*")}
 
 
 def test_a_camera_that_moved_is_in_the_result_of_the_refusal(room, capsys):
