@@ -27,7 +27,7 @@ from imgcal.io import holding, load_object, open_input
 from imgcal.messages import shortened
 from imgcal.online import Event, RigKeeper
 from imgcal.pipeline import DetectorName
-from imgcal.types import CalibrationObject, CameraRig, Detections
+from imgcal.types import CalibrationObject, CameraRig, Detections, object_difference, rig_difference
 from imgcal.watch import (
     CURRENT,
     STATE,
@@ -190,15 +190,35 @@ class Watch:
             return RigKeeper(rig, obj, detection=self.detection, detector=self.detector), False
         with _going_on():
             keeper = RigKeeper.restore(path, detection=self.detection, detector=self.detector)
-        same_object = torch.equal(keeper.obj.points, obj.points.to(keeper.obj.points))
-        if keeper.factory.camera_names != rig.camera_names or not same_object:
-            what = f"--object {self.object}" if keeper.factory.camera_names == rig.camera_names else f"--rig {self.rig}"
-            raise InputError(f"{path}: found what is known of another than {what}; --fresh begins anew")
+        for option, difference in (
+            (f"--rig {self.rig}", _rig_difference(rig, keeper.given)),
+            (f"--object {self.object}", _object_difference(obj, keeper.obj)),
+        ):
+            if difference is not None:
+                known = f"{path}: found what is known of another than {option}"
+                raise InputError(f"{known} ({difference}); --fresh begins anew")
         return keeper, True
 
     def _require(self, library: str, what: str) -> None:
         if missing(library):
             raise InputError(f"{shortened(self.input)}: {what} {advice(library)}")
+
+
+def _rig_difference(rig: CameraRig, known: CameraRig) -> str | None:
+    """Say in what a rig differs from the one that was begun with: also in its prior, and how fast it drifts."""
+    if rig.prior != known.prior:
+        return "prior"
+    return "drift rate" if rig.drift_rate != known.drift_rate else rig_difference(rig, known)
+
+
+def _object_difference(obj: CalibrationObject, known: CalibrationObject) -> str | None:
+    """Say in what an object differs from the one that was begun with: also in its tolerances."""
+    difference = object_difference(obj, known)
+    if difference is None and (
+        obj.scale_tolerance != known.scale_tolerance or not torch.allclose(obj.granted, known.granted.to(obj.granted))
+    ):
+        return "tolerance"
+    return difference
 
 
 def _nothing(tally: Tally, intake: Intake) -> str:

@@ -109,6 +109,11 @@ class RigKeeper:
         return self._memory.belief
 
     @property
+    def given(self) -> CameraRig:
+        """The factory calibration that it began with, whatever has been accepted as one since."""
+        return self._prior
+
+    @property
     def noise(self) -> float:
         """Noise (px, one standard deviation) that blobs have shown beyond what they say of themselves."""
         return self._memory.noise.additive

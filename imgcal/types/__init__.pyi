@@ -17,6 +17,7 @@ from .rig import (
     unpack18,
     unpack21,
 )
+from .sameness import object_difference, rig_difference
 from .volume import Volume
 
 __all__ = [
@@ -49,8 +50,10 @@ __all__ = [
     "check_observations",
     "check_rig",
     "limits",
+    "object_difference",
     "pack21",
     "parameter_names",
+    "rig_difference",
     "unpack18",
     "unpack21",
 ]

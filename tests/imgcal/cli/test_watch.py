@@ -5,6 +5,7 @@ import socket
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,11 @@ import torch
 from imgcal.cli.main import main
 from imgcal.cli.watch import metrics_address
 from imgcal.errors import InputError
-from imgcal.io import load_object, load_rig, save_detections, save_rig
+from imgcal.io import load_object, load_rig, save_detections, save_object, save_rig
 from imgcal.io.frames import write_frame
 from imgcal.online import RigKeeper
 from imgcal.types.observations import Detections
+from imgcal.types.rig import CameraRig, DriftRate, RigPrior
 from imgcal.watch import Progress
 from tests.imgcal.streams import Stream
 
@@ -189,17 +191,49 @@ def test_a_folder_that_has_been_read_to_its_end_is_said_to_be_known(stream, tmp_
     assert "all 3 snapshots of" in said.out and not said.err
 
 
-def test_what_is_known_of_another_rig_is_not_gone_on_with(blobs, tmp_path, capsys):
-    save_detections(blobs.of_snapshots(0, 5), tmp_path / "blobs.csv")
-    assert watch(tmp_path / "blobs.csv", tmp_path / "out") == 0
-    rig = load_rig("T4").select([0, 1])
-    save_rig(rig, tmp_path / "pair.yaml")
-    for option, name in (("--rig", str(tmp_path / "pair.yaml")), ("--object", "cube8")):
-        given = {"--rig": "T4", "--object": "asymmetric8", option: name}
-        arguments = [word for pair in given.items() for word in pair]
-        assert main(["watch", str(tmp_path), *arguments, "--out", str(tmp_path / "out")]) == 2
-        assert f"another than {option} {name}; --fresh begins anew" in capsys.readouterr().err
-    assert load_object("cube8").num_fiducials == 8
+@pytest.fixture(scope="module")
+def known(blobs, tmp_path_factory):
+    """What a run has left of T4 and asymmetric8."""
+    folder = tmp_path_factory.mktemp("known")
+    save_detections(blobs.of_snapshots(0, 5), folder / "blobs.csv")
+    assert watch(folder / "blobs.csv", folder / "out") == 0
+    return folder
+
+
+RIG, OBJECT = load_rig("T4"), load_object("asymmetric8")
+RATIONAL = replace(RIG, lens_model="rational", distortion=torch.nn.functional.pad(RIG.distortion, (0, 3)))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (RIG.select([0, 1]), "cameras: found cam01, cam02, expected cam01, cam02, cam03, cam04"),
+        (replace(RIG, focal_length=RIG.focal_length * 1.3), "focal length of cam01: found"),
+        (replace(RIG, image_size=RIG.image_size * 2), "image size of cam01: found 4096, 2176, expected 2048, 1088"),
+        (RATIONAL, "lens model of cam01: found rational, expected brown_conrady"),
+        (replace(RIG, prior=RigPrior(position=1.0)), "(prior)"),
+        (replace(RIG, drift_rate=DriftRate(position=1.0)), "(drift rate)"),
+        (load_object("cube8"), "fiducial 1: found"),
+        (replace(OBJECT, radius=torch.full((8,), 3.0).double()), "fiducial 1: found x, y, z, radius"),
+        (replace(OBJECT, tolerance=torch.full((8,), 0.5).double()), "(tolerance)"),
+    ],
+)
+def test_what_is_known_of_another_rig_or_object_is_not_gone_on_with(given, message, known, tmp_path, capsys):
+    option, path = ("--rig", tmp_path / "a.yaml") if isinstance(given, CameraRig) else ("--object", tmp_path / "a.csv")
+    save_rig(given, path) if isinstance(given, CameraRig) else save_object(given, path)
+    words = [word for pair in ({"--rig": "T4", "--object": "asymmetric8"} | {option: path}).items() for word in pair]
+    assert main(["watch", str(known), *map(str, words), "--out", str(known / "out")]) == 2
+    error = capsys.readouterr().err
+    assert f"another than {option} {path} (" in error and message in error
+    assert error.endswith("; --fresh begins anew\n") and error.count("\n") == 1
+
+
+def test_a_rig_that_was_accepted_as_factory_is_gone_on_with_by_the_file_it_began_with(known, tmp_path, capsys):
+    with RigKeeper.restore(known / "out" / "state.json") as keeper:
+        keeper.accept_as_factory()
+        keeper.saved({"time": 0.0, "name": "000"}).write(tmp_path / "state.json")
+    assert watch(known / "blobs.csv", tmp_path) == 0
+    assert "4 snapshots" in capsys.readouterr().out
 
 
 def test_what_was_left_and_cannot_be_used_is_told_with_the_way_out(tmp_path, monkeypatch, capsys):
