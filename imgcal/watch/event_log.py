@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from pathlib import Path
 
@@ -27,6 +28,7 @@ class EventLog:
             InputError: it cannot be written.
         """
         self.path, self._most = path, most_bytes
+        self._descriptor: int | None = None  # None = closed
         try:
             self._cut()
             self._descriptor = self._opened()
@@ -37,22 +39,46 @@ class EventLog:
         """Write an event.
 
         Raises:
-            OSError: the disk is full, for example; nothing of the line is there then.
+            OSError: the disk is full, for example; nothing of the line is there then. Or the line is there, and the
+                file, which has become long, could not be put aside.
         """
+        if self._descriptor is None:
+            raise OSError(f"{self.path}: closed")
         line = event.to_json().encode(errors="replace") + b"\n"
         size = os.fstat(self._descriptor).st_size
+        problem: OSError | None = None
         if size and size + len(line) > self._most:
-            os.close(self._descriptor)
-            os.replace(self.path, self.path.with_name(f"{self.path.stem}.1{self.path.suffix}"))
-            self._descriptor, size = self._opened(), 0
+            try:
+                self._put_aside()
+                size = 0
+            except OSError as error:
+                problem = error
         written = os.write(self._descriptor, line)
         if written < len(line):
             os.ftruncate(self._descriptor, size)
             raise OSError(f"{self.path}: {written} of {len(line)} bytes could be written")
+        if problem is not None:
+            raise problem
+
+    def _put_aside(self) -> None:
+        """Begin a new file; where that fails, the old one stays open."""
+        aside = self.path.with_name(f"{self.path.stem}.1{self.path.suffix}")
+        os.replace(self.path, aside)
+        try:
+            new = self._opened()
+        except OSError:
+            with contextlib.suppress(OSError):
+                os.replace(aside, self.path)
+            raise
+        assert self._descriptor is not None
+        old, self._descriptor = self._descriptor, new
+        os.close(old)
 
     def close(self) -> None:
         """Close the file."""
-        os.close(self._descriptor)
+        if self._descriptor is not None:
+            descriptor, self._descriptor = self._descriptor, None
+            os.close(descriptor)
 
     def _opened(self) -> int:
         return os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o644)

@@ -51,13 +51,26 @@ class Folder:
         return sum(natural_key(stem) <= natural_key(self.after) for stem in stems)
 
     def saved(self, name: str) -> None:
-        """Delete frames that have been read of the snapshots up to one: they will not be needed again."""
+        """Delete frames that have been read of the snapshots up to one: they will not be needed again.
+
+        Raises:
+            OSError: some of them cannot be deleted; that is tried again the next time, with the latest of them.
+        """
+        failed: list[Path] = []
+        problem: OSError | None = None
         for _ in range(len(self._read_files)):
             path = self._read_files.popleft()
-            if natural_key(path.stem) <= natural_key(name):
-                path.unlink(missing_ok=True)
-            else:
+            if natural_key(path.stem) > natural_key(name):
                 self._read_files.append(path)
+                continue
+            try:
+                path.unlink(missing_ok=True)
+            except OSError as error:
+                failed.append(path)
+                problem = error
+        self._read_files.extendleft(failed[-REMEMBERED:])
+        if problem is not None:
+            raise problem
 
     def items(self) -> Iterator[Item]:
         """Give frames snapshot by snapshot, those that are there first, then as they come."""

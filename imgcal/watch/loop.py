@@ -18,10 +18,10 @@ from imgcal.watch.event_log import EventLog
 from imgcal.watch.hook import Hook
 from imgcal.watch.intake import Intake
 from imgcal.watch.metrics import Tally
-from imgcal.watch.rig_files import RigFiles
+from imgcal.watch.rig_files import STATE, RigFiles
 from imgcal.watch.synchronization import TimedSnapshot
 
-STATE, EVENTS = "state.json", "events.jsonl"
+EVENTS = "events.jsonl"
 SAVED_EVERY = 1.0  # s between two savings of what is known
 LOOKED_EVERY = 0.1  # s that is waited for a snapshot before other things are seen to
 KEPT_EVERY = 3600.0  # s between two rigs of the history, where nothing happens
@@ -146,8 +146,7 @@ class Watch:
         """Save what is known, and close the outputs."""
         self.save()
         self._files.close()
-        if self._files.problem is not None:
-            self._failed("files", self._files.problem)
+        self._told_problems()
         self._log.close()
         if self._hook is not None:
             self._hook.close()
@@ -219,19 +218,16 @@ class Watch:
         """Write what is known: what a start after this moment goes on from."""
         self._saved = time.monotonic()
         state = self.tally.latest
-        unsaved = self._unsaved or self._files.problem is not None
+        unsaved = self._unsaved or bool(self._files.problems)
         if state is None or self._progress is None or not unsaved:
             return
-        if self._files.problem is not None:
-            self._failed("files", self._files.problem)
+        self._told_problems()
         progress = self._progress
         memory = self.keeper.saved(asdict(progress))
 
-        def write() -> None:
-            memory.write(self.folder / STATE)
-            self._when_saved(progress)
-
-        self._files.write(state, also=write)
+        self._files.write(
+            state, also=lambda: memory.write(self.folder / STATE), then=lambda: self._when_saved(progress)
+        )
         self._unsaved = False
         if self._kept is None or abs(state.time - self._kept) >= KEPT_EVERY:
             self._keep(state)
@@ -239,6 +235,10 @@ class Watch:
     def _keep(self, state: RigState) -> None:
         self._kept = state.time
         self._files.write(state, keep=True)
+
+    def _told_problems(self) -> None:
+        for output, message in self._files.problems.items():
+            self._failed(output, message)
 
     def _failed(self, output: str, message: str) -> None:
         self.tally.problems[output] += 1

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections import deque
 from collections.abc import Callable
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 from imgcal.errors import InputError
 from imgcal.io import RigCovariance, save_rig
 from imgcal.online import RigState
 
-CURRENT, HISTORY = "rig.yaml", "history"
+STATE, CURRENT, HISTORY, FRAMES = "state.json", "rig.yaml", "history", "frames"
 MOST_KEPT = 1000
 """Files of the history; more, and the oldest are removed."""
+
+_Step = tuple[str, Callable[[], None] | None]  # name of what is done; None = nothing of it now
 
 
 class RigFiles:
@@ -26,29 +30,38 @@ class RigFiles:
 
     def __init__(self, folder: Path, most_kept: int = MOST_KEPT) -> None:
         """Begin; the folder must exist."""
-        self.problem: str | None = None
-        """Why the last one could not be written."""
+        self.problems: dict[str, str] = {}
+        """What could not be done the last time, and why."""
         self._folder, self._most = folder, most_kept
         self._kept = deque(sorted((folder / HISTORY).glob("*/*.yaml")))
         self._current: RigState | None = None
         self._also: Callable[[], None] | None = None
+        self._then: Callable[[], None] | None = None
         self._to_keep: deque[RigState] = deque(maxlen=8)
         self._changed = threading.Condition()
         self._closing = False
         self._thread = threading.Thread(target=self._work, name="rig files", daemon=True)
         self._thread.start()
 
-    def write(self, state: RigState, keep: bool = False, also: Callable[[], None] | None = None) -> None:
+    def write(
+        self,
+        state: RigState,
+        keep: bool = False,
+        also: Callable[[], None] | None = None,
+        then: Callable[[], None] | None = None,
+    ) -> None:
         """Let the rig be written; returns at once.
 
         Args:
             state: what is known of it.
             keep: into the history as well.
-            also: writes what else belongs to this moment, before the rig.
+            also: writes the state that belongs to this moment, before the rig.
+            then: done once that has been written: deletes frames that are not needed any more.
         """
         with self._changed:
             self._current = state
-            self._also = also or self._also
+            if also is not None:
+                self._also, self._then = also, then
             if keep:
                 self._to_keep.append(state)
             self._changed.notify()
@@ -65,21 +78,30 @@ class RigFiles:
             with self._changed:
                 self._changed.wait_for(lambda: self._current or self._to_keep or self._closing)
                 current, self._current = self._current, None
-                also, self._also = self._also, None
+                (also, then), self._also, self._then = (self._also, self._then), None, None
                 to_keep = list(self._to_keep)
                 self._to_keep.clear()
             if current is None and not to_keep:
                 return
-            try:
-                if also is not None:
-                    also()
-                for state in to_keep:
-                    self._keep(state)
-                if current is not None:
-                    _save(current, self._folder / CURRENT)
-                self.problem = None
-            except (InputError, OSError) as error:
-                self.problem = str(error)
+            self._write(also, then, current, to_keep)
+
+    def _write(
+        self,
+        also: Callable[[], None] | None,
+        then: Callable[[], None] | None,
+        current: RigState | None,
+        to_keep: list[RigState],
+    ) -> None:
+        """Write what is known, the rig, and the history: one that fails keeps none of the others from it."""
+        work: list[_Step] = [(STATE, also)]
+        work += [] if current is None else [(CURRENT, partial(_save, current, self._folder / CURRENT))]
+        work += [(HISTORY, partial(self._keep, state)) for state in to_keep]
+        problems = _problems(work)
+        if STATE not in problems:
+            work.append((FRAMES, then))
+            problems |= _problems(work[-1:])
+        tried = {name for name, step in work if step is not None}
+        self.problems = {name: why for name, why in self.problems.items() if name not in tried} | problems
 
     def _keep(self, state: RigState) -> None:
         day, moment = datetime.fromtimestamp(state.time, UTC).strftime("%Y-%m-%d %H%M%S.%f").split()
@@ -91,9 +113,22 @@ class RigFiles:
         while len(self._kept) > self._most:
             oldest = self._kept.popleft()
             oldest.unlink(missing_ok=True)
-            if not any(oldest.parent.iterdir()):
-                oldest.parent.rmdir()
+            with contextlib.suppress(FileNotFoundError):  # somebody has tidied up
+                if not any(oldest.parent.iterdir()):
+                    oldest.parent.rmdir()
 
 
 def _save(state: RigState, path: Path) -> None:
     save_rig(state.rig, path, RigCovariance(state.std))
+
+
+def _problems(work: list[_Step]) -> dict[str, str]:
+    """Do one after the other; gives the names of those that fail, and why."""
+    problems: dict[str, str] = {}
+    for name, step in work:
+        try:
+            if step is not None:
+                step()
+        except (InputError, OSError) as error:
+            problems[name] = str(error)
+    return problems

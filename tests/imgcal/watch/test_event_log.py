@@ -52,6 +52,31 @@ def test_it_does_not_grow_for_ever(tmp_path):
     assert sum(path.stat().st_size for path in tmp_path.iterdir()) <= 2000
 
 
+@pytest.mark.parametrize("fails", ["replace", "open"])
+def test_where_the_long_file_cannot_be_put_aside_nothing_is_lost_nor_written_elsewhere(fails, tmp_path, monkeypatch):
+    log = EventLog(tmp_path / "events.jsonl", most_bytes=1000)
+    for number in range(3):
+        log.append(event(number, message="x" * 100))
+
+    def refuse(*_):
+        raise OSError("no such luck")
+
+    with monkeypatch.context() as broken, open(tmp_path / "others", "wb") as others:
+        broken.setattr(os, "replace", refuse) if fails == "replace" else broken.setattr(log, "_opened", refuse)
+        for number in (3, 4):
+            with pytest.raises(OSError, match="no such luck"):
+                log.append(event(number, message="x" * 100))
+        assert os.fstat(others.fileno()).st_size == 0
+    assert [line["snapshot"] for line in lines(tmp_path / "events.jsonl")] == [f"{n:05d}" for n in range(5)]
+    log.append(event(5))
+    log.close()
+    log.close()
+    with pytest.raises(OSError, match="closed"):
+        log.append(event(6))
+    assert [line["snapshot"] for line in lines(tmp_path / "events.jsonl")] == ["00005"]
+    assert len(lines(tmp_path / "events.1.jsonl")) == 5
+
+
 def test_a_full_disk_leaves_whole_lines(tmp_path):
     path = tmp_path / "events.jsonl"
     log = EventLog(path)

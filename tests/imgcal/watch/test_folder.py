@@ -1,4 +1,5 @@
 import os
+import shutil
 import threading
 import time
 
@@ -148,6 +149,23 @@ def test_snapshots_before_a_restart_are_not_read_again_and_what_is_saved_is_remo
     assert sorted(path.name for path in tmp_path.glob("frames/cam01/*")) == ["11.png", "8.png", "9.png"]
     folder.saved("11")
     assert sorted(path.name for path in tmp_path.glob("frames/cam01/*")) == ["8.png", "9.png"]
+
+
+def test_a_frame_that_cannot_be_deleted_keeps_no_other_and_is_tried_again(tmp_path, rig):
+    for name in ("1", "2", "3"):
+        put(tmp_path, "cam01", name)
+    folder = Folder(tmp_path, rig, remove=True, until_idle=0.3)
+    assert len([e for e in folder.items() if e is not None]) == 3
+    cam01 = tmp_path / "frames" / "cam01"
+    (cam01 / "1.png").rename(cam01 / "kept.png")
+    (cam01 / "1.png" / "full").mkdir(parents=True)  # cannot be unlinked
+    with pytest.raises(OSError, match=r"1\.png"):
+        folder.saved("2")
+    assert sorted(path.name for path in cam01.iterdir()) == ["1.png", "3.png", "kept.png"]
+    shutil.rmtree(cam01 / "1.png")
+    (cam01 / "kept.png").rename(cam01 / "1.png")
+    folder.saved("2")
+    assert [path.name for path in cam01.iterdir()] == ["3.png"]
 
 
 def test_what_is_remembered_is_bounded_and_nothing_is_read_twice(tmp_path, rig, monkeypatch):

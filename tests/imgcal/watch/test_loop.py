@@ -122,7 +122,7 @@ def test_what_cannot_be_written_is_counted_said_once_and_written_later(tmp_path)
             loop.save()
             time.sleep(0.2)
         loop.save()
-        assert loop.tally.problems["files"] >= 2 and len(told) == 1 and "state.json" in told[0]
+        assert loop.tally.problems["state.json"] >= 2 and len(told) == 1 and "state.json" in told[0]
         shutil.rmtree(tmp_path / "state.json")
     assert json.loads((tmp_path / "state.json").read_text())["number"] == 3
 

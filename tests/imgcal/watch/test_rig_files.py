@@ -1,3 +1,4 @@
+import shutil
 import threading
 import time
 from dataclasses import replace
@@ -8,6 +9,13 @@ import torch
 from imgcal.io import load_rig, load_rig_covariance
 from imgcal.watch.rig_files import RigFiles
 from tests.imgcal.watch.states import some_state
+
+
+def until(condition):
+    ends = time.monotonic() + 30
+    while not condition():
+        assert time.monotonic() < ends
+        time.sleep(0.01)
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +33,7 @@ def test_the_rig_with_its_standard_deviations_and_its_history(state, tmp_path):
     assert [str(path.relative_to(tmp_path)) for path in tmp_path.glob("history/*/*")] == [
         "history/2023-11-14/231320.000.yaml"
     ]
-    assert files.problem is None
+    assert not files.problems
 
 
 def test_the_history_is_bounded_over_restarts(state, tmp_path):
@@ -65,10 +73,50 @@ def test_what_cannot_be_written_is_said_and_tried_again(state, tmp_path):
     (tmp_path / "rig.yaml").mkdir()
     files = RigFiles(tmp_path)
     files.write(state)
-    while files.problem is None:
+    while not files.problems:
         pass
-    assert "rig.yaml" in files.problem
+    assert "rig.yaml" in files.problems["rig.yaml"]
     (tmp_path / "rig.yaml").rmdir()
     files.write(state)
     files.close()
-    assert files.problem is None and (tmp_path / "rig.yaml").is_file()
+    assert not files.problems and (tmp_path / "rig.yaml").is_file()
+
+
+def test_the_rig_is_written_whatever_else_fails(state, tmp_path):
+    done = []
+
+    def refuse():
+        raise OSError("no such luck")
+
+    (tmp_path / "history").write_text("a file")
+    files = RigFiles(tmp_path)
+    files.write(state, keep=True, also=lambda: done.append("state"), then=refuse)
+    files.close()
+    assert (tmp_path / "rig.yaml").is_file() and done == ["state"]
+    assert set(files.problems) == {"history", "frames"} and files.problems["frames"] == "no such luck"
+
+
+def test_frames_are_kept_where_the_state_was_not_written_and_what_was_not_tried_is_not_forgotten(state, tmp_path):
+    done = []
+
+    def refuse():
+        raise OSError("no such luck")
+
+    files = RigFiles(tmp_path)
+    files.write(state, also=refuse, then=lambda: done.append("frames"))
+    until(lambda: files.problems)
+    files.write(replace(state, time=1.7e9 + 60), keep=True)
+    until(lambda: list(tmp_path.glob("history/*/*.yaml")))
+    files.close()
+    assert files.problems == {"state.json": "no such luck"} and not done
+
+
+def test_a_history_that_somebody_has_tidied_up_goes_on(state, tmp_path):
+    files = RigFiles(tmp_path, most_kept=2)
+    for day in range(4):
+        if day == 2:
+            shutil.rmtree(tmp_path / "history")
+        files.write(replace(state, time=1.7e9 + 86400 * day), keep=True)
+        until(lambda day=day: len(list(tmp_path.glob("history/*/*.yaml"))) == 1 + day % 2)
+    files.close()
+    assert not files.problems
