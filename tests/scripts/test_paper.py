@@ -81,9 +81,9 @@ def test_what_is_named_is_trained_after_all_that_it_starts_from(told, tmp_path):
     runs = str(tmp_path / "runs")
     lines = told("train", "--seeds", "2", runs, "shipped-vit-cube8", "comparison-vit-pooled")
     names = [line.split()[3] for line in lines]
-    chain = ["shipped-points-cube8", "positions-vit"]
+    chain = ["shipped-points-asymmetric8", "shipped-points-cube8", "positions-vit"]
     assert names == [name for name in [*chain, "shipped-vit-cube8", "comparison-vit-pooled"] for _ in range(2)]
-    vit = lines[5]
+    vit = lines[7]
     assert f"--out {runs}/shipped-vit-cube8-seed2 --set" in vit and "training.seed=2" in vit
     starts = [f"{runs}/{name}-seed2" for name in ("positions-vit", "shipped-points-cube8")]
     assert f"training.init_from=[{','.join(starts)},]" in vit
