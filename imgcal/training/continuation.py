@@ -59,7 +59,7 @@ def restore(run: Run, state: TrainingState) -> None:
     run.plain.load_state_dict(tensors["network"])
     if run.average is not None:
         run.average.load_state_dict(tensors["average"])
-    if values.get("best") is not None:
+    if values.get("best") is not None and run.experiment.training.patience is not None:
         run.best = Best(make_average(run.plain), **values["best"])
         run.best.network.load_state_dict(tensors["best"])
     restore_optimizer(run.optimizer, tensors["optimizer"], values["optimizer"])

@@ -230,34 +230,32 @@ def validation(run: Run, network: nn.Module) -> dict[str, float]:
 def validate(run: Run, told: Callbacks, extra: bool) -> None:
     """Tell the errors of the weights as they would be the result; see `_tell`."""
     check_finite(run)
-    row = {}
     if run.accelerator.is_main_process and (found := validation(run, run.candidate)):
-        row = {"step": run.step, **found}
-        _tell(run, told, row, extra)
+        _tell(run, told, {"step": run.step, **found}, extra)
     if run.experiment.training.patience is not None:
-        _keep_best(run, row, extra)
+        _keep_best(run, extra)
 
 
-def _keep_best(run: Run, row: dict[str, Any], extra: bool) -> None:
+def _keep_best(run: Run, extra: bool) -> None:
     """Remember the weights if they are the best so far; all processes must call this together, the main one decides.
 
     An `extra` validation decides about the result alone, so that a continuation goes on as if nobody had stopped.
     """
-    judged = run.task.judged
-    if run.accelerator.is_main_process and judged not in row and not extra:
+    judged, metrics = run.task.judged, run.own_metrics
+    if run.accelerator.is_main_process and judged not in metrics and not extra:
         raise InputError(f"training: patience: found no {judged} to go by, expected validation_rigs to be 1 or more")
-    error = row.get(judged, math.inf)
+    error = metrics.get(judged, math.inf)
     error = error if math.isfinite(error) else math.inf  # any number is better
     if run.accelerator.num_processes > 1:
         error = float(broadcast(torch.tensor(error, dtype=torch.float64, device=run.accelerator.device)))
     if extra:
         so_far = math.inf if run.best is None else run.best.error
-        run.closing = Best(run.candidate, row, error) if error < so_far else None
+        run.closing = Best(run.candidate, metrics, error) if error < so_far else None
     elif run.best is None:
-        run.best = Best(make_average(run.candidate), row, error)
+        run.best = Best(make_average(run.candidate), metrics, error)
     elif error < run.best.error:
         run.best.network.load_state_dict(run.candidate.state_dict())
-        run.best.metrics, run.best.error, run.best.since = row, error, 0
+        run.best.metrics, run.best.error, run.best.since = metrics, error, 0
     else:
         run.best.since += 1
 
@@ -268,11 +266,10 @@ def _check_result(run: Run) -> None:
     Raises:
         RefusedError: the validation of what would be the result is not finite, or its weights are not.
     """
-    best, judged = run.closing or run.best, run.task.judged
-    network, found = (run.candidate, run.latest) if best is None else (best.network, best.metrics)
-    value = found.get(judged, 0.0)
+    network, metrics = run.chosen
+    value = metrics.get(run.task.judged, 0.0)
     if not math.isfinite(value):
-        raise RefusedError(f"step {run.step}: {judged} is {value:g}, expected a number: the network is of no use")
+        raise RefusedError(f"step {run.step}: {run.task.judged} is {value:g}, expected a number: the network is of no use")
     wrong = [name for name, tensor in network.state_dict().items() if not bool(tensor.isfinite().all())]
     if wrong:
         raise RefusedError(f"step {run.step}: found weights that are not finite ({wrong[0]}): the network is of no use")
@@ -283,10 +280,7 @@ def save(run: Run, told: Callbacks) -> None:
     check_finite(run)
     state = state_of(run)
     if run.accelerator.is_main_process:
-        metrics = {name: value for name, value in run.latest.items() if name != "lr"} | {"seconds": run.seconds}
-        best = run.closing or run.best
-        network, found = (run.candidate, {}) if best is None else (best.network, best.metrics)
-        told.on_checkpoint(run, state, run.task.result(network, metrics | found))
+        told.on_checkpoint(run, state, run.task.result(*run.chosen))
 
 
 def progress(run: Run, seconds: float) -> float:
@@ -331,6 +325,7 @@ def _agreed(run: Run, stop: bool) -> tuple[float, bool]:
 def _tell(run: Run, told: Callbacks, row: dict[str, Any], extra: bool) -> None:
     """Keep plain values and pass them on. An `extra` row is not due: the run ends here, for now."""
     run.latest |= row
+    run.told = row if run.told.get("step") != run.step else run.told | row
     if not extra:
         run.metrics |= row
     told.on_metrics(run, row, not extra)

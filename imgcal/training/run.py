@@ -30,7 +30,7 @@ class Best:
     """The weights that did best in validation, where `training.patience` asks for them."""
 
     network: nn.Module
-    metrics: dict[str, Any]  # of the validation: step, errors by name
+    metrics: dict[str, Any]  # `Run.own_metrics` when they were validated
     error: float  # that of the task's `judged`
     since: int = 0  # validations that were no better
 
@@ -58,6 +58,7 @@ class Run:
     window: list[dict[str, Tensor]] = field(default_factory=list)  # loss and means of each step since the last log
     metrics: dict[str, Any] = field(default_factory=dict)  # the latest of each name that were due
     latest: dict[str, Any] = field(default_factory=dict)  # the latest of each name
+    told: dict[str, Any] = field(default_factory=dict)  # all of one step, the last of which something was told
     pending: list[Pending] = field(default_factory=list)
     best: Best | None = None  # of the validations that were due
     closing: Best | None = None  # as the run ends, where that is better still
@@ -71,3 +72,16 @@ class Run:
     def candidate(self) -> nn.Module:
         """The network as it is judged: the running mean where there is one."""
         return self.plain if self.average is None else self.average
+
+    @property
+    def own_metrics(self) -> dict[str, Any]:
+        """What is known of the weights as they are now: nothing of earlier steps, which had others."""
+        told = self.told if self.told.get("step") == self.step else {}
+        own = {name: value for name, value in told.items() if name != "lr"}
+        return own | {"step": self.step, "seconds": self.seconds}
+
+    @property
+    def chosen(self) -> tuple[nn.Module, dict[str, Any]]:
+        """The network as it would be the result now, and its metrics."""
+        best = self.closing or self.best
+        return (self.candidate, self.own_metrics) if best is None else (best.network, best.metrics)

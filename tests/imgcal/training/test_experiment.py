@@ -120,6 +120,50 @@ def test_weights_that_are_best_when_the_run_ends_are_the_result(line):
     assert all(torch.equal(longer.result[name], rest.result[name]) for name in longer.result)
 
 
+def test_a_result_is_told_by_the_numbers_of_its_own_weights(line):
+    """With and without patience: nothing of other steps, which had other weights."""
+    often = ("training.log_every=5", "training.validate_every=10", "training.save_every=15", "schedule.kind=constant")
+    overshooting = (*ENDLESS, "training.log_every=5", "training.patience=4", "optimizer={lr: 0.8, ema: null}")
+    for setup in (line("training.steps=45", *often), line("training.steps=40", *often), line(*overshooting)):
+        told = Watching()
+        run = engine.train(setup, told)
+        step = told.metrics["step"]
+        own = {name: value for row in told.rows if row["step"] == step for name, value in row.items() if name != "lr"}
+        assert {"error", "validation_slope"} <= told.metrics.keys() == own.keys()
+        assert own == {**told.metrics, "seconds": own["seconds"]}
+        assert told.metrics["seconds"] <= run.seconds
+    parts = Watching()
+    engine.train(line("training.steps=100", *often), parts, should_stop=stopping_at(44))
+    engine.train(line("training.steps=100", *often), parts, parts.state, should_stop=stopping_at(2))
+    assert parts.metrics["step"] == 46
+    between = Between()
+    engine.train(line("training.steps=40", *often), between)
+    assert between.results[0] == (15, {"step", "seconds", "loss", "error", "points_per_s"})  # validated at 10 and 20
+
+
+class Between(Callbacks):
+    """Keeps which metrics each result has."""
+
+    def __init__(self):
+        self.results = []
+
+    def on_checkpoint(self, run, state, result):
+        self.results.append((run.step, set(result.metrics)))
+
+
+def test_a_continuation_without_patience_ends_with_its_last_weights(line):
+    often = (*ENDLESS, "optimizer={lr: 0.8, ema: null}")
+    patient, rest, again = Watching(), Watching(), Watching()
+    engine.train(line(*often, "training.patience=40"), patient, should_stop=stopping_at(60))
+    assert patient.metrics["step"] < 60
+    run = engine.train(line(*often), rest, patient.state, should_stop=stopping_at(10))
+    assert rest.metrics["step"] == run.step == 70
+    assert all(torch.equal(rest.result[name], tensor) for name, tensor in run.plain.state_dict().items())
+    assert rest.state.values["best"] is None and not rest.state.tensors["best"]
+    engine.train(line(*often, "training.patience=40"), again, rest.state, should_stop=stopping_at(10))
+    assert again.metrics["step"] > 70  # what was best before was forgotten
+
+
 def test_patience_needs_validations(line):
     with pytest.raises(InputError, match="training: found patience 3 and validation_rigs 0, expected some to go by"):
         line("training.patience=3", "training.validation_rigs=0")
