@@ -77,6 +77,7 @@ def compare_captures(
         InputError: a detector or a difficulty that there is not.
     """
     from imgcal.evaluation import Scene, compare_detectors, detector_tables, detector_values
+    from imgcal.pipeline import proposer_of
     from imgcal.synthesis import DIFFICULTIES, FrameModel
 
     chosen.check()
@@ -86,6 +87,9 @@ def compare_captures(
     models = {name: FrameModel(difficulty=DIFFICULTIES[name]) for name in names}
     scene = Scene(open_rig(rig), load_object(obj), models, chosen.snapshots)
     contenders = [contender(path) for path in detectors]
+    for one in contenders:
+        if one.detector != "classical":
+            proposer_of(one.detector)  # found out now, not when captures are made
     total = len(models) * chosen.captures
     kept = None if out is None else Kept(out / WORK, _scope(contenders, scene))
     with workers(total, kept) as mapped, counted("calibrating captures", total) as advance:

@@ -33,6 +33,8 @@ CHECKED_RIGS = 32
 """On which encoders are checked."""
 FEW = 8
 """Batches, or captures, that are done before Ray has started."""
+OF_BOTH = ("rig", "object", "seed", "address", "cores")
+"""What a comparison of captures reads of a `Setting`, too."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +112,7 @@ class Compare:
 
     def run(self) -> None:
         """Compare, print and write."""
+        self._check_options()
         if self.captured.captures:
             rig, obj = self.setting.rig or "O10", self.setting.object or "asymmetric8"
             who = partial(_workers, self.setting)
@@ -126,6 +129,25 @@ class Compare:
         if len(self.models) < 2:
             raise InputError(f"compare: found {len(self.models)} models, expected two or more")
         _run(self.models, self.setting, self.baselines, self.out)
+
+    def _check_options(self) -> None:
+        """Refuse options that are for the other kind of comparison.
+
+        Raises:
+            InputError: names the first of them, and what it is for.
+        """
+        unread: list[tuple[Setting | Compare | Captures, str]]
+        if self.captured.captures:
+            how, meant = "with", "networks are compared on points"
+            unread = [(self.setting, name) for name in vars(self.setting) if name not in OF_BOTH]
+            unread.append((self, "baselines"))
+        else:
+            how, meant = "without", "detectors are compared on captured frames"
+            unread = [(self.captured, name) for name in vars(self.captured)]
+        for options, name in unread:
+            if getattr(options, name) != getattr(type(options), name):
+                option = name.replace("_", "-")
+                raise InputError(f"--{option}: found it {how} --captures, expected it where {meant}")
 
 
 def _run(paths: tuple[Path, ...], setting: Setting, baselines: bool, out: Path | None) -> None:

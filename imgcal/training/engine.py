@@ -269,7 +269,9 @@ def _check_result(run: Run) -> None:
     network, metrics = run.chosen
     value = metrics.get(run.task.judged, 0.0)
     if not math.isfinite(value):
-        raise RefusedError(f"step {run.step}: {run.task.judged} is {value:g}, expected a number: the network is of no use")
+        raise RefusedError(
+            f"step {run.step}: {run.task.judged} is {value:g}, expected a number: the network is of no use"
+        )
     wrong = [name for name, tensor in network.state_dict().items() if not bool(tensor.isfinite().all())]
     if wrong:
         raise RefusedError(f"step {run.step}: found weights that are not finite ({wrong[0]}): the network is of no use")

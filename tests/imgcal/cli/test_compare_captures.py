@@ -49,6 +49,15 @@ def test_captures_that_are_done_are_not_done_again(tmp_path, capsys, monkeypatch
         (["--captures", "-1"], "--captures: found -1, expected 1 to 100000"),
         (["--captures", "1", "--cores", "0"], "--cores: found 0"),
         (["--captures", "1", "--rig", "none.yaml"], "none.yaml"),
+        (["--captures", "1", "--kappa", "0.01"], "--kappa: found it with --captures, expected it where networks are"),
+        (["--captures", "1", "--sweep-count", "5"], "--sweep-count: found it with --captures"),
+        (["--captures", "1", "--trust", "a:B"], "--trust: found it with --captures"),
+        (["--captures", "1", "--baselines"], "--baselines: found it with --captures"),
+        (
+            ["matched", "--difficulty", "clean"],
+            "--difficulty: found it without --captures, expected it where detectors",
+        ),
+        (["matched", "--snapshots", "2"], "--snapshots: found it without --captures"),
         (["matched"], "found classical, which is a detector, expected networks; detectors are compared on captured"),
     ],
 )
@@ -56,6 +65,22 @@ def test_what_cannot_be_done_is_said_in_one_line(arguments, expected, capsys):
     assert main(["compare", "classical", *arguments]) == 2
     error = capsys.readouterr().err
     assert expected in error and len(error.splitlines()) == 1
+
+
+def test_an_unknown_detector_is_said_before_any_capture_is_made(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(detectors, "draw_capture", None)
+    (tmp_path / "damaged.safetensors").write_bytes(b"nothing")
+    cases = {
+        "nosuch": "detector: found 'nosuch', expected classical, ",
+        str(tmp_path / "damaged.safetensors"): "damaged",
+    }
+    for named, expected in cases.items():
+        assert (
+            main(["compare", "classical", named, "--captures", "1", "--cores", "1", "--out", str(tmp_path / "o")]) == 2
+        )
+        error = capsys.readouterr().err
+        assert expected in error and len(error.splitlines()) == 1
+    assert not (tmp_path / "o").exists()
 
 
 def test_runs_that_differ_in_the_seed_have_one_name(tmp_path):
