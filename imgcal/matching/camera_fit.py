@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from imgcal.matching.marker_fit import MISFIT, NEAR, fit_markers
+from imgcal.matching.marker_fit import fit_markers
 from imgcal.matching.marker_shape import RINGS, common_shape, median
 from renderers.compiling import njit
 
@@ -38,7 +38,7 @@ def cut(grey, uv, scale, half, patches):
 
 
 @njit(cache=True, nogil=True)
-def fit_camera(grey, start, inside, sure, scale, half, passes, uv, found, misfit):
+def fit_camera(grey, start, inside, sure, scale, half, iterations, uv, found, misfit):
     """Fit the markers (N) of one camera.
 
     Args:
@@ -48,7 +48,7 @@ def fit_camera(grey, start, inside, sure, scale, half, passes, uv, found, misfit
         sure: (N,) those from which the common shape is taken.
         scale: (N,) size of each marker in parts of the usual one.
         half: px, half of the first windows.
-        passes: how often shape and places are found, each from the other.
+        iterations: (P,) of the places, in each of the passes in which shape and places are found from one another.
         uv: (N, 2) filled with the places.
         found: (N, 5) zeros, filled as by `fit_markers`.
         misfit: (N,) filled with the RMS difference from the common shape beyond noise, in parts of the amplitude.
@@ -61,7 +61,7 @@ def fit_camera(grey, start, inside, sure, scale, half, passes, uv, found, misfit
     whitening, profile = np.empty((2, 2)), np.empty(side + 2)
     close, some = np.zeros((count, count), np.bool_), np.empty(count)
     radius = 0.0
-    for number in range(passes):
+    for number in range(len(iterations)):
         chosen = np.flatnonzero(sure if sure.any() else inside)
         patches = np.empty((len(chosen), 2 * half + 1, 2 * half + 1), np.float32)
         cut(grey, place[chosen], scale[chosen], half, patches)
@@ -75,8 +75,8 @@ def fit_camera(grey, start, inside, sure, scale, half, passes, uv, found, misfit
                 apart = max(abs(place[n, 0] - place[m, 0]), abs(place[n, 1] - place[m, 1]))
                 close[n, m] = n != m and inside[n] and inside[m] and apart < 2 * window
         uv[:] = place
-        iterations = len(MISFIT) if number == 0 else NEAR
-        fit_markers(grey, inside, window, scale, close, (whitening, profile[:values]), iterations, uv, found)
+        shape, last = (whitening, profile[:values]), number == len(iterations) - 1
+        fit_markers(grey, inside, window, scale, close, shape, iterations[number], last, uv, found)
         for n in range(count):
             misfit[n] = np.sqrt(max(found[n, 3] - 1.5 * found[n, 4], 0.0)) / max(found[n, 0], 1e-9)
         for k in range(len(chosen)):

@@ -75,6 +75,7 @@ def correlate(
 
 @njit(cache=True, fastmath=True, error_model="numpy")
 def _correlate(cells, front, gain, size, steps, window, score, shift):
+    highest = np.empty(len(window), np.float32)
     for k in range(len(cells)):
         for c in range(cells.shape[1]):
             step, width, height = steps[c], size[c, 0], size[c, 1]
@@ -91,15 +92,22 @@ def _correlate(cells, front, gain, size, steps, window, score, shift):
                     row = gain[c, top + i]
                     for j in range(first, last):
                         window[i, j] += row[left + j]
-            most, at_i, at_j, total = window[0, 0], 0, 0, 0.0
             for i in range(side):
+                row, high = window[i], window[i, 0]
                 for j in range(side):
-                    if window[i, j] > most:
-                        most, at_i, at_j = window[i, j], i, j
+                    high = max(high, row[j])
+                highest[i] = high
+            at_i, at_j, most, total = 0, 0, highest[0], 0.0
             for i in range(side):
-                for j in range(side):
-                    if window[i, j] > most - 12:
-                        total += np.exp(window[i, j] - most)
+                if highest[i] > most:
+                    most, at_i = highest[i], i
+            while window[at_i, at_j] < most:
+                at_j += 1
+            for i in range(side):
+                if highest[i] > most - 12:
+                    for j in range(side):
+                        if window[i, j] > most - 12:
+                            total += np.exp(window[i, j] - most)
             # The shift is not known beforehand: the mean over all of them counts.
             score[k, c] = most + np.log(total / (side * side))
             shift[k, c, 0], shift[k, c, 1] = at_j - step, at_i - step

@@ -9,7 +9,6 @@ Where the object's place is known, all this is done within a window of each fram
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -17,13 +16,11 @@ from numpy.typing import NDArray
 
 from imgcal.detection import Frame
 from imgcal.matching.cameras import each_camera
+from imgcal.matching.ranks import average, raise_ranks, rank_spots
 
 SIZES = (0.0, 1.2, 2.4)  # cells, standard deviations of the spots that are looked for; 0 = as reduced
 SURROUND = 2.0  # of the ring around a spot, in parts of the spot's
 LEAST_SURROUND = 1.6  # cells
-BINS = 4096
-MOST = 9.0
-"""Surprise beyond which nothing counts more: a reflection is no better a marker for being bright."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +52,8 @@ class Maps:
         count, height, width = self.surprise.shape
         padded = np.zeros((count, -(-height // step) * step, -(-width // step) * step), np.float32)
         padded[:, :height, :width] = self.surprise
-        most = padded.reshape(count, padded.shape[1] // step, step, -1, step).max((2, 4))
+        rows = padded.reshape(count, -1, step, padded.shape[2]).max(2)
+        most = rows.reshape(count, rows.shape[1], -1, step).max(3)
         size = -(-self.size // step)
         return Maps(_ranked(most, size), self.factor * step, size, self.corner // step)
 
@@ -100,63 +98,30 @@ def surprise_maps(
             return
         left, top = windows[camera, ::2].tolist()
         # What is left over at the right and at the bottom is not seen.
-        area = slice(top, top + height * factor), slice(left, left + width * factor)
-        values = _spots(_reduced(frame[area], factor, dark))
+        cells = np.empty((height, width), np.float32)
+        average(frame, windows[camera, ::2], factor, cells)
+        _spots(-cells if dark else cells, response[camera, :, :height, :width])
+        covered = np.zeros((0, 0), np.uint8)
         if mask is not None:
-            covered = cv2.resize(mask[area].astype(np.uint8), (width, height), interpolation=cv2.INTER_AREA) > 0
-            values[:, covered] = 0.0
-        ranks = np.stack([rank(value) for value in values]) - np.float32(np.log(len(values)))
-        surprise[camera, :height, :width] = np.clip(ranks.max(0), 0, MOST)
-        response[camera, :, :height, :width] = values
+            area = mask[top : top + height * factor, left : left + width * factor].astype(np.uint8)
+            covered = np.asarray(cv2.resize(area, (width, height), interpolation=cv2.INTER_AREA))
+        rank_spots(response[camera], covered, size[camera], surprise[camera])
 
     each_camera(fill, range(len(frames)))
     return Maps(surprise, factor, size, windows[:, ::2] // factor), response
 
 
-def rank(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Minus the logarithm of the share of the values that are as large, for each of them."""
-    low, high = float(values.min()), float(values.max())
-    if not high > low:
-        return np.zeros_like(values)
-    # The interesting ones are few and large: bins are narrow at zero and wide far out.
-    squeezed = np.arcsinh(values)
-    low, high = float(np.arcsinh(low)), float(np.arcsinh(high))
-    place = ((squeezed - np.float32(low)) * np.float32((BINS - 1) / (high - low))).astype(np.int32)
-    count = np.bincount(place.ravel(), minlength=BINS)
-    above = np.cumsum(count[::-1])[::-1] - 0.5 * count
-    table = -np.log(np.maximum(above, 0.5) / values.size).astype(np.float32)
-    return table[place]
-
-
-def _ranked(values: NDArray[Any], size: NDArray[np.int64]) -> NDArray[np.float32]:
-    ranked = np.zeros(values.shape, np.float32)
-
-    def fill(camera: int) -> None:
-        width, height = size[camera].tolist()
-        if width:
-            part = rank(values[camera, :height, :width])
-            ranked[camera, :height, :width] = np.clip(part, 0, MOST)
-
-    each_camera(fill, range(len(values)))
+def _ranked(values: NDArray[np.float32], size: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Rank the values (C, H, W) of each camera among those of its map."""
+    ranked = np.zeros_like(values)
+    there = np.flatnonzero(size.prod(1)).tolist()
+    each_camera(lambda camera: raise_ranks(values[camera], size[camera], 1, ranked[camera]), there)
     return ranked
 
 
-def _reduced(part: Frame, factor: int, dark: bool) -> NDArray[np.float32]:
-    """Mean of each cell."""
-    values = part.astype(np.float32)
-    if factor > 1:
-        size = (part.shape[1] // factor, part.shape[0] // factor)
-        values = np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_AREA))
-    return -values if dark else values
-
-
-def _spots(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Respond to spots of each size, in standard deviations of the noise: (sizes, H, W)."""
-    found = np.empty((len(SIZES), *image.shape), np.float32)
-    for number, sigma in enumerate(SIZES):
-        around = max(LEAST_SURROUND, SURROUND * sigma)
-        spot = cv2.GaussianBlur(image, (0, 0), sigma) if sigma else image
-        difference = spot - cv2.GaussianBlur(image, (0, 0), around)
-        noise = 1.4826 * float(np.median(np.abs(difference[::3, ::3])))
-        found[number] = difference / max(noise, 1e-3)
-    return found
+def _spots(image: NDArray[np.float32], found: NDArray[np.float32]) -> None:
+    """Fill (sizes, H, W) with what each size of spots is brighter than the ring around it."""
+    rings = [max(LEAST_SURROUND, SURROUND * sigma) for sigma in SIZES]
+    blurred = {sigma: cv2.GaussianBlur(image, (0, 0), sigma) for sigma in {*SIZES, *rings} - {0.0}} | {0.0: image}
+    for number, (sigma, ring) in enumerate(zip(SIZES, rings, strict=True)):
+        np.subtract(blurred[sigma], blurred[ring], out=found[number])

@@ -242,7 +242,7 @@ def _improved(size, shape, misfit, last, count, pixels, place, told, work):
 
 
 @njit(cache=True, nogil=True)
-def fit_markers(grey, inside, half, scale, close, shape, iterations, uv, found):
+def fit_markers(grey, inside, half, scale, close, shape, iterations, told, uv, found):
     """Fit markers (N) in the windows around them, place by place.
 
     A marker that does not look like the shape leaves residuals that belong together: what pulls it to one side is said
@@ -257,6 +257,7 @@ def fit_markers(grey, inside, half, scale, close, shape, iterations, uv, found):
         close: (N, N) which other markers may reach into a window.
         shape: whitening (2, 2) and profile (R,).
         iterations: the last ones of `MISFIT`.
+        told: whether variances are asked for; they stay infinite where not.
         uv: (N, 2) where to begin; filled with the places.
         found: (N, 5) amplitudes, of neighbours that were fitted before; filled with amplitude, its variance, the
             variance of the place along an axis, the mean squared residual within the marker, and the squared noise.
@@ -277,5 +278,5 @@ def fit_markers(grey, inside, half, scale, close, shape, iterations, uv, found):
             for m in range(len(uv)):
                 if close[n, m] and found[m, 0] > 0:
                     _take_away(box, m, half, scale[m], found[m, 0], whitening, profile, uv, pixels[0])
-            last = iteration == len(MISFIT) - 1
+            last = told and iteration == len(MISFIT) - 1
             _improved(scale[n], shape, MISFIT[iteration], last, count, pixels, uv[n], found[n], work)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from imgcal.detection import Frame
 from imgcal.matching.camera_fit import USUAL_MISFIT, fit_camera
+from imgcal.matching.marker_fit import MISFIT, NEAR
 
 LEAST_SIGMA = 0.02  # px: what no fit is better than
 LEAST_SIGNIFICANCE = 5.0  # amplitude over its standard deviation
@@ -43,7 +45,7 @@ def measure_markers(
     radius: NDArray[np.float64],
     dark: bool,
     sure: NDArray[np.bool_],
-    passes: int = 2,
+    iterations: tuple[int, ...] = (len(MISFIT), NEAR),
 ) -> Measured:
     """Fit the markers of one camera near their expected places.
 
@@ -53,30 +55,37 @@ def measure_markers(
         radius: (N,) px, how large they are: roughly, but for their ratios.
         dark: markers are darker than their surroundings.
         sure: (N,) those from which the common shape is taken.
-        passes: how often shape and places are found, each from the other.
+        iterations: of the places, in each of the passes in which shape and places are found from one another.
     """
     height, width = frame.shape
-    usual = float(np.median(radius))
+    usual = _quantile(radius, 0.5)
     scale = radius / usual
     inside = np.asarray(((expected > -0.5) & (expected < (width - 0.5, height - 0.5))).all(1))
     if not inside.any():
         return _nothing(len(expected), usual)
-    half = int(np.clip(np.ceil(2.2 * usual + 4), 5, LARGEST))
+    half = min(max(math.ceil(2.2 * usual + 4), 5), LARGEST)
     grey, corner = _part(frame, expected[inside], 2 * half * float(scale.max()), dark)
     start, sure = np.where(inside[:, None], expected - corner, 0.0), np.asarray(sure, dtype=bool)
     uv, found, misfit = np.empty_like(start), np.zeros((len(start), 5)), np.zeros(len(start))
-    size = fit_camera(grey, start, inside, sure, scale, half, passes, uv, found, misfit)
+    size = fit_camera(grey, start, inside, sure, scale, half, np.array(iterations), uv, found, misfit)
     if size == 0:
         return _nothing(len(expected), usual)
     amplitude, spread, place = found.T[:3]
     # Where the middle of a marker does not look like the common shape, part of it may be hidden.
-    least = max(USUAL_MISFIT, 2 * float(np.quantile(misfit[inside], 0.25)))
+    least = max(USUAL_MISFIT, 2 * _quantile(misfit[inside], 0.25))
     doubt = HALF_HIDDEN * np.maximum(misfit - least, 0) * size * scale
     # What makes it uneven pulls it to one side, too: the fit follows, and no residual shows that.
     uneven = UNEVEN * np.maximum(misfit - EVEN, 0) * size * scale
     sigma = np.sqrt(place + LEAST_SIGMA**2 + doubt**2 + uneven**2)
     significance = np.where(inside & (amplitude > 0), amplitude / np.sqrt(np.maximum(spread, 1e-12)), 0.0)
     return Measured(uv + corner, sigma, amplitude, significance, size, misfit)
+
+
+def _quantile(values: NDArray[np.float64], share: float) -> float:
+    """Do what `np.quantile` does for some values (N,), in a tenth of the time."""
+    ordered, place = np.sort(values), share * (len(values) - 1)
+    low, high = ordered[math.floor(place)], ordered[math.ceil(place)]
+    return float(low + (place % 1) * (high - low))
 
 
 def _nothing(count: int, radius: float) -> Measured:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 import torch
@@ -31,10 +31,10 @@ class Scene:
 
     rig: CameraRig
     obj: CalibrationObject
-    std: Tensor  # (C, 15)
+    std: Tensor  # (C, parameters)
     distance: float  # mm, from the cameras to the object, roughly
 
-    @property
+    @cached_property
     def drift(self) -> NDArray[np.float64]:
         """One standard deviation of how far drift moves the object's image: (C,) pixels."""
         return pattern_prior(self.std, self.rig, self.distance).shift
@@ -59,6 +59,12 @@ class Ranked:
     def best(self, count: int) -> Ranked:
         """Keep the best ones, in order."""
         return self.select(np.argsort(-self.scores.total, kind="stable")[:count])
+
+    def or_better(self, other: Ranked) -> Ranked:
+        """Of two sets of as many poses, the better one of each pair."""
+        count = len(self.poses.rotation)
+        take = np.where(other.scores.total > self.scores.total, count, 0)
+        return (self + other).select(take + np.arange(count))
 
     def __add__(self, other: Ranked) -> Ranked:
         return Ranked(RigidTransform.cat([self.poses, other.poses]), self.scores + other.scores)
@@ -86,20 +92,13 @@ class Matcher:
         """Turn and move each pose to where it fits best: (K,) in their order."""
         turns = _axes(found.poses.rotation)
         for step in steps:
-            found = self.better(found, moved(found, self.scene))
-            tried = RigidTransform.stack([turned(found.poses, step * axis, self.scene.obj) for axis in turns])
+            found = found.or_better(self.rank(moved(found, self.scene)))
             count = len(found.poses.rotation)
-            scored = self.rank(RigidTransform(tried.rotation.flatten(0, 1), tried.translation.flatten(0, 1)))
+            tried = found.poses[torch.arange(count).repeat(len(turns))]
+            scored = self.rank(turned(tried, step * turns.repeat_interleave(count, 0), self.scene.obj))
             best = scored.scores.total.reshape(len(turns), count).argmax(0)
-            found = self.better(found, scored.select(best * count + np.arange(count)).poses)
-        return self.better(found, moved(found, self.scene))
-
-    def better(self, found: Ranked, poses: RigidTransform) -> Ranked:
-        """Of two sets of poses (K,), the better one of each pair."""
-        other = self.rank(poses)
-        both, count = found + other, len(found.poses.rotation)
-        take = np.where(other.scores.total > found.scores.total, count, 0)
-        return both.select(take + np.arange(count))
+            found = found.or_better(scored.select(best * count + np.arange(count)))
+        return found.or_better(self.rank(moved(found, self.scene)))
 
 
 def around(pose: RigidTransform, obj: CalibrationObject) -> RigidTransform:

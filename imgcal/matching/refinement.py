@@ -15,6 +15,7 @@ from imgcal.geometry import RigidTransform
 from imgcal.matching.cameras import each_camera
 from imgcal.matching.correlation import BLIND, gains
 from imgcal.matching.maps import SIZES, Maps
+from imgcal.matching.marker_fit import MISFIT, NEAR
 from imgcal.matching.photometry import Measured, measure_markers
 from imgcal.matching.poses import Ranked, Scene
 from imgcal.types import CameraRig, Observations
@@ -27,6 +28,7 @@ OUTLIER = 5.0  # standard deviations from which a measured marker is something e
 SHAPE_ERROR = 0.3  # px: what a measured place may be off beyond its own sigma
 LEAST_FITTED = 6  # fiducials of all cameras
 GATES = (8.0, 2.5)  # px that a measured place may be off the fitted rig, once and again
+ITERATIONS = ((len(MISFIT), NEAR), (NEAR,))  # of the places, see `measure_markers`: once found they are near
 
 
 @dataclass(frozen=True)
@@ -77,11 +79,15 @@ def fitted(
     sure = (found.scores.log_odds[0] > SURE)[:, None]
     reach = max(2, round(0.15 * spacing(predicted) / maps.factor))
     fit = _fit_peaks(scene, pose, maps, predicted, (reach, 2), sure)
-    for gate in GATES:
+    uv = np.full(predicted.shape, np.nan)
+    for gate, iterations in zip(GATES, ITERATIONS, strict=True):
         if fit is None:
             return None
         pose, predicted = fit.rig_from_object[0], predictions(fit.rig, scene, fit.rig_from_object[0])
-        markers = _measured(scene, fit, predicted, maps, response, frames, dark)
+        # What was measured where the fitted rig has it need not be found again.
+        there = np.linalg.norm(uv - predicted, axis=-1, keepdims=True) < gate
+        expected = np.where(there, uv, predicted)
+        markers = _measured(scene, fit, expected, maps, response, frames, dark, iterations)
         uv, sigma = np.stack([m.uv for m in markers]), np.stack([m.sigma for m in markers])
         off = np.linalg.norm(np.nan_to_num(uv) - predicted, axis=-1)
         near = off < np.hypot(gate, OUTLIER * np.minimum(sigma, 3.0))
@@ -171,32 +177,34 @@ def _fit(
 def _measured(
     scene: Scene,
     fit: Estimate,
-    predicted: NDArray[np.float64],
+    expected: NDArray[np.float64],
     maps: Maps,
     response: NDArray[np.float32],
     frames: Sequence[Frame | None],
     dark: bool,
+    iterations: tuple[int, ...],
 ) -> list[Measured]:
-    """Measure the markers of all cameras near their predictions (C, N, 2)."""
+    """Measure the markers of all cameras near where they are expected (C, N, 2)."""
     points = fit.rig_from_object.apply(scene.obj.points.to(scene.rig.focal_length))  # (1, N, 3)
     depth = fit.rig.expand(1).project_values(points).depth[0].numpy()
     focal = scene.rig.focal_length.mean(-1).numpy()[:, None]
     per_mm = focal / np.maximum(depth, 1.0)
     given = scene.obj.radius
     high = np.array(response.shape[-1:-3:-1]) - 1
-    cells = np.floor(maps.cells(predicted)).clip(0, high).astype(np.int64)
+    cells = np.floor(maps.cells(expected)).clip(0, high).astype(np.int64)
+    # As the images show them: blurred, they are larger than they are.
+    shown = response[np.arange(len(frames))[:, None], :, cells[..., 1], cells[..., 0]]  # (C, N, sizes)
+    seen = np.maximum(0.5, 1.6 * np.array(SIZES)[np.median(shown, axis=1).argmax(-1)]) * maps.factor
+    radius = per_mm * (np.ones(scene.obj.num_fiducials) if given is None else given.numpy())  # (C, N)
+    usual = np.median(radius, axis=1)
+    radius *= np.where((given is None) | (seen > usual), seen / usual, 1.0)[:, None]
+    sure = np.ones(radius.shape[1], dtype=bool)
 
     def measured(camera: int) -> Measured:
-        frame, radius = frames[camera], per_mm[camera] * (1.0 if given is None else given.numpy())
+        frame = frames[camera]
         if frame is None:
-            none = np.zeros(len(radius))
-            return Measured(np.full((len(radius), 2), np.nan), none + np.inf, none, none, 1.0, none)
-        # As the images show them: blurred, they are larger than they are.
-        seen = response[camera][:, cells[camera, :, 1], cells[camera, :, 0]]
-        size = max(0.5, 1.6 * SIZES[int(np.median(seen, axis=1).argmax())]) * maps.factor
-        if given is None or size > np.median(radius):
-            radius = radius * (size / np.median(radius))
-        sure = np.ones(len(radius), dtype=bool)
-        return measure_markers(frame, predicted[camera], radius, dark, sure)
+            none = np.zeros(len(sure))
+            return Measured(np.full((len(sure), 2), np.nan), none + np.inf, none, none, 1.0, none)
+        return measure_markers(frame, expected[camera], radius[camera], dark, sure, iterations)
 
     return each_camera(measured, range(len(frames)))

@@ -4,6 +4,8 @@ from scipy.ndimage import map_coordinates
 
 from imgcal.matching.camera_fit import USUAL_MISFIT, cut, fit_camera
 
+PASSES = np.array([4, 2])  # iterations of each
+
 
 def image(uv, radius=6.0):
     v, u = np.mgrid[:120, :160].astype(float)
@@ -28,7 +30,7 @@ def test_places_radius_and_who_does_not_look_like_the_others():
     grey[76:96, 53:63] = 20  # half of the fourth
     place, found, misfit = np.empty_like(uv), np.zeros((5, 5)), np.zeros(5)
     every = np.ones(5, bool)
-    radius = fit_camera(grey, uv + 0.8, every, every, np.ones(5), 17, 2, place, found, misfit)
+    radius = fit_camera(grey, uv + 0.8, every, every, np.ones(5), 17, PASSES, place, found, misfit)
     whole = [0, 1, 2, 4]
     assert np.abs(place - uv)[whole].max() < 0.05 and radius == pytest.approx(6.0, rel=0.1)
     assert misfit[3] > USUAL_MISFIT > misfit[whole].max()
@@ -38,4 +40,12 @@ def test_where_nothing_is_there_is_no_size():
     uv = np.array([[40.0, 40.0], [90.0, 60.0]])
     every = np.ones(2, bool)
     flat = 130 - image(uv)
-    assert fit_camera(flat, uv, every, every, np.ones(2), 17, 2, uv.copy(), np.zeros((2, 5)), np.zeros(2)) == 0
+    assert fit_camera(flat, uv, every, every, np.ones(2), 17, PASSES, uv.copy(), np.zeros((2, 5)), np.zeros(2)) == 0
+
+
+def test_what_is_known_to_be_near_is_measured_in_one_short_pass():
+    uv = np.array([[30.4, 28.7], [80.1, 31.3], [128.6, 35.2]])
+    grey, every = image(uv), np.ones(3, bool)
+    place, found = np.empty_like(uv), np.zeros((3, 5))
+    fit_camera(grey, uv + 0.3, every, every, np.ones(3), 17, PASSES[1:], place, found, np.zeros(3))
+    assert np.abs(place - uv).max() < 0.05 and np.isfinite(found[:, 1:3]).all()

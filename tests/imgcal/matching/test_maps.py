@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from imgcal.matching.maps import MOST, Maps, rank, surprise_maps
+from imgcal.matching.maps import Maps, surprise_maps
+from imgcal.matching.ranks import MOST
 
 
 def noise(seed=0, size=(256, 320)):
@@ -10,16 +11,6 @@ def noise(seed=0, size=(256, 320)):
 
 def as_frame(values):
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
-
-
-def test_ranks_of_noise_are_exponential_whatever_its_size():
-    values = np.random.default_rng(0).normal(0, 1, (200, 300)).astype(np.float32)
-    surprise = rank(values)
-    for level in (0.5, 1.0, 3.0, 5.0):
-        assert (surprise > level).mean() == pytest.approx(np.exp(-level), rel=0.15)
-    assert np.allclose(surprise, rank(7 * values), atol=0.2)
-    assert (np.diff(surprise.ravel()[values.ravel().argsort()]) >= -1e-6).all()
-    assert (rank(np.ones((4, 4), np.float32)) == 0).all()
 
 
 @pytest.mark.parametrize("dark", [False, True])

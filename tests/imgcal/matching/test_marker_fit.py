@@ -21,7 +21,7 @@ def image(places, amplitudes, side=61):
 def fitted(frame, start, close):
     uv, found, every = start.copy(), np.zeros((len(start), 5)), np.ones(len(start), bool)
     shape = (np.eye(2), profile())
-    fit_markers(frame.astype(np.float32), every, 12, np.ones(len(start)), close, shape, len(MISFIT), uv, found)
+    fit_markers(frame.astype(np.float32), every, 12, np.ones(len(start)), close, shape, len(MISFIT), True, uv, found)
     return uv, found
 
 
@@ -60,7 +60,7 @@ def test_a_step_is_the_slow_one():
         frame[33:36, 30:40] += smear
         uv, found, every = places + 0.2, np.zeros((1, 5)), np.ones(1, bool)
         alone, shape = np.zeros((1, 1), bool), (whitening, profile())
-        fit_markers(frame.astype(np.float32), every, 12, np.ones(1), alone, shape, 1, uv, found)
+        fit_markers(frame.astype(np.float32), every, 12, np.ones(1), alone, shape, 1, True, uv, found)
         expected, amplitude, variance = slow_step(frame, places[0] + 0.2, 12, whitening)
         assert np.allclose(uv[0], expected, atol=1e-3)
         assert np.allclose(found[0, [0, 2]], (amplitude, variance), rtol=1e-2)

@@ -1,0 +1,114 @@
+"""How unusual values are among all of a map: ranks by a histogram, compiled."""
+
+# Compiled functions take their types from their arguments.
+# ruff: noqa: ANN001, ANN201
+# mypy: allow-untyped-defs
+
+from __future__ import annotations
+
+import numpy as np
+
+from imgcal.matching.marker_shape import median
+from renderers.compiling import njit
+
+BINS = 4096
+MOST = 9.0
+"""Surprise beyond which nothing counts more: a reflection is no better a marker for being bright."""
+EVERY = 3  # row and column from whose values the noise is taken
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def raise_ranks(values, size, tries, ranks):
+    """Raise ranks, where they are lower, to minus the logarithm of the share of the values that are as large.
+
+    Args:
+        values: (H, W).
+        size: (2,) width and height of the part that counts.
+        tries: by how much one is luckier to find as large a value: in so many maps it is looked for.
+        ranks: (H, W) from 0 to `MOST`, raised.
+    """
+    width, height = size
+    low, high = values[0, 0], values[0, 0]
+    for i in range(height):
+        for j in range(width):
+            low, high = min(low, values[i, j]), max(high, values[i, j])
+    if not high > low:
+        return
+    # The interesting ones are few and large: bins are narrow at zero and wide far out, by a logarithm of |x| + 1 that
+    # is straight between powers of two, as the bits of a number are.
+    one, ends = np.ones(1, np.float32), np.empty(2, np.float32)
+    ends[0], ends[1] = abs(low) + np.float32(1), abs(high) + np.float32(1)
+    zero, bits = one.view(np.int32)[0], ends.view(np.int32)
+    first = bits[0] - zero if low > 0 else zero - bits[0]
+    last = bits[1] - zero if high > 0 else zero - bits[1]
+    scale = np.float32((BINS - 1) / (last - first))
+    place, count = np.empty((height, width), np.int32), np.zeros(BINS, np.int64)
+    row = np.empty(width, np.float32)
+    for i in range(height):
+        for j in range(width):
+            row[j] = abs(values[i, j]) + np.float32(1)
+        logarithm = row.view(np.int32)
+        for j in range(width):
+            squeezed = logarithm[j] - zero if values[i, j] > 0 else zero - logarithm[j]
+            place[i, j] = np.int32(np.float32(squeezed - first) * scale)
+        for j in range(width):
+            count[place[i, j]] += 1
+    table, above = np.zeros(BINS, np.float32), 0
+    for k in range(BINS - 1, -1, -1):
+        if count[k]:
+            share = max(above + 0.5 * count[k], 0.5) * tries / (width * height)
+            table[k] = min(-np.log(share), MOST)
+            above += count[k]
+    for i in range(height):
+        for j in range(width):
+            ranks[i, j] = max(ranks[i, j], table[place[i, j]])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def rank_spots(response, covered, size, ranks):
+    """Turn responses into standard deviations of their noise, and raise ranks to those of the best of them.
+
+    Args:
+        response: (sizes, H, W), of which as much is filled as `size` says; divided by the noise, 0 where covered.
+        covered: (H, W) non-zero where not to look, or empty.
+        size: (2,) width and height of the part that counts.
+        ranks: (H, W) zeros, filled.
+    """
+    width, height = size
+    held = np.empty(((height + EVERY - 1) // EVERY) * ((width + EVERY - 1) // EVERY), np.float32)
+    for k in range(len(response)):
+        values, number = response[k], 0
+        for i in range(0, height, EVERY):
+            for j in range(0, width, EVERY):
+                held[number] = abs(values[i, j])
+                number += 1
+        factor = np.float32(1 / max(1.4826 * median(held, number), 1e-3))
+        for i in range(height):
+            for j in range(width):
+                values[i, j] *= factor
+        if covered.size:
+            for i in range(height):
+                for j in range(width):
+                    if covered[i, j]:
+                        values[i, j] = 0
+        raise_ranks(values, size, len(response), ranks)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def average(frame, corner, factor, cells):
+    """Fill cells (H, W) with the means of blocks of a frame, the first of which begins at a column and row (2,)."""
+    height, width = cells.shape
+    left, top = corner
+    sums = np.empty(width * factor, np.int32)
+    scale = np.float32(1 / (factor * factor))
+    for i in range(height):
+        sums[:] = 0
+        for k in range(factor):
+            row = frame[top + i * factor + k]
+            for j in range(width * factor):
+                sums[j] += row[left + j]
+        for j in range(width):
+            total = 0
+            for k in range(factor):
+                total += sums[j * factor + k]
+            cells[i, j] = scale * total
