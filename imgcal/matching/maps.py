@@ -9,6 +9,7 @@ Where the object's place is known, all this is done within a window of each fram
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -111,7 +112,7 @@ def surprise_maps(
     return Maps(surprise, factor, size, windows[:, ::2] // factor), response
 
 
-def _ranked(values: NDArray[np.float32], size: NDArray[np.int64]) -> NDArray[np.float32]:
+def _ranked(values: NDArray[Any], size: NDArray[np.int64]) -> NDArray[np.float32]:
     """Rank the values (C, H, W) of each camera among those of its map."""
     ranked = np.zeros_like(values)
     there = np.flatnonzero(size.prod(1)).tolist()

@@ -123,11 +123,11 @@ def cut_patches(
         if frame is None:
             continue
         step = int(scale[camera, 0])
-        pixels = torch.arange(PATCH * step)
-        columns, rows = (corner[camera, :, axis, None].long() + pixels for axis in (0, 1))  # (N, 24 s)
         height, width = frame.shape
-        inside = ((rows >= 0) & (rows < height))[:, :, None] & ((columns >= 0) & (columns < width))[:, None]
-        grey = frame[rows.clamp(0, height - 1).numpy()[:, :, None], columns.clamp(0, width - 1).numpy()[:, None]]
-        values = torch.from_numpy(grey.astype(np.float32)).masked_fill(~inside, torch.nan)
-        patches[camera] = functional.avg_pool2d(values, step)
+        values = np.full((count, PATCH * step, PATCH * step), np.nan, np.float32)
+        for window, (column, row) in zip(values, corner[camera].long().tolist(), strict=True):
+            top, left = (min(max(place, 0), size) for place, size in ((row, height), (column, width)))
+            part = frame[top : max(row + PATCH * step, 0), left : max(column + PATCH * step, 0)]
+            window[top - row :, left - column :][: part.shape[0], : part.shape[1]] = part
+        patches[camera] = functional.avg_pool2d(torch.from_numpy(values), step)
     return -patches if inverted else patches, CropPlacement(corner - 0.5, scale, PATCH)

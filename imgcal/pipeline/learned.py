@@ -58,6 +58,9 @@ OUTLIER = 5.0  # standard deviations of a claim from the fitted rig, at which it
 LARGEST_SIGMA = 20.0  # px: where a claim is too vague to be one
 CHANCE = 0.05  # probability that a window is not what the network takes it for
 
+Fit = tuple[CameraRig, RigidTransform]
+"""The most probable rig, and poses (1,)."""
+
 
 @dataclass(frozen=True)
 class Sighting:
@@ -125,13 +128,14 @@ class LearnedProposer:
         if float(looks.found[0]) < LEAST_SEEN * float(looks.asked[0].sum()):
             tried = view.best(snapshot.rig, _turned(looks.poses[0], snapshot.obj))
             looks = tried if float(tried.found[0]) > float(looks.found[0]) else looks
+        fitted = view.fit(looks, view.observations(looks))
         for _ in range(LOOKS - 1):
-            fitted = view.fit(looks, view.observations(looks))
             if fitted is None:
                 reason = f"found {float(looks.found[0]):.0f} of {int(looks.asked[0].sum())} fiducials in the frames"
                 return Proposal.declined(snapshot, reason)
             looks = view.look(*fitted, window=self.network.config.close_window)
-        return view.proposal(looks)
+            fitted = view.fit(looks, view.observations(looks))
+        return view.proposal(looks, fitted)
 
 
 def load_proposer(
@@ -260,7 +264,7 @@ class _View:
     def _dark(self) -> bool:
         return self.snapshot.detection.polarity == "dark"
 
-    def fit(self, looks: Sighting, observations: Observations) -> tuple[CameraRig, RigidTransform] | None:
+    def fit(self, looks: Sighting, observations: Observations) -> Fit | None:
         """The most probable rig and pose (1,) that observations (1, C, N) speak for; None = they are too few."""
         if int(observations.seen.sum()) < LEAST_CLAIMS:
             return None
@@ -274,15 +278,14 @@ class _View:
             return None
         return fitted.rig, fitted.rig_from_object
 
-    def proposal(self, looks: Sighting) -> Proposal:
-        """Measure what agrees with one rig and pose: labelled blobs."""
+    def proposal(self, looks: Sighting, fitted: Fit | None) -> Proposal:
+        """Measure what agrees with the rig and pose that the claims speak for: labelled blobs."""
         snapshot, observations = self.snapshot, self.observations(looks)
         for gate in GATES:
-            fitted = self.fit(looks, observations)
             if fitted is None:
                 break
             observations = self.measured(looks, Expectation.of(fitted[0], snapshot.obj, fitted[1]), gate)
-        fitted = self.fit(looks, observations)
+            fitted = self.fit(looks, observations)
         if fitted is None:
             return Proposal.declined(snapshot, "found hardly any fiducials that agree with one pose", looks.margin)
         rig, poses = fitted
