@@ -93,66 +93,107 @@ def associate(
         ('unique', True)
     """
     count = len(detections.snapshot_names)
-    coded = _coded_snapshots(detections, count)
-    tracker = Tracker(rig, obj, options)
-    results: dict[int, tuple[SnapshotIdentity, NDArray[np.int64]]] = {}
-    looked: dict[int, Detections] = {}
-    rows = _rows_by_snapshot(detections, count)
-
-    def look(s: int) -> None:
-        assert sight is not None
-        name, blobs = detections.snapshot_names[s], detections.select(rows[s])
-        if tracker.looks_in_vain < MOST_LOOKS_IN_VAIN:
-            snapshot, labels, looked[s] = tracker.look(sight, s, blobs, name)
-            results[s] = snapshot, labels
-        else:
-            results[s] = SnapshotIdentity(name, "refused", NOT_TRIED, 0, None), rows[s] * 0 - 1
-
-    def camera(s: int) -> NDArray[np.int64]:
-        return looked[s].camera if s in looked else detections.camera[rows[s]]
-
-    def decide(s: int) -> None:
-        name = detections.snapshot_names[s]
-        if coded[s]:
-            results[s] = tracker.accept(name, detections.fiducial[rows[s]])
-        elif sight is not None and not sight.where_blobs_fail:
-            look(s)
-        else:
-            results[s] = tracker.decide(detections.select(rows[s]), name)
-
+    series = _Series(detections, Tracker(rig, obj, options), sight)
     order: Iterable[int] = range(count)
-    patience = Patience(count)
-    for number, s in enumerate(progress(order, count) if progress else order):
-        if coded[s] or patience.tries(number, tracker.in_vain):
-            decide(s)
-        else:
-            results[s] = SnapshotIdentity(detections.snapshot_names[s], "refused", NOT_TRIED, 0, None), rows[s] * 0 - 1
-    again = [s for s in range(count) if not coded[s] and _incomplete(*results[s], camera(s))]
-    accepted = np.array([s for s in range(count) if results[s][0].status != "refused"])
+    series.first(progress(order, count) if progress else order)
+    accepted = series.accepted
     if len(accepted):
-        patience, tracker.in_vain, tracker.looks_in_vain = Patience(len(again)), 0, 0
-        # Those nearest to where the object was seen first: they are the likeliest to show it.
-        for number, s in enumerate(sorted(again, key=lambda s: _gap(s, accepted))):
-            first = results[s][0]
-            if patience.tries(number, tracker.in_vain):
-                decide(s)
-            if first.status != "refused" and results[s][0].status != "refused":
-                # The rig that it helped to find labels more of it, but says nothing new of how sure it is.
-                retold = replace(results[s][0], status=first.status, alternatives=first.alternatives)
-                results[s] = retold, results[s][1]
+        series.again(accepted)
     if sight is not None and sight.where_blobs_fail:
-        refused = [s for s in range(count) if results[s][0].status == "refused"]
-        for s in sorted(refused, key=lambda s: _gap(s, accepted) if len(accepted) else s):
-            look(s)
-    table = _labelled(detections, rows, results, looked)
-    labelled = Associations(table, tuple(results[s][0] for s in range(count)))
+        series.where_blobs_fail(sight, accepted)
+    snapshots = tuple(series.results[s][0] for s in range(count))
+    labelled = Associations(_labelled(detections, series.rows, series.results, series.looked), snapshots)
     if not labelled.used:
-        reasons = Counter(snapshot.reason for snapshot in labelled.snapshots if snapshot.reason != NOT_TRIED)
-        reason, times = reasons.most_common(1)[0] if count else ("found no snapshot", 0)
-        tried = f"{reasons.total()} snapshots" + (f" tried, {count} in all" if reasons.total() < count else "")
-        why = f"{reason} ({times} of {tried})" if count else reason
-        raise RefusedError(f"identity: {why}")
+        raise RefusedError(f"identity: {_why(snapshots)}")
     return labelled
+
+
+class _Series:
+    """What was decided so far about the snapshots of some detections."""
+
+    def __init__(self, detections: Detections, tracker: Tracker, sight: Sight | None) -> None:
+        self.detections, self.tracker, self.sight = detections, tracker, sight
+        self.count = len(detections.snapshot_names)
+        self.coded = _coded_snapshots(detections, self.count)
+        self.rows = _rows_by_snapshot(detections, self.count)
+        self.results: dict[int, tuple[SnapshotIdentity, NDArray[np.int64]]] = {}
+        self.looked: dict[int, Detections] = {}  # what was measured in the frames instead of blobs
+
+    @property
+    def accepted(self) -> NDArray[np.int64]:
+        """Numbers of the snapshots that are not refused, ascending."""
+        return np.array([s for s in range(self.count) if self.results[s][0].status != "refused"], dtype=np.int64)
+
+    def first(self, order: Iterable[int]) -> None:
+        """Decide about each snapshot, as long as there is hope."""
+        patience = Patience(self.count)
+        for number, s in enumerate(order):
+            if self.coded[s] or patience.tries(number, self.tracker.in_vain):
+                self.decide(s)
+            else:
+                self._not_tried(s)
+
+    def again(self, accepted: NDArray[np.int64]) -> None:
+        """Try what is incomplete once more, with the rig that the accepted ones gave."""
+        incomplete = [s for s in range(self.count) if not self.coded[s] and self._incomplete(s)]
+        patience, tracker = Patience(len(incomplete)), self.tracker
+        tracker.in_vain, tracker.looks_in_vain = 0, 0
+        # Those nearest to where the object was seen first: they are the likeliest to show it.
+        for number, s in enumerate(sorted(incomplete, key=lambda s: _gap(s, accepted))):
+            first = self.results[s][0]
+            if patience.tries(number, tracker.in_vain):
+                self.decide(s)
+            found, labels = self.results[s]
+            if first.status != "refused" and found.status != "refused":
+                # The rig that it helped to find labels more of it, but says nothing new of how sure it is.
+                self.results[s] = replace(found, status=first.status, alternatives=first.alternatives), labels
+
+    def where_blobs_fail(self, sight: Sight, accepted: NDArray[np.int64]) -> None:
+        """Look at the frames of what is refused."""
+        refused = [s for s in range(self.count) if self.results[s][0].status == "refused"]
+        for s in sorted(refused, key=lambda s: _gap(s, accepted) if len(accepted) else s):
+            self.look(s, sight)
+
+    def decide(self, s: int) -> None:
+        """Decide about one snapshot, by the labels it has, its frames or its blobs."""
+        name = self.detections.snapshot_names[s]
+        if self.coded[s]:
+            self.results[s] = self.tracker.accept(name, self.detections.fiducial[self.rows[s]])
+        elif self.sight is not None and not self.sight.where_blobs_fail:
+            self.look(s, self.sight)
+        else:
+            self.results[s] = self.tracker.decide(self.detections.select(self.rows[s]), name)
+
+    def look(self, s: int, sight: Sight) -> None:
+        """Decide about one snapshot by its frames, as long as looks are worth it."""
+        if self.tracker.looks_in_vain >= MOST_LOOKS_IN_VAIN:
+            self._not_tried(s)
+            return
+        name, blobs = self.detections.snapshot_names[s], self.detections.select(self.rows[s])
+        snapshot, labels, self.looked[s] = self.tracker.look(sight, s, blobs, name)
+        self.results[s] = snapshot, labels
+
+    def _not_tried(self, s: int) -> None:
+        name = self.detections.snapshot_names[s]
+        self.results[s] = SnapshotIdentity(name, "refused", NOT_TRIED, 0, None), np.full_like(self.rows[s], -1)
+
+    def _incomplete(self, s: int) -> bool:
+        """Tell whether another try may help: the snapshot was refused, or no blob of some camera has a label."""
+        snapshot, labels = self.results[s]
+        camera = self.looked[s].camera if s in self.looked else self.detections.camera[self.rows[s]]
+        return snapshot.status == "refused" or not np.isin(camera, camera[labels >= 0]).all()
+
+
+def _why(snapshots: Sequence[SnapshotIdentity]) -> str:
+    """Say why nothing could be decided: what was said most often."""
+    if not snapshots:
+        return "found no snapshot"
+    reasons = Counter(snapshot.reason for snapshot in snapshots if snapshot.reason != NOT_TRIED)
+    reason, times = reasons.most_common(1)[0]
+    tried = f"{reasons.total()} snapshots" + (
+        f" tried, {len(snapshots)} in all" if reasons.total() < len(snapshots) else ""
+    )
+    return f"{reason} ({times} of {tried})"
 
 
 def without_snapshots(labelled: Associations, rows: Sequence[int]) -> Associations:
@@ -176,11 +217,6 @@ def _gap(snapshot: int, accepted: NDArray[np.int64]) -> int:
     """Snapshots to the nearest of the accepted ones, which are in ascending order."""
     near = int(np.searchsorted(accepted, snapshot))
     return int(np.abs(accepted[max(near - 1, 0) : near + 1] - snapshot).min())
-
-
-def _incomplete(snapshot: SnapshotIdentity, labels: NDArray[np.int64], camera: NDArray[np.int64]) -> bool:
-    """Tell whether another try may help: the snapshot was refused, or no blob of some camera (M,) has a label."""
-    return snapshot.status == "refused" or not np.isin(camera, camera[labels >= 0]).all()
 
 
 @dataclass

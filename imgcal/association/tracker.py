@@ -52,7 +52,7 @@ class Tracker:
         self.alternatives = 0  # that the accepted snapshots leave open, 0 = none was accepted yet
         self.in_vain = 0  # hypotheses that were tried since something was accepted
         self.looks_in_vain = 0  # snapshots in which a proposer found nothing, less those in which it did
-        self.accepted: list[tuple[Detections, NDArray[np.int64], RigidTransform]] = []
+        self.accepted: dict[str, tuple[Detections, NDArray[np.int64], RigidTransform]] = {}  # by name
 
     def accept(self, name: str, labels: NDArray[np.int64]) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
         """Take over the labels that came with a snapshot."""
@@ -90,7 +90,7 @@ class Tracker:
         if (few := self._too_few(name, labels)) is not None:
             return few, labels
         assert pose is not None  # an accepted identity has one
-        self._remember(blobs, labels, pose)
+        self._remember(name, blobs, labels, pose)
         return SnapshotIdentity(name, identity.status, identity.reason, identity.alternatives, pose), labels
 
     def _too_few(self, name: str, labels: NDArray[np.int64]) -> SnapshotIdentity | None:
@@ -151,19 +151,22 @@ class Tracker:
         extents = [np.linalg.norm(uv - np.median(uv, axis=0), axis=1).mean() for uv in cameras]
         return tolerance * float(np.median(extents)) / obj.size if extents else 0.0
 
-    def _remember(self, blobs: Detections, labels: NDArray[np.int64], pose: RigidTransform) -> None:
+    def _remember(self, name: str, blobs: Detections, labels: NDArray[np.int64], pose: RigidTransform) -> None:
         """Keep the pose; refit the rig after 1, 2, 4, 8, ... accepted snapshots."""
         self.pose = pose
-        if len(self.accepted) >= self.remembered:
+        known = name in self.accepted
+        if not known and len(self.accepted) >= self.remembered:
             return
-        self.accepted.append((blobs, labels, pose))
+        self.accepted[name] = blobs, labels, pose
         count = len(self.accepted)
-        if count & (count - 1):
+        # One that was tried again replaces what it said: it is no further witness.
+        if known or count & (count - 1):
             return
-        parts = [to_observations(replace(b, fiducial=given), self.factory, self.obj) for b, given, _ in self.accepted]
+        accepted = self.accepted.values()
+        parts = [to_observations(replace(b, fiducial=given), self.factory, self.obj) for b, given, _ in accepted]
         sigma = (torch.cat([p.sigma for p in parts]).square() + self.options.identity_error**2).sqrt()
         observations = Observations(torch.cat([p.uv for p in parts]), sigma, torch.cat([p.seen for p in parts]))
-        poses = RigidTransform.stack([p for _, _, p in self.accepted])
+        poses = RigidTransform.stack([p for _, _, p in accepted])
         fit = estimate(observations, self.factory, self.obj, poses, options=self.options.estimation)
         if bool(fit.converged):
             prior = (self.factory.prior or RigPrior()).std(self.factory)

@@ -129,3 +129,26 @@ def test_what_comes_late_in_a_long_capture_is_still_found(seen, o10, asymmetric8
     clutter = np.random.default_rng(0).uniform(0, 1, long.uv.shape) * (2048, 1088)
     long = replace(long, uv=np.where(number[:, None] < 16, clutter, long.uv), snapshot=number, snapshot_names=names)
     assert associate(without_labels(long), o10, asymmetric8).used == list(range(16, 24))
+
+
+def test_a_snapshot_that_is_tried_again_teaches_the_rig_once(seen, o10, asymmetric8, monkeypatch):
+    made = []
+
+    class Kept(tracker.Tracker):
+        def __init__(self, *arguments):
+            super().__init__(*arguments)
+            self.tried = []
+            made.append(self)
+
+        def decide(self, blobs, name):
+            self.tried.append(name)
+            return super().decide(blobs, name)
+
+    monkeypatch.setattr(series, "Tracker", Kept)
+    clutter = (seen.snapshot == 1) & (seen.camera == 3)  # a camera in which nothing is the object's
+    uv = np.where(clutter[:, None], np.random.default_rng(0).uniform(0, 1000, seen.uv.shape), seen.uv)
+    labelled = associate(without_labels(replace(seen, uv=uv)), o10, asymmetric8)
+    (kept,) = made
+    first, again = kept.tried[:4], kept.tried[4:]
+    assert first == list(seen.snapshot_names) and again == [seen.snapshot_names[1]] and labelled.used == [0, 1, 2, 3]
+    assert len(kept.accepted) == 4
