@@ -59,30 +59,33 @@ def build(
         >>> len(passes), passes[-1].rig.focal_length.shape  # coarse to fine; rigs, cameras, (fx, fy)
         (3, torch.Size([2, 4, 2]))
     """
+    with drawing_from(generator):
+        return _made(config, Parameterization(factory, obj, drift_std), images)
+
+
+def _made(config: NetworkConfig, parameterization: Parameterization, images: ImageOptions | None) -> Network:
+    """Make what a configuration says; see `build`."""
     # timm takes seconds to import: only for those who need it.
     from imgcal.networks.points import PaperPointNetwork, PointNetwork
 
-    parameterization, variant = Parameterization(factory, obj, drift_std), config.variant()
+    variant = config.variant()
     if isinstance(variant, PaperImages | PooledImages):
         from imgcal.networks.pooled_images import PaperImageNetwork, PooledImageNetwork
 
-        with drawing_from(generator):
-            if isinstance(variant, PaperImages):
-                return PaperImageNetwork(variant, parameterization, images)
-            return PooledImageNetwork(variant, parameterization, images)
+        if isinstance(variant, PaperImages):
+            return PaperImageNetwork(variant, parameterization, images)
+        return PooledImageNetwork(variant, parameterization, images)
     if isinstance(variant, HueCentroids | Images):
         from imgcal.networks.images import HueCentroidNetwork, ImageNetwork
 
-        with drawing_from(generator):
-            if isinstance(variant, Images):
-                return ImageNetwork(variant, parameterization, images)
-            return HueCentroidNetwork(variant, parameterization, images)
+        if isinstance(variant, Images):
+            return ImageNetwork(variant, parameterization, images)
+        return HueCentroidNetwork(variant, parameterization, images)
     if images is not None:
         raise InputError(f"images: found this block, but the network {config.preset} takes points")
-    with drawing_from(generator):
-        if isinstance(variant, PaperPoints):
-            return PaperPointNetwork(variant, parameterization)
-        return PointNetwork(variant, parameterization)
+    if isinstance(variant, PaperPoints):
+        return PaperPointNetwork(variant, parameterization)
+    return PointNetwork(variant, parameterization)
 
 
 def build_network(spec: NetworkSpec, rig: CameraRig, obj: CalibrationObject, generator: torch.Generator) -> Network:
