@@ -89,15 +89,16 @@ def _correlate(cells, front, gain, size, steps, window, score, shift):
                 left, top = int(np.floor(cells[k, c, n, 0])) - step, int(np.floor(cells[k, c, n, 1])) - step
                 first, last = max(0, -left), min(side, width - left)
                 for i in range(max(0, -top), min(side, height - top)):
-                    row = gain[c, top + i]
-                    for j in range(first, last):
-                        window[i, j] += row[left + j]
+                    # Slices of their own: of places that are sums, the sign would be asked, one by one.
+                    total, more = window[i, first:last], gain[c, top + i, left + first : left + last]
+                    for j in range(last - first):
+                        total[j] += more[j]
             for i in range(side):
                 row, high = window[i], window[i, 0]
                 for j in range(side):
                     high = max(high, row[j])
                 highest[i] = high
-            at_i, at_j, most, total = 0, 0, highest[0], 0.0
+            at_i, at_j, most, odds = 0, 0, highest[0], 0.0
             for i in range(side):
                 if highest[i] > most:
                     most, at_i = highest[i], i
@@ -107,7 +108,7 @@ def _correlate(cells, front, gain, size, steps, window, score, shift):
                 if highest[i] > most - 12:
                     for j in range(side):
                         if window[i, j] > most - 12:
-                            total += np.exp(window[i, j] - most)
+                            odds += np.exp(window[i, j] - most)
             # The shift is not known beforehand: the mean over all of them counts.
-            score[k, c] = most + np.log(total / (side * side))
+            score[k, c] = most + np.log(odds / (side * side))
             shift[k, c, 0], shift[k, c, 1] = at_j - step, at_i - step

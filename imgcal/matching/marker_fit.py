@@ -76,11 +76,13 @@ def _gathered(grey, n, half, uv, pixels):
     right, bottom = min(left + 2 * half + 1, width), min(top + 2 * half + 1, height)
     left, top = max(left, 0), max(top, 0)
     for i in range(top, bottom):
-        start, du, dv = (i - top) * (right - left), np.float32(left - uv[n, 0]), np.float32(i - uv[n, 1])
+        first, du, dv = (i - top) * (right - left), np.float32(left - uv[n, 0]), np.float32(i - uv[n, 1])
+        last, row = first + right - left, grey[i, left:right]
+        line, line_u, line_v = values[first:last], along_u[first:last], along_v[first:last]
         for j in range(right - left):
-            values[start + j] = grey[i, left + j]
-            along_u[start + j] = du + np.float32(j)
-            along_v[start + j] = dv
+            line[j] = row[j]
+            line_u[j] = du + np.float32(j)
+            line_v[j] = dv
     return left, right, top, bottom
 
 

@@ -104,9 +104,9 @@ def average(frame, corner, factor, cells):
     for i in range(height):
         sums[:] = 0
         for k in range(factor):
-            row = frame[top + i * factor + k]
+            row = frame[top + i * factor + k, left : left + width * factor]
             for j in range(width * factor):
-                sums[j] += row[left + j]
+                sums[j] += row[j]
         for j in range(width):
             total = 0
             for k in range(factor):
