@@ -48,18 +48,20 @@ class ZeroMQ:
                     yield from self._received(socket)
 
     def _received(self, socket: zmq.Socket[bytes]) -> Iterator[Item]:
-        """Receive until nothing has come for a while."""
+        """Receive until nothing has come, and nothing waits, for a while: the reader may be held up for longer."""
         heard = time.monotonic()
-        while time.monotonic() - heard < self.silence:
+        while True:
             if not socket.poll(TICK):
+                if time.monotonic() - heard >= self.silence:
+                    return
                 yield None
                 continue
-            heard = time.monotonic()
             parts = socket.recv_multipart(copy=False)
             try:
                 yield _exposure([memoryview(part.buffer) for part in parts])
             except InputError as error:
                 yield Unreadable(str(error))
+            heard = time.monotonic()
 
     def _connect(self, socket: zmq.Socket[bytes]) -> None:
         import zmq

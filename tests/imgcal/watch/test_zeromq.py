@@ -87,6 +87,25 @@ def test_a_message_of_any_size_is_not_taken(publisher):
     items.close()
 
 
+def test_what_waits_is_not_given_up_where_the_reader_was_held_up(publisher):
+    """With --keep-all the reader waits for the loop, which may compile for a minute."""
+    socket, address = publisher
+    items = ZeroMQ((address,), silence=0.3).items()
+
+    def send(seconds):
+        socket.send(json.dumps({"camera": "a", "time": seconds, "uv": []}).encode())
+
+    first(items, lambda: send(0.0))
+    for number in range(1, 101):
+        send(float(number))
+    time.sleep(0.6)
+    found = []
+    while not found or found[-1] < 100:
+        found.append(first(items).time)
+    assert [seconds for seconds in found if seconds] == list(range(1, 101))
+    items.close()
+
+
 @pytest.mark.parametrize("address", ["frames", "tcp://nowhere", "http://127.0.0.1:1", "tcp://127.0.0.1:70000"])
 def test_addresses_that_are_none(address):
     with pytest.raises(InputError, match=r"address|connected"):
