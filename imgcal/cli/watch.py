@@ -120,7 +120,7 @@ class Watch:
             if self.serve is not None:
                 from imgcal.live_page import LivePage, parse_address  # brings a server along, which is not in the core
 
-                page = stack.enter_context(LivePage(rig, obj, parse_address(self.serve)))
+                page = stack.enter_context(LivePage(rig, obj, parse_address(self.serve), problem=display.warn))
                 print(page.notice)
             loop = Loop(keeper, folder, hook, page, display.tell, display.warn, _removing(source))
             if self.metrics is not None:

@@ -12,15 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from imgcal.live_page.commands import Command
+from imgcal.live_page.notes import Notes
 from imgcal.live_page.text import rounded, stream_event
 from imgcal.live_page.timelines import Timelines, change_of, sigmas_of
 
-MOST_EVENTS = 200
 MOST_VISITED = 400  # places of the object that are drawn
 VISITED_SECONDS = 1.0
 LAYOUT_SECONDS = 5.0
-ALARMS = frozenset({"moved", "camera_lost", "dirty", "defocused", "object_bent", "object_exchanged", "clock_slip"})
-"""Events that wait for somebody to acknowledge them."""
 
 Array = NDArray[np.float64]
 
@@ -36,11 +35,9 @@ class Board:
         """Begin with what the loop's process said first."""
         self.greeting = greeting
         self.instance = f"{time.time_ns():x}"  # another one: the server was started again
-        self.events: deque[dict[str, Any]] = deque(maxlen=MOST_EVENTS)
-        self.count = 0  # of events so far
+        self.notes: Notes = greeting["notes"]
         self.state: dict[str, Any] | None = None
-        self.paused = False
-        self.switched: set[str] = set()  # actions that are on
+        self._actions = {action.name: action for action in greeting["actions"]}
         self.advice: dict[str, Any] | None = None
         self._std: Array | None = None
         self._timelines = Timelines()
@@ -79,19 +76,12 @@ class Board:
         self._std, self.advice = std, advice
         return {"volume": stream_event("volume", self._volume())}
 
-    def acknowledge(self, number: int) -> dict[str, bytes]:
-        """Note that somebody has seen an event, and all before it."""
-        for event in self.events:
-            event["open"] = event["open"] and event["number"] > number
-        return {"events": stream_event("events", list(self.events))}
-
-    def switch(self, name: str) -> dict[str, bytes]:
-        """Note that a command was given that has a state."""
-        if name in ("pause", "resume"):
-            self.paused = name == "pause"
-        else:
-            self.switched ^= {name}
-        return {"controls": stream_event("controls", self._controls())}
+    def obey(self, command: Command) -> dict[str, bytes]:
+        """Note a command that changes what is shown."""
+        self.notes.obey(command, self._actions)
+        if command.event is not None:
+            return {"events": self._events()}
+        return {"controls": stream_event("controls", self.notes.controls())}
 
     def everything(self) -> dict[str, bytes]:
         """All that somebody needs who looks for the first time."""
@@ -102,9 +92,9 @@ class Board:
         found: dict[str, Any] = {
             "hello": self._hello(),
             "layout": self._layout,
-            "controls": self._controls(),
+            "controls": self.notes.controls(),
             "history": self._timelines.content(),
-            "events": list(self.events),
+            "events": list(self.notes.events),
             "volume": self._volume(),
         }
         if self.state is not None:
@@ -126,9 +116,6 @@ class Board:
                 {"name": a.name, "label": a.label, "ofCamera": a.of_camera, "undo": a.undo} for a in given["actions"]
             ],
         }
-
-    def _controls(self) -> dict[str, Any]:
-        return {"paused": self.paused, "on": sorted(self.switched)}
 
     def _take_state(self, content: Mapping[str, Any]) -> dict[str, bytes]:
         now, points = float(content["time"]), content["object"]
@@ -164,17 +151,13 @@ class Board:
         return {key: stream_event("picture", self._pictures[key])}
 
     def _take_event(self, content: Mapping[str, Any]) -> dict[str, bytes]:
-        numbers = ("time", "since", "size", "sigma")
-        plain = {k: _known(v) if k in numbers else v for k, v in content.items()}
-        waits = plain["kind"] in ALARMS
-        for event in self.events:  # what is known better now, or is over, takes the place of what was told first
-            if event["open"] and event["camera"] == plain["camera"] and event["since"] == plain["since"] is not None:
-                event["open"], waits = False, True
-        if plain["kind"] == "factory":
+        if content["kind"] == "factory":
             self._visited.clear()
-        self.events.append(plain | {"number": self.count, "open": waits})
-        self.count += 1
-        return {"events": stream_event("events", list(self.events))}
+        self.notes.take(content)
+        return {"events": self._events()}
+
+    def _events(self) -> bytes:
+        return stream_event("events", list(self.notes.events))
 
     def _volume(self) -> dict[str, Any]:
         return {"advice": self.advice, "visited": list(self._visited)}
@@ -190,7 +173,3 @@ class _Rate:
         self._marks.append((now, snapshot))
         (start, first), (end, last) = self._marks[0], self._marks[-1]
         return None if end - start < 0.5 else round((last - first) / (end - start), 1)
-
-
-def _known(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else float(value)

@@ -16,6 +16,7 @@ from imgcal.estimation import WorkingVolume
 from imgcal.live_page.address import Address
 from imgcal.live_page.arrangement import arrangement
 from imgcal.live_page.commands import Action
+from imgcal.live_page.notes import Notes
 from imgcal.online import Event, RigState
 from imgcal.types import CalibrationObject, CameraRig
 
@@ -51,6 +52,7 @@ def greeting(
         "volume": (volume.low.double().numpy(), volume.high.double().numpy()),
         "image_size": rig.image_size.numpy(),
         "arrangement": arrangement(rig, volume),
+        "notes": Notes(),
     }
 
 

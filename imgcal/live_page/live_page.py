@@ -16,9 +16,13 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,12 +39,15 @@ from imgcal.live_page.contents import (
     rig_message,
     state_message,
 )
+from imgcal.live_page.notes import Notes
 from imgcal.live_page.viewing_volume import viewing_volume
 from imgcal.live_page.wire import framed
+from imgcal.messages import shortened
 from imgcal.online import Event, RigState
 from imgcal.types import CalibrationObject, CameraRig
 
 Frame = NDArray[np.uint8] | NDArray[np.uint16]
+Message = tuple[str, Callable[[], dict[str, Any]]]  # kind, and what makes the content
 
 STATES_A_SECOND = 10.0
 PICTURES_A_SECOND = 2.0  # of each camera
@@ -50,6 +57,10 @@ MOST_EVENTS = 1000  # that wait to be passed on
 MOST_COMMANDS = 64  # that wait to be fetched
 RESTART_SECONDS = 2.0  # between two starts of the server
 SERVER = "from imgcal.live_page.process import main; main({listening}, {pipe})"
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, RuntimeWarning, stacklevel=2)
 
 
 class LivePage:
@@ -72,6 +83,7 @@ class LivePage:
         token: str | None = None,
         actions: Sequence[Action] = (),
         title: str = "live",
+        problem: Callable[[str], None] = _warn,
     ) -> None:
         """Open the address and start the server.
 
@@ -82,6 +94,7 @@ class LivePage:
             token: for those who look on from elsewhere; None = a new one.
             actions: buttons beside those that every page has.
             title: of the page.
+            problem: gets what could not be shown, once of each kind, from another thread; a warning if not given.
 
         Raises:
             InputError: the address is taken, or the token too short.
@@ -96,11 +109,16 @@ class LivePage:
         self._rig, self._obj = rig, obj
         self._latest: RigState | None = None
         self._pictured: tuple[RigState, Mapping[str, Frame | None]] | None = None  # the latest that came with frames
-        self._events: list[Event] = []
+        self._events: deque[Event] = deque(maxlen=MOST_EVENTS)
+        self._notes: Notes = self._greeting["notes"]
+        self._actions = {action.name: action for action in actions}
+        self._problem, self._problems = problem, set[str]()
         self._news = threading.Condition()
         self._commands: queue.Queue[Command] = queue.Queue(MOST_COMMANDS)
         self._viewers = 0
         self._closing = False
+        self._ended: socket.socket | None = None  # the pipe of a server that has ended
+        self._changing = threading.Lock()  # of the server
         self._started = 0.0
         self._server: subprocess.Popen[bytes] | None = None
         self._pipe: socket.socket | None = None
@@ -137,14 +155,14 @@ class LivePage:
                 self._pictured = (state, frames or {})
             elif not self._pictured[1]:  # there never were any: blobs alone
                 self._pictured = (state, {})
-            if state.events and len(self._events) < MOST_EVENTS:
-                self._events.extend(state.events)
+            self._events.extend(state.events)
             self._news.notify()
 
     def tell(self, event: Event) -> None:
-        """Show an event that came with no state, with the next one."""
+        """Show an event that came with no state; returns at once."""
         with self._news:
             self._events.append(event)
+            self._news.notify()
 
     def commands(self) -> list[Command]:
         """What has been asked for since the last call; never waits."""
@@ -161,7 +179,8 @@ class LivePage:
                 return
             self._closing = True
             self._news.notify()
-        self._stop()
+        with self._changing:  # a server that is being started is ended, too
+            self._stop()
         self._listening.close()
         self._sender.join(timeout=5)
 
@@ -177,6 +196,7 @@ class LivePage:
 
     def _start(self) -> None:
         """Start the server, and a thread that listens to it."""
+        self._started = time.monotonic()
         ours, theirs = socket.socketpair()
         code = SERVER.format(listening=self._listening.fileno(), pipe=theirs.fileno())
         # Not from the current folder, which anybody may have filled.
@@ -190,9 +210,11 @@ class LivePage:
             start_new_session=True,  # an interruption of the loop is not its own
         )
         theirs.close()
-        self._pipe, self._started = ours, time.monotonic()
-        ours.sendall(framed("greeting", self._greeting))
+        self._pipe = ours
+        with self._news:
+            greeting = framed("greeting", self._greeting)  # with what people were told and did so far
         threading.Thread(target=self._listen, args=(ours,), name="live page commands", daemon=True).start()
+        ours.sendall(greeting)
 
     def _stop(self) -> None:
         if self._pipe is not None:
@@ -207,50 +229,92 @@ class LivePage:
                 self._server.wait()
 
     def _listen(self, pipe: socket.socket) -> None:
-        """Take what the server says: lines of JSON, which it has checked."""
+        """Take what the server says: lines of JSON, which it has checked; until it ends."""
         with contextlib.suppress(OSError, ValueError), pipe.makefile("r", encoding="utf-8") as lines:
             for line in lines:
-                content = json.loads(line)
-                if "viewers" in content:
-                    self._viewers = int(content["viewers"])
-                    continue
-                with contextlib.suppress(queue.Full):
-                    self._commands.put_nowait(Command(**content))
+                self._heard(json.loads(line))
+        with self._news:
+            self._ended = pipe
+            self._news.notify()
+
+    def _heard(self, content: dict[str, Any]) -> None:
+        if "viewers" in content:
+            self._viewers = int(content["viewers"])
+        elif "problem" in content:
+            self._failed(content["problem"], content["why"])
+        else:
+            command = Command(**content)
+            with self._news:
+                self._notes.obey(command, self._actions)
+            with contextlib.suppress(queue.Full):
+                self._commands.put_nowait(command)
 
     def _send(self) -> None:
-        """Pass on what is new, until the page is closed."""
-        courier = _Courier(self._rig, self._obj)
+        """Pass on what is new, until the page is closed; start the server again where it has ended."""
+        courier, last = _Courier(self._rig, self._obj), None
         while not self._closing:
             with self._news:
-                self._news.wait_for(lambda: self._latest is not None or self._closing, timeout=1 / STATES_A_SECOND)
-                latest, pictured, events = self._latest, self._pictured, self._events
-                self._latest = None
-                self._events = [] if latest is not None else events
+                self._news.wait_for(self._is_news, timeout=1 / STATES_A_SECOND)
+                latest, self._latest = self._latest, None
+                pictured, ended = self._pictured, self._ended is self._pipe
+                events = self._noted()
+            last = latest or last
             begun = time.monotonic()
             try:
-                if latest is not None:
-                    self._pass_on(courier.messages(latest, events))
+                if ended:
+                    raise BrokenPipeError("the server has ended")
+                self._pass_on(courier.messages(latest, events))
                 if self._viewers and pictured is not None:
                     self._pass_on(courier.pictures(*pictured))
             except OSError:
                 with self._news:
-                    self._events = [*events, *self._events]
-                    self._latest = self._latest or latest
+                    self._latest = self._latest or last
                 self._restart()
                 courier = _Courier(self._rig, self._obj)
             time.sleep(max(0.0, 1 / STATES_A_SECOND - (time.monotonic() - begun)))
 
-    def _pass_on(self, messages: Iterator[bytes]) -> None:
+    def _noted(self) -> list[dict[str, Any]]:
+        """Take the events that wait, and note them."""
+        found: list[dict[str, Any]] = []
+        while self._events:
+            try:
+                content = event_message(self._events.popleft())
+                self._notes.take(content)
+                found.append(content)
+            except Exception as error:
+                self._failed("event", repr(error))
+        return found
+
+    def _is_news(self) -> bool:
+        return self._latest is not None or bool(self._events) or self._closing or self._ended is self._pipe
+
+    def _pass_on(self, messages: Iterator[Message]) -> None:
+        """Send messages; what cannot be made of one is said once, and the others are sent."""
         assert self._pipe is not None
-        for message in messages:
+        for kind, make in messages:
+            try:
+                message = framed(kind, make())
+            except Exception as error:
+                self._failed(kind, repr(error))
+                continue
             self._pipe.sendall(message)
 
+    def _failed(self, kind: str, why: str) -> None:
+        if kind not in self._problems:
+            self._problems.add(kind)
+            with contextlib.suppress(Exception):  # whoever is told must not end the page
+                self._problem(f"live page: {kind}: {shortened(why)}")
+
     def _restart(self) -> None:
-        time.sleep(max(0.0, RESTART_SECONDS - (time.monotonic() - self._started)))
-        if not self._closing:
-            self._stop()
-            with contextlib.suppress(OSError):
-                self._start()
+        with self._news:
+            wait = RESTART_SECONDS - (time.monotonic() - self._started)
+            self._news.wait_for(lambda: self._closing, timeout=max(0.0, wait))
+        with self._changing:
+            if not self._closing:
+                self._stop()
+                self._viewers = 0
+                with contextlib.suppress(OSError):
+                    self._start()
 
 
 class _Courier:
@@ -263,24 +327,26 @@ class _Courier:
         self._rig_at = self._belief_at = 0.0  # s
         self._belief_seconds = BELIEF_SECONDS * max(rig.num_cameras / 10, 1.0) ** 2
 
-    def messages(self, state: RigState, events: Sequence[Event]) -> Iterator[bytes]:
-        """A new state, and what of it is due."""
+    def messages(self, state: RigState | None, events: Sequence[dict[str, Any]]) -> Iterator[Message]:
+        """Events, a new state, and what of it is due."""
         now = time.monotonic()
         for event in events:
-            yield framed("event", event_message(event))
-        yield framed("state", state_message(state, self._obj))
+            yield "event", partial(dict, event)
+        if state is None:
+            return
+        yield "state", partial(state_message, state, self._obj)
         if now - self._rig_at >= RIG_SECONDS or events:
             self._rig_at = now
-            yield framed("rig", rig_message(state))
+            yield "rig", partial(rig_message, state)
         if now - self._belief_at >= self._belief_seconds:
             self._belief_at = now
-            yield framed("belief", belief_message(state))
+            yield "belief", partial(belief_message, state)
 
-    def pictures(self, state: RigState, frames: Mapping[str, Frame | None]) -> Iterator[bytes]:
+    def pictures(self, state: RigState, frames: Mapping[str, Frame | None]) -> Iterator[Message]:
         """Those of the cameras that have waited the longest, as many as keep them all as new as they are to be."""
         now = time.monotonic()
         share = int(np.ceil(self._cameras * PICTURES_A_SECOND / STATES_A_SECOND))
         waiting = np.flatnonzero((self._shown < state.snapshot) & (now - self._shown_at >= 0.9 / PICTURES_A_SECOND))
         for camera in waiting[np.argsort(self._shown_at[waiting], kind="stable")][:share].tolist():
             self._shown[camera], self._shown_at[camera] = state.snapshot, now
-            yield framed("picture", picture_message(state, camera, frames))
+            yield "picture", partial(picture_message, state, camera, frames)

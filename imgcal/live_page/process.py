@@ -16,6 +16,7 @@ from imgcal.live_page.board import Board
 from imgcal.live_page.security import Gate
 from imgcal.live_page.server import Application
 from imgcal.live_page.wire import read_message
+from imgcal.messages import shortened
 
 POLITE = 5  # how much rather the loop runs than this
 GUIDANCE_SECONDS = 3.0  # rest between two computations, and twice as long as the last one took
@@ -61,10 +62,13 @@ async def _serve(listening: socket.socket, pipe: socket.socket) -> None:
     with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError):
         while True:
             kind, content = await read_message(reader)
-            if kind in ("rig", "belief"):
-                guide.learn(kind, content, application)
-            else:
-                application.spread(board.take(kind, content))
+            try:
+                if kind in ("rig", "belief"):
+                    guide.learn(kind, content, application)
+                else:
+                    application.spread(board.take(kind, content))
+            except Exception as error:  # what one message holds does not end the page
+                tell({"problem": kind, "why": shortened(repr(error))})
     server.should_exit = True
     with contextlib.suppress(asyncio.TimeoutError):
         await asyncio.wait_for(serving, 2)

@@ -130,7 +130,7 @@ class Application:
         try:
             body = await asyncio.wait_for(_body(receive), BODY_SECONDS)
             given = json.loads(body)
-            command = read_command(given, self._cameras, self._actions, self.board.count)
+            command = read_command(given, self._cameras, self._actions, self.board.notes.count)
         except _TooLargeError:
             return _refused(Refusal(413, f"expected at most {MOST_BODY} bytes"))
         except (ValueError, RecursionError, TimeoutError) as error:
@@ -141,13 +141,7 @@ class Application:
 
     def _obey(self, command: Command) -> None:
         self._tell(asdict(command))
-        if command.name == "acknowledge":
-            assert command.event is not None
-            self.spread(self.board.acknowledge(command.event))
-        elif command.name in ("pause", "resume") or (
-            command.name in self._actions and self._actions[command.name].undo is not None
-        ):
-            self.spread(self.board.switch(command.name))
+        self.spread(self.board.obey(command))
 
     async def _stream(self, receive: Receive, send: Send) -> None:
         """Send what is new, for as long as the viewer takes it."""

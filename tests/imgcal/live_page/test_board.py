@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from imgcal.live_page.address import Address
-from imgcal.live_page.board import MOST_EVENTS, MOST_VISITED, Board
+from imgcal.live_page.board import MOST_VISITED, Board
+from imgcal.live_page.commands import Command
 from imgcal.live_page.contents import event_message, greeting, picture_message, state_message
+from imgcal.live_page.notes import MOST_EVENTS
 from imgcal.live_page.viewing_volume import viewing_volume
 from tests.imgcal.live_page.pages import ACTIONS, alarm, made_state
 
@@ -29,7 +31,7 @@ def test_nothing_grows_however_long_it_runs(board, o10, asymmetric8):
         board.take("state", message | {"time": 2.0 * second})
     for _ in range(MOST_EVENTS + 50):
         board.take("event", events)
-    assert len(board.events) == MOST_EVENTS and board.count == MOST_EVENTS + 50
+    assert len(board.notes.events) == MOST_EVENTS and board.notes.count == MOST_EVENTS + 50
     assert len(board.contents()["volume"]["visited"]) == MOST_VISITED
     assert set(board.everything()) == {"hello", "layout", "controls", "history", "events", "volume", "state"}
 
@@ -58,21 +60,21 @@ def test_a_state_says_who_sees_and_what_is_off(board, o10, asymmetric8):
 def test_alarms_are_open_until_they_are_acknowledged(board):
     for name in ("cam01", "cam02", "cam03"):
         board.take("event", event_message(alarm(name)))
-    assert [event["open"] for event in content(board.acknowledge(1))] == [False, False, True]
+    assert [event["open"] for event in content(board.obey(Command("acknowledge", event=1)))] == [False, False, True]
 
 
 def test_what_is_known_better_takes_the_place_of_the_alarm(board):
     for camera, since, kind in (("cam01", 5.0, "moved"), ("cam01", 5.0, "relearnt"), ("cam02", 6.0, "relearnt")):
         board.take("event", event_message(replace(alarm(camera, since=since), kind=kind)))
-    assert [event["open"] for event in board.events] == [False, True, False]
-    board.acknowledge(1)
+    assert [event["open"] for event in board.notes.events] == [False, True, False]
+    board.obey(Command("acknowledge", event=1))
     board.take("event", event_message(replace(alarm("cam01", since=5.0), kind="relearnt")))
-    assert not any(event["open"] for event in board.events)
+    assert not any(event["open"] for event in board.notes.events)
 
 
 def test_buttons_with_a_state_are_on_and_off(board):
-    assert content(board.switch("warm"))["on"] == ["warm"] and content(board.switch("warm"))["on"] == []
-    assert content(board.switch("pause"))["paused"] and not content(board.switch("resume"))["paused"]
+    assert content(board.obey(Command("warm")))["on"] == ["warm"] and content(board.obey(Command("warm")))["on"] == []
+    assert content(board.obey(Command("pause")))["paused"] and not content(board.obey(Command("resume")))["paused"]
 
 
 def test_a_picture_replaces_the_one_before(board, o10, asymmetric8):

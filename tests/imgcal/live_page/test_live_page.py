@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError
+from imgcal.live_page import live_page as module
 from imgcal.live_page.address import Address
 from imgcal.live_page.live_page import LivePage
 from tests.imgcal.live_page.pages import Client, Stream, alarm, made_state
@@ -35,6 +36,85 @@ def test_the_server_is_started_again_where_it_ended(served, o10, asymmetric8):
     served.publish(made_state(o10, asymmetric8, 6, events=(alarm("cam02"),)))
     assert reader.wait("events", lambda content: content)[0]["camera"] == "cam02"
     reader.close()
+
+
+def test_a_server_that_ends_while_nothing_comes_is_started_again_with_what_it_knew(o10, asymmetric8):
+    with LivePage(o10, asymmetric8, Address(port=0)) as page:
+        page.tell(alarm("cam02"))  # shown without any state
+        page.publish(made_state(o10, asymmetric8, 7))
+        reader = Stream(page)
+        assert reader.wait("events", lambda content: content)[0]["camera"] == "cam02"
+        assert reader.wait("state")["snapshot"] == 7
+        client = Client(page)
+        assert client.command({"name": "acknowledge", "event": 0})[0] == 200
+        assert client.command({"name": "pause"})[0] == 200
+        end = time.monotonic() + 60
+        while len(page.commands()) < 1 and time.monotonic() < end:
+            time.sleep(0.05)
+        reader.wait("controls", lambda content: content["paused"])
+        reader.close()
+        first = page._server.pid
+        os.kill(first, signal.SIGKILL)
+        end = time.monotonic() + 60
+        while page._server.pid == first and time.monotonic() < end:
+            time.sleep(0.05)
+        assert page._server.pid != first
+        reader = Stream(page)
+        assert reader.wait("controls")["paused"]
+        events = reader.wait("events")
+        assert [(event["camera"], event["number"], event["open"]) for event in events] == [("cam02", 0, False)]
+        assert reader.wait("state")["snapshot"] == 7
+        reader.close()
+
+
+def test_a_server_that_is_being_started_while_the_page_is_closed_is_ended(o10, asymmetric8, monkeypatch):
+    page = LivePage(o10, asymmetric8, Address(port=0))
+    real, begun = module.subprocess.Popen, threading.Event()
+
+    def slow(*given, **more):
+        begun.set()
+        time.sleep(0.5)
+        return real(*given, **more)
+
+    monkeypatch.setattr(module.subprocess, "Popen", slow)
+    first = page._server
+    first.kill()
+    assert begun.wait(30)
+    page.close()
+    page._sender.join(10)
+    assert page._server is not first and page._server.returncode is not None
+
+
+def test_what_cannot_be_shown_is_said_once_and_all_else_is_shown(o10, asymmetric8, monkeypatch):
+    told, real = [], module.state_message
+
+    def fails(state, obj):
+        if state.snapshot < 3:
+            raise ValueError("odd")
+        return real(state, obj)
+
+    monkeypatch.setattr(module, "state_message", fails)
+    with LivePage(o10, asymmetric8, Address(port=0), problem=told.append) as page:
+        reader = Stream(page)
+        for snapshot in range(5):
+            page.publish(made_state(o10, asymmetric8, snapshot, events=(alarm("cam01"),)))
+            time.sleep(0.2)
+        assert len(reader.wait("events", lambda content: len(content) == 5)) == 5
+        assert reader.wait("state", lambda content: content["snapshot"] == 4)
+        page._pass_on(iter([("picture", lambda: {"camera": "of no number"})]))  # what the server cannot take
+        end = time.monotonic() + 60
+        while len(told) < 2 and time.monotonic() < end:
+            time.sleep(0.05)
+        reader.close()
+    assert told == ["live page: state: ValueError('odd')", "live page: picture: KeyError('jpeg')"]
+
+
+def test_events_that_wait_are_bounded(o10, asymmetric8):
+    page = LivePage(o10, asymmetric8, Address(port=0))
+    page.close()
+    for _ in range(module.MOST_EVENTS + 10):
+        page.tell(alarm("cam01"))
+    assert len(page._events) == module.MOST_EVENTS
 
 
 def test_closing_ends_the_server_and_its_address(o10, asymmetric8):

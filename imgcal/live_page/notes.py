@@ -1,0 +1,61 @@
+"""`Notes`: what people were told on the page and did there. The loop's side keeps them, too: servers come and go."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from imgcal.live_page.commands import Action, Command
+
+MOST_EVENTS = 200
+ALARMS = frozenset({"moved", "camera_lost", "dirty", "defocused", "object_bent", "object_exchanged", "clock_slip"})
+"""Events that wait for somebody to acknowledge them."""
+
+
+@dataclass
+class Notes:
+    """Events and switches, in constant memory.
+
+    Examples:
+        >>> notes = Notes()
+        >>> notes.obey(Command("pause"), {})
+        >>> notes.controls()
+        {'paused': True, 'on': []}
+    """
+
+    events: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=MOST_EVENTS))
+    count: int = 0  # of events so far
+    paused: bool = False
+    switched: set[str] = field(default_factory=set)  # actions that are on
+
+    def take(self, content: Mapping[str, Any]) -> None:
+        """Note an event (`contents.event_message`)."""
+        numbers = ("time", "since", "size", "sigma")
+        plain = {k: _known(v) if k in numbers else v for k, v in content.items()}
+        waits = plain["kind"] in ALARMS
+        for event in self.events:  # what is known better now, or is over, takes the place of what was told first
+            if event["open"] and event["camera"] == plain["camera"] and event["since"] == plain["since"] is not None:
+                event["open"], waits = False, True
+        self.events.append(plain | {"number": self.count, "open": waits})
+        self.count += 1
+
+    def obey(self, command: Command, actions: Mapping[str, Action]) -> None:
+        """Note what was asked for: an event and all before it are acknowledged, or something is switched."""
+        if command.event is not None:
+            for event in self.events:
+                event["open"] = event["open"] and event["number"] > command.event
+        elif command.name in ("pause", "resume"):
+            self.paused = command.name == "pause"
+        elif command.name in actions and actions[command.name].undo is not None:
+            self.switched ^= {command.name}
+
+    def controls(self) -> dict[str, Any]:
+        """What is switched, as plain values."""
+        return {"paused": self.paused, "on": sorted(self.switched)}
+
+
+def _known(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else float(value)

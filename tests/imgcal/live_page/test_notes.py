@@ -1,0 +1,42 @@
+import pickle
+
+import pytest
+
+from imgcal.live_page.commands import Command
+from imgcal.live_page.contents import event_message
+from imgcal.live_page.notes import MOST_EVENTS, Notes
+from tests.imgcal.live_page.pages import ACTIONS, alarm
+
+NAMED = {action.name: action for action in ACTIONS}
+
+
+def test_a_server_that_begins_with_them_knows_what_people_did():
+    notes = Notes()
+    for name in ("cam01", "cam02", "cam03"):
+        notes.take(event_message(alarm(name)))
+    for command in (Command("acknowledge", event=1), Command("pause"), Command("warm"), Command("bump", "cam01")):
+        notes.obey(command, NAMED)
+    again = pickle.loads(pickle.dumps(notes))
+    assert again == notes and again.controls() == {"paused": True, "on": ["warm"]}
+    again.take(event_message(alarm("cam04")))
+    assert [(event["number"], event["open"]) for event in again.events] == [
+        (0, False),
+        (1, False),
+        (2, True),
+        (3, True),
+    ]
+
+
+def test_they_are_bounded_and_numbers_go_on():
+    notes = Notes()
+    for _ in range(MOST_EVENTS + 5):
+        notes.take(event_message(alarm("cam01")))
+    assert len(notes.events) == MOST_EVENTS and notes.count == MOST_EVENTS + 5
+    assert notes.events[-1]["number"] == MOST_EVENTS + 4
+
+
+@pytest.mark.parametrize("name", ["factory", "bump"])
+def test_commands_without_a_state_switch_nothing(name):
+    notes = Notes()
+    notes.obey(Command(name), NAMED)
+    assert notes == Notes()
