@@ -111,7 +111,7 @@ class RigKeeper:
     @property
     def given(self) -> CameraRig:
         """The factory calibration that it began with, whatever has been accepted as one since."""
-        return self._prior
+        return self._memory.prior
 
     @property
     def noise(self) -> float:

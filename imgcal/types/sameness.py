@@ -38,10 +38,10 @@ def rig_difference(rig: CameraRig, expected: CameraRig) -> str | None:
         "rotation": lambda r: r.cam_from_rig.rotation.flatten(-2),
     }
     for what, value in values.items():
-        given, known = value(rig).double().cpu(), value(expected).double().cpu()
-        apart = ~torch.isclose(given, known, rtol=SAME, atol=SAME * float(known.abs().max().clamp_min(1)))
+        found, wanted = value(rig).double().cpu(), value(expected).double().cpu()
+        apart = ~torch.isclose(found, wanted, rtol=SAME, atol=SAME * float(wanted.abs().max().clamp_min(1)))
         for camera in apart.any(-1).nonzero().flatten().tolist():
-            return _found(f"{what} of {rig.camera_names[camera]}", _numbers(given[camera]), _numbers(known[camera]))
+            return _found(f"{what} of {rig.camera_names[camera]}", _numbers(found[camera]), _numbers(wanted[camera]))
     return None
 
 
