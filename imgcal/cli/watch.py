@@ -288,4 +288,8 @@ def _topics(given: tuple[str, ...]) -> dict[str, str]:
     wrong = [camera for camera, _, topic in pairs if not camera or not topic]
     if wrong:
         raise InputError(f"--topic: found {shortened(wrong[0])!r}, expected CAMERA=TOPIC")
+    cameras = [camera for camera, _, _ in pairs]
+    twice = [camera for camera in dict.fromkeys(cameras) if cameras.count(camera) > 1]
+    if twice:
+        raise InputError(f"--topic: found camera {shortened(twice[0])} twice, expected one topic of each")
     return {camera: topic for camera, _, topic in pairs}

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 
 import torch
 
+from imgcal.errors import RefusedError
 from imgcal.live_page.address import Address
 from imgcal.live_page.commands import Action, Command
 from imgcal.live_page.live_page import LivePage
@@ -124,4 +126,5 @@ class Demonstration:
             case "pause" | "resume", _:
                 self.paused = command.name == "pause"
             case "factory", _:
-                self.page.tell(self.keeper.accept_as_factory())
+                with contextlib.suppress(RefusedError):  # before the first snapshot it is the factory's
+                    self.page.tell(self.keeper.accept_as_factory())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Literal, get_args
@@ -58,18 +59,22 @@ class Event:
     message: str = ""  # one sentence
 
     def to_json(self) -> str:
-        """Write one line of `events.jsonl`: times in ISO 8601, UTC; `event` is what happened, `kind` how it changed."""
+        """Write one line of `events.jsonl`: times in ISO 8601, UTC; `event` is what happened, `kind` how it changed.
+
+        A number that is none (nan, infinity) is null.
+        """
+        since, size, sigma, evidence = map(_finite, (self.since, self.size, self.sigma, self.evidence))
         values = {
             "event": self.kind,
             "camera": self.camera,
             "snapshot": snapshot_name(self.snapshot),
-            "time": iso_time(self.time),
-            "since": None if self.since is None else iso_time(self.since),
+            "time": None if _finite(self.time) is None else iso_time(self.time),
+            "since": None if since is None else iso_time(since),
             "kind": self.change,
-            "size": self.size,
-            "sigma": self.sigma,
+            "size": size,
+            "sigma": sigma,
             "unit": self.unit,
-            "evidence": self.evidence,
+            "evidence": evidence,
             "message": self.message,
         }
         return json.dumps(values, allow_nan=False, ensure_ascii=False)
@@ -83,3 +88,7 @@ def snapshot_name(number: int) -> str:
 def iso_time(seconds: float) -> str:
     """ISO 8601 of seconds since the epoch, to the millisecond, in UTC."""
     return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds")
+
+
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None

@@ -272,8 +272,13 @@ class RigKeeper:
 
         Returns:
             The event, which comes with the next state, too.
+
+        Raises:
+            RefusedError: no snapshot has come yet.
         """
         memory = self._memory
+        if memory.count == 0:
+            raise RefusedError("factory: no snapshot has come yet, so the present rig is the factory calibration")
         known = memory.factory
         memory.factory = replace(memory.belief.rig, prior=known.prior, drift_rate=known.drift_rate)
         self._labelling.rig = memory.factory

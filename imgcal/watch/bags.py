@@ -65,6 +65,9 @@ class Bag:
                 )
             if topic is not None and topic not in images:
                 raise InputError(f"{self.path}: found no images of the topic {shortened(topic)}; {there}")
+            if topic is not None and topic in found:
+                cameras = listed((found[topic], camera))
+                raise InputError(f"{self.path}: found the topic {shortened(topic)} for {cameras}, expected one camera")
             if topic is not None:
                 found[topic] = camera
         unknown = sorted(set(self.topics) - set(self.rig.camera_names))

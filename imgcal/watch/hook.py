@@ -78,17 +78,18 @@ class Hook:
                 event = self._events.popleft()
             try:
                 self._run(event)
-            except (OSError, subprocess.SubprocessError):
+            except Exception:  # whatever one event holds, the next ones are told
                 self.failed += 1
 
     def _run(self, event: Event) -> None:
+        line = event.to_json().encode(errors="replace") + b"\n"
         environment = os.environ | {"IMGCAL_EVENT": event.kind, "IMGCAL_CAMERA": event.camera or ""}
         process = subprocess.Popen(
             self.command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
             env=environment, start_new_session=True,
         )  # fmt: skip
         try:
-            process.communicate(event.to_json().encode(errors="replace") + b"\n", self._timeout)
+            process.communicate(line, self._timeout)
         except subprocess.TimeoutExpired:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)

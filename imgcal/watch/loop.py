@@ -10,7 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol
 
-from imgcal.errors import InputError
+from imgcal.errors import InputError, RefusedError
 from imgcal.io import Frame, read_json
 from imgcal.online import Event, RigState
 from imgcal.types import CameraRig, Detections
@@ -50,7 +50,11 @@ class Keeper(Protocol):
         """Take down what is known, within milliseconds, and beside it how far its source has been worked on."""
 
     def accept_as_factory(self) -> Event:
-        """Make the present rig the factory calibration."""
+        """Make the present rig the factory calibration.
+
+        Raises:
+            RefusedError: no snapshot has come yet.
+        """
 
 
 class Page(Protocol):
@@ -119,7 +123,7 @@ class Watch:
             hook: command for events.
             page: shows what is known.
             told: gets every event.
-            problem: gets what could not be written, once.
+            problem: gets what could not be written, once, and what people ask for in vain.
             saved: gets how far the source has been worked on, once what it taught until then has been written.
         """
         self.keeper, self.folder, self.tally = keeper, folder, Tally()
@@ -251,5 +255,9 @@ class Watch:
             if command.name in ("pause", "resume"):
                 self.paused = command.name == "pause"
             elif command.name == "factory":
-                self.tell(self.keeper.accept_as_factory())
-                self._unsaved = True
+                try:
+                    self.tell(self.keeper.accept_as_factory())
+                except RefusedError as error:
+                    self._problem(str(error))
+                else:
+                    self._unsaved = True

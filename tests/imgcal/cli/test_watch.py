@@ -150,6 +150,7 @@ def test_a_killed_process_goes_on_and_ctrl_c_ends_it_cleanly(blobs, tmp_path):
         (["-", "--hook", "no-such-program"], 2, "--hook: found 'no-such-program'"),
         (["-", "--metrics", "nowhere"], 2, "found 'nowhere', expected [HOST:]PORT"),
         (["bag.mcap", "--topic", "cam01"], 2, "--topic: found 'cam01', expected CAMERA=TOPIC"),
+        (["bag.mcap", "--topic", "a=/x", "a=/y"], 2, "--topic: found camera a twice, expected one topic of each"),
         (["empty", "--rate", "0"], 2, "--rate: found it with a folder of frames (empty), expected a table of blobs"),
         (["empty", "--topic", "a=b"], 2, "--topic: found it with a folder of frames (empty), expected a recording"),
         (["-", "--until-idle", "3"], 2, "--until-idle: found it with standard input (-), expected a folder of frames"),

@@ -22,3 +22,10 @@ def test_an_event_is_one_line_with_its_times_in_words() -> None:
         "evidence": 412.0,
         "message": "cam07 turned\n0.3 degrees",
     }
+
+
+def test_a_number_that_is_none_is_null():
+    event = Event(1.5, 1, "moved", "cam01", since=float("nan"), size=float("inf"), sigma=float("-inf"), evidence=2.0)
+    line = json.loads(event.to_json())
+    assert (line["since"], line["size"], line["sigma"], line["evidence"]) == (None, None, None, 2.0)
+    assert json.loads(Event(float("nan"), 1, "moved").to_json())["time"] is None

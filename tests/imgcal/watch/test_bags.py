@@ -85,6 +85,7 @@ def test_topics_by_name_and_what_is_no_grey_image(tmp_path):
         ({}, "found no topic that names a camera.*image topics of this recording: /left"),
         ({"cam01": "/right"}, "found no images of the topic /right; image topics"),
         ({"cam01": "/left", "cam99": "/left"}, "found camera cam99"),
+        ({"cam01": "/left", "cam02": "/left"}, "found the topic /left for cam01, cam02, expected one camera"),
     ],
 )
 def test_topics_that_are_not_there(topics, message, tmp_path):

@@ -1,6 +1,7 @@
 import json
 import sys
 import time
+from dataclasses import replace
 
 import pytest
 
@@ -84,3 +85,11 @@ def test_one_that_fails_is_counted(tmp_path):
 def test_commands_that_are_none(command):
     with pytest.raises(InputError, match="--hook: found"):
         Hook(command)
+
+
+def test_an_event_that_cannot_be_written_is_counted_and_the_next_one_is_told(tmp_path):
+    hook = Hook(script(tmp_path, "import sys; open(sys.argv[1], 'a').write(sys.stdin.read())"))
+    hook.tell(replace(event(1), time="never"))
+    hook.tell(replace(event(2), size=float("inf")))
+    hook.close()
+    assert hook.failed == 1 and json.loads((tmp_path / "out").read_text())["snapshot"] == "00002"

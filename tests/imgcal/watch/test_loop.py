@@ -7,12 +7,13 @@ from types import SimpleNamespace
 import pytest
 
 from imgcal.errors import InputError
+from imgcal.online import RigKeeper
 from imgcal.watch import loop as module
 from imgcal.watch.exposures import CameraBlobs, Exposure
 from imgcal.watch.intake import Intake
 from imgcal.watch.loop import Progress, Watch
 from imgcal.watch.synchronization import TimedSnapshot
-from tests.imgcal.watch.states import RIG, KeeperOfStates, event
+from tests.imgcal.watch.states import OBJECT, RIG, KeeperOfStates, event
 
 NOTHING = CameraBlobs.of([])
 
@@ -136,6 +137,14 @@ def test_people_pause_go_on_and_accept_the_rig(tmp_path):
                 loop.run(intake, threading.Event())
     assert len(keeper.sources) == 2 and loop.tally.paused == 2
     assert events_of(tmp_path) == ["factory"] == [e.kind for e in page.told]
+
+
+def test_no_rig_is_accepted_before_there_is_a_snapshot(tmp_path):
+    page, told = PageOfLists(), []
+    page.asked = ["factory"]
+    with RigKeeper(RIG, OBJECT) as keeper, Watch(keeper, tmp_path, page=page, problem=told.append) as loop:
+        loop._obey()
+    assert events_of(tmp_path) == [] and len(told) == 1 and "no snapshot has come yet" in told[0]
 
 
 def test_it_stops_when_told(tmp_path):
