@@ -13,6 +13,7 @@ from torch import Tensor
 
 from imgcal.estimation import Gauge, RigBelief, WorkingVolume, pixel_jacobian, uncertainty_over
 from imgcal.geometry import cross_matrix
+from imgcal.io import DEFAULT_SIGMA
 from imgcal.live_page.text import rounded
 from imgcal.types import CameraRig
 
@@ -22,7 +23,6 @@ FINE, COARSE = 9, 7
 PLACES = {True: 4, False: 3}
 """Places along each side where the object is tried, for few cameras and for many."""
 MOST_POINTS = 8  # fiducials that a try takes
-USUAL_SIGMA = 0.1  # px
 
 
 def compare(content: dict[str, Any]) -> tuple[CameraRig, NDArray[np.float64]]:
@@ -56,7 +56,7 @@ def look(
     seen = rig.project(points).visible
     uncertainty = uncertainty_over(rig, covariance, volume.grid(5 if few else 4).flatten(0, -2))
     mm = uncertainty.point_error(points, seen)
-    sigma = content["sigma"] or USUAL_SIGMA
+    sigma = content["sigma"] or DEFAULT_SIGMA
     shape = torch.as_tensor(points_object)
     shape = (shape - shape.mean(0))[_spread(len(shape))] @ turn.mT
     places = _inner(volume, shape).grid(PLACES[few]).flatten(0, -2)

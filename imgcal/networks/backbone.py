@@ -12,10 +12,8 @@ from torch import Tensor, nn
 from imgcal.errors import InputError
 from imgcal.io import nearest
 from imgcal.messages import quoted, shortened
-from imgcal.networks.backbone_options import MOST_WEIGHTS, check_options
+from imgcal.networks.backbone_options import MOST_WEIGHTS, USUAL_SIZE, check_options
 from imgcal.networks.encoders import resized
-
-SIZE = 224  # pixels, width and height of images for encoders that take any
 
 
 class Backbone(nn.Module):
@@ -25,7 +23,7 @@ class Backbone(nn.Module):
         """Make it; `size` (pixels) is that of the images, for models that take any."""
         super().__init__()
         self.model: Any = make_backbone(name, pretrained, options)
-        self.size = input_size(self.model, size or SIZE)
+        self.size = input_size(self.model, size or USUAL_SIZE)
         self.width = cast(int, getattr(self.model, "head_hidden_size", None) or self.model.num_features)
 
     def forward(self, images: Tensor) -> Tensor:
@@ -70,7 +68,7 @@ def make_backbone(name: str, pretrained: bool, options: Mapping[str, Any]) -> nn
         raise InputError(f"backbone {name}: cannot be made of {quoted(repr(dict(options)))}: {found}") from error
 
 
-def input_size(model: Any, otherwise: int = SIZE) -> tuple[int, int]:
+def input_size(model: Any, otherwise: int = USUAL_SIZE) -> tuple[int, int]:
     """Height and width (pixels) of the images that a timm model takes; `otherwise` where it takes any."""
     of_patches = getattr(getattr(model, "patch_embed", None), "img_size", None)
     config = model.pretrained_cfg

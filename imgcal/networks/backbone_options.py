@@ -13,6 +13,7 @@ from imgcal.io import nearest
 from imgcal.messages import listed, shortened
 
 MOST_WEIGHTS = 500_000_000  # of a whole network: 2 GB
+USUAL_SIZE = 224  # pixels, width and height of images for encoders that take any
 LARGEST = 8192  # width or size in pixels
 MOST_BLOCKS = 128
 

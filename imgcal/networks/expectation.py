@@ -13,11 +13,9 @@ from torch.nn import functional
 
 from imgcal.geometry import RigidTransform
 from imgcal.networks.infrared import Queries
-from imgcal.networks.measurer import PATCH, RADIUS
-from imgcal.types import CalibrationObject, CameraRig, CropPlacement
+from imgcal.networks.measurer import RADIUS
+from imgcal.types import CROP_MARGIN, PATCH_SIZE, CalibrationObject, CameraRig, CropPlacement
 
-MARGIN = 0.06
-"""Share of the focal length that is left around the expected object: drift of 3 degrees."""
 USUAL_RADIUS = 0.05  # of an object's size, where it does not say how large its markers are
 
 Frames = Mapping[str, NDArray[np.uint8] | NDArray[np.uint16] | None]
@@ -45,7 +43,7 @@ class Expectation:
     def placement(self, rig: CameraRig, size: int) -> CropPlacement:
         """Place crops around what all poses expect: (C,)."""
         uv, visible = self.uv.movedim(0, 1).flatten(1, 2), self.visible.movedim(0, 1).flatten(1, 2)
-        return CropPlacement.around(uv, visible, MARGIN * rig.focal_length.mean(-1), size)
+        return CropPlacement.around(uv, visible, CROP_MARGIN * rig.focal_length.mean(-1), size)
 
     def queries(self, placement: CropPlacement, shift: Tensor | None = None) -> Queries:
         """Ask for all fiducials of all poses: (H C, N).
@@ -116,18 +114,18 @@ def cut_patches(
     """
     cameras, count = radius.shape
     scale = (radius.median(-1).values / RADIUS).round().clamp(1, 64)[:, None].expand(-1, count)
-    corner = (uv + 0.5 - scale[..., None] * PATCH / 2).round().nan_to_num().clamp(-1e6, 1e6)
-    patches = torch.full((cameras, count, PATCH, PATCH), torch.nan)
+    corner = (uv + 0.5 - scale[..., None] * PATCH_SIZE / 2).round().nan_to_num().clamp(-1e6, 1e6)
+    patches = torch.full((cameras, count, PATCH_SIZE, PATCH_SIZE), torch.nan)
     for camera, name in enumerate(names):
         frame = frames.get(name)
         if frame is None:
             continue
         step = int(scale[camera, 0])
         height, width = frame.shape
-        values = np.full((count, PATCH * step, PATCH * step), np.nan, np.float32)
+        values = np.full((count, PATCH_SIZE * step, PATCH_SIZE * step), np.nan, np.float32)
         for window, (column, row) in zip(values, corner[camera].long().tolist(), strict=True):
             top, left = (min(max(place, 0), size) for place, size in ((row, height), (column, width)))
-            part = frame[top : max(row + PATCH * step, 0), left : max(column + PATCH * step, 0)]
+            part = frame[top : max(row + PATCH_SIZE * step, 0), left : max(column + PATCH_SIZE * step, 0)]
             window[top - row :, left - column :][: part.shape[0], : part.shape[1]] = part
         patches[camera] = functional.avg_pool2d(torch.from_numpy(values), step)
-    return -patches if inverted else patches, CropPlacement(corner - 0.5, scale, PATCH)
+    return -patches if inverted else patches, CropPlacement(corner - 0.5, scale, PATCH_SIZE)

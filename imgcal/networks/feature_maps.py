@@ -10,11 +10,9 @@ from torch import Tensor, nn
 
 from imgcal.errors import InputError
 from imgcal.messages import quoted, shortened
-from imgcal.networks.backbone_options import MOST_WEIGHTS
+from imgcal.networks.backbone_options import MOST_WEIGHTS, USUAL_SIZE
 from imgcal.networks.config import Images, is_import_path
 from imgcal.networks.encoders import STRIDE, CnnEncoder, VitEncoder
-
-SIZE = 224  # pixels, width and height of images for encoders that take any
 
 
 def make_encoder(config: Images, size: int | None) -> tuple[nn.Module, int, int]:
@@ -35,7 +33,7 @@ def make_encoder(config: Images, size: int | None) -> tuple[nn.Module, int, int]
     if name in ("cnn", "vit") or is_import_path(name):
         if config.pretrained:
             raise InputError(f"backbone {shortened(name)}: found pretrained: true, which only models of timm know")
-        drawn = size or SIZE
+        drawn = size or USUAL_SIZE
         if name == "cnn":
             return _counted(name, lambda: CnnEncoder(config.width, **options)), config.width, drawn
         if name == "vit":

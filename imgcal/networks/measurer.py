@@ -17,9 +17,8 @@ from torch.nn import functional
 
 from imgcal.io import StrictModel
 from imgcal.networks.infrared_encoders import STRIDE, CnnEncoder, VitEncoder
-from imgcal.types import BlobKind
+from imgcal.types import PATCH_SIZE, BlobKind
 
-PATCH = 24  # pixels, each way
 RADIUS = 3.5  # patch pixels that a marker's radius is reduced to; smaller ones are taken as they are
 
 CNN_WIDTHS, VIT_WIDTH_AND_DEPTH = (8, 18, 54), (48, 2)  # as many weights and operations
@@ -57,7 +56,7 @@ class Measurer(nn.Module):
         self.encoder: nn.Module = (
             CnnEncoder(channels, CNN_WIDTHS)
             if config.encoder == "cnn"
-            else VitEncoder(channels, PATCH, *VIT_WIDTH_AND_DEPTH)
+            else VitEncoder(channels, PATCH_SIZE, *VIT_WIDTH_AND_DEPTH)
         )
         self.size = nn.Linear(2, channels)
         self.head = nn.Sequential(

@@ -12,6 +12,7 @@ from imgcal.detection import Frame
 from imgcal.estimation import Absorbed, Cusum
 from imgcal.online.events import Event, EventKind
 from imgcal.online.rig_state import RigState
+from imgcal.online.sightings import well_inside
 
 BLOCK = 1.0
 """Seconds that are put together: neighbouring snapshots say the same."""
@@ -34,8 +35,6 @@ MOST_SPREADS = 4.0
 """Standard deviations by which one block counts at most: shares are not normal."""
 CLEAN, CLEAN_BLOCKS = 1.5, 5
 """Standard deviations within which a value is as usual again, and for how many blocks it must be."""
-MARGIN = 0.05
-"""Of the image's size, from its border, within which a fiducial may as well be out of view."""
 SAID: tuple[tuple[EventKind, str], ...] = (
     ("defocused", "shows blobs that are larger than they used to be: out of focus"),
     ("dirty", "shows blobs that are fainter than they used to be: dirty, or badly lit"),
@@ -89,9 +88,7 @@ class ImageQuality:
             sigma = np.log(blobs.sigma[rows] / depth)  # a lamp is as bright as it is near
         seen = np.zeros(state.predicted.shape[:2], dtype=bool)
         seen[camera, fiducial] = True
-        image = rig.image_size.numpy()[:, None]
-        with np.errstate(invalid="ignore"):
-            inside = ((state.predicted > MARGIN * image) & (state.predicted < (1 - MARGIN) * image)).all(-1)
+        inside = well_inside(state.predicted, rig)
         others_tell = (seen.sum(0) - seen >= 2) & seen.any(axis=1, keepdims=True)  # of a camera that is not out
         at = np.nonzero(inside & others_tell)
         missing = (~seen[at]).astype(np.float64)

@@ -25,6 +25,13 @@ SILENT_SECONDS = 0.5
 """How long no frame comes from a camera before it counts as lost."""
 
 
+def well_inside(predicted: NDArray[np.float64], rig: CameraRig) -> NDArray[np.bool_]:
+    """Tell which predictions (C, N, 2) px, NaN = none, are so far inside of their image that they should be seen."""
+    size = rig.image_size.numpy()[:, None]
+    with np.errstate(invalid="ignore"):
+        return np.asarray(((predicted > MARGIN * size) & (predicted < (1 - MARGIN) * size)).all(-1))
+
+
 @dataclass(frozen=True)
 class Look:
     """What was looked at in a snapshot."""
@@ -96,10 +103,7 @@ class Sightings:
 
     def _should_see(self, rig: CameraRig, predicted: NDArray[np.float64]) -> set[int]:
         """Cameras in which the object is well inside of the image."""
-        size = rig.image_size.numpy()[:, None]
-        with np.errstate(invalid="ignore"):
-            inside = ((predicted > MARGIN * size) & (predicted < (1 - MARGIN) * size)).all(-1)
-        return set(np.flatnonzero(inside.sum(1) >= LEAST_EXPECTED).tolist())
+        return set(np.flatnonzero(well_inside(predicted, rig).sum(1) >= LEAST_EXPECTED).tolist())
 
     def _event(self, kind: str, camera: int, since: float, message: str, look: Look) -> Event:
         name = self.names[camera]

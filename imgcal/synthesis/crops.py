@@ -17,11 +17,10 @@ from torch.nn import functional
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.synthesis.drawing import Draw, host_generator
 from imgcal.synthesis.rigs import PhysicalDrift, RelativeDrift
-from imgcal.types import CameraRig, CropPlacement
+from imgcal.types import CROP_MARGIN, CameraRig, CropPlacement
 
 SIZE = 96  # crop pixels, each way
 PATCH = 24  # crop pixels, window that a spot is drawn in
-MARGIN = 0.06  # share of the focal length that is left around the expected object
 
 
 @dataclass(frozen=True)
@@ -92,7 +91,7 @@ def render_crops(scenes: Scenes, generator: torch.Generator) -> CropTruth:
     batch = believed.uv.shape[:2]
     focal = scenes.factory.focal_length[..., 0]
     ahead = believed.depth > 0
-    margin = MARGIN * focal * draw.between(0.8, 1.5, *batch)
+    margin = CROP_MARGIN * focal * draw.between(0.8, 1.5, *batch)
     placement = CropPlacement.around(believed.uv, ahead, margin, SIZE)
     place, expected = placement.to_crop(truth.uv), placement.to_crop(believed.uv)
     pixels = focal[..., None] * scenes.radius[:, None, None] / placement.scale[..., None]

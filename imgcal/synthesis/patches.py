@@ -13,10 +13,9 @@ import torch
 from torch import Tensor
 
 from imgcal.synthesis.drawing import Draw, host_generator
-from imgcal.types import BlobKind
+from imgcal.types import PATCH_SIZE, BlobKind
 from renderers import Smear, Spots, Surface, render_crops
 
-SIZE = 24  # pixels, each way
 CHUNK = 64  # patches of one size, one lens blur and one kind of trouble
 RADIUS, USUAL = (1.0, 2.6, 5.0), 0.75  # patch pixels; share of the patches beyond the middle one
 BLUR = (0.15, 0.9)  # patch pixels, of the lens
@@ -145,7 +144,7 @@ def _chunk(count: int, trouble: Trouble, draw: Draw) -> Patches:
     size = 1.2 * trouble.radius * (FACTORS[1] * 5.0**0.5 if trouble.false else 1.3)
     reach = size + (1.2 * trouble.radius * (PATH / 2 + DEFOCUS) if trouble.smeared else 0.0)
     middle = torch.zeros(count, 2, device=radius.device)
-    shown, _ = render_crops(spots, middle, 1.0, (SIZE, SIZE), trouble.blur, extent=(COARSER * size, reach))
+    shown, _ = render_crops(spots, middle, 1.0, (PATCH_SIZE, PATCH_SIZE), trouble.blur, extent=(COARSER * size, reach))
     kind = torch.full((count,), int(BlobKind.PARTIAL if trouble.uneven else BlobKind.WHOLE), device=radius.device)
     kind = torch.where(lost > LEAST_CUT, int(BlobKind.PARTIAL), kind)
     if trouble.merged or trouble.false:
@@ -186,7 +185,7 @@ def _with_neighbour(marker: Spots, radius: Tensor, away: tuple[float, float], dr
 
 def _ground(count: int, draw: Draw) -> Tensor:
     """Slopes and edges behind the marker: (M, S, S)."""
-    steps = torch.linspace(-1, 1, SIZE, device=draw.generator.device)
+    steps = torch.linspace(-1, 1, PATCH_SIZE, device=draw.generator.device)
     angle = draw.between(0, 2 * math.pi, 2, count)[..., None, None]
     along = steps * angle.cos() + steps[:, None] * angle.sin()
     slope = along[0] * draw.often(0.5, 0.3, count)[:, None, None]

@@ -3,7 +3,7 @@ from .calibration_object import CalibrationObject, Symmetry
 from .limits import BLOB_RADIUS, FIDUCIAL_RADIUS, MOST_PIXELS, SIGMA, Range, check_object, check_observations, check_rig
 from .moved_camera import Kind, MovedCamera, MovedError
 from .observations import UNUSABLE, BlobFlag, BlobKind, Detections, Observations
-from .placement import CropPlacement
+from .placement import CROP_MARGIN, PATCH_SIZE, CropPlacement
 from .prediction import Prediction, Views
 from .rig import (
     PARAMETER_NAMES,
@@ -22,10 +22,12 @@ from .volume import Volume
 
 __all__ = [
     "BLOB_RADIUS",
+    "CROP_MARGIN",
     "FIDUCIAL_RADIUS",
     "MOST_PIXELS",
     "PARAMETERS",
     "PARAMETER_NAMES",
+    "PATCH_SIZE",
     "PINHOLE",
     "SIGMA",
     "UNUSABLE",

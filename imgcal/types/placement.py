@@ -1,4 +1,4 @@
-"""`CropPlacement`: where square crops lie in their images, and how much they are reduced."""
+"""`CropPlacement`: where square crops lie in their images, and how much they are reduced; how they are cut."""
 
 from __future__ import annotations
 
@@ -6,6 +6,12 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+
+# What networks for frames are trained on and what they are given must be cut alike.
+CROP_MARGIN = 0.06
+"""Share of the focal length that is left around the expected object: drift of 3 degrees."""
+PATCH_SIZE = 24
+"""Pixels, width and height of a patch around one marker."""
 
 
 @dataclass(frozen=True)

@@ -24,10 +24,9 @@ from torch.utils.flop_counter import FlopCounterMode
 from imgcal.detection import Blobs, DetectionOptions, Frame, detect_snapshot
 from imgcal.io import load_object, load_rig
 from imgcal.networks import Measurer, load_measurer
-from imgcal.networks.measurer import PATCH
 from imgcal.pipeline import LearnedMeasurer
 from imgcal.synthesis import DIFFICULTIES, FrameModel, PhysicalDrift, Shot, simulate_shots, simulate_truth
-from imgcal.types import UNUSABLE, BlobKind
+from imgcal.types import PATCH_SIZE, UNUSABLE, BlobKind
 from renderers import Spots, render_crops
 from scripts.output import fill, markdown, read_json, surroundings, write_json
 
@@ -206,7 +205,7 @@ def sizes(networks: dict[str, Measurer]) -> dict[str, dict[str, int]]:
     families = {}
     for name, network in networks.items():
         with FlopCounterMode(display=False) as counter:
-            network(torch.zeros(1, PATCH, PATCH), torch.ones(1))
+            network(torch.zeros(1, PATCH_SIZE, PATCH_SIZE), torch.ones(1))
         weights = sum(parameter.numel() for parameter in network.parameters())
         families[name.rpartition("-")[0]] = {"parameters": weights, "flops": counter.get_total_flops()}
     return families

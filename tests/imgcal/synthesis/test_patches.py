@@ -4,8 +4,8 @@ import torch
 
 from imgcal.synthesis import expose_patches, render_patches
 from imgcal.synthesis.drawing import Draw
-from imgcal.synthesis.patches import LEAST_CUT, SIZE, Patches, Trouble, _chunk
-from imgcal.types import BlobKind
+from imgcal.synthesis.patches import LEAST_CUT, Patches, Trouble, _chunk
+from imgcal.types import PATCH_SIZE, BlobKind
 
 QUIET = {"merged": False, "false": False, "company": False, "cut": False, "uneven": False, "smeared": False}
 
@@ -15,7 +15,7 @@ def chunk(count: int, **trouble: bool) -> Patches:
 
 
 def centroid(images: torch.Tensor) -> torch.Tensor:
-    steps = torch.arange(SIZE) - (SIZE - 1) / 2
+    steps = torch.arange(PATCH_SIZE) - (PATCH_SIZE - 1) / 2
     total = images.sum((1, 2))
     return torch.stack([(images.sum(1) @ steps) / total, (images.sum(2) @ steps) / total], dim=-1)
 
