@@ -16,6 +16,7 @@ import numpy as np
 from imgcal.detection.fitting import BAND, FARTHEST, MOST, PARAMETERS, ROWS, fit_centre, start_of
 from imgcal.detection.moments import find_centroid, find_ramp, find_shape
 from imgcal.detection.territory import MARGIN, SKIRT, claim, spread_labels
+from imgcal.geometry import kernels
 from imgcal.types import BlobFlag
 from renderers.compiling import njit
 
@@ -177,8 +178,8 @@ def _background(frame, u, v, half, invert, ring):
                 ring[3, count] = ring[0, count]
                 count += 1
     value, x, y = ring[0, :count], ring[1, :count], ring[2, :count]
-    middle = _select(ring[3], count, count // 2)
-    quarter = _select(ring[3], count // 2 + 1, count // 4)
+    middle = kernels.ranked(ring[3], count, count // 2)
+    quarter = kernels.ranked(ring[3], count // 2 + 1, count // 4)
     # The lower half tells the spread: clutter in the ring is bright. One grey level is the estimate's quantization.
     reach = 4 * (np.float32(1.4826) * (middle - quarter) + 1)
     n = sx = sy = sxx = sxy = syy = g = gx = gy = 0.0
@@ -197,30 +198,6 @@ def _background(frame, u, v, half, invert, ring):
         squares += residual * residual if abs(value[r]) < reach else 0.0
     noise = max(np.sqrt(squares / max(n - 3, 1.0)), 12**-0.5)
     return noise, noise / np.sqrt(max((sxx + syy) / 2, 1.0)), (middle + c0, cx, cy)
-
-
-@njit(cache=True, nogil=True)
-def _select(values, count, rank):
-    """Value of a rank among the first `count` ones, which are left such that none before the rank is larger (Hoare)."""
-    low, high = 0, count - 1
-    while low < high:
-        pivot, i, j = values[(low + high) // 2], low, high
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while values[j] > pivot:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i += 1
-                j -= 1
-        if rank <= j:
-            high = j
-        elif rank >= i:
-            low = i
-        else:
-            break
-    return values[rank]
 
 
 @njit(cache=True, nogil=True, fastmath=True)

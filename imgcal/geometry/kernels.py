@@ -1,4 +1,4 @@
-"""Small compiled functions that the compiled loops of several rooms share: rotations, Cholesky factors.
+"""Small compiled functions that the compiled loops of several rooms share: rotations, Cholesky factors, ranks.
 
 `rotations.py` says the same in tensors, and is what these are tested against; lenses are in `lens_kernels.py`. Arrays
 are filled in place; the floating-point type is that of the arguments.
@@ -97,3 +97,27 @@ def subtract_gram(matrix, tall):
             first, second, third = tall[r, i], tall[r + 1, i], tall[r + 2, i]
             for j in range(i + 1):
                 matrix[i, j] -= first * tall[r, j] + second * tall[r + 1, j] + third * tall[r + 2, j]
+
+
+@njit(nogil=True)
+def ranked(values, count, rank):
+    """Value of a rank among the first `count` ones, which are reordered: none before it is larger then (Hoare)."""
+    low, high = 0, count - 1
+    while low < high:
+        pivot, i, j = values[(low + high) // 2], low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while values[j] > pivot:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if rank <= j:
+            high = j
+        elif rank >= i:
+            low = i
+        else:
+            break
+    return values[rank]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from imgcal.geometry import kernels
 from renderers.compiling import njit
 
 RINGS = 0.5  # px of the shorter axis, from one value of a profile to the next
@@ -19,37 +20,13 @@ TAPS = 4  # px that a blur with a standard deviation of one reaches
 @njit(cache=True, nogil=True)
 def median(values, count):
     """Median of the first `count` values, which are reordered."""
-    upper = _ranked(values, count, count // 2)
+    upper = kernels.ranked(values, count, count // 2)
     if count % 2:
         return upper
     lower = values[0]
     for i in range(1, count // 2):
         lower = max(lower, values[i])
     return (lower + upper) / 2
-
-
-@njit(cache=True, nogil=True)
-def _ranked(values, count, rank):
-    """Value of a rank among the first `count` ones; none before it is larger afterwards (Hoare)."""
-    low, high = 0, count - 1
-    while low < high:
-        pivot, i, j = values[(low + high) // 2], low, high
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while values[j] > pivot:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i += 1
-                j -= 1
-        if rank <= j:
-            high = j
-        elif rank >= i:
-            low = i
-        else:
-            break
-    return values[rank]
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")

@@ -40,3 +40,16 @@ def test_subtract_gram_fills_the_lower_triangle() -> None:
     found = matrix.copy()
     kernels.subtract_gram(found, tall)
     assert np.allclose(found, np.triu(matrix, 1) + np.tril(matrix - tall.T @ tall), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_ranks_are_those_of_sorted_values(kind: type) -> None:
+    random = np.random.default_rng(3)
+    for count in (1, 2, 7, 40):
+        for rank in {0, count // 4, count // 2, count - 1}:
+            values = random.integers(0, 9, count + 3).astype(kind)  # many are equal; the last three do not count
+            expected, rest = np.sort(values[:count]), values[count:].copy()
+            found = kernels.ranked(values, count, rank)
+            assert found == expected[rank] == values[rank]
+            assert (values[:rank] <= found).all() and (values[rank:count] >= found).all()
+            assert np.array_equal(np.sort(values[:count]), expected) and np.array_equal(values[count:], rest)
