@@ -29,7 +29,7 @@ from imgcal.messages import quoted, shortened
 from imgcal.networks.config import NetworkSpec, is_import_path, without_pretrained
 from imgcal.networks.factory import build_network
 from imgcal.networks.infrared import InfraredNetwork
-from imgcal.networks.infrared_checkpoint import INFRARED, MEASURER
+from imgcal.networks.infrared_checkpoint import INFRARED, MEASURER, read_weights
 from imgcal.networks.measurer import Measurer
 from imgcal.networks.network import Network
 from imgcal.networks.refiner import IterativeRefiner
@@ -167,10 +167,11 @@ def warm_start(start: str | Path | Sequence[str | Path], network: nn.Module) -> 
 def _take_over(path: str | Path, network: nn.Module) -> tuple[str, ...]:
     """Do the work of `warm_start` for one file."""
     path = model_file(path)
-    tensors, texts = read_tensors(path, FORMATS_OF_FRAMES.get(type(network), FORMAT))
+    tag = FORMATS_OF_FRAMES.get(type(network))
+    tensors, texts = read_tensors(path, FORMAT) if tag is None else read_weights(path, tag)
     own = dict(network.named_parameters())
     fitting = [name for name in own if name in tensors and tensors[name].shape == own[name].shape]
-    spec = None if type(network) in FORMATS_OF_FRAMES else _read_records(path, texts)[0]
+    spec = None if tag is not None else _read_records(path, texts)[0]
     if spec is not None and of_positions(spec):
         fitting = [name for name in fitting if name.startswith("positions.")]  # the rest has learnt nothing
     if not fitting:

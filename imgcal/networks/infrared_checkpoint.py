@@ -19,6 +19,14 @@ from imgcal.networks.randomness import drawing_from
 
 INFRARED, MEASURER = "imgcal-infrared/1", "imgcal-measurer/1"
 
+EARLIER = {
+    "norm_attention": "attention_norm",
+    "to_qkv": "query_key_value",
+    "from_heads": "attention_out",
+    "norm_mlp": "mlp_norm",
+}
+"""How networks that were trained earlier name the parts of a transformer block, and how they are named now."""
+
 Config = TypeVar("Config", bound=StrictModel)
 
 
@@ -78,8 +86,15 @@ def _write(path: str | Path, tag: str, network: nn.Module, config: StrictModel, 
     write_tensors(path, weights, tag, texts)
 
 
-def _read(path: str | Path, tag: str, kind: type[Config]) -> tuple[Config, dict[str, Tensor], dict[str, Any]]:
+def read_weights(path: str | Path, tag: str) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Read tensors by the names that networks have now, and texts; see `read_tensors`."""
     tensors, texts = read_tensors(path, tag)
+    named = {".".join(EARLIER.get(part, part) for part in name.split(".")): each for name, each in tensors.items()}
+    return named, texts
+
+
+def _read(path: str | Path, tag: str, kind: type[Config]) -> tuple[Config, dict[str, Tensor], dict[str, Any]]:
+    tensors, texts = read_weights(path, tag)
     try:
         content, metrics = read_json(texts["config"]), read_json(texts["metrics"])
         if not isinstance(content, dict) or not isinstance(metrics, dict):

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from imgcal.networks.layers import TransformerBlock
+
 STRIDE = 2
 """Crop pixels a cell of the feature map, of either encoder."""
 
@@ -16,7 +18,7 @@ EncoderName = Literal["cnn-small", "cnn", "cnn-large", "vit-small", "vit", "vit-
 """Encoders that an experiment file can name."""
 
 
-class CnnEncoder(nn.Module):
+class CropCnn(nn.Module):
     """Strides 2, 4 and 8 in 3x3 convolutions, and an additive way back up.
 
     Dense convolutions, since depthwise ones are slow on a CPU; no norm, since brightness is already normalized and
@@ -33,11 +35,11 @@ class CnnEncoder(nn.Module):
         super().__init__()
         a, b, c = widths
         self.stem = nn.Conv2d(1, a, 3, stride=2, padding=1)
-        self.fine = Residual(a)
+        self.fine = CropResidual(a)
         self.down_middle = nn.Conv2d(a, b, 3, stride=2, padding=1)
-        self.middle = Residual(b)
+        self.middle = CropResidual(b)
         self.down_coarse = nn.Conv2d(b, c, 3, stride=2, padding=1)
-        self.coarse = Residual(c)
+        self.coarse = CropResidual(c)
         self.up_middle = nn.Conv2d(c, b, 1)
         self.up_fine = nn.Conv2d(b, a, 1)
         self.out = nn.Conv2d(a, channels, 3, padding=1)
@@ -56,7 +58,7 @@ class CnnEncoder(nn.Module):
         return {"stem": "^(?:stem|fine)", "blocks": blocks}
 
 
-class VitEncoder(nn.Module):
+class CropVit(nn.Module):
     """Patches of 6 pixels, blocks of attention over the whole crop, then each token draws its own 3 x 3 cells."""
 
     def __init__(
@@ -78,9 +80,9 @@ class VitEncoder(nn.Module):
         self.embed: nn.Module = nn.Conv2d(1, width, patch, stride=patch)
         if stem:
             fine, tokens = nn.Conv2d(1, stem, 3, stride=2, padding=1), nn.Conv2d(stem, width, 3, stride=3)
-            self.embed = nn.Sequential(fine, nn.GELU(), Residual(stem), tokens)
+            self.embed = nn.Sequential(fine, nn.GELU(), CropResidual(stem), tokens)
         self.position = nn.Parameter(0.02 * torch.randn(1, (size // patch) ** 2, width))
-        self.blocks = nn.Sequential(*(AttentionBlock(width, heads) for _ in range(depth)))
+        self.blocks = nn.Sequential(*(TransformerBlock(width, heads) for _ in range(depth)))
         self.norm = nn.LayerNorm(width)
         self.out = nn.Linear(width, channels * 9)
 
@@ -96,7 +98,7 @@ class VitEncoder(nn.Module):
         return {"stem": "^(?:embed|position)", "blocks": [(r"^blocks\.(\d+)", None), (r"^(?:norm|out)", (99999,))]}
 
 
-class Residual(nn.Module):
+class CropResidual(nn.Module):
     """Two 3x3 convolutions beside the identity."""
 
     def __init__(self, width: int) -> None:
@@ -110,33 +112,14 @@ class Residual(nn.Module):
         return x + self.second(functional.gelu(self.first(x)))
 
 
-class AttentionBlock(nn.Module):
-    """Attention and MLP, each behind a LayerNorm and beside the identity."""
-
-    def __init__(self, width: int, heads: int) -> None:
-        super().__init__()
-        self.heads = heads
-        self.norm_attention, self.norm_mlp = nn.LayerNorm(width), nn.LayerNorm(width)
-        self.to_qkv, self.from_heads = nn.Linear(width, 3 * width), nn.Linear(width, width)
-        self.mlp = nn.Sequential(nn.Linear(width, 4 * width), nn.GELU(), nn.Linear(4 * width, width))
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Keep the shape (P, T, width)."""
-        # Plain products: the backward pass of the fused attention is slow on a CPU.
-        q, k, v = self.to_qkv(self.norm_attention(x)).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        weights = (q @ k.mT * q.shape[-1] ** -0.5).softmax(-1)
-        x = x + self.from_heads((weights @ v).transpose(1, 2).flatten(2))
-        return x + self.mlp(self.norm_mlp(x))
-
-
 ENCODERS: dict[EncoderName, Callable[[int, int], nn.Module]] = {
-    "cnn-small": lambda channels, size: CnnEncoder(channels, (17, 34, 62)),
-    "cnn": lambda channels, size: CnnEncoder(channels),
-    "cnn-large": lambda channels, size: CnnEncoder(channels, (34, 68, 124)),
-    "vit-small": lambda channels, size: VitEncoder(channels, size, width=64, depth=2),
-    "vit": lambda channels, size: VitEncoder(channels, size),
-    "vit-large": lambda channels, size: VitEncoder(channels, size, width=96, depth=4),
-    "vit-stem": lambda channels, size: VitEncoder(channels, size, width=72, stem=16),
+    "cnn-small": lambda channels, size: CropCnn(channels, (17, 34, 62)),
+    "cnn": lambda channels, size: CropCnn(channels),
+    "cnn-large": lambda channels, size: CropCnn(channels, (34, 68, 124)),
+    "vit-small": lambda channels, size: CropVit(channels, size, width=64, depth=2),
+    "vit": lambda channels, size: CropVit(channels, size),
+    "vit-large": lambda channels, size: CropVit(channels, size, width=96, depth=4),
+    "vit-stem": lambda channels, size: CropVit(channels, size, width=72, stem=16),
 }
 """Makers by name: channels of the feature map and pixels of the crop in, encoder out; of one size, one cost."""
 

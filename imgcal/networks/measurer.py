@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from imgcal.io import StrictModel
-from imgcal.networks.infrared_encoders import STRIDE, CnnEncoder, VitEncoder
+from imgcal.networks.infrared_encoders import STRIDE, CropCnn, CropVit
 from imgcal.types import PATCH_SIZE, BlobKind
 
 RADIUS = 3.5  # patch pixels that a marker's radius is reduced to; smaller ones are taken as they are
@@ -54,9 +54,9 @@ class Measurer(nn.Module):
         self.config = config
         channels = config.channels
         self.encoder: nn.Module = (
-            CnnEncoder(channels, CNN_WIDTHS)
+            CropCnn(channels, CNN_WIDTHS)
             if config.encoder == "cnn"
-            else VitEncoder(channels, PATCH_SIZE, *VIT_WIDTH_AND_DEPTH)
+            else CropVit(channels, PATCH_SIZE, *VIT_WIDTH_AND_DEPTH)
         )
         self.size = nn.Linear(2, channels)
         self.head = nn.Sequential(

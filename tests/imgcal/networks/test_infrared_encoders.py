@@ -3,7 +3,7 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from imgcal.networks import InfraredConfig, InfraredNetwork
-from imgcal.networks.infrared_encoders import ENCODERS, STRIDE, EncoderName, VitEncoder
+from imgcal.networks.infrared_encoders import ENCODERS, STRIDE, CropVit, EncoderName
 from imgcal.training.optimization import layer_scales
 
 
@@ -24,7 +24,7 @@ def test_same_stride_parameters_and_operations(pair: tuple[EncoderName, EncoderN
 def test_vit_cells_lie_where_their_pixels_are() -> None:
     # A bright patch changes the cells of its own token most: pixel_shuffle has put them in the right order.
     torch.manual_seed(0)
-    encoder = VitEncoder(4, 48, width=16, depth=1, heads=2)
+    encoder = CropVit(4, 48, width=16, depth=1, heads=2)
     crop = torch.zeros(1, 1, 48, 48)
     dark = encoder(crop)
     crop[..., 30:36, 6:12] = 5.0
