@@ -26,11 +26,11 @@ from scripts.output import ROOT, command, make_folder, markdown, read_json, repl
 # In the order of the page, with minutes that they take.
 BENCHMARKS = {
     "recalibration": 8,
-    "blobs": 4,
+    "blobs": 2,
     "projection": 2,
     "splatting": 2,
-    "identity": 4,
-    "end_to_end": 5,
+    "identity": 3,
+    "end_to_end": 3,
     "networks": 2,
 }
 PAGE = ROOT / "docs" / "benchmarks.md"
