@@ -12,11 +12,12 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from imgcal.estimation import EstimationOptions, estimate, initial_pose
+from imgcal.estimation import Estimate, EstimationOptions, estimate, initial_pose
 from imgcal.evaluation import classical
 from imgcal.networks import ImageNetwork, Network, Sightings
 from imgcal.refinement import (
     ImageRefinementOptions,
+    RobustOptions,
     as_prediction,
     observed,
     refine_images,
@@ -73,7 +74,17 @@ class Given:
 
 Predict = Callable[[Given], Prediction]
 Passes = Callable[[Given], tuple[Prediction, ...]]
-Refine = Callable[[Prediction, Given], Prediction]
+
+
+@dataclass(frozen=True)
+class Refined:
+    """What a refinement came to, and where it has to be said that it failed."""
+
+    prediction: Prediction  # (B,)
+    found: Tensor  # (B,) bool; False: what was seen contradicts the rig, or no minimum was found
+
+
+Refine = Callable[[Prediction, Given], Refined]
 
 
 @dataclass(frozen=True)
@@ -128,12 +139,17 @@ def steps_from_factory(count: int) -> Predict:
 def robust_from_pnp(given: Given) -> Prediction:
     """PnP in spite of outliers, then the same robust refinement that follows the networks."""
     start = robust_pose(given.views, given.factory, given.obj, given.sigma)
-    return refined_by_points(start, given)
+    return refined_by_points(start, given).prediction
 
 
-def refined_by_points(prediction: Prediction, given: Given) -> Prediction:
-    """`refine_robustly` with what is given."""
-    return refine_robustly(prediction, given.views, given.factory, given.obj, given.prior_std, sigma=given.sigma)
+def refined_by_points(prediction: Prediction, given: Given) -> Refined:
+    """`refine_robustly` with what is given; it has failed where most points are outliers to the rig that it found."""
+    options = RobustOptions()
+    known, sigma = (given.factory, given.obj, given.prior_std), given.sigma
+    result = refine_robustly(prediction, given.views, *known, sigma=sigma, options=options)
+    uv = result.cameras_from_object.project(given.obj.points, given.obj.radius).uv
+    fits = given.seen & ((uv - given.uv).norm(dim=-1) <= options.gate * sigma)
+    return Refined(result, 2 * fits.sum((1, 2)) > given.seen.sum((1, 2)))
 
 
 def pnp(given: Given) -> Prediction:
@@ -205,26 +221,33 @@ def refined_by_sightings(
     prediction: Prediction, sightings: Sightings, factory: CameraRig, obj: CalibrationObject, prior_std: Tensor
 ) -> Prediction:
     """Refine on the positions that an image network has found, each with the sigma that it predicts; Cauchy's loss."""
+    return as_prediction(_fit_to_sightings(prediction, sightings, factory, obj, prior_std))
+
+
+def _fit_to_sightings(
+    prediction: Prediction, sightings: Sightings, factory: CameraRig, obj: CalibrationObject, prior_std: Tensor
+) -> Estimate:
     sigma = (sightings.sigma.square() + SIGHTED_SIGMA**2).sqrt().to("cpu", torch.float64)
     views = Views(*(None if part is None else part.cpu() for part in (sightings.views.uv, sightings.views.seen)))
-    return as_prediction(refine_points(prediction, views, factory, obj, prior_std, sigma))
+    return refine_points(prediction, views, factory, obj, prior_std, sigma)
 
 
 def _refined_by_images(network: Network, options: ImageOptions) -> Refine:
     """Render and compare; where images do not confirm the rig, the positions that the network has found decide."""
 
     @torch.no_grad()
-    def refine(prediction: Prediction, given: Given) -> Prediction:
+    def refine(prediction: Prediction, given: Given) -> Refined:
         comparison = ImageRefinementOptions(image=options, position_noise=given.sigma)
         images = given.images(options)
         fit, _ = refine_images(prediction, images, given.factory, given.obj, given.prior_std, comparison)
         rows = (~fit.converged).nonzero().squeeze(-1)
         if not isinstance(network, ImageNetwork) or not len(rows):
-            return as_prediction(fit)
+            return Refined(as_prediction(fit), fit.converged)
         device = next(network.parameters()).device
         sightings = network.sight(images[rows].to(device))
-        mended = refined_by_sightings(prediction[rows], sightings, given.factory, given.obj, given.prior_std)
+        mended = _fit_to_sightings(prediction[rows], sightings, given.factory, given.obj, given.prior_std)
         order = torch.arange(len(images)).index_copy(0, rows, len(images) + torch.arange(len(rows)))
-        return Prediction.cat([as_prediction(fit), mended])[order]
+        found = fit.converged.index_copy(0, rows, mended.converged)
+        return Refined(Prediction.cat([as_prediction(fit), as_prediction(mended)])[order], found)
 
     return refine

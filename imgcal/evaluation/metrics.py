@@ -44,6 +44,11 @@ class Errors:
     def __getitem__(self, rows: slice) -> Errors:
         return Errors(**{name: getattr(self, name)[rows] for name in KINDS})
 
+    def where(self, found: Tensor) -> Errors:
+        """Leave no number where nothing was found, (B,) bool, or where it is none: nan in every kind."""
+        there = found & self.re.isfinite()
+        return Errors(**{name: torch.where(there, getattr(self, name), torch.nan) for name in KINDS})
+
 
 KINDS = tuple(field.name for field in fields(Errors))
 HELD_OUT = 32

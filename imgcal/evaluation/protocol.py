@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import statistics
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -77,22 +78,23 @@ class Protocol:
 
 
 class Statistics(TypedDict):
-    """An error in pixels, over all rigs of all trials."""
+    """An error in pixels, over all rigs of all trials; means and quantiles of those for which something was found."""
 
     rigs: int
+    found: float  # share of the rigs for which something was found: a refinement may fail
     mean: float  # over rigs, averaged over trials
     spread: float | None  # standard deviation of the trials' means; None = one trial
     trial_means: tuple[float, ...]
     median: float
     p95: float
     p99: float
-    share_under_half_px: float
+    share_under_half_px: float  # of all rigs
     share_under_one_px: float
 
 
 @dataclass(frozen=True)
 class Scores:
-    """Errors of one column over all trials."""
+    """Errors of one column over all trials; nan where nothing was found."""
 
     trials: tuple[Errors, ...]
     bounds: tuple[Errors, ...]  # of the first rigs of each trial
@@ -105,13 +107,15 @@ class Scores:
     def statistics(self, kind: Literal["re", "held_out"] = "re") -> Statistics:
         """Sum up RE, on the object's own points or on those that took no part."""
         values = [getattr(trial, kind) for trial in self.trials]
-        means = [float(trial.mean()) for trial in values]
+        means = [float(trial.nanmean()) for trial in values]
         re = torch.cat(values).double()
-        median, p95, p99 = re.quantile(re.new_tensor((0.5, 0.95, 0.99))).tolist()
+        median, p95, p99 = re.nanquantile(re.new_tensor((0.5, 0.95, 0.99))).tolist()
+        there = [mean for mean in means if not math.isnan(mean)]
         return Statistics(
             rigs=len(re),
-            mean=statistics.fmean(means),
-            spread=statistics.stdev(means) if len(means) > 1 else None,
+            found=1 - float(re.isnan().double().mean()),
+            mean=statistics.fmean(there) if there else math.nan,
+            spread=statistics.stdev(there) if len(there) > 1 else None,
             trial_means=tuple(means),
             median=median,
             p95=p95,
@@ -133,6 +137,7 @@ class Scores:
         shared = [min(len(trial), len(bound)) for trial, bound in pairs]
         found = concatenate([trial[:count] for (trial, _), count in zip(pairs, shared, strict=True)])
         bound = concatenate([bound[:count] for (_, bound), count in zip(pairs, shared, strict=True)])
+        bound = bound.where(~found.re.isnan())
         limits = {kind: _rms(getattr(bound, kind)) for kind in KINDS}
         return {kind: _rms(getattr(found, kind)) / limit if limit > 0 else None for kind, limit in limits.items()}
 
@@ -344,7 +349,8 @@ def _measure(name: str, method: Method, batch: Sample, first: int) -> dict[str, 
         if len(passes) > 1:
             found["one_pass"].append(errors(passes[0], truth, given.obj))
         if method.refine is not None:
-            found["refined"].append(errors(method.refine(passes[-1], given), truth, given.obj))
+            refined = method.refine(passes[-1], given)
+            found["refined"].append(errors(refined.prediction, truth, given.obj).where(refined.found))
     joined = {stage: vars(concatenate(parts)) if parts else None for stage, parts in found.items()}
     return {**joined, "passes": number, "rigs": count}
 
@@ -360,4 +366,4 @@ def _row(trials: Sequence[_Collected], bounds: tuple[Errors, ...]) -> Row:
 
 
 def _rms(values: Tensor) -> float:
-    return float(values.square().mean().sqrt())
+    return float(values.square().nanmean().sqrt())

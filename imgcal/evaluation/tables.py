@@ -12,7 +12,7 @@ from statistics import fmean, stdev
 from rich.table import Table as RichTable
 
 from imgcal.evaluation.encoder_check import LEAST_RISE
-from imgcal.evaluation.protocol import REFERENCE, Evaluation, Row, Scores
+from imgcal.evaluation.protocol import REFERENCE, Evaluation, Row, Scores, Statistics
 from imgcal.evaluation.summary import Facts, Summary, as_values
 from imgcal.evaluation.sweeps import AXES
 from imgcal.io import write_text
@@ -105,17 +105,23 @@ def _errors(seeds: Sequence[Scores]) -> tuple[str, ...]:
     """Cells of one line: means over training seeds, the spread of the mean RE over them, or over trials of one."""
     found = [scores.statistics() for scores in seeds]
     held_out = [scores.statistics("held_out")["median"] for scores in seeds]
-    means = [one["mean"] for one in found]
+    means = [one["mean"] for one in found if not math.isnan(one["mean"])]
     spread = stdev(means) if len(means) > 1 else found[0]["spread"]
     return (
-        number(fmean(means)) + ("" if spread is None else f" ± {number(spread)}"),
-        number(fmean(one["median"] for one in found)),
-        number(fmean(one["p99"] for one in found)),
+        number(_mean(means)) + ("" if spread is None else f" ± {number(spread)}") + _of_rigs(found),
+        number(_mean([one["median"] for one in found])),
+        number(_mean([one["p99"] for one in found])),
         f"{100 * fmean(one['share_under_one_px'] for one in found):.1f} %",
         f"{100 * fmean(one['share_under_half_px'] for one in found):.1f} %",
-        number(fmean(held_out)),
+        number(_mean(held_out)),
         f"{found[0]['rigs']}",
     )
+
+
+def _of_rigs(found: Sequence[Statistics]) -> str:
+    """Say of how many rigs the mean is, where the refinement of others has failed."""
+    share = fmean(one["found"] for one in found)
+    return "" if share == 1 else f" ({100 * share:.1f} % of rigs)"
 
 
 @dataclass(frozen=True)
@@ -181,7 +187,7 @@ def _parameters_table(summary: Summary) -> Table:
     for line in _lines(summary):
         errors = [scores.parameters() for scores in line.scores]
         bounds = [scores.cramer_rao_ratios() for scores in line.scores]
-        cells = [number(fmean(one[kind] for one in errors)) for kind in kinds]
+        cells = [number(_mean([one[kind] for one in errors])) for kind in kinds]
         rows.append((line.label, *cells, *(number(_mean([one[kind] for one in bounds])) for kind in ratios)))
     title = "Parameters, RMS error" + (", and ratio to the Cramer-Rao bound" if bounded else "")
     return Table(title, header, tuple(rows))
@@ -199,7 +205,7 @@ def _cost_table(summary: Summary) -> Table:
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
-    there = [value for value in values if value is not None]
+    there = [value for value in values if value is not None and not math.isnan(value)]
     return fmean(there) if there else None
 
 

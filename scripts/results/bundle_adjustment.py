@@ -87,7 +87,7 @@ def main(arguments: list[str] | None = None) -> None:
         columns["network"] = _each(method.predict, sample)
         refine = method.refine
         assert refine is not None  # every network has a refinement
-        columns["network + MAP"] = _each(lambda given: refine(method.predict(given), given), sample)
+        columns["network + MAP"] = _each(lambda given: refine(method.predict(given), given).prediction, sample)
     result = surroundings() | {"columns": {name: column.summary() for name, column in columns.items()}}
     for name, row in result["columns"].items():
         print(f"{name:26s} {row['trials']:5d} trials, RE mean {row['mean_px']:.4f} px", row.get("seconds_p50", ""))

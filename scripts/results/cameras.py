@@ -73,7 +73,7 @@ def main(arguments: list[str] | None = None) -> None:
 def predict(method: Method, given: Given, refined: bool) -> Prediction:
     """Predict, and refine if asked to."""
     found = method.predict(given)
-    return method.refine(found, given) if refined and method.refine is not None else found
+    return method.refine(found, given).prediction if refined and method.refine is not None else found
 
 
 def drawn(truth: CameraRig, predicted: CameraRig, fiducials: Tensor, title: str) -> str:

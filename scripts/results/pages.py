@@ -153,10 +153,12 @@ def mean(runs: Runs, stage: str) -> str:
     if not found:
         return ""
     means = [column["mean"] for column in found]
+    share = fmean(column.get("found", 1.0) for column in found)
     if None in means:
-        return "not finite"
+        return "not finite" if share == 1 else "none found"
     spread = stdev(means) if len(means) > 1 else found[0]["spread"]
-    return _px(fmean(means)) + ("" if spread is None else f" ± {spread:.1g}")
+    refined = "" if share == 1 else f" ({100 * share:.1f} % of rigs)"
+    return _px(fmean(means)) + ("" if spread is None else f" ± {spread:.1g}") + refined
 
 
 def seeds(runs: Runs) -> str:

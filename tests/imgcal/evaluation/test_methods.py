@@ -107,7 +107,8 @@ def test_a_network_gets_single_precision_and_its_refinement_double(sample):
     assert network.calls == [torch.float32]
     assert prediction.rig.focal_length.dtype == torch.float64
     refined = method.refine(disturbed(some.truth, some.given().prior_std), some.given())
-    assert (re(refined, some) < 0.02).all()
+    assert refined.found.all()
+    assert (re(refined.prediction, some) < 0.02).all()
 
 
 def test_an_image_network_gets_images_that_are_drawn_once(sample):
@@ -136,7 +137,7 @@ def test_images_are_refined_by_render_and_compare(sample):
 
     method = network_method(Looks(some.conditions))
     guess = disturbed(some.truth, some.given().prior_std, 0.05)
-    assert (re(method.refine(guess, some.given()), some) < 0.2).all()
+    assert (re(method.refine(guess, some.given()).prediction, some) < 0.2).all()
     assert (re(guess, some) > 0.2).all()
 
 
@@ -154,6 +155,24 @@ def test_sightings_are_refined_with_their_own_sigma(sample):
     assert (re(found, some) < 0.1).all()
 
 
+def test_a_refinement_that_fails_says_so(sample):
+    some = sample(3)
+    given = some.given()
+    nowhere = 1000 * torch.rand(given.uv.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    contradicted = torch.cat((given.uv[:2], nowhere[2:]))
+    guess = disturbed(some.truth, given.prior_std)
+    points = network_method(Fake(some.conditions))
+    assert points.refine(guess, replace(given, views=replace(given.views, uv=contradicted))).found.tolist() == [
+        True, True, False,
+    ]  # fmt: skip
+
+    class Looks(Fake):
+        image_options = ImageOptions(size=32, dot=1.0)
+
+    given.drawn[Looks.image_options] = torch.zeros(3, 4, 3, 32, 32)  # nothing to be seen
+    assert not network_method(Looks(some.conditions)).refine(guess, given).found.any()
+
+
 def test_where_images_confirm_no_rig_positions_of_the_network_decide(sample, monkeypatch):
     some = sample(3)
     given = some.given()
@@ -167,4 +186,5 @@ def test_where_images_confirm_no_rig_positions_of_the_network_decide(sample, mon
     monkeypatch.setattr("imgcal.evaluation.methods.ImageNetwork", Sees)
     given.drawn[ImageOptions(size=32, dot=1.0)] = torch.zeros(3, 4, 3, 32, 32)  # nothing to be seen
     refined = network_method(Sees(some.conditions)).refine(disturbed(some.truth, given.prior_std), given)
-    assert (re(refined, some) < 0.05).all()
+    assert refined.found.all()
+    assert (re(refined.prediction, some) < 0.05).all()

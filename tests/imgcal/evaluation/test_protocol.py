@@ -1,3 +1,4 @@
+import math
 from dataclasses import replace
 
 import pytest
@@ -5,7 +6,7 @@ import torch
 
 from imgcal.errors import InputError, RefusedError
 from imgcal.evaluation import BASELINES, Conditions, Method, Protocol, evaluate, network_method
-from imgcal.evaluation.methods import factory_alone
+from imgcal.evaluation.methods import Refined, factory_alone
 from imgcal.evaluation.metrics import KINDS, Errors
 from imgcal.evaluation.protocol import LEAST_SIGMA, Scores, draw
 from imgcal.synthesis import LEVELS, Degradation, ImageOptions
@@ -31,6 +32,37 @@ def test_statistics_of_known_errors():
     held_out = Scores((replace(trial, held_out=torch.tensor([3.0, 5.0])),), ()).statistics("held_out")
     assert (held_out["mean"], held_out["rigs"]) == (4.0, 2)
     assert Scores((of_re([0.0, 1.0]),), ()).statistics()["spread"] is None
+
+
+def test_what_was_not_found_is_counted_and_is_in_no_mean():
+    wild = of_re([1.0, 2e39, 3.0, torch.inf]).where(torch.tensor([True, False, True, True]))
+    scores = Scores((wild, of_re([2.0])), (of_re([0.5]),))
+    found = scores.statistics()
+    assert (found["rigs"], found["found"], found["median"]) == (5, 0.6, 2.0)
+    assert found["mean"] == 2.0 and found["spread"] == 0.0
+    assert found["share_under_one_px"] == 0.0 and scores.parameters()["position"] == 1.0
+    assert Scores((of_re([9.0, 1.0]).where(torch.tensor([False, True])),), (of_re([9.0, 0.5]),)).cramer_rao_ratios()[
+        "re"
+    ] == pytest.approx(2.0)
+    nothing = Scores((of_re([1.0]).where(torch.tensor([False])),), (of_re([1.0]),))
+    assert nothing.statistics()["found"] == 0.0 and math.isnan(nothing.statistics()["mean"])
+    assert nothing.cramer_rao_ratios()["re"] is None
+
+
+def test_refinements_that_fail_are_in_no_mean(conditions):
+    known = straight_down(conditions(kappa=0.002))
+    fake = network_method(Fake(known))
+
+    def refine(prediction, given):
+        refined = fake.refine(prediction, given)
+        wild = refined.prediction.rig.focal_length.clone()
+        wild[0] = 1e30
+        rig = replace(refined.prediction.rig, focal_length=wild)
+        return Refined(replace(refined.prediction, rig=rig), torch.arange(len(wild)) > 0)
+
+    found = evaluate({"fake": replace(fake, refine=refine)}, known, Protocol(count=6, trials=2)).rows["fake"].refined
+    assert found.statistics()["found"] == pytest.approx(5 / 6) and found.statistics()["mean"] < 0.02
+    assert found.statistics()["share_under_one_px"] == pytest.approx(5 / 6)
 
 
 def test_cramer_rao_ratios_are_of_the_rigs_that_have_a_bound():
