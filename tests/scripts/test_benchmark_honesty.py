@@ -1,7 +1,8 @@
 import json
 
 from imgcal import load_object, load_rig
-from scripts.benchmarks.honesty import ATTACKS, BENT, effort, judged, recovered, tables
+from scripts.benchmarks.honesty import effort, judged, recovered, tables
+from scripts.benchmarks.honesty_attacks import ATTACKS, BENT
 from scripts.benchmarks.honesty_prediction import Case
 
 
