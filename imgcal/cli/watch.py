@@ -30,6 +30,7 @@ from imgcal.pipeline import DetectorName
 from imgcal.types import CalibrationObject, CameraRig, Detections, object_difference, rig_difference
 from imgcal.watch import (
     CURRENT,
+    EVENTS,
     STATE,
     Bag,
     BlobTable,
@@ -44,6 +45,7 @@ from imgcal.watch import (
     Timing,
     Videos,
     ZeroMQ,
+    forget_after,
     holds_videos,
 )
 from imgcal.watch import Watch as Loop
@@ -107,8 +109,9 @@ class Watch:
         with _going_on():
             progress = None if self.fresh else Progress.load(folder)
         source = self._source(rig, obj, progress)
-        goes_on = source.live or isinstance(source, Folder)  # a folder knows which files have been read
-        after = None if progress is None or goes_on else progress.time
+        goes_on = source.live and not self.keep_all  # what came since the last state is gone
+        knows = goes_on or isinstance(source, Folder)  # a folder knows which files have been read
+        after = None if progress is None or knows else progress.time
         intake = Intake(source, rig, Timing(self.tolerance, self.patience), self.keep_all, after=after)
         hook = None if self.hook is None else Hook(self.hook)
         display = Display(Console(file=sys.stdout, soft_wrap=True), intake)
@@ -125,6 +128,9 @@ class Watch:
             loop = Loop(keeper, folder, hook, page, display.tell, display.warn, _removing(source))
             if self.metrics is not None:
                 stack.enter_context(Metrics(loop.tally, intake, hook, metrics_address(self.metrics)))
+            told = 0 if not restored else None if progress is None else progress.logged
+            if not (goes_on or self.fresh or told is None):  # what came after will come again
+                forget_after(folder / EVENTS, told)
             stack.enter_context(loop)
             stopped = stack.enter_context(_stopping())
             stack.enter_context(display.of(loop.tally))

@@ -1,11 +1,11 @@
 from .bags import Bag
-from .event_log import EventLog
+from .event_log import EventLog, forget_after
 from .exposures import CameraBlobs, Exposure, Item, Source, Unreadable, checked
 from .folder import Folder
 from .hook import Hook
 from .intake import Intake
 from .json_lines import JsonLines
-from .loop import STATE, Keeper, Page, Progress, Watch
+from .loop import EVENTS, STATE, Keeper, Page, Progress, Watch
 from .metrics import Metrics, Tally
 from .recordings import BlobTable, Videos, holds_videos
 from .rig_files import CURRENT, RigFiles
@@ -15,6 +15,7 @@ from .zeromq import ZeroMQ
 __all__ = [
     "COUNTS",
     "CURRENT",
+    "EVENTS",
     "STATE",
     "Bag",
     "BlobTable",
@@ -41,5 +42,6 @@ __all__ = [
     "Watch",
     "ZeroMQ",
     "checked",
+    "forget_after",
     "holds_videos",
 ]

@@ -35,6 +35,11 @@ class EventLog:
         except OSError as error:
             raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
 
+    @property
+    def size(self) -> int | None:
+        """Bytes of the file; None = closed."""
+        return None if self._descriptor is None else os.fstat(self._descriptor).st_size
+
     def append(self, event: Event) -> None:
         """Write an event.
 
@@ -91,3 +96,18 @@ class EventLog:
             file.seek(max(size - LONGEST, 0))
             end = file.read()
             file.truncate(size - len(end) + end.rfind(b"\n") + 1)
+
+
+def forget_after(path: Path, size: int) -> None:
+    """Cut off the events that came after the file had a size: those of snapshots that will be worked on once more.
+
+    Nothing happens where the file is shorter: since then, a new one has been begun.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    try:
+        if path.is_file() and path.stat().st_size > size >= 0:
+            os.truncate(path, size)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol
@@ -76,6 +76,7 @@ class Progress:
 
     time: float  # s, of the last snapshot
     name: str | None = None  # of it, where its source names snapshots
+    logged: int | None = None  # bytes of events.jsonl until then
 
     @classmethod
     def load(cls, folder: Path) -> Progress | None:
@@ -91,12 +92,12 @@ class Progress:
             entry = read_json(path.read_text())["progress"]
             if entry is None:
                 return None
-            time, name = float(entry["time"]), entry["name"]
-            if not (name is None or isinstance(name, str)):
-                raise ValueError("the name is no text")
+            time, name, logged = float(entry["time"]), entry["name"], entry.get("logged")
+            if not (name is None or isinstance(name, str)) or not (logged is None or isinstance(logged, int)):
+                raise ValueError("the name is no text, or the length no number")
         except (ValueError, TypeError, KeyError, OverflowError) as error:
             raise InputError(f"{path}: found something else than imgcal watch writes there") from error
-        return cls(time, name)
+        return cls(time, name, logged)
 
 
 class Watch:
@@ -226,9 +227,8 @@ class Watch:
         if state is None or self._progress is None or not unsaved:
             return
         self._told_problems()
-        progress = self._progress
+        progress = replace(self._progress, logged=self._log.size)
         memory = self.keeper.saved(asdict(progress))
-
         self._files.write(
             state, also=lambda: memory.write(self.folder / STATE), then=lambda: self._when_saved(progress)
         )

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.watch.event_log import EventLog
+from imgcal.watch.event_log import EventLog, forget_after
 from tests.imgcal.watch.states import event
 
 
@@ -116,3 +116,20 @@ def test_a_folder_in_its_place(tmp_path):
     (tmp_path / "events.jsonl").mkdir()
     with pytest.raises(InputError, match="cannot be written"):
         EventLog(tmp_path / "events.jsonl")
+
+
+def test_what_came_after_a_moment_is_cut_off(tmp_path):
+    path = tmp_path / "events.jsonl"
+    forget_after(path, 0)
+    assert not path.exists()
+    log = EventLog(path)
+    log.append(event(1))
+    size = log.size
+    log.append(event(2))
+    log.close()
+    for asked in (10**6, size, size):
+        forget_after(path, asked)
+    assert [line["snapshot"] for line in lines(path)] == ["00001"] and path.stat().st_size == size
+    (tmp_path / "empty").touch()
+    forget_after(tmp_path / "empty", 5)  # a new one was begun
+    assert not (tmp_path / "empty").stat().st_size

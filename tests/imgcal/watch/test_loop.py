@@ -84,7 +84,7 @@ def test_the_state_is_saved_once_a_second_with_how_far_the_source_is(tmp_path, m
     with Watch(keeper, tmp_path) as loop, Intake(Slow(*(k / 10 for k in range(10))), RIG) as intake:
         loop.run(intake, threading.Event())
     assert 3 <= len(keeper.saves) <= 10 and keeper.saves[-1] == 10
-    assert Progress.load(tmp_path) == Progress(0.9)
+    assert Progress.load(tmp_path) == Progress(0.9, logged=(tmp_path / "events.jsonl").stat().st_size)
 
 
 def test_a_start_goes_on_after_the_last_snapshot_that_the_state_knows(tmp_path):
@@ -93,11 +93,11 @@ def test_a_start_goes_on_after_the_last_snapshot_that_the_state_knows(tmp_path):
         for number in range(2):
             loop.take(snapshot(float(number), str(number)))
         loop.save()
-    assert Progress.load(tmp_path) == Progress(1.0, "1") == saved[-1]
+    assert Progress.load(tmp_path) == Progress(1.0, "1", 0) == saved[-1]
     keeper.disk_full = True  # as where the process is killed before the state is written
     with Watch(keeper, tmp_path, saved=saved.append) as loop:
         loop.take(snapshot(2.0, "2"))
-    assert Progress.load(tmp_path) == Progress(1.0, "1") == saved[-1]
+    assert Progress.load(tmp_path) == Progress(1.0, "1", 0) == saved[-1]
     assert json.loads((tmp_path / "state.json").read_text())["number"] == 2
 
 

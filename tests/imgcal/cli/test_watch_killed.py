@@ -1,0 +1,137 @@
+"""A recording is watched, the process killed in the midst, the same command given again: nothing is lost or doubled."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from imgcal.cli.main import main
+from imgcal.io import load_rig, save_rig
+from imgcal.watch import Progress
+from tests.imgcal.streams import Stream
+
+SNAPSHOTS, BUMPED_AT = 48, 20
+
+DYING = """
+import os, signal, sys
+from imgcal.cli.main import run
+from imgcal.io import atomic
+from imgcal.watch import event_log, loop
+
+moment, number = sys.argv.pop(1).split(":")
+loop.SAVED_EVERY = 0.0
+left = [int(number)]
+
+def passed():
+    left[0] -= 1
+    if not left[0]:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+def before(owner, name, counts):
+    whole = getattr(owner, name)
+    def dying(*given):
+        if counts(*given):
+            passed()
+        return whole(*given)
+    setattr(owner, name, dying)
+
+def after(owner, name, counts):
+    whole = getattr(owner, name)
+    def dying(*given):
+        result = whole(*given)
+        if counts(*given):
+            passed()
+        return result
+    setattr(owner, name, dying)
+
+if moment == "learnt":  # the state of a while ago is what is there
+    loop.SAVED_EVERY = 0.3
+    after(loop.Watch, "take", lambda self, snapshot: True)
+elif moment == "told":
+    after(event_log.EventLog, "append", lambda self, event: event.kind == "moved")
+elif moment == "saving":  # the new state is written beside the old one, and has not taken its place
+    before(atomic.os, "replace", lambda source, target: str(target).endswith("state.json"))
+run()
+"""
+
+
+@pytest.fixture(scope="module")
+def blobs(tmp_path_factory):
+    """Lines of JSON of all snapshots; the second camera is turned by 0.3 degrees on the way."""
+    stream = Stream("T4", "asymmetric8", SNAPSHOTS, seed=3)
+    bumped = stream.bumped([1], turn_deg=0.3)
+    path = tmp_path_factory.mktemp("blobs") / "blobs.ndjson"
+    with open(path, "w") as file:
+        for s in range(SNAPSHOTS):
+            found, _ = stream.blobs(s, bumped if s >= BUMPED_AT else stream.true)
+            for camera, name in enumerate(stream.rig.camera_names):
+                uv = found.uv[found.camera == camera].tolist()
+                line = {"camera": name, "time": 1e9 + s / 60, "uv": uv, "sigma": 0.07}
+                file.write(json.dumps(line) + "\n")
+    return "-", path, ["--rig", "T4", "--object", "asymmetric8"]
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    """Frames of a capture in a folder, whose time stamps are those of the files."""
+    folder = tmp_path_factory.mktemp("frames")
+    save_rig(load_rig("T4").resized(torch.tensor([512, 272])), folder / "rig.yaml")
+    known = ["--rig", str(folder / "rig.yaml"), "--object", "asymmetric8"]
+    made = [*known, "--out", str(folder / "capture"), "--snapshots", "8", "--kappa", "0.002", "--no-clutter"]
+    assert main(["simulate", *made]) == 0
+    for path in (folder / "capture" / "frames").glob("*/*"):
+        os.utime(path, (1e9 + int(path.stem) / 5,) * 2)
+    return str(folder / "capture"), None, [*known, "--until-idle", "0.5"]
+
+
+def watch(given, out, *, killed=None, piped=False):
+    """Run the command in a process of its own."""
+    source, stdin, options = given
+    code = [sys.executable, "-m", "imgcal"] if killed is None else [sys.executable, "-c", DYING, killed]
+    options = [*options, "--out", str(out), *(["--keep-all"] if piped else [])]
+    with open(os.devnull if stdin is None else stdin, "rb") as file:
+        fed = {"input": file.read()} if piped else {"stdin": file}
+        done = subprocess.run(
+            [*code, "watch", source, *options], capture_output=True, timeout=600, **fed,
+            env=os.environ | {"PYTHONPATH": str(Path.cwd())},
+        )  # fmt: skip
+    assert done.returncode == (0 if killed is None else -signal.SIGKILL), done.stderr.decode()
+    return done.stdout.decode()
+
+
+def events(out):
+    told = [json.loads(line) for line in (out / "events.jsonl").read_text().splitlines()]
+    return [event for event in told if "started again" not in event["message"]]
+
+
+def assert_same(out, whole, snapshots):
+    state = json.loads((out / "state.json").read_text())
+    assert int(state["snapshot"]) == snapshots - 1
+    assert events(out) == events(whole)
+    assert (out / "rig.yaml").read_bytes() == (whole / "rig.yaml").read_bytes()
+
+
+@pytest.mark.parametrize("piped", [False, True], ids=["file", "pipe"])
+def test_blobs_in_lines(blobs, piped, tmp_path):
+    watch(blobs, tmp_path / "whole", piped=piped)
+    assert {event["camera"] for event in events(tmp_path / "whole") if event["event"] == "moved"} == {"cam02"}
+    out = tmp_path / "out"
+    for moment in ("learnt:7", "told:1", "saving:2"):
+        watch(blobs, out, killed=moment, piped=piped)
+    assert Progress.load(out).time < 1e9 + (SNAPSHOTS - 2) / 60
+    assert f"{SNAPSHOTS} snapshots" not in watch(blobs, out, piped=piped)  # it went on
+    assert_same(out, tmp_path / "whole", SNAPSHOTS)
+
+
+def test_frames_in_a_folder(frames, tmp_path):
+    watch(frames, tmp_path / "whole")
+    for moment in ("learnt:3", "saving:2"):
+        watch(frames, tmp_path / "out", killed=moment)
+    watch(frames, tmp_path / "out")
+    assert_same(tmp_path / "out", tmp_path / "whole", 8)
+    assert "all 8 snapshots" in watch(frames, tmp_path / "out")
