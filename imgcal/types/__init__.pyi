@@ -3,6 +3,7 @@ from .calibration_object import CalibrationObject, Symmetry
 from .limits import BLOB_RADIUS, FIDUCIAL_RADIUS, MOST_PIXELS, SIGMA, Range, check_object, check_observations, check_rig
 from .moved_camera import Kind, MovedCamera, MovedError
 from .observations import UNUSABLE, BlobFlag, BlobKind, Detections, Observations
+from .packing import pack21, unpack18, unpack21
 from .placement import CROP_MARGIN, PATCH_SIZE, CropPlacement
 from .prediction import Prediction, Views
 from .rig import (
@@ -12,10 +13,7 @@ from .rig import (
     CameraRig,
     DriftRate,
     RigPrior,
-    pack21,
     parameter_names,
-    unpack18,
-    unpack21,
 )
 from .sameness import object_difference, rig_difference
 from .volume import Volume

@@ -8,8 +8,8 @@ from imgcal.geometry.transforms import RigidTransform
 from imgcal.io import load_object, load_rig
 from imgcal.networks.parameterization import POSE_SHIFT, Parameterization
 from imgcal.synthesis.rigs import RelativeDrift, synthesize
+from imgcal.types.packing import pack18, pack21
 from imgcal.types.prediction import Prediction
-from imgcal.types.rig import pack18, pack21
 from tests.imgcal.lensed import KINDS, lensed
 
 DRIFT = RelativeDrift(0.03, 0.03)

@@ -27,8 +27,9 @@ from imgcal.training.losses import (
     principal_point_shift,
     reprojection_rmse,
 )
+from imgcal.types.packing import pack21
 from imgcal.types.prediction import Prediction
-from imgcal.types.rig import PARAMETERS, pack21
+from imgcal.types.rig import PARAMETERS
 from tests.imgcal.lensed import KINDS, lensed
 
 B, C, N = 3, 10, 8

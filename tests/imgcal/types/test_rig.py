@@ -1,4 +1,4 @@
-"""`CameraRig`: packings, moves, resizing, selections."""
+"""`CameraRig`: moves, resizing, selections."""
 
 from dataclasses import replace
 
@@ -14,11 +14,8 @@ from imgcal.types.rig import (
     PARAMETERS,
     CameraRig,
     RigPrior,
-    pack18,
-    pack21,
-    unpack18,
-    unpack21,
 )
+from tests.imgcal.types.same_rig import assert_same
 
 SHAPES = [(), (1,), (2, 3), (10,)]  # the last one has as many rigs as cameras
 
@@ -27,37 +24,10 @@ def drifted(rig: CameraRig, *batch: int, seed: int = 0) -> CameraRig:
     return PhysicalDrift(rotation_deg=3).apply(rig, torch.Generator().manual_seed(seed), *batch)
 
 
-def assert_same(first: CameraRig, second: CameraRig) -> None:
-    torch.testing.assert_close(first.focal_length, second.focal_length)
-    torch.testing.assert_close(first.principal_point, second.principal_point)
-    torch.testing.assert_close(first.distortion, second.distortion)
-    torch.testing.assert_close(first.cam_from_rig.rotation, second.cam_from_rig.rotation)
-    torch.testing.assert_close(first.cam_from_rig.translation, second.cam_from_rig.translation)
-
-
 def poses(*batch: int) -> RigidTransform:
     count = torch.Size(batch).numel()
     centroid = torch.zeros(3, dtype=torch.float64)
     return sample_rig_from_object(count, 850.0, centroid, PoseRange(), torch.Generator().manual_seed(5)).reshape(*batch)
-
-
-@pytest.mark.parametrize("batch", SHAPES)
-def test_packings_round_trip(o10: CameraRig, batch: tuple[int, ...]) -> None:
-    rig = drifted(o10, *batch).from_object(poses(*batch))
-    packed21, packed18 = pack21(rig), pack18(rig)
-    assert packed21.shape == (*batch, 10, 21)
-    assert packed18.shape == (*batch, 10, 18)
-    assert_same(unpack21(packed21, o10), rig)
-    assert_same(unpack18(packed18, o10), rig)
-
-
-def test_packing_follows_the_paper(o10: CameraRig) -> None:
-    packed = pack21(o10)[3]
-    torch.testing.assert_close(packed[:9], o10.cam_from_rig.rotation[3].reshape(9))
-    torch.testing.assert_close(packed[9:12], o10.cam_from_rig.translation[3])
-    torch.testing.assert_close(packed[12:14], o10.focal_length[3])
-    torch.testing.assert_close(packed[14:16], o10.principal_point[3])
-    torch.testing.assert_close(packed[16:], o10.distortion[3])
 
 
 @pytest.mark.parametrize("batch", SHAPES)
