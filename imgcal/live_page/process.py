@@ -13,6 +13,7 @@ from typing import Any
 import uvicorn
 
 from imgcal.live_page.board import Board
+from imgcal.live_page.connections import MOST_CONNECTIONS, Connection
 from imgcal.live_page.security import Gate
 from imgcal.live_page.server import Application
 from imgcal.live_page.wire import read_message
@@ -20,7 +21,6 @@ from imgcal.messages import shortened
 
 POLITE = 5  # how much rather the loop runs than this
 GUIDANCE_SECONDS = 3.0  # rest between two computations, and twice as long as the last one took
-MOST_CONNECTIONS = 256
 MOST_HEADERS = 16384  # bytes
 BUFFER = 1 << 20
 
@@ -53,8 +53,8 @@ async def _serve(listening: socket.socket, pipe: socket.socket) -> None:
     application = Application(board, Gate(greeting["address"], greeting["token"]), guide.rig_yaml, tell)
     server = uvicorn.Server(
         uvicorn.Config(
-            application, http="h11", ws="none", lifespan="off", interface="asgi3", access_log=False,
-            log_level="error", server_header=False, proxy_headers=False, limit_concurrency=MOST_CONNECTIONS,
+            application, http=Connection, ws="none", lifespan="off", interface="asgi3", access_log=False,
+            log_level="error", server_header=False, proxy_headers=False, limit_concurrency=2 * MOST_CONNECTIONS,
             h11_max_incomplete_event_size=MOST_HEADERS, timeout_graceful_shutdown=1, loop="asyncio",
         )
     )  # fmt: skip
