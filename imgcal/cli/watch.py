@@ -38,6 +38,7 @@ from imgcal.watch import (
     Hook,
     Intake,
     JsonLines,
+    Known,
     Metrics,
     Progress,
     Source,
@@ -85,7 +86,7 @@ class Watch:
     fresh: bool = False  #: forget what an earlier run left in OUT, begin from the factory rig
     tolerance: float = Timing.tolerance  #: s that the time stamps of one snapshot may be apart
     patience: float = Timing.patience  #: s that a camera is waited for
-    keep_all: bool = False  #: drop no snapshot where they come faster than they are worked on: for recordings in pipes
+    keep_all: bool = False  #: drop no snapshot where they come faster than worked on: for recordings that come live
     rate: float | None = None  #: snapshots a second of a table of blobs (30)
     topic: tuple[str, ...] = ()  #: CAMERA=TOPIC of a recording, where the topic does not name the camera
     videos_differ: bool = False  #: accept videos whose lengths or time stamps differ: frames go together by time
@@ -108,11 +109,12 @@ class Watch:
     def _watch(self, rig: CameraRig, obj: CalibrationObject, folder: Path) -> None:
         with _going_on():
             progress = None if self.fresh else Progress.load(folder)
-        source = self._source(rig, obj, progress)
+        source, origin = self._source(rig, obj, progress), self._origin()
+        rate = source.rate if isinstance(source, BlobTable) else None
         goes_on = source.live and not self.keep_all  # what came since the last state is gone
         knows = goes_on or isinstance(source, Folder)  # a folder knows which files have been read
-        after = None if progress is None or knows else progress.time
-        intake = Intake(source, rig, Timing(self.tolerance, self.patience), self.keep_all, after=after)
+        known = None if progress is None or knows else self._known(folder, progress, source)
+        intake = Intake(source, rig, Timing(self.tolerance, self.patience), self.keep_all, known=known)
         hook = None if self.hook is None else Hook(self.hook)
         display = Display(Console(file=sys.stdout, soft_wrap=True), intake)
         with contextlib.ExitStack() as stack:
@@ -125,11 +127,15 @@ class Watch:
 
                 page = stack.enter_context(LivePage(rig, obj, parse_address(self.serve), problem=display.warn))
                 print(page.notice)
-            loop = Loop(keeper, folder, hook, page, display.tell, display.warn, _removing(source))
+            loop = Loop(
+                keeper, folder, hook, page, display.tell, display.warn, _removing(source), source=origin, rate=rate
+            )
             if self.metrics is not None:
                 stack.enter_context(Metrics(loop.tally, intake, hook, metrics_address(self.metrics)))
             told = 0 if not restored else None if progress is None else progress.logged
-            if not (goes_on or self.fresh or told is None):  # what came after will come again
+            if not (
+                goes_on or self.fresh or told is None or self._is_another(progress)
+            ):  # what came after will come again
                 forget_after(folder / EVENTS, told)
             stack.enter_context(loop)
             stopped = stack.enter_context(_stopping())
@@ -141,13 +147,33 @@ class Watch:
         said = display.result(self.out / CURRENT)
         if stopped.interrupted:
             raise KeyboardInterrupt(f"interrupted after {said}; the same command goes on from there")
-        known = intake.known_before + (source.known_before() if isinstance(source, Folder) else 0)
-        if tally.snapshots == 0 and known:
-            read = f"all {known:,} snapshots of {self.input} had been read before"
+        before = intake.known_before + (source.known_before() if isinstance(source, Folder) else 0)
+        if tally.snapshots == 0 and before:
+            read = f"all {before:,} snapshots of {self.input} had been read before"
             said = f"{read}; --fresh begins from the factory rig | {said}"
         elif tally.latest is None or tally.learnt == 0:
             raise RefusedError(_nothing(tally, intake))
+        elif before:
+            said = f"{said} | {before:,} had been read before"
         print(said)
+
+    def _origin(self) -> str:
+        """Which source it is, wherever the command is run."""
+        return self.input if self.input == "-" or "://" in self.input else str(Path(self.input).resolve())
+
+    def _is_another(self, progress: Progress | None) -> bool:
+        """Whether INPUT is another one than before; what a version noted that did not note it is taken for the same."""
+        return progress is not None and progress.source not in (None, self._origin())
+
+    def _known(self, folder: Path, progress: Progress, source: Source) -> Known:
+        """How far an earlier run has worked on this recording, or that it was another one."""
+        another = self._is_another(progress)
+        rate = source.rate if isinstance(source, BlobTable) else None
+        if not another and rate is not None and progress.rate not in (None, rate):
+            expected = f"{progress.rate:g} as in {folder / STATE}"
+            raise InputError(f"--rate: found {rate:g}, expected {expected}; --fresh begins anew")
+        gone = isinstance(source, BlobTable) and progress.name not in source.blobs.snapshot_names
+        return Known(progress.time, None if gone else progress.name, another)
 
     def _source(self, rig: CameraRig, obj: CalibrationObject, progress: Progress | None) -> Source:
         """Find out what INPUT is."""
@@ -165,7 +191,7 @@ class Watch:
             return Bag(path, rig, _topics(self.topic))
         if path.is_dir() and not holds_videos(path):
             self._check_options("a folder of frames")
-            name = None if progress is None else progress.name
+            name = None if progress is None or self._is_another(progress) else progress.name
             return Folder(path, rig, self.remove, name, self.until_idle)
         if path.is_dir():
             self._check_options("a folder of videos")

@@ -3,7 +3,7 @@ from .event_log import EventLog, forget_after
 from .exposures import CameraBlobs, Exposure, Item, Source, Unreadable, checked
 from .folder import Folder
 from .hook import Hook
-from .intake import Intake
+from .intake import Intake, Known
 from .json_lines import JsonLines
 from .loop import EVENTS, STATE, Keeper, Page, Progress, Watch
 from .metrics import Metrics, Tally
@@ -28,6 +28,7 @@ __all__ = [
     "Item",
     "JsonLines",
     "Keeper",
+    "Known",
     "Metrics",
     "Page",
     "Progress",

@@ -6,6 +6,7 @@ import contextlib
 import threading
 import time
 from collections import Counter, deque
+from dataclasses import dataclass
 from types import TracebackType
 
 from imgcal.errors import InputError
@@ -23,6 +24,37 @@ WOKEN = 0.2  # s
 LONGEST_OPENING = 10.0  # s
 
 
+@dataclass(frozen=True)
+class Known:
+    """How far an earlier run has worked on a recording."""
+
+    time: float  # s, of the last snapshot
+    name: str | None = None  # of it, where the recording names snapshots
+    another: bool = False  # that was another recording: all of this one must be later
+
+    def includes(self, snapshot: TimedSnapshot) -> bool:
+        """Tell whether a snapshot has been worked on: all up to the one of that name, or else of that time.
+
+        Raises:
+            InputError: it is of another recording, and not later.
+        """
+        if self.another:
+            if snapshot.time > self.time:
+                return False
+            raise InputError(
+                f"found a recording that is not the one before, and begins at {snapshot.time:.9g} s, expected one "
+                f"after {self.time:.9g} s; --fresh begins anew"
+            )
+        return self._is_named(snapshot) or snapshot.time <= self.time
+
+    def ends_with(self, snapshot: TimedSnapshot) -> bool:
+        """Tell whether this is the last one that has been worked on."""
+        return self._is_named(snapshot) and snapshot.name == self.name
+
+    def _is_named(self, snapshot: TimedSnapshot) -> bool:
+        return self.name is not None and snapshot.name is not None
+
+
 class Intake:
     """Snapshots of a source as they become complete. A context manager: leaving it ends the thread.
 
@@ -36,7 +68,7 @@ class Intake:
         timing: Timing = Timing(),
         keep_all: bool = False,
         waiting: int = MOST_WAITING,
-        after: float | None = None,
+        known: Known | None = None,
     ) -> None:
         """Prepare to read.
 
@@ -46,7 +78,7 @@ class Intake:
             timing: when they belong together.
             keep_all: drop nothing, even if the source is live: it is taken for a recording.
             waiting: most snapshots that wait.
-            after: s, time of the last snapshot of a recording that an earlier run has worked on; None = none.
+            known: how far an earlier run has worked on this recording; None = not at all.
         """
         self.synchronizer = Synchronizer(rig.camera_names, timing)
         self.dropped = 0
@@ -58,7 +90,7 @@ class Intake:
         self.known_before = 0
         """Snapshots of a recording that an earlier run has worked on."""
         self._source, self._rig, self._most, self._keep_all = source, rig, waiting, keep_all
-        self._after = after
+        self._known = known
         self._snapshots: deque[TimedSnapshot] = deque()
         self._bytes = 0
         self._changed = threading.Condition()
@@ -167,9 +199,13 @@ class Intake:
         self.reasons.append(one_line(item.reason))
 
     def _put(self, snapshot: TimedSnapshot) -> None:
-        if self._after is not None and snapshot.time <= self._after:
-            self.known_before += 1
-            return
+        if self._known is not None:
+            included = self._known.includes(snapshot)
+            self.known_before += included
+            if not included or self._known.ends_with(snapshot):
+                self._known = None  # what comes from now on is new
+            if included:
+                return
         with self._changed:
             while not self.live and len(self._snapshots) >= self._most and not self._closing:
                 self._changed.wait(WOKEN)

@@ -77,6 +77,8 @@ class Progress:
     time: float  # s, of the last snapshot
     name: str | None = None  # of it, where its source names snapshots
     logged: int | None = None  # bytes of events.jsonl until then
+    source: str | None = None  # which one it was; None = not known
+    rate: float | None = None  # snapshots a second, of a source that has no times
 
     @classmethod
     def load(cls, folder: Path) -> Progress | None:
@@ -93,11 +95,14 @@ class Progress:
             if entry is None:
                 return None
             time, name, logged = float(entry["time"]), entry["name"], entry.get("logged")
-            if not (name is None or isinstance(name, str)) or not (logged is None or isinstance(logged, int)):
-                raise ValueError("the name is no text, or the length no number")
+            source, rate = entry.get("source"), entry.get("rate")
+            if not all(text is None or isinstance(text, str) for text in (name, source)):
+                raise ValueError("a name is no text")
+            if not (logged is None or isinstance(logged, int)):
+                raise ValueError("the length is no number")
+            return cls(time, name, logged, source, None if rate is None else float(rate))
         except (ValueError, TypeError, KeyError, OverflowError) as error:
             raise InputError(f"{path}: found something else than imgcal watch writes there") from error
-        return cls(time, name, logged)
 
 
 class Watch:
@@ -115,6 +120,8 @@ class Watch:
         told: Callable[[Event], None] = lambda event: None,
         problem: Callable[[str], None] = lambda message: None,
         saved: Callable[[Progress], None] = lambda progress: None,
+        source: str | None = None,
+        rate: float | None = None,
     ) -> None:
         """Prepare; nothing is written before it is entered.
 
@@ -126,11 +133,13 @@ class Watch:
             told: gets every event.
             problem: gets what could not be written, once, and what people ask for in vain.
             saved: gets how far the source has been worked on, once what it taught until then has been written.
+            source: which source it is.
+            rate: snapshots a second, of a source that has no times.
         """
         self.keeper, self.folder, self.tally = keeper, folder, Tally()
         self.paused = False
         self._hook, self._page, self._told, self._problem = hook, page, told, problem
-        self._when_saved = saved
+        self._when_saved, self._source, self._rate = saved, source, rate
         self._saved = time.monotonic()
         self._progress: Progress | None = None
         self._unsaved = False
@@ -197,7 +206,8 @@ class Watch:
         self.tally.latest = state
         for exposure in snapshot.exposures.values():
             self.tally.stamped(exposure.camera, exposure.time - snapshot.time)
-        self._progress, self._unsaved = Progress(snapshot.time, snapshot.name), True
+        self._progress = Progress(snapshot.time, snapshot.name, source=self._source, rate=self._rate)
+        self._unsaved = True
         for event in state.events:
             self.tell(event)
         if self._page is not None:

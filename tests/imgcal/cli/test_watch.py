@@ -229,6 +229,25 @@ def test_what_is_known_of_another_rig_or_object_is_not_gone_on_with(given, messa
     assert error.endswith("; --fresh begins anew\n") and error.count("\n") == 1
 
 
+def test_a_recording_is_gone_on_with_by_its_names_and_rate_and_another_one_is_not_taken_for_it(blobs, tmp_path, capsys):
+    save_detections(blobs.of_snapshots(0, 4), tmp_path / "first.csv")
+    save_detections(blobs.of_snapshots(0, 6), tmp_path / "second.csv")
+    out = tmp_path / "out"
+    assert watch(tmp_path / "first.csv", out) == 0
+    progress = json.loads((out / "state.json").read_text())["progress"]
+    expected = {"time": 0.1, "name": "003", "source": str(tmp_path / "first.csv"), "rate": 30.0}
+    assert progress == expected | {"logged": 0}
+    (tmp_path / "second.csv").replace(tmp_path / "first.csv")  # it has grown
+    capsys.readouterr()
+    assert watch(tmp_path / "first.csv", out, "--rate", "60") == 2
+    assert f"--rate: found 60, expected 30 as in {out}/state.json; --fresh" in capsys.readouterr().err
+    assert watch(tmp_path / "first.csv", out) == 0
+    assert "2 snapshots, 1 events" in (said := capsys.readouterr().out) and "| 4 had been read before" in said
+    save_detections(blobs.of_snapshots(0, 6), tmp_path / "second.csv")
+    assert watch(tmp_path / "second.csv", out) == 2
+    assert "not the one before, and begins at 0 s, expected one after" in capsys.readouterr().err
+
+
 def test_a_rig_that_was_accepted_as_factory_is_gone_on_with_by_the_file_it_began_with(known, tmp_path, capsys):
     with RigKeeper.restore(known / "out" / "state.json") as keeper:
         keeper.accept_as_factory()

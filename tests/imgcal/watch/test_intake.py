@@ -8,7 +8,7 @@ from imgcal.errors import InputError
 from imgcal.io import load_rig
 from imgcal.watch import intake as module
 from imgcal.watch.exposures import CameraBlobs, Exposure, Unreadable
-from imgcal.watch.intake import Intake
+from imgcal.watch.intake import Intake, Known
 from imgcal.watch.synchronization import Timing
 
 PAIR = load_rig("T4").select([0, 1])
@@ -121,3 +121,25 @@ def test_leaving_ends_a_source_that_would_go_on_for_ever():
     with Intake(source, PAIR) as intake:
         intake.next(1.0)
     assert source.closed and not intake._thread.is_alive()
+
+
+@pytest.mark.parametrize(
+    ("known", "new", "before"),
+    [
+        (Known(2.0), ["c"], 2),
+        (Known(99.0, "b"), ["c"], 2),  # other times, as after another rate: names tell
+        (Known(0.5, another=True), ["z", "b", "c"], 0),
+    ],
+)
+def test_what_an_earlier_run_has_worked_on_is_left_out(known, new, before):
+    items = [Exposure(c, t, NOTHING, n) for t, n in ((1.0, "z"), (2.0, "b"), (3.0, "c")) for c in PAIR.camera_names]
+    with Intake(Given(items, live=False), PAIR, known=known) as intake:
+        found = taken(intake)
+    assert [snapshot.name for snapshot in found] == new and intake.known_before == before
+
+
+def test_another_recording_that_is_not_later_is_refused():
+    items = [Exposure(camera, 1.0, NOTHING, "a") for camera in PAIR.camera_names]
+    refused = pytest.raises(InputError, match="begins at 1 s, expected one after 5 s; --fresh begins anew")
+    with refused, Intake(Given(items, live=False), PAIR, known=Known(5.0, "a", another=True)) as intake:
+        intake.next(5.0)
