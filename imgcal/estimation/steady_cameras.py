@@ -98,6 +98,11 @@ class Gauge:
         )
         return self._root(covariance.diagonal())
 
+    def spread(self, rig: CameraRig, covariance: Tensor) -> Tensor:
+        """One standard deviation of the difference of a rig whose cameras have a covariance (K C, K C): (C, K)."""
+        jacobian = self.jacobian(rig)
+        return self._root((jacobian @ covariance * jacobian).sum(-1))
+
     def prior_std(self, factory: CameraRig, std: Tensor) -> Tensor:
         """The same before the data, of independent standard deviations (C, K): (C, K)."""
         return self._root(self.jacobian(factory).square() @ std.double().flatten().square())

@@ -33,7 +33,7 @@ def compare(content: dict[str, Any]) -> tuple[CameraRig, NDArray[np.float64]]:
 
 def look(
     content: dict[str, Any], points_object: NDArray[np.float64], volume: WorkingVolume
-) -> tuple[dict[str, Any], NDArray[np.float64]]:
+) -> tuple[dict[str, Any], CameraRig, Tensor]:
     """Compute what the page says of the volume.
 
     Args:
@@ -42,14 +42,16 @@ def look(
         volume: where the object is seen.
 
     Returns:
-        Plain values for the page; one standard deviation of each camera's change against the factory (C, 15).
+        Plain values for the page; the rig of this belief, and one standard deviation of each camera's change against
+        the factory (C, K).
 
     Raises:
         RefusedError: the information is singular.
+        torch.linalg.LinAlgError: so is a determinant's matrix.
     """
     belief, factory, turn = pickle.loads(content["pickled"])
     rig, covariance = belief.rig, belief.covariance()
-    std = change_std(rig, factory, covariance)
+    std = Gauge.of_most(rig, factory).spread(rig, covariance)
     few = rig.num_cameras <= FEW_CAMERAS
     grid = volume.grid(FINE if few else COARSE)
     points = grid.flatten(0, -2)
@@ -74,14 +76,7 @@ def look(
         "gain": rounded(gain.numpy(), 3),
         "best": best if float(gain[best]) > 0 else None,
     }
-    return advice, std.numpy()
-
-
-def change_std(rig: CameraRig, factory: CameraRig, covariance: Tensor) -> Tensor:
-    """One standard deviation of each camera's change against the factory, as most cameras see it: (C, 15)."""
-    jacobian = Gauge.of_most(rig, factory).jacobian(factory)
-    variance = ((jacobian @ covariance) * jacobian).sum(-1)
-    return variance.clamp_min(0).sqrt().unflatten(0, (rig.num_cameras, -1))
+    return advice, rig, std
 
 
 def information_gain(belief: RigBelief, covariance: Tensor, places: Tensor, shape: Tensor, sigma: float) -> Tensor:

@@ -7,6 +7,7 @@ import contextlib
 import json
 import os
 import socket
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -44,12 +45,13 @@ async def _serve(listening: socket.socket, pipe: socket.socket) -> None:
         _, greeting = await read_message(reader)
     except asyncio.IncompleteReadError:
         return
-    board, guide = Board(greeting), Guide(greeting)
+    board = Board(greeting)
 
     def tell(content: dict[str, Any]) -> None:
         if not writer.is_closing():  # the loop may have ended
             writer.write(json.dumps(content).encode() + b"\n")
 
+    guide = Guide(greeting, tell)
     application = Application(board, Gate(greeting["address"], greeting["token"]), guide.rig_yaml, tell)
     server = uvicorn.Server(
         uvicorn.Config(
@@ -78,14 +80,14 @@ async def _serve(listening: socket.socket, pipe: socket.socket) -> None:
 class Guide:
     """Computes what follows from rigs and beliefs beside the server; what comes while it computes is passed over."""
 
-    def __init__(self, greeting: dict[str, Any]) -> None:
-        """Begin with what the loop's process said first."""
-        self._greeting = greeting
+    def __init__(self, greeting: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> None:
+        """Begin with what the loop's process said first, and what passes an object on to it."""
+        self._greeting, self._tell = greeting, tell
         self._pool = ThreadPoolExecutor(2, initializer=_of_one_thread)
         self._waiting: dict[str, dict[str, Any]] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
-        self._rig: Any = None
-        self._std: Any = None
+        self._rig: Any = None  # the latest
+        self._known: Any = None  # the latest whose deviations are known, with these: of one moment
 
     def learn(self, kind: str, content: dict[str, Any], application: Application) -> None:
         """Take a rig or a belief, and have the viewers told what follows from it."""
@@ -95,19 +97,27 @@ class Guide:
             self._tasks[kind] = asyncio.get_running_loop().create_task(work(application))
 
     async def _compare(self, application: Application) -> None:
-        loop = asyncio.get_running_loop()
         while "rig" in self._waiting:
-            found = await loop.run_in_executor(self._pool, self._compared, self._waiting.pop("rig"))
-            application.spread(application.board.take_change(*found))
+            found = await self._computed("rig", self._compared)
+            if found is not None:
+                application.spread(application.board.take_change(*found))
 
     async def _look(self, application: Application) -> None:
         loop = asyncio.get_running_loop()
         while "belief" in self._waiting:
             begun = loop.time()
-            found = await loop.run_in_executor(self._pool, self._looked, self._waiting.pop("belief"))
+            found = await self._computed("belief", self._looked)
             if found is not None:
                 application.spread(application.board.take_advice(*found))
             await asyncio.sleep(max(GUIDANCE_SECONDS, 2 * (loop.time() - begun)))
+
+    async def _computed(self, kind: str, work: Callable[[dict[str, Any]], Any]) -> Any:
+        """Compute what follows from the latest of a kind, in a thread; None = nothing can be said of it."""
+        try:
+            return await asyncio.get_running_loop().run_in_executor(self._pool, work, self._waiting.pop(kind))
+        except Exception as error:  # the next one may do
+            self._tell({"problem": kind, "why": shortened(repr(error))})
+            return None
 
     def _compared(self, content: dict[str, Any]) -> Any:
         from imgcal.live_page.arrangement import arrangement
@@ -118,14 +128,17 @@ class Guide:
         return content["time"], layout, change, self._rig.focal_length.numpy()
 
     def _looked(self, content: dict[str, Any]) -> Any:
+        from torch.linalg import LinAlgError
+
         from imgcal.errors import RefusedError
         from imgcal.live_page.guidance import look
 
         try:
-            advice, self._std = look(content, self._greeting["points"], self._volume())
-        except RefusedError:  # nothing can be said yet
+            advice, rig, std = look(content, self._greeting["points"], self._volume())
+        except (RefusedError, LinAlgError):  # nothing can be said yet
             return None
-        return advice, self._std
+        self._known = rig, std
+        return advice, std.numpy()
 
     def _volume(self) -> Any:
         import torch
@@ -135,15 +148,13 @@ class Guide:
         return WorkingVolume(*(torch.as_tensor(corner) for corner in self._greeting["volume"]))
 
     def rig_yaml(self) -> str | None:
-        """The present rig as a rig file, with its deviations where they are known; None before the first snapshot."""
-        if self._rig is None:
+        """The rig as a rig file, of the latest moment of which its deviations are known; None before any snapshot."""
+        rig, std = (self._rig, None) if self._known is None else self._known
+        if rig is None:
             return None
-        import torch
-
         from imgcal.io import RigCovariance, rig_text
 
-        std = None if self._std is None else RigCovariance(torch.as_tensor(self._std))
-        return rig_text(self._rig, covariance=std)
+        return rig_text(rig, covariance=None if std is None else RigCovariance(std))
 
 
 def _of_one_thread() -> None:

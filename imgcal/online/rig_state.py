@@ -73,6 +73,4 @@ class RigState:
     @cached_property
     def std(self) -> Tensor:
         """One standard deviation of `moved`, and so of the cameras against most of the others: (C, K)."""
-        jacobian = self.gauge.jacobian(self.rig)
-        spread = (jacobian @ self.belief.covariance() * jacobian).sum(1)
-        return spread.clamp_min(0).sqrt().unflatten(0, (-1, self.rig.num_parameters))
+        return self.gauge.spread(self.rig, self.belief.covariance())
