@@ -1,6 +1,7 @@
 import json
+from pathlib import Path
 
-from imgcal.online import Event
+from imgcal.online import EVENT_KINDS, Event
 
 
 def test_an_event_is_one_line_with_its_times_in_words() -> None:
@@ -29,3 +30,9 @@ def test_a_number_that_is_none_is_null():
     line = json.loads(event.to_json())
     assert (line["since"], line["size"], line["sigma"], line["evidence"]) == (None, None, None, 2.0)
     assert json.loads(Event(float("nan"), 1, "moved").to_json())["time"] is None
+
+
+def test_the_documents_name_every_event():
+    text = (Path(__file__).parents[3] / "docs" / "live.md").read_text()
+    told = text.partition("Events: ")[2].partition("`keeper.save(path)`")[0]
+    assert [kind for kind in EVENT_KINDS if f"`{kind}`" not in told] == []

@@ -1,5 +1,9 @@
 """What a state says of motion: a motion of the whole rig is none, and its standard deviation is of the same thing."""
 
+import re
+from pathlib import Path
+from typing import get_args
+
 import numpy as np
 import torch
 
@@ -7,6 +11,7 @@ import imgcal
 from imgcal.estimation import RigBelief
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.online import RigState
+from imgcal.online.rig_state import CameraHealth
 from imgcal.types import Detections
 
 
@@ -40,3 +45,9 @@ def test_standard_deviations_leave_out_what_all_cameras_share() -> None:
     torch.testing.assert_close(made.std[:, 6:], absolute[:, 6:])
     assert (made.std[:, :6] < 1.2 * absolute[:, :6]).all()
     assert (made.std[:, :6] > 0.5 * absolute[:, :6]).all()
+
+
+def test_the_documents_and_the_class_say_what_every_state_of_a_camera_means():
+    text = (Path(__file__).parents[3] / "docs" / "live.md").read_text().partition("`state.cameras[name]`")[2]
+    rows = re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE)
+    assert set(rows) == set(get_args(CameraHealth)) and len(rows) == len(set(rows))
