@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Collection
 
+from imgcal.errors import RefusedError
+from imgcal.estimation.absorption import absorbed
+from imgcal.estimation.map_estimate import EstimationOptions
+from imgcal.estimation.open_change import let_free
 from imgcal.estimation.recent_snapshots import SCREENED, RecentSnapshots
-from imgcal.estimation.rig_changes import ChangeTest
+from imgcal.estimation.rig_belief import RigBelief
+from imgcal.estimation.rig_changes import JUMPS, ChangeTest
+from imgcal.geometry import RigidTransform
+from imgcal.types import Observations
 
 SIGNIFICANT = 60.0
 """Chi-squared (two or three degrees of freedom) that a camera which stands still exceeds once in 10^12 tests."""
@@ -17,6 +25,9 @@ REMAINING = 20.0
 """What is left of the significance without the snapshot that speaks most for a change: one wrong label is none."""
 NEARBY = 4
 """Snapshots around the most significant one among which the first one after a change is looked for."""
+
+MOST_EXCESS = 4.0
+"""Chi-squared per degree of freedom up to which a snapshot fits that is else refused."""
 
 
 def changed_before(recent: RecentSnapshots, count: int) -> int | None:
@@ -80,6 +91,26 @@ def changed_cameras(test: ChangeTest, known: dict[int, str | None]) -> tuple[dic
         camera = surest(given, free)
         free[camera], evidence[camera] = None, max(float(score[camera]) for score in given.scores().values())
     return free, evidence
+
+
+def contradicting(
+    belief: RigBelief, observations: Observations, rig_from_object: RigidTransform, options: EstimationOptions
+) -> int | None:
+    """The camera that may have moved where a snapshot is refused; None = no single one.
+
+    Args:
+        belief: what is known.
+        observations: (1, C, N) of the snapshot.
+        rig_from_object: (1,) first guess of the object's pose.
+        options: how to minimize.
+    """
+    found: dict[int, float] = {}
+    for camera in observations.seen[0].any(-1).nonzero()[:, 0].tolist():
+        with contextlib.suppress(RefusedError):
+            result = absorbed(let_free(belief, {camera: None}, JUMPS[-1]), observations, rig_from_object, options)
+            if result.chi2 <= MOST_EXCESS * max(result.dof, 1):
+                found[camera] = result.evidence
+    return max(found, key=lambda camera: found[camera], default=None)
 
 
 def _worst(test: ChangeTest, known: Collection[int]) -> float:

@@ -10,10 +10,18 @@ from types import MappingProxyType
 
 from imgcal.errors import RefusedError
 from imgcal.estimation.absorption import absorbed, joined
-from imgcal.estimation.change_search import NEARBY, changed_before, changed_cameras, likeliest_age, surest
+from imgcal.estimation.change_search import (
+    NEARBY,
+    changed_before,
+    changed_cameras,
+    contradicting,
+    likeliest_age,
+    surest,
+)
 from imgcal.estimation.clock_slip import ClockSlip
 from imgcal.estimation.drift_learning import DriftLearning
 from imgcal.estimation.drift_pace import DriftPaces
+from imgcal.estimation.held_cameras import HeldCameras
 from imgcal.estimation.object_change import ObjectChange, changed_object
 from imgcal.estimation.object_question import Misfit, never_fitted, object_explains
 from imgcal.estimation.open_change import OpenChange, let_free
@@ -21,12 +29,11 @@ from imgcal.estimation.recent_snapshots import RecentSnapshots
 from imgcal.estimation.rig_belief import Absorbed, RigBelief, aged
 from imgcal.estimation.rig_changes import CHANGES, JUMPS
 from imgcal.estimation.rig_filter import RigFilter
+from imgcal.estimation.seen_apart import without
 from imgcal.estimation.slip_question import SlipQuestion, Suspicion
 from imgcal.geometry import RigidTransform
 from imgcal.types import Observations
 
-MOST_EXCESS = 4.0
-"""Chi-squared per degree of freedom up to which a snapshot fits that is else refused."""
 FEW = 16
 """Snapshots up to which what was known before a change is too little to go by: it bends, within what it leaves open, by
 more than it says, and others would be blamed. What came before is then forgotten ..."""
@@ -63,7 +70,9 @@ class RigMonitor:
         self.open: dict[int, Change] = {}  # changes whose kind is not decided yet, by camera
         self.object_change: ObjectChange | None = None  # that became known with the latest snapshot
         self.slips: tuple[ClockSlip, ...] = ()  # that became known with the latest snapshot
+        self.apart: tuple[int, ...] = ()  # cameras of which it became known that they have moments of their own
         self._clocks = SlipQuestion()
+        self._held = HeldCameras()
         self._misfit = Misfit()
         self._recent = RecentSnapshots(rig_filter.belief, rig_filter.walk)
         self._drifting = DriftLearning(DriftPaces(rig_filter.belief.rig.num_cameras))
@@ -72,6 +81,11 @@ class RigMonitor:
         self.first = 0  # number of the first snapshot of which something is known
         self._moved_early: set[int] = set()  # cameras of which the factory knows nothing more
         self._suspect: int | None = None  # the camera without which the last snapshot would not have been refused
+
+    @property
+    def held(self) -> frozenset[int]:
+        """Cameras that see the object elsewhere than the others do; nothing is learnt of them until it is known why."""
+        return frozenset(self._held.cameras)
 
     def update(
         self,
@@ -96,9 +110,12 @@ class RigMonitor:
             RefusedError: see `absorbed`. What no minimum is found for, but for one camera, is refused once; if the next
                 snapshot says the same, that camera has moved.
         """
-        self.object_change, self.slips = None, ()
-        if moved:
-            result, changes = self._moved(moved, observations, rig_from_object, seconds)
+        self.object_change, self.slips, self.apart = None, (), ()
+        new = [camera for camera in moved if camera not in self._held.cameras]
+        if new:
+            result, changes = self._moved(new, observations, rig_from_object, seconds)
+        elif self._held.cameras:
+            result, changes = self._beside_held(observations, rig_from_object, seconds)
         else:
             result, changes = self._followed(observations, rig_from_object, seconds)
         return result.of_last(), changes
@@ -110,10 +127,11 @@ class RigMonitor:
         try:
             result = self.filter.follow(observations, rig_from_object, seconds)
         except RefusedError:
-            suspect, self._suspect = self._suspect, self._contradicting(observations, rig_from_object)
-            if suspect is None or suspect != self._suspect:
+            last, belief = self._suspect, self.filter.belief
+            self._suspect = contradicting(belief, observations, rig_from_object, self.filter.options)
+            if last is None or last != self._suspect:
                 raise
-            return self._moved((suspect,), observations, rig_from_object, seconds)
+            return self._moved((last,), observations, rig_from_object, seconds)
         self._suspect = None
         self._recent.append(result, observations, seconds)
         if self._since is not None:
@@ -143,42 +161,69 @@ class RigMonitor:
         self, cameras: Collection[int], observations: Observations, rig_from_object: RigidTransform, seconds: float
     ) -> tuple[Absorbed, tuple[Change, ...]]:
         """Learn from a snapshot before which cameras have moved, however far, or their clocks slipped."""
-        free: dict[int, str | None] = dict.fromkeys(sorted(cameras))
-        earlier, before = len(self._recent), aged(self.filter.belief, seconds, self.filter.walk)
-        snapshots = [*self._recent.snapshots(earlier), (observations, rig_from_object)]
-        try:
-            pauses = [*self._recent.pauses(earlier), seconds]
-            suspicion = Suspicion(before, snapshots, pauses, 1, free)
-            slipped = self._clocks.ask(suspicion, self.filter.count, self.filter.options, self._since is None)
-        except RefusedError:  # not yet
-            seen = observations.seen.clone()
-            seen[:, list(cameras)] = False
-            return self._followed(replace(observations, seen=seen), rig_from_object, seconds)
-        if slipped is not None:
-            self.slips = slipped.slips
-            return self._followed(*slipped.snapshots[-1], seconds)
-        told = list(self._judged(last=True))
-        if self.filter.count - self.first < FEW:
-            self.filter.count += 1
-            return self._begin_again(free, [(observations, rig_from_object)], [seconds], {}, told)
-        before = aged(self.filter.belief, seconds, self.filter.walk)
-        first = let_free(before, free, JUMPS[-1])
-        result = self.filter.restart(first, [(observations, rig_from_object)])
-        self.filter.count += 1
-        self._recent.began(result, observations, seconds)
         self._suspect = None
-        return result, (*told, *self._begin(free, result, before, seconds))
+        self._held.hold(cameras, self.filter.count - self.first < FEW)
+        return self._beside_held(observations, rig_from_object, seconds)
 
-    def _contradicting(self, observations: Observations, rig_from_object: RigidTransform) -> int | None:
-        """The camera that may have moved where a snapshot is refused; None = no single one."""
-        found: dict[int, float] = {}
-        for camera in observations.seen[0].any(-1).nonzero()[:, 0].tolist():
-            free = let_free(self.filter.belief, {camera: None}, JUMPS[-1])
-            with contextlib.suppress(RefusedError):
-                result = absorbed(free, observations, rig_from_object, self.filter.options)
-                if result.chi2 <= MOST_EXCESS * max(result.dof, 1):
-                    found[camera] = result.evidence
-        return max(found, key=lambda camera: found[camera], default=None)
+    def _beside_held(
+        self, observations: Observations, rig_from_object: RigidTransform, seconds: float
+    ) -> tuple[Absorbed, tuple[Change, ...]]:
+        """Learn from a snapshot without the cameras that are held, and ask what has happened to these."""
+        held = self._held
+        result, changes = self._followed(without(observations, held.cameras), rig_from_object, seconds)
+        if not held.cameras or not held.take(observations):
+            return result, changes
+        with contextlib.suppress(RefusedError):  # not yet
+            anew = self._asked_held()
+            if anew is not None:
+                return anew[0], (*changes, *anew[1])
+        return result, changes
+
+    def _asked_held(self) -> tuple[Absorbed, tuple[Change, ...]] | None:
+        """Ask what has happened to the cameras that are held; what was learnt anew where they have moved.
+
+        Raises:
+            RefusedError: it cannot be told yet, or they do not see enough.
+        """
+        held, total = self._held, len(self._recent)
+        window = held.window(total)
+        count, poses = len(window), [pose for _, pose in self._recent.snapshots(total)]
+        snapshots = [*self._recent.snapshots(total)[:-count], *zip(window, poses[-count:], strict=True)]
+        before, free = self._recent.belief_before(count), dict[int, str | None].fromkeys(sorted(held.cameras))
+        suspicion = Suspicion(before, snapshots, self._recent.pauses(total), count, free, wide=held.wide, held=True)
+        patient = self._since is None
+        answer = self._clocks.ask(suspicion, self.filter.count - count, self.filter.options, patient)
+        if answer.kind == "apart":
+            self.apart = () if held.told else tuple(sorted(held.cameras))
+            held.told = True
+            return None
+        held.release()
+        if answer.kind == "moved":
+            told = self._judged(last=True)
+            return self._restarted(free, snapshots[-count:], {}, told, before)
+        self.slips = () if answer.slipped is None else answer.slipped.slips
+        return None
+
+    def _restarted(
+        self,
+        free: dict[int, str | None],
+        snapshots: Sequence[tuple[Observations, RigidTransform]],
+        evidence: Mapping[int, float],
+        told: Sequence[Change],
+        before: RigBelief,
+    ) -> tuple[Absorbed, tuple[Change, ...]]:
+        """Learn the latest snapshots, which the filter has absorbed otherwise, with cameras that have moved before.
+
+        Raises:
+            RefusedError: see `absorbed`.
+        """
+        count = len(snapshots)
+        if self.filter.count - count - self.first < FEW:
+            return self._begin_again(free, snapshots, self._recent.pauses(count), evidence, told)
+        seconds = self._recent.seconds(count)
+        result = self.filter.restart(let_free(before, free, JUMPS[-1]), snapshots)
+        self._recent.took(snapshots, self._recent.pauses(count), result)
+        return result, (*told, *self._begin(free, result, before, seconds, evidence))
 
     def _begin_again(
         self,
@@ -239,8 +284,8 @@ class RigMonitor:
         known = since is not None and bool(free)
         free, evidence = changed_cameras(self._recent.test(age), free)
         snapshots = self._recent.snapshots(age)
-        if (slipped := self._slipped_since(before, age, free)) is not None:
-            return slipped, tuple(told)
+        if (in_time := self._in_time_since(before, age, free)) is not None:
+            return in_time, tuple(told)
         if self.filter.count - age - self.first < FEW:
             return self._begin_again(free, snapshots, self._recent.pauses(age), evidence, told)
         moved = absorbed(let_free(before, free), *joined(snapshots), self.filter.options)
@@ -250,8 +295,8 @@ class RigMonitor:
         self._recent.restarted(result, age)
         return result, (*told, *self._begin(free, result, before, seconds, evidence))
 
-    def _slipped_since(self, before: RigBelief, age: int, cameras: Mapping[int, str | None]) -> Absorbed | None:
-        """Learn the latest snapshots anew as cameras had seen them in time; None = it is not their clocks.
+    def _in_time_since(self, before: RigBelief, age: int, cameras: Mapping[int, str | None]) -> Absorbed | None:
+        """Learn the latest snapshots anew as cameras had seen them in time, or without them; None = they have moved.
 
         Raises:
             RefusedError: it cannot be told yet.
@@ -261,13 +306,22 @@ class RigMonitor:
         everything = self.filter.count - self.first == count
         first = let_free(self._prior, dict.fromkeys(sorted(self._moved_early)), JUMPS[-1]) if everything else None
         suspicion = Suspicion(before, snapshots, pauses, age, cameras, first)
-        slipped = self._clocks.ask(suspicion, self.filter.count - age, self.filter.options, self._since is None)
-        if slipped is None:
+        answer = self._clocks.ask(suspicion, self.filter.count - age, self.filter.options, self._since is None)
+        if answer.kind == "moved":
             return None
-        self.slips = slipped.slips
-        result = self.filter.restart(slipped.before, slipped.snapshots)
+        if answer.slipped is not None:
+            self.slips = answer.slipped.slips
+            before, snapshots = answer.slipped.before, answer.slipped.snapshots
+        else:
+            self._held.hold(cameras, self.filter.count - age - self.first < FEW)
+            before, snapshots = (before, snapshots[-age:]) if first is None else (first, snapshots)
+            for observations, _ in snapshots:
+                self._held.take(observations)
+            self.apart, self._held.told = tuple(sorted(cameras)), True
+            snapshots = [(without(observations, cameras), pose) for observations, pose in snapshots]
+        result = self.filter.restart(before, snapshots)
         self._recent = RecentSnapshots(result.belief, self.filter.walk)
-        self._recent.took(slipped.snapshots, pauses[-len(slipped.snapshots) :], result)
+        self._recent.took(snapshots, pauses[-len(snapshots) :], result)
         self.open, self._since = {}, None
         return result
 

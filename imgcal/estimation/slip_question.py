@@ -1,4 +1,8 @@
-"""Have cameras moved, or have their clocks slipped? Both are supposed of the same snapshots, and compared."""
+"""Have cameras moved, or have their clocks slipped? All that may be is supposed of the same snapshots, and compared.
+
+Cameras have moved; or their clocks have slipped by some time, where it is known how the object moves; or they see the
+object at moments of their own, nobody knows which (`seen_apart.py`); or nothing has happened.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +10,7 @@ import contextlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any, Literal, cast
 
 import numpy as np
 
@@ -16,6 +21,7 @@ from imgcal.estimation.map_estimate import EstimationOptions
 from imgcal.estimation.open_change import let_free
 from imgcal.estimation.rig_belief import RigBelief
 from imgcal.estimation.rig_changes import JUMPS
+from imgcal.estimation.seen_apart import apart_evidence
 from imgcal.geometry import RigidTransform
 from imgcal.types import Observations
 
@@ -23,6 +29,13 @@ SLIP_ODDS = 5.0
 """Log odds from which it is a clock that has slipped, not a camera that has moved, or the other way round ..."""
 SLIP_PATIENCE = 16
 """... and the snapshots for which that is waited for, before it is what is more probable."""
+LEAST_SNAPSHOTS = 2
+"""Snapshots that tell a camera that has moved from one with moments of its own: one explains any pose of the object."""
+LEAST_WIDE = 5e-4
+"""Seconds, one standard deviation, to which a slip must be known of a camera of which hardly anything else is."""
+LEAST_EARLIER, LEAST_SECONDS = 12, 1.0
+"""Snapshots before a change, or seconds since the beginning, from which a camera that moves is told from one that has
+exposed late from the first snapshot on: within less, an object moves steadily, and both shift an image alike."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +48,8 @@ class Suspicion:
     count: int  # of those since then
     cameras: Mapping[int, str | None]  # the surest first
     first: RigBelief | None = None  # what was believed before all of them, where that is what the factory says
+    wide: bool = False  # it is hardly known where these cameras are
+    held: bool = False  # nothing has been learnt of these cameras since then
 
     def clocks(self, options: EstimationOptions) -> tuple[float, Slipped | None]:
         """Suppose that it is the clocks of all these cameras that have slipped, or of the first alone.
@@ -47,17 +62,52 @@ class Suspicion:
         moved, found = self._moved(options), list[tuple[float, Slipped]]()
         for cameras in dict.fromkeys(some):
             with contextlib.suppress(RefusedError):
-                late = slipped(self.before, self.snapshots, self.pauses, self.count, cameras, options)
+                late = slipped(self.before, self.snapshots, self.pauses, self.count, cameras, options, self.wide)
                 if late is not None:
                     found.append((late.evidence - moved, late))
-        if self.first is not None and self.count < len(self.snapshots):
+        if (earlier := self._earlier(options)) is not None and self.first is not None:
             count = len(self.snapshots)
             with contextlib.suppress(RefusedError):
-                earlier = absorbed(self.first, *joined(self.snapshots[: -self.count]), options).evidence
                 late = slipped(self.first, self.snapshots, self.pauses, count, some[0], options, wide=True)
                 if late is not None:
                     found.append((late.evidence - earlier - moved, late))
         return max(found, key=lambda one: one[0], default=(-math.inf, None))
+
+    @property
+    def too_early(self) -> bool:
+        """Tell whether hardly anything had been seen before."""
+        new = self.first is not None and len(self.snapshots) - self.count < LEAST_EARLIER
+        return new and sum(self.pauses) < LEAST_SECONDS
+
+    def apart(self, options: EstimationOptions) -> float:
+        """Log odds that all these cameras, or the first alone, see the object at moments of their own, against moves.
+
+        Where there is an earlier belief, also that it has been so before everything.
+        """
+        since, moved, found = joined(self.snapshots[-self.count :]), self._moved(options), [-math.inf]
+        for cameras in dict.fromkeys((tuple(self.cameras)[:1], tuple(self.cameras))):
+            with contextlib.suppress(RefusedError):
+                found.append(apart_evidence(self.before, *since, cameras, options) - moved)
+        if (earlier := self._earlier(options)) is not None and self.first is not None:
+            with contextlib.suppress(RefusedError):
+                every = apart_evidence(self.first, *joined(self.snapshots), tuple(self.cameras), options)
+                found.append(every - earlier - moved)
+        return max(found)
+
+    def steady(self, options: EstimationOptions) -> float:
+        """Log odds that nothing has happened, against moves."""
+        with contextlib.suppress(RefusedError):
+            result = absorbed(self.before, *joined(self.snapshots[-self.count :]), options)
+            return result.evidence - self._moved(options)
+        return -math.inf
+
+    def _earlier(self, options: EstimationOptions) -> float | None:
+        """Log probability of the snapshots before, nothing having happened in them; None = they are not all."""
+        if self.first is None or self.count >= len(self.snapshots):
+            return None
+        with contextlib.suppress(RefusedError):
+            return absorbed(self.first, *joined(self.snapshots[: -self.count]), options).evidence
+        return None
 
     def _moved(self, options: EstimationOptions) -> float:
         """Log probability of the snapshots since, the cameras having moved."""
@@ -69,14 +119,23 @@ class Suspicion:
         return float(np.logaddexp.reduce(found)) - math.log(len(JUMPS)) if found else -math.inf
 
 
+@dataclass(frozen=True)
+class Answer:
+    """What has happened to cameras that seem to have moved."""
+
+    kind: Literal["moved", "slipped", "apart", "steady"]
+    odds: float  # log odds against the next best
+    slipped: Slipped | None = None
+
+
 @dataclass
 class SlipQuestion:
-    """Asks of each suspicion whether it is clocks, and waits for a while where that cannot be told."""
+    """Asks of each suspicion what has happened, and waits for a while where that cannot be told."""
 
-    unsure: int = 0  # snapshots in a row that might tell of a slip or of a move
+    unsure: int = 0  # answers in a row that could not be told
 
-    def ask(self, suspicion: Suspicion, since: int, options: EstimationOptions, patient: bool) -> Slipped | None:
-        """Ask whether clocks have slipped of cameras that seem to have moved.
+    def ask(self, suspicion: Suspicion, since: int, options: EstimationOptions, patient: bool) -> Answer:
+        """Ask what has happened to cameras that seem to have moved.
 
         Args:
             suspicion: which, and what was seen.
@@ -84,18 +143,31 @@ class SlipQuestion:
             options: how to minimize.
             patient: it may be waited for.
 
-        Returns:
-            What slips make of the snapshots; None = the cameras have moved.
-
         Raises:
             RefusedError: it cannot be told yet.
         """
-        odds, found = suspicion.clocks(options)
-        self.unsure = self.unsure + 1 if abs(odds) < SLIP_ODDS else 0
-        if 0 < self.unsure <= SLIP_PATIENCE and patient:
+        slip_odds, found = suspicion.clocks(options)
+        odds = {"moved": 0.0, "slipped": slip_odds}
+        if suspicion.count >= LEAST_SNAPSHOTS:
+            odds["apart"] = suspicion.apart(options)
+        if suspicion.held:
+            odds["steady"] = suspicion.steady(options)
+        best, second = sorted(odds, key=lambda kind: -odds[kind])[:2]
+        lead = odds[best] - odds[second]
+        early = best == "moved" and (suspicion.too_early or (suspicion.held and suspicion.count < LEAST_SNAPSHOTS))
+        vague = best == "slipped" and found is not None and _too_vague(found, suspicion)
+        self.unsure = self.unsure + 1 if lead < SLIP_ODDS else 0
+        if early or vague or (0 < self.unsure <= SLIP_PATIENCE and patient):
             raise RefusedError("estimation: it cannot be told yet whether a camera has moved, or its clock slipped")
         self.unsure = 0
-        if found is None or odds < 0:
-            return None
+        if best != "slipped" or found is None:
+            return Answer(cast(Any, best), lead)
         since -= len(found.snapshots) - suspicion.count
-        return replace(found, slips=tuple(replace(slip, since=since, odds=odds) for slip in found.slips))
+        slips = tuple(replace(slip, since=since, odds=lead) for slip in found.slips)
+        return Answer("slipped", lead, replace(found, slips=slips))
+
+
+def _too_vague(found: Slipped, suspicion: Suspicion) -> bool:
+    """Tell whether a slip of cameras that are hardly known is itself hardly known."""
+    wide = suspicion.wide or len(found.snapshots) > suspicion.count
+    return wide and any(slip.sigma > LEAST_WIDE for slip in found.slips)

@@ -89,6 +89,12 @@ class ClockOffsets:
         late = float(self.late[slip.camera] + slip.seconds)
         return self._found(state, slip.camera, late, slip.sigma, slip.odds, since)
 
+    def apart(self, state: RigState, camera: int, since: float) -> Event:
+        """Tell that a camera exposes at moments of its own, by how much nobody knows yet."""
+        name = state.factory.camera_names[camera]
+        message = f"{name} sees the object at other moments than the other cameras, by how much is not known yet"
+        return Event(state.time, state.snapshot, "clock_slip", name, since, message=message)
+
     def _found(
         self, state: RigState, camera: int, late: float, sigma: float, evidence: float, since: float | None = None
     ) -> Iterable[Event]:

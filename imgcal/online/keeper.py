@@ -250,9 +250,12 @@ class RigKeeper:
         for slip in memory.monitor.slips if result is not None else ():
             events += self._clock.slipped(state, slip, memory.since(slip.since, slip.camera))
             state = replace(state, lag=self._lag(state.detections))
+        for camera in memory.monitor.apart if result is not None else ():
+            events.append(self._clock.apart(state, camera, memory.off.get(camera, time)))
         names = memory.prior.camera_names
         silent = () if frames is None else (c for c, name in enumerate(names) if frames.get(name) is None)
-        astray = frozenset() if labelled is None else labelled.astray
+        # A camera with moments of its own has not moved far.
+        astray = frozenset() if labelled is None else labelled.astray - memory.monitor.held
         look = Look(time, number, state.detections, state.predicted, astray, frozenset(silent))
         events += memory.sightings.take(state.rig, look)
         events += memory.relearning.learnt(memory.belief, frozenset(memory.monitor.open), time, number)

@@ -28,6 +28,7 @@ MODULES = frozenset(
         "estimation.cusum",
         "estimation.drift_learning",
         "estimation.drift_pace",
+        "estimation.held_cameras",
         "estimation.map_estimate",
         "estimation.object_change",
         "estimation.object_question",

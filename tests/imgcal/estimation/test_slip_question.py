@@ -1,7 +1,7 @@
 """A clock that slips and a camera that moves are told apart, where the object moves; what cannot be told waits."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 
@@ -43,12 +43,23 @@ class Told:
     """A suspicion whose answer is known."""
 
     odds: float
+    apart_odds: float = -math.inf
+    steady_odds: float = -math.inf
     count: int = COUNT
+    held: bool = False
+    wide: bool = False
+    too_early: bool = False
 
     def clocks(self, options: EstimationOptions) -> tuple[float, Slipped]:
         made = followed(1)
         slip = ClockSlip(1, 0, 0.01, 1e-4, math.nan)
         return self.odds, Slipped(made.beliefs[0], (slip,), [made.snapshots[0]] * 5, 0.0)
+
+    def apart(self, options: EstimationOptions) -> float:
+        return self.apart_odds
+
+    def steady(self, options: EstimationOptions) -> float:
+        return self.steady_odds
 
 
 def test_what_cannot_be_told_waits_and_is_then_what_is_more_probable() -> None:
@@ -56,9 +67,55 @@ def test_what_cannot_be_told_waits_and_is_then_what_is_more_probable() -> None:
     for _ in range(SLIP_PATIENCE):
         with pytest.raises(RefusedError, match="cannot be told yet"):
             question.ask(Told(1.0), 40, OPTIONS, patient=True)
-    slipped = question.ask(Told(1.0), 40, OPTIONS, patient=True)
-    assert slipped is not None
-    (slip,) = slipped.slips
+    answer = question.ask(Told(1.0), 40, OPTIONS, patient=True)
+    assert answer.slipped is not None
+    (slip,) = answer.slipped.slips
     assert (slip.since, slip.odds) == (40 - (5 - COUNT), 1.0)  # it was found in earlier snapshots, too
-    assert SlipQuestion().ask(Told(-1.0), 40, OPTIONS, patient=False) is None
-    assert SlipQuestion().ask(Told(-2 * SLIP_ODDS), 40, OPTIONS, patient=True) is None
+    assert SlipQuestion().ask(Told(-1.0), 40, OPTIONS, patient=False).kind == "moved"
+    assert SlipQuestion().ask(Told(-2 * SLIP_ODDS), 40, OPTIONS, patient=True).kind == "moved"
+
+
+@pytest.mark.parametrize(
+    ("told", "kind"),
+    [
+        (Told(-9.0, apart_odds=20.0), "apart"),
+        (Told(40.0, apart_odds=20.0), "slipped"),
+        (Told(-9.0, apart_odds=20.0, steady_odds=90.0), "moved"),  # only what is held can be as if nothing was
+        (Told(-9.0, apart_odds=-9.0, steady_odds=90.0, held=True), "steady"),
+        (Told(-9.0, apart_odds=20.0, count=1), "moved"),  # one snapshot is explained by either
+    ],
+)
+def test_what_is_most_probable_is_answered(told: Told, kind: str) -> None:
+    if kind == "moved" and told.count > 1:
+        told.apart_odds = -20.0
+    assert SlipQuestion().ask(told, 40, OPTIONS, patient=True).kind == kind
+
+
+@pytest.mark.parametrize("told", [Told(-9.0, held=True, count=1), Told(-9.0, too_early=True)])
+def test_a_move_is_not_told_of_too_little(told: Told) -> None:
+    with pytest.raises(RefusedError, match="cannot be told yet"):
+        SlipQuestion().ask(told, 40, OPTIONS, patient=False)
+
+
+def test_a_slip_that_is_hardly_known_of_a_camera_that_is_hardly_known_waits() -> None:
+    told = Told(40.0, wide=True)
+    assert SlipQuestion().ask(told, 40, OPTIONS, patient=True).kind == "slipped"  # to 0.1 ms
+    vague = replace(told.clocks(OPTIONS)[1], slips=(ClockSlip(1, 0, 0.01, 2e-3, math.nan),))
+    told.clocks = lambda options: (40.0, vague)
+    with pytest.raises(RefusedError, match="cannot be told yet"):
+        SlipQuestion().ask(told, 40, OPTIONS, patient=False)
+
+
+@pytest.mark.parametrize("rate", [4.0, 60.0])
+def test_a_camera_with_moments_of_its_own_is_told_from_one_that_moved_at_any_rate(rate: float) -> None:
+    for happened, apart in (
+        ({"slips": [Slip(BEFORE, 2, 0.25)]}, True),
+        ({"bumps": [Bump(BEFORE, 2, "position", 5.0)]}, False),
+    ):
+        made = followed(BEFORE + COUNT, rate=rate, **happened)
+        pauses = [1 / rate] * len(made.snapshots)
+        suspicion = Suspicion(made.beliefs[BEFORE], made.snapshots, pauses, COUNT, {2: None}, held=True)
+        assert (suspicion.apart(OPTIONS) > 10 * SLIP_ODDS) == apart
+        assert suspicion.apart(OPTIONS) > 10 * SLIP_ODDS or suspicion.apart(OPTIONS) < -10 * SLIP_ODDS
+        assert suspicion.steady(OPTIONS) < -10 * SLIP_ODDS
+        assert SlipQuestion().ask(suspicion, 0, OPTIONS, patient=True).kind == ("apart" if apart else "moved")

@@ -1,0 +1,51 @@
+"""Cameras that see the object elsewhere than the others do, and nobody knows yet why: nothing is learnt of them."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection
+from dataclasses import dataclass, field
+
+from imgcal.types import Observations
+
+MOST = 16
+"""Latest snapshots that are asked why ..."""
+MOST_WIDE = 64
+"""... of cameras that are known; and of others, of which it takes more to tell anything."""
+ASKED = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
+EVERY = 32
+"""Numbers of snapshots since cameras are held after which it is asked, and how often later."""
+
+
+@dataclass
+class HeldCameras:
+    """Cameras of which nothing is learnt, and what they have seen meanwhile."""
+
+    cameras: set[int] = field(default_factory=set)
+    seen: deque[Observations] = field(default_factory=lambda: deque(maxlen=MOST_WIDE))  # (1, C, N), of all cameras
+    taken: int = 0  # snapshots since they are held in which they see the object
+    wide: bool = False  # it is hardly known where they are
+    told: bool = False  # that they see the object at moments of their own
+
+    def hold(self, cameras: Collection[int], wide: bool) -> None:
+        """Hold cameras, and begin anew where one of them is new."""
+        if not set(cameras) <= self.cameras:
+            self.seen.clear()
+            self.cameras, self.taken, self.told, self.wide = self.cameras | set(cameras), 0, False, wide
+
+    def take(self, observations: Observations) -> bool:
+        """Keep a snapshot, and tell whether to ask what has happened to them."""
+        self.seen.append(observations)
+        if not bool(observations.seen[:, list(self.cameras)].any()):
+            return False
+        self.taken += 1
+        return self.taken in ASKED or self.taken % EVERY == 0
+
+    def window(self, most: int) -> list[Observations]:
+        """The latest snapshots that are asked, at most so many."""
+        return list(self.seen)[-min(MOST_WIDE if self.wide else MOST, most) :]
+
+    def release(self) -> None:
+        """Hold none."""
+        self.cameras, self.taken, self.told, self.wide = set(), 0, False, False
+        self.seen.clear()
