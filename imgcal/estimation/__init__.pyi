@@ -49,6 +49,7 @@ from .moves import find_moves
 from .object_change import ObjectChange, changed_object
 from .object_motion import ObjectMotion
 from .object_shape import SNAPSHOTS_TO_BEND, FiducialOffset, ShapeEvidence, offsets
+from .open_change import Change
 from .pose_initialization import initial_pose
 from .pose_support import ON_A_LINE, UndeterminedPosesError, require_poses
 from .recent_snapshots import RecentSnapshots
@@ -57,7 +58,7 @@ from .rig_changes import CHANGES, ChangeTest, change_of_errors, pixel_changes, s
 from .rig_error import displaced, error_between, step_by_error
 from .rig_filter import RigFilter
 from .rig_initialization import K3, ColdStart, cold_start, ordinary_lens
-from .rig_monitor import Change, RigMonitor
+from .rig_monitor import RigMonitor
 from .rig_uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian, rigid_motion, uncertainty_over
 from .robust_losses import squared
 from .steady_cameras import Gauge

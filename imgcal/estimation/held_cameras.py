@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
+from imgcal.estimation.recent_snapshots import RecentSnapshots
+from imgcal.estimation.seen_apart import without
+from imgcal.estimation.slip_question import Suspicion
+from imgcal.geometry import RigidTransform
 from imgcal.types import Observations
 
 MOST = 16
@@ -41,9 +45,29 @@ class HeldCameras:
         self.taken += 1
         return self.taken in ASKED or self.taken % EVERY == 0
 
-    def window(self, most: int) -> list[Observations]:
-        """The latest snapshots that are asked, at most so many."""
-        return list(self.seen)[-min(MOST_WIDE if self.wide else MOST, most) :]
+    def hold_since(
+        self, snapshots: Sequence[tuple[Observations, RigidTransform]], cameras: Collection[int], wide: bool
+    ) -> list[tuple[Observations, RigidTransform]]:
+        """Hold cameras that have moments of their own; returns what may be learnt of snapshots with them."""
+        self.hold(cameras, wide)
+        for observations, _ in snapshots:
+            self.take(observations)
+        self.told = True
+        return [(without(observations, self.cameras), pose) for observations, pose in snapshots]
+
+    def suspicion(self, recent: RecentSnapshots) -> Suspicion:
+        """What is to be asked: these cameras, and the latest snapshots with what they have seen.
+
+        Raises:
+            RefusedError: nothing is known of the rig.
+        """
+        total = recent.snapshots(len(recent))
+        window = list(self.seen)[-min(MOST_WIDE if self.wide else MOST, len(total)) :]
+        count = len(window)
+        snapshots = [*total[:-count], *zip(window, [pose for _, pose in total[-count:]], strict=True)]
+        before, pauses = recent.belief_before(count), recent.pauses(len(recent))
+        cameras = dict.fromkeys(sorted(self.cameras))
+        return Suspicion(before, snapshots, pauses, count, cameras, wide=self.wide, held=True)
 
     def release(self) -> None:
         """Hold none."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -20,6 +21,19 @@ ALONE, MIXED = 3.0, 15.0
 """... against a change of all kinds at once, and of that against each: what is believed wrongly does no harm then."""
 JUDGED = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
 """Numbers of snapshots since a change at which its kind is asked for."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """What happened to a camera."""
+
+    camera: int
+    since: int  # number of the first snapshot, counted from 0, that saw it from its new place
+    kind: str  # of `CHANGES`; "unknown" = not decided yet, or none of them alone
+    size: float  # rad, mm or pixels; nan where the kind is not known
+    sigma: float  # one standard deviation of it
+    decided: bool = False  # the last that will be said of it
+    evidence: float = math.nan  # chi-squared of its having stood still; nan = it was told that it moved
 
 
 @dataclass
@@ -107,6 +121,26 @@ class OpenChange:
             return None
         # Told as what it most probably is, and believed to be anything.
         return None, max(CHANGES, key=lambda kind: odds[kind]) if self.late else None
+
+    def judged(
+        self, test: ChangeTest, changes: Mapping[int, Change], last: bool
+    ) -> tuple[tuple[Change, ...], dict[int, str | None]]:
+        """Decide of which kind open changes are, by camera, where that can be told, or it is time.
+
+        Returns:
+            What is told of them, and what is believed of the cameras that are decided.
+        """
+        told, kinds = [], dict[int, str | None]()
+        for camera, change in changes.items():
+            decided = self.decided(test, camera, last)
+            if decided is None:
+                continue
+            kinds[camera], kind = decided
+            size = (math.nan, math.nan) if kind is None else self.size(test, camera, kind)
+            scores = test.given(self.others(camera)).scores()
+            evidence = max(float(scores[name][camera]) for name in ([kind] if kind else CHANGES))
+            told.append(Change(camera, change.since, kind or "unknown", *size, decided=True, evidence=evidence))
+        return tuple(told), kinds
 
     def size(self, test: ChangeTest, camera: int, kind: str) -> tuple[float, float]:
         """How far a camera went, were it of this kind alone, and the standard deviation of that."""

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
 
 from imgcal.errors import RefusedError
@@ -24,13 +23,13 @@ from imgcal.estimation.drift_pace import DriftPaces
 from imgcal.estimation.held_cameras import HeldCameras
 from imgcal.estimation.object_change import ObjectChange, changed_object
 from imgcal.estimation.object_question import Misfit, never_fitted, object_explains
-from imgcal.estimation.open_change import OpenChange, let_free
+from imgcal.estimation.open_change import Change, OpenChange, let_free
 from imgcal.estimation.recent_snapshots import RecentSnapshots
 from imgcal.estimation.rig_belief import Absorbed, RigBelief, aged
-from imgcal.estimation.rig_changes import CHANGES, JUMPS
+from imgcal.estimation.rig_changes import JUMPS
 from imgcal.estimation.rig_filter import RigFilter
 from imgcal.estimation.seen_apart import without
-from imgcal.estimation.slip_question import SlipQuestion, Suspicion
+from imgcal.estimation.slip_question import SlipQuestion, Suspicion, doubtful_cameras
 from imgcal.geometry import RigidTransform
 from imgcal.types import Observations
 
@@ -39,19 +38,6 @@ FEW = 16
 more than it says, and others would be blamed. What came before is then forgotten ..."""
 UNSURE = 8
 """... and of the object nothing is asked before so many have been learnt."""
-
-
-@dataclass(frozen=True)
-class Change:
-    """What happened to a camera."""
-
-    camera: int
-    since: int  # number of the first snapshot, counted from 0, that saw it from its new place
-    kind: str  # of `CHANGES`; "unknown" = not decided yet, or none of them alone
-    size: float  # rad, mm or pixels; nan where the kind is not known
-    sigma: float  # one standard deviation of it
-    decided: bool = False  # the last that will be said of it
-    evidence: float = math.nan  # chi-squared of its having stood still; nan = it was told that it moved
 
 
 class RigMonitor:
@@ -72,7 +58,7 @@ class RigMonitor:
         self.slips: tuple[ClockSlip, ...] = ()  # that became known with the latest snapshot
         self.apart: tuple[int, ...] = ()  # cameras of which it became known that they have moments of their own
         self._clocks = SlipQuestion()
-        self._held = HeldCameras()
+        self.held = HeldCameras()  # of which nothing is learnt until it is known why they see the object elsewhere
         self._misfit = Misfit()
         self._recent = RecentSnapshots(rig_filter.belief, rig_filter.walk)
         self._drifting = DriftLearning(DriftPaces(rig_filter.belief.rig.num_cameras))
@@ -81,11 +67,6 @@ class RigMonitor:
         self.first = 0  # number of the first snapshot of which something is known
         self._moved_early: set[int] = set()  # cameras of which the factory knows nothing more
         self._suspect: int | None = None  # the camera without which the last snapshot would not have been refused
-
-    @property
-    def held(self) -> frozenset[int]:
-        """Cameras that see the object elsewhere than the others do; nothing is learnt of them until it is known why."""
-        return frozenset(self._held.cameras)
 
     def update(
         self,
@@ -111,13 +92,11 @@ class RigMonitor:
                 snapshot says the same, that camera has moved.
         """
         self.object_change, self.slips, self.apart = None, (), ()
-        new = [camera for camera in moved if camera not in self._held.cameras]
+        new = [camera for camera in moved if camera not in self.held.cameras]
         if new:
-            result, changes = self._moved(new, observations, rig_from_object, seconds)
-        elif self._held.cameras:
-            result, changes = self._beside_held(observations, rig_from_object, seconds)
-        else:
-            result, changes = self._followed(observations, rig_from_object, seconds)
+            self.held.hold(new, self.filter.count - self.first < FEW)
+        learn = self._beside_held if self.held.cameras else self._followed
+        result, changes = learn(observations, rig_from_object, seconds)
         return result.of_last(), changes
 
     def _followed(
@@ -131,7 +110,9 @@ class RigMonitor:
             self._suspect = contradicting(belief, observations, rig_from_object, self.filter.options)
             if last is None or last != self._suspect:
                 raise
-            return self._moved((last,), observations, rig_from_object, seconds)
+            self.held.hold((last,), self.filter.count - self.first < FEW)
+            self._suspect = None
+            return self._beside_held(observations, rig_from_object, seconds)
         self._suspect = None
         self._recent.append(result, observations, seconds)
         if self._since is not None:
@@ -157,19 +138,11 @@ class RigMonitor:
             return result, self._judged(self._since.late)
         return result, ()
 
-    def _moved(
-        self, cameras: Collection[int], observations: Observations, rig_from_object: RigidTransform, seconds: float
-    ) -> tuple[Absorbed, tuple[Change, ...]]:
-        """Learn from a snapshot before which cameras have moved, however far, or their clocks slipped."""
-        self._suspect = None
-        self._held.hold(cameras, self.filter.count - self.first < FEW)
-        return self._beside_held(observations, rig_from_object, seconds)
-
     def _beside_held(
         self, observations: Observations, rig_from_object: RigidTransform, seconds: float
     ) -> tuple[Absorbed, tuple[Change, ...]]:
         """Learn from a snapshot without the cameras that are held, and ask what has happened to these."""
-        held = self._held
+        held = self.held
         result, changes = self._followed(without(observations, held.cameras), rig_from_object, seconds)
         if not held.cameras or not held.take(observations):
             return result, changes
@@ -185,45 +158,32 @@ class RigMonitor:
         Raises:
             RefusedError: it cannot be told yet, or they do not see enough.
         """
-        held, total = self._held, len(self._recent)
-        window = held.window(total)
-        count, poses = len(window), [pose for _, pose in self._recent.snapshots(total)]
-        snapshots = [*self._recent.snapshots(total)[:-count], *zip(window, poses[-count:], strict=True)]
-        before, free = self._recent.belief_before(count), dict[int, str | None].fromkeys(sorted(held.cameras))
-        suspicion = Suspicion(before, snapshots, self._recent.pauses(total), count, free, wide=held.wide, held=True)
-        patient = self._since is None
-        answer = self._clocks.ask(suspicion, self.filter.count - count, self.filter.options, patient)
+        held, suspicion = self.held, self.held.suspicion(self._recent)
+        since, patient = self.filter.count - suspicion.count, self._since is None
+        answer = self._clocks.ask(suspicion, since, self.filter.options, patient)
         if answer.kind == "apart":
             self.apart = () if held.told else tuple(sorted(held.cameras))
             held.told = True
             return None
         held.release()
         if answer.kind == "moved":
-            told = self._judged(last=True)
-            return self._restarted(free, snapshots[-count:], {}, told, before)
+            return self._restarted(suspicion, self._judged(last=True))
         self.slips = () if answer.slipped is None else answer.slipped.slips
         return None
 
-    def _restarted(
-        self,
-        free: dict[int, str | None],
-        snapshots: Sequence[tuple[Observations, RigidTransform]],
-        evidence: Mapping[int, float],
-        told: Sequence[Change],
-        before: RigBelief,
-    ) -> tuple[Absorbed, tuple[Change, ...]]:
+    def _restarted(self, moved: Suspicion, told: Sequence[Change]) -> tuple[Absorbed, tuple[Change, ...]]:
         """Learn the latest snapshots, which the filter has absorbed otherwise, with cameras that have moved before.
 
         Raises:
             RefusedError: see `absorbed`.
         """
-        count = len(snapshots)
+        count, free = moved.count, dict(moved.cameras)
+        snapshots, pauses = moved.snapshots[-count:], moved.pauses[-count:]
         if self.filter.count - count - self.first < FEW:
-            return self._begin_again(free, snapshots, self._recent.pauses(count), evidence, told)
-        seconds = self._recent.seconds(count)
-        result = self.filter.restart(let_free(before, free, JUMPS[-1]), snapshots)
-        self._recent.took(snapshots, self._recent.pauses(count), result)
-        return result, (*told, *self._begin(free, result, before, seconds, evidence))
+            return self._begin_again(free, snapshots, pauses, {}, told)
+        result = self.filter.restart(let_free(moved.before, free, JUMPS[-1]), snapshots)
+        self._recent.took(snapshots, pauses, result)
+        return result, (*told, *self._begin(free, result, moved.before, sum(pauses)))
 
     def _begin_again(
         self,
@@ -313,12 +273,9 @@ class RigMonitor:
             self.slips = answer.slipped.slips
             before, snapshots = answer.slipped.before, answer.slipped.snapshots
         else:
-            self._held.hold(cameras, self.filter.count - age - self.first < FEW)
             before, snapshots = (before, snapshots[-age:]) if first is None else (first, snapshots)
-            for observations, _ in snapshots:
-                self._held.take(observations)
-            self.apart, self._held.told = tuple(sorted(cameras)), True
-            snapshots = [(without(observations, cameras), pose) for observations, pose in snapshots]
+            snapshots = self.held.hold_since(snapshots, cameras, self.filter.count - age - self.first < FEW)
+            self.apart = tuple(sorted(cameras))
         result = self.filter.restart(before, snapshots)
         self._recent = RecentSnapshots(result.belief, self.filter.walk)
         self._recent.took(snapshots, pauses[-len(snapshots) :], result)
@@ -330,9 +287,9 @@ class RigMonitor:
         age = min(age, len(self._recent))
         if self.filter.count - age - self.first < UNSURE:
             return None
-        snapshots, pauses = self._recent.snapshots(age), self._recent.pauses(age)
         with contextlib.suppress(RefusedError):
-            return self._asked_object(self._recent.belief_before(age), snapshots, pauses)
+            before = self._recent.belief_before(age)
+            return self._asked_object(before, self._recent.snapshots(age), self._recent.pauses(age))
         return None
 
     def _learnt_first_object(self, result: Absorbed) -> Absorbed | None:
@@ -373,6 +330,27 @@ class RigMonitor:
             self.filter.count -= unlearnt
         return None if found is None else found.of_last()
 
+    def ask_clocks(
+        self, snapshots: Sequence[tuple[Observations, RigidTransform]], pauses: Sequence[float]
+    ) -> tuple[int, ...]:
+        """Ask which cameras are to be doubted where labels fit in most cameras no more; they are held then.
+
+        Args:
+            snapshots: observations (1, C, N), with those labels, and poses (1,): of the latest ones, not learnt.
+            pauses: s before each of them.
+
+        Returns:
+            Those of which it is sure that they have moments of their own.
+        """
+        if self._since is not None:
+            return ()
+        before = aged(self.filter.belief, self.filter.waited + pauses[0], self.filter.walk)
+        found, sure = doubtful_cameras(before, snapshots, self.filter.options)
+        if found:
+            self.held.hold(found, self.filter.count - self.first < FEW)
+            self.held.told = sure
+        return tuple(sorted(found)) if sure else ()
+
     def _asked_object(
         self,
         before: RigBelief,
@@ -407,16 +385,7 @@ class RigMonitor:
         if since is None:
             return ()
         test = since.test(self.filter.walk)
-        told, kinds = [], dict[int, str | None]()
-        for camera, change in self.open.items():
-            decided = since.decided(test, camera, last)
-            if decided is None:
-                continue
-            kinds[camera], kind = decided
-            size = (float("nan"), float("nan")) if kind is None else since.size(test, camera, kind)
-            scores = test.given(since.others(camera)).scores()
-            evidence = max(float(scores[name][camera]) for name in ([kind] if kind else CHANGES))
-            told.append(Change(camera, change.since, kind or "unknown", *size, decided=True, evidence=evidence))
+        told, kinds = since.judged(test, self.open, last)
         since.kinds.update(kinds)
         if any(kind is not None for kind in kinds.values()):
             first, belief, information = since.supposed(test)
@@ -425,4 +394,4 @@ class RigMonitor:
         self.open = {camera: change for camera, change in self.open.items() if camera not in kinds}
         if not self.open:
             self._since = None
-        return tuple(told)
+        return told

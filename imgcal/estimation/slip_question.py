@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, cast
 
@@ -18,6 +18,7 @@ from imgcal.errors import RefusedError
 from imgcal.estimation.absorption import absorbed, joined
 from imgcal.estimation.clock_slip import Slipped, slipped
 from imgcal.estimation.map_estimate import EstimationOptions
+from imgcal.estimation.object_change import changed_object
 from imgcal.estimation.open_change import let_free
 from imgcal.estimation.rig_belief import RigBelief
 from imgcal.estimation.rig_changes import JUMPS
@@ -59,7 +60,7 @@ class Suspicion:
             everything; -inf and None = no slips explain what was seen.
         """
         some = [tuple(self.cameras)[:1], tuple(self.cameras)]
-        moved, found = self._moved(options), list[tuple[float, Slipped]]()
+        moved, found = self.evidence_of_moves(options), list[tuple[float, Slipped]]()
         for cameras in dict.fromkeys(some):
             with contextlib.suppress(RefusedError):
                 late = slipped(self.before, self.snapshots, self.pauses, self.count, cameras, options, self.wide)
@@ -84,7 +85,7 @@ class Suspicion:
 
         Where there is an earlier belief, also that it has been so before everything.
         """
-        since, moved, found = joined(self.snapshots[-self.count :]), self._moved(options), [-math.inf]
+        since, moved, found = joined(self.snapshots[-self.count :]), self.evidence_of_moves(options), [-math.inf]
         for cameras in dict.fromkeys((tuple(self.cameras)[:1], tuple(self.cameras))):
             with contextlib.suppress(RefusedError):
                 found.append(apart_evidence(self.before, *since, cameras, options) - moved)
@@ -98,7 +99,7 @@ class Suspicion:
         """Log odds that nothing has happened, against moves."""
         with contextlib.suppress(RefusedError):
             result = absorbed(self.before, *joined(self.snapshots[-self.count :]), options)
-            return result.evidence - self._moved(options)
+            return result.evidence - self.evidence_of_moves(options)
         return -math.inf
 
     def _earlier(self, options: EstimationOptions) -> float | None:
@@ -109,7 +110,7 @@ class Suspicion:
             return absorbed(self.first, *joined(self.snapshots[: -self.count]), options).evidence
         return None
 
-    def _moved(self, options: EstimationOptions) -> float:
+    def evidence_of_moves(self, options: EstimationOptions) -> float:
         """Log probability of the snapshots since, the cameras having moved."""
         found = []
         for jump in JUMPS:
@@ -165,6 +166,49 @@ class SlipQuestion:
         since -= len(found.snapshots) - suspicion.count
         slips = tuple(replace(slip, since=since, odds=lead) for slip in found.slips)
         return Answer("slipped", lead, replace(found, slips=slips))
+
+
+def doubtful_cameras(
+    before: RigBelief, snapshots: Sequence[tuple[Observations, RigidTransform]], options: EstimationOptions
+) -> tuple[tuple[int, ...], bool]:
+    """Find the cameras, half of them at most, that explain snapshots which fit nowhere.
+
+    Args:
+        before: what was believed before them.
+        snapshots: observations (1, C, N) and the object's pose (1,) of each.
+        options: how to minimize.
+
+    Returns:
+        Cameras that have moved, or have moments of their own; none where a change of the object is as probable. And
+        whether it is surely moments of their own.
+    """
+    observations, poses = joined(snapshots)
+    count, found, apart = observations.seen.shape[1], tuple[int, ...](), -math.inf
+    while 2 * len(found) + 2 <= count:
+        odds = {}
+        for camera in set(range(count)) - set(found):
+            with contextlib.suppress(RefusedError):
+                odds[camera] = apart_evidence(before, observations, poses, (*found, camera), options)
+        best = max(odds, key=lambda one: odds[one], default=None)
+        if best is None or odds[best] < apart + SLIP_ODDS:
+            break
+        found, apart = (*found, best), odds[best]
+    if not found:
+        return (), False
+    moved = Suspicion(before, list(snapshots), [], len(snapshots), dict.fromkeys(found)).evidence_of_moves(options)
+    explained = max(apart, moved) >= _unexplained(before, snapshots, options) + SLIP_ODDS
+    return (found, apart >= moved + SLIP_ODDS) if explained else ((), False)
+
+
+def _unexplained(
+    before: RigBelief, snapshots: Sequence[tuple[Observations, RigidTransform]], options: EstimationOptions
+) -> float:
+    """Log probability of snapshots where all cameras stand still and are in time; the object may have changed."""
+    with contextlib.suppress(RefusedError):
+        steady = absorbed(before, *joined(snapshots), options)
+        changed = changed_object(before, snapshots, options, steady)
+        return steady.evidence + (0.0 if changed is None else changed[0].odds)
+    return -math.inf
 
 
 def _too_vague(found: Slipped, suspicion: Suspicion) -> bool:

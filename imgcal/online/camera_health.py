@@ -29,7 +29,7 @@ def health_of(memory: KeeperMemory) -> dict[str, CameraHealth]:
             found[name] = "unseen"
         elif camera in memory.relearning.events:
             found[name] = "relearning"
-        elif camera in memory.off or camera in memory.sightings.doubted or camera in memory.monitor.held:
+        elif camera in memory.off or camera in memory.sightings.doubted or camera in memory.monitor.held.cameras:
             found[name] = "doubtful"
         else:
             found[name] = memory.told_health.get(camera, "ok")

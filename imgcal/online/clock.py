@@ -89,12 +89,6 @@ class ClockOffsets:
         late = float(self.late[slip.camera] + slip.seconds)
         return self._found(state, slip.camera, late, slip.sigma, slip.odds, since)
 
-    def apart(self, state: RigState, camera: int, since: float) -> Event:
-        """Tell that a camera exposes at moments of its own, by how much nobody knows yet."""
-        name = state.factory.camera_names[camera]
-        message = f"{name} sees the object at other moments than the other cameras, by how much is not known yet"
-        return Event(state.time, state.snapshot, "clock_slip", name, since, message=message)
-
     def _found(
         self, state: RigState, camera: int, late: float, sigma: float, evidence: float, since: float | None = None
     ) -> Iterable[Event]:
@@ -120,8 +114,9 @@ class ClockOffsets:
         inverse = np.linalg.inv(np.where(known[:, None, None], scaled, np.eye(3)))
         offset = np.where(known, (inverse[:, 0] * self._right / scale).sum(1) / scale[:, 0], np.nan)
         sigma = np.where(known, np.sqrt(inverse[:, 0, 0]) / scale[:, 0], np.nan)
-        offset += self.late
-        return offset - (np.nanmedian(offset) if known.any() else 0.0), sigma
+        # Most cameras are as late as is known: where half of them slipped together, what is known already stays.
+        offset += self.late - (np.nanmedian(offset) if known.any() else 0.0)
+        return offset, sigma
 
     @staticmethod
     def _places(state: RigState) -> NDArray[np.float64]:
@@ -212,6 +207,19 @@ class ClockOffsets:
         if not all(each.shape == self._told.shape and np.isfinite(each).all() for each in (told, late)):
             raise ValueError(f"{self.name}: expected seconds of {len(self._told)} cameras")
         self._told, self.late = told, late
+
+
+def apart_event(camera: str, since: float, time: float, snapshot: int) -> Event:
+    """Tell that a camera exposes at moments of its own, by how much nobody knows yet.
+
+    Args:
+        camera: its name.
+        since: s since the epoch.
+        time: s since the epoch, now.
+        snapshot: number of the update.
+    """
+    message = f"{camera} sees the object at other moments than the other cameras, by how much is not known yet"
+    return Event(time, snapshot, "clock_slip", camera, since, message=message)
 
 
 def _middle(values: NDArray[np.float64], count: NDArray[np.int64]) -> NDArray[np.float64]:

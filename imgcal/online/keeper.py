@@ -18,7 +18,7 @@ from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import Absorbed, Change, RigBelief
 from imgcal.geometry import RigidTransform
 from imgcal.online.camera_health import health_of, sentence_of, take_health
-from imgcal.online.clock import ClockOffsets
+from imgcal.online.clock import ClockOffsets, apart_event
 from imgcal.online.default_tests import default_tests
 from imgcal.online.events import Event, snapshot_name
 from imgcal.online.keeper_file import KeeperFile, read_memory, unusable
@@ -247,15 +247,15 @@ class RigKeeper:
     ) -> RigState:
         """Add what became known of cameras, and what is said of them."""
         memory, time, number = self._memory, state.time, state.snapshot
+        names = memory.prior.camera_names
         for slip in memory.monitor.slips if result is not None else ():
             events += self._clock.slipped(state, slip, memory.since(slip.since, slip.camera))
             state = replace(state, lag=self._lag(state.detections))
         for camera in memory.monitor.apart if result is not None else ():
-            events.append(self._clock.apart(state, camera, memory.off.get(camera, time)))
-        names = memory.prior.camera_names
+            events.append(apart_event(names[camera], memory.off.get(camera, time), time, number))
         silent = () if frames is None else (c for c, name in enumerate(names) if frames.get(name) is None)
         # A camera with moments of its own has not moved far.
-        astray = frozenset() if labelled is None else labelled.astray - memory.monitor.held
+        astray = frozenset() if labelled is None else labelled.astray - memory.monitor.held.cameras
         look = Look(time, number, state.detections, state.predicted, astray, frozenset(silent))
         events += memory.sightings.take(state.rig, look)
         events += memory.relearning.learnt(memory.belief, frozenset(memory.monitor.open), time, number)

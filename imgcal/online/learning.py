@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from imgcal.estimation import Absorbed, Change, RigFilter, RigMonitor
+from imgcal.online.clock import apart_event
 from imgcal.online.drift_watch import DriftWatch
 from imgcal.online.keeper_memory import KeeperMemory
 from imgcal.online.label_checks import Checked
@@ -83,6 +84,19 @@ def ask_object(memory: KeeperMemory, learnt: bool) -> Absorbed | None:
         memory.learnt = doubted[-1].time
     memory.doubts.asked(result is not None)
     return result
+
+
+def ask_clocks(memory: KeeperMemory) -> bool:
+    """Ask whether labels fit in no camera because of some that are to be held then, and tell what is sure of them."""
+    doubted = memory.doubts.refused
+    snapshots = [(memory.observed(one.blobs), one.rig_from_object) for one in doubted]
+    found = memory.monitor.ask_clocks(snapshots, [one.seconds for one in doubted])
+    for camera in found:
+        name, since = memory.prior.camera_names[camera], doubted[0].time
+        memory.pending.append(apart_event(name, since, memory.time, memory.count - 1))
+    if memory.monitor.held.cameras:
+        memory.doubts = ObjectDoubts(memory.obj.num_fiducials)
+    return bool(memory.monitor.held.cameras)
 
 
 def _again(memory: KeeperMemory, result: Absorbed) -> Absorbed:

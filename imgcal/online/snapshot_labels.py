@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from imgcal.association import to_observations
 from imgcal.detection import Frame
 from imgcal.errors import RefusedError
@@ -14,7 +16,7 @@ from imgcal.online.following import near_prediction
 from imgcal.online.keeper_memory import KeeperMemory
 from imgcal.online.label_checks import Checked, check_labels
 from imgcal.online.labelling import LEAST_FOLLOWED, Labelling
-from imgcal.online.learning import ask_object
+from imgcal.online.learning import ask_clocks, ask_object
 from imgcal.online.object_doubts import object_event
 from imgcal.types import Detections
 
@@ -61,6 +63,8 @@ def labelled_snapshot(
         obj = memory.obj_now
         pose = initial_pose(to_observations(blobs, memory.prior, obj), memory.belief.rig, obj)[0]
     checked = _checked(memory, blobs, pose.reshape(1))
+    if checked.usual > memory.most_usual and memory.doubts.due and ask_clocks(memory):
+        checked = _checked(memory, blobs, pose.reshape(1))
     if checked.usual > memory.most_usual and memory.doubts.due and ask_object(memory, learnt=False) is not None:
         change = memory.monitor.object_change
         assert change is not None
@@ -106,7 +110,17 @@ def _extrapolated(memory: KeeperMemory) -> RigidTransform:
 
 
 def _checked(memory: KeeperMemory, named: Detections, pose: RigidTransform) -> Checked:
-    return check_labels(named, memory.belief.rig, memory.obj_now, pose, memory.options)
+    """See which labels fit; cameras with moments of their own have no say in where the object is."""
+    given = memory.belief.rig, memory.obj_now, pose, memory.options
+    every = check_labels(named, *given)
+    if not memory.monitor.held.cameras:
+        return every
+    held = np.isin(named.camera, list(memory.monitor.held.cameras))
+    others = check_labels(replace(named, fiducial=np.where(held, -1, named.fiducial)), *given)
+    fiducial = np.where(held, every.blobs.fiducial, others.blobs.fiducial)
+    blobs, labels = replace(others.blobs, fiducial=fiducial), int((fiducial >= 0).sum())
+    off = others.off | every.off & np.isin(np.arange(len(every.off)), list(memory.monitor.held.cameras))
+    return replace(others, blobs=blobs, given=every.given, off=off, labels=labels)
 
 
 def _searched(memory: KeeperMemory, checked: Checked) -> Labelled:

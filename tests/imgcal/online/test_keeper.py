@@ -194,3 +194,36 @@ def test_a_camera_that_turns_away_is_in_doubt_at_once_and_then_lost() -> None:
     lost = [event for state in states for event in state.events]
     assert [(event.kind, event.camera) for event in lost] == [("camera_lost", "cam04")]
     assert lost[0].since == pytest.approx(20 / 60, abs=0.05) and "turned away" in lost[0].message
+
+
+def events_of(made: Stream, count: int) -> tuple[list[Event], RigState]:
+    states = kept(made, count)
+    return [event for state in states for event in state.events], states[-1]
+
+
+@pytest.mark.parametrize(("rate", "late"), [(2.0, 0.05), (4.0, -0.02), (60.0, 0.3)])
+def test_a_clock_that_slips_by_nobody_knows_how_much_is_told_as_that_and_as_no_move(rate: float, late: float) -> None:
+    made = stream(1, conditions=Conditions(rate=rate), slips=[Slip(40, 1, late)])
+    events, last = events_of(made, 60)
+    assert {(event.kind, event.camera) for event in events} == {("clock_slip", "cam02")}
+    assert events[0].size is None and events[0].snapshot <= 48
+    assert last.cameras["cam02"] == "doubtful"
+    assert normalized(last, made.rig) < 1.6  # nothing wrong has been learnt
+
+
+@pytest.mark.parametrize("late", [0.0167, -0.03])
+def test_clocks_of_half_of_the_cameras_that_slip_at_once_are_told_and_nothing_else(late: float) -> None:
+    made = stream(5, slips=[Slip(60, 1, late), Slip(60, 2, late)])
+    events, last = events_of(made, 110)
+    assert {event.kind for event in events} == {"clock_slip"}
+    apart = last.clock_offset[[1, 2]] - last.clock_offset[[0, 3]]
+    assert apart == pytest.approx(late, abs=0.002)
+    assert set(last.cameras.values()) == {"ok"}
+
+
+@pytest.mark.parametrize("rate", [4.0, 60.0])
+def test_a_camera_that_is_late_from_the_first_snapshot_on_is_told_as_that_or_doubted(rate: float) -> None:
+    made = stream(1, conditions=Conditions(rate=rate), slips=[Slip(0, 1, 0.02)])
+    events, last = events_of(made, 50)
+    assert {(event.kind, event.camera) for event in events} == {("clock_slip", "cam02")}
+    assert last.cameras["cam02"] in ("ok", "doubtful")

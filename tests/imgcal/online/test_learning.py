@@ -27,5 +27,7 @@ def test_a_camera_that_sees_the_object_elsewhere_waits_for_the_next_snapshot_and
     assert not result.residual[0, 2].any()  # nothing was learnt of it
     known = memory.before
     _, changes = learnt_from(memory, made.labelled(made.blobs()).checked)
+    assert not changes and memory.monitor.held.cameras == {2}  # one snapshot more, and it is sure that it is no clock
+    _, changes = learnt_from(memory, made.labelled(made.blobs()).checked)
     assert [change.camera for change in changes] == [2]
     assert memory.looks[2] == 0 and memory.before is known
