@@ -71,6 +71,7 @@ async def _serve(listening: socket.socket, pipe: socket.socket) -> None:
                     application.spread(board.take(kind, content))
             except Exception as error:  # what one message holds does not end the page
                 tell({"problem": kind, "why": shortened(repr(error))})
+    application.close()
     server.should_exit = True
     with contextlib.suppress(asyncio.TimeoutError):
         await asyncio.wait_for(serving, 2)

@@ -62,6 +62,7 @@ class Application:
         """
         self.board, self.gate, self._rig_yaml, self._tell = board, gate, rig_yaml, tell
         self.viewers: set[Viewer] = set()
+        self._closing = False
         self._commands, self._downloads = Allowance(10, 5.0), Allowance(4, 1.0)
         self._cameras = tuple(board.greeting["cameras"])
         self._actions = {action.name: action for action in board.greeting["actions"]}
@@ -70,6 +71,11 @@ class Application:
         """Hand messages to all viewers; none of them is waited for."""
         for viewer in self.viewers:
             viewer.add(messages)
+
+    def close(self) -> None:
+        """End what is being answered without end."""
+        self._closing = True
+        self.spread({})
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request."""
@@ -156,12 +162,13 @@ class Application:
         try:
             head = HEADERS | {"Content-Type": "text/event-stream", "X-Accel-Buffering": "no"}
             await send({"type": "http.response.start", "status": 200, "headers": _raw(head)})
-            while not gone.done():
+            more = True
+            while more and not gone.done():
                 waiting = asyncio.ensure_future(viewer.news.wait())
                 await asyncio.wait((waiting, gone), timeout=ALIVE_SECONDS, return_when=asyncio.FIRST_COMPLETED)
                 waiting.cancel()
-                chunk = viewer.take() or b": still here\n\n"
-                message = {"type": "http.response.body", "body": chunk, "more_body": True}
+                chunk, more = viewer.take() or b": still here\n\n", not self._closing
+                message = {"type": "http.response.body", "body": chunk, "more_body": more}
                 await asyncio.wait_for(send(message), STUCK_SECONDS)
         except TimeoutError:
             pass  # the connection is closed, since the answer has no end

@@ -126,6 +126,16 @@ def test_closing_ends_the_server_and_its_address(o10, asymmetric8):
         pass
 
 
+def test_closing_while_somebody_looks_on_ends_the_stream_and_says_nothing(o10, asymmetric8, capfd):
+    with LivePage(o10, asymmetric8, Address(port=0)) as page:
+        reader = Stream(page)
+        reader.wait("hello")
+        server = page._server
+    server.wait(timeout=30)
+    reader.close()
+    assert capfd.readouterr().err == ""
+
+
 def test_a_viewer_that_never_reads_and_a_server_that_hangs_hold_up_nobody(served, o10, asymmetric8):
     stuck = Stream(served)  # it reads no more than the head
     reader = Stream(served)
