@@ -48,7 +48,7 @@ class PaddedBlobs:
 
 
 def gather(detections: Detections, rig: CameraRig) -> PaddedBlobs:
-    """Collect the usable blobs of one snapshot; of several at exactly the same place the first one.
+    """Collect the usable blobs of one snapshot that the lens can show; of several at exactly the same place the first.
 
     Args:
         detections: blobs of one snapshot; its cameras are the rig's, in the rig's order.
@@ -66,30 +66,36 @@ def gather(detections: Detections, rig: CameraRig) -> PaddedBlobs:
     rows = np.flatnonzero(detections.usable)
     places = np.column_stack((detections.camera[rows], detections.uv[rows]))
     rows = rows[np.sort(np.unique(places, axis=0, return_index=True)[1])]
-    camera = detections.camera[rows]
-    order = np.argsort(camera, kind="stable")
-    rows, camera = rows[order], camera[order]
-    count = np.bincount(camera, minlength=rig.num_cameras)
-    slot = np.arange(len(rows)) - (np.cumsum(count) - count)[camera]
-    shape = (rig.num_cameras, max(int(count.max()), 1))
-    uv, row, sigma, radius = np.full((*shape, 2), FAR), np.full(shape, -1), np.ones(shape), np.full(shape, np.nan)
-    uv[camera, slot], row[camera, slot], sigma[camera, slot] = detections.uv[rows], rows, detections.sigma[rows]
-    radius[camera, slot] = detections.radius[rows]
+    ideal = np.empty((len(rows), 2), dtype=np.float32)
     lens = (rig.focal_length.numpy(), rig.principal_point.numpy(), rig.distortion.numpy())
-    ideal = np.full(uv.shape, FAR, dtype=np.float32)
-    _undistort(uv, count, *lens, lens_codes(rig.lens_model, *rig.distortion.shape), ideal)
-    return PaddedBlobs(uv, ideal, sigma, radius, row, count, len(detections))
+    lenses = lens_codes(rig.lens_model, *rig.distortion.shape)
+    _undistort(detections.uv[rows], detections.camera[rows], *lens, lenses, ideal)
+    finite = np.isfinite(ideal).all(-1)  # a lens that was fitted to next to nothing may show no such place
+    rows, ideal = rows[finite], ideal[finite]
+    order = np.argsort(detections.camera[rows], kind="stable")
+    rows, ideal = rows[order], ideal[order]
+    camera = detections.camera[rows]
+    count = np.bincount(camera, minlength=rig.num_cameras)
+    at = camera, np.arange(len(rows)) - (np.cumsum(count) - count)[camera]
+    shape = (rig.num_cameras, max(int(count.max()), 1))
+    padded = PaddedBlobs(
+        np.full((*shape, 2), FAR), np.full((*shape, 2), FAR, dtype=np.float32), np.ones(shape),
+        np.full(shape, np.nan), np.full(shape, -1), count, len(detections),
+    )  # fmt: skip
+    padded.uv[at], padded.ideal[at], padded.row[at] = detections.uv[rows], ideal, rows
+    padded.sigma[at], padded.radius[at] = detections.sigma[rows], detections.radius[rows]
+    return padded
 
 
 @njit(cache=True)
-def _undistort(uv, count, focal, principal, distortion, lenses, ideal):
-    """Fill pixels from the principal point, without distortion; see `PaddedBlobs.ideal`."""
-    for c in range(len(uv)):
-        for m in range(count[c]):
-            xd, yd = (uv[c, m, 0] - principal[c, 0]) / focal[c, 0], (uv[c, m, 1] - principal[c, 1]) / focal[c, 1]
-            x, y = lens_kernels.undistort(lenses, c, xd, yd, distortion[c])
-            mean = (focal[c, 0] + focal[c, 1]) / 2
-            ideal[c, m, 0], ideal[c, m, 1] = mean * x, mean * y
+def _undistort(uv, camera, focal, principal, distortion, lenses, ideal):
+    """Fill pixels (R, 2) from the principal point, without distortion; see `PaddedBlobs.ideal`."""
+    for r in range(len(uv)):
+        c = camera[r]
+        xd, yd = (uv[r, 0] - principal[c, 0]) / focal[c, 0], (uv[r, 1] - principal[c, 1]) / focal[c, 1]
+        x, y = lens_kernels.undistort(lenses, c, xd, yd, distortion[c])
+        mean = (focal[c, 0] + focal[c, 1]) / 2
+        ideal[r, 0], ideal[r, 1] = mean * x, mean * y
 
 
 @dataclass(frozen=True)

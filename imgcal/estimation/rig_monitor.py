@@ -38,6 +38,8 @@ FEW = 16
 more than it says, and others would be blamed. What came before is then forgotten ..."""
 UNSURE = 8
 """... and of the object nothing is asked before so many have been learnt."""
+DOUBT = 16
+"""Snapshots for which a camera is in doubt that seemed to have moved, and of which nothing could be told."""
 
 
 class RigMonitor:
@@ -57,6 +59,7 @@ class RigMonitor:
         self.object_change: ObjectChange | None = None  # that became known with the latest snapshot
         self.slips: tuple[ClockSlip, ...] = ()  # that became known with the latest snapshot
         self.apart: tuple[int, ...] = ()  # cameras of which it became known that they have moments of their own
+        self.undecided: dict[int, int] = {}  # cameras that seem to have moved, and for how many snapshots yet
         self._clocks = SlipQuestion()
         self.held = HeldCameras()  # of which nothing is learnt until it is known why they see the object elsewhere
         self._misfit = Misfit()
@@ -92,6 +95,7 @@ class RigMonitor:
                 snapshot says the same, that camera has moved.
         """
         self.object_change, self.slips, self.apart = None, (), ()
+        self.undecided = {camera: left - 1 for camera, left in self.undecided.items() if left > 1}
         new = [camera for camera in moved if camera not in self.held.cameras]
         if new:
             self.held.hold(new, self.filter.count - self.first < FEW)
@@ -125,7 +129,9 @@ class RigMonitor:
                 return anew, ()
         if found is not None:
             with contextlib.suppress(RefusedError):  # what cannot be told or learnt is tested with the next snapshot
-                return self._alarmed(found)
+                told = self._alarmed(found)
+                self.undecided = {}
+                return told
         if self.filter.due:
             result = self.filter.relinearize()
             self._recent.relinearized(result)
@@ -243,6 +249,7 @@ class RigMonitor:
             before, seconds = self._recent.belief_before(age), self._recent.seconds(age)
         known = since is not None and bool(free)
         free, evidence = changed_cameras(self._recent.test(age), free)
+        self.undecided |= dict.fromkeys(free, DOUBT)
         snapshots = self._recent.snapshots(age)
         if (in_time := self._in_time_since(before, age, free)) is not None:
             return in_time, tuple(told)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, cast
 
 import numpy as np
+import torch
 
 from imgcal.errors import RefusedError
 from imgcal.estimation.absorption import absorbed, joined
@@ -37,6 +38,8 @@ LEAST_WIDE = 5e-4
 LEAST_EARLIER, LEAST_SECONDS = 12, 1.0
 """Snapshots before a change, or seconds since the beginning, from which a camera that moves is told from one that has
 exposed late from the first snapshot on: within less, an object moves steadily, and both shift an image alike."""
+LEAST_MOTION = 5.0
+"""Standard deviations by which the blobs of an object that moves go along an axis, in the median."""
 
 
 @dataclass(frozen=True)
@@ -76,9 +79,21 @@ class Suspicion:
 
     @property
     def too_early(self) -> bool:
-        """Tell whether hardly anything had been seen before."""
+        """Tell whether hardly anything had been seen before, of an object that moves: else no clock shows."""
         new = self.first is not None and len(self.snapshots) - self.count < LEAST_EARLIER
-        return new and sum(self.pauses) < LEAST_SECONDS
+        return new and sum(self.pauses) < LEAST_SECONDS and self._object_moves
+
+    @property
+    def _object_moves(self) -> bool:
+        """Tell whether blobs went elsewhere in the snapshots before."""
+        seen = [(one.seen[0], one.uv[0], one.sigma[0]) for one, _ in self.snapshots[: -self.count]]
+        if not seen:
+            return True
+        there, uv, sigma = (torch.stack(parts) for parts in zip(*seen, strict=True))  # (S, C, N), (S, C, N, 2)
+        last = torch.where(there[..., None], uv, -torch.inf).amax(0)
+        first = torch.where(there[..., None], uv, torch.inf).amin(0)
+        went = (last - first).amax(-1)[there.sum(0) > 1]
+        return not len(went) or bool(went.median() > LEAST_MOTION * sigma[there].median())
 
     def apart(self, options: EstimationOptions) -> float:
         """Log odds that all these cameras, or the first alone, see the object at moments of their own, against moves.

@@ -22,6 +22,7 @@ SAID: Mapping[CameraHealth, str] = {
 def health_of(memory: KeeperMemory) -> dict[str, CameraHealth]:
     """How each camera is, by name."""
     found: dict[str, CameraHealth] = {}
+    doubted = {*memory.sightings.doubted, *memory.monitor.held.cameras, *memory.monitor.undecided}
     for camera, name in enumerate(memory.prior.camera_names):
         if camera in memory.sightings.lost:
             found[name] = "lost"
@@ -29,7 +30,7 @@ def health_of(memory: KeeperMemory) -> dict[str, CameraHealth]:
             found[name] = "unseen"
         elif camera in memory.relearning.events:
             found[name] = "relearning"
-        elif camera in memory.off or camera in memory.sightings.doubted or camera in memory.monitor.held.cameras:
+        elif camera in memory.off or camera in doubted:
             found[name] = "doubtful"
         else:
             found[name] = memory.told_health.get(camera, "ok")

@@ -83,3 +83,13 @@ def test_patterns_of_sampled_rigs_move_and_bend_as_much_as_the_spread_says(o10, 
     bent = (change - shift[:, :, None]) / np.sqrt((pattern**2).sum(-1).mean(1))[:, None, None]
     # Of lengths in the pattern, at most: a turn about the view moves all of it and bends none.
     assert 0.5 * allowed.shape < np.sqrt((bent**2).sum(-1).mean()) < 1.5 * allowed.shape
+
+
+def test_what_a_lens_cannot_show_is_left_out(o10, asymmetric8) -> None:
+    blobs = take(o10, asymmetric8, 0).detections
+    distortion = o10.distortion.clone()
+    distortion[3] = torch.nan  # fitted to nothing
+    found, whole = gather(blobs, replace(o10, distortion=distortion)), gather(blobs, o10)
+    others = [camera for camera in range(10) if camera != 3]
+    assert found.count[3] == 0 and (found.uv[3] == FAR).all()
+    assert (found.count[others] == whole.count[others]).all() and np.isfinite(found.ideal).all()

@@ -14,10 +14,13 @@ def test_the_worst_is_said_of_a_camera() -> None:
     assert health_of(memory)["cam02"] == "dirty"
     memory.off[1] = 0.0
     assert health_of(memory)["cam02"] == "doubtful"
+    memory.off.clear()
+    memory.monitor.undecided = {1: 3}
+    assert health_of(memory)["cam02"] == "doubtful"
     memory.relearning.events[1] = Event(0.0, 1, "moved", "cam02")
     assert health_of(memory)["cam02"] == "relearning"
+    memory.monitor.undecided = {}
     memory.relearning.events.clear()
-    memory.off.clear()
     take_health(memory, Event(0.0, 2, "clean", "cam02"))
     assert health_of(memory)["cam02"] == "ok"
 
