@@ -14,8 +14,9 @@ from pydantic import Field, model_validator
 from imgcal.geometry import RigidTransform
 from imgcal.io.atomic import write_text
 from imgcal.io.names import title_of
-from imgcal.io.rig_yaml import FORMAT as RIG_FORMAT
-from imgcal.io.rig_yaml import CameraImages, Coefficient, Focal, Name, Pixel, check_names, load_rig
+from imgcal.io.rig_schema import FORMAT as RIG_FORMAT
+from imgcal.io.rig_schema import CameraImages, Coefficient, Focal, Name, Pixel, check_names
+from imgcal.io.rig_yaml import load_rig
 from imgcal.io.validation import StrictModel, validated
 from imgcal.io.yaml_file import Flow, read_yaml, yaml_text
 from imgcal.types import CameraRig, RigPrior, limits
