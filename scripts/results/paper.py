@@ -54,6 +54,7 @@ REDUCED = {
         "network.change.backbone=vit_tiny_patch16_224",
         f"network.change.options={SMALL_VIT}",
         "images={size: 112, dot: 1.0}",
+        "optimizer.lr=3e-4",  # at the convolutions' 3e-3 it hardly begins to learn
     ),
     "cnn": (
         "network.change.backbone=resnet10t",
@@ -148,7 +149,7 @@ def sized(row: str, options: Options, seed: int) -> RigExperiment:
             changes += [*FULL["images" if images else "points"], *EVERY]
             steps = options.steps or experiment.training.steps or 1
         case "reduced":
-            steps = options.steps or (400 if images else 500)
+            steps = options.steps or (1200 if images else 500)
             changes += [*SHORT, *REDUCED[kind], f"training.batch_size={8 if images else 64}"]
             changes += ["training.save_every=250", "training.validate_every=250"]
         case "toy":

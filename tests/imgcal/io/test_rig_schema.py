@@ -1,4 +1,4 @@
-"""What a rig file may not hold is said in one line, which names the file, the camera and what was expected."""
+"""What a rig file holds; what it may not hold is said in one line: the file, the camera, what was expected."""
 
 import re
 from dataclasses import replace
@@ -10,7 +10,9 @@ import torch
 import yaml
 
 from imgcal.errors import InputError
-from imgcal.io.rig_yaml import RigCovariance, load_rig, save_rig
+from imgcal.geometry.rotations import rotation_from_vector
+from imgcal.io.rig_yaml import RigCovariance, load_rig, load_rig_covariance, save_rig
+from imgcal.types.rig import RigPrior
 
 TEXT = """\
 format: imgcal-rig/1
@@ -33,6 +35,24 @@ prior:
   focal_length: 0.03
   principal_point: 11.0
 """
+
+
+def test_reads_the_documented_example(tmp_path: Path) -> None:
+    path = tmp_path / "pair.yaml"
+    path.write_text(TEXT)
+    rig = load_rig(path)
+    assert rig.camera_names == ("left", "right")
+    assert rig.name == "pair"
+    assert rig.working_distance == 850.14
+    assert rig.prior == RigPrior(focal_length=0.03, principal_point=11.0)
+    assert rig.image_size.tolist() == [[2048, 1088], [640, 480]]
+    assert rig.focal_length.dtype == torch.float64
+    assert rig.distortion[0].tolist() == [0.1, -0.1, 0.0, 9e-05, 0.0]
+    assert rig.cam_from_rig.translation[1].tolist() == [100.0, 0.0, 0.0]
+    torch.testing.assert_close(
+        rig.cam_from_rig.rotation[0], rotation_from_vector(torch.tensor([0, 0.1, 0], dtype=torch.float64))
+    )
+    assert load_rig_covariance(path) is None
 
 
 @pytest.mark.parametrize(

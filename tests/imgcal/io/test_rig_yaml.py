@@ -14,28 +14,6 @@ from imgcal.io.rig_yaml import RigCovariance, load_rig, load_rig_covariance, sav
 from imgcal.types.rig import CameraRig, DriftRate, RigPrior
 from imgcal.types.volume import Volume
 
-TEXT = """\
-format: imgcal-rig/1
-name: pair
-working_distance: 850.14                 # mm, optional
-cameras:
-  - name: left
-    image_size: [2048, 1088]
-    focal_length: [1627.0, 1627]
-    principal_point: [1024.0, 544.0]
-    distortion: [0.1, -0.1, 0.0, 9e-05, 0.0]
-    cam_from_rig: {rotation_vector: [0.0, 0.1, 0.0], translation: [0.0, 0.0, 1.0]}
-  - name: right
-    image_size: [640, 480]
-    focal_length: [800.0, 801.0]
-    principal_point: [320.0, 240.0]
-    distortion: [0.0, 0.0, 0.0, 0.0, 0.0]
-    cam_from_rig: {rotation_vector: [0.0, 0.0, 0.0], translation: [100.0, 0.0, 0.0]}
-prior:
-  focal_length: 0.03
-  principal_point: 11.0
-"""
-
 
 def make_rig(numbers: torch.Tensor, names: tuple[str, ...] = ("a", "b", "c")) -> CameraRig:
     """Make a rig of the given numbers: (C, 15) rotation, translation, f - 1000, principal point, distortion."""
@@ -59,24 +37,6 @@ def covariance_of(cameras: int) -> RigCovariance:
     root = torch.randn(15 * cameras, 15 * cameras, generator=generator, dtype=torch.float64)
     root[:6] = 0  # the reference camera's place is exact
     return RigCovariance.from_matrix(root @ root.mT / 100, cameras, "a")
-
-
-def test_reads_the_documented_example(tmp_path: Path) -> None:
-    path = tmp_path / "pair.yaml"
-    path.write_text(TEXT)
-    rig = load_rig(path)
-    assert rig.camera_names == ("left", "right")
-    assert rig.name == "pair"
-    assert rig.working_distance == 850.14
-    assert rig.prior == RigPrior(focal_length=0.03, principal_point=11.0)
-    assert rig.image_size.tolist() == [[2048, 1088], [640, 480]]
-    assert rig.focal_length.dtype == torch.float64
-    assert rig.distortion[0].tolist() == [0.1, -0.1, 0.0, 9e-05, 0.0]
-    assert rig.cam_from_rig.translation[1].tolist() == [100.0, 0.0, 0.0]
-    torch.testing.assert_close(
-        rig.cam_from_rig.rotation[0], rotation_from_vector(torch.tensor([0, 0.1, 0], dtype=torch.float64))
-    )
-    assert load_rig_covariance(path) is None
 
 
 @pytest.mark.parametrize(("name", "cameras"), [("O10", 10), ("O6", 6), ("U7", 7), ("T4", 4)])
