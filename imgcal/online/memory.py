@@ -52,6 +52,7 @@ MODULES = frozenset(
         "types.calibration_object",
         "types.observations",
         "types.rig",
+        "types.volume",
     )
 )
 """Whose classes may be saved and restored; they have been imported before anything is restored."""

@@ -17,6 +17,7 @@ from imgcal.messages import shortened
 from imgcal.types.calibration_object import CalibrationObject
 from imgcal.types.observations import Observations
 from imgcal.types.rig import CameraRig
+from imgcal.types.volume import Volume
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,8 @@ def check_rig(rig: CameraRig) -> None:
             place = wrong.nonzero()[0].tolist()
             camera = shortened(rig.camera_names[place[-2]])
             _fail(f"rig {rig.name}: camera {camera}: {name}", float(tensor[tuple(place)]), plausible)
+    if rig.volume is not None:
+        Volume(rig.volume.points)  # checks them
 
 
 def check_object(obj: CalibrationObject) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,15 +69,16 @@ class Volume:
         """Tell whether the volume is the box between `low` and `high`."""
         return len(self.points) == 8 and set(self.points) == set(Volume.box(self.low, self.high).points)
 
-    @cached_property
-    def _planes(self) -> NDArray[np.float64]:
-        """Outward normals and offsets of the faces: (F, 4)."""
-        from scipy.spatial import ConvexHull  # slow to import, and few ask
-
-        return np.asarray(ConvexHull(np.array(self.points)).equations)
-
     def contains(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Tell which points (M, 3) mm are inside, a hair's breadth of rounding included: (M,)."""
         slack = FLAT * float(np.ptp(np.array(self.points), axis=0).max())
-        inside = np.all(points @ self._planes[:, :3].T + self._planes[:, 3] <= slack, axis=1)
+        inside = np.all(points @ _planes(self.points)[:, :3].T + _planes(self.points)[:, 3] <= slack, axis=1)
         return np.asarray(inside)
+
+
+@lru_cache(maxsize=16)
+def _planes(points: tuple[Corner, ...]) -> NDArray[np.float64]:
+    """Outward normals and offsets of the faces of the body that holds some points: (F, 4)."""
+    from scipy.spatial import ConvexHull  # slow to import, and few ask
+
+    return np.asarray(ConvexHull(np.array(points)).equations)

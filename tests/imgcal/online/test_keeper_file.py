@@ -17,7 +17,7 @@ import torch
 import imgcal
 from imgcal.errors import InputError
 from imgcal.online import RigKeeper, RigState
-from imgcal.types import CameraRig
+from imgcal.types import CameraRig, DriftRate, RigPrior, Volume
 from scripts.benchmarks.rig_streams import Bump, Stream
 
 CHILD = """
@@ -73,6 +73,23 @@ def test_the_same_snapshots_give_the_same_states(saved, tmp_path: Path) -> None:
             assert alike(keeper.update(blobs, seconds), state)
         keeper.save(tmp_path / "again.json")
     assert [path.name for path in tmp_path.iterdir()] == ["again.json"]
+
+
+def test_what_a_rig_file_may_hold_beside_its_cameras_is_gone_on_with(tmp_path: Path) -> None:
+    made = stream()
+    volume = Volume.box((-100.0, -100.0, 700.0), (100.0, 100.0, 900.0))
+    rig = replace(made.factory, volume=volume, prior=RigPrior(position=3.0), drift_rate=DriftRate(position=0.1))
+    with RigKeeper(rig, made.obj) as keeper:
+        for seconds, blobs in made.snapshots(3):
+            keeper.update(blobs, seconds)
+        keeper.save(tmp_path / "state.json")
+    with RigKeeper.restore(tmp_path / "state.json") as keeper:
+        assert keeper.given.volume == volume == keeper.factory.volume
+        assert (keeper.given.prior, keeper.given.drift_rate) == (rig.prior, rig.drift_rate)
+    text = (tmp_path / "state.json").read_text()
+    (tmp_path / "state.json").write_text(text.replace("700.0", "900.0"))
+    with pytest.raises(InputError, match="points that all lie in"):
+        RigKeeper.restore(tmp_path / "state.json")
 
 
 def test_people_can_read_it(saved) -> None:
