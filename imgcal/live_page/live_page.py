@@ -115,6 +115,7 @@ class LivePage:
         self._problem, self._problems = problem, set[str]()
         self._news = threading.Condition()
         self._commands: queue.Queue[Command] = queue.Queue(MOST_COMMANDS)
+        self._answers: deque[dict[str, Any]] = deque()  # to commands; the server asks for no more than it waits for
         self._viewers = 0
         self._closing = False
         self._ended: socket.socket | None = None  # the pipe of a server that has ended
@@ -213,6 +214,7 @@ class LivePage:
         self._pipe = ours
         with self._news:
             greeting = framed("greeting", self._greeting)  # with what people were told and did so far
+            self._answers.clear()  # whom they were for has gone
         threading.Thread(target=self._listen, args=(ours,), name="live page commands", daemon=True).start()
         ours.sendall(greeting)
 
@@ -243,11 +245,22 @@ class LivePage:
         elif "problem" in content:
             self._failed(content["problem"], content["why"])
         else:
-            command = Command(**content)
-            with self._news:
+            self._asked(content.pop("number"), Command(**content))
+
+    def _asked(self, number: int, command: Command) -> None:
+        """Take a command, and answer whether it will come to the loop: one that does not is shown as done nowhere."""
+        taken = command.event is not None  # that is the page's own affair
+        try:
+            self._commands.put_nowait(command)
+            taken = True
+        except queue.Full:
+            if not taken:
+                self._failed("commands", f"{MOST_COMMANDS} wait, and nobody fetches them")
+        with self._news:
+            if taken:
                 self._notes.obey(command, self._actions)
-            with contextlib.suppress(queue.Full):
-                self._commands.put_nowait(command)
+            self._answers.append({"number": number, "taken": taken})
+            self._news.notify()
 
     def _send(self) -> None:
         """Pass on what is new, until the page is closed; start the server again where it has ended."""
@@ -258,11 +271,13 @@ class LivePage:
                 latest, self._latest = self._latest, None
                 pictured, ended = self._pictured, self._ended is self._pipe
                 events = self._noted()
+                answers = [self._answers.popleft() for _ in range(len(self._answers))]
             last = latest or last
             begun = time.monotonic()
             try:
                 if ended:
                     raise BrokenPipeError("the server has ended")
+                self._pass_on(("answer", partial(dict, answer)) for answer in answers)
                 self._pass_on(courier.messages(latest, events))
                 if self._viewers and pictured is not None:
                     self._pass_on(courier.pictures(*pictured))
@@ -286,7 +301,8 @@ class LivePage:
         return found
 
     def _is_news(self) -> bool:
-        return self._latest is not None or bool(self._events) or self._closing or self._ended is self._pipe
+        news = self._latest is not None or bool(self._events) or bool(self._answers)
+        return news or self._closing or self._ended is self._pipe
 
     def _pass_on(self, messages: Iterator[Message]) -> None:
         """Send messages; what cannot be made of one is said once, and the others are sent."""

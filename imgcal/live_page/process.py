@@ -67,6 +67,8 @@ async def _serve(listening: socket.socket, pipe: socket.socket) -> None:
             try:
                 if kind in ("rig", "belief"):
                     guide.learn(kind, content, application)
+                elif kind == "answer":
+                    application.answered(**content)
                 else:
                     application.spread(board.take(kind, content))
             except Exception as error:  # what one message holds does not end the page

@@ -16,6 +16,8 @@ from imgcal.live_page.security import HEADERS, Allowance, Gate, Refusal
 MOST_VIEWERS = 64
 MOST_BODY = 1024  # bytes of a command
 BODY_SECONDS = 5.0
+ANSWER_SECONDS = 5.0  # for the loop's process to take a command
+MOST_ASKED = 64  # commands that it has not answered
 STUCK_SECONDS = 20.0  # a viewer that takes nothing for so long is sent away
 ALIVE_SECONDS = 10.0  # between signs of life where nothing is new
 JSON = "application/json"
@@ -64,6 +66,8 @@ class Application:
         self.viewers: set[Viewer] = set()
         self._closing = False
         self._commands, self._downloads = Allowance(10, 5.0), Allowance(4, 1.0)
+        self._asked: dict[int, tuple[Command, asyncio.Future[bool]]] = {}  # not answered yet, by number
+        self._count = 0  # of commands
         self._cameras = tuple(board.greeting["cameras"])
         self._actions = {action.name: action for action in board.greeting["actions"]}
 
@@ -142,12 +146,34 @@ class Application:
         except (ValueError, RecursionError, TimeoutError) as error:
             reason = str(error) if type(error) is ValueError else "expected a command as JSON"
             return _refused(Refusal(400, reason))
-        self._obey(command)
-        return 200, JSON, b"{}", {}
+        try:
+            if await self._asked_for(command):
+                return 200, JSON, b"{}", {}
+            return _refused(Refusal(503, "the program that runs the rig takes no commands now"))
+        except TimeoutError:
+            return _refused(Refusal(504, "the program that runs the rig has not answered yet"))
 
-    def _obey(self, command: Command) -> None:
-        self._tell(asdict(command))
-        self.spread(self.board.obey(command))
+    async def _asked_for(self, command: Command) -> bool:
+        """Pass a command on to the loop's process, and wait for its word whether it takes it.
+
+        Raises:
+            TimeoutError: there is none yet.
+        """
+        if len(self._asked) >= MOST_ASKED:
+            return False
+        self._count += 1
+        answer: asyncio.Future[bool] = asyncio.get_running_loop().create_future()
+        self._asked[self._count] = command, answer
+        self._tell(asdict(command) | {"number": self._count})
+        return await asyncio.wait_for(answer, ANSWER_SECONDS)
+
+    def answered(self, number: int, taken: bool) -> None:
+        """Take the answer of the loop's process to a command: now it is shown as done, however late that is."""
+        command, answer = self._asked.pop(number)
+        if taken:
+            self.spread(self.board.obey(command))
+        if not answer.done():  # who asked may have gone
+            answer.set_result(taken)
 
     async def _stream(self, receive: Receive, send: Send) -> None:
         """Send what is new, for as long as the viewer takes it."""

@@ -1,11 +1,11 @@
 // What people can ask for. Each command carries the token of this page.
 
 async function command(name, more = {}) {
-  const camera = more.camera, told = { pause: "Paused.", resume: "Goes on.", acknowledge: "Acknowledged.", factory: "This is the factory calibration now." };
+  const camera = more.camera, told = { pause: "Paused.", resume: "Goes on.", acknowledge: "Acknowledged.", factory: "Asked for: an event tells when it is so." };
   try {
     const answer = await fetch("/command", { method: "POST", headers: { "Content-Type": "application/json", "X-Imgcal-Token": data.token }, body: JSON.stringify({ name, ...more }) });
     say($("said"), answer.ok ? told[name] || "Done." : `Not done: ${(await answer.text()).trim()}`);
-    if (!answer.ok) notice(`not done: ${answer.status === 403 ? "reload the page" : "try again"}`);
+    if (!answer.ok) notice(`not done: ${answer.status === 403 ? "reload the page" : answer.status > 500 ? "the program that runs the rig does not listen" : "try again"}`);
     return answer.ok;
   } catch {
     notice("not done: no connection");

@@ -10,7 +10,7 @@ from imgcal.errors import InputError
 from imgcal.live_page import live_page as module
 from imgcal.live_page.address import Address
 from imgcal.live_page.live_page import LivePage
-from tests.imgcal.live_page.pages import Client, Stream, alarm, made_state
+from tests.imgcal.live_page.pages import ACTIONS, Client, Stream, alarm, made_state
 
 
 def test_a_taken_address_is_an_error_before_anything_is_started(served, o10, asymmetric8):
@@ -167,8 +167,23 @@ def test_a_viewer_that_never_reads_and_a_server_that_hangs_hold_up_nobody(served
         viewer.close()
 
 
-def test_commands_that_nobody_fetches_are_bounded(served):
-    from imgcal.live_page.live_page import MOST_COMMANDS
-
-    assert served._commands.maxsize == MOST_COMMANDS
-    assert served.commands() == []
+def test_a_command_that_the_loop_never_gets_is_shown_as_done_nowhere(o10, asymmetric8, monkeypatch):
+    monkeypatch.setattr(module, "MOST_COMMANDS", 1)
+    told = []
+    with LivePage(o10, asymmetric8, Address(port=0), actions=ACTIONS, problem=told.append) as page:
+        page.tell(alarm("cam02"))
+        reader, client = Stream(page), Client(page)
+        reader.wait("events", lambda content: content)
+        assert client.command({"name": "warm"})[0] == 200
+        assert reader.wait("controls", lambda content: content["on"])["on"] == ["warm"]
+        status, _, reason = client.command({"name": "pause"})
+        assert status == 503 and reason == "the program that runs the rig takes no commands now\n"
+        assert client.command({"name": "acknowledge", "event": 0})[0] == 200  # for that no loop is needed
+        assert not reader.wait("events", lambda content: content)[0]["open"]
+        late = Stream(page)
+        assert late.wait("controls") == {"paused": False, "on": ["warm"]} == page._notes.controls()
+        assert [command.name for command in page.commands()] == ["warm"]
+        assert told == ["live page: commands: 1 wait, and nobody fetches them"]
+        assert client.command({"name": "pause"})[0] == 200 and [c.name for c in page.commands()] == ["pause"]
+        for one in (reader, late):
+            one.close()
