@@ -48,6 +48,7 @@ from imgcal.watch import (
     ZeroMQ,
     forget_after,
     holds_videos,
+    put_aside,
 )
 from imgcal.watch import Watch as Loop
 
@@ -116,7 +117,7 @@ class Watch:
         known = None if progress is None or knows else self._known(folder, progress, source)
         intake = Intake(source, rig, Timing(self.tolerance, self.patience), self.keep_all, known=known)
         hook = None if self.hook is None else Hook(self.hook)
-        display = Display(Console(file=sys.stdout, soft_wrap=True), intake)
+        display = Display(Console(file=sys.stdout, soft_wrap=True), intake, hook)
         with contextlib.ExitStack() as stack:
             keeper, restored = self._keeper(folder, rig, obj)
             stack.enter_context(keeper)
@@ -137,16 +138,23 @@ class Watch:
                 goes_on or self.fresh or told is None or self._is_another(progress)
             ):  # what came after will come again
                 forget_after(folder / EVENTS, told)
+            anew = self.fresh and put_aside(folder)
             stack.enter_context(loop)
             stopped = stack.enter_context(_stopping())
             stack.enter_context(display.of(loop.tally))
-            if restored:
-                loop.tell(Event(time.time(), 0, "restart", message="started again from what was known"))
+            if restored or anew:
+                how = "started again from what was known" if restored else "begun anew with the factory calibration"
+                loop.tell(Event(time.time(), 0, "restart", message=how))
             loop.run(intake, stopped, display.draw)
         tally = loop.tally
         said = display.result(self.out / CURRENT)
+        if loop.unwritten:
+            said = f"{said} | not written: {'; '.join(loop.unwritten.values())}"
         if stopped.interrupted:
-            raise KeyboardInterrupt(f"interrupted after {said}; the same command goes on from there")
+            there = "what was written last" if STATE in loop.unwritten else "there"
+            raise KeyboardInterrupt(f"interrupted after {said}; the same command goes on from {there}")
+        if loop.unwritten:
+            raise InputError(f"watch: {said}")
         before = intake.known_before + (source.known_before() if isinstance(source, Folder) else 0)
         if tally.snapshots == 0 and before:
             read = f"all {before:,} snapshots of {self.input} had been read before"

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from imgcal.messages import one_line
 from imgcal.online import Event
-from imgcal.watch import Intake, Tally
+from imgcal.watch import EVENTS, Hook, Intake, Tally
 
 SAID_EVERY = 10.0  # s between two lines where nobody looks at a terminal
 DRAWN_EVERY = 0.25  # s
@@ -26,9 +26,9 @@ LEAST_OFFSET = 5e-4  # s: smaller ones are the exposure's length
 class Display:
     """Shows how it goes; with `rich` where somebody looks."""
 
-    def __init__(self, console: Console, intake: Intake) -> None:
+    def __init__(self, console: Console, intake: Intake, hook: Hook | None = None) -> None:
         """Prepare; nothing is shown before `of`."""
-        self._console, self._intake, self._tally = console, intake, Tally()
+        self._console, self._intake, self._hook, self._tally = console, intake, hook, Tally()
         self._live: Live | None = None
         self._drawn = self._said = -SAID_EVERY
         self._snapshots = 0
@@ -90,6 +90,9 @@ class Display:
         tally, intake = self._tally, self._intake
         counts = {"refused": tally.refused, "dropped": intake.dropped, "unreadable": intake.unreadable.total()}
         counts |= {kind: intake.synchronizer.counts[kind].total() for kind in SHOWN}
+        counts["events not written"] = tally.problems[EVENTS]
+        if self._hook is not None:
+            counts |= {"hooks failed": self._hook.failed, "events without a hook": self._hook.dropped}
         return [f"{count:,} {kind}" for kind, count in counts.items() if count]
 
     def _waiting(self) -> str:

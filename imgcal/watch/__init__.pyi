@@ -8,7 +8,7 @@ from .json_lines import JsonLines
 from .loop import EVENTS, STATE, Keeper, Page, Progress, Watch
 from .metrics import Metrics, Tally
 from .recordings import BlobTable, Videos, holds_videos
-from .rig_files import CURRENT, RigFiles
+from .rig_files import CURRENT, RigFiles, put_aside
 from .synchronization import COUNTS, Synchronizer, TimedSnapshot, Timing
 from .zeromq import ZeroMQ
 
@@ -45,4 +45,5 @@ __all__ = [
     "checked",
     "forget_after",
     "holds_videos",
+    "put_aside",
 ]

@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import threading
+import time
 from collections import deque
 
 from imgcal.errors import InputError
@@ -46,10 +47,12 @@ class Hook:
             raise InputError(f"--hook: found {shortened(command)!r}, expected a program that can be run")
         self.dropped = self.failed = 0
         """Events that were dropped; runs that ended with an error, or not in time."""
+        self.problem: str | None = None
+        """What went wrong the last time; None = nothing did."""
         self._timeout = timeout
         self._events: deque[Event] = deque()
         self._changed = threading.Condition()
-        self._closing = False
+        self._closing, self._ends = False, float("inf")  # when the last one must have ended, s
         self._thread = threading.Thread(target=self._work, name="hook", daemon=True)
         self._thread.start()
 
@@ -58,28 +61,35 @@ class Hook:
         with self._changed:
             self._events.append(event)
             if len(self._events) > MOST_WAITING:
-                self._events.popleft()
-                self.dropped += 1
+                self._drop(f"more than {MOST_WAITING} events waited for the command")
             self._changed.notify()
 
+    def _drop(self, why: str) -> None:
+        self._events.popleft()
+        self.dropped += 1
+        self.problem = f"--hook: events were dropped: {why}"
+
     def close(self) -> None:
-        """Let the commands be run that wait, as far as one timeout suffices."""
+        """Let the commands be run that wait, as far as one timeout suffices; the others are dropped."""
         with self._changed:
-            self._closing = True
+            self._closing, self._ends = True, time.monotonic() + self._timeout
             self._changed.notify()
         self._thread.join(self._timeout + 1)
+        with self._changed:
+            while self._events:
+                self._drop("the command was not done with them in time")
 
     def _work(self) -> None:
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._events or self._closing)
-                if not self._events:
+                if not self._events or time.monotonic() >= self._ends:
                     return
                 event = self._events.popleft()
             try:
                 self._run(event)
-            except Exception:  # whatever one event holds, the next ones are told
-                self.failed += 1
+            except Exception as error:  # whatever one event holds, the next ones are told
+                self._fail(f"could not be run: {error}")
 
     def _run(self, event: Event) -> None:
         line = event.to_json().encode(errors="replace") + b"\n"
@@ -88,11 +98,18 @@ class Hook:
             self.command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
             env=environment, start_new_session=True,
         )  # fmt: skip
+        timeout = min(self._timeout, max(self._ends - time.monotonic(), 0.0))
         try:
-            process.communicate(line, self._timeout)
+            process.communicate(line, timeout)
         except subprocess.TimeoutExpired:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
             process.communicate()
+            self._fail(f"was killed after {timeout:.3g} s")
+            return
         if process.returncode:
-            self.failed += 1
+            self._fail(f"ended with exit code {process.returncode}")
+
+    def _fail(self, how: str) -> None:
+        self.failed += 1
+        self.problem = f"--hook: {shortened(shlex.join(self.command))} {how}"

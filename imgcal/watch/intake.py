@@ -12,7 +12,7 @@ from types import TracebackType
 from imgcal.errors import InputError
 from imgcal.messages import one_line
 from imgcal.types import CameraRig
-from imgcal.watch.exposures import Exposure, Item, Source, Unreadable, checked
+from imgcal.watch.exposures import CameraBlobs, Exposure, Item, Source, Unreadable, checked
 from imgcal.watch.synchronization import Synchronizer, TimedSnapshot, Timing
 
 MOST_WAITING = 8
@@ -93,6 +93,7 @@ class Intake:
         self._known = known
         self._snapshots: deque[TimedSnapshot] = deque()
         self._bytes = 0
+        self._blobs: bool | None = None  # whether blobs come, or frames; None = nothing has come
         self._changed = threading.Condition()
         self._closing = self._ended = self._begun = False
         self._error: BaseException | None = None
@@ -182,7 +183,7 @@ class Intake:
         now = time.monotonic() if self.live else 0.0
         if isinstance(item, Exposure):
             try:
-                done = self.synchronizer.add(checked(item, self._rig), now)
+                done = self.synchronizer.add(self._of_one_kind(checked(item, self._rig)), now)
             except InputError as error:
                 known = item.camera if item.camera in self._rig.camera_names else ""
                 self._note(Unreadable(str(error), known))
@@ -193,6 +194,19 @@ class Intake:
             done = self.synchronizer.waited(now)
         for snapshot in done:
             self._put(snapshot)
+
+    def _of_one_kind(self, exposure: Exposure) -> Exposure:
+        """Compare an exposure with the first one.
+
+        Raises:
+            InputError: a frame among blobs, or blobs among frames: nobody works on both.
+        """
+        blobs = isinstance(exposure.content, CameraBlobs)
+        self._blobs = blobs if self._blobs is None else self._blobs
+        if blobs != self._blobs:
+            found, expected = ("blobs", "a frame") if blobs else ("a frame", "blobs")
+            raise InputError(f"{exposure.camera}: found {found}, expected {expected} as in what came first")
+        return exposure
 
     def _note(self, item: Unreadable) -> None:
         self.unreadable[item.camera or ""] += 1

@@ -18,7 +18,7 @@ from imgcal.watch.event_log import EventLog
 from imgcal.watch.hook import Hook
 from imgcal.watch.intake import Intake
 from imgcal.watch.metrics import Tally
-from imgcal.watch.rig_files import STATE, RigFiles
+from imgcal.watch.rig_files import FRAMES, STATE, RigFiles
 from imgcal.watch.synchronization import TimedSnapshot
 
 EVENTS = "events.jsonl"
@@ -142,7 +142,7 @@ class Watch:
         self._when_saved, self._source, self._rate = saved, source, rate
         self._saved = time.monotonic()
         self._progress: Progress | None = None
-        self._unsaved = False
+        self._unsaved = self._hook_told = False
         self._kept: float | None = None  # s, time of the snapshot whose rig went into the history last
 
     def __enter__(self) -> Watch:
@@ -164,6 +164,12 @@ class Watch:
         self._log.close()
         if self._hook is not None:
             self._hook.close()
+            self._told_of_hook()
+
+    @property
+    def unwritten(self) -> dict[str, str]:
+        """What could not be written the last time that it was tried, by output, and why."""
+        return {output: why for output, why in self._files.problems.items() if output != FRAMES}
 
     def run(self, intake: Intake, stopped: threading.Event, looked: Callable[[], None] = lambda: None) -> None:
         """Work on what comes until it ends, or until told to stop.
@@ -181,6 +187,7 @@ class Watch:
             if snapshot is None and intake.ended:
                 return
             self._obey()
+            self._told_of_hook()
             if snapshot is not None:
                 self.take(snapshot)
             if time.monotonic() - self._saved >= SAVED_EVERY:
@@ -253,6 +260,13 @@ class Watch:
     def _told_problems(self) -> None:
         for output, message in self._files.problems.items():
             self._failed(output, message)
+
+    def _told_of_hook(self) -> None:
+        """Say once that the command fails; how often, the display and the metrics say."""
+        problem = None if self._hook is None or self._hook_told else self._hook.problem
+        if problem is not None:
+            self._hook_told = True
+            self._problem(problem)
 
     def _failed(self, output: str, message: str) -> None:
         self.tally.problems[output] += 1

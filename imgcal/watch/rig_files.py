@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from imgcal.io import RigCovariance, save_rig
 from imgcal.online import RigState
 
 STATE, CURRENT, HISTORY, FRAMES = "state.json", "rig.yaml", "history", "frames"
+LONGEST_END = 10.0  # s that are waited at the end for what has not been written
 MOST_KEPT = 1000
 """Files of the history; more, and the oldest are removed."""
 
@@ -71,7 +73,9 @@ class RigFiles:
         with self._changed:
             self._closing = True
             self._changed.notify()
-        self._thread.join(10.0)
+        self._thread.join(LONGEST_END)
+        if self._thread.is_alive():  # a disk that does not answer
+            self.problems |= {CURRENT: f"{self._folder / CURRENT}: was not written within {LONGEST_END:g} s"}
 
     def _work(self) -> None:
         while True:
@@ -104,9 +108,7 @@ class RigFiles:
         self.problems = {name: why for name, why in self.problems.items() if name not in tried} | problems
 
     def _keep(self, state: RigState) -> None:
-        day, moment = datetime.fromtimestamp(state.time, UTC).strftime("%Y-%m-%d %H%M%S.%f").split()
-        path = self._folder / HISTORY / day / f"{moment[:-3]}.yaml"
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path = _history_path(self._folder, state.time)
         _save(state, path)
         if not self._kept or self._kept[-1] != path:
             self._kept.append(path)
@@ -116,6 +118,36 @@ class RigFiles:
             with contextlib.suppress(FileNotFoundError):  # somebody has tidied up
                 if not any(oldest.parent.iterdir()):
                     oldest.parent.rmdir()
+
+
+def put_aside(folder: Path) -> bool:
+    """Forget what an earlier run knew: its state is deleted, its rig goes into the history.
+
+    Returns:
+        Whether there was something.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    state, rig = folder / STATE, folder / CURRENT
+    found = state.is_file() or rig.is_file()
+    try:
+        if state.is_file():  # first: a start after this one must not go on from it
+            state.unlink()
+        if rig.is_file():
+            os.replace(rig, _history_path(folder, rig.stat().st_mtime))
+    except OSError as error:
+        problem = error.strerror or error
+        raise InputError(f"{folder}: what an earlier run left there cannot be put aside: {problem}") from error
+    return found
+
+
+def _history_path(folder: Path, time: float) -> Path:
+    """Name of the rig of a moment (s since the epoch) in the history, whose folder is made."""
+    day, moment = datetime.fromtimestamp(time, UTC).strftime("%Y-%m-%d %H%M%S.%f").split()
+    path = folder / HISTORY / day / f"{moment[:-3]}.yaml"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
 
 
 def _save(state: RigState, path: Path) -> None:

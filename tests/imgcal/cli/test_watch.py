@@ -309,12 +309,34 @@ def test_a_port_that_is_taken_is_told_in_one_line(option, tmp_path, monkeypatch,
     assert f"127.0.0.1:{port}" in error and "Errno" not in error and error.count("\n") == 1
 
 
-def test_a_rig_that_cannot_be_written_is_told_at_the_end_too(blobs, tmp_path, capsys):
+def test_a_rig_that_cannot_be_written_is_told_at_once_and_is_no_success(blobs, tmp_path, capsys):
     save_detections(blobs.of_snapshots(0, 3), tmp_path / "blobs.csv")
     (tmp_path / "out" / "rig.yaml").mkdir(parents=True)
-    assert watch(tmp_path / "blobs.csv", tmp_path / "out") == 0
-    (note,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: ")]
+    assert watch(tmp_path / "blobs.csv", tmp_path / "out") == 2
+    said = capsys.readouterr()
+    (note,) = [line for line in said.out.splitlines() if line.startswith("note: ")]
     assert "rig.yaml" in note
+    assert f"watch: 3 snapshots, 0 events: {tmp_path}/out/rig.yaml | not written: " in said.err
+    assert (tmp_path / "out" / "state.json").is_file()
+
+
+def test_fresh_leaves_nothing_to_go_on_from_even_before_it_has_learnt(blobs, tmp_path, monkeypatch, capsys):
+    save_detections(blobs.of_snapshots(0, 4), tmp_path / "blobs.csv")
+    out = tmp_path / "out"
+    assert watch(tmp_path / "blobs.csv", out) == 0
+    known = (out / "rig.yaml").read_bytes()
+    kept = set(out.glob("history/*/*.yaml"))
+    (tmp_path / "nothing").write_text("")
+    with open(tmp_path / "nothing") as nothing:
+        monkeypatch.setattr(sys, "stdin", nothing)
+        assert watch("-", out, "--fresh") == 3
+    assert not (out / "state.json").exists() and not (out / "rig.yaml").exists()
+    (put_aside,) = set(out.glob("history/*/*.yaml")) - kept
+    assert put_aside.read_bytes() == known
+    assert [event["message"] for event in events(out)] == ["begun anew with the factory calibration"]
+    assert "restart: begun anew with the factory calibration" in capsys.readouterr().out
+    assert watch(tmp_path / "blobs.csv", out) == 0
+    assert "4 snapshots" in capsys.readouterr().out  # all of them, once more
 
 
 def test_addresses():

@@ -1,6 +1,7 @@
 import io
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 from rich.console import Console
@@ -48,7 +49,8 @@ def test_what_did_not_go_as_it_should_is_told_at_the_end(monkeypatch):
     with shown.of(tally):
         tally.snapshots, tally.refused = 5, 2
         shown._intake.dropped = 3
-    wrong = "2 refused | 3 dropped | 1 unreadable | the latest that could not be read: junk"
+        shown._hook = SimpleNamespace(failed=4, dropped=0)
+    wrong = "2 refused | 3 dropped | 1 unreadable | 4 hooks failed | the latest that could not be read: junk"
     assert shown.result(Path("out/rig.yaml")) == f"5 snapshots, 0 events: out/rig.yaml | {wrong}"
 
 

@@ -54,6 +54,7 @@ def test_one_that_hangs_is_killed_with_what_it_started_and_never_waited_for(tmp_
     (child,) = (tmp_path / "out").read_text().split()
     until(lambda: not _runs(child))
     hook.close()
+    assert hook.problem.endswith(" was killed after 4 s")
 
 
 def _runs(pid):
@@ -72,13 +73,26 @@ def test_more_events_than_it_can_take_are_dropped_and_counted(tmp_path, monkeypa
     hook.close()
     names = [json.loads(line)["snapshot"] for line in (tmp_path / "out").read_text().splitlines()]
     assert names[-3:] == ["00007", "00008", "00009"] and len(names) + hook.dropped == 10
+    assert hook.problem == "--hook: events were dropped: more than 3 events waited for the command"
 
 
 def test_one_that_fails_is_counted(tmp_path):
     hook = Hook(script(tmp_path, "raise SystemExit(3)"))
     hook.tell(event())
     hook.close()
-    assert hook.failed == 1
+    assert hook.failed == 1 and hook.problem.endswith(" ended with exit code 3")
+
+
+def test_what_is_left_at_the_end_is_killed_or_dropped_in_time(tmp_path):
+    code = "import os, sys, time\nopen(sys.argv[1], 'a').write(f'{os.getpid()}\\n')\ntime.sleep(60)"
+    hook = Hook(script(tmp_path, code), timeout=2.0)
+    for number in range(5):
+        hook.tell(event(number))
+    until(lambda: (tmp_path / "out").is_file() and (tmp_path / "out").read_text().endswith("\n"))
+    hook.close()
+    runs = (tmp_path / "out").read_text().split()
+    assert hook.failed + hook.dropped == 5 and hook.dropped > 0 and "in time" in hook.problem
+    until(lambda: not any(_runs(process) for process in runs))
 
 
 @pytest.mark.parametrize("command", ["", "no-such-program --now", "echo 'open", "   "])

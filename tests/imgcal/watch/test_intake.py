@@ -51,6 +51,16 @@ def test_a_recording_waits_and_nothing_of_it_is_dropped():
     assert intake.dropped == 0 and source.closed
 
 
+def test_frames_among_blobs_are_told_and_not_silently_left_out():
+    frame = np.zeros(PAIR.image_size[1].tolist()[::-1], np.uint8)
+    given = snapshots(3)
+    given[3] = Exposure(given[3].camera, given[3].time, frame)
+    with Intake(Given(given), PAIR) as intake:
+        found = taken(intake)
+    assert [len(one.exposures) for one in found] == [2, 1, 2] and dict(intake.unreadable) == {"cam02": 1}
+    assert list(intake.reasons) == ["cam02: found a frame, expected blobs as in what came first"]
+
+
 @pytest.mark.parametrize("keep_all", [False, True])
 def test_of_a_live_source_the_oldest_are_dropped_and_counted(keep_all):
     with Intake(Given(snapshots(100), live=True), PAIR, keep_all=keep_all) as intake:

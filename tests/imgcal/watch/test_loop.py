@@ -10,6 +10,7 @@ from imgcal.errors import InputError
 from imgcal.online import RigKeeper
 from imgcal.watch import loop as module
 from imgcal.watch.exposures import CameraBlobs, Exposure
+from imgcal.watch.hook import Hook
 from imgcal.watch.intake import Intake
 from imgcal.watch.loop import Progress, Watch
 from imgcal.watch.synchronization import TimedSnapshot
@@ -145,6 +146,14 @@ def test_no_rig_is_accepted_before_there_is_a_snapshot(tmp_path):
     with RigKeeper(RIG, OBJECT) as keeper, Watch(keeper, tmp_path, page=page, problem=told.append) as loop:
         loop._obey()
     assert events_of(tmp_path) == [] and len(told) == 1 and "no snapshot has come yet" in told[0]
+
+
+def test_a_hook_that_fails_is_told_once(tmp_path):
+    keeper, told, hook = KeeperOfStates(), [], Hook("false")
+    keeper.events = {0: [event(0)], 1: [event(1)], 2: [event(2)]}
+    with Watch(keeper, tmp_path, hook, problem=told.append) as loop, Intake(Snapshots(0.0, 1.0, 2.0), RIG) as intake:
+        loop.run(intake, threading.Event())
+    assert hook.failed == 3 and told == ["--hook: false ended with exit code 1"]
 
 
 def test_it_stops_when_told(tmp_path):
