@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from imgcal.messages import one_line
+from imgcal.messages import listed, one_line
 from imgcal.online import Event
 from imgcal.watch import EVENTS, Hook, Intake, Tally
 
@@ -76,7 +76,7 @@ class Display:
         if state is not None and state.refused is not None:
             parts.append("nothing learnt now")
         parts.append(f"{tally.snapshots:,} snapshots, {self._rate:.3g}/s")
-        return " | ".join([*parts, *self._counts(), *self._clocks()])
+        return " | ".join([*parts, *self._counts(), *self._clocks(), *self._alone()])
 
     def result(self, rig: Path) -> str:
         """Say in one line what came of it, and what did not: `rig` is the file."""
@@ -90,6 +90,7 @@ class Display:
         tally, intake = self._tally, self._intake
         counts = {"refused": tally.refused, "dropped": intake.dropped, "unreadable": intake.unreadable.total()}
         counts |= {kind: intake.synchronizer.counts[kind].total() for kind in SHOWN}
+        counts |= {"leaps of all clocks": intake.synchronizer.leaps}
         counts["events not written"] = tally.problems[EVENTS]
         if self._hook is not None:
             counts |= {"hooks failed": self._hook.failed, "events without a hook": self._hook.dropped}
@@ -99,6 +100,12 @@ class Display:
         """Say that nothing has come, and what did not look like anything that could."""
         reasons = self._intake.reasons
         return "waiting for the first snapshot" + (f": {reasons[-1]}" if reasons else "")
+
+    def _alone(self) -> list[str]:
+        """Name the cameras whose time stamps go with no other's."""
+        names, tolerance = self._intake.synchronizer.alone, self._intake.synchronizer.timing.tolerance
+        said = f"time stamps more than {1e3 * tolerance:g} ms (--tolerance) beside the other cameras': set their clocks"
+        return [f"{listed(names)}: {said}"] if names else []
 
     def _clocks(self) -> list[str]:
         """Name the cameras whose time stamps do not say when they expose."""

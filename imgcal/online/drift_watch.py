@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
+import torch
 from torch import Tensor
 
 from imgcal.estimation import CHANGES, Gauge, RigBelief
@@ -61,7 +62,7 @@ class DriftWatch:
         for camera in range(len(self.names)):
             if camera in unsettled:
                 continue
-            found = self._largest(change[camera], self.std[camera])
+            found = self._largest(change[camera], torch.maximum(self.std, std)[camera])
             if found is not None:
                 events.append(self._event(camera, *found, std[camera], time, number))
                 anew.add(camera)

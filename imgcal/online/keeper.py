@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -118,12 +118,16 @@ class RigKeeper:
         """Noise (px, one standard deviation) that blobs have shown beyond what they say of themselves."""
         return self._memory.noise.additive
 
-    def update(self, source: Mapping[str, Frame | None] | Detections, time: float) -> RigState:
+    def update(
+        self, source: Mapping[str, Frame | None] | Detections, time: float, silent: Collection[str] = ()
+    ) -> RigState:
         """Learn from a snapshot.
 
         Args:
             source: frames by camera, (H, W), None = no frame; or blobs that were found elsewhere, labelled or not.
             time: s since the epoch. A time before the last one counts as the same time.
+            silent: cameras that sent nothing, where blobs come: without it, they are taken to have seen nothing. Of
+                frames, those that have none are.
 
         Returns:
             What is known now. A snapshot that cannot decide teaches nothing: `refused` says why.
@@ -152,7 +156,8 @@ class RigKeeper:
         if result is not None:
             events += self._told(changes)
         state = self._state(shown, lag, result, refused)
-        return self._concluded(state, frames, labelled, result, events)
+        out = silent if frames is None else [name for name in memory.prior.camera_names if frames.get(name) is None]
+        return self._concluded(state, frames, frozenset(out), labelled, result, events)
 
     def _labelled(
         self, detections: Detections, lag: NDArray[np.float64], frames: Mapping[str, Frame | None] | None
@@ -241,6 +246,7 @@ class RigKeeper:
         self,
         state: RigState,
         frames: Mapping[str, Frame | None] | None,
+        out: frozenset[str],
         labelled: Labelled | None,
         result: Absorbed | None,
         events: list[Event],
@@ -253,7 +259,7 @@ class RigKeeper:
             state = replace(state, lag=self._lag(state.detections))
         for camera in memory.monitor.apart if result is not None else ():
             events.append(apart_event(names[camera], memory.off.get(camera, time), time, number))
-        silent = () if frames is None else (c for c, name in enumerate(names) if frames.get(name) is None)
+        silent = (camera for camera, name in enumerate(names) if name in out)
         # A camera with moments of its own has not moved far.
         astray = frozenset() if labelled is None else labelled.astray - memory.monitor.held.cameras
         look = Look(time, number, state.detections, state.predicted, astray, frozenset(silent))

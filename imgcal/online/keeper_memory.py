@@ -103,6 +103,18 @@ class KeeperMemory:
         """What is known of the rig now."""
         return self.monitor.filter.belief
 
+    def passed(self, time: float) -> float:
+        """Seconds since the last snapshot that was learnt, as far as they count.
+
+        In longer ones no more is forgotten: one kind of value may have wandered as far as the factory calibration may
+        be off. Clocks that were set (from 1970, after a start) are not taken for years in which everything wandered.
+        """
+        if self.learnt is None:
+            return 0.0
+        prior, rate = self.prior.prior or RigPrior(), self.monitor.filter.rate
+        hours = [(getattr(prior, name) / wander) ** 2 for name, wander in vars(rate).items() if wander > 0]
+        return min(max(time - self.learnt, 0.0), 3600 * min(hours, default=0.0))
+
     @property
     def obj_now(self) -> CalibrationObject:
         """The object as it is known now."""

@@ -39,7 +39,7 @@ def learnt_from(memory: KeeperMemory, checked: Checked) -> tuple[Absorbed, tuple
     moved = [camera for camera in off if camera in memory.off and camera not in still_open]
     fiducial = np.where(np.isin(checked.blobs.camera, waiting), -1, checked.blobs.fiducial)
     blobs = replace(checked.blobs, fiducial=fiducial)
-    seconds = 0.0 if memory.learnt is None else max(time - memory.learnt, 0.0)
+    seconds = memory.passed(time)
     observations = memory.observed(blobs)
     if not off and not still_open:
         memory.before = memory.belief
@@ -55,7 +55,9 @@ def learnt_from(memory: KeeperMemory, checked: Checked) -> tuple[Absorbed, tuple
         result = ask_object(memory, learnt=True) or result
     memory.looks += observations.seen[0].any(-1).numpy()
     memory.looks[[change.camera for change in changes]] = 0
-    memory.off, memory.learnt, memory.in_vain = off, time, 0
+    seen = np.unique(checked.given.camera[checked.given.fiducial >= 0])
+    waits = {camera: since for camera, since in memory.off.items() if camera not in seen}  # for the next that it shows
+    memory.off, memory.learnt, memory.in_vain = waits | off, time, 0
     if monitor.slips:  # poses were off that have been found with blobs of another time
         memory.poses.clear()
     memory.poses.append((time, result.rig_from_object))

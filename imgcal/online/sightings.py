@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,7 +23,10 @@ one may be garbage. It is in doubt at once."""
 ABSENT_SECONDS, ABSENT_SNAPSHOTS = 2.0, 30
 """How long, and how often, a camera must miss what it should see before it counts as lost: arms hide objects, too."""
 SILENT_SECONDS = 0.5
-"""How long no frame comes from a camera before it counts as lost."""
+"""How long nothing comes from a camera, at least, before it counts as lost; also, until it is known how often it sends,
+`ABSENT_SECONDS`."""
+RESTS, LATEST = 3.0, 8
+"""Times its usual rest, the median of so many, that a camera that sends less often than the others is waited for."""
 
 
 def well_inside(predicted: NDArray[np.float64], rig: CameraRig) -> NDArray[np.bool_]:
@@ -41,7 +45,7 @@ class Look:
     blobs: Detections  # labelled
     predicted: NDArray[np.float64]  # (C, N, 2), nan where that is not known
     astray: frozenset[int]  # cameras that see what may be the object, and not where it should be
-    silent: frozenset[int]  # cameras without a frame
+    silent: frozenset[int]  # cameras of which nothing came
 
 
 @dataclass
@@ -52,7 +56,8 @@ class Sightings:
     seen: set[int] = field(default_factory=set)  # cameras that have ever had labels
     lost: dict[int, float] = field(default_factory=dict)  # camera -> since when
     missing: dict[int, tuple[float, int]] = field(default_factory=dict)  # not lost yet: since when, how often
-    silent: dict[int, float] = field(default_factory=dict)  # since when no frame came
+    silent: dict[int, float] = field(default_factory=dict)  # since when nothing came
+    heard: dict[int, deque[float]] = field(default_factory=dict)  # when something came, the latest times
     astray: dict[int, tuple[float, int]] = field(default_factory=dict)  # since when, and how often
 
     @property
@@ -67,7 +72,7 @@ class Sightings:
         some = set(np.flatnonzero(count).tolist())
         self.seen |= some
         labelled = set(np.flatnonzero(count >= least_back(look.predicted.shape[1])).tolist()) - look.astray
-        self.silent = {camera: self.silent.get(camera, look.time) for camera in look.silent}
+        self._listen(look)
         absent = self._should_see(rig, look.predicted) - some - look.astray - look.silent
         for cameras, missed in ((absent, self.missing), (look.astray, self.astray)):
             for camera in labelled & missed.keys():
@@ -87,6 +92,22 @@ class Sightings:
                 events.append(self._event("camera_back", camera, since, "sees the object again", look))
         return events
 
+    def _listen(self, look: Look) -> None:
+        """Note from which cameras something came, and since when nothing does."""
+        for camera in set(range(len(self.names))) - look.silent:
+            heard = self.heard.setdefault(camera, deque(maxlen=LATEST + 1))
+            if heard and look.time < heard[-1]:  # the clocks were set back
+                heard.clear()
+            heard.append(look.time)
+        self.silent = {camera: min(self.silent.get(camera, look.time), look.time) for camera in look.silent}
+
+    def _patience(self, camera: int) -> float:
+        """How long (s) a camera may be silent."""
+        times = self.heard.get(camera, ())
+        if len(times) < 3:
+            return ABSENT_SECONDS
+        return max(SILENT_SECONDS, RESTS * float(np.median(np.diff(times))))
+
     def _why(self, camera: int, look: Look) -> tuple[float, str] | None:
         first, times = self.astray.get(camera, (look.time, 0))
         if times >= ASTRAY:
@@ -94,8 +115,8 @@ class Sightings:
                 "sees what may be the object, but not where it should be: it has moved far; move the object through "
                 "the middle of its image, and it will be found again"
             )
-        if camera in self.silent and look.time - self.silent[camera] >= SILENT_SECONDS:
-            return self.silent[camera], "sends no frames"
+        if camera in self.silent and look.time - self.silent[camera] >= self._patience(camera):
+            return self.silent[camera], "sends nothing"
         first, times = self.missing.get(camera, (look.time, 0))
         if times >= ABSENT_SNAPSHOTS and look.time - first >= ABSENT_SECONDS:
             return first, "does not see the object, which should be in view: it is covered, or has turned away"

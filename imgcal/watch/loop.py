@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import TracebackType
@@ -43,8 +43,10 @@ class Keeper(Protocol):
     def factory(self) -> CameraRig:
         """The factory calibration."""
 
-    def update(self, source: Mapping[str, Frame | None] | Detections, time: float) -> RigState:
-        """Learn from a snapshot."""
+    def update(
+        self, source: Mapping[str, Frame | None] | Detections, time: float, silent: Collection[str] = ()
+    ) -> RigState:
+        """Learn from a snapshot, for which some cameras sent nothing."""
 
     def saved(self, progress: dict[str, Any]) -> Writable:
         """Take down what is known, within milliseconds, and beside it how far its source has been worked on."""
@@ -203,7 +205,8 @@ class Watch:
         started = time.perf_counter()
         self.tally.snapshots += 1
         try:
-            state = self.keeper.update(snapshot.source(names), snapshot.time)
+            silent = [name for name in names if name not in snapshot.exposures]
+            state = self.keeper.update(snapshot.source(names), snapshot.time, silent)
         except InputError as error:
             self.tally.unusable += 1
             self._failed("snapshots", str(error))

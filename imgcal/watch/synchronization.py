@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter, deque
 from collections.abc import Mapping
@@ -18,6 +19,15 @@ MOST_PENDING = 32
 """Snapshots that are waited for at a time; beyond, the oldest goes on as it is."""
 OUT_AFTER = 10
 """Snapshots in a row without a camera, after which nobody waits for it."""
+INTERVALS, LEAST_INTERVALS = 8, 3
+"""Latest times between two exposures of a camera whose median says when its next one is due; until there are so many,
+it always is."""
+BEGINNING = 3.0
+"""Seconds for which a camera that has sent but little is waited for: it may send once a second."""
+EARLY = 0.05
+"""Share of that time by which it may come earlier."""
+ALONE = 30
+"""Snapshots in a row in which a camera is alone while others come together, from which its time stamps are told."""
 LEAP = 10.0
 """Seconds by which a clock may not leap: the exposure is left out, unless the other cameras' clocks did the same."""
 LONGEST_ASTRAY = 100
@@ -28,9 +38,9 @@ REMEMBERED = 4096
 COUNTS = ("received", "missing", "late", "duplicate", "out_of_order", "astray")
 """What is counted for each camera.
 
-`missing`: snapshots without it. `late`: it came after its snapshot had gone on. `duplicate`: its second of a snapshot.
-`astray`: its clock is more than `LEAP` off. These three are left out. `out_of_order`: earlier than one before; used
-where its snapshot has not gone on.
+`missing`: snapshots without it in which it was due. `late`: it came after its snapshot had gone on. `duplicate`: its
+second of a snapshot. `astray`: its clock is more than `LEAP` off. These three are left out. `out_of_order`: earlier
+than one before; used where its snapshot has not gone on.
 """
 
 
@@ -139,6 +149,10 @@ class Synchronizer:
         self._pending: list[_Pending] = []  # in the order in which they will go on
         self._absent = Counter(dict.fromkeys(camera_names, 0))  # snapshots in a row without a camera
         self._newest: dict[str, float] = {}  # latest time stamp of each camera
+        self._stamps = {name: deque[float](maxlen=INTERVALS + 1) for name in camera_names}  # the latest of each camera
+        self._alone: Counter[str] = Counter()  # snapshots in a row of one camera alone, with others beside it
+        self.alone: tuple[str, ...] = ()
+        """Cameras whose time stamps are always beside those of the others: their clocks are."""
         self._offset: dict[str, float] = {}  # its last time stamp, against this machine's clock when it came
         self._gone = (-math.inf, -math.inf)  # earliest and latest time stamp of the snapshot that went on last
         self._names: deque[str] = deque(maxlen=REMEMBERED)
@@ -197,6 +211,7 @@ class Synchronizer:
         self._absent[camera] = 0
         self._offset[camera] = exposure.time - now
         self.counts["out_of_order"][camera] += exposure.time < before
+        self._stamps[camera].append(exposure.time)
         self._newest[camera] = max(before, exposure.time)
         pending = self._place(exposure, now)
         if pending is None:
@@ -223,7 +238,9 @@ class Synchronizer:
         return new
 
     def _may_go(self, pending: _Pending, now: float) -> bool:
-        if len(self._pending) > MOST_PENDING or all(name in pending.exposures for name in self._there()):
+        if len(self._pending) > MOST_PENDING or all(
+            name in pending.exposures or not self._is_due(name, pending) for name in self._there()
+        ):
             return True
         if pending.name is not None:
             return now - pending.arrived > self.timing.patience
@@ -238,14 +255,43 @@ class Synchronizer:
             self._names.append(pending.name)
             self._known.add(pending.name)
         for name in self.camera_names:
-            if name not in pending.exposures:
+            if name not in pending.exposures and self._is_due(name, pending):
                 self._absent[name] += 1
                 self.counts["missing"][name] += 1
+        for name in pending.exposures:
+            self._alone[name] = self._alone[name] + 1 if self._is_beside(name, pending) else 0
+        self.alone = tuple(name for name in self.camera_names if self._alone[name] >= ALONE)
         return pending.finished()
 
+    def _rest(self, name: str) -> float:
+        """How long a camera usually rests between two exposures; nan = it has sent too few to say that."""
+        stamps = sorted(self._stamps[name])
+        rests = sorted(later - earlier for earlier, later in itertools.pairwise(stamps))
+        return rests[len(rests) // 2] if len(rests) >= LEAST_INTERVALS else math.nan
+
+    def _nearest(self, name: str, pending: _Pending) -> float:
+        """How far the nearest of a camera's latest exposures is from a snapshot."""
+        return min((abs(stamp - pending.latest) for stamp in self._stamps[name]), default=math.inf)
+
+    def _is_due(self, name: str, pending: _Pending) -> bool:
+        """Tell whether a camera that sends less often than others should have sent for a snapshot."""
+        between = (1 - EARLY) * self._rest(name) - self.timing.tolerance
+        return pending.name is not None or not self._nearest(name, pending) < between
+
+    def _is_beside(self, name: str, pending: _Pending) -> bool:
+        """Tell whether a snapshot is of one camera alone, while others expose shortly before or after it."""
+        if len(pending.exposures) > 1 or pending.name is not None:
+            return False
+        return any(self._nearest(other, pending) < self._rest(name) / 2 for other in self.camera_names if other != name)
+
     def _there(self) -> list[str]:
-        """The cameras that are waited for."""
-        return [name for name in self.camera_names if self._absent[name] < OUT_AFTER]
+        """The cameras that are waited for; also one that has just begun: nobody knows yet how often it sends."""
+        latest = max(self._newest.values(), default=0.0)
+        return [name for name in self.camera_names if self._absent[name] < OUT_AFTER or self._begins(name, latest)]
+
+    def _begins(self, name: str, latest: float) -> bool:
+        few = len(self._stamps[name]) <= LEAST_INTERVALS
+        return few and latest - self._newest.get(name, -math.inf) < BEGINNING
 
     def _clock(self, now: float) -> float:
         """What the cameras' clocks say now: the middle one, of two the one that is behind."""
@@ -258,5 +304,7 @@ class Synchronizer:
     def _begin_anew(self) -> None:
         self.leaps += 1
         self._newest.clear()
+        for stamps in self._stamps.values():
+            stamps.clear()
         self._offset.clear()
         self._gone = (-math.inf, -math.inf)

@@ -63,6 +63,14 @@ def test_one_line_that_changes_in_a_terminal(monkeypatch):
     assert "\x1b" in text.getvalue() and text.getvalue().count("moved: cam02 moved") == 1
 
 
+def test_cameras_whose_stamps_go_with_no_other_are_named(monkeypatch):
+    shown, _, tally = display(monkeypatch, False)
+    shown._intake.synchronizer.alone, shown._intake.synchronizer.leaps = ("cam02",), 3
+    with shown.of(tally):
+        said = "cam02: time stamps more than 5 ms (--tolerance) beside the other cameras': set their clocks"
+        assert "| 3 leaps of all clocks |" in shown.line() and shown.line().endswith(f"| {said}")
+
+
 def test_a_clock_that_is_off_is_named(monkeypatch):
     shown, _, tally = display(monkeypatch, False)
     offset, sigma = np.array([0.0, 0.004, np.nan, 0.001]), np.array([1e-4, 1e-4, np.nan, 1e-3])

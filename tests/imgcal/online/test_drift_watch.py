@@ -51,6 +51,17 @@ def test_a_move_between_two_looks_is_no_drift() -> None:
     assert watch.take(there, frozenset(), EVERY_SECONDS + 1, 2) == []
 
 
+def test_what_is_not_known_any_more_has_not_drifted() -> None:
+    """After a long pause the rig is known less well than before: what it is found to be then is no drift yet."""
+    rig, obj = imgcal.load_rig("U7").to(torch.float64), imgcal.load_object("asymmetric8")
+    sure = RigBelief.of_prior(rig, obj, torch.full((7, 15), 1e-5, dtype=torch.float64))
+    watch, step = DriftWatch(rig.camera_names), torch.zeros(7, 15, dtype=torch.float64)
+    step[3, 1] = math.radians(0.2)
+    watch.take(sure, frozenset(), 0.0, 0)
+    unsure = RigBelief.of_prior(rig.retract(step), obj, torch.full((7, 15), 0.01, dtype=torch.float64))
+    assert watch.take(unsure, frozenset(), EVERY_SECONDS + 1, 1) == []
+
+
 def test_cameras_are_replaced() -> None:
     rig = imgcal.load_rig("T4").to(torch.float64)
     other = rig.retract(torch.full((4, 15), 0.01, dtype=torch.float64))

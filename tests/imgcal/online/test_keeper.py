@@ -10,7 +10,7 @@ import torch
 import imgcal
 from imgcal.errors import InputError
 from imgcal.online import Event, RigKeeper, RigState
-from imgcal.types import CameraRig, Detections
+from imgcal.types import CameraRig, Detections, RigPrior
 from scripts.benchmarks.rig_streams import Bump, Conditions, Slip, Stream
 
 
@@ -227,3 +227,51 @@ def test_a_camera_that_is_late_from_the_first_snapshot_on_is_told_as_that_or_dou
     events, last = events_of(made, 50)
     assert {(event.kind, event.camera) for event in events} == {("clock_slip", "cam02")}
     assert last.cameras["cam02"] in ("ok", "doubtful")
+
+
+@pytest.mark.parametrize("leap", [1.7e9, 3.2e6])
+def test_clocks_that_are_set_are_no_years_of_drift(leap: float) -> None:
+    """From 1970, as after a start without a network, or of another month."""
+    made = stream(5)
+    with RigKeeper(made.factory, made.obj) as keeper:
+        for number, (time, blobs) in enumerate(made.snapshots(120)):
+            state = keeper.update(blobs, time % 1e8 + leap * (number >= 60))
+            assert state.events == () and set(state.cameras.values()) == {"ok"}
+            assert normalized(state, made.rig) < 2.0
+    prior = (made.factory.prior or RigPrior()).std(made.factory)
+    assert (state.std < 1.5 * prior).all()
+
+
+def test_cameras_that_send_less_often_than_others_are_neither_doubted_nor_lost() -> None:
+    made = stream(6)
+    names, health = made.factory.camera_names, set()
+    with RigKeeper(made.factory, made.obj) as keeper:
+        for number, (time, blobs) in enumerate(made.snapshots(200)):
+            out = {2} if number % 7 else set()
+            out |= {3} if number % 60 else set()
+            kept = blobs.select(~np.isin(blobs.camera, list(out)))
+            state = keeper.update(kept, time, silent=[names[camera] for camera in out])
+            assert state.events == ()
+            health |= set(state.cameras.values())
+    assert health == {"ok"}
+    for number, (time, blobs) in enumerate(made.snapshots(200), 200):
+        state = keeper.update(blobs.select(blobs.camera != 3), time, silent=[names[3]])
+        if number < 230:
+            assert state.events == ()
+    assert state.cameras["cam04"] == "lost"
+
+
+def test_a_bump_of_a_camera_that_sends_less_often_is_told_though_it_is_never_seen_twice_in_a_row() -> None:
+    made = stream(7, bumps=[Bump(150, 3, "rotation", math.radians(0.5))])
+    events, health = [], []
+    with RigKeeper(made.factory, made.obj) as keeper:
+        for number, (time, blobs) in enumerate(made.snapshots(260)):
+            out = {3} if number % 12 else set()
+            blobs = blobs.select(~np.isin(blobs.camera, list(out)))
+            state = keeper.update(blobs, time, silent=[made.factory.camera_names[camera] for camera in out])
+            events += state.events
+            health.append(state.cameras["cam04"])
+    assert {(event.kind, event.camera) for event in events} <= {("moved", "cam04"), ("relearnt", "cam04")}
+    assert events[0].snapshot <= 192
+    assert events[0].since is not None and 150 <= round(events[0].since * 60) <= 168
+    assert set(health[168:192]) <= {"doubtful", "relearning"}

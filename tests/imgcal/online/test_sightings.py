@@ -49,6 +49,19 @@ def test_a_camera_that_is_astray_or_silent_is_lost() -> None:
     assert sightings.lost.keys() >= {2}
 
 
+def test_a_camera_is_silent_by_its_own_measure() -> None:
+    sightings = Sightings(("a", "b", "c", "d"))
+    slow = [look(s / 10, [0, 1, 3] + [2] * (s % 10 == 0), silent=frozenset({2} if s % 10 else ())) for s in range(60)]
+    assert kinds(sightings, slow) == []  # once a second
+    gone = [(s, look(s / 10, [0, 1, 3], silent=frozenset({2}))) for s in range(60, 100)]
+    told = [(event, s) for s, given in gone for event in kinds(sightings, [given])]
+    assert told == [(("camera_lost", "c", pytest.approx(5.1)), 81)]
+    back = look(1.0, [0, 1, 2, 3])  # the clocks were set back
+    assert kinds(sightings, [back]) == [("camera_back", "c", pytest.approx(5.1))]
+    again = [look(1.0 + s / 10, [0, 1, 3], silent=frozenset({2})) for s in range(1, 30)]
+    assert kinds(sightings, again) == [("camera_lost", "c", pytest.approx(1.1))]
+
+
 def test_a_camera_that_suddenly_sees_nothing_is_in_doubt_before_it_is_lost() -> None:
     sightings = Sightings(("a", "b", "c", "d"))
     doubted = []

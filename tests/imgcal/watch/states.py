@@ -41,7 +41,7 @@ class KeeperOfStates:
         self.events = {}  # number of the update -> events
         self._state = replace(some_state(), clock_offset=np.zeros(4), clock_offset_sigma=np.ones(4))
 
-    def update(self, source, time):
+    def update(self, source, time, silent=()):
         number = len(self.sources)
         self.sources.append(source)
         if number in self.fails:

@@ -7,7 +7,7 @@ import pytest
 from imgcal.errors import InputError
 from imgcal.types.observations import Detections
 from imgcal.watch.exposures import CameraBlobs, Exposure
-from imgcal.watch.synchronization import MOST_PENDING, OUT_AFTER, REMEMBERED, Synchronizer, Timing
+from imgcal.watch.synchronization import LEAST_INTERVALS, MOST_PENDING, OUT_AFTER, REMEMBERED, Synchronizer, Timing
 
 NOTHING = CameraBlobs.of([])
 ABC = ("a", "b", "c")
@@ -189,3 +189,33 @@ def test_blobs_become_detections_and_frames_stay_frames():
 def test_impossible_timings(values):
     with pytest.raises(InputError, match="expected 0 to 5 s"):
         Timing(**values)
+
+
+@pytest.mark.parametrize("every", [4, 30, 120])
+def test_a_camera_that_sends_less_often_is_waited_for_when_it_is_due_and_at_no_other_time(every):
+    sync, done, waited = Synchronizer(ABC, Timing(patience=0.1)), [], []
+    for k in range(20 * every):
+        for camera in "abc" if k % every == 0 else "ab":  # it comes last
+            done += sync.add(at(camera, k / 120))
+        waited.append(sync.waiting)
+    learnt = done[-8 * every :]
+    assert cameras(learnt).count("abc") == 8 and sync.counts["late"]["c"] <= LEAST_INTERVALS
+    assert np.mean([number > 0 for number in waited[-8 * every :]]) < 0.3
+    assert sync.counts["missing"]["c"] < 20 * every / 2
+
+
+def test_cameras_whose_stamps_go_with_no_other_are_named():
+    sync = Synchronizer(ABC, Timing())
+    for k in range(200):
+        for camera in ABC:
+            sync.add(at(camera, k / 30 + (0.012 if camera == "b" and 50 <= k < 150 else 0.0)))
+        if k < 79 or 90 < k < 150 or k > 155:
+            assert sync.alone == (("b",) if 90 < k < 150 else ())
+
+
+def test_a_camera_that_sends_more_often_than_others_is_not_beside_them():
+    sync = Synchronizer(ABC, Timing())
+    for k in range(1200):
+        for camera in ABC if k % 120 == 0 else "a":
+            sync.add(at(camera, k / 120))
+        assert sync.alone == ()
