@@ -46,7 +46,7 @@ from .map_estimate import (
 )
 from .map_operator import encoded, map_state, with_lenses, without_lenses
 from .moves import find_moves
-from .object_change import ObjectChange, changed_object
+from .object_change import SHAPE, ObjectChange, changed_object
 from .object_motion import ObjectMotion
 from .object_shape import SNAPSHOTS_TO_BEND, FiducialOffset, ShapeEvidence, offsets
 from .open_change import Change
@@ -74,6 +74,7 @@ __all__ = [
     "MAP_SIZE",
     "ON_A_LINE",
     "POSE_PARAMETERS",
+    "SHAPE",
     "SNAPSHOTS_TO_BEND",
     "Absorbed",
     "BlockScatter",

@@ -26,37 +26,47 @@ LEAST_SIGMAS = 3.0
 MANY = 64
 """Fiducials of an object that is a print, from here on: none of them goes anywhere by itself."""
 
+SHAPE = -1
+"""In place of a fiducial's number: all of them are somewhere else."""
+
 
 @dataclass(frozen=True)
 class ObjectChange:
     """What happened to the object."""
 
-    fiducial: int | None  # the one that is somewhere else; None = the object has another scale: it is another one
+    fiducial: int | None  # the one that is somewhere else, `SHAPE` = all; None = another scale: it is another object
     since: int  # number of the first snapshot, counted from 0, that saw it so
-    size: float  # mm that the fiducial went, or the relative change of scale
+    size: float  # mm that the fiducial went (RMS of all), or the relative change of scale
     sigma: float  # one standard deviation of it
     odds: float  # log odds against that cameras have moved
 
 
 def let_object_free(belief: RigBelief, fiducial: int | None) -> RigBelief:
-    """Let a fiducial be off, or, where that is None, the scale."""
+    """Let a fiducial be off (`SHAPE`: all of them), or, where that is None, the scale."""
     obj, known, wide = belief.obj, len(belief.object_offset), belief.unit.numel()
-    number = -1 if fiducial is None else fiducial
     if not known:
         tolerance = torch.zeros(obj.num_fiducials, dtype=torch.float64)
         if fiducial is not None:
-            tolerance[fiducial] = BENT
+            tolerance[slice(None) if fiducial == SHAPE else fiducial] = BENT
         obj = replace(obj, tolerance=tolerance, scale_tolerance=SCALED if fiducial is None else 0.0)
         size = 3 * obj.num_fiducials + 1
         factor = torch.eye(wide + size, dtype=torch.float64)
         factor[:wide, :wide] = belief.factor
         return replace(belief, obj=obj, object_offset=belief.object_offset.new_zeros(size), factor=factor)
     std = object_prior_std(obj)
-    rows = torch.arange(known)[slice(-1, None) if fiducial is None else slice(3 * number, 3 * number + 3)]
+    rows = _rows(known, fiducial)
     spread = torch.zeros(wide + known, dtype=torch.float64)
     spread[wide + rows] = (SCALED if fiducial is None else BENT) / std[rows].clamp_min(1e-6)
     covariance = torch.cholesky_inverse(belief.factor) + spread.square().diag()
     return replace(belief, factor=torch.linalg.cholesky(torch.cholesky_inverse(torch.linalg.cholesky(covariance))))
+
+
+def _rows(known: int, fiducial: int | None) -> Tensor:
+    """Which of the numbers of what is known of an object belong to a change of it."""
+    rows = torch.arange(known)
+    if fiducial is None:
+        return rows[-1:]
+    return rows[:-1] if fiducial == SHAPE else rows[3 * fiducial : 3 * fiducial + 3]
 
 
 def changed_object(
@@ -99,24 +109,26 @@ def changed_object(
 
 
 def _doubtful(observations: Observations, residual: Tensor) -> list[int]:
-    """Fiducials that may be off: each question takes as long as all that is known of the object."""
+    """Fiducials that may be off, all of them first: each question takes as long as all that is known of the object."""
     if observations.seen.shape[-1] > MANY:
         return []
     squared = torch.where(observations.seen, (residual.square().sum(-1) / observations.sigma.square()), 0.0)
     count = observations.seen.sum((0, 1))
     mean = squared.sum((0, 1)) / count.clamp_min(1)
     found = [int(n) for n in mean.argsort(descending=True) if int(count[n])]
-    return sorted(found[:MOST_ASKED])
+    return [SHAPE, *sorted(found[:MOST_ASKED])]
 
 
 def _size(before: RigBelief, after: RigBelief, fiducial: int | None) -> tuple[float, float]:
     """How far it went, and the standard deviation of that."""
     std = object_prior_std(after.obj)
-    rows = torch.tensor([len(std) - 1]) if fiducial is None else 3 * fiducial + torch.arange(3)
+    rows = _rows(len(std), fiducial)
     was = before.object_offset if len(before.object_offset) else torch.zeros_like(std)
     change: Tensor = ((after.object_offset - was) * std)[rows]
     wide = after.unit.numel()
     covariance = torch.cholesky_inverse(after.factor)[wide:, wide:][rows[:, None], rows] * std[rows] * std[rows, None]
     size = float(change.norm())
     along = change / max(size, 1e-30)
-    return (float(change[0]) if fiducial is None else size), float((along @ covariance @ along).clamp_min(0).sqrt())
+    share = (3 / len(rows)) ** 0.5 if fiducial == SHAPE else 1.0  # of one fiducial
+    sigma = share * float((along @ covariance @ along).clamp_min(0).sqrt())
+    return (float(change[0]) if fiducial is None else share * size), sigma

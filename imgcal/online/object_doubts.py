@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from imgcal.estimation import ObjectChange
+from imgcal.estimation import SHAPE, ObjectChange
 from imgcal.geometry import RigidTransform
 from imgcal.online.events import Event
 from imgcal.online.label_checks import Checked
@@ -105,6 +105,12 @@ def object_event(change: ObjectChange, since: float, time: float, snapshot: int)
         message = f"the object is {100 * abs(change.size):.3g} % {how} than its file says: another one"
         values = (100 * change.size, 100 * change.sigma)
         return Event(time, snapshot, "object_exchanged", None, since, None, *values, None, change.odds, message)
+    if change.fiducial == SHAPE:
+        message = (
+            f"the object is not as its file says: its fiducials are {change.size:.3g} mm (RMS) from there: another one"
+        )
+        size = (change.size, change.sigma)
+        return Event(time, snapshot, "object_exchanged", None, since, None, *size, "mm", change.odds, message)
     message = f"fiducial {change.fiducial} of the object is {change.size:.3g} +- {change.sigma:.1g} mm from its place"
     size = (change.size, change.sigma)
     return Event(time, snapshot, "object_bent", None, since, None, *size, "mm", change.odds, message)

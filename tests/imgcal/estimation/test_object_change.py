@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import imgcal
-from imgcal.estimation import EstimationOptions, RigBelief, RigFilter, RigMonitor, absorbed, object_change
+from imgcal.estimation import SHAPE, EstimationOptions, RigBelief, RigFilter, RigMonitor, absorbed, object_change
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import Observations
 from renderers import palette
@@ -39,6 +39,34 @@ def test_a_change_of_the_object_is_told_and_learnt(fiducial: int | None, toleran
     assert abs(found.size - (0.01 if fiducial is None else 0.985)) < 5 * found.sigma
     off = monitor.filter.belief.points_object - points
     assert float((off - off.mean(0)).norm(dim=-1).max()) < 0.1
+
+
+@pytest.mark.parametrize(("seed", "spread"), [(1, 1.0), (2, 1.0), (3, 4.0)])
+def test_another_object_of_the_same_design_is_told_as_that_and_no_camera_is_blamed(seed: int, spread: float) -> None:
+    factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+    generator = torch.Generator().manual_seed(seed)
+    truth = simulate_truth(factory, obj, 40, generator, PhysicalDrift())
+    other = obj.points + spread * torch.randn(8, 3, generator=generator, dtype=torch.float64)
+    monitor, told, found = RigMonitor(RigFilter(factory, obj)), [], []
+    for s in range(40):
+        image = truth.rig.expand(1).project(truth.rig_from_object[s : s + 1].apply(other if s >= 30 else obj.points))
+        uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
+        there = Observations(uv, torch.full(uv.shape[:-1], NOISE, dtype=torch.float64), image.visible)
+        told += monitor.update(there, truth.rig_from_object[s : s + 1], 1 / 60)[1]
+        found += [] if monitor.object_change is None else [monitor.object_change]
+    assert told == []
+    assert found[0].fiducial == SHAPE
+    assert 28 <= found[0].since <= 33
+    assert found[0].size == pytest.approx(_apart(obj.points, other), rel=0.3)
+    assert _apart(monitor.filter.belief.points_object, other) < 0.1
+
+
+def _apart(points: torch.Tensor, others: torch.Tensor) -> float:
+    """RMS distance, a rigid motion taken out."""
+    centred, target = points - points.mean(0), others - others.mean(0)
+    u, _, vh = torch.linalg.svd(centred.mT @ target)
+    turned = centred @ u @ torch.diag(torch.tensor([1.0, 1.0, float(torch.det(u @ vh))]).double()) @ vh
+    return float((turned - target).norm(dim=-1).square().mean().sqrt())
 
 
 def test_a_fiducial_that_never_was_where_the_file_says_is_told() -> None:

@@ -7,10 +7,11 @@ import pytest
 import torch
 
 import imgcal
+from imgcal.estimation import SHAPE, ObjectChange
 from imgcal.geometry import RigidTransform
 from imgcal.online import Event, RigKeeper
 from imgcal.online.label_checks import Checked
-from imgcal.online.object_doubts import ASKED, ObjectDoubts
+from imgcal.online.object_doubts import ASKED, ObjectDoubts, object_event
 from imgcal.types import Detections
 from scripts.benchmarks.rig_streams import Conditions, Stream
 
@@ -81,3 +82,13 @@ def test_labels_are_given_back_of_fiducials_that_most_cameras_see_elsewhere() ->
     fits = checked([])
     doubts.take(fits, fits.blobs, 1 / 60, 2.0)
     assert doubts.odd == {}
+
+
+def test_what_changed_of_the_object_is_said() -> None:
+    told = [object_event(ObjectChange(fiducial, 3, 0.012, 1e-4, 50.0), 1.0, 2.0, 9) for fiducial in (None, SHAPE, 4)]
+    assert [(event.kind, event.unit) for event in told] == [
+        ("object_exchanged", None), ("object_exchanged", "mm"), ("object_bent", "mm"),
+    ]  # fmt: skip
+    assert "1.2 % larger" in told[0].message
+    assert told[1].message.endswith("its fiducials are 0.012 mm (RMS) from there: another one")
+    assert told[2].message.startswith("fiducial 4 of the object is 0.012 ")
