@@ -13,7 +13,10 @@ from imgcal.online.events import Event
 from imgcal.online.rig_state import RigState
 
 SECONDS, SNAPSHOTS = 3.0, 30
-"""How long, and how often in a row, a snapshot must be refused: an object half hidden is refused for moments."""
+"""How long, and how often, a snapshot must be refused: an object half hidden is refused for moments."""
+KNOWN, BY_CHANCE = 0.75, 3
+"""Share of the fiducials of the cameras that see something like it from which it is the object that is seen; a snapshot
+that was learnt with fewer labels may have them by chance, and takes back so many that were refused."""
 SHARE, CAMERAS = 0.6, 2
 """Blobs, in parts of the object's fiducials, from which a camera sees something like it, and cameras that must."""
 
@@ -33,12 +36,17 @@ class ForeignObject:
         self, state: RigState, frames: Mapping[str, Frame | None] | None, absorbed: Absorbed | None
     ) -> Iterable[Event]:
         """See `SequentialTest`."""
-        if state.refused is None:
-            self._known, self._since, self._times = True, None, 0
-            return ()
-        blobs = state.detections
+        blobs, fiducials = state.detections, len(state.belief.points_object)
         count = np.bincount(blobs.camera[blobs.usable], minlength=len(blobs.camera_names))
-        if (count >= SHARE * len(state.belief.points_object)).sum() < CAMERAS:
+        like_it = count >= SHARE * fiducials
+        if state.refused is None:
+            labelled = np.bincount(blobs.camera[blobs.fiducial >= 0], minlength=len(like_it))
+            if labelled[like_it].sum() >= KNOWN * fiducials * like_it.sum():
+                self._known, self._times = True, 0
+            self._times = max(self._times - BY_CHANCE, 0)
+            self._since = self._since if self._times else None
+            return ()
+        if like_it.sum() < CAMERAS:
             self._since, self._times = None, 0
             return ()
         self._since = state.time if self._since is None else self._since

@@ -51,7 +51,10 @@ class Relearning:
         size, sigma = (None, None) if unit is None else (change.size * scale, change.sigma * scale)
         how = HOW[kind] if size is None else f"{HOW[kind]} {size:.3g} +- {sigma:.1g} {unit}"
         evidence = change.evidence if math.isfinite(change.evidence) else None
-        event = Event(time, number, "moved", name, since, kind, size, sigma, unit, evidence, f"{name} {how}")
+        message = f"{name} {how}"
+        if len(self.names) == 2:
+            message += f", or {self.names[1 - change.camera]}: of two cameras nobody can tell which"
+        event = Event(time, number, "moved", name, since, kind, size, sigma, unit, evidence, message)
         self.events[change.camera] = event
         if change.camera not in self.before:
             self.before[change.camera] = relative_std(before)[change.camera]

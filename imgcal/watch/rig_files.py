@@ -161,6 +161,8 @@ def _problems(work: list[_Step]) -> dict[str, str]:
         try:
             if step is not None:
                 step()
-        except (InputError, OSError) as error:
+        except OSError as error:
+            problems[name] = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+        except InputError as error:
             problems[name] = str(error)
     return problems

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from imgcal.online import ForeignObject
 from tests.imgcal.online.states import state_at
@@ -27,6 +28,18 @@ def test_a_foreign_object_is_told_once() -> None:
     again = ForeignObject()
     again.restored(test.saved())
     assert watched(again, "identity", True, 30.0, 200) == []
+
+
+@pytest.mark.parametrize(("refused_of_ten", "told"), [(9, 1), (6, 0)])
+def test_a_few_labels_by_chance_do_not_make_it_the_object(refused_of_ten: int, told: int) -> None:
+    test, events = ForeignObject(), []
+    watched(test, None, True, 0.0, 1)
+    state = state_at(0, 1.0)
+    some = replace(state.detections, fiducial=np.where(np.arange(32) % 2, -1, state.detections.fiducial))
+    for number in range(200):
+        refused = "identity" if number % 10 < refused_of_ten else None
+        events += test(replace(state, time=1 + number / 20, refused=refused, detections=some), None, None)
+    assert len(events) == told
 
 
 def test_an_absent_object_is_no_foreign_one() -> None:

@@ -31,3 +31,10 @@ def test_a_camera_is_known_again_when_it_is_known_as_well_as_before() -> None:
     assert (learnt.kind, learnt.camera, learnt.since, learnt.snapshot) == ("relearnt", "cam02", 1.0, 16)
     assert learnt.sigma == pytest.approx(sigma_of(relative_std(known)[1], "rotation"))
     assert relearning.events == {}
+
+
+def test_of_two_cameras_it_is_said_that_it_may_be_the_other() -> None:
+    rig, obj = imgcal.load_rig("T4").to(torch.float64).select([0, 2]), imgcal.load_object("asymmetric8")
+    change = Change(1, 0, "unknown", math.nan, math.nan)
+    told = Relearning(rig.camera_names).told(change, 1.0, 1.1, 4, RigBelief.of_prior(rig, obj))
+    assert told.message == "cam03 moved, or cam01: of two cameras nobody can tell which"

@@ -120,3 +120,11 @@ def test_a_history_that_somebody_has_tidied_up_goes_on(state, tmp_path):
         until(lambda day=day: len(list(tmp_path.glob("history/*/*.yaml"))) == 1 + day % 2)
     files.close()
     assert not files.problems
+
+
+def test_what_cannot_be_done_is_said_with_its_place_and_in_words(tmp_path):
+    (tmp_path / "history").touch()
+    files = RigFiles(tmp_path)
+    files.write(some_state(time=1.7e9), keep=True)
+    files.close()
+    assert files.problems == {"history": f"{tmp_path}/history/2023-11-14: Not a directory"}
