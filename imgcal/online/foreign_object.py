@@ -49,7 +49,7 @@ class ForeignObject:
         if like_it.sum() < CAMERAS:
             self._since, self._times = None, 0
             return ()
-        self._since = state.time if self._since is None else self._since
+        self._since = state.time if self._since is None else min(self._since, state.time)  # clocks may be set back
         self._times += 1
         if not self._known or self._times < SNAPSHOTS or state.time - self._since < SECONDS:
             return ()

@@ -68,6 +68,9 @@ class ImageQuality:
         self, state: RigState, frames: Mapping[str, Frame | None] | None, absorbed: Absorbed | None
     ) -> Iterable[Event]:
         """See `SequentialTest`."""
+        if self._began is None:  # also after a start that goes on: what was before is not known to the second
+            self._good[:] = state.time
+        self._good = np.minimum(self._good, state.time)  # clocks may be set back
         if self._began is None or not 0 <= state.time - self._began < LONGEST:
             self._began, self._values = state.time, _nothing()
         events = self._judged(state) if state.time - self._began >= BLOCK else []

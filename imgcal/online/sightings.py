@@ -79,7 +79,7 @@ class Sightings:
                 del missed[camera]
             for camera in cameras:
                 first, times = missed.get(camera, (look.time, 0))
-                missed[camera] = first, times + 1
+                missed[camera] = min(first, look.time), times + 1  # clocks may be set back
         events = []
         for camera in range(len(self.names)):
             why = self._why(camera, look)

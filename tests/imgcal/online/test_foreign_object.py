@@ -30,6 +30,14 @@ def test_a_foreign_object_is_told_once() -> None:
     assert watched(again, "identity", True, 30.0, 200) == []
 
 
+def test_clocks_that_are_set_back_meanwhile_do_not_keep_it_from_being_told() -> None:
+    test = ForeignObject()
+    watched(test, None, True, 5000.0, 1)
+    watched(test, "identity", True, 5001.0, 20)
+    (event,) = watched(test, "identity", True, 1400.0, 200)
+    assert (event.since, event.time < 1405) == (1400.0, True)
+
+
 @pytest.mark.parametrize(("refused_of_ten", "told"), [(9, 1), (6, 0)])
 def test_a_few_labels_by_chance_do_not_make_it_the_object(refused_of_ten: int, told: int) -> None:
     test, events = ForeignObject(), []

@@ -45,6 +45,18 @@ def test_good_cameras_are_left_alone_and_a_clean_one_is_told() -> None:
         again.restored({name: [[1.0]] for name in test.saved()})
 
 
+def test_what_is_told_after_a_start_that_goes_on_is_not_since_1970() -> None:
+    known, _ = watched(None)
+    test, events = ImageQuality(4), []
+    test.restored(known.saved())
+    state = state_at(0, 0.0)
+    large = np.where(state.detections.camera == 1, 1.3 * state.detections.radius, state.detections.radius)
+    for number in range(40):
+        spoiled = replace(state.detections, radius=large)
+        events += test(replace(state, detections=spoiled, time=1.7e9 + number / 3), None, None)
+    assert [(event.kind, event.since) for event in events] == [("defocused", 1.7e9)]
+
+
 def test_a_camera_that_sends_nothing_is_not_dirty() -> None:
     test, events = ImageQuality(4), []
     for number in range(200):

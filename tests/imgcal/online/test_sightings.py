@@ -49,6 +49,13 @@ def test_a_camera_that_is_astray_or_silent_is_lost() -> None:
     assert sightings.lost.keys() >= {2}
 
 
+def test_clocks_that_are_set_back_keep_no_camera_from_being_told_lost() -> None:
+    sightings = Sightings(("a", "b", "c", "d"))
+    kinds(sightings, [look(5000 + s / 30, [0, 1, 2, 3] if s < 10 else [0, 1, 2]) for s in range(20)])
+    told = kinds(sightings, [look(1400 + s / 30, [0, 1, 2]) for s in range(90)])
+    assert told == [("camera_lost", "d", 1400.0)]
+
+
 def test_a_camera_is_silent_by_its_own_measure() -> None:
     sightings = Sightings(("a", "b", "c", "d"))
     slow = [look(s / 10, [0, 1, 3] + [2] * (s % 10 == 0), silent=frozenset({2} if s % 10 else ())) for s in range(60)]
