@@ -4,13 +4,11 @@ import shutil
 from dataclasses import replace
 
 import pytest
-import torch
 
 import imgcal
 from imgcal.estimation import camera_std
-from imgcal.geometry.transforms import RigidTransform
 from imgcal.io import read_frame, write_text
-from imgcal.types.rig import CameraRig
+from tests.captures.sets import nominal
 
 HELD_OUT_LIMIT = 0.25  # px RMS, from the captures' README
 
@@ -26,14 +24,6 @@ def grid(captures, tmp_path_factory):
     write_text(folder / "object.csv", "\n".join(["x,y,z", *rows]) + "\n")
     assert read_frame(folder / "frames" / "cam" / "00.png").shape == (480, 640)
     return folder
-
-
-def nominal():
-    return CameraRig(
-        torch.tensor([[550.0, 550.0]], dtype=torch.float64), torch.tensor([[320.0, 240.0]], dtype=torch.float64),
-        torch.zeros(1, 5, dtype=torch.float64), RigidTransform.identity(1, dtype=torch.float64),
-        torch.tensor([[640, 480]]), ("cam",),
-    )  # fmt: skip
 
 
 def test_the_first_half_of_the_views_predicts_the_second(grid, calibrate, score):

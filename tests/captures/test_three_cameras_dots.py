@@ -1,35 +1,23 @@
 """437 bright dots on a lattice, three cameras, one frame each, seen through glass."""
 
-import numpy as np
 import pytest
 import torch
 
-from imgcal.cli.main import main
-from imgcal.io import load_detections, load_object, save_detections
-from imgcal.types.rig import RigPrior
-from tests.captures.conftest import as_detections, at_own_centres, disturbed, fit_rig, read_points
+from imgcal.io import save_detections
+from tests.captures.conftest import disturbed
+from tests.captures.sets import three_cameras_dots
 
-CAMERAS = ("cam1", "cam2", "cam3")
 LIMITS = {"cam1": 0.40, "cam2": 0.46, "cam3": 0.46}  # px RMS, from the captures' README
-# Refraction is no small drift of distortion; what drifted by a few percent is said by the prior.
-PRIOR = RigPrior(focal_length=0.01, principal_point=20.0, distortion=0.05, rotation=0.005, position=3.0)
 
 
 @pytest.fixture(scope="module")
 def dots(captures, tmp_path_factory):
-    folder = captures / "three-cameras-dots"
-    points = read_points(folder / "correspondences.csv", load_object(folder / "object.csv").points.numpy(), CAMERAS)
-    half = np.random.default_rng(0).random(len(points.uv)) < 0.5
-    factory = fit_rig(points.select(half), CAMERAS, (1280, 1024), PRIOR)
+    real = three_cameras_dots(captures)
+    assert real.share > 0.95
     # The other half, measured by our own detector where the published blobs are.
-    table = tmp_path_factory.mktemp("dots") / "blobs.csv"
-    assert main(["detect", str(folder), "--out", str(table)]) == 0
-    found = load_detections(table)
-    held_out, share = at_own_centres(points.select(~half), found)
-    assert share > 0.95
-    other = table.parent / "held_out.csv"
-    save_detections(as_detections(held_out, CAMERAS), other)
-    return folder, factory, points, other
+    held_out = tmp_path_factory.mktemp("dots") / "held_out.csv"
+    save_detections(real.held_out, held_out)
+    return captures / "three-cameras-dots", real.factory, real.points, held_out
 
 
 @pytest.mark.parametrize(("pixels", "seed"), [(9.0, 0), (12.0, 1), (14.0, 2)])

@@ -11,7 +11,8 @@ import torch
 from imgcal.cli.main import main
 from imgcal.io import load_detections, load_object, save_detections, save_rig
 from tests.captures.conftest import as_detections, fit_rig, predicted, read_points
-from tests.captures.test_three_cameras_dots import CAMERAS, PRIOR
+from tests.captures.sets import DOTS as CAMERAS
+from tests.captures.sets import PRIOR
 
 SNAPSHOTS, BUMPED_AT, RATE = 13, 4, 20.0
 BUMPED = 1  # cam2
