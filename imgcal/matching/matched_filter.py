@@ -27,7 +27,7 @@ SURE_CAMERA = 2.0  # log odds from which a camera has a say in that
 CLEAR = 40.0  # log odds between the best pose and the best distinct one at which the search ends
 FINE_CLIMBS = (0.03, 0.012)
 """Radians: steps on the finest maps."""
-MOST_RIVALS = 2  # that are fitted, too, where the best pose does not stand out by far
+MOST_RIVALS = 4  # that are fitted, too, where the best pose does not stand out by far
 PARALLAX = 60.0  # px: what a pose from one camera may be off in the others
 NEARLY = 0.07  # rad that a pose may be turned against the known one before windows are placed anew
 WORTHWHILE = 0.6  # of the frames, above which these are looked at as a whole
@@ -91,8 +91,11 @@ class View:
             against = rivals.scores.total.tolist()
             for k in range(min(MOST_RIVALS, len(against))):
                 rival = self._fitted(rivals.select(np.array([k])))
-                if rival is not None and differs(rival.predicted[None], result.predicted, scene.obj)[0]:
-                    against[k] = max(against[k], rival.log_odds(scene, self.fine))
+                if rival is None:
+                    continue
+                # One that comes to the same places when it is fitted was none.
+                other = bool(differs(rival.predicted[None], result.predicted, scene.obj)[0])
+                against[k] = max(against[k], rival.log_odds(scene, self.fine)) if other else 0.0
             margin = max(margin, result.log_odds(scene, self.fine) - max([0.0, *against]))
         rows = rows_of(result.uv, result.sigma, result.seen, result.radius, snapshot.blobs)
         return Proposal(rows, result.rig_from_object, margin)

@@ -9,11 +9,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from imgcal.association import lattice_shifts
 from imgcal.detection import Frame
 from imgcal.estimation import Estimate, EstimationOptions, estimate
 from imgcal.geometry import RigidTransform
 from imgcal.matching.cameras import each_camera
-from imgcal.matching.correlation import BLIND, gains
+from imgcal.matching.correlation import BLIND, gain_at, gains
 from imgcal.matching.maps import SIZES, Maps
 from imgcal.matching.marker_fit import MISFIT, NEAR
 from imgcal.matching.photometry import Measured, measure_markers
@@ -26,6 +27,7 @@ SURPRISED = 4.0  # surprise from which a cell may be a marker
 LEAST_IN_CAMERA = 3  # fiducials that fit, below which a camera says nothing
 OUTLIER = 5.0  # standard deviations from which a measured marker is something else
 SHAPE_ERROR = 0.3  # px: what a measured place may be off beyond its own sigma
+MOST_STEPS = 4  # of a lattice that a camera's image may have been shifted by
 LEAST_FITTED = 6  # fiducials of all cameras
 GATES = (8.0, 2.5)  # px that a measured place may be off the fitted rig, once and again
 ITERATIONS = ((len(MISFIT), NEAR), (NEAR,))  # of the places, see `measure_markers`: once found they are near
@@ -48,12 +50,9 @@ class Fitted:
 
         No image is shifted any more; what the fit of each has cost is that its place was known by the prior only.
         """
-        cells = np.floor(maps.cells(self.predicted)).astype(int)
-        inside = np.asarray(((cells >= 0) & (cells < maps.size[:, None])).all(-1))
-        cells = np.where(inside[..., None], cells, 0)
-        gain = gains(maps)[np.arange(len(cells))[:, None], cells[..., 1], cells[..., 0]]
+        there = gain_at(maps, gains(maps), self.predicted)
         cost = np.log(np.maximum(2 * np.pi * (scene.drift / maps.factor) ** 2, 1.0))
-        return float(np.log(BLIND + (1 - BLIND) * np.exp(np.where(inside, gain, 0).sum(1) - cost)).sum())
+        return float(np.log(BLIND + (1 - BLIND) * np.exp(there - cost)).sum())
 
 
 def fitted(
@@ -81,6 +80,7 @@ def fitted(
     fit = _fit_peaks(scene, pose, maps, predicted, (reach, 2), sure)
     uv = np.full(predicted.shape, np.nan)
     for gate, iterations in zip(GATES, ITERATIONS, strict=True):
+        fit = _in_step(scene, fit, maps)
         if fit is None:
             return None
         pose, predicted = fit.rig_from_object[0], predictions(fit.rig, scene, fit.rig_from_object[0])
@@ -156,6 +156,30 @@ def _fit_peaks(
             break
         pose, predicted = fit.rig_from_object[0], predictions(fit.rig, scene, fit.rig_from_object[0])
         sure = np.ones_like(sure)
+    return fit
+
+
+def _in_step(scene: Scene, fit: Estimate | None, maps: Maps) -> Estimate | None:
+    """Shift the pattern by steps of its lattice in each camera in which more of it shows then, and fit again.
+
+    A camera whose image was shifted by one dot shows all but the edge; with rig and pose fitted, the edge is seen.
+    """
+    motions = lattice_shifts(scene.obj)
+    if not motions or fit is None:
+        return fit
+    steps = [RigidTransform(torch.from_numpy(m.rotation), torch.from_numpy(m.translation)) for m in motions]
+    gain = gains(maps)
+    for _ in range(MOST_STEPS):
+        pose = fit.rig_from_object[0]
+        shifted = np.stack([predictions(fit.rig, scene, at) for at in (pose, *(pose @ step for step in steps))])
+        best = np.stack([gain_at(maps, gain, uv) for uv in shifted]).argmax(0)  # (C,)
+        if not best.any():
+            break
+        predicted = shifted[best, np.arange(len(best))]
+        again = _fit_peaks(scene, pose, maps, predicted, (2,), np.ones((len(best), 1), dtype=bool))
+        if again is None:
+            break
+        fit = again
     return fit
 
 
