@@ -166,10 +166,14 @@ class _Series:
 
     def look(self, s: int, sight: Sight) -> None:
         """Decide about one snapshot by its frames, as long as looks are worth it."""
-        if self.tracker.looks_in_vain >= MOST_LOOKS_IN_VAIN:
-            self._not_tried(s)
-            return
         name, blobs = self.detections.snapshot_names[s], self.detections.select(self.rows[s])
+        if self.tracker.looks_in_vain >= MOST_LOOKS_IN_VAIN:
+            if sight.where_blobs_fail:
+                self._not_tried(s)
+            else:
+                self.looked.pop(s, None)
+                self.results[s] = self.tracker.decide(blobs, name)
+            return
         snapshot, labels, self.looked[s] = self.tracker.look(sight, s, blobs, name)
         self.results[s] = snapshot, labels
 

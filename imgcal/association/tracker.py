@@ -66,20 +66,36 @@ class Tracker:
     def look(
         self, sight: Sight, number: int, blobs: Detections, name: str
     ) -> tuple[SnapshotIdentity, NDArray[np.int64], Detections]:
-        """Label one snapshot by what a proposer sees in its frames; also gives the blobs that the labels are of."""
+        """Label one snapshot by what a proposer sees in its frames; also gives the blobs that the labels are of.
+
+        Where it sees nothing, and blobs have not been asked before, these say where to look, or else decide.
+        """
         known = () if self.pose is None else (self.pose,)
         snapshot = Snapshot(
             sight.frames(number), blobs, self.rig, self.obj, self.prior_std, known, sight.detection, sight.masks
         )
-        proposal = sight.proposer.propose(snapshot)
-        near = False
-        if self.pose is not None and proposal.rig_from_object is not None:
-            near = bool(geodesic_angle(self.pose.rotation, proposal.rig_from_object.rotation) < NEARLY_KNOWN)
-        error = float(np.hypot(self.options.identity_error, self._tolerance_px(blobs)))
-        identity, found = judge(proposal, snapshot, self.options.identity, error=error, pose_known=near)
+        identity, found = self._judged(sight, snapshot)
+        identity, found_by = self._taken_over(identity), sight.proposer.name
+        if not identity.accepted and not sight.where_blobs_fail:
+            told = self._identify(blobs)
+            if told.accepted and told.rig_from_object is not None:
+                there, at = self._judged(sight, replace(snapshot, candidates=(told.rig_from_object,)))
+                if there.accepted:
+                    identity, found = replace(there, status=told.status, alternatives=told.alternatives), at
+                else:
+                    identity, found, found_by = told, blobs, "classical"
         self.looks_in_vain = max(0, self.looks_in_vain + (-1 if identity.accepted else 1))
-        concluded, labels = self._concluded(self._taken_over(identity), found, name)
-        return replace(concluded, found_by=sight.proposer.name), labels, found
+        concluded, labels = self._concluded(identity, found, name)
+        return replace(concluded, found_by=found_by), labels, found
+
+    def _judged(self, sight: Sight, snapshot: Snapshot) -> tuple[Identity, Detections]:
+        """Let a proposer look, and decide about what it says."""
+        proposal, near = sight.proposer.propose(snapshot), False
+        if snapshot.candidates and proposal.rig_from_object is not None:
+            known, found = snapshot.candidates[0].rotation, proposal.rig_from_object.rotation
+            near = bool(geodesic_angle(known, found) < NEARLY_KNOWN)
+        error = float(np.hypot(self.options.identity_error, self._tolerance_px(snapshot.blobs)))
+        return judge(proposal, snapshot, self.options.identity, error=error, pose_known=near)
 
     def _concluded(
         self, identity: Identity, blobs: Detections, name: str

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from dataclasses import replace
 
@@ -55,8 +56,9 @@ def calibrate(
         initializer: network whose first guess the estimate starts from (`load_initializer`).
         progress: wraps the loop over snapshots, for a progress bar.
         detector: who finds the fiducials in frames: `classical` (blobs), `matched` (a matched filter for frames in
-            which blobs fail), `auto` (the filter where blobs decide nothing), or a `Proposer`; a `Sight` brings frames
-            that are not in memory. Blobs that contradict count, and identity and all checks decide as ever.
+            which blobs fail), `auto` (the filter where blobs decide nothing, or the calibration from them is refused),
+            or a `Proposer`; a `Sight` brings frames that are not in memory. Blobs that contradict count, decide what a
+            proposer finds nothing in, and identity and all checks decide as ever.
         measurer: measures the blobs of frames again (`LearnedMeasurer.load`): half-hidden and unevenly lit markers;
             also those that `learned` finds.
 
@@ -85,6 +87,13 @@ def calibrate(
         given = detections if sight is None else _as_given(labelled)
         fit = fit_steady(labelled, given, rig, obj, options, initializer)
     except RefusedError as error:
+        if sight is not None and labelled is not None and sight.where_blobs_fail and _by_blobs(labelled):
+            # They told the pose, and failed all the same.
+            with contextlib.suppress(RefusedError):
+                sight = replace(sight, where_blobs_fail=False)
+                return calibrate(
+                    detections, rig, obj, options, initializer=initializer, progress=progress, detector=sight
+                )
         require_units(error, rig, obj)
         if labelled is not None:
             require_same_moments(error, detections, labelled, rig, obj, options)
@@ -96,6 +105,12 @@ def calibrate(
     }
     late = late_cameras(detections, fit.tally, rig, obj, options)
     return replace(fit, seconds=seconds, late=late)
+
+
+def _by_blobs(labelled: Associations) -> bool:
+    """Tell whether blobs decided about some snapshot, of which nobody has looked at the frames then."""
+    snapshots = (labelled.snapshots[number] for number in labelled.used)
+    return any(snapshot.found_by == "classical" and snapshot.status != "coded" for snapshot in snapshots)
 
 
 def require_units(error: RefusedError, rig: CameraRig, obj: CalibrationObject, from_scratch: bool = False) -> None:

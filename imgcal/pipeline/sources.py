@@ -27,7 +27,7 @@ DetectorName = str
 Detector = DetectorName | Proposer | Sight
 """Who finds the fiducials in frames: blobs (classical), a matched filter, or the filter where blobs decide nothing
 (auto); a network, or the network where blobs decide nothing (both); something else that proposes labels; or one of them
-with frames that are not in memory."""
+with frames that are not in memory. Blobs decide where nobody else can."""
 ROWS = tuple(field.name for field in fields(Detections) if not field.name.endswith("_names"))
 
 

@@ -6,7 +6,7 @@ import torch
 
 from imgcal.association import IdentityOptions, Proposal, Sight, Snapshot, associate, judge, rows_of
 from imgcal.association.proposals import together
-from imgcal.geometry import RigidTransform, rotation_from_vector
+from imgcal.geometry import RigidTransform, geodesic_angle, rotation_from_vector
 from imgcal.io import load_object
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
 
@@ -124,3 +124,35 @@ def test_hidden_fiducials_among_false_blobs_are_no_objection(truth, o10, asymmet
     assert found.accepted and labelled.sum() > 30
     error = blobs.uv[labelled] - truth.uv[0].numpy()[blobs.camera[labelled], found.labels[labelled]]
     assert np.abs(error).max() < 1
+
+
+@dataclass(frozen=True)
+class NearSighted(Oracle):
+    """Sees the object only within some degrees of where it is known to be."""
+
+    degrees: float = 3.0
+
+    def propose(self, snapshot):
+        pose = self.truth.rig_from_object[int(snapshot.frames["number"][0, 0])]
+        off = [float(geodesic_angle(pose.rotation, known.rotation)) for known in snapshot.candidates]
+        near = np.degrees(min(off, default=np.pi)) < self.degrees
+        return super().propose(snapshot) if near else Proposal.declined(snapshot, "found nothing")
+
+
+@pytest.mark.parametrize(("degrees", "name"), [(3.0, "oracle"), (0.0, "classical")])
+def test_where_a_proposer_finds_nothing_blobs_say_where_to_look_or_decide(truth, o10, asymmetric8, degrees, name):
+    """Many fiducials cannot be searched for anywhere; and what blobs know is not lost, though they are asked last."""
+    blobs = true_detections(truth)
+    given = replace(blobs, fiducial=np.full(len(blobs), -1))
+    found = associate(given, o10, asymmetric8, sight=Sight(NearSighted(truth, degrees=degrees), frames, False))
+    assert [snapshot.found_by for snapshot in found.snapshots] == [name, name]
+    assert found.identity == "unique" and (found.detections.fiducial >= 0).all()
+
+
+def test_after_many_looks_in_vain_blobs_still_decide(o10, asymmetric8):
+    """The object is out of sight at first, and a proposer that never finds it looks no more."""
+    truth = simulate_truth(o10, asymmetric8, 12, torch.Generator().manual_seed(3), PhysicalDrift())
+    seen = true_detections(truth)
+    given = replace(seen, fiducial=np.full(len(seen), -1)).select((seen.snapshot >= 9) | (seen.fiducial < 2))
+    found = associate(given, o10, asymmetric8, sight=Sight(NearSighted(truth, degrees=0.0), frames, False))
+    assert found.used == [9, 10, 11]

@@ -1,13 +1,14 @@
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 import torch
 
+from imgcal.association import Proposal, Sight, rows_of
 from imgcal.errors import RefusedError
 from imgcal.estimation import relative_covariance
 from imgcal.pipeline import calibrate
-from imgcal.synthesis.captures import simulate_truth, true_detections
+from imgcal.synthesis.captures import Truth, simulate_truth, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
 
 
@@ -73,3 +74,32 @@ def test_a_refusal_names_what_python_offers(o10, asymmetric8):
     with pytest.raises(RefusedError, match=r"PipelineOptions\(blind_cameras=True\)") as refusal:
         calibrate(table.select(table.camera != 3), o10, asymmetric8)
     assert "--" not in str(refusal.value) and "--blind-cameras" in refusal.value.for_command
+
+
+@dataclass(frozen=True)
+class Oracle:
+    """Proposes the truth; snapshots come with their numbers as frames."""
+
+    truth: Truth
+    name: str = "oracle"
+
+    def propose(self, snapshot):
+        number = int(snapshot.frames["number"][0, 0])
+        some = np.full(self.truth.uv.shape[1:3], 0.1)
+        rows = rows_of(self.truth.uv[number].numpy(), some, some > 0, 30 * some, snapshot.blobs)
+        return Proposal(rows, self.truth.rig_from_object[number], 100.0)
+
+
+def test_where_a_calibration_from_blobs_is_refused_the_frames_are_looked_at(o10, asymmetric8):
+    """Blobs tell the pose in every snapshot, and yet they do not suffice: one camera shows none."""
+    truth = simulate_truth(o10, asymmetric8, 2, torch.Generator().manual_seed(0), PhysicalDrift())
+    seen = true_detections(truth)
+    blobs = replace(seen, fiducial=np.full(len(seen), -1)).select(seen.camera != 3)
+    with pytest.raises(RefusedError, match="found no fiducial"):
+        calibrate(blobs, o10, asymmetric8)
+    sight = Sight(Oracle(truth), lambda number: {"number": np.full((1, 1), number)}, where_blobs_fail=True)
+    result = calibrate(blobs, o10, asymmetric8, detector=sight)
+    assert dict(result.detectors) == {"oracle": 2}
+    assert dict(
+        calibrate(replace(seen, fiducial=np.full(len(seen), -1)), o10, asymmetric8, detector=sight).detectors
+    ) == {"classical": 2}

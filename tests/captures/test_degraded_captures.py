@@ -1,0 +1,29 @@
+"""Real frames, made harder until blobs decide nothing: the whole pattern still shows, and calibrates right."""
+
+import pytest
+import torch
+
+import imgcal
+from scripts.results.degraded_captures import task
+from tests.captures.sets import dot_grid, nominal
+
+
+def test_a_lattice_is_not_seen_one_dot_aside(captures):
+    """In one camera, all but an edge fits as well one dot aside: nobody believed a pattern that was found so."""
+    given = task("cavity", captures)
+    frames = given.degraded("discs", 4.0, seed=0)
+    with pytest.raises(imgcal.RefusedError):
+        imgcal.calibrate(frames, given.rig, given.obj)
+    result = imgcal.calibrate(frames, given.rig, given.obj, detector="auto")
+    assert dict(result.detectors) == {"matched": 1}
+    assert given.off(result.rig) < 1
+
+
+def test_many_dots_are_looked_for_where_blobs_say(captures):
+    """A hundred dots in any pose are too many for the filter alone: it refused every view that blobs could read."""
+    frames, obj = dot_grid(captures)
+    dark = imgcal.DetectionOptions(polarity="dark")
+    result = imgcal.calibrate({"cam": frames[:8]}, nominal(), obj, detection=dark, detector="matched")
+    assert dict(result.detectors) == {"matched": 8}
+    # From all 15 views: 540.4 and 541.9 (the captures' README).
+    assert (result.rig.focal_length - torch.tensor([[540.4, 541.9]])).abs().max() < 2
