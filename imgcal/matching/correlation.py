@@ -54,7 +54,7 @@ def gains(maps: Maps) -> NDArray[np.float32]:
 def gain_at(maps: Maps, gain: NDArray[np.float32], uv: NDArray[np.float64]) -> NDArray[np.float64]:
     """Sum the log odds (C, H, W) of the cells at places (C, N, 2), in pixels, as far as they are in the image: (C,)."""
     cells = np.floor(maps.cells(uv)).astype(np.int64)
-    inside = ((cells >= 0) & (cells < maps.size[:, None])).all(-1)
+    inside = np.asarray(((cells >= 0) & (cells < maps.size[:, None])).all(-1))
     cells = np.where(inside[..., None], cells, 0)
     return np.where(inside, gain[np.arange(len(cells))[:, None], cells[..., 1], cells[..., 0]], 0.0).sum(1)
 

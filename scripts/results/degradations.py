@@ -51,7 +51,8 @@ class Degradation:
 
 def blurred(frame: Frame, sigma: float, look: Look, draw: np.random.Generator) -> NDArray[np.floating]:
     """Out of focus: a Gaussian of so many radii."""
-    return cv2.GaussianBlur(frame.astype(np.float32), (0, 0), sigma * look.radius, borderType=cv2.BORDER_REPLICATE)
+    seen = cv2.GaussianBlur(frame.astype(np.float32), (0, 0), sigma * look.radius, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(seen, dtype=np.float32)
 
 
 def moved(frame: Frame, length: float, look: Look, draw: np.random.Generator) -> NDArray[np.floating]:
@@ -65,7 +66,8 @@ def moved(frame: Frame, length: float, look: Look, draw: np.random.Generator) ->
         for down in (0, 1):
             column, row = np.floor(u).astype(int) + right, np.floor(v).astype(int) + down
             np.add.at(kernel, (row, column), (1 - abs(u - column)) * (1 - abs(v - row)))
-    return cv2.filter2D(frame.astype(np.float32), -1, kernel / kernel.sum(), borderType=cv2.BORDER_REPLICATE)
+    seen = cv2.filter2D(frame.astype(np.float32), -1, kernel / kernel.sum(), borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(seen, dtype=np.float32)
 
 
 def darkened(frame: Frame, gain: float, look: Look, draw: np.random.Generator) -> NDArray[np.floating]:
