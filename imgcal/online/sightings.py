@@ -116,7 +116,7 @@ class Sightings:
                 "the middle of its image, and it will be found again"
             )
         if camera in self.silent and look.time - self.silent[camera] >= self._patience(camera):
-            return self.silent[camera], "sends nothing"
+            return self.silent[camera], "sends nothing at the moments of the other cameras"
         first, times = self.missing.get(camera, (look.time, 0))
         if times >= ABSENT_SNAPSHOTS and look.time - first >= ABSENT_SECONDS:
             return first, "does not see the object, which should be in view: it is covered, or has turned away"

@@ -28,6 +28,8 @@ EARLY = 0.05
 """Share of that time by which it may come earlier."""
 ALONE = 30
 """Snapshots in a row in which a camera is alone while others come together, from which its time stamps are told."""
+NEIGHBOUR = 1.1
+"""Of its usual rest, within which others must have exposed: one that sends more often than they is alone by right."""
 LEAP = 10.0
 """Seconds by which a clock may not leap: the exposure is left out, unless the other cameras' clocks did the same."""
 LONGEST_ASTRAY = 100
@@ -35,11 +37,12 @@ LONGEST_ASTRAY = 100
 REMEMBERED = 4096
 """Names of snapshots that are known to have gone on."""
 
-COUNTS = ("received", "missing", "late", "duplicate", "out_of_order", "astray")
+COUNTS = ("received", "missing", "late", "duplicate", "out_of_order", "astray", "beside")
 """What is counted for each camera.
 
 `missing`: snapshots without it in which it was due. `late`: it came after its snapshot had gone on. `duplicate`: its
-second of a snapshot. `astray`: its clock is more than `LEAP` off. These three are left out. `out_of_order`: earlier
+second of a snapshot. `astray`: its clock is more than `LEAP` off. `beside`: its time stamps have been beside those of
+the others for long. These four are left out. `out_of_order`: earlier
 than one before; used where its snapshot has not gone on.
 """
 
@@ -197,12 +200,22 @@ class Synchronizer:
         done: list[TimedSnapshot] = []
         while self._pending and self._may_go(self._pending[0], now):
             done.append(self._went_on(self._pending.pop(0)))
-        return tuple(done)
+        return self._of_others(done)
 
     def flush(self) -> tuple[TimedSnapshot, ...]:
         """Give all that is being gathered, as it is."""
         pending, self._pending = self._pending, []
-        return tuple(self._went_on(snapshot) for snapshot in pending)
+        return self._of_others([self._went_on(snapshot) for snapshot in pending])
+
+    def _of_others(self, done: list[TimedSnapshot]) -> tuple[TimedSnapshot, ...]:
+        """Leave out what a camera sees at moments of its own: nobody knows where the object was then."""
+        kept = []
+        for snapshot in done:
+            if len(snapshot.exposures) == 1 and (name := next(iter(snapshot.exposures))) in self.alone:
+                self.counts["beside"][name] += 1
+            else:
+                kept.append(snapshot)
+        return tuple(kept)
 
     def _take(self, exposure: Exposure, now: float) -> None:
         camera, before = exposure.camera, self._newest.get(exposure.camera, -math.inf)
@@ -282,7 +295,9 @@ class Synchronizer:
         """Tell whether a snapshot is of one camera alone, while others expose shortly before or after it."""
         if len(pending.exposures) > 1 or pending.name is not None:
             return False
-        return any(self._nearest(other, pending) < self._rest(name) / 2 for other in self.camera_names if other != name)
+        return any(
+            self._nearest(other, pending) < NEIGHBOUR * self._rest(name) for other in self.camera_names if other != name
+        )
 
     def _there(self) -> list[str]:
         """The cameras that are waited for; also one that has just begun: nobody knows yet how often it sends."""

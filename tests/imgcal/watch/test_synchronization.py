@@ -204,13 +204,25 @@ def test_a_camera_that_sends_less_often_is_waited_for_when_it_is_due_and_at_no_o
     assert sync.counts["missing"]["c"] < 20 * every / 2
 
 
+def test_a_clock_that_runs_is_beside_the_others_until_a_whole_frame_has_passed():
+    sync, done = Synchronizer(ABC, Timing()), []
+    for k in range(600):
+        for camera in ABC:
+            done += sync.add(at(camera, k / 30 * (1 + 1.5e-3 * (camera == "b"))))
+    lone = [snapshot.time for snapshot in done if cameras([snapshot]) == ["b"]]
+    assert len(lone) <= 32 and max(lone) < 5 and sync.counts["beside"]["b"] > 300
+
+
 def test_cameras_whose_stamps_go_with_no_other_are_named():
-    sync = Synchronizer(ABC, Timing())
+    sync, done = Synchronizer(ABC, Timing()), []
     for k in range(200):
         for camera in ABC:
-            sync.add(at(camera, k / 30 + (0.012 if camera == "b" and 50 <= k < 150 else 0.0)))
+            done += sync.add(at(camera, k / 30 + (0.012 if camera == "b" and 50 <= k < 150 else 0.0)))
         if k < 79 or 90 < k < 150 or k > 155:
             assert sync.alone == (("b",) if 90 < k < 150 else ())
+    found = cameras(done)
+    assert 29 <= found.count("b") <= 30 and found.count("b") + sync.counts["beside"]["b"] == 100
+    assert found.count("ac") == 100 and found[-40:] == ["abc"] * 40
 
 
 def test_a_camera_that_sends_more_often_than_others_is_not_beside_them():
