@@ -149,8 +149,7 @@ def sized(row: str, options: Options, seed: int) -> RigExperiment:
             changes += [*FULL["images" if images else "points"], *EVERY]
             steps = options.steps or experiment.training.steps or 1
         case "reduced":
-            compared = 1200 if row.startswith("ablation") else 400  # ViT beside CNN; table 1 has ViTs alone
-            steps = options.steps or (compared if images else 500)
+            steps = options.steps or (1200 if images else 500)
             changes += [*SHORT, *REDUCED[kind], f"training.batch_size={8 if images else 64}"]
             changes += ["training.save_every=250", "training.validate_every=250"]
         case "toy":
