@@ -17,6 +17,8 @@ from imgcal.types import Observations
 
 BENT = 3.0
 """Millimetres, one standard deviation of each axis: how far a fiducial may be off that is."""
+ROUGH = 0.2
+"""The same of fiducials that are all off by a little, since the object was made or measured less well than is said."""
 SCALED = 0.1
 """The same of the object's scale, relative."""
 MOST_ASKED = 8
@@ -41,13 +43,13 @@ class ObjectChange:
     odds: float  # log odds against that cameras have moved
 
 
-def let_object_free(belief: RigBelief, fiducial: int | None) -> RigBelief:
-    """Let a fiducial be off (`SHAPE`: all of them), or, where that is None, the scale."""
+def let_object_free(belief: RigBelief, fiducial: int | None, by: float = BENT) -> RigBelief:
+    """Let a fiducial be off by so many mm (`SHAPE`: all of them), or, where that is None, the scale."""
     obj, known, wide = belief.obj, len(belief.object_offset), belief.unit.numel()
     if not known:
         tolerance = torch.zeros(obj.num_fiducials, dtype=torch.float64)
         if fiducial is not None:
-            tolerance[slice(None) if fiducial == SHAPE else fiducial] = BENT
+            tolerance[slice(None) if fiducial == SHAPE else fiducial] = by
         obj = replace(obj, tolerance=tolerance, scale_tolerance=SCALED if fiducial is None else 0.0)
         size = 3 * obj.num_fiducials + 1
         factor = torch.eye(wide + size, dtype=torch.float64)
@@ -56,7 +58,7 @@ def let_object_free(belief: RigBelief, fiducial: int | None) -> RigBelief:
     std = object_prior_std(obj)
     rows = _rows(known, fiducial)
     spread = torch.zeros(wide + known, dtype=torch.float64)
-    spread[wide + rows] = (SCALED if fiducial is None else BENT) / std[rows].clamp_min(1e-6)
+    spread[wide + rows] = (SCALED if fiducial is None else by) / std[rows].clamp_min(1e-6)
     covariance = torch.cholesky_inverse(belief.factor) + spread.square().diag()
     return replace(belief, factor=torch.linalg.cholesky(torch.cholesky_inverse(torch.linalg.cholesky(covariance))))
 
@@ -92,9 +94,9 @@ def changed_object(
     given = joined(list(snapshots))
     cameras = otherwise.evidence + least
     best: tuple[float, int | None, Absorbed] | None = None
-    for fiducial in (None, *_doubtful(given[0], otherwise.residual)):
+    for fiducial, by in _doubtful(given[0], otherwise.residual):
         try:
-            result = absorbed(let_object_free(before, fiducial), *given, options)
+            result = absorbed(let_object_free(before, fiducial, by), *given, options)
         except RefusedError:
             continue
         if best is None or result.evidence > best[0]:
@@ -108,27 +110,41 @@ def changed_object(
     return ObjectChange(fiducial, 0, size, sigma, evidence - cameras), result.before
 
 
-def _doubtful(observations: Observations, residual: Tensor) -> list[int]:
-    """Fiducials that may be off, all of them first: each question takes as long as all that is known of the object."""
+def _doubtful(observations: Observations, residual: Tensor) -> list[tuple[int | None, float]]:
+    """What may be off, and by how much: each question takes as long as all that is known of the object."""
+    scale: tuple[int | None, float] = (None, BENT)
     if observations.seen.shape[-1] > MANY:
-        return []
+        return [scale]
     squared = torch.where(observations.seen, (residual.square().sum(-1) / observations.sigma.square()), 0.0)
     count = observations.seen.sum((0, 1))
     mean = squared.sum((0, 1)) / count.clamp_min(1)
     found = [int(n) for n in mean.argsort(descending=True) if int(count[n])]
-    return [SHAPE, *sorted(found[:MOST_ASKED])]
+    return [scale, (SHAPE, ROUGH), (SHAPE, BENT), *((n, BENT) for n in sorted(found[:MOST_ASKED]))]
 
 
 def _size(before: RigBelief, after: RigBelief, fiducial: int | None) -> tuple[float, float]:
-    """How far it went, and the standard deviation of that."""
+    """How far it went, and the standard deviation of that: of all fiducials what is no motion and no scale."""
     std = object_prior_std(after.obj)
     rows = _rows(len(std), fiducial)
     was = before.object_offset if len(before.object_offset) else torch.zeros_like(std)
     change: Tensor = ((after.object_offset - was) * std)[rows]
     wide = after.unit.numel()
     covariance = torch.cholesky_inverse(after.factor)[wide:, wide:][rows[:, None], rows] * std[rows] * std[rows, None]
+    if fiducial == SHAPE:
+        motions, _ = torch.linalg.qr(_similarities(after.obj.points))
+        change = change - motions @ (motions.mT @ change)
     size = float(change.norm())
     along = change / max(size, 1e-30)
     share = (3 / len(rows)) ** 0.5 if fiducial == SHAPE else 1.0  # of one fiducial
     sigma = share * float((along @ covariance @ along).clamp_min(0).sqrt())
     return (float(change[0]) if fiducial is None else share * size), sigma
+
+
+def _similarities(points: Tensor) -> Tensor:
+    """Directions of fiducials (N, 3) in which an object moves, turns or grows and keeps its shape: (3 N, 7)."""
+    arms = points - points.mean(0)
+    shifts, turns = (
+        torch.eye(3).to(points).expand(len(points), -1, -1),
+        torch.linalg.cross(torch.eye(3).to(points)[None], arms[:, None], dim=-1),
+    )
+    return torch.cat((shifts, turns, arms[:, None]), 1).movedim(1, -1).flatten(0, 1)

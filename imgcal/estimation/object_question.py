@@ -22,7 +22,7 @@ LEAST_USUAL = 30
 """Snapshots from which it is known how well they usually fit."""
 OBJECT_ODDS = 30.0
 """Log odds from which the object has changed where no camera has."""
-OBJECT_ASKED, MOST_FIRST = (8, 16, 32), 2.0
+OBJECT_ASKED, MOST_FIRST = (8, 16, 32, 64), 2.0
 """Numbers of first snapshots, and the standard deviations that chi-squared must be more than is expected, from which it
 is asked whether the object never was as its file says."""
 

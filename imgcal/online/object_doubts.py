@@ -106,9 +106,8 @@ def object_event(change: ObjectChange, since: float, time: float, snapshot: int)
         values = (100 * change.size, 100 * change.sigma)
         return Event(time, snapshot, "object_exchanged", None, since, None, *values, None, change.odds, message)
     if change.fiducial == SHAPE:
-        message = (
-            f"the object is not as its file says: its fiducials are {change.size:.3g} mm (RMS) from there: another one"
-        )
+        off = f"its fiducials are {change.size:.3g} mm (RMS) from there"
+        message = f"the object is not as its file says: {off}; made less exactly, or another one"
         size = (change.size, change.sigma)
         return Event(time, snapshot, "object_exchanged", None, since, None, *size, "mm", change.odds, message)
     message = f"fiducial {change.fiducial} of the object is {change.size:.3g} +- {change.sigma:.1g} mm from its place"

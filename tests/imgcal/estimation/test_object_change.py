@@ -85,6 +85,23 @@ def test_a_fiducial_that_never_was_where_the_file_says_is_told() -> None:
     assert abs(found[0].size - 0.985) < 5 * found[0].sigma
 
 
+@pytest.mark.parametrize("seed", [2, 4, 6])
+def test_an_object_that_never_was_as_its_file_says_is_told_however_it_is_turned(seed: int) -> None:
+    factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+    generator = torch.Generator().manual_seed(seed)
+    truth = simulate_truth(factory, obj, 16, generator, PhysicalDrift())
+    other = obj.points + 0.15 * torch.randn(8, 3, generator=generator, dtype=torch.float64)
+    monitor, found = RigMonitor(RigFilter(factory, obj)), []
+    for s in range(16):
+        image = truth.rig.expand(1).project(truth.rig_from_object[s : s + 1].apply(other))
+        uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
+        there = Observations(uv, torch.full(uv.shape[:-1], NOISE, dtype=torch.float64), image.visible)
+        monitor.update(there, truth.rig_from_object[s : s + 1], 1 / 60)
+        found += [] if monitor.object_change is None else [monitor.object_change]
+    assert [(change.fiducial, change.since) for change in found] == [(SHAPE, 0)]
+    assert found[0].size == pytest.approx(_apart(obj.points, other), abs=5 * found[0].sigma)
+
+
 def test_few_questions_are_asked_of_a_print(monkeypatch: pytest.MonkeyPatch) -> None:
     rig, generator = imgcal.load_rig("T4"), torch.Generator().manual_seed(3)
     across = torch.arange(12.0, dtype=torch.float64)
@@ -92,7 +109,7 @@ def test_few_questions_are_asked_of_a_print(monkeypatch: pytest.MonkeyPatch) -> 
     obj = imgcal.CalibrationObject(torch.nn.functional.pad(points, (0, 1)), palette(len(points)).double())
     truth, asked = simulate_truth(rig, obj, 3, generator, PhysicalDrift()), []
 
-    def noted(belief: RigBelief, fiducial: int | None) -> RigBelief:
+    def noted(belief: RigBelief, fiducial: int | None, by: float) -> RigBelief:
         asked.append(fiducial)
         return belief  # with more than 400 values of the object, an answer takes seconds
 
