@@ -32,6 +32,7 @@ from .pooled_images import PaperImageNetwork, PooledImageNetwork
 from .randomness import drawing_from
 from .soft_positions import find_soft_positions
 from .subject import check_object, check_rig, check_says_rigs
+from .tiles import Tiles
 
 __all__ = [
     "PRESETS",
@@ -65,6 +66,7 @@ __all__ = [
     "PositionNetwork",
     "Queries",
     "Sightings",
+    "Tiles",
     "build",
     "build_network",
     "check_object",

@@ -31,11 +31,21 @@ class Expectation:
     visible: Tensor  # (H, C, N) bool
 
     @classmethod
-    def of(cls, rig: CameraRig, obj: CalibrationObject, rig_from_object: RigidTransform) -> Expectation:
-        """Project an object at poses (H,) into a rig without batch axes."""
+    def of(
+        cls, rig: CameraRig, obj: CalibrationObject, rig_from_object: RigidTransform, usual: float | None = None
+    ) -> Expectation:
+        """Project an object at poses (H,) into a rig without batch axes.
+
+        Args:
+            rig: the cameras.
+            obj: the object.
+            rig_from_object: poses (H,).
+            usual: mm, radius of markers where the object does not say how large they are; None = of its size.
+        """
         points = rig_from_object.apply(obj.points.to(rig.focal_length))
         seen = rig.expand(len(points)).project(points)
-        size = obj.points.new_full((obj.num_fiducials,), USUAL_RADIUS * obj.size) if obj.radius is None else obj.radius
+        usual = USUAL_RADIUS * obj.size if usual is None else usual
+        size = obj.points.new_full((obj.num_fiducials,), usual) if obj.radius is None else obj.radius
         focal = rig.focal_length.mean(-1)[:, None]  # (C, 1)
         radius = focal * size.to(focal) / seen.depth.clamp(min=1e-3)
         return cls(seen.uv, radius, seen.depth, seen.visible)

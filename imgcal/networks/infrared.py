@@ -9,8 +9,8 @@ one network serves any rig and any object.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from typing import Annotated
 
 import torch
@@ -46,6 +46,10 @@ class Queries:
     depth: Tensor  # (P, N) distance from the camera's plane over the mean of all fiducials, minus 1
     asked: Tensor  # (P, N) bool: expected in view
 
+    def select(self, rows: Tensor) -> Queries:
+        """Keep the crops of these rows."""
+        return Queries(self.place[rows], self.radius[rows], self.depth[rows], self.asked[rows])
+
     def geometry(self, size: int) -> Tensor:
         """How the fiducials lie to one another: (P, N, 6)."""
         asked = self.asked[..., None].to(self.place)
@@ -65,6 +69,11 @@ class Evidence:
     log_sigma: Tensor  # (P, N, K, K) of the offset's error, crop pixels, one standard deviation of each axis
     present: Tensor  # (P, N) logit that the fiducial is seen in its window at all
     cells: Tensor  # (P, N, K, K, 2) crop pixels, the cells' middles
+
+    @classmethod
+    def cat(cls, parts: Sequence[Evidence]) -> Evidence:
+        """Put crops after one another."""
+        return cls(*(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(cls)))
 
 
 class InfraredNetwork(nn.Module):

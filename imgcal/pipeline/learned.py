@@ -4,6 +4,9 @@ It looks where candidates of the pose put the object, in all cameras. Where it s
 and lets the evidence of all cameras together decide. What it then claims is turned into a rig and a pose, and it looks
 again, with windows that are now centred: cameras that see well so help those that do not. Its claims are proposals:
 identity and the most probable rig judge them like blobs.
+
+Objects of many small markers are looked at in tiles. Inside a lattice neighbours look alike one step aside: all tiles
+of a camera decide together by which step most of its markers are there, and where that is close the camera is left out.
 """
 
 from __future__ import annotations
@@ -11,13 +14,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from imgcal.association import Proposal, Proposer, Snapshot, rows_of
 from imgcal.detection import Frame
@@ -26,11 +27,12 @@ from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import model_file
 from imgcal.matching import each_camera, measure_markers
 from imgcal.networks import (
-    Claims,
     Evidence,
     Expectation,
     InfraredNetwork,
     Measurer,
+    Queries,
+    Tiles,
     claim,
     cut_crops,
     cut_patches,
@@ -38,7 +40,8 @@ from imgcal.networks import (
     load_measurer,
     normalized,
 )
-from imgcal.types import CalibrationObject, CameraRig, CropPlacement, Observations
+from imgcal.pipeline.looks import CHANCE, Sighting
+from imgcal.types import CalibrationObject, CameraRig, Observations
 
 LEAST_PROBABILITY = 0.5  # of a claim
 LEAST_SEEN = 0.5  # share of what is asked for, below which other poses are tried
@@ -56,41 +59,13 @@ ROBUST = EstimationOptions(loss="cauchy", threshold=2.0, max_iterations=30, tole
 MODEL_ERROR = 0.3  # px: what a measured place may be off beyond its own sigma
 OUTLIER = 5.0  # standard deviations of a claim from the fitted rig, at which it is dropped
 LARGEST_SIGMA = 20.0  # px: where a claim is too vague to be one
-CHANCE = 0.05  # probability that a window is not what the network takes it for
+TILES_AT_ONCE = 8  # more leave the caches, and fill the memory
+STEPS = 9  # displacements of a camera that are compared: none, and the steps of a lattice around it
+SAME_PLACE = 4.0  # crop pixels within which two of them claim one place for a fiducial
+LEAST_AHEAD = 2.0  # markers that the best one shows more than the next, below which none is known
 
 Fit = tuple[CameraRig, RigidTransform]
 """The most probable rig, and poses (1,)."""
-
-
-@dataclass(frozen=True)
-class Sighting:
-    """What one look says: H poses, C cameras, N fiducials."""
-
-    rig: CameraRig  # that was looked with
-    poses: RigidTransform  # (H,)
-    evidence: Evidence  # (H C, N)
-    claims: Claims  # (H C, N)
-    asked: Tensor  # (H, C, N) bool
-
-    @cached_property
-    def found(self) -> Tensor:
-        """How many fiducials each pose shows, expected: (H,)."""
-        return self.claims.probability.view(self.asked.shape).sum((1, 2))
-
-    @cached_property
-    def margin(self) -> float:
-        """Log odds of the first pose's displacements being none against the best other one, camera by camera."""
-        logits, asked = self.evidence.logits, self.asked.flatten(0, 1)
-        size = logits.shape[-1]
-        probability = functional.avg_pool2d(logits.flatten(2).softmax(-1).unflatten(2, (size, size)), 3, 1, 1) * 9
-        present = self.evidence.present.sigmoid()[..., None, None] * (1 - CHANCE)
-        even = 9 / size**2
-        odds = (present * probability.clamp(max=1) / even + 1 - present).log()
-        joint = (odds * asked[..., None, None]).sum(1)  # of all fiducials of a camera, by common displacement
-        middle = slice(size // 2 - 3, size // 2 + 3)
-        here = joint[:, middle, middle].amax((1, 2))
-        joint[:, middle, middle] = -torch.inf
-        return float((here - joint.amax((1, 2)).clamp(min=0)).sum())
 
 
 @dataclass(frozen=True)
@@ -110,9 +85,21 @@ class LearnedProposer:
             return near or Proposal.declined(snapshot, "found no pose to look around")
         found = self.finder.propose(snapshot)
         if found.rig_from_object is None:
-            return near or Proposal.declined(snapshot, found.reason)
+            return near or self._at_origin(snapshot) or Proposal.declined(snapshot, found.reason)
         there = self._around(replace(snapshot, candidates=(found.rig_from_object,)))
         return there if near is None or len(there.detections) > len(near.detections) else near
+
+    def _at_origin(self, snapshot: Snapshot) -> Proposal | None:
+        """Look where many captures have their object, if it is one of many small markers: the finder gives up on these.
+
+        Others are searched for everywhere.
+        """
+        origin = RigidTransform.identity(dtype=snapshot.rig.focal_length.dtype)
+        size = self.network.config.crop
+        if not Tiles.of_object(snapshot.rig, snapshot.obj, RigidTransform.stack((origin,)), size).divided:
+            return None
+        proposal = self._around(replace(snapshot, candidates=(origin,)))
+        return None if proposal.reason else proposal
 
     def _convinces(self, proposal: Proposal, snapshot: Snapshot) -> bool:
         """Tell whether so much is seen that the object cannot well be elsewhere."""
@@ -124,14 +111,16 @@ class LearnedProposer:
 
     def _around(self, snapshot: Snapshot) -> Proposal:
         view = _View.of(self.network, self.measurer, snapshot)
-        looks = view.best(snapshot.rig, RigidTransform.stack(snapshot.candidates))
-        if float(looks.found[0]) < LEAST_SEEN * float(looks.asked[0].sum()):
-            tried = view.best(snapshot.rig, _turned(looks.poses[0], snapshot.obj))
-            looks = tried if float(tried.found[0]) > float(looks.found[0]) else looks
+        poses = RigidTransform.stack(snapshot.candidates)
+        view, looks = view.aligned(poses[:1]) if view.tiles.divided else (view, view.near(poses))
+        if view.tiles.divided and not looks.count:
+            return Proposal.declined(
+                snapshot, "too little of the object is to be seen to tell one step of its pattern from the next"
+            )
         fitted = view.fit(looks, view.observations(looks))
         for _ in range(LOOKS - 1):
             if fitted is None:
-                reason = f"found {float(looks.found[0]):.0f} of {int(looks.asked[0].sum())} fiducials in the frames"
+                reason = f"found {float(looks.found[0]):.0f} of {looks.count} fiducials in the frames"
                 return Proposal.declined(snapshot, reason)
             looks = view.look(*fitted, window=self.network.config.close_window)
             fitted = view.fit(looks, view.observations(looks))
@@ -165,26 +154,80 @@ class _View:
     measurer: Measurer | None
     snapshot: Snapshot
     frames: Mapping[str, Frame | None]  # without what is masked
-    placement: CropPlacement  # (C,)
-    features: Tensor  # (C, D, G, G)
+    tiles: Tiles
+    features: Tensor  # (T, D, G, G)
+    most: float = math.inf  # log odds: what is known of whole steps of a pattern bounds what is known of the rest
 
     @classmethod
     def of(cls, network: InfraredNetwork, measurer: Measurer | None, snapshot: Snapshot) -> _View:
         rig, size = snapshot.rig, network.config.crop
         poses = RigidTransform.stack(snapshot.candidates)
-        placement = Expectation.of(rig, snapshot.obj, poses).placement(rig, size)
+        tiles = Tiles.of_object(rig, snapshot.obj, poses, size)
         frames = {name: _masked(frame, snapshot.masks.get(name)) for name, frame in snapshot.frames.items()}
-        crops = cut_crops(frames, rig.camera_names, placement, inverted=snapshot.detection.polarity == "dark")
+        names = tuple(rig.camera_names[camera] for camera in tiles.camera.tolist())
+        crops = cut_crops(frames, names, tiles.placement, inverted=snapshot.detection.polarity == "dark")
         features = network.encoder(normalized(crops)[:, None]).contiguous()
-        return cls(network, measurer, snapshot, frames, placement, features)
+        return cls(network, measurer, snapshot, frames, tiles, features)
 
-    def look(self, rig: CameraRig, poses: RigidTransform, window: int | None = None) -> Sighting:
-        """Ask for all fiducials at poses (H,)."""
-        count = len(poses.rotation)
-        queries = Expectation.of(rig, self.snapshot.obj, poses).queries(self.placement)
-        evidence = self.network.search(self.features.repeat(count, 1, 1, 1), queries, window)
+    def expected(self, rig: CameraRig, poses: RigidTransform) -> Expectation:
+        """Where poses (H,) put the fiducials."""
+        return Expectation.of(rig, self.snapshot.obj, poses, self.tiles.usual)
+
+    def look(
+        self, rig: CameraRig, poses: RigidTransform, window: int | None = None, aside: Tensor | None = None
+    ) -> Sighting:
+        """Ask for all fiducials at poses (H,), or so many crop pixels (C, 2) aside."""
+        count, placement = len(poses.rotation), self.tiles.placement
+        shift = None
+        if aside is not None:
+            shift = (placement.scale[:, None] * aside[self.tiles.camera]).expand(count, -1, -1)
+        queries = self.tiles.of(self.expected(rig, poses)).queries(placement, shift)
+        evidence = self._searched(queries, count, window)
         asked = queries.asked.unflatten(0, (count, -1))
-        return Sighting(rig, poses, evidence, claim(evidence, queries.asked), asked)
+        return Sighting(rig, poses, self.tiles, evidence, claim(evidence, queries.asked), asked)
+
+    def _searched(self, queries: Queries, count: int, window: int | None) -> Evidence:
+        """Ask for queries (H T, n) of so many poses."""
+        if not self.tiles.divided:
+            return self.network.search(self.features.repeat(count, 1, 1, 1), queries, window)
+        parts = [
+            self.network.search(self.features[rows], queries.select(rows), window)
+            for rows in torch.arange(len(self.features)).split(TILES_AT_ONCE)
+        ]
+        return Evidence.cat(parts)
+
+    def aligned(self, pose: RigidTransform) -> tuple[_View, Sighting]:
+        """Find by how much each camera sees the object (1,) aside, by which of the steps of its pattern.
+
+        Returns:
+            The view, without cameras in which steps cannot be told apart, and a look from there.
+        """
+        rig, window = self.snapshot.rig, self.network.config.close_window
+        steps = self.look(rig, pose).displacements(STEPS)
+        looks = [self.look(rig, pose, window, aside) for aside in steps]
+        found = torch.stack([look.found_in_camera for look in looks])
+        best, cameras = found.argmax(0), torch.arange(rig.num_cameras)
+        claimed = [self.observations(look) for look in looks]
+        uv, seen = torch.cat([each.uv for each in claimed]), torch.cat([each.seen for each in claimed])  # (K, C, N)
+        both = seen & seen[best, cameras]
+        near = SAME_PLACE * self._joined(self.tiles.placement.scale[:, None].expand_as(self.tiles.counts))
+        one = both & ((uv - uv[best, cameras]).norm(dim=-1) < near)
+        # Steps from which the same markers are seen in the same places are no rivals.
+        rivals = found.masked_fill(2 * one.sum(-1) > both.sum(-1), 0.0)
+        ahead = found.amax(0) - rivals.amax(0)
+        sure = ahead >= LEAST_AHEAD
+        most = -math.log(CHANCE) * float(ahead[sure].sum())
+        view = replace(self, tiles=self.tiles.only(sure), most=most)
+        return view, view.look(rig, pose, window, steps[best, cameras])
+
+    def near(self, poses: RigidTransform) -> Sighting:
+        """Of poses (H,), and where these show too little of others near them, the one that shows most."""
+        rig = self.snapshot.rig
+        looks = self.best(rig, poses)
+        if float(looks.found[0]) < LEAST_SEEN * looks.count:
+            tried = self.best(rig, _turned(looks.poses[0], self.snapshot.obj))
+            looks = tried if float(tried.found[0]) > float(looks.found[0]) else looks
+        return looks
 
     def best(self, rig: CameraRig, poses: RigidTransform) -> Sighting:
         """Of poses (H,) the one that shows most in all cameras together."""
@@ -193,11 +236,16 @@ class _View:
 
     def observations(self, looks: Sighting) -> Observations:
         """What the first pose claims, in image pixels: (1, C, N)."""
-        claims, scale = looks.claims, self.placement.scale[:, None]
-        uv = self.placement.to_image(claims.place.to(self.placement.corner))
+        claims, placement = looks.claims, self.tiles.placement
+        scale = placement.scale[:, None]
+        uv = placement.to_image(claims.place.to(placement.corner))
         sigma = (claims.sigma.to(scale).square() + LEAST_SIGMA**2).sqrt() * scale
         seen = (claims.probability > LEAST_PROBABILITY) & (sigma < LARGEST_SIGMA)
-        return Observations(uv[None], sigma[None], seen[None])
+        return Observations(*(self._joined(values)[None] for values in (uv, sigma, seen)))
+
+    def _joined(self, values: Tensor) -> Tensor:
+        """Arrange values (T, n, ...) by camera: (C, N, ...)."""
+        return self.tiles.joined(values, self.snapshot.rig.num_cameras, self.snapshot.obj.num_fiducials)
 
     def measured(self, looks: Sighting, expected: Expectation, gate: float) -> Observations:
         """Measure all fiducials where a fitted rig has them (1, C, N), at full scale, as far as the network sees them.
@@ -208,7 +256,7 @@ class _View:
             gate: pixels that a place may be off, beyond what its sigma explains.
         """
         claimed = self.observations(looks)
-        shown = looks.asked[0] & (looks.evidence.present.sigmoid() > LEAST_PRESENT)
+        shown = self._joined(looks.asked[0] & (looks.evidence.present.sigmoid() > LEAST_PRESENT))
         surely, last = claimed.seen[0] & shown, gate == GATES[-1]
         place, sigma, good = self._read(expected.uv[0], expected.radius[0], surely, last)
         good &= shown
@@ -281,20 +329,21 @@ class _View:
     def proposal(self, looks: Sighting, fitted: Fit | None) -> Proposal:
         """Measure what agrees with the rig and pose that the claims speak for: labelled blobs."""
         snapshot, observations = self.snapshot, self.observations(looks)
+        margin = min(looks.margin, self.most)
         for gate in GATES:
             if fitted is None:
                 break
-            observations = self.measured(looks, Expectation.of(fitted[0], snapshot.obj, fitted[1]), gate)
+            observations = self.measured(looks, self.expected(*fitted), gate)
             fitted = self.fit(looks, observations)
         if fitted is None:
-            return Proposal.declined(snapshot, "found hardly any fiducials that agree with one pose", looks.margin)
+            return Proposal.declined(snapshot, "found hardly any fiducials that agree with one pose", margin)
         rig, poses = fitted
-        expected = Expectation.of(rig, snapshot.obj, poses)
+        expected = self.expected(rig, poses)
         off = (expected.uv - observations.uv).norm(dim=-1) / (observations.sigma.square() + MODEL_ERROR**2).sqrt()
         seen = (observations.seen & (off < OUTLIER))[0]
         uv, sigma, radius = (values[0].numpy() for values in (observations.uv, observations.sigma, expected.radius))
         rows = rows_of(uv, sigma, seen.numpy(), radius, snapshot.blobs)
-        return Proposal(rows, poses[0], looks.margin)
+        return Proposal(rows, poses[0], margin)
 
 
 def _masked(frame: np.ndarray | None, mask: np.ndarray | None) -> np.ndarray | None:
