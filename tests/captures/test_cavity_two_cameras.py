@@ -28,3 +28,11 @@ def test_recovers_a_disturbed_calibration(pixels, seed, cavity, calibrate, score
     scored = score(held_out, outcome.rig, folder / "object.csv")["per_camera"]
     for camera, limit in LIMITS.items():
         assert scored[camera]["rms_px"] <= limit, scored
+
+
+def test_a_network_that_looks_at_tiles_recovers_it(cavity, calibrate, score):
+    """Its labels are right; the rig is a tenth of a pixel worse than that of blobs, as the matched filter's is."""
+    folder, factory, points, held_out = cavity
+    outcome = calibrate(folder, disturbed(factory, points, 8.0, 0), folder / "object.csv", "--detector", "learned")
+    assert outcome.code == 0, outcome.result["reason"]
+    assert score(held_out, outcome.rig, folder / "object.csv")["rms_px"] <= 0.9
