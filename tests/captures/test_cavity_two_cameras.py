@@ -35,4 +35,5 @@ def test_a_network_that_looks_at_tiles_recovers_it(cavity, calibrate, score):
     folder, factory, points, held_out = cavity
     outcome = calibrate(folder, disturbed(factory, points, 8.0, 0), folder / "object.csv", "--detector", "learned")
     assert outcome.code == 0, outcome.result["reason"]
+    assert outcome.result["detector"] == {"learned": 1}
     assert score(held_out, outcome.rig, folder / "object.csv")["rms_px"] <= 0.9

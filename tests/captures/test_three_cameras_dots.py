@@ -52,6 +52,7 @@ def test_a_network_that_looks_at_tiles_recovers_it_as_well(dots, calibrate, scor
     rig = disturbed(factory, points, 12.0, 1)
     outcome = calibrate(folder, rig, folder / "object.csv", "--detector", "learned")
     assert outcome.code == 0, outcome.result["reason"]
+    assert outcome.result["detector"] == {"learned": 1}
     scored = score(held_out, outcome.rig, folder / "object.csv")["per_camera"]
     for camera, limit in LIMITS.items():
         assert scored[camera]["rms_px"] <= limit, scored
