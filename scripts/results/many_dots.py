@@ -22,17 +22,15 @@ import tyro
 from numpy.typing import NDArray
 
 import imgcal
-from imgcal.detection import Frame, detect_snapshot, to_detections
+from imgcal.detection import Frame
 from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform, rotation_from_vector
-from imgcal.io import load_object, read_frame
 from imgcal.synthesis import Difficulty, FrameModel, Truth, simulate_shots
-from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
+from imgcal.types import CalibrationObject, CameraRig, Detections
 from renderers import BlobRange, ClutterModel
 from scripts.output import RESULTS, ROOT, command, fill, markdown, read_json, surroundings, write_json
-from tests.captures import test_cavity_two_cameras as cavity
-from tests.captures import test_three_cameras_dots as dots
-from tests.captures.conftest import Points, as_detections, at_own_centres, disturbed, fit_rig, read_points
+from tests.captures.conftest import Points, as_detections, disturbed
+from tests.captures.sets import PRIOR, SIZE, cavity_two_cameras, three_cameras_dots
 
 JSON, PAGE = RESULTS / "many-dots.json", ROOT / "docs" / "infrared.md"
 NEAR = 3.0  # px within which a place is right
@@ -40,13 +38,13 @@ WRONG = 2.0  # px: held-out RMS of a rig that is none; dots are 35 and more apar
 PIXELS = (9.0, 12.0, 14.0)  # that factory rigs are off
 PITCH = (((0,), (22, 0)), ((0,), (-35, 0)), ((0, 2), (0, 22)), ((1,), (30, 10)), ((0, 1, 2), (-25, 0)))
 """Cameras of the lattice of 437 dots, and px that their images are aside: more than half of a pitch."""
-IMAGE = (1280, 1024)
 VISIBLE = 0.25  # share of a dot that must be seen for it to count
 CLUTTER = ClutterModel(
     reflections=BlobRange(4, (6.0, 30.0), (2.0, 6.0), (0.5, 2.0)),
     blobs=BlobRange(1500, (0.6, 3.0), (1.0, 1.5), (0.1, 1.5)),
 )
 HARD = Difficulty(peak_snr=(3.0, 6.0), clutter=CLUTTER, hidden=0.1)
+STATUS = ("calibrated", "left to blobs", "refused", "wrong")
 DETECTORS = ("classical", "matched", "learned, one crop a camera", "learned")
 
 
@@ -64,35 +62,19 @@ class Case:
 
 def real(captures: Path) -> Iterator[Case]:
     """Both real targets, each disturbed several times."""
-    for folder, module, seed in (
-        (captures / "cavity-two-cameras", cavity, 1),
-        (captures / "three-cameras-dots", dots, 0),
-    ):
-        obj = load_object(folder / "object.csv")
-        points = _published(folder, obj.points.numpy())
-        half = np.random.default_rng(seed).random(len(points.uv)) < 0.5
-        factory = fit_rig(points.select(half), module.CAMERAS, IMAGE, module.PRIOR)
-        frames = {name: read_frame(next((folder / "frames").glob(f"{name}.*"))) for name in module.CAMERAS}
-        found = to_detections([detect_snapshot(frames, imgcal.DetectionOptions())], module.CAMERAS, ("0",))
-        held_out = as_detections(at_own_centres(points.select(~half), found)[0], module.CAMERAS)
-        uv = np.full((len(module.CAMERAS), obj.num_fiducials, 2), np.nan)
-        uv[points.camera, points.fiducial] = points.uv
+    for name, read in (("cavity-two-cameras", cavity_two_cameras), ("three-cameras-dots", three_cameras_dots)):
+        known = read(captures)
+        frames = {camera: shots[0] for camera, shots in known.frames.items()}
+        uv = np.full((len(frames), known.obj.num_fiducials, 2), np.nan)
+        uv[known.points.camera, known.points.fiducial] = known.points.uv
         for draw, pixels in enumerate(PIXELS):
-            rig = disturbed(factory, points, pixels, draw)
-            yield Case(folder.name, frames, rig, obj, uv, held_out)
-        for cameras, shift in PITCH if module is dots else ():
-            step = torch.zeros(3, 15, dtype=torch.float64)
+            rig = disturbed(known.factory, known.points, pixels, draw)
+            yield Case(name, frames, rig, known.obj, uv, known.held_out)
+        for cameras, shift in PITCH if name == "three-cameras-dots" else ():
+            step = torch.zeros(len(frames), 15, dtype=torch.float64)
             step[list(cameras), 8:10] = torch.tensor(shift, dtype=torch.float64)
-            yield Case(f"{folder.name}, more than half a pitch aside", frames, factory.retract(step), obj, uv, held_out)
-
-
-def _published(folder: Path, object_points: NDArray[np.float64]) -> Points:
-    if folder.name == "three-cameras-dots":
-        return read_points(folder / "correspondences.csv", object_points, dots.CAMERAS)
-    points = cavity.published_dots(folder, object_points)
-    # Two places are a particle beside the dot: they stand out of a first fit.
-    near = cavity.residuals(fit_rig(points, cavity.CAMERAS, IMAGE, cavity.PRIOR), points) < 2.5
-    return points.select(near)
+            rig = known.factory.retract(step)
+            yield Case(f"{name}, more than half a pitch aside", frames, rig, known.obj, uv, known.held_out)
 
 
 def simulated(count: int) -> Iterator[Case]:
@@ -105,8 +87,7 @@ def simulated(count: int) -> Iterator[Case]:
         torch.full((2, 2), 5000.0, dtype=torch.float64), torch.tensor([[640.0, 512.0]] * 2, dtype=torch.float64),
         torch.zeros(2, 5, dtype=torch.float64),
         RigidTransform(rotation_from_vector(turns), torch.tensor([[0.0, 0.0, 500.0]] * 2, dtype=torch.float64)),
-        torch.tensor([IMAGE] * 2), ("a", "b"), "true", None,
-        RigPrior(focal_length=0.01, principal_point=20.0, distortion=0.05, rotation=0.005, position=3.0),
+        torch.tensor([SIZE] * 2), ("a", "b"), "true", None, PRIOR,
     )  # fmt: skip
     poses = RigidTransform(rotation_from_vector(torch.tensor([[0.0, 0.0, 0.0], [0.1, -0.1, 0.05]]).double()),
                            torch.zeros(2, 3, dtype=torch.float64))  # fmt: skip
@@ -124,25 +105,27 @@ def simulated(count: int) -> Iterator[Case]:
 
 
 def asked(name: str, case: Case) -> dict[str, Any]:
-    """Calibrate, and count what the labels of the estimate are worth."""
-    known = ~np.isnan(case.uv[..., 0])
+    """Calibrate, and count what the labels of the estimate are worth, if they are this detector's own."""
+    known, detector = ~np.isnan(case.uv[..., 0]), name.partition(",")[0]
+    nothing = {"right": 0, "wrong": 0, "known": int(known.sum())}
     started = time.process_time()
     try:
-        result = imgcal.calibrate(dict(case.frames), case.rig, case.obj, detector=name.partition(",")[0])
+        result = imgcal.calibrate(dict(case.frames), case.rig, case.obj, detector=detector)
     except RefusedError as refused:
-        said = {"status": "refused", "reason": str(refused), "right": 0, "wrong": 0}
-        return said | {"known": int(known.sum()), "seconds": time.process_time() - started}
+        seconds = time.process_time() - started
+        return {"status": "refused", "reason": str(refused), "seconds": seconds} | nothing
     seconds = time.process_time() - started
+    if detector not in result.detectors:
+        return {"status": "left to blobs", "seconds": seconds} | nothing
     labelled = result.labelled.detections
     labelled = labelled.select(labelled.fiducial >= 0)
     rows = labelled.camera, labelled.fiducial
     off = np.linalg.norm(labelled.uv - case.uv[rows], axis=1)[known[rows]]
     scored = imgcal.score(case.held_out, result.rig, case.obj)
     rms = float(scored.distances.square().mean().sqrt())
-    return {
-        "status": "wrong" if rms > WRONG else "calibrated", "held_out_px": rms, "right": int((off < NEAR).sum()),
-        "wrong": int((off >= NEAR).sum()), "known": int(known.sum()), "seconds": seconds,
-    }  # fmt: skip
+    status = "wrong" if rms > WRONG else "calibrated"
+    labels = {"right": int((off < NEAR).sum()), "wrong": int((off >= NEAR).sum())}
+    return {"status": status, "held_out_px": rms, "seconds": seconds} | nothing | labels
 
 
 def measure(cases: Iterator[Case], detectors: tuple[str, ...]) -> list[dict[str, Any]]:
@@ -170,13 +153,13 @@ def table(outcomes: list[dict[str, Any]]) -> str:
                 continue
             share = 100 / sum(one["known"] for one in mine)
             right, wrong = (share * sum(one[key] for one in mine) for key in ("right", "wrong"))
-            status = [sum(one["status"] == each for one in mine) for each in ("calibrated", "refused", "wrong")]
+            status = [sum(one["status"] == each for one in mine) for each in STATUS]
             px = [one["held_out_px"] for one in mine if one["status"] == "calibrated"]
             rms = f"{median(px):.3f} / {max(px):.3f}" if px else ""
             seconds = median(one["seconds"] for one in mine)
             shares = f"{right:.1f} / {wrong:.1f} / {100 - right - wrong:.1f}"
             rows.append([case, name, shares, " / ".join(map(str, status)), rms, f"{seconds:.2g}"])
-    head = ["target", "detector", "right / wrong / absent %", "calibrated / refused / wrong"]
+    head = ["target", "detector", "right / wrong / absent %", " / ".join(STATUS)]
     return markdown([*head, "held-out RMS px, median / worst", "CPU s"], rows)
 
 
