@@ -16,9 +16,11 @@ MOST = 16
 """Latest snapshots that are asked why ..."""
 MOST_WIDE = 64
 """... of cameras that are known; and of others, of which it takes more to tell anything."""
-ASKED = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
+ASKED = (1, 2, 3, 4, 6, 8, 12, 16, 20, 24, 28, 32, 48, 64)
 EVERY = 32
 """Numbers of snapshots since cameras are held after which it is asked, and how often later."""
+SHAKEN_SECONDS = 2.0
+"""For how long a camera that sees the object at moments of its own may as well be one that is being shaken."""
 
 
 @dataclass
@@ -28,17 +30,28 @@ class HeldCameras:
     cameras: set[int] = field(default_factory=set)
     seen: deque[Observations] = field(default_factory=lambda: deque(maxlen=MOST_WIDE))  # (1, C, N), of all cameras
     taken: int = 0  # snapshots since they are held in which they see the object
+    seconds: float = 0.0  # since then
     wide: bool = False  # it is hardly known where they are
-    told: bool = False  # that they see the object at moments of their own
+    apart: bool = False  # they see the object at moments of their own, or are shaken ...
+    told: bool = False  # ... and it is told that it is the former
 
     def hold(self, cameras: Collection[int], wide: bool) -> None:
         """Hold cameras, and begin anew where one of them is new."""
         if not set(cameras) <= self.cameras:
             self.seen.clear()
-            self.cameras, self.taken, self.told, self.wide = self.cameras | set(cameras), 0, False, wide
+            self.cameras, self.wide = self.cameras | set(cameras), wide
+            self.taken, self.seconds, self.apart, self.told = 0, 0.0, False, False
 
-    def take(self, observations: Observations) -> bool:
-        """Keep a snapshot, and tell whether to ask what has happened to them."""
+    def tell(self) -> tuple[int, ...]:
+        """Cameras that surely have moments of their own, once: they would stand still by now if they were shaken."""
+        if not self.apart or self.told or self.seconds < SHAKEN_SECONDS:
+            return ()
+        self.told = True
+        return tuple(sorted(self.cameras))
+
+    def take(self, observations: Observations, seconds: float) -> bool:
+        """Keep a snapshot, so long after the one before, and tell whether to ask what has happened to them."""
+        self.seconds += seconds if self.seen else 0.0
         self.seen.append(observations)
         if not bool(observations.seen[:, list(self.cameras)].any()):
             return False
@@ -46,13 +59,24 @@ class HeldCameras:
         return self.taken in ASKED or self.taken % EVERY == 0
 
     def hold_since(
-        self, snapshots: Sequence[tuple[Observations, RigidTransform]], cameras: Collection[int], wide: bool
+        self,
+        snapshots: Sequence[tuple[Observations, RigidTransform]],
+        pauses: Sequence[float],
+        cameras: Collection[int],
+        wide: bool,
     ) -> list[tuple[Observations, RigidTransform]]:
-        """Hold cameras that have moments of their own; returns what may be learnt of snapshots with them."""
+        """Hold cameras that seem to have moments of their own; returns what may be learnt of snapshots with them.
+
+        Args:
+            snapshots: observations (1, C, N) and the object's pose (1,) of each.
+            pauses: s before each of them.
+            cameras: those.
+            wide: it is hardly known where they are.
+        """
         self.hold(cameras, wide)
-        for observations, _ in snapshots:
-            self.take(observations)
-        self.told = True
+        for (observations, _), seconds in zip(snapshots, pauses, strict=True):
+            self.take(observations, seconds)
+        self.apart = True
         return [(without(observations, self.cameras), pose) for observations, pose in snapshots]
 
     def suspicion(self, recent: RecentSnapshots) -> Suspicion:
@@ -71,5 +95,6 @@ class HeldCameras:
 
     def release(self) -> None:
         """Hold none."""
-        self.cameras, self.taken, self.told, self.wide = set(), 0, False, False
+        self.cameras, self.wide = set(), False
+        self.taken, self.seconds, self.apart, self.told = 0, 0.0, False, False
         self.seen.clear()

@@ -150,12 +150,14 @@ class RigMonitor:
         """Learn from a snapshot without the cameras that are held, and ask what has happened to these."""
         held = self.held
         result, changes = self._followed(without(observations, held.cameras), rig_from_object, seconds)
-        if not held.cameras or not held.take(observations):
+        if not held.cameras:
             return result, changes
-        with contextlib.suppress(RefusedError):  # not yet
-            anew = self._asked_held()
-            if anew is not None:
-                return anew[0], (*changes, *anew[1])
+        if held.take(observations, seconds):
+            with contextlib.suppress(RefusedError):  # not yet
+                anew = self._asked_held()
+                if anew is not None:
+                    return anew[0], (*changes, *anew[1])
+        self.apart = held.tell()
         return result, changes
 
     def _asked_held(self) -> tuple[Absorbed, tuple[Change, ...]] | None:
@@ -167,9 +169,8 @@ class RigMonitor:
         held, suspicion = self.held, self.held.suspicion(self._recent)
         since, patient = self.filter.count - suspicion.count, self._since is None
         answer = self._clocks.ask(suspicion, since, self.filter.options, patient)
-        if answer.kind == "apart":
-            self.apart = () if held.told else tuple(sorted(held.cameras))
-            held.told = True
+        held.apart = answer.kind == "apart"
+        if held.apart:
             return None
         held.release()
         if answer.kind == "moved":
@@ -281,8 +282,8 @@ class RigMonitor:
             before, snapshots = answer.slipped.before, answer.slipped.snapshots
         else:
             before, snapshots = (before, snapshots[-age:]) if first is None else (first, snapshots)
-            snapshots = self.held.hold_since(snapshots, cameras, self.filter.count - age - self.first < FEW)
-            self.apart = tuple(sorted(cameras))
+            few = self.filter.count - age - self.first < FEW
+            snapshots = self.held.hold_since(snapshots, pauses[-len(snapshots) :], cameras, few)
         result = self.filter.restart(before, snapshots)
         self._recent = RecentSnapshots(result.belief, self.filter.walk)
         self._recent.took(snapshots, pauses[-len(snapshots) :], result)
