@@ -338,26 +338,20 @@ class RigMonitor:
             self.filter.count -= unlearnt
         return None if found is None else found.of_last()
 
-    def ask_clocks(
-        self, snapshots: Sequence[tuple[Observations, RigidTransform]], pauses: Sequence[float]
-    ) -> tuple[int, ...]:
+    def ask_clocks(self, snapshots: Sequence[tuple[Observations, RigidTransform]], pauses: Sequence[float]) -> None:
         """Ask which cameras are to be doubted where labels fit in most cameras no more; they are held then.
 
         Args:
             snapshots: observations (1, C, N), with those labels, and poses (1,): of the latest ones, not learnt.
             pauses: s before each of them.
-
-        Returns:
-            Those of which it is sure that they have moments of their own.
         """
         if self._since is not None:
-            return ()
+            return
         before = aged(self.filter.belief, self.filter.waited + pauses[0], self.filter.walk)
         found, sure = doubtful_cameras(before, snapshots, self.filter.options)
         if found:
             self.held.hold(found, self.filter.count - self.first < FEW)
-            self.held.told = sure
-        return tuple(sorted(found)) if sure else ()
+            self.held.apart, self.held.seconds = sure, sum(pauses[1:])
 
     def _asked_object(
         self,

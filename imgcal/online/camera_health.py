@@ -8,6 +8,8 @@ from imgcal.online.events import Event
 from imgcal.online.keeper_memory import KeeperMemory
 from imgcal.online.rig_state import CameraHealth
 
+VAIN = 2
+"""Snapshots in a row that fit in most cameras no more: the labels of a single one may be wrong."""
 SAID: Mapping[CameraHealth, str] = {
     "lost": "lost",
     "blind": "blind",
@@ -23,6 +25,8 @@ def health_of(memory: KeeperMemory) -> dict[str, CameraHealth]:
     """How each camera is, by name."""
     found: dict[str, CameraHealth] = {}
     doubted = {*memory.sightings.doubted, *memory.monitor.held.cameras, *memory.monitor.undecided}
+    if memory.in_vain >= VAIN:
+        doubted |= set(range(memory.prior.num_cameras))  # nobody knows yet which of them are not where they were
     for camera, name in enumerate(memory.prior.camera_names):
         if camera in memory.sightings.lost:
             found[name] = "lost"

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from imgcal.estimation import Absorbed, Change, RigFilter, RigMonitor
-from imgcal.online.clock import apart_event
 from imgcal.online.drift_watch import DriftWatch
 from imgcal.online.keeper_memory import KeeperMemory
 from imgcal.online.label_checks import Checked
@@ -89,14 +88,12 @@ def ask_object(memory: KeeperMemory, learnt: bool) -> Absorbed | None:
 
 
 def ask_clocks(memory: KeeperMemory) -> bool:
-    """Ask whether labels fit in no camera because of some that are to be held then, and tell what is sure of them."""
+    """Ask whether labels fit in no camera because of some that are to be held then."""
     doubted = memory.doubts.refused
     snapshots = [(memory.observed(one.blobs), one.rig_from_object) for one in doubted]
-    found = memory.monitor.ask_clocks(snapshots, [one.seconds for one in doubted])
-    for camera in found:
-        name, since = memory.prior.camera_names[camera], doubted[0].time
-        memory.pending.append(apart_event(name, since, memory.time, memory.count - 1))
+    memory.monitor.ask_clocks(snapshots, [one.seconds for one in doubted])
     if memory.monitor.held.cameras:
+        memory.off |= dict.fromkeys(memory.monitor.held.cameras, doubted[0].time)
         memory.doubts = ObjectDoubts(memory.obj.num_fiducials)
     return bool(memory.monitor.held.cameras)
 

@@ -1,7 +1,7 @@
 """How each camera is, the worst first, and the sentence that says so."""
 
 from imgcal.online import Event
-from imgcal.online.camera_health import health_of, sentence_of, take_health
+from imgcal.online.camera_health import VAIN, health_of, sentence_of, take_health
 from tests.imgcal.online.memories import Remembered
 
 
@@ -23,6 +23,8 @@ def test_the_worst_is_said_of_a_camera() -> None:
     memory.relearning.events.clear()
     take_health(memory, Event(0.0, 2, "clean", "cam02"))
     assert health_of(memory)["cam02"] == "ok"
+    memory.in_vain = VAIN
+    assert health_of(memory) == {**dict.fromkeys(("cam01", "cam02", "cam03"), "doubtful"), "cam04": "unseen"}
 
 
 def test_the_rig_is_said_in_a_sentence() -> None:

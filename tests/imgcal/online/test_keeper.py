@@ -234,6 +234,24 @@ def test_a_camera_that_is_shaken_is_in_doubt_until_it_stands_still_and_then_told
     assert normalized(state, made.rig) < 1.6
 
 
+@pytest.mark.parametrize("count", [1, 5])
+def test_half_of_the_cameras_that_are_knocked_are_told_and_nobody_is_calibrated_meanwhile(count: int) -> None:
+    steps = [Bump(70 + s, camera, "position", 5.0) for s in range(count) for camera in (0, 3)]
+    made = stream(3, conditions=Conditions(clutter=0.0), bumps=steps)
+    events = []
+    with RigKeeper(made.factory, made.obj) as keeper:
+        for number, (time, blobs) in enumerate(made.snapshots(110)):
+            state = keeper.update(blobs, time)
+            events += state.events
+            known = [state.cameras[name] for name in ("cam01", "cam04")]
+            assert number < 71 or events or "ok" not in known
+    assert {(event.kind, event.camera) for event in events} <= {
+        (kind, name) for kind in ("moved", "relearnt") for name in ("cam01", "cam04")
+    }
+    assert {event.camera for event in events if event.kind == "moved"} == {"cam01", "cam04"}
+    assert normalized(state, made.rig) < 1.6
+
+
 @pytest.mark.parametrize("late", [0.0167, -0.03])
 def test_clocks_of_half_of_the_cameras_that_slip_at_once_are_told_and_nothing_else(late: float) -> None:
     made = stream(5, slips=[Slip(60, 1, late), Slip(60, 2, late)])
