@@ -40,13 +40,15 @@ def absorbed(
 
     Raises:
         RefusedError: the observations do not determine the object's pose, or no minimum was found.
-        ValueError: there are not as many poses as snapshots.
+        ValueError: there are not as many poses as snapshots, or cameras shake and the belief is not on a CPU.
     """
     if rig_from_object.translation.shape[0] != observations.seen.shape[0]:
         given = f"{rig_from_object.translation.shape[0]} poses of {observations.seen.shape[0]} snapshots"
         raise ValueError(f"rig_from_object: found {given}, expected one of each")
     if belief.factor.device.type == "cpu":
         return _absorbed_compiled(belief, observations, rig_from_object, options)
+    if observations.shake is not None:
+        raise ValueError(f"observations: found shake on {belief.factor.device}, expected it on a CPU alone")
     return absorbed_in_tensors(belief, observations, rig_from_object, options)
 
 
@@ -54,17 +56,18 @@ def _absorbed_compiled(
     belief: RigBelief, observations: Observations, rig_from_object: RigidTransform, options: EstimationOptions
 ) -> Absorbed:
     """Do the work of `absorbed` in one compiled call."""
-    constants, unit = belief.constants, belief.unit
+    constants, unit, shake = belief.constants, belief.unit, observations.shake
     seen = observations.seen.numpy()
     uv = np.where(seen[..., None], observations.uv.numpy(), 0.0).astype(np.float64, copy=False)
     uv = np.ascontiguousarray(uv.swapaxes(-1, -2))
     sigma = np.where(seen, observations.sigma.numpy(), np.inf)
     rotation = np.ascontiguousarray(rig_from_object.rotation.detach().double().reshape(-1, 3, 3).numpy())
     translation = rig_from_object.translation.detach().double().reshape(-1, 3).numpy()
+    shaken = np.empty((0, 0)) if shake is None else np.ascontiguousarray(shake.double().numpy())
     loss = (lm_cpu.LOSS_CODES[options.loss], float(options.threshold))
     found = absorption_cpu.absorb(
         constants.shared,
-        (uv, (1 / sigma).astype(np.float64, copy=False)),
+        (uv, (1 / sigma).astype(np.float64, copy=False), shaken),
         (belief.arrays, unit.numpy(), belief.object_offset.numpy(), constants.own_std, belief.information.numpy()),
         (rotation, translation + rotation @ constants.centroid),
         (*loss, options.max_iterations, options.tolerance, SLACK, DAMPED, STALLED, MOST_DAMPING),
@@ -87,6 +90,8 @@ def _absorbed_compiled(
     poses = RigidTransform(torch.from_numpy(found.rotation), torch.from_numpy(translation))
     residual = torch.from_numpy(np.where(seen[..., None], found.residual.swapaxes(-1, -2), 0.0))
     evidence = belief.half_log_determinant - half_log_determinant - found.cost
+    if shake is not None:
+        evidence -= float(np.log1p(shake.numpy() ** 2 * np.square(1 / sigma).sum(-1)).sum())
     dof = 2 * int(np.count_nonzero(seen)) - 6 * len(seen)
     return Absorbed(now, poses, residual, 2 * found.cost, dof, evidence, belief, brought)
 
@@ -108,5 +113,10 @@ def _rig_of(values: RigArrays, like: CameraRig) -> CameraRig:
 def joined(snapshots: Sequence[tuple[Observations, RigidTransform]]) -> tuple[Observations, RigidTransform]:
     """Put snapshots together: (S, C, N) and (S,)."""
     observations, poses = zip(*snapshots, strict=True)
-    values = (torch.cat([getattr(part, name) for part in observations]) for name in ("uv", "sigma", "seen"))
-    return Observations(*values), RigidTransform.cat(poses)
+    uv, sigma, seen = (torch.cat([getattr(part, name) for part in observations]) for name in ("uv", "sigma", "seen"))
+    shake = None
+    if any(part.shake is not None for part in observations):
+        still = torch.zeros(1, observations[0].seen.shape[1], dtype=torch.float64)
+        parts = [still.expand(len(part.seen), -1) if part.shake is None else part.shake for part in observations]
+        shake = torch.cat(parts)
+    return Observations(uv, sigma, seen, shake), RigidTransform.cat(poses)

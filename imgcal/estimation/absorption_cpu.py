@@ -68,7 +68,7 @@ class Minimum:
 
 def absorb(
     shared: tuple[Any, ...],
-    seen: tuple[Array, Array],
+    seen: tuple[Array, Array, Array],
     known: tuple[RigArrays, Array, Array, Array, Array],
     poses: tuple[Array, Array],
     options: tuple[int, float, int, float, float, float, float, float],
@@ -77,14 +77,15 @@ def absorb(
 
     Args:
         shared: what `linearization_cpu` is given of all rigs alike: points and squared radii, and so on.
-        seen: pixels (S, C, 2, N), and the roots of their weights (S, C, N).
+        seen: pixels (S, C, 2, N), the roots of their weights (S, C, N), and by how much cameras shake (S, C): see
+            `linearization_cpu.linearize_rig`.
         known: the rig, units (C, K) of its errors, offset (M,) of the object and its prior standard deviation (M,), and
             the information (D, D) about both.
         poses: first guess, rotation (S, 3, 3) and centre (S, 3).
         options: code and threshold of the loss, iterations at most, tolerance, by how much the cost may rise,
             the damping up to which a small step shows the minimum, that once a step has failed, and the greatest one.
     """
-    uv, root_weight = seen
+    uv = seen[0]
     rig, unit, own, own_std, information = known
     (count, cameras, _, fiducials), free = uv.shape, unit.shape[1]
     size = len(own)
@@ -99,7 +100,7 @@ def absorb(
     factor, gathered = np.empty((wide, wide)), np.empty((wide, wide))
     brought = (np.empty((count, 6)), np.empty((count, wide)), np.empty((2, wide)))
     best, status, cost = _absorb(
-        shared, (uv, root_weight), rig.parts, (unit, own, own_std, information), rigs, states, blocks,
+        shared, seen, rig.parts, (unit, own, own_std, information), rigs, states, blocks,
         (factor, gathered), brought, options,
     )  # fmt: skip
     last = 1 - best  # where the last step was taken from
@@ -192,7 +193,7 @@ def _factorized(matrix, damping, factor):
 @njit(cache=True, fastmath=kernels.FAST)
 def _evaluate(shared, seen, known_rig, known, rigs, states, blocks, distance, b, loss, threshold):
     """Linearize all snapshots at row b, write the distance from what is known, and return the cost."""
-    uv, root_weight = seen
+    uv, root_weight, shake = seen
     unit, own0, own_std, prior = known
     rotation, position, focal, principal, distortion = rigs
     offset, turned, centre, own = states
@@ -207,7 +208,7 @@ def _evaluate(shared, seen, known_rig, known, rigs, states, blocks, distance, b,
             unit, own_std,
         )  # fmt: skip
         state = (offset, turned[b, s : s + 1], centre[b, s : s + 1], own[b])
-        cost += linearize_rig(given, state, blocks_of(row, s), False, loss, threshold)
+        cost += linearize_rig(given, state, blocks_of(row, s), False, loss, threshold, shake[s : s + 1])
         for i in range(len(own0)):
             cost -= 0.5 * own[b, i] ** 2
     write_error(rotation[b], position[b], focal[b], principal[b], distortion[b], known_rig, unit, distance[b])

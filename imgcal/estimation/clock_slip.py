@@ -156,10 +156,10 @@ class _Late:
             behind = self.image(camera, seconds) - self.image(camera, 0.0)
             uv[:, camera] -= behind
             sigma[:, camera] = torch.hypot(sigma[:, camera], INEXACT * behind.norm(dim=-1))
-        observations = Observations(uv, sigma, seen)
+        observations = Observations(uv, sigma, seen, self.given.shake)
         result = absorbed(self.before, observations, self.there.rig_from_object, self.options)
         unlikely = 2 * float((sigma / self.given.sigma).log()[seen].sum())
         unlikely += sum(0.5 * (seconds / USUAL_SLIP) ** 2 for seconds in late.values())
         rows = range(len(uv))
-        parts = [Observations(uv[[s]], sigma[[s]], seen[[s]]) for s in rows]
+        parts = [observations.of_snapshots([s]) for s in rows]
         return [(parts[s], result.rig_from_object[s : s + 1]) for s in rows], result.evidence - unlikely

@@ -106,7 +106,7 @@ def _fit_pose(given, offset, poses, blocks, loss, threshold):
     """Levenberg-Marquardt on a pose; the row of the best, -1 where the pose is not determined."""
     rotation, centre = poses
     camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual = blocks
-    own = np.empty(0)
+    own, steady = np.empty(0), np.empty((0, 0))
     lower, step, turn, left = np.empty((6, 6)), np.empty(6), np.empty((3, 3)), np.empty((3, 3))
     damping, best, cost, gain = 0.0, 0, np.inf, np.inf
     for tried in range(MOST_STEPS + 1):
@@ -115,7 +115,7 @@ def _fit_pose(given, offset, poses, blocks, loss, threshold):
             camera[t], coupling[t], pose[t], border[t], camera_gradient[t], pose_gradient[t], own_gradient[t],
             residual[t],
         )  # fmt: skip
-        trial = linearize_rig(given, (offset, rotation[t], centre[t], own), row, False, loss, threshold)
+        trial = linearize_rig(given, (offset, rotation[t], centre[t], own), row, False, loss, threshold, steady)
         if tried:
             if trial <= cost:
                 best, cost = t, trial

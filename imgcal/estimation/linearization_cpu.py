@@ -4,6 +4,9 @@ Three tuples of arrays go in and out: what is `given` (points of the object and 
 observations and the roots of their weights, the factory rig, the prior, that of the object), the `state`, and the
 `blocks` of the normal equations. Layouts: `lm_cpu._Blocks`; what fits each camera and what each snapshot is summed up
 before it is written. The object's own parameters stand behind the coupled ones, and have a border of their own.
+
+Where a camera shakes, all that it sees in a snapshot is shifted alike, by nobody knows how much: the most probable
+shift is taken out of the residuals, and what it might have been instead out of the normal equations (Schur complement).
 """
 
 # Compiled functions take their types from their arguments.
@@ -17,13 +20,17 @@ import numpy as np
 from imgcal.geometry import NEAREST_DEPTH, kernels, lens_kernels
 from renderers.compiling import njit
 
+SHIFTS = 50
+"""Rounds at most in which a shift is found; each weighs residuals anew."""
+
 
 @njit(cache=True, fastmath=kernels.FAST)
 def linearize_all(given, state, blocks, cost, cameras_first, loss, threshold):
     """Fill the blocks and the costs of all rigs of a batch."""
+    steady = np.empty((0, 0))
     for b in range(len(cost)):
         cost[b] = linearize_rig(
-            given_of(given, b), state_of(state, b), blocks_of(blocks, b), cameras_first, loss, threshold
+            given_of(given, b), state_of(state, b), blocks_of(blocks, b), cameras_first, loss, threshold, steady
         )
 
 
@@ -57,8 +64,12 @@ def blocks_of(blocks, b):
 
 
 @njit(cache=True, fastmath=kernels.FAST)
-def linearize_rig(given, state, blocks, cameras_first, loss, threshold):
-    """Fill the blocks of the normal equations and return the cost."""
+def linearize_rig(given, state, blocks, cameras_first, loss, threshold, shake):
+    """Fill the blocks of the normal equations and return the cost.
+
+    `shake`: (S, C) pixels, one standard deviation of a shift that all points of a camera share in a snapshot; empty =
+    none. It is for equations in which poses are eliminated first.
+    """
     (
         points, radius_squared, lenses, uv, root_weight,
         rotation0, position0, focal0, principal0, distortion0, prior_std, own_std,
@@ -87,6 +98,7 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold):
     derivative, back = np.empty((2, 3), dtype=kind), np.empty(3, dtype=kind)
     bent, scale = len(own_std) > 0, 1.0
     rows_own = np.empty((2, 4), dtype=kind)
+    shift, shared, shared_own = np.zeros(2, dtype=kind), np.empty((2, wide), dtype=kind), np.empty((2, len(own_std)))
     cost = 0.0
     if bent:
         cost = _start_object(own_offset, coupling, border, own_gradient)
@@ -110,6 +122,13 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold):
                 for j in range(i + 1):
                     products[i, j] = 0
             unit = max(1.0, np.sqrt(centre[s, 0] ** 2 + centre[s, 1] ** 2 + centre[s, 2] ** 2))
+            shaken, total = len(shake) > 0 and shake[s, c] > 0, 0.0
+            if shaken:
+                camera_at = (rotation_cam, position0[c], parameters, coefficients, (fx, fy, cx, cy))
+                _project(given, state, c, s, scale, camera_at, residual[s, c])
+                cost += _take_shift(residual[s, c], root_weight[s, c], shake[s, c], loss, threshold, shift)
+                shared[:] = 0
+                shared_own[:] = 0
             for n in range(fiducials):
                 at_x, at_y, at_z = points[n, 0], points[n, 1], points[n, 2]
                 if bent:
@@ -135,6 +154,8 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold):
                 residual[s, c, 0, n], residual[s, c, 1, n] = ru, rv
                 if weight == 0:
                     continue
+                if shaken:
+                    ru, rv = ru - shift[0], rv - shift[1]
                 value, slope = _loss((ru * ru + rv * rv) * weight * weight, loss, threshold)
                 cost += 0.5 * value
                 weight *= np.sqrt(slope)
@@ -178,10 +199,20 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold):
                 ru, rv = ru * weight, rv * weight
                 if bent:
                     _add_object(rows, rows_own, ru, rv, c, s, n, coupling, border, own_gradient, cameras_first)
+                if shaken:
+                    total += weight * weight
+                    _add_shared(rows, rows_own, weight, n, shared, shared_own)
                 for i in range(wide):
                     gradient[i] += rows[0, i] * ru + rows[1, i] * rv
                     for j in range(i + 1):
                         products[i, j] += rows[0, i] * rows[0, j] + rows[1, i] * rows[1, j]
+            if shaken:
+                share = 1 / (1 / shake[s, c] ** 2 + total)
+                for i in range(wide):
+                    for j in range(i + 1):
+                        products[i, j] -= share * (shared[0, i] * shared[0, j] + shared[1, i] * shared[1, j])
+                if bent:
+                    _subtract_object(share, shared, shared_own, c, s, coupling, border)
             _distribute(
                 products, gradient, c, s, free, camera, coupling, pose, camera_gradient, pose_gradient, cameras_first
             )
@@ -229,6 +260,81 @@ def _add_object(rows, rows_own, ru, rv, c, s, n, coupling, border, own_gradient,
         for j in range(k + 1):
             other = 3 * n + j if j < 3 else last
             border[own, first + other] += rows_own[0, j] * mine_u + rows_own[1, j] * mine_v
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _project(given, state, c, s, scale, camera_at, residual):
+    """Write what a camera sees in a snapshot, predicted minus observed: (2, N) pixels."""
+    points, radius_squared, lenses, uv, _, _, _, _, _, _, _, own_std = given
+    _, rotation, centre, own_offset = state
+    rotation_cam, position, parameters, coefficients, (fx, fy, cx, cy) = camera_at
+    at, point = np.empty(3), np.empty(3)
+    for n in range(residual.shape[1]):
+        for i in range(3):
+            at[i] = points[n, i]
+            if len(own_std):
+                at[i] = scale * at[i] + own_offset[3 * n + i] * own_std[3 * n + i]
+        for i in range(3):
+            point[i] = rotation[s, i, 0] * at[0] + rotation[s, i, 1] * at[1] + rotation[s, i, 2] * at[2]
+            point[i] += centre[s, i] - position[i] - parameters[3 + i]
+        x, y, z = point[0], point[1], point[2]
+        for i in range(3):
+            point[i] = rotation_cam[i, 0] * x + rotation_cam[i, 1] * y + rotation_cam[i, 2] * z
+        image = lens_kernels.image_of(
+            lenses, c, point[0], point[1], max(point[2], NEAREST_DEPTH), radius_squared[n], coefficients
+        )
+        residual[0, n], residual[1, n] = fx * image[5] + cx - uv[s, c, 0, n], fy * image[6] + cy - uv[s, c, 1, n]
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _take_shift(residual, root_weight, shake, loss, threshold, shift):
+    """Write the most probable shift of a camera's image (2,), and return what it costs."""
+    shift[:] = 0
+    for _ in range(SHIFTS):
+        total, u, v = 1 / shake**2, 0.0, 0.0
+        for n in range(len(root_weight)):
+            weight = root_weight[n] ** 2
+            if weight == 0:
+                continue
+            du, dv = residual[0, n] - shift[0], residual[1, n] - shift[1]
+            _, slope = _loss((du * du + dv * dv) * weight, loss, threshold)
+            total += weight * slope
+            u += weight * slope * residual[0, n]
+            v += weight * slope * residual[1, n]
+        u, v = u / total, v / total
+        near = abs(u - shift[0]) + abs(v - shift[1]) < 1e-9
+        shift[0], shift[1] = u, v
+        if near:
+            break
+    return 0.5 * (shift[0] ** 2 + shift[1] ** 2) / shake**2
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _add_shared(rows, rows_own, weight, n, shared, shared_own):
+    """Add the derivatives of one observation to those of the shift that it shares."""
+    size = shared_own.shape[1]
+    for r in range(2):
+        for i in range(shared.shape[1]):
+            shared[r, i] += weight * rows[r, i]
+        if size:
+            for k in range(3):
+                shared_own[r, 3 * n + k] += weight * rows_own[r, k]
+            shared_own[r, size - 1] += weight * rows_own[r, 3]
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _subtract_object(share, shared, shared_own, c, s, coupling, border):
+    """Take out of the object's part of the blocks what a shift may have been; poses are eliminated first."""
+    size, wide = border.shape
+    first, free = wide - size, shared.shape[1] - 6
+    for own in range(size):
+        mine_u, mine_v = share * shared_own[0, own], share * shared_own[1, own]
+        for i in range(free):
+            border[own, free * c + i] -= shared[0, i] * mine_u + shared[1, i] * mine_v
+        for i in range(6):
+            coupling[s, i, first + own] -= shared[0, free + i] * mine_u + shared[1, free + i] * mine_v
+        for other in range(own + 1):
+            border[own, first + other] -= shared_own[0, other] * mine_u + shared_own[1, other] * mine_v
 
 
 @njit(cache=True, fastmath=kernels.FAST)

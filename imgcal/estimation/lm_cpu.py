@@ -268,9 +268,9 @@ def _minimize_rig(given, states, blocks, cost, converged, iterations, limits, to
     schur = np.empty((wide, wide), kind)
     camera_step, pose_step = np.empty(camera_gradient.shape[1:], kind), np.empty(pose_gradient.shape[1:], kind)
     own_step = np.empty(own_gradient.shape[1], kind)
-    rounding = 4 * np.finfo(kind).eps
+    rounding, steady = 4 * np.finfo(kind).eps, np.empty((0, 0))
     damping, growth, relax, best = LEAST_DAMPING, FIRST_GROWTH, RELAX, 0
-    cost[0] = linearize_rig(given, state_of(states, 0), blocks_of(blocks, 0), cameras_first, loss, threshold)
+    cost[0] = linearize_rig(given, state_of(states, 0), blocks_of(blocks, 0), cameras_first, loss, threshold, steady)
     for iteration in range(max_iterations):
         iterations[0] = iteration + 1
         b, t = best, 1 - best
@@ -288,7 +288,7 @@ def _minimize_rig(given, states, blocks, cost, converged, iterations, limits, to
         if np.isfinite(gain):
             trial = state_of(states, t)
             move(state_of(states, b), camera_step, pose_step, own_step, trial)
-            trial_cost = linearize_rig(given, trial, blocks_of(blocks, t), cameras_first, loss, threshold)
+            trial_cost = linearize_rig(given, trial, blocks_of(blocks, t), cameras_first, loss, threshold, steady)
             small = gain <= tolerance + rounding * cost[0]
             if trial_cost < cost[0]:
                 relax = min(max(1 - (2 * (cost[0] - trial_cost) / gain - 1) ** 3, RELAX), GREATEST_RELAX)

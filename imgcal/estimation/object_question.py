@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from imgcal.estimation.absorption import absorbed, joined
 from imgcal.estimation.cusum import Cusum, RunningMedian
 from imgcal.estimation.map_estimate import EstimationOptions
 from imgcal.estimation.object_change import ObjectChange, changed_object
 from imgcal.estimation.rig_belief import Absorbed, RigBelief
+from imgcal.estimation.shaking import shaken
 from imgcal.geometry import RigidTransform
 from imgcal.types import Observations
 
@@ -57,10 +58,14 @@ def never_fitted(result: Absorbed, count: int) -> bool:
 def object_explains(
     before: RigBelief, snapshots: Sequence[tuple[Observations, RigidTransform]], options: EstimationOptions
 ) -> tuple[ObjectChange, RigBelief] | None:
-    """Ask whether a change of the object explains snapshots that a steady rig does not: see `changed_object`.
+    """Ask whether a change of the object explains snapshots that a steady rig, or one that shakes, does not.
+
+    See `changed_object`.
 
     Raises:
         RefusedError: see `absorbed`.
     """
-    steady = absorbed(before, *joined(snapshots), options)
+    steady, shaking = absorbed(before, *joined(snapshots), options), shaken(before, snapshots, (), options)
+    if shaking is not None:
+        steady = replace(steady, evidence=max(steady.evidence, shaking.evidence))
     return changed_object(before, snapshots, options, steady, OBJECT_ODDS)

@@ -29,6 +29,7 @@ from imgcal.estimation.rig_belief import Absorbed, RigBelief, aged
 from imgcal.estimation.rig_changes import JUMPS
 from imgcal.estimation.rig_filter import RigFilter
 from imgcal.estimation.seen_apart import without
+from imgcal.estimation.shaking import ShakeLevel
 from imgcal.estimation.slip_question import SlipQuestion, Suspicion, doubtful_cameras
 from imgcal.geometry import RigidTransform
 from imgcal.types import Observations
@@ -62,6 +63,7 @@ class RigMonitor:
         self.undecided: dict[int, int] = {}  # cameras that seem to have moved, and for how many snapshots yet
         self._clocks = SlipQuestion()
         self.held = HeldCameras()  # of which nothing is learnt until it is known why they see the object elsewhere
+        self.shaking = ShakeLevel(rig_filter.belief.rig.num_cameras)
         self._misfit = Misfit()
         self._recent = RecentSnapshots(rig_filter.belief, rig_filter.walk)
         self._drifting = DriftLearning(DriftPaces(rig_filter.belief.rig.num_cameras))
@@ -96,6 +98,7 @@ class RigMonitor:
         """
         self.object_change, self.slips, self.apart = None, (), ()
         self.undecided = {camera: left - 1 for camera, left in self.undecided.items() if left > 1}
+        observations = self.shaking.of(observations)
         new = [camera for camera in moved if camera not in self.held.cameras]
         if new:
             self.held.hold(new, self.filter.count - self.first < FEW)
@@ -139,6 +142,8 @@ class RigMonitor:
                 return anew, ()
             if self._since is not None:
                 self._since = OpenChange.of(result, self._since.before, self._since.seconds, self._since.kinds)
+        if self._since is None:
+            self.shaking.take(observations, result.residual[-1:])
         self._drifting.take(self.filter, self._recent, seconds, quiet=self._since is None)
         if self._since is not None and self._since.due:
             return result, self._judged(self._since.late)
@@ -264,7 +269,10 @@ class RigMonitor:
         return result, (*told, *self._begin(free, result, before, seconds, evidence))
 
     def _in_time_since(self, before: RigBelief, age: int, cameras: Mapping[int, str | None]) -> Absorbed | None:
-        """Learn the latest snapshots anew as cameras had seen them in time, or without them; None = they have moved.
+        """Learn the latest snapshots anew as cameras had seen them in time, or at rest, or without them.
+
+        Returns:
+            What was learnt; None = they have moved.
 
         Raises:
             RefusedError: it cannot be told yet.
@@ -280,6 +288,9 @@ class RigMonitor:
         if answer.slipped is not None:
             self.slips = answer.slipped.slips
             before, snapshots = answer.slipped.before, answer.slipped.snapshots
+        elif answer.shaken is not None:
+            self.shaking.believe(answer.shaken.shake)
+            before, snapshots = answer.shaken.before, answer.shaken.snapshots
         else:
             before, snapshots = (before, snapshots[-age:]) if first is None else (first, snapshots)
             few = self.filter.count - age - self.first < FEW

@@ -59,7 +59,7 @@ def apart_evidence(
         rows = alone.seen[:, camera].any(-1).nonzero()[:, 0]
         if not len(rows):
             continue
-        alone = Observations(alone.uv[rows], alone.sigma[rows], alone.seen[rows])
+        alone = alone.of_snapshots(rows)
         there = poses[rows]
         own = absorbed(result.belief, alone, there, options)
         information = _pose_information(own.belief, alone, own.rig_from_object)

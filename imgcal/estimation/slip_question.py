@@ -1,7 +1,8 @@
 """Have cameras moved, or have their clocks slipped? All that may be is supposed of the same snapshots, and compared.
 
 Cameras have moved; or their clocks have slipped by some time, where it is known how the object moves; or they see the
-object at moments of their own, nobody knows which (`seen_apart.py`); or nothing has happened.
+object at moments of their own, nobody knows which (`seen_apart.py`); or they shake (`shaking.py`); or nothing has
+happened.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from imgcal.estimation.open_change import let_free
 from imgcal.estimation.rig_belief import RigBelief
 from imgcal.estimation.rig_changes import JUMPS
 from imgcal.estimation.seen_apart import apart_evidence
+from imgcal.estimation.shaking import Shaken, shaken
 from imgcal.geometry import RigidTransform
 from imgcal.types import Observations
 
@@ -110,6 +112,17 @@ class Suspicion:
                 found.append(every - earlier - moved)
         return max(found)
 
+    def shaken(self, options: EstimationOptions) -> tuple[float, Shaken | None]:
+        """Log odds that cameras shake, against moves; where there is an earlier belief, also that they always have."""
+        since, moved = self.snapshots[-self.count :], self.evidence_of_moves(options)
+        best = shaken(self.before, since, self.cameras, options)
+        odds = -math.inf if best is None else best.evidence - moved
+        if (earlier := self._earlier(options)) is not None and self.first is not None:
+            always = shaken(self.first, self.snapshots, self.cameras, options)
+            if always is not None and always.evidence - earlier - moved > odds:
+                return always.evidence - earlier - moved, always
+        return odds, best
+
     def steady(self, options: EstimationOptions) -> float:
         """Log odds that nothing has happened, against moves."""
         with contextlib.suppress(RefusedError):
@@ -139,9 +152,10 @@ class Suspicion:
 class Answer:
     """What has happened to cameras that seem to have moved."""
 
-    kind: Literal["moved", "slipped", "apart", "steady"]
+    kind: Literal["moved", "slipped", "apart", "shaken", "steady"]
     odds: float  # log odds against the next best
     slipped: Slipped | None = None
+    shaken: Shaken | None = None
 
 
 @dataclass
@@ -166,18 +180,22 @@ class SlipQuestion:
         odds = {"moved": 0.0, "slipped": slip_odds}
         if suspicion.count >= LEAST_SNAPSHOTS:
             odds["apart"] = suspicion.apart(options)
+        shaking: Shaken | None = None
         if suspicion.held:
             odds["steady"] = suspicion.steady(options)
+        else:
+            odds["shaken"], shaking = suspicion.shaken(options)
         best, second = sorted(odds, key=lambda kind: -odds[kind])[:2]
         lead = odds[best] - odds[second]
-        early = best == "moved" and (suspicion.too_early or (suspicion.held and suspicion.count < LEAST_SNAPSHOTS))
+        early = best in ("moved", "shaken") and suspicion.too_early
+        early |= best == "moved" and suspicion.held and suspicion.count < LEAST_SNAPSHOTS
         vague = best == "slipped" and found is not None and _too_vague(found, suspicion)
         self.unsure = self.unsure + 1 if lead < SLIP_ODDS else 0
         if early or vague or (0 < self.unsure <= SLIP_PATIENCE and patient):
             raise RefusedError("estimation: it cannot be told yet whether a camera has moved, or its clock slipped")
         self.unsure = 0
         if best != "slipped" or found is None:
-            return Answer(cast(Any, best), lead)
+            return Answer(cast(Any, best), lead, shaken=shaking if best == "shaken" else None)
         since -= len(found.snapshots) - suspicion.count
         slips = tuple(replace(slip, since=since, odds=lead) for slip in found.slips)
         return Answer("slipped", lead, replace(found, slips=slips))

@@ -39,6 +39,7 @@ MODULES = frozenset(
         "estimation.rig_belief",
         "estimation.rig_filter",
         "estimation.rig_monitor",
+        "estimation.shaking",
         "estimation.slip_question",
         "geometry.transforms",
         "online.drift_watch",

@@ -6,6 +6,7 @@ import math
 from collections import deque
 
 import numpy as np
+import torch
 
 from imgcal.association import PipelineOptions, SnapshotIdentity
 from imgcal.errors import RefusedError
@@ -92,10 +93,15 @@ class NoiseLevel:
 
     def _follow(self, observations: Observations, result: Absorbed, count: int) -> None:
         """Follow the noise by what single snapshots leave."""
-        seen = observations.seen[0]
-        squared = (result.residual[0].square().sum(-1) / observations.sigma[0].square())[seen]
+        seen, residual = observations.seen[0], result.residual[0]
         if result.dof <= 0:
             return
+        if observations.shake is not None:  # what all points of a camera share is no noise of theirs
+            weight = torch.where(seen, observations.sigma[0].square().reciprocal(), 0.0)[..., None]
+            residual = residual - (weight * residual).sum(1, keepdim=True) / weight.sum(1, keepdim=True).clamp_min(
+                1e-12
+            )
+        squared = (residual.square().sum(-1) / observations.sigma[0].square())[seen]
         # The median of squared residuals of two coordinates is 2 log 2; outliers do not count.
         free = result.dof / (2 * len(squared))
         self._ratios.append(float(squared.median()) / (2 * math.log(2) * free))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum, IntFlag
 
@@ -109,8 +110,14 @@ class Observations:
     uv: Tensor  # (*B, S, C, N, 2) pixels; any finite value where not seen
     sigma: Tensor  # (*B, S, C, N) pixels, one standard deviation of each axis
     seen: Tensor  # (*B, S, C, N) bool
+    shake: Tensor | None = None  # (S, C) pixels, one sd of a shift that all points share; `absorbed` knows of it
 
     __repr__ = brief_repr
+
+    def of_snapshots(self, rows: Tensor | Sequence[int]) -> Observations:
+        """Keep some snapshots, where there are no batch axes."""
+        shake = None if self.shake is None else self.shake[rows]
+        return Observations(self.uv[rows], self.sigma[rows], self.seen[rows], shake)
 
     def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Observations:
         """Change the floating-point type, move to a device, or both."""
@@ -118,4 +125,5 @@ class Observations:
             self.uv.to(dtype=dtype, device=device),
             self.sigma.to(dtype=dtype, device=device),
             self.seen.to(device=device),
+            None if self.shake is None else self.shake.to(dtype=dtype, device=device),
         )

@@ -32,6 +32,7 @@ COUNTS = {
     "monitor steady": 145, "monitor drifting": 145, "monitor bump": 500, "monitor sweep": 240, "monitor two": 60,
     "monitor away": 60, "monitor half degree": 60, "monitor creep": 4, "monitor whole rig": 40,
     "keeper steady": 20, "keeper drifting": 20, "keeper bump": 120,
+    "monitor shaking": 20, "keeper shaking": 20, "keeper shaking bump": 40, "keeper knock bump": 60,
 }  # fmt: skip
 """Items of each experiment: without a bump, eight hours of snapshots together."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,11 @@ BEFORE, AFTER = 300, 300
 """Snapshots before and after a bump: at 60 a second."""
 LONG = 6000
 """Snapshots of an item without a bump."""
+SHAKE = 0.15
+"""Pixels by which all that a camera sees is shifted alike, in each snapshot otherwise: half as much again as a blob's
+noise."""
+KNOCK = 3.0
+"""Times `GATE` that a camera goes in each step of a knock."""
 CREEP = math.radians(0.1) / 36000
 """Rad a snapshot: 0.1 degree in ten minutes."""
 
@@ -43,8 +48,9 @@ class Item:
 
 
 def without_bumps(item: Item) -> dict[str, Any]:
-    """Follow a rig that stands still, or wanders."""
-    followed = Followed(stream_of(item.seed, RIGS[item.seed % len(RIGS)], item.name.endswith("drifting")))
+    """Follow a rig that stands still, or wanders, or whose cameras shake."""
+    shake = SHAKE if item.name.endswith("shaking") else 0.0
+    followed = Followed(stream_of(item.seed, RIGS[item.seed % len(RIGS)], item.name.endswith("drifting"), shake=shake))
     for number in range(LONG):
         followed.step(number)
     return {"snapshots": len(followed.numbers), "alarms": len([c for _, c in followed.told if not c.decided])}
@@ -175,8 +181,13 @@ def kept(item: Item) -> dict[str, Any]:
     count = LONG // 10
     if item.name.endswith("bump"):
         bumps, count = (bump,), bump.snapshot + AFTER
+    steps = bumps
+    if "knock" in item.name:  # it lasts for two to nine snapshots, one step each
+        bump = replace(bump, size=KNOCK * bump.size)
+        bumps, steps = (bump,), tuple(replace(bump, snapshot=bump.snapshot + n) for n in range(2 + item.seed % 8))
     drift = DriftRate() if item.name.endswith("drifting") else DriftRate(0.0, 0.0, 0.0, 0.0, 0.0)
-    stream = Stream(imgcal.load_rig(name), imgcal.load_object("asymmetric8"), item.seed, Conditions(drift=drift), bumps)
+    conditions = Conditions(shake=SHAKE if "shaking" in item.name else 0.0, drift=drift)
+    stream = Stream(imgcal.load_rig(name), imgcal.load_object("asymmetric8"), item.seed, conditions, steps)
     events, refused, sure, wrong = [], 0, 0, 0
     with imgcal.RigKeeper(stream.factory, stream.obj) as keeper:
         for seconds, blobs in stream.snapshots(count):
@@ -184,7 +195,7 @@ def kept(item: Item) -> dict[str, Any]:
             refused += state.refused is not None
             events += [e for e in state.events if e.kind == "moved"]
             number = state.snapshot
-            after = bool(bumps) and number >= bump.snapshot and number % 5 == 0
+            after = bool(bumps) and number >= steps[-1].snapshot and number % 5 == 0
             if after and state.cameras[stream.factory.camera_names[bump.camera]] == "ok":
                 sure += 1
                 wrong += int(distance(state.belief, stream.rig)[bump.camera] > SURELY)
@@ -204,6 +215,7 @@ RUNS = {
     "monitor steady": without_bumps, "monitor drifting": without_bumps, "monitor bump": bumped, "monitor sweep": bumped,
     "monitor two": bumped, "monitor away": bumped, "monitor half degree": half_degree, "monitor creep": creeping,
     "monitor whole rig": whole_rig, "keeper steady": kept, "keeper drifting": kept, "keeper bump": kept,
+    "monitor shaking": without_bumps, "keeper shaking": kept, "keeper shaking bump": kept, "keeper knock bump": kept,
 }  # fmt: skip
 
 

@@ -44,7 +44,7 @@ class Followed:
         self._row = row
         if self._labels[row] < 6:
             return None
-        observations = Observations(*(x[row : row + 1] for x in vars(self._ahead).values()))
+        observations = self._ahead.of_snapshots([row])
         pose = self.pose
         if pose is None or number - self.last > 3:
             pose = initial_pose(observations, self.monitor.filter.belief.rig, self.stream.obj)
@@ -64,11 +64,13 @@ class Followed:
         return self._rigs[self._row]
 
 
-def stream_of(seed: int, name: str, drifting: bool = False, bumps: tuple[Bump, ...] = (), **more: Any) -> Stream:
+def stream_of(
+    seed: int, name: str, drifting: bool = False, bumps: tuple[Bump, ...] = (), shake: float = 0.0, **more: Any
+) -> Stream:
     """A labelled stream of a shipped rig and object."""
     drift = DriftRate() if drifting else DriftRate(0.0, 0.0, 0.0, 0.0, 0.0)
     factory, obj = imgcal.load_rig(name), imgcal.load_object("asymmetric8")
-    return Stream(factory, obj, seed, Conditions(drift=drift, labelled=True), bumps, **more)
+    return Stream(factory, obj, seed, Conditions(shake=shake, drift=drift, labelled=True), bumps, **more)
 
 
 def held_out(rig: CameraRig, truth: CameraRig, stream: Stream) -> float:

@@ -23,6 +23,7 @@ class Conditions:
     """How well the object is seen, and how much the rig wanders."""
 
     noise: float = 0.1  # px
+    shake: float = 0.0  # px, of all that a camera sees in a snapshot alike
     hidden: float = 0.1  # share of fiducials
     clutter: float = 0.5  # false blobs a camera and snapshot
     rate: float = 60.0  # snapshots/s
@@ -103,7 +104,7 @@ class Stream:
                 self.rig = self.changed(bump)
         uv, visible = self._images(torch.tensor([number]), self.rig.expand(1))
         uv, seen = uv[0], visible[0]
-        uv = uv + given.noise * noise.standard_normal(uv.shape)
+        uv = uv + given.noise * noise.standard_normal(uv.shape) + self._shaken(uv[:, :1])
         seen = seen & (noise.random(seen.shape) >= given.hidden)
         if any(first <= number < last for first, last in self.absent):
             seen[:] = False
@@ -135,7 +136,7 @@ class Stream:
         given, noise, count = self.conditions, self.noise, last - first
         rigs = self._rigs(first, last)
         uv, visible = self._images(torch.arange(first, last), rigs)
-        uv = uv + given.noise * noise.standard_normal(uv.shape)
+        uv = uv + given.noise * noise.standard_normal(uv.shape) + self._shaken(uv[:, :, :1])
         seen = visible & (noise.random(uv.shape[:-1]) >= given.hidden)
         for begin, end in self.absent:
             seen[max(begin - first, 0) : max(end - first, 0)] = False
@@ -173,6 +174,11 @@ class Stream:
                 if bump.snapshot == end < last:
                     self.rig = self.changed(bump)
         return CameraRig.cat(parts)
+
+    def _shaken(self, uv: NDArray[np.float64]) -> NDArray[np.float64] | float:
+        """Shifts of what cameras see, like one fiducial of each."""
+        size = self.conditions.shake
+        return size * self.noise.standard_normal(uv.shape) if size else 0.0
 
     def _is_out(self, camera: int, number: int) -> bool:
         first, last = self.out.get(camera, (0, 0))

@@ -31,7 +31,7 @@ def followed(count: int, seed: int = 5, rate: float = 60.0, **happened) -> Follo
     follows = RigFilter(stream.factory, stream.obj)
     recent, beliefs, snapshots = RecentSnapshots(follows.belief, follows.walk), [follows.belief], []
     for number in range(count):
-        observations = Observations(*(x[[number]] for x in vars(seen).values()))
+        observations = seen.of_snapshots([number])
         result = follows.follow(observations, poses[number : number + 1], 1 / rate)
         recent.append(result, observations, 1 / rate)
         if follows.due:

@@ -7,8 +7,9 @@ import torch
 
 import imgcal
 from imgcal.errors import RefusedError
-from imgcal.estimation import Absorbed, EstimationOptions, RigBelief, absorbed, error_between
+from imgcal.estimation import Absorbed, EstimationOptions, RigBelief, absorbed, displaced, error_between
 from imgcal.estimation.absorption_in_tensors import absorbed_in_tensors
+from imgcal.geometry import rotation_from_vector
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import Observations
 
@@ -72,3 +73,56 @@ def test_both_refuse_a_snapshot_without_a_pose() -> None:
     for function in (absorbed, absorbed_in_tensors):
         with pytest.raises(RefusedError, match="do not determine the object's pose"):
             function(belief, replace(observations, seen=few), poses)
+
+
+@pytest.mark.parametrize("loose", [False, True])
+def test_a_shift_that_all_points_of_a_camera_share_is_weighed_by_its_covariance(loose: bool) -> None:
+    belief, observations, poses = scene(loose, radius=True, count=1)
+    observations.uv[0, 1, 2] -= 30.0
+    shake = torch.tensor([[0.3, 0.0, 0.5, 0.1]], dtype=torch.float64)
+    observations = replace(observations, uv=observations.uv + shake[..., None, None], shake=shake)
+    result = absorbed(belief, observations, poses, EstimationOptions(loss="squared", tolerance=1e-12))
+    rig, wide, (seen,) = result.belief.rig, belief.unit.numel(), observations.seen
+
+    def residual(values: torch.Tensor) -> torch.Tensor:
+        """Change the rig, the object and its pose."""
+        there = displaced(rig, values[:wide].view(belief.unit.shape) * belief.unit)
+        size = len(belief.object_offset)
+        bent = replace(result.belief, object_offset=result.belief.object_offset + values[wide : wide + size])
+        turn = rotation_from_vector(values[-6:-3])
+        at = result.rig_from_object.rotation[0] @ bent.points_object.mT
+        points = (turn @ at).mT + result.rig_from_object.translation[0] + values[-3:]
+        image = there.project(points, belief.obj.radius).uv
+        return (image - observations.uv[0])[seen].flatten()
+
+    nothing = torch.zeros(wide + len(belief.object_offset) + 6, dtype=torch.float64)
+    off, jacobian = residual(nothing), torch.autograd.functional.jacobian(residual, nothing)
+    camera = seen.nonzero()[:, 0]
+    shared = (camera[:, None] == camera).double() * shake[0, camera].square()
+    covariance = torch.kron(shared + NOISE**2 * torch.eye(len(camera)), torch.eye(2)).double()
+    weight = torch.linalg.inv(covariance)
+    full = jacobian.mT @ weight @ jacobian
+    expected = full[:-6, :-6] - full[:-6, -6:] @ torch.linalg.solve(full[-6:, -6:], full[-6:, :-6])
+    scale = float(expected.abs().max())
+    torch.testing.assert_close(result.brought.information(), expected, rtol=1e-3, atol=1e-5 * scale)
+    gradient = jacobian.mT @ weight @ off
+    assert float(gradient[-6:].abs().max()) < 1e-3 * float(full[-6:, -6:].diagonal().sqrt().max())
+    torch.testing.assert_close(result.brought.pull[0], -gradient[:-6], rtol=1e-2, atol=1e-3 * scale**0.5)
+    data = float(off @ weight @ off)
+    change = torch.cat(((error_between(rig, belief.rig) / belief.unit).flatten(), result.belief.object_offset))
+    known = float((belief.factor.mT @ change).square().sum())
+    assert result.chi2 == pytest.approx(data + known, rel=1e-4)
+    still = replace(observations, shake=None)
+    plain = absorbed(belief, still, poses, EstimationOptions(loss="squared"))
+    assert torch.equal(result.residual.isfinite(), plain.residual.isfinite())
+    weights = observations.seen.sum(-1) * (shake / NOISE).square()
+    odds = 0.5 * (plain.chi2 - result.chi2) - float(weights.log1p().sum())
+    known = plain.belief.half_log_determinant - result.belief.half_log_determinant
+    assert result.evidence - plain.evidence == pytest.approx(odds + known, rel=1e-6)
+
+
+def test_shake_is_for_cpus_alone() -> None:
+    belief, observations, poses = scene(False, False, 1)
+    shaken = replace(observations, shake=torch.ones(1, 4))
+    with pytest.raises(ValueError, match="found shake on meta"):
+        absorbed(replace(belief, factor=belief.factor.to("meta")), shaken, poses)

@@ -6,7 +6,6 @@ import pytest
 
 import imgcal
 from imgcal.estimation import RigFilter, RigMonitor, initial_pose
-from imgcal.types import Observations
 from scripts.benchmarks.rig_streams import Bump, Conditions, Slip, Stream
 
 BEFORE = 40
@@ -18,7 +17,7 @@ def told(**happened) -> tuple[list, list]:
     monitor, pose = RigMonitor(RigFilter(stream.factory, stream.obj)), None
     seen, _ = stream.labelled(0, BEFORE + 30)
     for number in range(BEFORE + 30):
-        observations = Observations(*(x[[number]] for x in vars(seen).values()))
+        observations = seen.of_snapshots([number])
         pose = initial_pose(observations, monitor.filter.belief.rig, stream.obj) if pose is None else pose
         result, changes = monitor.update(observations, pose, 1 / 60)
         pose = result.rig_from_object

@@ -8,7 +8,7 @@ import torch
 import imgcal
 from imgcal.estimation import CHANGES, ChangeTest, RigBelief, RigFilter, RigMonitor, change_of_errors, pixel_changes
 from imgcal.estimation.drift_pace import SECONDS, DriftPaces, Stretch
-from imgcal.types import CameraRig, DriftRate, Observations
+from imgcal.types import CameraRig, DriftRate
 from scripts.benchmarks.rig_streams import Conditions, Stream
 
 STEADY = DriftRate(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -89,7 +89,7 @@ def crept(turn: float, seconds: int, seed: int) -> tuple[RigMonitor, CameraRig, 
         poses = made.poses_at(torch.arange(first, last, dtype=torch.float64) / RATE)
         observations, _ = made.labelled(first, last)
         for row in range(last - first):
-            one = Observations(*(x[row : row + 1] for x in vars(observations).values()))
+            one = observations.of_snapshots([row])
             told += len(monitor.update(one, poses[row : row + 1], 1 / RATE)[1])
         made.creep = creep
     return monitor, made.rig, told

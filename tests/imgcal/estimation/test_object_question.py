@@ -44,9 +44,7 @@ def test_an_object_that_never_was_as_its_file_says_explains_the_first_snapshots(
     result = absorbed(before, seen, truth.rig_from_object)
     assert never_fitted(result, 16) == bent
     assert not never_fitted(result, 15)  # not asked then
-    parts = [
-        (Observations(*(x[[s]] for x in vars(seen).values())), truth.rig_from_object[s : s + 1]) for s in range(16)
-    ]
+    parts = [(seen.of_snapshots([s]), truth.rig_from_object[s : s + 1]) for s in range(16)]
     found = object_explains(before, parts, EstimationOptions())
     assert (found is not None) == bent
     if found is not None:

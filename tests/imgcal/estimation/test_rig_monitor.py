@@ -135,7 +135,7 @@ def test_of_a_camera_that_moves_within_the_first_snapshots_no_other_and_no_objec
     poses, (observations, rigs) = made.poses_at(times), made.labelled(0, 50)
     monitor, told = RigMonitor(RigFilter(made.factory, made.obj)), []
     for s in range(50):
-        one = Observations(*(x[s : s + 1] for x in vars(observations).values()))
+        one = observations.of_snapshots([s])
         _, changes = monitor.update(one, poses[s : s + 1], 1 / seen.rate)
         told += changes
         assert monitor.object_change is None
@@ -152,7 +152,7 @@ def test_a_camera_of_which_it_cannot_be_told_yet_is_undecided_until_it_is() -> N
     poses, (observations, _) = made.poses_at(torch.arange(90, dtype=torch.float64) / 60), made.labelled(0, 90)
     monitor, told, undecided = RigMonitor(RigFilter(made.factory, made.obj)), [], []
     for s in range(90):
-        one = Observations(*(x[s : s + 1] for x in vars(observations).values()))
+        one = observations.of_snapshots([s])
         _, changes = monitor.update(one, poses[s : s + 1], 1 / 60)
         told += [(s, change.camera) for change in changes]
         undecided.append(set(monitor.undecided))

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, replace
 
 import pytest
+import torch
 
 from imgcal.errors import RefusedError
 from imgcal.estimation import ClockSlip, EstimationOptions
@@ -45,6 +46,7 @@ class Told:
     odds: float
     apart_odds: float = -math.inf
     steady_odds: float = -math.inf
+    shaken_odds: float = -math.inf
     count: int = COUNT
     held: bool = False
     wide: bool = False
@@ -60,6 +62,9 @@ class Told:
 
     def steady(self, options: EstimationOptions) -> float:
         return self.steady_odds
+
+    def shaken(self, options: EstimationOptions) -> tuple[float, None]:
+        return self.shaken_odds, None
 
 
 def test_what_cannot_be_told_waits_and_is_then_what_is_more_probable() -> None:
@@ -82,6 +87,8 @@ def test_what_cannot_be_told_waits_and_is_then_what_is_more_probable() -> None:
         (Told(40.0, apart_odds=20.0), "slipped"),
         (Told(-9.0, apart_odds=20.0, steady_odds=90.0), "moved"),  # only what is held can be as if nothing was
         (Told(-9.0, apart_odds=-9.0, steady_odds=90.0, held=True), "steady"),
+        (Told(-9.0, apart_odds=20.0, shaken_odds=30.0), "shaken"),
+        (Told(-9.0, apart_odds=20.0, shaken_odds=30.0, held=True), "apart"),  # what is held shakes by more than that
         (Told(-9.0, apart_odds=20.0, count=1), "moved"),  # one snapshot is explained by either
     ],
 )
@@ -119,3 +126,23 @@ def test_a_camera_with_moments_of_its_own_is_told_from_one_that_moved_at_any_rat
         assert suspicion.apart(OPTIONS) > 10 * SLIP_ODDS or suspicion.apart(OPTIONS) < -10 * SLIP_ODDS
         assert suspicion.steady(OPTIONS) < -10 * SLIP_ODDS
         assert SlipQuestion().ask(suspicion, 0, OPTIONS, patient=True).kind == ("apart" if apart else "moved")
+
+
+@pytest.mark.parametrize("shakes", [True, False])
+def test_a_camera_that_shakes_a_little_is_told_from_one_that_moved(shakes: bool) -> None:
+    made, generator = followed(BEFORE + 6), torch.Generator().manual_seed(2)
+    shift = 0.6 * torch.randn(6, 2, generator=generator, dtype=torch.float64)
+    shift = shift if shakes else torch.tensor([[0.9, -0.7]], dtype=torch.float64).expand(6, -1)
+    snapshots = list(made.snapshots)
+    for s in range(6):
+        one, pose = snapshots[BEFORE + s]
+        uv = one.uv.clone()
+        uv[:, 2] += shift[s]
+        snapshots[BEFORE + s] = (replace(one, uv=uv), pose)
+    suspicion = Suspicion(made.beliefs[BEFORE], snapshots, [1 / 60] * len(snapshots), 6, {2: None})
+    odds, found = suspicion.shaken(OPTIONS)
+    assert (odds > 2 * SLIP_ODDS) if shakes else (odds < -2 * SLIP_ODDS)
+    answer = SlipQuestion().ask(suspicion, BEFORE, OPTIONS, patient=True)
+    assert answer.kind == ("shaken" if shakes else "moved")
+    assert (answer.shaken is None) != shakes
+    assert not shakes or (found is not None and float(found.shake[2]) > 0)

@@ -1,7 +1,9 @@
 """A rig that is kept calibrated: steady, bumped, without its object, and asked nonsense."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -250,6 +252,35 @@ def test_half_of_the_cameras_that_are_knocked_are_told_and_nobody_is_calibrated_
     }
     assert {event.camera for event in events if event.kind == "moved"} == {"cam01", "cam04"}
     assert normalized(state, made.rig) < 1.6
+
+
+def shaking(made: Stream, count: int, cameras: list[int], since: int) -> Iterator[tuple[float, Detections]]:
+    """Shift all that cameras see alike, in each snapshot otherwise, as a fan or a floor does."""
+    generator = np.random.default_rng(7)
+    for number, (time, blobs) in enumerate(made.snapshots(count)):
+        shift = 0.15 * generator.standard_normal((made.factory.num_cameras, 2))
+        shift *= np.isin(np.arange(len(shift)), cameras)[:, None] * (number >= since)
+        yield time, replace(blobs, uv=blobs.uv + shift[blobs.camera])
+
+
+@pytest.mark.parametrize(("cameras", "since"), [([0, 1, 2, 3], 0), ([0, 1, 2, 3], 80), ([1], 80)])
+def test_cameras_that_shake_a_little_have_not_moved_and_one_that_is_bumped_is_told(
+    cameras: list[int], since: int, tmp_path: Path
+) -> None:
+    made = stream(2, bumps=[Bump(240, 2, "rotation", math.radians(0.3))])
+    events: list[Event] = []
+    keeper = RigKeeper(made.factory, made.obj)
+    for number, (time, blobs) in enumerate(shaking(made, 300, cameras, since)):
+        state = keeper.update(blobs, time)
+        events += state.events
+        if number == 200:  # what is known of it is saved, too
+            keeper.save(tmp_path / "state.json")
+            keeper = RigKeeper.restore(tmp_path / "state.json")
+        if number == 239:
+            assert events == [] and set(state.cameras.values()) == {"ok"}
+            assert normalized(state, made.rig) < 1.6
+    assert events[0].kind == "moved" and events[0].snapshot <= 250
+    assert {event.camera for event in events} == {"cam03"}
 
 
 @pytest.mark.parametrize("late", [0.0167, -0.03])

@@ -1,0 +1,156 @@
+"""Do cameras shake? A fan, a floor, a trigger that jitters: all that a camera sees in a snapshot is shifted alike.
+
+Such noise does not average out over the points of a snapshot. Taken for noise of each point by itself, it looks like
+cameras that move, over and over, and like a rig that is known better than it is.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections import deque
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.errors import RefusedError
+from imgcal.estimation.absorption import absorbed, joined
+from imgcal.estimation.map_estimate import EstimationOptions
+from imgcal.estimation.rig_belief import RigBelief
+from imgcal.geometry import RigidTransform
+from imgcal.types import Observations
+
+SHAKES = (0.15, 0.5, 1.5)
+"""Pixels, one standard deviation: by how much cameras are supposed to shake. What shakes by more is held."""
+EVERY = 64
+"""Snapshots of which it is asked how much cameras shake."""
+OTHER = 2.0
+"""Factor between two variances that are told apart; 1.3 comes by chance."""
+LEAST_POINTS = 3
+"""That a camera sees, from which they can be shifted alike."""
+LEAST_SHIFTS, SMOOTH = 4, 0.7
+"""Snapshots that tell whether shifts follow each other smoothly, as a clock that is off would have it; and von
+Neumann's ratio (2 where each is drawn by itself) below which they do."""
+
+
+@dataclass(frozen=True)
+class Shaken:
+    """Some snapshots, if cameras shake."""
+
+    before: RigBelief  # what was believed before them
+    snapshots: list[tuple[Observations, RigidTransform]]
+    shake: Tensor  # (C,) px
+    evidence: float  # log probability, to compare with that of `Absorbed`
+
+
+def shaken(
+    before: RigBelief,
+    snapshots: Sequence[tuple[Observations, RigidTransform]],
+    cameras: Collection[int],
+    options: EstimationOptions,
+) -> Shaken | None:
+    """Suppose that cameras have shaken in some snapshots: all of them, or some, and nothing has moved.
+
+    Args:
+        before: what was believed before them.
+        snapshots: observations (1, C, N) and the object's pose (1,) of each.
+        cameras: some that may shake while others do not.
+        options: how to minimize.
+
+    Returns:
+        The most probable of these; None = none explains the snapshots.
+    """
+    observations, poses = joined(list(snapshots))
+    count, total = observations.seen.shape[:2]
+    known = torch.zeros(count, total, dtype=torch.float64) if observations.shake is None else observations.shake
+    best: tuple[float, Tensor, Tensor] | None = None
+    sets = dict.fromkeys((tuple(range(total)), tuple(sorted(cameras)) or tuple(range(total))))
+    for some in sets:
+        for size in SHAKES:
+            shake = known.clone()
+            shake[:, list(some)] = shake[:, list(some)].clamp_min(size)
+            with contextlib.suppress(RefusedError):
+                result = absorbed(before, replace(observations, shake=shake), poses, options)
+                if best is None or result.evidence > best[0]:
+                    best = result.evidence, shake, result.residual
+    if best is None:
+        return None
+    evidence, shake, residual = best
+    if _smooth(_shifts(observations, residual)[0][:, shake[-1] > 0]):
+        return None
+    again = [(replace(one, shake=shake[s : s + 1]), pose) for s, (one, pose) in enumerate(snapshots)]
+    return Shaken(before, again, shake[-1], evidence - math.log(len(sets) * len(SHAKES)))
+
+
+def _shifts(observations: Observations, residual: Tensor) -> tuple[Tensor, Tensor]:
+    """What all that a camera sees is off, (S, C, 2) pixels, and the variance (S, C) that noise gives it."""
+    weight = torch.where(observations.seen, observations.sigma.square().reciprocal(), 0.0)
+    total = weight.sum(-1).clamp_min(1e-12)
+    return (weight[..., None] * residual).sum(-2) / total[..., None], 1 / total
+
+
+def _smooth(shifts: Tensor) -> bool:
+    """Tell whether shifts (S, C, 2) follow each other smoothly."""
+    if len(shifts) < LEAST_SHIFTS:
+        return False
+    about = (shifts - shifts.mean(0)).square().sum()
+    return bool(shifts.diff(dim=0).square().sum() < SMOOTH * about)
+
+
+@dataclass
+class ShakeLevel:
+    """By how much each camera shakes, followed by what single snapshots leave.
+
+    Examples:
+        >>> level = ShakeLevel(2)
+        >>> level.shake
+        tensor([0., 0.], dtype=torch.float64)
+    """
+
+    cameras: int
+    shake: Tensor = field(init=False)  # (C,) px, one standard deviation of each axis
+    latest: deque[NDArray[np.float64]] = field(default_factory=lambda: deque(maxlen=EVERY))  # (2, C) px^2: see `take`
+
+    def __post_init__(self) -> None:
+        """Begin with cameras that stand still."""
+        self.shake = torch.zeros(self.cameras, dtype=torch.float64)
+
+    def of(self, observations: Observations) -> Observations:
+        """Observations (1, C, N) with what is known of it."""
+        return replace(observations, shake=self.shake[None]) if bool(self.shake.any()) else observations
+
+    def believe(self, shake: Tensor) -> None:
+        """Begin anew with what has been found out otherwise: (C,) pixels."""
+        self.shake = shake
+        self.latest.clear()
+
+    def take(self, observations: Observations, residual: Tensor) -> None:
+        """Take what a snapshot that nobody doubts has left: (1, C, N) and pixels (1, C, N, 2)."""
+        shifts, expected = _shifts(observations, residual)
+        enough = observations.seen[0].sum(1) >= LEAST_POINTS
+        both = torch.stack((shifts[0].square().mean(-1), expected[0]))
+        self.latest.append(torch.where(enough, both, torch.nan).numpy())
+        if len(self.latest) == EVERY:
+            self._ask()
+
+    def _ask(self) -> None:
+        """Ask how large shifts are against what noise makes of them."""
+        known = np.stack(self.latest)
+        self.latest.clear()
+        often = np.isfinite(known[:, 0]).sum(0) > EVERY // 2
+        if not often.any():
+            return
+        found, expected = np.full((2, self.cameras), np.nan)
+        # The mean square of two coordinates is exponential; where the object is moved takes some of the shifts.
+        free = max(1 - 1.5 / self.cameras, 0.25)
+        found[often] = np.nanmedian(known[:, 0, often], axis=0) / (math.log(2) * free)
+        expected[often] = np.nanmedian(known[:, 1, often], axis=0)
+        before = self.shake.numpy()
+        ratio = found / (expected + before**2)
+        other = often & ((ratio > OTHER) | (ratio < 1 / OTHER))
+        variance = np.where(found > OTHER * expected, found - expected, 0.0)
+        self.shake = torch.from_numpy(np.where(other, np.sqrt(np.maximum(variance, 0.0)), before))
