@@ -114,8 +114,8 @@ class Observations:
 
     __repr__ = brief_repr
 
-    def of_snapshots(self, rows: Tensor | Sequence[int]) -> Observations:
-        """Keep some snapshots, where there are no batch axes."""
+    def of_snapshots(self, rows: Tensor | Sequence[int] | int) -> Observations:
+        """Keep some snapshots; or captures, where these are the first axis."""
         shake = None if self.shake is None else self.shake[rows]
         return Observations(self.uv[rows], self.sigma[rows], self.seen[rows], shake)
 

@@ -164,7 +164,8 @@ def _misfit(rigs: CameraRig, observations: Observations, cases: Cases) -> np.nda
     """RMS residual (B,) with fixed rigs and fitted poses."""
     held = torch.zeros_like(cases.prior_std)
     snapshots = observations.uv.shape[1]
-    every = Observations(*(value.flatten(0, 1)[:, None] for value in vars(observations).values()))
+    parts = (observations.uv, observations.sigma, observations.seen)
+    every = Observations(*(value.flatten(0, 1)[:, None] for value in parts))
     repeated = rigs.map_tensors(lambda tensor, _: tensor.repeat_interleave(snapshots, 0))
     found = estimate(every, repeated, cases.obj, prior_std=held, options=SQUARED)
     return found.rms.unflatten(0, (-1, snapshots)).square().mean(1).sqrt().nan_to_num(math.inf).numpy()

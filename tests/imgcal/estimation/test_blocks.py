@@ -51,7 +51,7 @@ def test_blocks_of_a_capture_scatter_as_the_published_covariance_says(simulate) 
     case, _ = wandering(simulate, 8, 48)
     focal, flat, published = [], [], []
     for row in range(8):
-        one = replace(case.observations, **{k: v[row] for k, v in vars(case.observations).items()})
+        one = case.observations.of_snapshots(row)
         one = replace(one, sigma=torch.full_like(one.sigma, 0.075))  # what the residuals show
         found = estimate(one, case.factory, case.obj, case.poses[row], prior_std=case.prior_std)
         measured = replace(found, inflation=scatter(found).factor)

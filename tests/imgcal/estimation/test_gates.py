@@ -16,7 +16,6 @@ from imgcal.estimation.implicit import map_cost
 from imgcal.estimation.map_estimate import PATIENCE, initial_state
 from imgcal.estimation.robust_losses import LOSSES
 from imgcal.synthesis.rigs import Drift, PhysicalDrift, RelativeDrift
-from imgcal.types.observations import Observations
 
 SQUARED = EstimationOptions(loss="squared")
 
@@ -87,7 +86,7 @@ def test_beginning_again_leaves_the_others_alone(simulate) -> None:
     problem, start = case.problem(), initial_state(case.problem(), together.rig_from_object, None)
     assert 0 < int((~lm_cpu.minimize(problem, start, "squared", 3.0, PATIENCE, 1e-4).converged).sum()) < 40
     for row in range(0, 40, 5):
-        observations = Observations(*(value[row] for value in vars(case.observations).values()))
+        observations = case.observations.of_snapshots(row)
         alone = estimate(observations, case.factory, case.obj, prior_std=case.prior_std, options=SQUARED)
         torch.testing.assert_close(together.chi2[row], alone.chi2)
         torch.testing.assert_close(together.rig[row].focal_length, alone.rig.focal_length)

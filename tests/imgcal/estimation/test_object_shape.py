@@ -15,7 +15,7 @@ LOSS = NamedLoss("huber", 3.0)
 
 def evidence(case, row):
     """What one of a batch of rigs says about the object."""
-    one = replace(case.observations, **{k: v[row] for k, v in vars(case.observations).items()})
+    one = case.observations.of_snapshots(row)
     found = estimate(one, case.factory, case.obj, prior_std=case.prior_std)
     return found, shape_evidence(found.problem, found.solution, LOSS)
 
@@ -46,7 +46,7 @@ def test_one_displaced_fiducial_is_found_and_no_other(simulate, fiducial: int) -
         prior_std = learnt_tolerances(shape)
         assert np.delete(prior_std, fiducial).max() < 0.2 * prior_std[fiducial]
         obj = replace(case.obj, tolerance=torch.from_numpy(prior_std))
-        one = replace(case.observations, **{k: v[row] for k, v in vars(case.observations).items()})
+        one = case.observations.of_snapshots(row)
         fit = estimate(one, case.factory, obj, found.rig_from_object, prior_std=case.prior_std)
         each = offsets(fit, case.obj.points.numpy())
         assert [o.fiducial for o in each if o.distance > 4 * o.sigma + 0.01] == [fiducial]
