@@ -116,7 +116,7 @@ class RigKeeper:
     @property
     def noise(self) -> float:
         """Noise (px, one standard deviation) that blobs have shown beyond what they say of themselves."""
-        return self._memory.noise.additive
+        return float(np.median(self._memory.noise.additive))
 
     def update(
         self, source: Mapping[str, Frame | None] | Detections, time: float, silent: Collection[str] = ()

@@ -133,7 +133,9 @@ class KeeperMemory:
         """How far off most cameras may be, px."""
         if len(self.usual) < LEAST_USUAL:
             return math.inf
-        return self.options.identity_error + UNUSUAL * max(float(np.median(self.usual)), self.noise.additive)
+        return self.options.identity_error + UNUSUAL * max(
+            float(np.median(self.usual)), float(np.median(self.noise.additive))
+        )
 
     def predicted(self, pose: RigidTransform | None) -> NDArray[np.float64]:
         """Where the rig puts the fiducials of an object in a pose (1,): (C, N, 2) pixels; None = nan."""
@@ -146,7 +148,8 @@ class KeeperMemory:
     def observed(self, blobs: Detections) -> Observations:
         """Labelled blobs of a snapshot with the noise that they have shown: (1, C, N)."""
         seen = to_observations(blobs, self.prior, self.obj)
-        return replace(seen, sigma=(seen.sigma.square() + self.noise.additive**2).sqrt())
+        additive = torch.from_numpy(self.noise.additive)[:, None]
+        return replace(seen, sigma=torch.hypot(seen.sigma, additive))
 
     def since(self, number: int, camera: int | None = None) -> float:
         """When it happened what the filter found since a snapshot of this number, to a camera or the object: s."""

@@ -1,4 +1,4 @@
-"""How large the noise of a running rig's blobs is, beyond what the blobs say themselves."""
+"""How large the noise of each camera's blobs is, beyond what the blobs say themselves."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections import deque
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from imgcal.association import PipelineOptions, SnapshotIdentity
 from imgcal.errors import RefusedError
@@ -31,14 +32,14 @@ class NoiseLevel:
     def __init__(self, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions) -> None:
         """Begin with the noise that the blobs say."""
         self._rig, self._obj, self._options = rig, obj, options
-        self.additive = 0.0  # px
+        self.additive = np.zeros(rig.num_cameras)  # (C,) px
         self.restart()
 
     def restart(self) -> None:
         """Ask first snapshots again."""
         self._early: list[Kept] = []
         self._asking = True
-        self._ratios: deque[float] = deque(maxlen=EVERY)
+        self._ratios: deque[NDArray[np.float64]] = deque(maxlen=EVERY)  # (C, N)
         self.first: list[tuple[Detections, RigidTransform]] = []  # snapshots that showed another noise, and poses
 
     def take(self, blobs: Detections, observations: Observations, result: Absorbed, steady: bool, count: int) -> bool:
@@ -75,8 +76,8 @@ class NoiseLevel:
             fit = fit_labelled(stacked(tuple(self._early), self._rig), self._rig, self._obj, self._options)
         except RefusedError:
             return False
-        before, now = self.additive, fit.additive_noise
-        if not self._differs(now):
+        before, now = self.additive, np.full(len(self.additive), fit.additive_noise)
+        if not self._differs(fit.additive_noise):
             return False
         self.additive = now
         poses = fit.rig_from_object
@@ -88,7 +89,7 @@ class NoiseLevel:
 
     def _differs(self, additive: float) -> bool:
         sigma = float(np.median(self._early[-1].blobs.sigma))
-        before, now = math.hypot(sigma, self.additive), math.hypot(sigma, additive)
+        before, now = math.hypot(sigma, float(np.median(self.additive))), math.hypot(sigma, additive)
         return max(before, now) > OTHER * min(before, now)
 
     def _follow(self, observations: Observations, result: Absorbed, count: int) -> None:
@@ -98,18 +99,30 @@ class NoiseLevel:
             return
         if observations.shake is not None:  # what all points of a camera share is no noise of theirs
             weight = torch.where(seen, observations.sigma[0].square().reciprocal(), 0.0)[..., None]
-            residual = residual - (weight * residual).sum(1, keepdim=True) / weight.sum(1, keepdim=True).clamp_min(
-                1e-12
-            )
-        squared = (residual.square().sum(-1) / observations.sigma[0].square())[seen]
+            total = weight.sum(1, keepdim=True).clamp_min(1e-12)
+            residual = residual - (weight * residual).sum(1, keepdim=True) / total
         # The median of squared residuals of two coordinates is 2 log 2; outliers do not count.
-        free = result.dof / (2 * len(squared))
-        self._ratios.append(float(squared.median()) / (2 * math.log(2) * free))
-        if count % EVERY or len(self._ratios) < EVERY:
+        free = result.dof / (2 * int(seen.sum()))
+        squared = residual.square().sum(-1) / observations.sigma[0].square() / (2 * math.log(2) * free)
+        self._ratios.append(torch.where(seen, squared, torch.nan).numpy())
+        if count % EVERY == 0 and len(self._ratios) == EVERY:
+            self._ask_later(observations)
+
+    def _ask_later(self, observations: Observations) -> None:
+        """Ask the latest snapshots how large the noise of each camera is against what is believed of it."""
+        known = np.stack(self._ratios)
+        often = np.isfinite(known).any(-1).sum(0) > EVERY // 2
+        some = often & observations.seen[0].any(1).numpy()
+        if not some.any():
             return
-        ratio = float(np.median(self._ratios))
-        if max(ratio, 1 / max(ratio, 1e-9)) > OTHER**2:
-            variance = float(observations.sigma[0][seen].square().median())
-            own = max(variance - self.additive**2, 0.0)
-            self.additive = math.sqrt(max(variance * ratio - own, 0.0))
-            self._ratios.clear()
+        ratio = np.nanmedian(known[:, some], axis=(0, 2))
+        other = np.maximum(ratio, 1 / np.maximum(ratio, 1e-9)) > OTHER**2
+        if not other.any():
+            return
+        sigma = torch.where(observations.seen[0], observations.sigma[0], torch.nan)[torch.from_numpy(some)]
+        variance = np.square(np.nanmedian(sigma.numpy(), axis=1))
+        before = self.additive[some]
+        own = np.maximum(variance - before**2, 0.0)
+        self.additive = self.additive.copy()
+        self.additive[some] = np.where(other, np.sqrt(np.maximum(variance * ratio - own, 0.0)), before)
+        self._ratios.clear()
