@@ -80,17 +80,16 @@ def shaken(
     if best is None:
         return None
     evidence, shake, residual = best
-    if _smooth(_shifts(observations, residual)[0][:, shake[-1] > 0]):
+    if _smooth(_shifts(observations, residual)[:, shake[-1] > 0]):
         return None
     again = [(replace(one, shake=shake[s : s + 1]), pose) for s, (one, pose) in enumerate(snapshots)]
     return Shaken(before, again, shake[-1], evidence - math.log(len(sets) * len(SHAKES)))
 
 
-def _shifts(observations: Observations, residual: Tensor) -> tuple[Tensor, Tensor]:
-    """What all that a camera sees is off, (S, C, 2) pixels, and the variance (S, C) that noise gives it."""
-    weight = torch.where(observations.seen, observations.sigma.square().reciprocal(), 0.0)
-    total = weight.sum(-1).clamp_min(1e-12)
-    return (weight[..., None] * residual).sum(-2) / total[..., None], 1 / total
+def _shifts(observations: Observations, residual: Tensor) -> Tensor:
+    """By how much all that a camera sees is off: (S, C, 2) pixels."""
+    weight = torch.where(observations.seen, observations.sigma.square().reciprocal(), 0.0)[..., None]
+    return (weight * residual).sum(-2) / weight.sum(-2).clamp_min(1e-12)
 
 
 def _smooth(shifts: Tensor) -> bool:
@@ -130,10 +129,13 @@ class ShakeLevel:
 
     def take(self, observations: Observations, residual: Tensor) -> None:
         """Take what a snapshot that nobody doubts has left: (1, C, N) and pixels (1, C, N, 2)."""
-        shifts, expected = _shifts(observations, residual)
-        enough = observations.seen[0].sum(1) >= LEAST_POINTS
-        both = torch.stack((shifts[0].square().mean(-1), expected[0]))
-        self.latest.append(torch.where(enough, both, torch.nan).numpy())
+        seen = observations.seen[0].numpy()
+        weight = np.where(seen, observations.sigma[0].numpy() ** -2.0, 0.0)
+        total = np.maximum(weight.sum(1), 1e-12)
+        shift = np.einsum("cn,cni->ci", weight, residual[0].numpy()) / total[:, None]
+        both = np.stack((0.5 * np.einsum("ci,ci->c", shift, shift), 1 / total))
+        both[:, seen.sum(1) < LEAST_POINTS] = np.nan
+        self.latest.append(both)
         if len(self.latest) == EVERY:
             self._ask()
 

@@ -103,8 +103,9 @@ class NoiseLevel:
             residual = residual - (weight * residual).sum(1, keepdim=True) / total
         # The median of squared residuals of two coordinates is 2 log 2; outliers do not count.
         free = result.dof / (2 * int(seen.sum()))
-        squared = residual.square().sum(-1) / observations.sigma[0].square() / (2 * math.log(2) * free)
-        self._ratios.append(torch.where(seen, squared, torch.nan).numpy())
+        whitened = (residual / observations.sigma[0, ..., None]).numpy()
+        squared = np.einsum("cni,cni->cn", whitened, whitened) / (2 * math.log(2) * free)
+        self._ratios.append(np.where(seen.numpy(), squared, np.nan))
         if count % EVERY == 0 and len(self._ratios) == EVERY:
             self._ask_later(observations)
 
