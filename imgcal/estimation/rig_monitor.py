@@ -248,7 +248,8 @@ class RigMonitor:
         age = likeliest_age(self._recent, surest(test), age)
         if since is not None and age >= since.count - NEARBY:  # it was then that the open ones changed
             again = surest(self._recent.test(age)) in since.kinds
-            age = age if again else since.count  # again: the first snapshots were from the old place
+            # Again: the first snapshots were from the old place.
+            age = age if again else min(since.count, len(self._recent))
             before, seconds, free = since.before, since.seconds, dict(since.kinds)
         else:
             told = list(self._judged(last=True))

@@ -74,6 +74,18 @@ def test_a_bump_is_told_with_camera_kind_and_size(camera: int, kind: str) -> Non
     assert monitor.open == {}
 
 
+def test_a_camera_that_changes_while_a_change_of_another_is_open_for_longer_than_snapshots_are_kept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monitor, _, _ = followed({30: {1: "focal_length"}}, 33, seed=12)
+    assert monitor._since is not None
+    monkeypatch.setattr(type(monitor._since), "due", False)
+    everything = "imgcal.estimation.rig_monitor.likeliest_age"
+    monkeypatch.setattr(everything, lambda recent, camera, age: 64 if len(recent) == 64 else age)
+    monitor, _, told = followed({30: {1: "focal_length"}, 94: {2: "focal_length"}}, 100, seed=12)
+    assert monitor.filter.count == 100 and told[0].camera == 1
+
+
 def test_two_cameras_at_once() -> None:
     _, _, told = followed({30: {1: "rotation", 3: "principal_point"}}, 60, seed=21)
     assert {change.camera for change in told} == {1, 3}
@@ -82,7 +94,7 @@ def test_two_cameras_at_once() -> None:
 
 def test_the_others_stay_known() -> None:
     before, _, _ = followed({}, 30, seed=12)
-    after, _, told = followed({30: {2: "focal_length"}}, 33, seed=12)
+    after, _, told = followed({96: {2: "focal_length"}}, 33, seed=12)
     assert told[0].camera == 2
     known, now = before.filter.belief.std(), after.filter.belief.std()
     others = [0, 1, 3]
