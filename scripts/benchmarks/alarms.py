@@ -33,6 +33,7 @@ COUNTS = {
     "monitor away": 60, "monitor half degree": 60, "monitor creep": 4, "monitor whole rig": 40,
     "keeper steady": 20, "keeper drifting": 20, "keeper bump": 120,
     "monitor shaking": 20, "keeper shaking": 20, "keeper shaking bump": 40, "keeper knock bump": 60,
+    "keeper noisy": 20, "keeper lens": 20,
 }  # fmt: skip
 """Items of each experiment: without a bump, eight hours of snapshots together."""
 

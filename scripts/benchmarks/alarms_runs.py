@@ -28,6 +28,8 @@ LONG = 6000
 SHAKE = 0.15
 """Pixels by which all that a camera sees is shifted alike, in each snapshot otherwise: half as much again as a blob's
 noise."""
+HARDER = {"shaking": Conditions(shake=SHAKE), "noisy": Conditions(noisy=0.3), "lens": Conditions(lens=0.05)}
+"""What a word in an experiment's name stands for."""
 KNOCK = 3.0
 """Times `GATE` that a camera goes in each step of a knock."""
 CREEP = math.radians(0.1) / 36000
@@ -186,7 +188,9 @@ def kept(item: Item) -> dict[str, Any]:
         bump = replace(bump, size=KNOCK * bump.size)
         bumps, steps = (bump,), tuple(replace(bump, snapshot=bump.snapshot + n) for n in range(2 + item.seed % 8))
     drift = DriftRate() if item.name.endswith("drifting") else DriftRate(0.0, 0.0, 0.0, 0.0, 0.0)
-    conditions = Conditions(shake=SHAKE if "shaking" in item.name else 0.0, drift=drift)
+    conditions = replace(
+        next((given for word, given in HARDER.items() if word in item.name), Conditions()), drift=drift
+    )
     stream = Stream(imgcal.load_rig(name), imgcal.load_object("asymmetric8"), item.seed, conditions, steps)
     events, refused, sure, wrong = [], 0, 0, 0
     with imgcal.RigKeeper(stream.factory, stream.obj) as keeper:
@@ -216,6 +220,7 @@ RUNS = {
     "monitor two": bumped, "monitor away": bumped, "monitor half degree": half_degree, "monitor creep": creeping,
     "monitor whole rig": whole_rig, "keeper steady": kept, "keeper drifting": kept, "keeper bump": kept,
     "monitor shaking": without_bumps, "keeper shaking": kept, "keeper shaking bump": kept, "keeper knock bump": kept,
+    "keeper noisy": kept, "keeper lens": kept,
 }  # fmt: skip
 
 

@@ -24,6 +24,8 @@ class Conditions:
 
     noise: float = 0.1  # px
     shake: float = 0.0  # px, of all that a camera sees in a snapshot alike
+    noisy: float = 0.0  # px, more noise of the second camera than its blobs say
+    lens: float = 0.0  # px RMS of each axis, that lenses bend an image and nobody knows, over 300 to 900 px
     hidden: float = 0.1  # share of fiducials
     clutter: float = 0.5  # false blobs a camera and snapshot
     rate: float = 60.0  # snapshots/s
@@ -105,6 +107,9 @@ class Stream:
         uv, visible = self._images(torch.tensor([number]), self.rig.expand(1))
         uv, seen = uv[0], visible[0]
         uv = uv + given.noise * noise.standard_normal(uv.shape) + self._shaken(uv[:, :1])
+        if given.noisy:
+            uv[1] += given.noisy * noise.standard_normal(uv[1].shape)
+        uv = uv + self._bent(uv)
         seen = seen & (noise.random(seen.shape) >= given.hidden)
         if any(first <= number < last for first, last in self.absent):
             seen[:] = False
@@ -179,6 +184,15 @@ class Stream:
         """Shifts of what cameras see, like one fiducial of each."""
         size = self.conditions.shake
         return size * self.noise.standard_normal(uv.shape) if size else 0.0
+
+    def _bent(self, uv: NDArray[np.float64]) -> NDArray[np.float64] | float:
+        """What lenses do that nobody knows to what cameras (C, N, 2) see: waves over the image, two for each axis."""
+        if not self.conditions.lens:
+            return 0.0
+        draw = np.random.default_rng((self.seed, 1))
+        length, phase = draw.uniform(300, 900, (len(uv), 1, 2, 2)), draw.uniform(0, 2 * np.pi, (len(uv), 1, 2, 2))
+        waves: NDArray[np.float64] = np.sin(2 * np.pi * uv[..., None, :] / length + phase)
+        return self.conditions.lens * waves.sum(-1)
 
     def _is_out(self, camera: int, number: int) -> bool:
         first, last = self.out.get(camera, (0, 0))
