@@ -81,7 +81,7 @@ class Display:
         if state is not None and state.refused is not None:
             parts.append("nothing learnt now")
         parts.append(f"{tally.snapshots:,} snapshots, {self._rate:.3g}/s")
-        return " | ".join([*parts, *self._counts(), *self._clocks(), *self._alone()])
+        return " | ".join([*parts, *self._counts(), *self._clocks(), *self._trembling(), *self._alone()])
 
     def result(self, rig: Path) -> str:
         """Say in one line what came of it, and what did not: `rig` is the file."""
@@ -125,6 +125,14 @@ class Display:
                 stamped = self._tally.stamps.get(name, 0.0)
                 found.append(f"{name} exposes {1e3 * (offset - stamped):+.1f} ms beside its time stamps")
         return found
+
+    def _trembling(self) -> list[str]:
+        """Name the cameras that tremble."""
+        state = self._tally.latest
+        if state is None:
+            return []
+        names = zip(state.factory.camera_names, state.shake.tolist(), strict=True)
+        return [f"{name} trembles by {size:.2g} px" for name, size in names if size > 0]
 
     def _print(self, text: str) -> None:
         self._console.print(text, markup=False, highlight=False, soft_wrap=True)

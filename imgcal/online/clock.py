@@ -148,6 +148,8 @@ class ClockOffsets:
         sigma[at] = blobs.sigma[rows]
         with np.errstate(invalid="ignore"):
             good = np.isfinite(velocity).all(-1) & (np.linalg.norm(residual, axis=-1) < MOST_PIXELS)
+        # A camera in doubt sees the object elsewhere for whatever reason; only the others are late by little.
+        good &= np.array([state.cameras.get(name) != "doubtful" for name in state.factory.camera_names])[:, None]
         good &= ~self._others(velocity, residual, sigma, good)[:, None]
         weight = np.where(good, 1 / np.square(sigma), 0.0)
         motion, residual = np.where(good[..., None], velocity, 0.0), np.where(good[..., None], residual, 0.0)

@@ -240,6 +240,8 @@ class RigKeeper:
             events=(),
             clock_offset=offset,
             clock_offset_sigma=sigma,
+            noise=memory.noise.additive,
+            shake=memory.monitor.shaking.shake.numpy(),
         )
 
     def _concluded(

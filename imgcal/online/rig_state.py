@@ -54,6 +54,8 @@ class RigState:
     events: tuple[Event, ...]  # that became known with this snapshot
     clock_offset: NDArray[np.float64]  # (C,) s that a camera exposes later than most; nan = not known
     clock_offset_sigma: NDArray[np.float64]  # (C,) s, one standard deviation
+    noise: NDArray[np.float64]  # (C,) pixels, that blobs have beyond what they say of themselves
+    shake: NDArray[np.float64]  # (C,) pixels, by which all that a camera sees is shifted alike, each time otherwise
 
     @property
     def rig(self) -> CameraRig:

@@ -159,6 +159,8 @@ def _of_cameras(state: RigState) -> Iterator[Metric]:
         ("residual_pixels", "RMS residual of the latest snapshot", state.residual),
         ("clock_offset_seconds", "How much later each camera exposes than most, by the motion", state.clock_offset),
         ("clock_offset_sigma_seconds", "One standard deviation of it", state.clock_offset_sigma),
+        ("noise_pixels", "Noise of each camera's blobs beyond what they say of themselves", state.noise),
+        ("shake_pixels", "By how much each camera trembles, one standard deviation", state.shake),
         ("rotation_radians", "Turn of each camera since the factory calibration", state.moved[:, :3].norm(dim=1)),
         ("position_millimetres", "Shift of each camera", state.moved[:, 3:6].norm(dim=1)),
         ("focal_length_pixels", "Change of the focal length", state.moved[:, 6:8].abs().amax(1)),

@@ -62,6 +62,8 @@ def made_state(rig, obj, snapshot=0, now=None, health=None, events=(), place=Non
         events=events,
         clock_offset=np.full(rig.num_cameras, np.nan),
         clock_offset_sigma=np.full(rig.num_cameras, np.nan),
+        noise=np.zeros(rig.num_cameras),
+        shake=np.zeros(rig.num_cameras),
     )
 
 

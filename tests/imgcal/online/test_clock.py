@@ -32,6 +32,14 @@ def test_a_late_camera_is_told_with_its_offset() -> None:
     assert 0.0095 < offset[2] < 0.0105
 
 
+def test_of_a_camera_in_doubt_no_offset_is_told() -> None:
+    test, events = ClockOffsets(4), []
+    for number in range(60):
+        state = state_at(number, number / 20, lambda camera: 0.01 if camera == 2 else 0.0)
+        events += test(replace(state, cameras={"cam03": "doubtful"}), None, None)
+    assert events == [] and np.isnan(test.offsets()[0][2])
+
+
 def test_a_small_offset_is_reckoned_with_and_not_told() -> None:
     test, events = watched({2: 5e-4})
     assert events == []

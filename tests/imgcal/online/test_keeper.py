@@ -279,6 +279,7 @@ def test_cameras_that_shake_a_little_have_not_moved_and_one_that_is_bumped_is_to
         if number == 239:
             assert events == [] and set(state.cameras.values()) == {"ok"}
             assert normalized(state, made.rig) < 1.6
+            assert (state.shake[cameras] > 0.08).all() and (state.shake < 0.25).all()
     assert events[0].kind == "moved" and events[0].snapshot <= 250
     assert {event.camera for event in events} == {"cam03"}
 

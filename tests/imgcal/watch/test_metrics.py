@@ -50,6 +50,7 @@ def test_what_is_counted_is_served(tmp_path):
     assert found["imgcal_events_total", "moved"] == 1 and found["imgcal_events_total", "drift"] == 0
     assert found["imgcal_camera", "cam01", "ok"] == 1
     assert found["imgcal_update_seconds_count",] == found["imgcal_update_seconds_bucket", "+Inf"] == 3
+    assert found["imgcal_shake_pixels", "cam02"] == found["imgcal_noise_pixels", "cam02"] == 0
     assert found["imgcal_clock_offset_seconds", "cam02"] == 0 == found["imgcal_stamp_offset_seconds", "cam02"]
     assert found["imgcal_rotation_radians", "cam03"] >= 0
 
