@@ -22,8 +22,8 @@ ASKED = (1, 2, 4, 8, 16, 32)
 """Numbers of first snapshots that are asked together."""
 OTHER = 1.2
 """Factor between two noise levels that are told apart."""
-EVERY = 64
-"""Snapshots after which it is asked again, of as many."""
+FIRST, EVERY = (16, 32), 64
+"""Snapshots after which cameras are asked, one by one; and how often later, of as many at most."""
 
 
 class NoiseLevel:
@@ -106,13 +106,13 @@ class NoiseLevel:
         whitened = (residual / observations.sigma[0, ..., None]).numpy()
         squared = np.einsum("cni,cni->cn", whitened, whitened) / (2 * math.log(2) * free)
         self._ratios.append(np.where(seen.numpy(), squared, np.nan))
-        if count % EVERY == 0 and len(self._ratios) == EVERY:
+        if (count in FIRST or count % EVERY == 0) and len(self._ratios) >= FIRST[0]:
             self._ask_later(observations)
 
     def _ask_later(self, observations: Observations) -> None:
         """Ask the latest snapshots how large the noise of each camera is against what is believed of it."""
         known = np.stack(self._ratios)
-        often = np.isfinite(known).any(-1).sum(0) > EVERY // 2
+        often = np.isfinite(known).any(-1).sum(0) > len(known) // 2
         some = often & observations.seen[0].any(1).numpy()
         if not some.any():
             return
