@@ -109,7 +109,7 @@ class DriftPaces:
             kept[1:] = kept[:-1].clone()
         self.information[0], self.pull[0] = self._of(test, walk, stretch.seconds)
         model = self._model(test, walk)
-        leader = int(self._ratios(model).amax((0, 1, 3)).argmax())
+        leader = int(self._ratios(model).amax((0, 2, 3)).argmax())
         rest = self._of(
             test.given({leader: None}), walk, stretch.seconds
         )  # of one that creeps, all others see something

@@ -19,8 +19,9 @@ MOST_WIDE = 64
 ASKED = (1, 2, 3, 4, 6, 8, 12, 16, 20, 24, 28, 32, 48, 64)
 EVERY = 32
 """Numbers of snapshots since cameras are held after which it is asked, and how often later."""
-SHAKEN_SECONDS = 2.0
-"""For how long a camera that sees the object at moments of its own may as well be one that is being shaken."""
+SHAKEN_SECONDS, SHAKEN = 2.0, 20
+"""For how long, and how many snapshots at least, a camera that sees the object at moments of its own may as well be one
+that is being shaken."""
 
 
 @dataclass
@@ -44,7 +45,7 @@ class HeldCameras:
 
     def tell(self) -> tuple[int, ...]:
         """Cameras that surely have moments of their own, once: they would stand still by now if they were shaken."""
-        if not self.apart or self.told or self.seconds < SHAKEN_SECONDS:
+        if not self.apart or self.told or self.seconds < SHAKEN_SECONDS or len(self.seen) < SHAKEN:
             return ()
         self.told = True
         return tuple(sorted(self.cameras))

@@ -144,7 +144,7 @@ class RigMonitor:
                 self._since = OpenChange.of(result, self._since.before, self._since.seconds, self._since.kinds)
         if self._since is None:
             self.shaking.take(observations, result.residual[-1:])
-        self._drifting.take(self.filter, self._recent, seconds, quiet=self._since is None)
+        self._drifting.take(self.filter, self._recent, seconds, quiet=self._since is None and found is None)
         if self._since is not None and self._since.due:
             return result, self._judged(self._since.late)
         return result, ()
@@ -153,9 +153,9 @@ class RigMonitor:
         self, observations: Observations, rig_from_object: RigidTransform, seconds: float
     ) -> tuple[Absorbed, tuple[Change, ...]]:
         """Learn from a snapshot without the cameras that are held, and ask what has happened to these."""
-        held = self.held
-        result, changes = self._followed(without(observations, held.cameras), rig_from_object, seconds)
-        if not held.cameras:
+        held, cameras = self.held, set(self.held.cameras)
+        result, changes = self._followed(without(observations, cameras), rig_from_object, seconds)
+        if not held.cameras or held.cameras != cameras:  # those that are new have taken it already
             return result, changes
         if held.take(observations, seconds):
             with contextlib.suppress(RefusedError):  # not yet
@@ -173,6 +173,7 @@ class RigMonitor:
         """
         held, suspicion = self.held, self.held.suspicion(self._recent)
         since, patient = self.filter.count - suspicion.count, self._since is None
+        held.apart = False
         answer = self._clocks.ask(suspicion, since, self.filter.options, patient)
         held.apart = answer.kind == "apart"
         if held.apart:
@@ -350,20 +351,27 @@ class RigMonitor:
             self.filter.count -= unlearnt
         return None if found is None else found.of_last()
 
-    def ask_clocks(self, snapshots: Sequence[tuple[Observations, RigidTransform]], pauses: Sequence[float]) -> None:
+    def ask_clocks(
+        self, snapshots: Sequence[tuple[Observations, RigidTransform]], pauses: Sequence[float]
+    ) -> tuple[int, ...]:
         """Ask which cameras are to be doubted where labels fit in most cameras no more; they are held then.
 
         Args:
             snapshots: observations (1, C, N), with those labels, and poses (1,): of the latest ones, not learnt.
             pauses: s before each of them.
+
+        Returns:
+            Those that have not been held before.
         """
         if self._since is not None:
-            return
+            return ()
         before = aged(self.filter.belief, self.filter.waited + pauses[0], self.filter.walk)
         found, sure = doubtful_cameras(before, snapshots, self.filter.options)
-        if found:
-            self.held.hold(found, self.filter.count - self.first < FEW)
+        new = tuple(sorted(set(found) - self.held.cameras))
+        if new:
+            self.held.hold(new, self.filter.count - self.first < FEW)
             self.held.apart, self.held.seconds = sure, sum(pauses[1:])
+        return new
 
     def _asked_object(
         self,

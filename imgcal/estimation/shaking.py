@@ -25,7 +25,7 @@ from imgcal.geometry import RigidTransform
 from imgcal.types import Observations
 
 SHAKES = (0.15, 0.5, 1.5)
-"""Pixels, one standard deviation: by how much cameras are supposed to shake. What shakes by more is held."""
+"""Pixels, one standard deviation: by how much cameras are supposed to shake. What shakes by more is told as moved."""
 EVERY = 64
 """Snapshots of which it is asked how much cameras shake."""
 OTHER = 2.0
@@ -112,7 +112,7 @@ class ShakeLevel:
 
     cameras: int
     shake: Tensor = field(init=False)  # (C,) px, one standard deviation of each axis
-    latest: deque[NDArray[np.float64]] = field(default_factory=lambda: deque(maxlen=EVERY))  # (2, C) px^2: see `take`
+    latest: deque[NDArray[np.float64]] = field(default_factory=lambda: deque(maxlen=EVERY))  # (3, C): see `take`
 
     def __post_init__(self) -> None:
         """Begin with cameras that stand still."""
@@ -133,7 +133,7 @@ class ShakeLevel:
         weight = np.where(seen, observations.sigma[0].numpy() ** -2.0, 0.0)
         total = np.maximum(weight.sum(1), 1e-12)
         shift = np.einsum("cn,cni->ci", weight, residual[0].numpy()) / total[:, None]
-        both = np.stack((0.5 * np.einsum("ci,ci->c", shift, shift), 1 / total))
+        both = np.concatenate((shift.T, 1 / total[None]))  # shifts, and the variance that noise gives them
         both[:, seen.sum(1) < LEAST_POINTS] = np.nan
         self.latest.append(both)
         if len(self.latest) == EVERY:
@@ -147,10 +147,12 @@ class ShakeLevel:
         if not often.any():
             return
         found, expected = np.full((2, self.cameras), np.nan)
-        # The mean square of two coordinates is exponential; where the object is moved takes some of the shifts.
+        # The mean square of two coordinates is exponential; where the object is moved takes some of the shifts. What
+        # stays the same is no shaking.
         free = max(1 - 1.5 / self.cameras, 0.25)
-        found[often] = np.nanmedian(known[:, 0, often], axis=0) / (math.log(2) * free)
-        expected[often] = np.nanmedian(known[:, 1, often], axis=0)
+        shifts = known[:, :2, often] - np.nanmedian(known[:, :2, often], axis=0)
+        found[often] = np.nanmedian(np.square(shifts).mean(1), axis=0) / (math.log(2) * free)
+        expected[often] = np.nanmedian(known[:, 2, often], axis=0)
         before = self.shake.numpy()
         ratio = found / (expected + before**2)
         other = often & ((ratio > OTHER) | (ratio < 1 / OTHER))

@@ -25,7 +25,7 @@ from imgcal.estimation.open_change import let_free
 from imgcal.estimation.rig_belief import RigBelief
 from imgcal.estimation.rig_changes import JUMPS
 from imgcal.estimation.seen_apart import apart_evidence
-from imgcal.estimation.shaking import Shaken, shaken
+from imgcal.estimation.shaking import LEAST_SHIFTS, Shaken, shaken
 from imgcal.geometry import RigidTransform
 from imgcal.types import Observations
 
@@ -188,6 +188,7 @@ class SlipQuestion:
         best, second = sorted(odds, key=lambda kind: -odds[kind])[:2]
         lead = odds[best] - odds[second]
         early = best in ("moved", "shaken") and suspicion.too_early
+        early |= best == "shaken" and suspicion.count < LEAST_SHIFTS  # one shift twice is no random one
         early |= best == "moved" and suspicion.held and suspicion.count < LEAST_SNAPSHOTS
         vague = best == "slipped" and found is not None and _too_vague(found, suspicion)
         self.unsure = self.unsure + 1 if lead < SLIP_ODDS else 0

@@ -91,11 +91,11 @@ def ask_clocks(memory: KeeperMemory) -> bool:
     """Ask whether labels fit in no camera because of some that are to be held then."""
     doubted = memory.doubts.refused
     snapshots = [(memory.observed(one.blobs), one.rig_from_object) for one in doubted]
-    memory.monitor.ask_clocks(snapshots, [one.seconds for one in doubted])
-    if memory.monitor.held.cameras:
-        memory.off |= dict.fromkeys(memory.monitor.held.cameras, doubted[0].time)
+    held = memory.monitor.ask_clocks(snapshots, [one.seconds for one in doubted])
+    if held:
+        memory.off |= dict.fromkeys(held, doubted[0].time)
         memory.doubts = ObjectDoubts(memory.obj.num_fiducials)
-    return bool(memory.monitor.held.cameras)
+    return bool(held)
 
 
 def _again(memory: KeeperMemory, result: Absorbed) -> Absorbed:

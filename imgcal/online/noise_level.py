@@ -103,6 +103,8 @@ class NoiseLevel:
             residual = residual - (weight * residual).sum(1, keepdim=True) / total
         # The median of squared residuals of two coordinates is 2 log 2; outliers do not count.
         free = result.dof / (2 * int(seen.sum()))
+        if observations.shake is not None:
+            free *= 1 - int(seen.any(1).sum()) / int(seen.sum())
         whitened = (residual / observations.sigma[0, ..., None]).numpy()
         squared = np.einsum("cni,cni->cn", whitened, whitened) / (2 * math.log(2) * free)
         self._ratios.append(np.where(seen.numpy(), squared, np.nan))

@@ -1,5 +1,6 @@
 """A camera is bumped while the rig is in use: which, when, how, how far; and the others stay known."""
 
+import contextlib
 import math
 
 import pytest
@@ -172,3 +173,33 @@ def test_a_camera_of_which_it_cannot_be_told_yet_is_undecided_until_it_is() -> N
     first = told[0][0]
     assert undecided[:4] == [set()] * 4 and undecided[first:] == [set()] * (90 - first)
     assert first > 8 and undecided[6:first] == [{2}] * (first - 6)
+
+
+def watched(stream: Stream, count: int) -> list[tuple[int, int]]:
+    """Follow labelled snapshots: number and camera of each change that was told."""
+    seen, _ = stream.labelled(0, count)
+    rate = stream.conditions.rate
+    poses = stream.poses_at(torch.arange(count, dtype=torch.float64) / rate)
+    monitor, told = RigMonitor(RigFilter(stream.factory, stream.obj)), []
+    for number in range(count):
+        with contextlib.suppress(RefusedError):
+            _, changes = monitor.update(seen.of_snapshots([number]), poses[number : number + 1], 1 / rate)
+            told += [(number, change.camera) for change in changes]
+    return told
+
+
+def test_two_cameras_are_followed_for_as_long_as_drift_is_learnt() -> None:
+    rig, obj = imgcal.load_rig("T4").select([0, 1]), imgcal.load_object("asymmetric8")
+    assert watched(Stream(rig, obj, 1, Conditions(rate=1.0, labelled=True)), 200) == []
+
+
+def test_a_bump_of_which_it_cannot_be_told_yet_is_not_learnt_as_drift() -> None:
+    """One snapshot a second of cameras that tremble: the question is open when a stretch of drift ends."""
+    rig, obj, bump = (
+        imgcal.load_rig("T4"),
+        imgcal.load_object("asymmetric8"),
+        Bump(150, 1, "rotation", math.radians(0.1)),
+    )
+    told = watched(Stream(rig, obj, 5, Conditions(rate=1.0, shake=0.3, labelled=True), [bump]), 180)
+    assert told and {camera for _, camera in told} == {1}
+    assert 150 <= told[0][0] <= 160

@@ -87,7 +87,7 @@ def test_what_cannot_be_told_waits_and_is_then_what_is_more_probable() -> None:
         (Told(40.0, apart_odds=20.0), "slipped"),
         (Told(-9.0, apart_odds=20.0, steady_odds=90.0), "moved"),  # only what is held can be as if nothing was
         (Told(-9.0, apart_odds=-9.0, steady_odds=90.0, held=True), "steady"),
-        (Told(-9.0, apart_odds=20.0, shaken_odds=30.0), "shaken"),
+        (Told(-9.0, apart_odds=20.0, shaken_odds=30.0, count=4), "shaken"),
         (Told(-9.0, apart_odds=20.0, shaken_odds=30.0, held=True), "apart"),  # what is held shakes by more than that
         (Told(-9.0, apart_odds=20.0, count=1), "moved"),  # one snapshot is explained by either
     ],
