@@ -17,6 +17,7 @@ from imgcal.pipeline.learned import LearnedProposer, load_proposer
 from imgcal.pipeline.measuring import LearnedMeasurer
 from imgcal.synthesis import DIFFICULTIES, FrameModel, PhysicalDrift, Truth, simulate_frames, simulate_truth
 from imgcal.types import Detections, RigPrior
+from tests.imgcal.pipeline.oracles import Blind, sure_of
 
 RIG, OBJ = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
 
@@ -35,16 +36,7 @@ class Knowing(InfraredNetwork):
         place, seen = self.place.repeat(count, 1, 1), self.seen.repeat(count, 1)
         offset = place[:, :, None, None] - cells
         near = (offset.abs() <= 1).all(-1) & seen[..., None, None]
-        present = 12.0 * (2 * near.flatten(2).any(-1).float() - 1)
-        return Evidence(15.0 * near, offset.clamp(-3, 3), torch.full(near.shape, -2.0), present, cells)
-
-
-class Blind(Measurer):
-    """Measures nothing: what is claimed stays."""
-
-    def forward(self, patches: Tensor, radius: Tensor) -> Measured:
-        kind = torch.tensor([0.0, 0.0, 0.0, 9.0]).expand(len(patches), 4)
-        return Measured(torch.zeros(len(patches), 2), torch.zeros(len(patches)), kind)
+        return sure_of(near, offset, cells)
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,13 @@ import imgcal
 from imgcal.association import Proposal, Snapshot
 from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
-from imgcal.networks import Evidence, InfraredNetwork, Measured, Measurer, Queries
+from imgcal.networks import Evidence, InfraredNetwork, Queries
 from imgcal.pipeline import learned
 from imgcal.pipeline.learned import LearnedProposer, load_proposer
 from imgcal.synthesis import Difficulty, FrameModel, Truth, simulate_shots
 from imgcal.types import Detections
 from renderers import BlobRange, ClutterModel
+from tests.imgcal.pipeline.oracles import Blind, sure_of
 from tests.imgcal.plates import plate, telephoto
 
 RIG, OBJ = telephoto(), plate()
@@ -57,16 +58,7 @@ class Columns(InfraredNetwork):
         nearest = off.argmin(-1)
         offset = apart.gather(-2, nearest[..., None, None].expand(*nearest.shape, 1, 2))[..., 0, :]
         near = off.amin(-1) <= 1
-        present = 12.0 * (2 * near.flatten(2).any(-1).float() - 1)
-        return Evidence(15.0 * near, offset.clamp(-3, 3), torch.full(near.shape, -2.0), present, cells)
-
-
-class Blind(Measurer):
-    """Measures nothing: what is claimed stays."""
-
-    def forward(self, patches: Tensor, radius: Tensor) -> Measured:
-        kind = torch.tensor([0.0, 0.0, 0.0, 9.0]).expand(len(patches), 4)
-        return Measured(torch.zeros(len(patches), 2), torch.zeros(len(patches)), kind)
+        return sure_of(near, offset, cells)
 
 
 def snapshot(frames: dict[str, np.ndarray], *candidates: RigidTransform) -> Snapshot:
