@@ -18,12 +18,8 @@ from imgcal.watch import EVENTS, Hook, Intake, Tally
 
 SAID_EVERY = 10.0  # s between two lines where nobody looks at a terminal
 DRAWN_EVERY = 0.25  # s
-SHOWN = (
-    "late",
-    "duplicate",
-    "astray",
-    "beside",
-)  # what is told of exposures where it happens; missing ones show as lost cameras
+SHOWN = ("late", "duplicate", "astray", "beside")
+"""What is told of exposures where it happens; missing ones show as lost cameras."""
 CLOCK_SIGMAS = 5.0
 LEAST_OFFSET = 5e-4  # s: smaller ones are the exposure's length
 

@@ -61,6 +61,7 @@ from .rig_initialization import K3, ColdStart, cold_start, ordinary_lens
 from .rig_monitor import RigMonitor
 from .rig_uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian, rigid_motion, uncertainty_over
 from .robust_losses import squared
+from .shaking import shared_shifts
 from .steady_cameras import Gauge
 from .variance_components import BENT, ObjectQuestion, Start, estimate_variance_components
 
@@ -155,6 +156,7 @@ __all__ = [
     "retract",
     "rig_at",
     "rigid_motion",
+    "shared_shifts",
     "spread_of",
     "squared",
     "step_by_error",

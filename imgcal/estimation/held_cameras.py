@@ -39,9 +39,7 @@ class HeldCameras:
     def hold(self, cameras: Collection[int], wide: bool) -> None:
         """Hold cameras, and begin anew where one of them is new."""
         if not set(cameras) <= self.cameras:
-            self.seen.clear()
-            self.cameras, self.wide = self.cameras | set(cameras), wide
-            self.taken, self.seconds, self.apart, self.told = 0, 0.0, False, False
+            self._begin(self.cameras | set(cameras), wide)
 
     def tell(self) -> tuple[int, ...]:
         """Cameras that surely have moments of their own, once: they would stand still by now if they were shaken."""
@@ -96,6 +94,10 @@ class HeldCameras:
 
     def release(self) -> None:
         """Hold none."""
-        self.cameras, self.wide = set(), False
+        self._begin(set(), wide=False)
+
+    def _begin(self, cameras: set[int], wide: bool) -> None:
+        """Hold cameras of which nothing has been seen yet."""
+        self.cameras, self.wide = cameras, wide
         self.taken, self.seconds, self.apart, self.told = 0, 0.0, False, False
         self.seen.clear()

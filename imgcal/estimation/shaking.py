@@ -80,24 +80,33 @@ def shaken(
     if best is None:
         return None
     evidence, shake, residual = best
-    if _smooth(_shifts(observations, residual)[:, shake[-1] > 0]):
+    if _smooth(shared_shifts(observations, residual)[0][:, shake[-1].numpy() > 0]):
         return None
     again = [(replace(one, shake=shake[s : s + 1]), pose) for s, (one, pose) in enumerate(snapshots)]
     return Shaken(before, again, shake[-1], evidence - math.log(len(sets) * len(SHAKES)))
 
 
-def _shifts(observations: Observations, residual: Tensor) -> Tensor:
-    """By how much all that a camera sees is off: (S, C, 2) pixels."""
-    weight = torch.where(observations.seen, observations.sigma.square().reciprocal(), 0.0)[..., None]
-    return (weight * residual).sum(-2) / weight.sum(-2).clamp_min(1e-12)
+def shared_shifts(observations: Observations, residual: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """By how much all that a camera sees in a snapshot is off, and how much of that noise makes.
+
+    Args:
+        observations: (S, C, N).
+        residual: (S, C, N, 2) pixels.
+
+    Returns:
+        Weighted means (S, C, 2) of the residuals, and the variance (S, C) that noise gives each of their axes.
+    """
+    weight = np.where(observations.seen.numpy(), observations.sigma.numpy() ** -2.0, 0.0)
+    total = np.maximum(weight.sum(-1), 1e-12)
+    return np.einsum("scn,scni->sci", weight, residual.numpy()) / total[..., None], 1 / total
 
 
-def _smooth(shifts: Tensor) -> bool:
+def _smooth(shifts: NDArray[np.float64]) -> bool:
     """Tell whether shifts (S, C, 2) follow each other smoothly."""
     if len(shifts) < LEAST_SHIFTS:
         return False
-    about = (shifts - shifts.mean(0)).square().sum()
-    return bool(shifts.diff(dim=0).square().sum() < SMOOTH * about)
+    about = np.square(shifts - shifts.mean(0)).sum()
+    return bool(np.square(np.diff(shifts, axis=0)).sum() < SMOOTH * about)
 
 
 @dataclass
@@ -129,12 +138,9 @@ class ShakeLevel:
 
     def take(self, observations: Observations, residual: Tensor) -> None:
         """Take what a snapshot that nobody doubts has left: (1, C, N) and pixels (1, C, N, 2)."""
-        seen = observations.seen[0].numpy()
-        weight = np.where(seen, observations.sigma[0].numpy() ** -2.0, 0.0)
-        total = np.maximum(weight.sum(1), 1e-12)
-        shift = np.einsum("cn,cni->ci", weight, residual[0].numpy()) / total[:, None]
-        both = np.concatenate((shift.T, 1 / total[None]))  # shifts, and the variance that noise gives them
-        both[:, seen.sum(1) < LEAST_POINTS] = np.nan
+        (shift,), (variance,) = shared_shifts(observations, residual)
+        both = np.concatenate((shift.T, variance[None]))
+        both[:, observations.seen[0].sum(1).numpy() < LEAST_POINTS] = np.nan
         self.latest.append(both)
         if len(self.latest) == EVERY:
             self._ask()

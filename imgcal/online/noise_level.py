@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from imgcal.association import PipelineOptions, SnapshotIdentity
 from imgcal.errors import RefusedError
-from imgcal.estimation import Absorbed
+from imgcal.estimation import Absorbed, shared_shifts
 from imgcal.geometry import RigidTransform
 from imgcal.online.labelling import NEAR
 from imgcal.online.window import Kept, stacked
@@ -94,18 +94,15 @@ class NoiseLevel:
 
     def _follow(self, observations: Observations, result: Absorbed, count: int) -> None:
         """Follow the noise by what single snapshots leave."""
-        seen, residual = observations.seen[0], result.residual[0]
+        seen, residual = observations.seen[0], result.residual[0].numpy()
         if result.dof <= 0:
             return
-        if observations.shake is not None:  # what all points of a camera share is no noise of theirs
-            weight = torch.where(seen, observations.sigma[0].square().reciprocal(), 0.0)[..., None]
-            total = weight.sum(1, keepdim=True).clamp_min(1e-12)
-            residual = residual - (weight * residual).sum(1, keepdim=True) / total
         # The median of squared residuals of two coordinates is 2 log 2; outliers do not count.
         free = result.dof / (2 * int(seen.sum()))
-        if observations.shake is not None:
+        if observations.shake is not None:  # what all points of a camera share is no noise of theirs
+            residual = residual - shared_shifts(observations, result.residual)[0][0, :, None]
             free *= 1 - int(seen.any(1).sum()) / int(seen.sum())
-        whitened = (residual / observations.sigma[0, ..., None]).numpy()
+        whitened = residual / observations.sigma[0, ..., None].numpy()
         squared = np.einsum("cni,cni->cn", whitened, whitened) / (2 * math.log(2) * free)
         self._ratios.append(np.where(seen.numpy(), squared, np.nan))
         if (count in FIRST or count % EVERY == 0) and len(self._ratios) >= FIRST[0]:
