@@ -11,10 +11,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imgcal.estimation import Gauge, RigBelief, WorkingVolume, pixel_jacobian, uncertainty_over
+from imgcal.estimation import Gauge, WorkingVolume, pixel_jacobian, uncertainty_over
 from imgcal.geometry import cross_matrix
 from imgcal.io import DEFAULT_SIGMA
 from imgcal.live_page.text import rounded
+from imgcal.monitoring import RigBelief
 from imgcal.types import CameraRig
 
 FEW_CAMERAS = 16

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.detection import Frame
-from imgcal.estimation import Absorbed, ClockSlip
 from imgcal.geometry import RigidTransform
+from imgcal.monitoring import ClockSlip, MeasurementUpdate
 from imgcal.online.events import Event
 from imgcal.online.rig_state import RigState
 
@@ -58,7 +58,7 @@ class ClockOffsets:
         self._period = math.nan
 
     def __call__(
-        self, state: RigState, frames: Mapping[str, Frame | None] | None, absorbed: Absorbed | None
+        self, state: RigState, frames: Mapping[str, Frame | None] | None, absorbed: MeasurementUpdate | None
     ) -> Iterable[Event]:
         """See `SequentialTest`."""
         pose, last = state.rig_from_object, self._last

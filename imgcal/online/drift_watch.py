@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from imgcal.estimation import CHANGES, Gauge, RigBelief
+from imgcal.estimation import Gauge
+from imgcal.monitoring import CHANGES, RigBelief
 from imgcal.online.events import UNITS, ChangeKind, Event
 from imgcal.online.relearning import relative_std
 from imgcal.types import CameraRig

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from imgcal.detection import Frame
-from imgcal.estimation import Absorbed
+from imgcal.monitoring import MeasurementUpdate
 from imgcal.online.events import Event
 from imgcal.online.rig_state import RigState
 
@@ -33,7 +33,7 @@ class ForeignObject:
         self._times = 0
 
     def __call__(
-        self, state: RigState, frames: Mapping[str, Frame | None] | None, absorbed: Absorbed | None
+        self, state: RigState, frames: Mapping[str, Frame | None] | None, absorbed: MeasurementUpdate | None
     ) -> Iterable[Event]:
         """See `SequentialTest`."""
         blobs, fiducials = state.detections, len(state.belief.points_object)

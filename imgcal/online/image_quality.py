@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.detection import Frame
-from imgcal.estimation import Absorbed, Cusum
+from imgcal.monitoring import Cusum, MeasurementUpdate
 from imgcal.online.events import Event, EventKind
 from imgcal.online.rig_state import RigState
 from imgcal.online.sightings import well_inside
@@ -65,7 +65,7 @@ class ImageQuality:
         self._test = Cusum(3 * cameras, 1.0, RUN_LENGTH)
 
     def __call__(
-        self, state: RigState, frames: Mapping[str, Frame | None] | None, absorbed: Absorbed | None
+        self, state: RigState, frames: Mapping[str, Frame | None] | None, absorbed: MeasurementUpdate | None
     ) -> Iterable[Event]:
         """See `SequentialTest`."""
         if self._began is None:  # also after a start that goes on: what was before is not known to the second

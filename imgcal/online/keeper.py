@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from imgcal.association import PipelineOptions, Proposer
 from imgcal.detection import DetectionOptions, Frame
 from imgcal.errors import InputError, RefusedError
-from imgcal.estimation import Absorbed, Change, RigBelief
 from imgcal.geometry import RigidTransform
+from imgcal.monitoring import Change, MeasurementUpdate, RigBelief
 from imgcal.online.camera_health import health_of, sentence_of, take_health
 from imgcal.online.clock import ClockOffsets, apart_event
 from imgcal.online.default_tests import default_tests
@@ -211,7 +211,7 @@ class RigKeeper:
         return events
 
     def _state(
-        self, shown: Detections, lag: NDArray[np.float64], result: Absorbed | None, refused: str | None
+        self, shown: Detections, lag: NDArray[np.float64], result: MeasurementUpdate | None, refused: str | None
     ) -> RigState:
         """What is known now, without health and events."""
         memory, pose = self._memory, None if result is None else result.rig_from_object
@@ -250,7 +250,7 @@ class RigKeeper:
         frames: Mapping[str, Frame | None] | None,
         out: frozenset[str],
         labelled: Labelled | None,
-        result: Absorbed | None,
+        result: MeasurementUpdate | None,
         events: list[Event],
     ) -> RigState:
         """Add what became known of cameras, and what is said of them."""

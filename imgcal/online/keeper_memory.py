@@ -13,8 +13,8 @@ import torch
 from numpy.typing import NDArray
 
 from imgcal.association import PipelineOptions, to_observations
-from imgcal.estimation import RigBelief, RigFilter, RigMonitor
 from imgcal.geometry import RigidTransform
+from imgcal.monitoring import RigBelief, RigFilter, RigMonitor
 from imgcal.online.drift_watch import DriftWatch
 from imgcal.online.events import Event
 from imgcal.online.late_cameras import POSES

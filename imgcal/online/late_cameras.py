@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from imgcal.estimation import ObjectMotion, RigBelief, image_of
 from imgcal.geometry import RigidTransform
+from imgcal.monitoring import ObjectMotion, RigBelief, image_of
 from imgcal.types import Detections
 
 INEXACT, UNSTEADY = 0.1, 30.0

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from imgcal.estimation import Absorbed, Change, RigFilter, RigMonitor
+from imgcal.monitoring import Change, MeasurementUpdate, RigFilter, RigMonitor
 from imgcal.online.drift_watch import DriftWatch
 from imgcal.online.keeper_memory import KeeperMemory
 from imgcal.online.label_checks import Checked
@@ -16,7 +16,7 @@ LEAST_LOOKS = 8
 """Snapshots of a camera, from where it stands, from which its values say where its labels must be."""
 
 
-def learnt_from(memory: KeeperMemory, checked: Checked) -> tuple[Absorbed, tuple[Change, ...]]:
+def learnt_from(memory: KeeperMemory, checked: Checked) -> tuple[MeasurementUpdate, tuple[Change, ...]]:
     """Absorb a snapshot; what a camera sees that does not fit for the first time waits for the next one.
 
     Args:
@@ -69,7 +69,7 @@ def learnt_from(memory: KeeperMemory, checked: Checked) -> tuple[Absorbed, tuple
     return result, changes
 
 
-def ask_object(memory: KeeperMemory, learnt: bool) -> Absorbed | None:
+def ask_object(memory: KeeperMemory, learnt: bool) -> MeasurementUpdate | None:
     """Ask whether labels do not fit because the object is not as its file says; what was learnt then.
 
     Args:
@@ -98,7 +98,7 @@ def ask_clocks(memory: KeeperMemory) -> bool:
     return bool(held)
 
 
-def _again(memory: KeeperMemory, result: Absorbed) -> Absorbed:
+def _again(memory: KeeperMemory, result: MeasurementUpdate) -> MeasurementUpdate:
     """Learn the first snapshots again, with the noise that they have shown."""
     monitor = RigMonitor(RigFilter(memory.prior, memory.obj, memory.drift, memory.options.estimation))
     for blobs, pose in memory.noise.first:

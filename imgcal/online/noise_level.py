@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from imgcal.association import PipelineOptions, SnapshotIdentity
 from imgcal.errors import RefusedError
-from imgcal.estimation import Absorbed, shared_shifts
 from imgcal.geometry import RigidTransform
+from imgcal.monitoring import MeasurementUpdate, shared_shifts
 from imgcal.online.labelling import NEAR
 from imgcal.online.window import Kept, stacked
 from imgcal.pipeline import fit_labelled
@@ -42,7 +42,9 @@ class NoiseLevel:
         self._ratios: deque[NDArray[np.float64]] = deque(maxlen=EVERY)  # (C, N)
         self.first: list[tuple[Detections, RigidTransform]] = []  # snapshots that showed another noise, and poses
 
-    def take(self, blobs: Detections, observations: Observations, result: Absorbed, steady: bool, count: int) -> bool:
+    def take(
+        self, blobs: Detections, observations: Observations, result: MeasurementUpdate, steady: bool, count: int
+    ) -> bool:
         """Take a snapshot that has been learnt.
 
         Args:
@@ -92,7 +94,7 @@ class NoiseLevel:
         before, now = math.hypot(sigma, float(np.median(self.additive))), math.hypot(sigma, additive)
         return max(before, now) > OTHER * min(before, now)
 
-    def _follow(self, observations: Observations, result: Absorbed, count: int) -> None:
+    def _follow(self, observations: Observations, result: MeasurementUpdate, count: int) -> None:
         """Follow the noise by what single snapshots leave."""
         seen, residual = observations.seen[0], result.residual[0].numpy()
         if result.dof <= 0:

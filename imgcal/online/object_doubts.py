@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from imgcal.estimation import SHAPE, ObjectChange
 from imgcal.geometry import RigidTransform
+from imgcal.monitoring import SHAPE, ObjectChange
 from imgcal.online.events import Event
 from imgcal.online.label_checks import Checked
 from imgcal.types import Detections

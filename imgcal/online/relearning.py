@@ -8,7 +8,8 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from imgcal.estimation import CHANGES, Change, Gauge, RigBelief
+from imgcal.estimation import Gauge
+from imgcal.monitoring import CHANGES, Change, RigBelief
 from imgcal.online.events import UNITS, ChangeKind, Event
 
 RELEARNT = 1.1

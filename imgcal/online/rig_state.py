@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imgcal.estimation import Gauge, RigBelief
+from imgcal.estimation import Gauge
 from imgcal.geometry import RigidTransform
+from imgcal.monitoring import RigBelief
 from imgcal.online.events import Event
 from imgcal.types import CameraRig, Detections
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.association import PipelineOptions
-from imgcal.estimation import RigBelief
 from imgcal.geometry import RigidTransform
+from imgcal.monitoring import RigBelief
 from imgcal.online.following import LEAST_BLOBS, LEAST_EXPLAINED, astray, found_again, spare_blobs
 from imgcal.online.label_checks import LEAST_AGREEING, Checked, check_labels
 from imgcal.online.resection import labels_at, resected

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any, Protocol
 
 from imgcal.detection import Frame
-from imgcal.estimation import Absorbed
+from imgcal.monitoring import MeasurementUpdate
 from imgcal.online.events import Event
 from imgcal.online.rig_state import RigState
 
@@ -17,7 +17,7 @@ class SequentialTest(Protocol):
     name: str
 
     def __call__(
-        self, state: RigState, frames: Mapping[str, Frame | None] | None, absorbed: Absorbed | None
+        self, state: RigState, frames: Mapping[str, Frame | None] | None, absorbed: MeasurementUpdate | None
     ) -> Iterable[Event]:
         """Say what became known.
 

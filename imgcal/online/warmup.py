@@ -11,9 +11,9 @@ import torch
 
 from imgcal.detection import detect
 from imgcal.errors import RefusedError
-from imgcal.estimation import RecentSnapshots, RigFilter
 from imgcal.geometry import lens_width
 from imgcal.io import load_object, load_rig
+from imgcal.monitoring import RecentSnapshots, RigFilter
 from imgcal.online.keeper import RigKeeper
 from imgcal.online.recalibrator import Recalibrator
 from imgcal.pipeline import calibrate, score

@@ -12,8 +12,9 @@ import torch
 
 import imgcal
 from imgcal.errors import RefusedError
-from imgcal.estimation import Change, Gauge, RigFilter, pixel_changes, spread_of, widened
+from imgcal.estimation import Gauge
 from imgcal.geometry import RigidTransform, rotation_from_vector
+from imgcal.monitoring import Change, RigFilter, pixel_changes, spread_of, widened
 from imgcal.types import DriftRate
 from scripts.benchmarks.followed_streams import RIGS, SURELY, Followed, distance, held_out, stream_of
 from scripts.benchmarks.rig_streams import Bump, Conditions, Stream

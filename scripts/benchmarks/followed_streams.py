@@ -9,8 +9,9 @@ from torch import Tensor
 
 import imgcal
 from imgcal.errors import RefusedError
-from imgcal.estimation import Change, Gauge, RigBelief, RigFilter, RigMonitor, estimate, initial_pose
+from imgcal.estimation import Gauge, estimate, initial_pose
 from imgcal.geometry import RigidTransform
+from imgcal.monitoring import Change, RigBelief, RigFilter, RigMonitor
 from imgcal.types import CameraRig, DriftRate, Observations
 from scripts.benchmarks.rig_streams import Bump, Conditions, Stream
 

@@ -20,9 +20,10 @@ import torch
 import tyro
 
 import imgcal
-from imgcal.estimation import EstimationOptions, RigFilter, camera_covariance, estimate, fit_pose, uncertainty_over
+from imgcal.estimation import EstimationOptions, camera_covariance, estimate, fit_pose, uncertainty_over
 from imgcal.evaluation.true_error import normalized_error
 from imgcal.geometry import RigidTransform
+from imgcal.monitoring import RigFilter
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import CameraRig, Detections, DriftRate, Observations, RigPrior
 from scripts.benchmarks.rig_streams import Conditions, Stream

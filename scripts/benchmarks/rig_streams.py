@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import imgcal
-from imgcal.estimation import CHANGES
 from imgcal.geometry import RigidTransform, rotation_from_vector
+from imgcal.monitoring import CHANGES
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import CameraRig, Detections, DriftRate, Observations
 

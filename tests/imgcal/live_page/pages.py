@@ -8,10 +8,10 @@ import time
 import numpy as np
 import torch
 
-from imgcal.estimation import RigBelief
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.live_page.commands import Action
+from imgcal.monitoring import RigBelief
 from imgcal.online import Event, RigState
 from imgcal.synthesis.captures import Truth, true_detections
 from imgcal.types.rig import CameraRig

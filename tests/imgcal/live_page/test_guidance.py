@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.estimation import RigBelief, absorbed
 from imgcal.live_page.contents import belief_message, rig_message
 from imgcal.live_page.guidance import compare, information_gain, look
 from imgcal.live_page.viewing_volume import viewing_volume
+from imgcal.monitoring import RigBelief, absorb
 from imgcal.types.observations import Observations
 from tests.imgcal.live_page.pages import made_state
 
@@ -28,7 +28,7 @@ def test_the_gain_is_what_the_filter_learns(o10, asymmetric8):
     """Information gain against the determinants of the filter's own covariance before and after such a snapshot."""
     belief = RigBelief.of_prior(o10, asymmetric8)
     observations, pose = seen_at(o10, asymmetric8, PLACES[1])
-    after = absorbed(belief, observations, pose).belief
+    after = absorb(belief, observations, pose).belief
     expected = float(after.factor.diagonal().log().sum() - belief.factor.diagonal().log().sum())
     points = pose.apply(asymmetric8.points)[0]
     shape, middle = points - points.mean(0), points.mean(0)
@@ -41,7 +41,7 @@ def test_nothing_is_learnt_where_nothing_is_seen_and_less_where_one_has_been(o10
     shape = asymmetric8.points - asymmetric8.points.mean(0)
     before = information_gain(belief, belief.covariance(), PLACES, shape, 0.1)
     assert before[2] == 0 and before[0] > 10
-    after = absorbed(belief, *seen_at(o10, asymmetric8, PLACES[0])).belief
+    after = absorb(belief, *seen_at(o10, asymmetric8, PLACES[0])).belief
     gain = information_gain(after, after.covariance(), PLACES, shape, 0.1)
     assert gain[0] < gain[1] < before[1]
 

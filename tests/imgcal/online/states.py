@@ -8,8 +8,8 @@ import numpy as np
 import torch
 
 import imgcal
-from imgcal.estimation import RigBelief
 from imgcal.geometry import RigidTransform, rotation_from_vector
+from imgcal.monitoring import RigBelief
 from imgcal.online import RigState
 from imgcal.types import Detections
 

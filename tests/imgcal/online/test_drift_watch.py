@@ -6,7 +6,7 @@ from dataclasses import replace
 import torch
 
 import imgcal
-from imgcal.estimation import RigBelief
+from imgcal.monitoring import RigBelief
 from imgcal.online.drift_watch import EVERY_SECONDS, DriftWatch, with_cameras
 
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import imgcal
-from imgcal.estimation import SHAPE, ObjectChange
 from imgcal.geometry import RigidTransform
+from imgcal.monitoring import SHAPE, ObjectChange
 from imgcal.online import Event, RigKeeper
 from imgcal.online.camera_health import VAIN
 from imgcal.online.label_checks import Checked

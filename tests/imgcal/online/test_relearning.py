@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import imgcal
-from imgcal.estimation import Change, RigBelief, widened
+from imgcal.monitoring import Change, RigBelief, widened
 from imgcal.online.relearning import Relearning, relative_std, sigma_of
 
 

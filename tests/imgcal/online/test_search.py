@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from imgcal.association.options import PipelineOptions
-from imgcal.estimation import RigBelief
 from imgcal.geometry.transforms import RigidTransform
+from imgcal.monitoring import RigBelief
 from imgcal.online import search
 from imgcal.online.label_checks import Checked
 from imgcal.online.resection import Resected

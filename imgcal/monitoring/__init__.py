@@ -1,0 +1,5 @@
+"""Follow a rig over time: a sequential filter, and the diagnosis of what changes."""
+
+import lazy_loader as lazy
+
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

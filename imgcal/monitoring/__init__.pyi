@@ -1,0 +1,40 @@
+from .change_test import CHANGES, ChangeTest, change_of_errors, pixel_changes, spread_of
+from .clock_slip import ClockSlip, image_of
+from .cusum import Cusum, cusum_threshold
+from .measurement_update import absorb
+from .object_change import SHAPE, ObjectChange, changed_object
+from .object_motion import ObjectMotion
+from .pending_change import Change
+from .recent_snapshots import RecentSnapshots
+from .rig_belief import MeasurementUpdate, RigBelief, age_belief, widened
+from .rig_filter import RigFilter
+from .rig_monitor import RigMonitor
+from .shaking import shared_shifts
+from .snapshot_information import SnapshotInformation
+
+__all__ = [
+    "CHANGES",
+    "SHAPE",
+    "Change",
+    "ChangeTest",
+    "ClockSlip",
+    "Cusum",
+    "MeasurementUpdate",
+    "ObjectChange",
+    "ObjectMotion",
+    "RecentSnapshots",
+    "RigBelief",
+    "RigFilter",
+    "RigMonitor",
+    "SnapshotInformation",
+    "absorb",
+    "age_belief",
+    "change_of_errors",
+    "changed_object",
+    "cusum_threshold",
+    "image_of",
+    "pixel_changes",
+    "shared_shifts",
+    "spread_of",
+    "widened",
+]

@@ -1,0 +1,119 @@
+"""Which camera has changed, and before how many of the latest snapshots?"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Collection
+
+from imgcal.errors import RefusedError
+from imgcal.estimation import EstimationOptions
+from imgcal.geometry import RigidTransform
+from imgcal.monitoring.change_test import JUMPS, ChangeTest
+from imgcal.monitoring.measurement_update import absorb
+from imgcal.monitoring.pending_change import free_cameras
+from imgcal.monitoring.recent_snapshots import SCREENED, RecentSnapshots
+from imgcal.monitoring.rig_belief import RigBelief
+from imgcal.types import Observations
+
+SIGNIFICANT = 60.0
+"""Chi-squared (two or three degrees of freedom) that a camera which stands still exceeds once in 10^12 tests."""
+SUSPECTED = 20.0
+"""The same of the quick test, from which the other one is asked: a third of it where half of what is known is new."""
+SLOW = {16: 16, 64: 32}
+"""Numbers of snapshots that are tested without a suspicion, and after how many each: where little was known before."""
+REMAINING = 20.0
+"""What is left of the significance without the snapshot that speaks most for a change: one wrong label is none."""
+NEARBY = 4
+"""Snapshots around the most significant one among which the first one after a change is looked for."""
+
+MOST_EXCESS = 4.0
+"""Chi-squared per degree of freedom up to which a snapshot fits that is else refused."""
+
+
+def changed_before(recent: RecentSnapshots, count: int) -> int | None:
+    """Before how many snapshots some camera has surely changed; None = none has.
+
+    Args:
+        recent: the latest snapshots.
+        count: of all snapshots so far.
+    """
+    ages = {age for age, every in SLOW.items() if age <= len(recent) and count % every == 0}
+    screened = recent.screened()
+    if screened.max() >= SUSPECTED:
+        ages.add(int(SCREENED[int(screened.max(1).argmax())]))
+    for age in sorted(ages):
+        scores = recent.test(age).scores()
+        kind = max(scores, key=lambda name: float(scores[name].max()))
+        camera = int(scores[kind].argmax())
+        if float(scores[kind][camera]) >= SIGNIFICANT and recent.steady(age, camera, kind) >= REMAINING:
+            return age
+    return None
+
+
+def likeliest_age(recent: RecentSnapshots, camera: int, age: int) -> int:
+    """Number of snapshots since a camera changed, by how probable that is; `age` is asked first."""
+    found: dict[int, float] = {}
+
+    def ask(candidates: set[int]) -> int:
+        for candidate in candidates - found.keys():
+            if 1 <= candidate <= len(recent):
+                found[candidate] = recent.test(candidate, aged=False).odds({camera: None})
+        return max(found, key=lambda candidate: found[candidate])
+
+    best = ask({int(n) for n in SCREENED} | {age, 1})
+    for _ in range(NEARBY):
+        nearest = ask(set(range(best - NEARBY, best + NEARBY + 1)))
+        if nearest == best:
+            break
+        best = nearest
+    return best
+
+
+def surest(test: ChangeTest, known: Collection[int] = ()) -> int:
+    """The camera whose change, of any kind, is most probable; of those that are not known to have changed."""
+    odds = {camera: test.odds({camera: None}) for camera in range(len(test.pixels)) if camera not in known}
+    return max(odds, key=lambda camera: odds[camera])
+
+
+def changed_cameras(test: ChangeTest, known: dict[int, str | None]) -> tuple[dict[int, str | None], dict[int, float]]:
+    """Let cameras free that have changed, the surest first, until what has been seen since then is explained.
+
+    Args:
+        test: what has been seen since then.
+        known: cameras that are known to have changed already, and how.
+
+    Returns:
+        Cameras that have changed, at least one, and how (None = nobody knows); and the chi-squared of each new one.
+    """
+    free, evidence = dict(known), dict[int, float]()
+    while not free or _worst(test.given(free), free) >= SIGNIFICANT:
+        given = test.given(free)
+        camera = surest(given, free)
+        free[camera], evidence[camera] = None, max(float(score[camera]) for score in given.scores().values())
+    return free, evidence
+
+
+def contradicting(
+    belief: RigBelief, observations: Observations, rig_from_object: RigidTransform, options: EstimationOptions
+) -> int | None:
+    """The camera that may have moved where a snapshot is refused; None = no single one.
+
+    Args:
+        belief: what is known.
+        observations: (1, C, N) of the snapshot.
+        rig_from_object: (1,) first guess of the object's pose.
+        options: how to minimize.
+    """
+    found: dict[int, float] = {}
+    for camera in observations.seen[0].any(-1).nonzero()[:, 0].tolist():
+        with contextlib.suppress(RefusedError):
+            result = absorb(free_cameras(belief, {camera: None}, JUMPS[-1]), observations, rig_from_object, options)
+            if result.chi2 <= MOST_EXCESS * max(result.dof, 1):
+                found[camera] = result.evidence
+    return max(found, key=lambda camera: found[camera], default=None)
+
+
+def _worst(test: ChangeTest, known: Collection[int]) -> float:
+    """Largest score of any kind of a camera that is not known to have changed."""
+    others = [camera for camera in range(len(test.pixels)) if camera not in known]
+    return max((float(scores[camera]) for scores in test.scores().values() for camera in others), default=0.0)

@@ -1,0 +1,222 @@
+"""Has a camera changed? What later snapshots say is compared with what was known before, kind of change by kind.
+
+Let P be the covariance of what was known, A the information that the later snapshots brought and g their pull at what
+was known before. If nothing changed, the pull that is left once both have been put together, r = g - A S^-1 g with
+S = P^-1 + A, has the covariance G = A - A S^-1 A. A jump d of a camera's parameters adds G d. The score test of each
+kind of change of each camera asks whether that is there (a generalized likelihood ratio with the jump estimated), and
+the same r and G tell how probable any jump is of which only the spread is known.
+
+A camera model is never exact, and an object that hardly moves shows the same error in every snapshot. A jump that
+moves the image by less than `MODEL_ERROR` is therefore taken to be there always.
+
+Source: Willsky and Jones, "A Generalized Likelihood Ratio Approach to the Detection and Estimation of Jumps in Linear
+Systems", 1976; Hausman, "Specification Tests in Econometrics", 1978.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from imgcal.errors import RefusedError
+from imgcal.estimation import step_by_error
+from imgcal.types import CameraRig
+
+CHANGES: Mapping[str, slice] = {
+    "rotation": slice(0, 3),
+    "position": slice(3, 6),
+    "focal_length": slice(6, 8),
+    "principal_point": slice(8, 10),
+}
+"""Kinds of change, and where they stand among a camera's parameters."""
+JUMPS = (0.6, 6.0, 60.0, 600.0)
+"""Pixels, standard deviations of a change, before anything is known of it, each as probable as the others: by how much
+it moves the image, whatever its kind, so that no kind is preferred."""
+LARGE = 60.0
+"""Pixels, the same of a camera that has moved, as far as that is learnt from what it still labels ..."""
+LENS = 60.0
+"""... and the most of focal length, principal point and distortion, which no push changes by more."""
+DISTORTED = 2e-4
+"""Standard deviation of the distortion for each such pixel, where the kind of change is not known."""
+LEAST_LEARNT = 1e-6
+"""Directions of which less was learnt than this share of the most of their kind do not take part."""
+LEAST_VARIANCE = 1e-3
+"""Share of a variance that is left where one is taken away: rounding."""
+MODEL_ERROR = 0.02
+"""Pixels, one standard deviation of each axis: by how much a camera's image may be off in a way that changes slowly."""
+SLOPE = 0.25
+"""Tangent of the angle to the optical axis at which a change of the focal length counts as what it moves there."""
+USUAL_DISTANCE = 1000.0  # mm, of a rig that has no working distance
+
+
+def pixel_changes(rig: CameraRig) -> Tensor:
+    """Change of each parameter that moves the image by about a pixel: (C, K)."""
+    focal = rig.focal_length.mean(-1, keepdim=True)
+    change = torch.ones(rig.num_cameras, rig.num_parameters, dtype=torch.float64)
+    change[:, :3] /= focal
+    change[:, 2] /= SLOPE
+    change[:, 3:6] *= (rig.working_distance or USUAL_DISTANCE) / focal
+    change[:, 5] /= SLOPE
+    change[:, 6:8] /= SLOPE
+    change[:, 10:] = DISTORTED * rig.has_coefficient
+    return change
+
+
+def spread_of(changes: Mapping[int, str | None], pixels: Tensor, jump: float = LARGE) -> Tensor:
+    """Standard deviations (C, K) of changes of some kinds by camera, None = of all; zero where nothing changes.
+
+    Args:
+        changes: kinds by camera.
+        pixels: (C, K) see `pixel_changes`.
+        jump: pixels.
+    """
+    std = torch.zeros_like(pixels)
+    for camera, kind in changes.items():
+        part = slice(None) if kind is None else CHANGES[kind]
+        std[camera, part] = jump * pixels[camera, part]
+    std[:, 6:] *= min(1.0, LENS / jump)
+    return std
+
+
+def change_of_errors(rig: CameraRig, unit: Tensor) -> Tensor:
+    """Error in units by a change of a camera's own parameters: (C, K, K); a turn about its centre shifts nothing."""
+    return torch.linalg.inv(step_by_error(rig)) / unit[:, :, None]
+
+
+@dataclass(frozen=True)
+class ChangeTest:
+    """What is left of the pull on every camera's own parameters: the two numbers r and G of every test."""
+
+    pull: Tensor  # (K C,)
+    learnt: Tensor  # (K C, K C) its covariance where nothing has changed
+    pixels: Tensor  # (C, K) see `pixel_changes`
+
+    @classmethod
+    def of(cls, information: Tensor, brought: Tensor, pull: Tensor, change: Tensor, pixels: Tensor) -> ChangeTest:
+        """Prepare the tests.
+
+        Args:
+            information: (D, D) of what was known before, aged to the time of the later snapshots.
+            brought: (D, D) information of the later snapshots.
+            pull: (D,) of the later snapshots, where what was known before put the rig.
+            change: (C, K, K) see `change_of_errors`.
+            pixels: (C, K) see `pixel_changes`.
+
+        Raises:
+            RefusedError: nothing is known of the rig.
+        """
+        cameras = len(change)
+        wide = pixels.numel()
+        factor, failed = torch.linalg.cholesky_ex(information + brought)
+        if bool(failed):
+            raise RefusedError("estimation: these observations leave a rig that nothing is known of")
+        half = torch.linalg.solve_triangular(factor, torch.cat((brought[:, :wide], pull[:, None]), 1), upper=False)
+        left = torch.cat((brought[:wide, :wide], pull[:wide, None]), 1) - half[:, :wide].mT @ half
+        own = torch.einsum("cij,cik->cjk", change, left.unflatten(0, (cameras, -1)))  # (C, K, K C + 1)
+        learnt = own[..., :-1].unflatten(-1, (cameras, -1))
+        learnt = torch.einsum("cidj,djk->cidk", learnt, change).reshape(wide, wide)
+        return cls(own[..., -1].flatten(), 0.5 * (learnt + learnt.mT), pixels)
+
+    def scores(self) -> dict[str, Tensor]:
+        """Test each camera for each kind of change: for each of `CHANGES` (C,).
+
+        Chi-squared, where nothing has changed, with at most as many degrees of freedom as the kind has parameters.
+        """
+        cameras = len(self.pixels)
+        pull = self.pull.unflatten(0, (cameras, -1))
+        learnt = self.learnt.unflatten(0, (cameras, -1)).unflatten(-1, (cameras, -1))
+        own = learnt.diagonal(dim1=0, dim2=2).movedim(-1, 0)  # (C, K, K)
+        return {
+            kind: _Own.of(pull[:, part], own[:, part, part]).score((MODEL_ERROR * self.pixels[:, part]).square())
+            for kind, part in CHANGES.items()
+        }
+
+    def change(self, kind: str, variance: Tensor) -> tuple[Tensor, Tensor]:
+        """What is learnt of a change of each camera of a kind with k numbers, where these wander besides.
+
+        Args:
+            kind: of `CHANGES`.
+            variance: (C, k) by which they do, beyond what was taken for granted; less than nothing is possible.
+
+        Returns:
+            Its information (C, k, k), and its pull (C, k).
+        """
+        cameras, part = len(self.pixels), CHANGES[kind]
+        pull = self.pull.unflatten(0, (cameras, -1))[:, part]
+        learnt = self.learnt.unflatten(0, (cameras, -1)).unflatten(-1, (cameras, -1))
+        return _Own.of(pull, learnt.diagonal(dim1=0, dim2=2).movedim(-1, 0)[:, part, part]).change(variance)
+
+    def odds(self, changes: Mapping[int, str | None]) -> float:
+        """Log odds that cameras have changed in some ways, None = in any, against that nothing has."""
+        found = []
+        for jump in JUMPS:
+            _, factor, pull = self._free(changes, jump)
+            found.append(0.5 * pull.square().sum() - factor.diagonal().log().sum() - math.log(len(JUMPS)))
+        return float(torch.logsumexp(torch.stack(found), 0))
+
+    def given(self, changes: Mapping[int, str | None]) -> ChangeTest:
+        """Test for others where some cameras may have changed."""
+        scaled, factor, pull = self._free(changes, LARGE)
+        taken = torch.linalg.solve_triangular(factor, scaled, upper=False)
+        return ChangeTest(self.pull - taken.mT @ pull, self.learnt - taken.mT @ taken, self.pixels)
+
+    def jump(self, camera: int, kind: str) -> tuple[Tensor, Tensor]:
+        """Estimate a change of a camera of a kind with K numbers, were there no other: (K,) and covariance (K, K)."""
+        first = camera * self.pixels.shape[1]
+        part = slice(first + CHANGES[kind].start, first + CHANGES[kind].stop)
+        covariance = torch.linalg.pinv(self.learnt[part, part], hermitian=True)
+        return covariance @ self.pull[part], covariance
+
+    def _free(self, changes: Mapping[int, str | None], jump: float) -> tuple[Tensor, Tensor, Tensor]:
+        """What R parameters that may have changed do, in units of their standard deviations.
+
+        Returns:
+            Covariance with all pulls (R, K C), Cholesky factor (R, R) of their own, the jump included, and the
+            whitened pull (R,).
+        """
+        std = spread_of(changes, self.pixels, jump).flatten()
+        rows = std.nonzero()[:, 0]
+        scaled = std[rows, None] * self.learnt[rows]
+        own = scaled[:, rows] * std[rows]
+        factor = torch.linalg.cholesky(own + torch.eye(len(rows), dtype=std.dtype))
+        pull = torch.linalg.solve_triangular(factor, (std * self.pull)[rows, None], upper=False)[:, 0]
+        return scaled, factor, pull
+
+
+@dataclass(frozen=True)
+class _Own:
+    """What is left of the pull on a few parameters of each camera, along directions of which something was learnt."""
+
+    along: Tensor  # (C, k) in standard deviations where nothing has changed; zero where nothing was learnt
+    spread: Tensor  # (C, k, k) by which a change of each parameter moves it
+
+    @classmethod
+    def of(cls, pull: Tensor, learnt: Tensor) -> _Own:
+        """Take pulls (C, k) and their covariance (C, k, k)."""
+        scale = learnt.diagonal(dim1=-2, dim2=-1).clamp_min(1e-30).sqrt()
+        values, vectors = torch.linalg.eigh(learnt / (scale[:, :, None] * scale[:, None, :]))
+        known = values > LEAST_LEARNT
+        root = torch.where(known, values, 1.0).sqrt()
+        along = torch.where(known, (vectors.mT @ (pull / scale)[..., None])[..., 0] / root, 0.0)
+        return cls(along, scale[:, :, None] * vectors * torch.where(known, root, 0.0)[:, None, :])
+
+    def score(self, variance: Tensor) -> Tensor:
+        """Squares (C,) in units of the covariance, to which changes of a variance (C, k) are added."""
+        values, vectors = self._with(variance)
+        return ((vectors.mT @ self.along[..., None])[..., 0].square() / values).sum(-1)
+
+    def change(self, variance: Tensor) -> tuple[Tensor, Tensor]:
+        """Information (C, k, k) and pull (C, k) of a change, besides changes of a variance (C, k)."""
+        values, vectors = self._with(variance)
+        spread = self.spread @ vectors / values.sqrt()[:, None, :]
+        along = (vectors.mT @ self.along[..., None])[..., 0] / values.sqrt()
+        return spread @ spread.mT, (spread @ along[..., None])[..., 0]
+
+    def _with(self, variance: Tensor) -> tuple[Tensor, Tensor]:
+        """Variances (C, k) where changes are added, and their directions (C, k, k)."""
+        values, vectors = torch.linalg.eigh(self.spread.mT @ (variance[:, :, None] * self.spread))
+        return (1 + values).clamp_min(LEAST_VARIANCE), vectors

@@ -1,0 +1,170 @@
+"""Does a camera drift faster than is taken for granted? What stretch after stretch leaves unexplained tells.
+
+A filter that trusts a rate of drift which is too low follows too slowly, and does not know that it does. What a stretch
+of snapshots says against what was known before (`ChangeTest`) is independent from stretch to stretch while that rate
+holds; a camera that creeps adds the same to each. So the latest stretches, one, two, ... sixteen of them, are asked
+together whether each kind of value of each camera went steadily in some direction, at one of several speeds (a
+generalized likelihood ratio of a ramp). The variance that is believed is a mean, each speed as probable as that says: a
+random walk that goes as far as the ramp in the time in which a filter learns. A creep is known within minutes, and
+forgotten as soon.
+
+Source: Willsky and Jones, see `change_test.py`; Magill, "Optimal Adaptive Estimation of Sampled Stochastic Processes",
+1965.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from imgcal.estimation import error_between
+from imgcal.monitoring.change_test import CHANGES, MODEL_ERROR, ChangeTest, change_of_errors, pixel_changes
+from imgcal.monitoring.rig_belief import RigBelief, age_belief
+from imgcal.types import DriftRate
+
+SECONDS = 20.0
+"""Time of a stretch."""
+WINDOWS = (1, 2, 3, 4, 6, 8, 12, 16)
+"""Numbers of latest stretches that are asked together."""
+SPEEDS = torch.tensor((1.0, 2.0, 4.0, 8.0), dtype=torch.float64)
+"""Standard deviations of a stretch's random walk, at the rate that is taken for granted, by which a value may go in
+each stretch instead."""
+DOUBT = 6.0
+"""Log odds against each of them, before anything is seen."""
+LEARNING = 133.0
+"""Seconds in which a random walk goes as far as the ramp that it stands for."""
+
+
+@dataclass
+class Stretch:
+    """What some snapshots say about what was believed before them."""
+
+    before: RigBelief
+    brought: Tensor  # (D, D) information
+    pull: Tensor  # (D,) where `before` puts the rig
+    seconds: float = 0.0
+
+    @classmethod
+    def after(cls, before: RigBelief, seconds: float = 0.0) -> Stretch:
+        """Begin with none; `seconds` of its time have passed."""
+        return cls(before, torch.zeros_like(before.factor), before.factor.new_zeros(len(before.factor)), seconds)
+
+    def add(self, belief: RigBelief, brought: Tensor, pull: Tensor) -> None:
+        """Add snapshots.
+
+        Args:
+            belief: at any time.
+            brought: (D, D) their information.
+            pull: (D,) theirs, where that belief puts the rig.
+        """
+        error = (error_between(belief.rig, self.before.rig) / self.before.unit).flatten()
+        distance = torch.cat((error, belief.object_offset - self.before.object_offset))
+        self.brought, self.pull = self.brought + brought, self.pull + pull + brought @ distance
+
+    def test(self, rate: DriftRate | Tensor) -> ChangeTest:
+        """Test for changes meanwhile; what the rig wandered, at a rate, is none."""
+        before = self.before
+        known = age_belief(before, self.seconds, rate).information
+        change = change_of_errors(before.rig, before.unit)
+        return ChangeTest.of(known, self.brought, self.pull, change, pixel_changes(before.rig))
+
+
+class DriftPaces:
+    """By how many times each kind of value of each camera drifts faster than is taken for granted.
+
+    Examples:
+        >>> paces = DriftPaces(4)
+        >>> paces.of_parameters(15).shape, float(paces.squared.max())
+        (torch.Size([4, 15]), 1.0)
+    """
+
+    def __init__(self, cameras: int) -> None:
+        """Begin with what is taken for granted."""
+        shape = (WINDOWS[-1], cameras, len(CHANGES))
+        self.information = torch.zeros(*shape, 3, 3, dtype=torch.float64)  # of speeds, by the latest stretches, ...
+        self.pull = torch.zeros(*shape, 3, dtype=torch.float64)  # ... the last one first
+        self.squared = torch.ones(shape[1:], dtype=torch.float64)  # (C, kinds) paces
+
+    def of_parameters(self, width: int) -> Tensor:
+        """The paces of every parameter: (C, K)."""
+        pace = torch.ones(len(self.squared), width, dtype=torch.float64)
+        for number, part in enumerate(CHANGES.values()):
+            pace[:, part] = self.squared[:, number, None].sqrt()
+        return pace
+
+    def take(self, stretch: Stretch, walk: Tensor) -> Tensor:
+        """Learn from a stretch.
+
+        Args:
+            stretch: what was seen.
+            walk: (C, K) standard deviation of an hour's drift as it is taken for granted.
+
+        Returns:
+            (C, K) the variance that what is believed at its end lacks: what became known has gone on for some time.
+        """
+        test = stretch.test(walk * self.of_parameters(walk.shape[1]))
+        for kept in (self.information, self.pull):
+            kept[1:] = kept[:-1].clone()
+        self.information[0], self.pull[0] = self._of(test, walk, stretch.seconds)
+        model = self._model(test, walk)
+        leader = int(self._ratios(model).amax((0, 2, 3)).argmax())
+        rest = self._of(
+            test.given({leader: None}), walk, stretch.seconds
+        )  # of one that creeps, all others see something
+        others = torch.arange(len(self.squared)) != leader
+        self.information[0, others], self.pull[0, others] = rest[0][others], rest[1][others]
+        ratios, was = self._ratios(model), self.squared
+        best, window = ratios.amax(0).max(-1).values, ratios.amax(-1).argmax(0)
+        weight = (ratios.amax(0) - DOUBT).exp()
+        self.squared = 1 + (weight * SPEEDS.square()).sum(-1) / (1 + weight.sum(-1)) * (LEARNING / SECONDS)
+        lasted = torch.where(best > 0, torch.tensor(WINDOWS)[window], 0)
+        lacking = (self.squared - was).clamp_min(0) * lasted
+        variance = torch.zeros_like(walk)
+        for number, part in enumerate(CHANGES.values()):
+            variance[:, part] = lacking[:, number, None] * walk[:, part].square() * (stretch.seconds / 3600)
+        return variance
+
+    def _of(self, test: ChangeTest, walk: Tensor, seconds: float) -> tuple[Tensor, Tensor]:
+        """Information (C, kinds, 3, 3) and pull (C, kinds, 3) of what each value went, in steps of the random walk."""
+        information, pull = torch.zeros_like(self.information[0]), torch.zeros_like(self.pull[0])
+        for number, (kind, part) in enumerate(CHANGES.items()):
+            size = part.stop - part.start
+            wandered = walk[:, part].square() * (seconds / 3600)
+            found = test.change(kind, (1 - self.squared[:, number, None]) * wandered)
+            step = walk[:, part] * (SECONDS / 3600) ** 0.5 * (seconds / SECONDS)
+            information[:, number, :size, :size] = found[0] * step[:, :, None] * step[:, None, :]
+            pull[:, number, :size] = found[1] * step
+        return information, pull
+
+    def _model(self, test: ChangeTest, walk: Tensor) -> Tensor:
+        """Variance (C, kinds, 3) of errors of camera models, in steps of the walk; zero where nothing wanders."""
+        variance = torch.zeros_like(self.pull[0])
+        for number, part in enumerate(CHANGES.values()):
+            step = walk[:, part] * (SECONDS / 3600) ** 0.5
+            error = (MODEL_ERROR * test.pixels[:, part] / step.clamp_min(1e-30)).square()
+            variance[:, number, : part.stop - part.start] = torch.where(step > 0, error, 0.0)
+        return variance
+
+    def _ratios(self, model: Tensor) -> Tensor:
+        """Log likelihood ratio (windows, C, kinds, speeds) of a ramp against the rate that is taken for granted.
+
+        Either way the camera model errs by a variance (C, kinds, 3), once in a window.
+        """
+        last = torch.tensor(WINDOWS)
+        information, pull = self.information.cumsum(0)[last - 1], self.pull.cumsum(0)[last - 1]
+        error = (model / last.square()[:, None, None, None])[..., None, :]  # of a speed
+        steady = _log_evidence(information, pull, error)
+        return _log_evidence(information, pull, error + SPEEDS.square()[:, None]) - steady
+
+
+def _log_evidence(information: Tensor, pull: Tensor, variance: Tensor) -> Tensor:
+    """Log probability (*B, V) of what was learnt (*B, k, k) and (*B, k) of numbers of some variances (*B, V, k)."""
+    std = variance.sqrt()
+    covariance = (
+        torch.eye(pull.shape[-1], dtype=pull.dtype) + std[..., None] * information[..., None, :, :] * std[..., None, :]
+    )
+    factor = torch.linalg.cholesky(covariance)
+    along = torch.linalg.solve_triangular(factor, (std * pull[..., None, :])[..., None], upper=False)[..., 0]
+    return 0.5 * along.square().sum(-1) - factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)

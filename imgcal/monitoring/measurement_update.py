@@ -1,0 +1,110 @@
+"""Learn from labelled snapshots of a rig that stood still meanwhile: `absorb`.
+
+The state is every camera's parameters and, where the object has tolerances, the object's; the object's pose is
+eliminated from each snapshot. Several snapshots may be absorbed at once: they are then linearized where they lead
+together, which is what `RigFilter` does with its first ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from imgcal.errors import RefusedError
+from imgcal.estimation import EstimationOptions, lm_cpu
+from imgcal.geometry import RigidTransform
+from imgcal.monitoring import measurement_update_cpu
+from imgcal.monitoring.measurement_update_cpu import DAMPED, MOST_DAMPING, SLACK, STALLED, WHY_NOT
+from imgcal.monitoring.rig_arrays import RigArrays
+from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief
+from imgcal.monitoring.snapshot_information import SnapshotInformation
+from imgcal.types import CameraRig, Observations
+
+
+def absorb(
+    belief: RigBelief,
+    observations: Observations,
+    rig_from_object: RigidTransform,
+    options: EstimationOptions = EstimationOptions(),
+) -> MeasurementUpdate:
+    """Learn from labelled snapshots of a rig that stood still while they were taken.
+
+    Args:
+        belief: what was known before.
+        observations: (S, C, N) of the object that the belief is about.
+        rig_from_object: (S,) first guess of the object's poses.
+        options: how to minimize.
+
+    Raises:
+        RefusedError: the observations do not determine the object's pose, or no minimum was found.
+        ValueError: there are not as many poses as snapshots.
+    """
+    if rig_from_object.translation.shape[0] != observations.seen.shape[0]:
+        given = f"{rig_from_object.translation.shape[0]} poses of {observations.seen.shape[0]} snapshots"
+        raise ValueError(f"rig_from_object: found {given}, expected one of each")
+    constants, unit, shake = belief.constants, belief.unit, observations.shake
+    seen = observations.seen.numpy()
+    uv = np.where(seen[..., None], observations.uv.numpy(), 0.0).astype(np.float64, copy=False)
+    uv = np.ascontiguousarray(uv.swapaxes(-1, -2))
+    sigma = np.where(seen, observations.sigma.numpy(), np.inf)
+    rotation = np.ascontiguousarray(rig_from_object.rotation.detach().double().reshape(-1, 3, 3).numpy())
+    translation = rig_from_object.translation.detach().double().reshape(-1, 3).numpy()
+    shaken = np.empty((0, 0)) if shake is None else np.ascontiguousarray(shake.double().numpy())
+    loss = (lm_cpu.LOSS_CODES[options.loss], float(options.threshold))
+    found = measurement_update_cpu.absorb(
+        constants.shared,
+        (uv, (1 / sigma).astype(np.float64, copy=False), shaken),
+        (belief.arrays, unit.numpy(), belief.object_offset.numpy(), constants.own_std, belief.information.numpy()),
+        (rotation, translation + rotation @ constants.centroid),
+        (*loss, options.max_iterations, options.tolerance, SLACK, DAMPED, STALLED, MOST_DAMPING),
+    )
+    if found.status:
+        raise RefusedError(f"estimation: {WHY_NOT[found.status]}")
+    own, factor = torch.from_numpy(found.own), torch.from_numpy(found.factor)
+    now = RigBelief(_rig_of(found.rig, belief.rig), belief.obj, own, factor, unit)
+    brought = SnapshotInformation(
+        _rig_of(found.from_rig, belief.rig), torch.from_numpy(found.from_own), unit,
+        *(torch.from_numpy(part) for part in (found.camera, found.border, found.carried, found.pull)),
+    )  # fmt: skip
+    # What the properties would make of it, at hand.
+    half_log_determinant = float(np.log(found.factor.diagonal()).sum())
+    information = torch.from_numpy(found.information)
+    vars(now).update(information=information, arrays=found.rig, constants=constants)
+    vars(now).update(half_log_determinant=half_log_determinant)
+    vars(brought).update(arrays=found.from_rig)
+    translation = found.centre - found.rotation @ constants.centroid
+    poses = RigidTransform(torch.from_numpy(found.rotation), torch.from_numpy(translation))
+    residual = torch.from_numpy(np.where(seen[..., None], found.residual.swapaxes(-1, -2), 0.0))
+    evidence = belief.half_log_determinant - half_log_determinant - found.cost
+    if shake is not None:
+        evidence -= float(np.log1p(shake.numpy() ** 2 * np.square(1 / sigma).sum(-1)).sum())
+    dof = 2 * int(np.count_nonzero(seen)) - 6 * len(seen)
+    return MeasurementUpdate(now, poses, residual, 2 * found.cost, dof, evidence, belief, brought)
+
+
+def _rig_of(values: RigArrays, like: CameraRig) -> CameraRig:
+    """The rig that has these values; `replace` would take longer than a projection."""
+    translation = -(values.rotation @ values.position[..., None])[..., 0]
+    rig = object.__new__(CameraRig)
+    vars(rig).update(vars(like))
+    vars(rig).update(
+        focal_length=torch.from_numpy(values.focal_length),
+        principal_point=torch.from_numpy(values.principal_point),
+        distortion=torch.from_numpy(values.distortion),
+        cam_from_rig=RigidTransform(torch.from_numpy(values.rotation), torch.from_numpy(translation)),
+    )
+    return rig
+
+
+def stack_snapshots(snapshots: Sequence[tuple[Observations, RigidTransform]]) -> tuple[Observations, RigidTransform]:
+    """Put snapshots together: (S, C, N) and (S,)."""
+    observations, poses = zip(*snapshots, strict=True)
+    uv, sigma, seen = (torch.cat([getattr(part, name) for part in observations]) for name in ("uv", "sigma", "seen"))
+    shake = None
+    if any(part.shake is not None for part in observations):
+        still = torch.zeros(1, observations[0].seen.shape[1], dtype=torch.float64)
+        parts = [still.expand(len(part.seen), -1) if part.shake is None else part.shake for part in observations]
+        shake = torch.cat(parts)
+    return Observations(uv, sigma, seen, shake), RigidTransform.cat(poses)

@@ -1,0 +1,343 @@
+"""`measurement_update.absorb` compiled for CPUs: one call a snapshot, without temporaries.
+
+`measurement_update_in_tensors` says the same in tensors, and is what this is tested against. K parameters a camera, M
+of the object, D = K C + M; S snapshots, each linearized as a rig of its own (`linearization_cpu.linearize_rig`). All
+states and equations have two rows: the best so far, and the one that is tried.
+"""
+
+# Compiled functions take their types from their arguments.
+# ruff: noqa: ANN001, ANN202
+# mypy: allow-untyped-defs, no-check-untyped-defs
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imgcal.estimation import blocks_of, linearize_rig
+from imgcal.geometry import kernels
+from imgcal.monitoring.rig_arrays import RigArrays
+from imgcal.monitoring.rig_error_cpu import times_basis, write_basis, write_error
+from renderers.compiling import njit
+
+Array = NDArray[np.float64]
+
+FOUND, NO_POSE, NOTHING_KNOWN, NO_MINIMUM = 0, 1, 2, 3
+"""How it ended: with a minimum; a snapshot does not determine its pose; a factorization failed; no minimum."""
+
+WHY_NOT = {
+    NO_POSE: "the observations do not determine the object's pose in every snapshot",
+    NOTHING_KNOWN: "these observations leave a rig that nothing is known of: labels may be wrong",
+    NO_MINIMUM: "found no minimum for these observations, expected one: labels may be wrong",
+}
+MOST_DAMPING = 1e8
+SLACK = 1e-6
+"""By how much the cost may rise in a step, relative: rounding."""
+DAMPED, STALLED = 1e-3, 10.0
+"""Damping up to which a step that is as short as the tolerance shows that this is the minimum; the second where lightly
+damped steps have failed: their direction is approximate where the belief is far away."""
+
+PATIENCE, LOOSER = 12, 1.5
+"""Iterations after which, and factor by which in each, the tolerance grows: where snapshots contradict a belief, steps
+are slow to become small."""
+
+
+@dataclass(frozen=True)
+class Minimum:
+    """What `absorb` found."""
+
+    status: int  # FOUND, ...
+    rig: RigArrays
+    rotation: Array  # (S, 3, 3) rig_from_object
+    centre: Array  # (S, 3) mm, the object's centroid in the rig
+    own: Array  # (M,) the object's offset
+    residual: Array  # (S, C, 2, N) pixels, predicted minus observed
+    cost: float
+    information: Array  # (D, D)
+    factor: Array  # (D, D) its lower Cholesky factor
+    camera: Array  # (S, C, K, K) what each snapshot brought: see `SnapshotInformation`
+    border: Array  # (S, M, D)
+    carried: Array  # (S, 6, D)
+    pull: Array  # (S, D)
+    from_rig: RigArrays  # where that is linearized
+    from_own: Array  # (M,)
+
+
+def absorb(
+    shared: tuple[Any, ...],
+    seen: tuple[Array, Array, Array],
+    known: tuple[RigArrays, Array, Array, Array, Array],
+    poses: tuple[Array, Array],
+    options: tuple[int, float, int, float, float, float, float, float],
+) -> Minimum:
+    """Find what is most probable after some snapshots.
+
+    Args:
+        shared: what `linearization_cpu` is given of all rigs alike: points and squared radii, and so on.
+        seen: pixels (S, C, 2, N), the roots of their weights (S, C, N), and by how much cameras shake (S, C): see
+            `linearization_cpu.linearize_rig`.
+        known: the rig, units (C, K) of its errors, offset (M,) of the object and its prior standard deviation (M,), and
+            the information (D, D) about both.
+        poses: first guess, rotation (S, 3, 3) and centre (S, 3).
+        options: code and threshold of the loss, iterations at most, tolerance, by how much the cost may rise,
+            the damping up to which a small step shows the minimum, that once a step has failed, and the greatest one.
+    """
+    uv = seen[0]
+    rig, unit, own, own_std, information = known
+    (count, cameras, _, fiducials), free = uv.shape, unit.shape[1]
+    size = len(own)
+    wide = cameras * free + size
+    rigs = tuple(np.stack((part, part)) for part in rig.parts)
+    states = (np.zeros((cameras, free)), *(np.stack((part, part)) for part in (*poses, own)))
+    blocks = (
+        np.empty((2, count, cameras, free, free)), np.empty((2, count, 1, 6, wide)), np.empty((2, count, 1, 6, 6)),
+        np.empty((2, count, size, wide)), np.empty((2, count, cameras, free)), np.empty((2, count, 1, 6)),
+        np.empty((2, count, size)), np.empty((2, count, 1, cameras, 2, fiducials)),
+    )  # fmt: skip
+    factor, gathered = np.empty((wide, wide)), np.empty((wide, wide))
+    brought = (np.empty((count, 6)), np.empty((count, wide)), np.empty((2, wide)))
+    best, status, cost = _absorb(
+        shared, seen, rig.parts, (unit, own, own_std, information), rigs, states, blocks,
+        (factor, gathered), brought, options,
+    )  # fmt: skip
+    last = 1 - best  # where the last step was taken from
+    return Minimum(
+        status=status,
+        rig=RigArrays(*(part[best] for part in rigs)),
+        rotation=states[1][best],
+        centre=states[2][best],
+        own=states[3][best],
+        residual=blocks[7][best, :, 0],
+        cost=cost,
+        information=gathered,
+        factor=factor,
+        camera=blocks[0][last],
+        border=blocks[3][last],
+        carried=blocks[1][last, :, 0],
+        pull=brought[1],
+        from_rig=RigArrays(*(part[last] for part in rigs)),
+        from_own=states[3][last],
+    )
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _absorb(shared, seen, known_rig, known, rigs, states, blocks, matrices, brought, options):
+    """Newton's method with damping where a step fails; see `measurement_update_in_tensors.update_in_tensors`."""
+    loss, threshold, most, tolerance, slack, light, stalled, most_damping = options
+    unit, _, _, prior = known
+    factor, gathered = matrices
+    half, pull, distance = brought
+    wide = len(prior)
+    step, right, poses = np.empty(wide), np.empty(wide), np.empty((len(half), 6))
+    damping, best = 0.0, 0
+    cost = _evaluate(shared, seen, known_rig, known, rigs, states, blocks, distance, 0, loss, threshold)
+    fresh = True
+    for iteration in range(most):
+        enough = tolerance * LOOSER ** max(0, iteration - PATIENCE)
+        b, t = best, 1 - best
+        if fresh:
+            status = _gather(unit, known, rigs, states, blocks, gathered, half, pull, b)
+            if status != 0:
+                return best, status, cost
+            fresh = False
+        for i in range(wide):
+            value = 0.0
+            for s in range(len(pull)):
+                value += pull[s, i]
+            for j in range(wide):
+                value -= prior[i, j] * distance[b, j]
+            right[i] = step[i] = value
+        if not _factorized(gathered, damping, factor):
+            return best, 2, cost
+        kernels.cholesky_solve(factor, step)
+        gain = 0.0
+        for i in range(wide):
+            gain += 0.5 * step[i] * right[i]
+        for s in range(len(half)):
+            for i in range(6):
+                gain += 0.5 * half[s, i] ** 2
+        _move(unit, rigs, states, blocks, half, step, poses, b, t)
+        trial = _evaluate(shared, seen, known_rig, known, rigs, states, blocks, distance, t, loss, threshold)
+        if trial <= cost + slack * max(1.0, cost):
+            done = gain <= enough and damping <= light
+            best, cost, fresh = t, trial, True
+            if done:
+                if damping > 0 and not _factorized(gathered, 0.0, factor):
+                    return best, 2, cost
+                for i in range(wide):
+                    for j in range(i):
+                        gathered[j, i] = gathered[i, j]
+                        factor[j, i] = 0.0
+                return best, 0, cost
+            damping = 0.0 if damping <= 1e-6 else damping / 8
+        else:
+            damping, light = max(8 * damping, 1e-4), stalled
+            if damping > most_damping:
+                break
+    return best, 3, cost
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _factorized(matrix, damping, factor):
+    """Write the lower Cholesky factor of a matrix (D, D) whose diagonal grows by a share; False where there is none."""
+    for i in range(len(matrix)):
+        for j in range(i + 1):
+            factor[i, j] = matrix[i, j]
+        factor[i, i] *= 1 + damping
+    return kernels.cholesky(factor)
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _evaluate(shared, seen, known_rig, known, rigs, states, blocks, distance, b, loss, threshold):
+    """Linearize all snapshots at row b, write the distance from what is known, and return the cost."""
+    uv, root_weight, shake = seen
+    unit, own0, own_std, prior = known
+    rotation, position, focal, principal, distortion = rigs
+    offset, turned, centre, own = states
+    camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual = blocks
+    row = (
+        camera[b], coupling[b], pose[b], border[b], camera_gradient[b], pose_gradient[b], own_gradient[b], residual[b],
+    )  # fmt: skip
+    cost = 0.0
+    for s in range(len(uv)):
+        given = shared + (  # noqa: RUF005 (numba knows no other way)
+            uv[s : s + 1], root_weight[s : s + 1], rotation[b], position[b], focal[b], principal[b], distortion[b],
+            unit, own_std,
+        )  # fmt: skip
+        state = (offset, turned[b, s : s + 1], centre[b, s : s + 1], own[b])
+        cost += linearize_rig(given, state, blocks_of(row, s), False, loss, threshold, shake[s : s + 1])
+        for i in range(len(own0)):
+            cost -= 0.5 * own[b, i] ** 2
+    write_error(rotation[b], position[b], focal[b], principal[b], distortion[b], known_rig, unit, distance[b])
+    first = unit.size
+    for i in range(len(own0)):
+        distance[b, first + i] = own[b, i] - own0[i]
+    for i in range(len(prior)):
+        value = 0.0
+        for j in range(len(prior)):
+            value += prior[i, j] * distance[b, j]
+        cost += 0.5 * value * distance[b, i]
+    return cost
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _gather(unit, known, rigs, states, blocks, gathered, half, pull, b):
+    """Take the poses out of row b, and sum up the information; 1 where a pose is not determined.
+
+    What each snapshot brought takes the place of its blocks: `camera`, `border`, and `coupling` (carried).
+    """
+    _, _, _, prior = known
+    rotation, position, _, _, _ = rigs
+    _, _, _, own = states
+    camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, _ = blocks
+    cameras, free = unit.shape
+    wide, size = len(prior), own.shape[1]
+    first_own = cameras * free
+    for i in range(wide):
+        for j in range(i + 1):
+            gathered[i, j] = prior[i, j]
+    basis = np.empty((cameras, 6, 3))
+    for c in range(cameras):
+        write_basis(rotation[b, c], position[b, c], unit[c], basis[c])
+    for s in range(len(pull)):
+        for c in range(cameras):
+            block = camera[b, s, c]
+            for i in range(free):
+                block[i, i] -= 1.0
+            for i in range(free):
+                times_basis(block[i], basis[c])
+            for j in range(free):
+                x, y, z = 0.0, 0.0, 0.0
+                for i in range(6):
+                    x += block[i, j] * basis[c, i, 0]
+                    y += block[i, j] * basis[c, i, 1]
+                    z += block[i, j] * basis[c, i, 2]
+                block[0, j], block[1, j], block[2, j] = x, y, z
+            times_basis(camera_gradient[b, s, c], basis[c])
+            at = c * free
+            for i in range(free):
+                pull[s, at + i] = -camera_gradient[b, s, c, i]
+                for j in range(i + 1):
+                    gathered[at + i, at + j] += block[i, j]
+            for i in range(6):
+                times_basis(coupling[b, s, 0, i, at : at + free], basis[c])
+            for i in range(size):
+                times_basis(border[b, s, i, at : at + free], basis[c])
+        for i in range(size):
+            border[b, s, i, first_own + i] -= 1.0
+            pull[s, first_own + i] = own[b, i] - own_gradient[b, s, i]
+            for j in range(first_own + i + 1):
+                gathered[first_own + i, j] += border[b, s, i, j]
+            for j in range(i):
+                border[b, s, j, first_own + i] = border[b, s, i, first_own + j]
+        if not kernels.cholesky(pose[b, s, 0]):
+            return 1
+        _take_pose_out(pose[b, s, 0], pose_gradient[b, s, 0], coupling[b, s, 0], half[s], pull[s])
+        kernels.subtract_gram(gathered, coupling[b, s, 0])
+    return 0
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _take_pose_out(lower, gradient, carried, half, pull):
+    """Solve by the factor (6, 6) of a pose for its gradient (6,) and its coupling (6, D); add what that pulls (D,)."""
+    for i in range(6):
+        value, inverse = gradient[i], 1 / lower[i, i]
+        for k in range(i):
+            value -= lower[i, k] * half[k]
+            for j in range(len(pull)):
+                carried[i, j] -= lower[i, k] * carried[k, j]
+        half[i] = value * inverse
+        for j in range(len(pull)):
+            carried[i, j] *= inverse
+            pull[j] += carried[i, j] * half[i]
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _move(unit, rigs, states, blocks, half, step, poses, b, t):
+    """Write row b plus a step to row t; poses follow."""
+    rotation, position, focal, principal, distortion = rigs
+    _, turned, centre, own = states
+    _, coupling, pose, _, _, _, _, _ = blocks
+    cameras, free = unit.shape
+    turn, left, vector = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    for c in range(cameras):
+        at = c * free
+        for i in range(3):
+            vector[i] = step[at + i] * unit[c, i]
+        kernels.exponential(vector, turn, left)
+        for i in range(3):
+            for j in range(3):
+                rotation[t, c, i, j] = (
+                    rotation[b, c, i, 0] * turn[j, 0]
+                    + rotation[b, c, i, 1] * turn[j, 1]
+                    + rotation[b, c, i, 2] * turn[j, 2]
+                )
+            position[t, c, i] = (
+                turn[i, 0] * position[b, c, 0] + turn[i, 1] * position[b, c, 1] + turn[i, 2] * position[b, c, 2]
+            ) + step[at + 3 + i] * unit[c, 3 + i]
+        for i in range(2):
+            focal[t, c, i] = focal[b, c, i] + step[at + 6 + i] * unit[c, 6 + i]
+            principal[t, c, i] = principal[b, c, i] + step[at + 8 + i] * unit[c, 8 + i]
+        for i in range(free - 10):
+            distortion[t, c, i] = distortion[b, c, i] + step[at + 10 + i] * unit[c, 10 + i]
+    for i in range(own.shape[1]):
+        own[t, i] = own[b, i] + step[cameras * free + i]
+    for s in range(len(half)):
+        carried, lower = coupling[b, s, 0], pose[b, s, 0]
+        for i in range(6):
+            value = half[s, i]
+            for j in range(len(step)):
+                value += carried[i, j] * step[j]
+            poses[s, i] = -value
+        for i in range(5, -1, -1):
+            for k in range(i + 1, 6):
+                poses[s, i] -= lower[k, i] * poses[s, k]
+            poses[s, i] /= lower[i, i]
+        away = max(1.0, np.sqrt(centre[b, s, 0] ** 2 + centre[b, s, 1] ** 2 + centre[b, s, 2] ** 2))
+        for i in range(3):
+            centre[t, s, i] = centre[b, s, i] + poses[s, 3 + i] * away
+        kernels.exponential(poses[s], turn, left)
+        kernels.multiply(turn, turned[b, s], turned[t, s])

@@ -1,0 +1,185 @@
+"""Cameras that have changed, nobody knows how yet: what was seen since then decides which kind of change it was."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from imgcal.estimation import displaced, error_between
+from imgcal.monitoring.change_test import CHANGES, LARGE, ChangeTest, change_of_errors, pixel_changes, spread_of
+from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, age_belief, widened
+from imgcal.monitoring.rig_filter import YOUNG_SECONDS
+from imgcal.types import CameraRig
+
+DECIDED = 5.0
+"""Log odds of a kind of change against every other, from which it is told ..."""
+ALONE, MIXED = 3.0, 15.0
+"""... against a change of all kinds at once, and of that against each: what is believed wrongly does no harm then."""
+JUDGED = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
+"""Numbers of snapshots since a change at which its kind is asked for."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """What happened to a camera."""
+
+    camera: int
+    since: int  # number of the first snapshot, counted from 0, that saw it from its new place
+    kind: str  # of `CHANGES`; "unknown" = not decided yet, or none of them alone
+    size: float  # rad, mm or pixels; nan where the kind is not known
+    sigma: float  # one standard deviation of it
+    decided: bool = False  # the last that will be said of it
+    evidence: float = math.nan  # chi-squared of its having stood still; nan = it was told that it moved
+
+
+@dataclass
+class PendingChange:
+    """What was believed before some cameras changed, and what has been seen since, in one chart."""
+
+    before: RigBelief
+    origin: RigBelief  # of the chart: rig and object where the later snapshots led, when they were last linearized
+    brought: Tensor  # (D, D)
+    weighted: Tensor  # (D,) pull at the origin
+    count: int  # snapshots
+    seconds: float
+    kinds: dict[int, str | None]  # of the cameras that changed; None = not decided
+
+    @property
+    def late(self) -> bool:
+        """Tell whether more snapshots are not worth waiting for."""
+        return self.count >= JUDGED[-1] or self.seconds > YOUNG_SECONDS
+
+    def distance(self, belief: RigBelief) -> Tensor:
+        """Error (D,) in the chart of what was believed at some time.
+
+        Cameras that changed are compared by their own parameters, so that a large change of one kind is of no other.
+        """
+        at = _distance(belief.rig, belief.object_offset, self.origin)
+        change, step = change_of_errors(belief.rig, belief.unit), self.origin.rig.local(belief.rig)
+        width = belief.rig.num_parameters
+        for camera in self.kinds:
+            at[camera * width : (camera + 1) * width] = -(change[camera] @ step[camera])
+        return at
+
+    @classmethod
+    def of(
+        cls, result: MeasurementUpdate, before: RigBelief, seconds: float, kinds: dict[int, str | None]
+    ) -> PendingChange:
+        """Begin with the snapshots that were absorbed together after it."""
+        brought = result.brought
+        origin = replace(result.belief, rig=brought.rig, object_offset=brought.object_offset)
+        return cls(before, origin, brought.information(), brought.pull.sum(0), len(brought), seconds, kinds)
+
+    @property
+    def due(self) -> bool:
+        """Tell whether the kind is to be asked for now."""
+        return self.late or self.count in JUDGED
+
+    def take(self, result: MeasurementUpdate, seconds: float) -> None:
+        """Add what a snapshot has brought."""
+        brought = result.brought
+        information = brought.information()
+        at = _distance(brought.rig, brought.object_offset, self.origin)
+        self.brought, self.weighted = self.brought + information, self.weighted + brought.pull[0] + information @ at
+        self.count, self.seconds = self.count + 1, self.seconds + seconds
+
+    def others(self, camera: int) -> dict[int, str | None]:
+        """The other cameras that changed, and how."""
+        return {other: kind for other, kind in self.kinds.items() if other != camera}
+
+    def test(self, walk: Tensor) -> ChangeTest:
+        """What the snapshots since the change say against what was believed before it.
+
+        Args:
+            walk: (C, K) standard deviation of an hour's drift.
+        """
+        before = self.before
+        known = age_belief(before, self.seconds, walk).information
+        pull = self.weighted - self.brought @ self.distance(before)
+        change = change_of_errors(before.rig, before.unit)
+        return ChangeTest.of(known, self.brought, pull, change, pixel_changes(before.rig))
+
+    def decided(self, test: ChangeTest, camera: int, last: bool) -> tuple[str | None, str | None] | None:
+        """Decide how a camera has changed.
+
+        Args:
+            test: see `test`.
+            camera: its number.
+            last: it is to be decided now.
+
+        Returns:
+            What is believed, None = any kind, and what is told, None = nothing; None = it cannot be told yet.
+        """
+        odds = {kind: test.odds({**self.others(camera), camera: kind}) for kind in (*CHANGES, None)}
+        best, second = sorted(odds, key=lambda kind: -odds[kind])[:2]
+        least = MIXED if best is None else ALONE if second is None else DECIDED
+        if odds[best] - odds[second] >= least:
+            return best, best
+        if not last:
+            return None
+        # Told as what it most probably is, and believed to be anything.
+        return None, max(CHANGES, key=lambda kind: odds[kind]) if self.late else None
+
+    def judged(
+        self, test: ChangeTest, changes: Mapping[int, Change], last: bool
+    ) -> tuple[tuple[Change, ...], dict[int, str | None]]:
+        """Decide of which kind open changes are, by camera, where that can be told, or it is time.
+
+        Returns:
+            What is told of them, and what is believed of the cameras that are decided.
+        """
+        told, kinds = [], dict[int, str | None]()
+        for camera, change in changes.items():
+            decided = self.decided(test, camera, last)
+            if decided is None:
+                continue
+            kinds[camera], kind = decided
+            size = (math.nan, math.nan) if kind is None else self.size(test, camera, kind)
+            scores = test.given(self.others(camera)).scores()
+            evidence = max(float(scores[name][camera]) for name in ([kind] if kind else CHANGES))
+            told.append(Change(camera, change.since, kind or "unknown", *size, decided=True, evidence=evidence))
+        return tuple(told), kinds
+
+    def size(self, test: ChangeTest, camera: int, kind: str) -> tuple[float, float]:
+        """How far a camera went, were it of this kind alone, and the standard deviation of that."""
+        change, covariance = test.given(self.others(camera)).jump(camera, kind)
+        size = float(change.norm())
+        along = change / max(size, 1e-30)
+        return size, float((along @ covariance @ along).clamp_min(0).sqrt())
+
+    def supposed(self, test: ChangeTest) -> tuple[RigBelief, RigBelief, Tensor]:
+        """Believe that cameras have changed in the `kinds` only.
+
+        What was believed is moved along with them first: a large turn is no small one times a number.
+
+        Returns:
+            What was believed before, what is believed now, and its information (D, D), both without any drift since.
+        """
+        step = torch.zeros_like(self.before.unit)
+        for camera, kind in self.kinds.items():
+            if kind is not None:
+                step[camera, CHANGES[kind]] = test.given(self.others(camera)).jump(camera, kind)[0]
+        first = free_cameras(replace(self.before, rig=self.before.rig.retract(step)), self.kinds)
+        information = first.information + self.brought
+        factor = torch.linalg.cholesky(information)
+        pull = first.information @ self.distance(first) + self.weighted
+        error = torch.cholesky_solve(pull[:, None], factor)[:, 0]
+        origin, wide = self.origin, first.unit.numel()
+        rig = displaced(origin.rig, error[:wide].view(first.unit.shape) * first.unit)
+        belief = replace(first, rig=rig, object_offset=origin.object_offset + error[wide:], factor=factor)
+        return first, belief, information
+
+
+def free_cameras(belief: RigBelief, changes: Mapping[int, str | None], jump: float = LARGE) -> RigBelief:
+    """Let cameras have changed in some way, None = in all ways, by so many pixels."""
+    return widened(belief, spread_of(changes, pixel_changes(belief.rig), jump).square())
+
+
+def _distance(rig: CameraRig, object_offset: Tensor, origin: RigBelief) -> Tensor:
+    """Error (D,) of a rig and an object in a chart."""
+    cameras = (error_between(rig, origin.rig) / origin.unit).flatten()
+    return torch.cat((cameras, object_offset - origin.object_offset))

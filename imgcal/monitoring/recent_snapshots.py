@@ -1,0 +1,301 @@
+"""The latest snapshots that a filter has absorbed, in a form that tells quickly whether a camera has changed since.
+
+All of them stand in one chart: errors of the rig in units, whose origin does not matter. What was known before any of
+them is what was known before the first one and what those between brought; when the filter has aged its belief, a new
+such base begins.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.errors import RefusedError
+from imgcal.estimation import displaced
+from imgcal.geometry import RigidTransform
+from imgcal.monitoring.change_test import CHANGES, ChangeTest, change_of_errors, pixel_changes
+from imgcal.monitoring.recent_screening import add_error, add_row, put, screen
+from imgcal.monitoring.rig_arrays import RigArrays
+from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, error_covariance
+from imgcal.monitoring.snapshot_information import SnapshotInformation, add_blocks
+from imgcal.types import CameraRig, Observations
+
+OLDEST = 64
+"""Snapshots within which a change must show: one second at 60 a second."""
+MOST_BASES = 8
+"""How often the belief may have aged within them."""
+SCREENED = np.array((2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64))
+"""Numbers of snapshots that are screened."""
+PARTS = np.array([(part.start, part.stop) for part in CHANGES.values()])
+
+
+@dataclass
+class _Base:
+    """What was known before a snapshot."""
+
+    number: int  # of the snapshot
+    information: Tensor  # (D, D)
+    weighted: Tensor  # (D,) information times the error of what was most probable
+    own: bool = False  # nobody else has these numbers
+
+
+@dataclass(frozen=True)
+class _Seen:
+    observations: Observations
+    rig_from_object: RigidTransform
+    seconds: float  # since the snapshot before
+
+
+class RecentSnapshots:
+    """A ring of the latest `OLDEST` snapshots."""
+
+    def __init__(self, belief: RigBelief, walk: Tensor) -> None:
+        """Begin with none.
+
+        Args:
+            belief: of the filter.
+            walk: (C, K) standard deviation of every value after an hour, at which it ages.
+        """
+        (cameras, free), wide = belief.unit.shape, len(belief.factor)
+        self.walk, self._belief = walk, belief
+        self._unit = belief.unit.numpy()
+        self._carried = np.zeros((OLDEST, 6, wide))
+        self._border = np.zeros((OLDEST, wide - cameras * free, wide))
+        self._weighted = np.zeros((OLDEST, wide))  # pull, as it would be at the chart's origin
+        self._ring = (self._carried, self._border, self._weighted)
+        blocks = (OLDEST + 1, cameras, free, free)
+        self._totals = (np.zeros(blocks), np.zeros(blocks))  # rounded by 10^-7 of a snapshot after a year
+        self._pixels = pixel_changes(belief.rig)
+        self._begin(belief.rig, belief.object_offset)
+
+    def _begin(self, rig: CameraRig, object_offset: Tensor) -> None:
+        """Begin with none, the chart's origin at a rig."""
+        self._seen: deque[_Seen] = deque()
+        self._bases: list[_Base] = []
+        self._next = 0  # number of the next snapshot
+        for total in self._totals:
+            total[0] = 0.0
+        self._aged = True  # the next snapshot needs a base
+        self._rig = RigArrays.of(rig)  # the last one of which the error was asked for ...
+        self._at = np.zeros_like(self._weighted[0])  # ... and that error
+        self._at[self._unit.size :] = object_offset.numpy()
+        self._change = change_of_errors(rig, torch.from_numpy(self._unit))
+
+    def __len__(self) -> int:
+        return len(self._seen)
+
+    def append(self, result: MeasurementUpdate, observations: Observations, seconds: float) -> None:
+        """Take a snapshot that has just been absorbed.
+
+        Args:
+            result: of the filter.
+            observations: (1, C, N).
+            seconds: since the snapshot before.
+        """
+        while len(self._seen) >= OLDEST or len(self._bases) >= MOST_BASES:
+            self._drop()
+        if self._aged or self._belief is not result.before:
+            before = self._error(result.before.arrays, result.before.object_offset)
+            information = result.before.information
+            self._bases.append(_Base(self._next, information, information @ before))
+            self._change = change_of_errors(result.before.rig, result.before.unit)
+        self._put(result.brought, 0, self._error(result.brought.arrays, result.brought.object_offset))
+        self._seen.append(_Seen(observations, result.rig_from_object, seconds))
+        self._follow(result.belief)
+        self._aged = False
+
+    def relinearized(self, result: MeasurementUpdate) -> None:
+        """Take the same snapshots, and any number before them, as they are where they lead together."""
+        brought, before, seen = result.brought, result.before, self._seen
+        self._begin(brought.rig, brought.object_offset)
+        origin = torch.from_numpy(self._at.copy())
+        information = before.information
+        weighted = information @ (origin + brought.distance_from(before.rig, before.object_offset))
+        first = len(brought) - len(seen)
+        if first:
+            earlier = brought.select(slice(0, first))
+            gained = earlier.information()
+            information, weighted = information + gained, weighted + earlier.pull.sum(0) + gained @ origin
+        self._bases = [_Base(0, information, weighted)]
+        for s, entry in enumerate(seen):
+            self._put(brought, first + s, origin)
+            self._seen.append(entry)
+        self._follow(result.belief)
+
+    def restarted(self, result: MeasurementUpdate, last: int) -> None:
+        """Forget all but the last snapshots, which were absorbed together."""
+        while len(self._seen) > last:
+            self._seen.popleft()
+        self.relinearized(result)
+
+    def began(self, result: MeasurementUpdate, observations: Observations, seconds: float) -> None:
+        """Forget all snapshots, and take one that another belief than the last one has absorbed."""
+        self.took([(observations, result.rig_from_object)], [seconds], result)
+
+    def took(
+        self,
+        snapshots: Sequence[tuple[Observations, RigidTransform]],
+        pauses: Sequence[float],
+        result: MeasurementUpdate,
+    ) -> None:
+        """Forget all snapshots, and take some that were absorbed together.
+
+        Args:
+            snapshots: observations (1, C, N) and poses (1,).
+            pauses: s before each of them.
+            result: what they taught.
+        """
+        self._seen = deque(_Seen(*snapshot, pause) for snapshot, pause in zip(snapshots, pauses, strict=True))
+        self.relinearized(result)
+
+    def rebased(self, belief: RigBelief, information: Tensor) -> None:
+        """Believe something else, of which these snapshots brought a part.
+
+        Args:
+            belief: what is believed now.
+            information: (D, D) of it, before it was aged.
+        """
+        at = self._follow(belief)
+        brought, weighted = self._sums(0, self._next)
+        self._bases = [_Base(self._next - len(self), information - brought, information @ at - weighted)]
+        self._aged = True
+
+    def snapshots(self, age: int) -> list[tuple[Observations, RigidTransform]]:
+        """The latest `age` ones."""
+        return [(entry.observations, entry.rig_from_object) for entry in list(self._seen)[-age:]]
+
+    def seconds(self, age: int) -> float:
+        """How long ago the snapshot before the latest `age` ones was."""
+        return sum(self.pauses(age))
+
+    def pauses(self, age: int) -> list[float]:
+        """Seconds before each of the latest `age` snapshots."""
+        return [entry.seconds for entry in list(self._seen)[-age:]]
+
+    def screened(self) -> NDArray[np.float64]:
+        """Score each camera since each of `SCREENED`: (ages, C); see `screen`."""
+        scores = np.empty((len(SCREENED), len(self._change)))
+        known = (self._at, self._change.numpy(), PARTS)
+        screen(self._ring, self._totals, self._next, len(self), *known, SCREENED, scores)
+        return scores
+
+    def test(self, age: int, aged: bool = True) -> ChangeTest:
+        """Test for changes before the latest `age` snapshots.
+
+        Args:
+            age: how many.
+            aged: all that the rig may have wandered since then may have happened then.
+
+        Raises:
+            RefusedError: nothing is known of the rig.
+        """
+        number = self._next - age
+        information, at = self._known(number)
+        brought, weighted = self._sums(number, self._next)
+        pull = weighted - brought @ at
+        variance = self.walk.square() * (self.seconds(age) / 3600)
+        if aged and bool(variance.any()):
+            covariance = torch.cholesky_inverse(_cholesky(information))
+            add_blocks(covariance, error_covariance(self._belief, variance))
+            information = torch.cholesky_inverse(_cholesky(covariance))
+        return ChangeTest.of(information, brought, pull, self._change, self._pixels)
+
+    def steady(self, age: int, camera: int, kind: str) -> float:
+        """Score of a change of a camera, all else taken to be known, without the snapshot that speaks most for it."""
+        number, part = self._next - age, CHANGES[kind]
+        _, at = self._known(number)
+        own, pull = [], []
+        row = slice(camera * self._unit.shape[1], (camera + 1) * self._unit.shape[1])
+        change = self._change[camera, :, part]
+        for k in range(number, self._next):
+            brought, weighted = self._sums(k, k + 1)
+            pull.append(change.mT @ (weighted - brought @ at)[row])
+            own.append(change.mT @ brought[row, row] @ change)
+        pulls, blocks = torch.stack(pull), torch.stack(own)
+        left, weight = pulls.sum(0) - pulls, blocks.sum(0) - blocks
+        weight = weight + 1e-9 * torch.diag_embed(blocks.sum(0).diagonal()).clamp_min(1e-30)
+        return float((left * torch.linalg.solve(weight, left[..., None])[..., 0]).sum(-1).min())
+
+    def belief_before(self, age: int) -> RigBelief:
+        """What was believed before the latest `age` snapshots.
+
+        Raises:
+            RefusedError: nothing was known of the rig.
+        """
+        information, at = self._known(self._next - age)
+        wide = self._unit.size
+        error = (at - torch.from_numpy(self._at))[:wide].view(self._unit.shape)
+        rig = displaced(self._belief.rig, error * self._belief.unit)
+        return replace(self._belief, rig=rig, object_offset=at[wide:], factor=_cholesky(information))
+
+    def brought(self, count: int) -> tuple[Tensor, Tensor]:
+        """Information (D, D) of the latest snapshots, and their pull (D,) at what is believed now."""
+        information, weighted = self._sums(self._next - count, self._next)
+        return information, weighted - information @ torch.from_numpy(self._at)
+
+    def _known(self, number: int) -> tuple[Tensor, Tensor]:
+        """Information (D, D) before a snapshot, and what was most probable (D,)."""
+        base = next(base for base in reversed(self._bases) if base.number <= number)
+        brought, weighted = self._sums(base.number, number)
+        information, weighted = base.information + brought, base.weighted + weighted
+        factor = _cholesky(information)
+        return information, torch.cholesky_solve(weighted[:, None], factor)[:, 0]
+
+    def _sums(self, first: int, last: int) -> tuple[Tensor, Tensor]:
+        """Information (D, D) and weighted errors (D,) of some snapshots."""
+        first = max(first, self._next - len(self))
+        rows = np.arange(first, last) % OLDEST
+        carried = torch.from_numpy(self._carried[rows].reshape(-1, self._at.size))
+        information = -(carried.mT @ carried)
+        total = self._totals[0]
+        add_blocks(information, torch.from_numpy(total[last % len(total)] - total[first % len(total)]))
+        wide = self._unit.size
+        if self._border.shape[1]:
+            border = torch.from_numpy(self._border[rows].sum(0))
+            information[wide:] += border
+            information[:wide, wide:] += border[:, :wide].mT
+        return information, torch.from_numpy(self._weighted[rows].sum(0))
+
+    def _put(self, brought: SnapshotInformation, number: int, at: Tensor) -> None:
+        """Write the numbers of one snapshot, linearized at an error, into the ring."""
+        parts = (brought.camera, brought.carried, brought.border, brought.pull)
+        put(self._ring, self._totals, self._next, tuple(part[number].numpy() for part in parts), at.numpy())
+        self._next += 1
+
+    def _drop(self) -> None:
+        """Forget the oldest snapshot: it becomes part of what was known before."""
+        base = self._bases[0]
+        if len(self._bases) > 1 and self._bases[1].number == base.number + 1:
+            self._bases.pop(0)
+        else:
+            if not base.own:  # the belief has the same numbers
+                base.information, base.own = base.information.clone(), True
+            add_row(self._ring, self._totals, base.number, base.information.numpy(), base.weighted.numpy())
+            base.number += 1
+        self._seen.popleft()
+
+    def _follow(self, belief: RigBelief) -> Tensor:
+        """Remember what is believed now, and return its error."""
+        self._belief = belief
+        return self._error(belief.arrays, belief.object_offset)
+
+    def _error(self, rig: RigArrays, object_offset: Tensor) -> Tensor:
+        """Error (D,) of a rig in the chart."""
+        wide = self._unit.size
+        add_error(rig.parts, self._rig.parts, self._unit, self._at[:wide].reshape(self._unit.shape))
+        self._rig = rig
+        self._at[wide:] = object_offset.numpy()
+        return torch.from_numpy(self._at.copy())
+
+
+def _cholesky(matrix: Tensor) -> Tensor:
+    factor, failed = torch.linalg.cholesky_ex(matrix)
+    if bool(failed):
+        raise RefusedError("estimation: these observations leave a rig that nothing is known of")
+    return factor

@@ -1,0 +1,176 @@
+"""What is known of a rig (`RigBelief`), what snapshots make of it (`MeasurementUpdate`), and what time does to it.
+
+Information is kept as its Cholesky factor about errors in which a motion of the whole rig is the same direction
+everywhere (`rig_error.py`), so that it says nothing about what no image shows, however often the estimate has moved
+meanwhile.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.errors import RefusedError
+from imgcal.estimation import Problem, lm_cpu, object_prior_std, step_by_error
+from imgcal.geometry import RigidTransform
+from imgcal.monitoring.measurement_update_cpu import NOTHING_KNOWN, WHY_NOT
+from imgcal.monitoring.rig_arrays import RigArrays
+from imgcal.monitoring.snapshot_information import SnapshotInformation, add_blocks
+from imgcal.types import CalibrationObject, CameraRig, DriftRate, RigPrior
+
+LEAST_STD = (1e-9,) * 3 + (1e-6,) * 3 + (1e-6,) * 4
+LEAST_COEFFICIENT = 1e-9
+"""Standard deviation (rad, mm, pixels, 1) of a value that is fixed: small, and not zero."""
+
+
+@dataclass(frozen=True)
+class ObjectArrays:
+    """What compiled loops are given of an object and of lenses."""
+
+    shared: tuple[NDArray[np.float64] | None, ...]  # see `linearization_cpu`
+    centroid: NDArray[np.float64]  # (3,) mm
+    own_std: NDArray[np.float64]  # (M,) prior standard deviation of the object's offset
+
+    @classmethod
+    def of(cls, obj: CalibrationObject, rig: CameraRig) -> ObjectArrays:
+        """Take an object, and the lenses of a rig."""
+        centroid = obj.points.mean(0)
+        own_std = obj.points.new_zeros(0) if obj.exact else object_prior_std(obj)
+        squared = None if obj.radius is None else obj.radius.double().square()
+        none = obj.points.new_zeros(0)
+        problem = Problem(none, none, obj.points - centroid, centroid, squared, rig, none)
+        return cls(lm_cpu.shared_given(problem), centroid.numpy(), own_std.numpy())
+
+
+@dataclass(frozen=True)
+class RigBelief:
+    """The most probable rig, and how surely it is known."""
+
+    rig: CameraRig  # without batch axes, float64
+    obj: CalibrationObject  # with its tolerances, as it was given
+    object_offset: Tensor  # (M,) in units of its prior standard deviation: what is known of it; M = 0 where it is exact
+    factor: Tensor  # (D, D) lower Cholesky factor of the information; D = K C + M
+    unit: Tensor  # (C, K) rad, mm, pixels, 1: of the cameras' errors
+
+    @classmethod
+    def of_prior(cls, rig: CameraRig, obj: CalibrationObject, prior_std: Tensor | None = None) -> RigBelief:
+        """What the factory says: `prior_std` (C, K), None = as the rig file has it."""
+        rig = rig.to(torch.float64)
+        std = (rig.prior or RigPrior()).std(rig) if prior_std is None else prior_std
+        least = torch.full((rig.num_parameters,), LEAST_COEFFICIENT, dtype=torch.float64)
+        least[: len(LEAST_STD)] = torch.tensor(LEAST_STD, dtype=torch.float64)
+        unit = std.double().clamp_min(least)
+        step = whitened(step_by_error(rig), unit)
+        own, wide = 0 if obj.exact else 3 * obj.num_fiducials + 1, rig.num_cameras * rig.num_parameters
+        information = torch.eye(wide + own, dtype=torch.float64)
+        add_blocks(information, step.mT @ step - torch.eye(rig.num_parameters, dtype=torch.float64))
+        return cls(rig, obj, rig.focal_length.new_zeros(own), cholesky_factor(information), unit)
+
+    @cached_property
+    def information(self) -> Tensor:
+        """Inverse covariance (D, D) of the errors in their units."""
+        return self.factor @ self.factor.mT
+
+    @cached_property
+    def arrays(self) -> RigArrays:
+        """The rig for compiled loops."""
+        return RigArrays.of(self.rig)
+
+    @cached_property
+    def half_log_determinant(self) -> float:
+        """Of the information."""
+        return float(np.log(self.factor.numpy().diagonal()).sum())
+
+    @cached_property
+    def constants(self) -> ObjectArrays:
+        """What compiled loops are given of the object and the lenses; the same of all beliefs about them."""
+        return ObjectArrays.of(self.obj, self.rig)
+
+    def covariance(self) -> Tensor:
+        """Joint covariance (K C, K C) of the cameras in the units and order of `CameraRig.parameter_names`."""
+        cameras, wide = self.rig.num_cameras, self.unit.numel()
+        covariance = torch.cholesky_inverse(self.factor)[:wide, :wide]
+        blocks = covariance.unflatten(0, (cameras, -1)).unflatten(-1, (cameras, -1))
+        step = step_by_error(self.rig) * self.unit[:, None, :]
+        return torch.einsum("cij,cjdk,dlk->cidl", step, blocks, step).reshape(wide, wide)
+
+    def std(self) -> Tensor:
+        """One standard deviation of every parameter: (C, K)."""
+        return self.covariance().diagonal().clamp_min(0).sqrt().view(self.unit.shape)
+
+    @property
+    def points_object(self) -> Tensor:
+        """The fiducials as they are known now: (N, 3) mm."""
+        if not len(self.object_offset):
+            return self.obj.points
+        offset = self.object_offset * object_prior_std(self.obj)
+        centroid = self.obj.points.mean(0)
+        return centroid + (self.obj.points - centroid) * (1 + offset[-1]) + offset[:-1].unflatten(0, (-1, 3))
+
+
+@dataclass(frozen=True)
+class MeasurementUpdate:
+    """What some snapshots have taught."""
+
+    belief: RigBelief
+    rig_from_object: RigidTransform  # (S,) the object's poses
+    residual: Tensor  # (S, C, N, 2) pixels, predicted minus observed; zero where not seen
+    chi2: float  # sum of squared whitened residuals (robust), and of the change in standard deviations of the belief
+    dof: int  # 2 observations - 6 snapshots: what chi2 is expected to be
+    evidence: float  # log probability of what was seen, up to what is the same for every belief before it (Laplace)
+    before: RigBelief  # what they were absorbed into
+    brought: SnapshotInformation  # what they say by themselves
+
+    def of_last(self) -> MeasurementUpdate:
+        """The same, with pose and residual of the last snapshot alone: (1,) and (1, C, N, 2)."""
+        return replace(self, rig_from_object=self.rig_from_object[-1:], residual=self.residual[-1:])
+
+
+def age_belief(belief: RigBelief, seconds: float, rate: DriftRate | Tensor) -> RigBelief:
+    """Know less of a rig after some time, over which every value took a random walk on its own.
+
+    Args:
+        belief: what was known.
+        seconds: how long ago.
+        rate: of the walks; or the standard deviation (C, K) of each after an hour.
+    """
+    if seconds <= 0:
+        return belief
+    walk = rate.std(belief.rig) if isinstance(rate, DriftRate) else rate
+    variance = walk.square() * (seconds / 3600)
+    return widened(belief, variance) if variance.any() else belief
+
+
+def widened(belief: RigBelief, variance: Tensor) -> RigBelief:
+    """Know less of some parameters: add variances (C, K), in the units and order of `CameraRig.parameter_names`."""
+    covariance = torch.cholesky_inverse(belief.factor)
+    add_blocks(covariance, error_covariance(belief, variance))
+    return replace(belief, factor=cholesky_factor(torch.cholesky_inverse(cholesky_factor(covariance))))
+
+
+def error_covariance(belief: RigBelief, variance: Tensor) -> Tensor:
+    """Covariance (C, K, K) of errors in units, of variances (C, K) of a camera's own parameters."""
+    error_by_step = torch.linalg.inv(step_by_error(belief.rig)) / belief.unit[:, :, None]
+    return error_by_step @ torch.diag_embed(variance) @ error_by_step.mT
+
+
+def cholesky_factor(matrix: Tensor) -> Tensor:
+    """Factorize what is positive definite but for rounding.
+
+    Raises:
+        RefusedError: it is not.
+    """
+    factor, failed = torch.linalg.cholesky_ex(matrix)
+    if bool(failed):
+        raise RefusedError(f"estimation: {WHY_NOT[NOTHING_KNOWN]}")
+    return factor
+
+
+def whitened(step: Tensor, unit: Tensor) -> Tensor:
+    """Whitened offsets by errors in units, of the derivative of a step by an error: (C, K, K)."""
+    return step * unit[:, None, :] / unit[:, :, None]

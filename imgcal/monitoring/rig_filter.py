@@ -1,0 +1,147 @@
+"""Follow a rig in constant memory: `RigFilter`. What is learnt from a snapshot: `measurement_update.py`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from imgcal.estimation import EstimationOptions
+from imgcal.geometry import RigidTransform
+from imgcal.monitoring.measurement_update import absorb, stack_snapshots
+from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, age_belief
+from imgcal.types import CalibrationObject, CameraRig, DriftRate, Observations
+
+TOGETHER = (*range(2, 17), 20, 25, 32, 40, 50, 64, 80, 100, 128)
+"""Numbers of snapshots that are absorbed together once there are as many."""
+MEMORY = TOGETHER[-1]
+YOUNG_SECONDS = 60.0
+"""Time over which a rig may be taken to stand still; what it wanders by then is far below the noise of a snapshot."""
+LEAST_SECONDS = 1.0
+"""Time that is worth an inversion of the information."""
+
+
+class RigFilter:
+    """Follows a rig, snapshot after snapshot, in constant memory.
+
+    The first snapshots are kept, and absorbed again together while their number grows: what was linearized far from the
+    truth is so no more.
+
+    Examples:
+        >>> import torch, imgcal
+        >>> from imgcal.synthesis import PhysicalDrift, simulate_truth
+        >>> factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+        >>> truth = simulate_truth(factory, obj, 5, torch.Generator().manual_seed(1), PhysicalDrift())
+        >>> follows, seen = RigFilter(factory, obj), torch.ones(1, 4, 8, dtype=torch.bool)
+        >>> for s in range(5):
+        ...     there = Observations(truth.uv[[s]], torch.full(seen.shape, 0.05), seen)
+        ...     result = follows.update(there, truth.rig_from_object[[s]], seconds=1 / 60)
+        >>> follows.belief.std()[0, 6] < 0.1 * 0.02 * factory.focal_length[0, 0]  # the factory knew it to 2 %
+        tensor(True)
+    """
+
+    def __init__(
+        self,
+        rig: CameraRig,
+        obj: CalibrationObject,
+        rate: DriftRate | None = None,
+        options: EstimationOptions = EstimationOptions(),
+        prior_std: Tensor | None = None,
+    ) -> None:
+        """Begin with the factory calibration.
+
+        Args:
+            rig: the factory calibration, without batch axes.
+            obj: the calibration object.
+            rate: how fast the rig wanders; None = as the rig says.
+            options: how to minimize.
+            prior_std: (C, K) how far the factory values may be off; None = as the rig says.
+        """
+        self.rate, self.options = rate or rig.drift_rate or DriftRate(), options
+        self.belief = RigBelief.of_prior(rig, obj, prior_std)
+        self.count = 0  # snapshots absorbed
+        self._young = True  # the first snapshots are still kept
+        self.pace = torch.ones_like(self.belief.unit)  # (C, K) times the rate at which values are believed to wander
+        self._first = self.belief
+        self._early: list[tuple[Observations, RigidTransform]] = []
+        self._span = self._waited = 0.0  # s, since the first snapshot; of it, what the belief has not aged by
+
+    @property
+    def walk(self) -> Tensor:
+        """How far every value is believed to wander in an hour, one standard deviation: (C, K)."""
+        return self.rate.std(self.belief.rig) * self.pace
+
+    @property
+    def young(self) -> bool:
+        """Tell whether the first snapshots are still kept, to be absorbed again."""
+        return self._young
+
+    @property
+    def waited(self) -> float:
+        """Time (s) by which the belief has not aged yet."""
+        return self._waited
+
+    def update(
+        self, observations: Observations, rig_from_object: RigidTransform, seconds: float = 0.0
+    ) -> MeasurementUpdate:
+        """Learn from a snapshot; where it is refused, nothing is learnt, and its time counts for the next one.
+
+        Args:
+            observations: (1, C, N).
+            rig_from_object: (1,) first guess of the object's pose.
+            seconds: since the update before.
+
+        Raises:
+            RefusedError: see `absorb`.
+        """
+        result = self.follow(observations, rig_from_object, seconds)
+        return self.relinearize() if self.due else result
+
+    def follow(
+        self, observations: Observations, rig_from_object: RigidTransform, seconds: float = 0.0
+    ) -> MeasurementUpdate:
+        """Do the work of `update`, and leave it to the caller to `relinearize` where that is `due`."""
+        passed = max(seconds, 0.0) if self.count else 0.0
+        self._span, self._waited = self._span + passed, self._waited + passed
+        due = self._waited if self._waited >= LEAST_SECONDS else 0.0
+        result = absorb(age_belief(self.belief, due, self.walk), observations, rig_from_object, self.options)
+        self.belief, self._waited, self.count = result.belief, self._waited - due, self.count + 1
+        still = self._span <= YOUNG_SECONDS or not any(vars(self.rate).values())  # a steady rig stands still for ever
+        self._young = self._young and len(self._early) < MEMORY and still
+        if self._young:
+            self._early.append((observations, result.rig_from_object))
+        else:
+            self._early.clear()
+        return result
+
+    @property
+    def due(self) -> bool:
+        """Tell whether the first snapshots are to be absorbed together now."""
+        return len(self._early) in TOGETHER
+
+    def relinearize(self) -> MeasurementUpdate:
+        """Absorb the first snapshots anew, all together; `rig_from_object` and `residual` are those of the last one."""
+        result = absorb(self._first, *stack_snapshots(self._early), self.options)
+        self.belief, self._waited = age_belief(result.belief, self._span, self.walk), 0.0
+        return replace(result.of_last(), belief=self.belief)
+
+    def restart(self, first: RigBelief, snapshots: Sequence[tuple[Observations, RigidTransform]]) -> MeasurementUpdate:
+        """Begin anew: with what was believed before some snapshots, and these.
+
+        Args:
+            first: what was believed before them.
+            snapshots: observations (1, C, N) and the object's pose (1,) of each.
+
+        Raises:
+            RefusedError: see `absorb`; the filter stays as it was.
+        """
+        result = absorb(first, *stack_snapshots(snapshots), self.options)
+        self.belief, self._first, self._early = result.belief, first, list(snapshots)
+        self._young, self._span, self._waited = True, 0.0, 0.0
+        return result
+
+    def suppose(self, first: RigBelief, belief: RigBelief) -> None:
+        """Hold other beliefs: before the first snapshots that are kept, and now."""
+        self._first, self.belief, self._waited = first, belief, 0.0

@@ -1,0 +1,166 @@
+"""Do cameras shake? A fan, a floor, a trigger that jitters: all that a camera sees in a snapshot is shifted alike.
+
+Such noise does not average out over the points of a snapshot. Taken for noise of each point by itself, it looks like
+cameras that move, over and over, and like a rig that is known better than it is.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections import deque
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.errors import RefusedError
+from imgcal.estimation import EstimationOptions
+from imgcal.geometry import RigidTransform
+from imgcal.monitoring.measurement_update import absorb, stack_snapshots
+from imgcal.monitoring.rig_belief import RigBelief
+from imgcal.types import Observations
+
+SHAKES = (0.15, 0.5, 1.5)
+"""Pixels, one standard deviation: by how much cameras are supposed to shake. What shakes by more is told as moved."""
+EVERY = 64
+"""Snapshots of which it is asked how much cameras shake."""
+OTHER = 2.0
+"""Factor between two variances that are told apart; 1.3 comes by chance."""
+LEAST_POINTS = 3
+"""That a camera sees, from which they can be shifted alike."""
+LEAST_SHIFTS, SMOOTH = 4, 0.7
+"""Snapshots that tell whether shifts follow each other smoothly, as a clock that is off would have it; and von
+Neumann's ratio (2 where each is drawn by itself) below which they do."""
+
+
+@dataclass(frozen=True)
+class Shaken:
+    """Some snapshots, if cameras shake."""
+
+    before: RigBelief  # what was believed before them
+    snapshots: list[tuple[Observations, RigidTransform]]
+    shake: Tensor  # (C,) px
+    evidence: float  # log probability, to compare with that of `MeasurementUpdate`
+
+
+def shaken(
+    before: RigBelief,
+    snapshots: Sequence[tuple[Observations, RigidTransform]],
+    cameras: Collection[int],
+    options: EstimationOptions,
+) -> Shaken | None:
+    """Suppose that cameras have shaken in some snapshots: all of them, or some, and nothing has moved.
+
+    Args:
+        before: what was believed before them.
+        snapshots: observations (1, C, N) and the object's pose (1,) of each.
+        cameras: some that may shake while others do not.
+        options: how to minimize.
+
+    Returns:
+        The most probable of these; None = none explains the snapshots.
+    """
+    observations, poses = stack_snapshots(list(snapshots))
+    count, total = observations.seen.shape[:2]
+    known = torch.zeros(count, total, dtype=torch.float64) if observations.shake is None else observations.shake
+    best: tuple[float, Tensor, Tensor] | None = None
+    sets = dict.fromkeys((tuple(range(total)), tuple(sorted(cameras)) or tuple(range(total))))
+    for some in sets:
+        for size in SHAKES:
+            shake = known.clone()
+            shake[:, list(some)] = shake[:, list(some)].clamp_min(size)
+            with contextlib.suppress(RefusedError):
+                result = absorb(before, replace(observations, shake=shake), poses, options)
+                if best is None or result.evidence > best[0]:
+                    best = result.evidence, shake, result.residual
+    if best is None:
+        return None
+    evidence, shake, residual = best
+    if _smooth(shared_shifts(observations, residual)[0][:, shake[-1].numpy() > 0]):
+        return None
+    again = [(replace(one, shake=shake[s : s + 1]), pose) for s, (one, pose) in enumerate(snapshots)]
+    return Shaken(before, again, shake[-1], evidence - math.log(len(sets) * len(SHAKES)))
+
+
+def shared_shifts(observations: Observations, residual: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """By how much all that a camera sees in a snapshot is off, and how much of that noise makes.
+
+    Args:
+        observations: (S, C, N).
+        residual: (S, C, N, 2) pixels.
+
+    Returns:
+        Weighted means (S, C, 2) of the residuals, and the variance (S, C) that noise gives each of their axes.
+    """
+    weight = np.where(observations.seen.numpy(), observations.sigma.numpy() ** -2.0, 0.0)
+    total = np.maximum(weight.sum(-1), 1e-12)
+    return np.einsum("scn,scni->sci", weight, residual.numpy()) / total[..., None], 1 / total
+
+
+def _smooth(shifts: NDArray[np.float64]) -> bool:
+    """Tell whether shifts (S, C, 2) follow each other smoothly."""
+    if len(shifts) < LEAST_SHIFTS:
+        return False
+    about = np.square(shifts - shifts.mean(0)).sum()
+    return bool(np.square(np.diff(shifts, axis=0)).sum() < SMOOTH * about)
+
+
+@dataclass
+class ShakeLevel:
+    """By how much each camera shakes, followed by what single snapshots leave.
+
+    Examples:
+        >>> level = ShakeLevel(2)
+        >>> level.shake
+        tensor([0., 0.], dtype=torch.float64)
+    """
+
+    cameras: int
+    shake: Tensor = field(init=False)  # (C,) px, one standard deviation of each axis
+    latest: deque[NDArray[np.float64]] = field(default_factory=lambda: deque(maxlen=EVERY))  # (3, C): see `take`
+
+    def __post_init__(self) -> None:
+        """Begin with cameras that stand still."""
+        self.shake = torch.zeros(self.cameras, dtype=torch.float64)
+
+    def of(self, observations: Observations) -> Observations:
+        """Observations (1, C, N) with what is known of it."""
+        return replace(observations, shake=self.shake[None]) if bool(self.shake.any()) else observations
+
+    def believe(self, shake: Tensor) -> None:
+        """Begin anew with what has been found out otherwise: (C,) pixels."""
+        self.shake = shake
+        self.latest.clear()
+
+    def take(self, observations: Observations, residual: Tensor) -> None:
+        """Take what a snapshot that nobody doubts has left: (1, C, N) and pixels (1, C, N, 2)."""
+        (shift,), (variance,) = shared_shifts(observations, residual)
+        both = np.concatenate((shift.T, variance[None]))
+        both[:, observations.seen[0].sum(1).numpy() < LEAST_POINTS] = np.nan
+        self.latest.append(both)
+        if len(self.latest) == EVERY:
+            self._ask()
+
+    def _ask(self) -> None:
+        """Ask how large shifts are against what noise makes of them."""
+        known = np.stack(self.latest)
+        self.latest.clear()
+        often = np.isfinite(known[:, 0]).sum(0) > EVERY // 2
+        if not often.any():
+            return
+        found, expected = np.full((2, self.cameras), np.nan)
+        # The mean square of two coordinates is exponential; where the object is moved takes some of the shifts. What
+        # stays the same is no shaking.
+        free = max(1 - 1.5 / self.cameras, 0.25)
+        shifts = known[:, :2, often] - np.nanmedian(known[:, :2, often], axis=0)
+        found[often] = np.nanmedian(np.square(shifts).mean(1), axis=0) / (math.log(2) * free)
+        expected[often] = np.nanmedian(known[:, 2, often], axis=0)
+        before = self.shake.numpy()
+        ratio = found / (expected + before**2)
+        other = often & ((ratio > OTHER) | (ratio < 1 / OTHER))
+        variance = np.where(found > OTHER * expected, found - expected, 0.0)
+        self.shake = torch.from_numpy(np.where(other, np.sqrt(np.maximum(variance, 0.0)), before))

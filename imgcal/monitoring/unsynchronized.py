@@ -1,0 +1,98 @@
+"""Does a camera that stands where it was see the object at moments of its own? Then it sees it elsewhere each time.
+
+A camera whose clock is off by more than anybody can say how the object moves, or whose snapshots are too far apart for
+that, is supposed to be where it was, and to see the object in a pose of its own in every snapshot. One change of the
+camera explains one such pose as well, and not several: two or three snapshots tell, at any rate and for any slip.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from imgcal.estimation import EstimationOptions
+from imgcal.geometry import RigidTransform, rotation_from_vector, vector_from_rotation
+from imgcal.monitoring.measurement_update import absorb
+from imgcal.monitoring.rig_belief import RigBelief
+from imgcal.types import Observations
+
+ELSEWHERE = (0.2,) * 3 + (50.0,) * 3
+"""Standard deviations of the pose (rad, mm) in which such a camera sees the object, about that of the others."""
+NUDGE = (1e-5,) * 3 + (1e-3,) * 3
+"""By which a pose is changed for derivatives (rad, mm)."""
+
+
+def unsynchronized_evidence(
+    before: RigBelief,
+    observations: Observations,
+    rig_from_object: RigidTransform,
+    cameras: Collection[int],
+    options: EstimationOptions,
+) -> float:
+    """Log probability of snapshots in which some cameras see the object at moments of their own.
+
+    Args:
+        before: what was believed before them.
+        observations: (S, C, N).
+        rig_from_object: (S,) poses of the object, as most cameras see it.
+        cameras: those with moments of their own, each.
+        options: how to minimize.
+
+    Returns:
+        What is comparable with `MeasurementUpdate.evidence` of the same snapshots.
+
+    Raises:
+        RefusedError: the other cameras, or one of these, do not determine poses.
+    """
+    result = absorb(before, without(observations, cameras), rig_from_object, options)
+    poses, evidence = result.rig_from_object, result.evidence
+    spread = torch.tensor(ELSEWHERE, dtype=torch.float64)
+    others = _pose_information(result.belief, without(observations, cameras), poses)
+    every = _pose_information(result.belief, observations, poses)
+    evidence += 0.5 * float((torch.logdet(every) - torch.logdet(others)).sum())  # `absorb` leaves out what all share
+    for camera in cameras:
+        rest = [other for other in range(observations.seen.shape[1]) if other != camera]
+        alone = without(observations, rest)
+        rows = alone.seen[:, camera].any(-1).nonzero()[:, 0]
+        if not len(rows):
+            continue
+        alone = alone.of_snapshots(rows)
+        there = poses[rows]
+        own = absorb(result.belief, alone, there, options)
+        information = _pose_information(own.belief, alone, own.rig_from_object)
+        turn = vector_from_rotation(own.rig_from_object.rotation @ there.rotation.mT)
+        way = torch.cat((turn, own.rig_from_object.translation - there.translation), -1)
+        scatter = spread.square().diag() + torch.linalg.inv(information)  # of the pose about that of the others
+        squared = (way * torch.linalg.solve(scatter, way[..., None])[..., 0]).sum(-1)
+        evidence += own.evidence - 0.5 * float((torch.logdet(scatter) + torch.logdet(information) + squared).sum())
+    return evidence
+
+
+def without(observations: Observations, cameras: Collection[int]) -> Observations:
+    """The same, some cameras having seen nothing."""
+    seen = observations.seen.clone()
+    seen[:, list(cameras)] = False
+    return replace(observations, seen=seen)
+
+
+def _pose_information(belief: RigBelief, observations: Observations, rig_from_object: RigidTransform) -> Tensor:
+    """Information (S, 6, 6) of snapshots about the object's poses, as left rotation and translation (rad, mm)."""
+    nudge = torch.tensor(NUDGE, dtype=torch.float64).diag()
+    turned, shifted = rotation_from_vector(nudge[:, :3]), nudge[:, 3:]
+
+    def image(rotation: Tensor, translation: Tensor) -> Tensor:
+        pose = RigidTransform(rotation, translation)
+        rig = belief.rig.expand(len(translation))
+        return rig.project_values(pose.apply(belief.points_object), belief.obj.radius).uv
+
+    start = image(rig_from_object.rotation, rig_from_object.translation)
+    columns = [
+        (image(turned[k] @ rig_from_object.rotation, rig_from_object.translation + shifted[k]) - start) / NUDGE[k]
+        for k in range(len(NUDGE))
+    ]
+    weight = torch.where(observations.seen, 1 / observations.sigma, 0.0)[..., None, None]
+    jacobian = torch.nan_to_num(torch.stack(columns, -1)) * weight  # (S, C, N, 2, 6)
+    return torch.einsum("scnij,scnik->sjk", jacobian, jacobian)

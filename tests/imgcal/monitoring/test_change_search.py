@@ -1,0 +1,35 @@
+"""Which cameras have changed, and when: asked of the latest snapshots."""
+
+import math
+
+from imgcal.monitoring.change_search import SIGNIFICANT, changed_before, changed_cameras, likeliest_age, surest
+from scripts.benchmarks.rig_streams import Bump
+from tests.imgcal.monitoring.followed import followed
+
+TURN = math.radians(0.1)
+
+
+def test_a_steady_rig_has_not_changed() -> None:
+    steady = followed(40)
+    assert changed_before(steady.recent, steady.filter.count) is None
+
+
+def test_a_camera_that_was_turned_is_found_with_its_moment() -> None:
+    turned = followed(46, bumps=[Bump(40, 2, "rotation", TURN)])
+    age = changed_before(turned.recent, turned.filter.count)
+    assert age is not None
+    test = turned.recent.test(age)
+    assert surest(test) == 2
+    assert likeliest_age(turned.recent, 2, age) == 6
+    free, evidence = changed_cameras(turned.recent.test(6), {})
+    assert free == {2: None} and evidence[2] >= SIGNIFICANT
+
+
+def test_two_cameras_are_found_and_what_is_known_is_not_found_again() -> None:
+    turned = followed(46, bumps=[Bump(40, 1, "rotation", TURN), Bump(40, 3, "position", 1.0)])
+    test = turned.recent.test(6)
+    free, evidence = changed_cameras(test, {})
+    assert free.keys() == evidence.keys() == {1, 3}
+    free, evidence = changed_cameras(test, {1: "rotation"})
+    assert free == {1: "rotation", 3: None} and evidence.keys() == {3}
+    assert surest(test, known={1}) == 3

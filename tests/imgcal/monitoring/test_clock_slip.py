@@ -1,0 +1,50 @@
+"""A clock that slips and a camera that moves are told apart, where the object moves."""
+
+import math
+
+import pytest
+
+import imgcal
+from imgcal.estimation import initial_pose
+from imgcal.monitoring import RigFilter, RigMonitor
+from scripts.benchmarks.rig_streams import Bump, Conditions, Slip, Stream
+
+BEFORE = 40
+
+
+def told(**happened) -> tuple[list, list]:
+    """Follow a rig until something is told: changes, and slips."""
+    stream = Stream(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), 5, Conditions(labelled=True), **happened)
+    monitor, pose = RigMonitor(RigFilter(stream.factory, stream.obj)), None
+    seen, _ = stream.labelled(0, BEFORE + 30)
+    for number in range(BEFORE + 30):
+        observations = seen.of_snapshots([number])
+        pose = initial_pose(observations, monitor.filter.belief.rig, stream.obj) if pose is None else pose
+        result, changes = monitor.update(observations, pose, 1 / 60)
+        pose = result.rig_from_object
+        if changes or monitor.slips:
+            return list(changes), list(monitor.slips)
+    return [], []
+
+
+@pytest.mark.parametrize("late", [0.002, -0.01, 0.0167])
+def test_a_slip_is_told_with_its_camera_and_its_size(late: float) -> None:
+    changes, (slip,) = told(slips=[Slip(BEFORE, 2, late)])
+    assert changes == []
+    assert slip.camera == 2
+    assert slip.seconds == pytest.approx(late, abs=max(5 * slip.sigma, 2e-4))
+    assert abs(slip.since - BEFORE) <= 1
+    assert slip.odds > 0
+
+
+@pytest.mark.parametrize(
+    ("kind", "size"), [("rotation", math.radians(0.1)), ("position", 1.0), ("principal_point", 1.0)]
+)
+def test_a_move_while_the_object_moves_is_no_slip(kind: str, size: float) -> None:
+    changes, slips = told(bumps=[Bump(BEFORE, 2, kind, size)])
+    assert slips == []
+    assert [change.camera for change in changes] == [2]
+
+
+def test_nothing_is_told_of_a_rig_that_stands_still() -> None:
+    assert told() == ([], [])

@@ -1,0 +1,124 @@
+"""The object changes while the rig stands still: no camera is blamed, and the new shape is learnt."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+import imgcal
+from imgcal.estimation import EstimationOptions
+from imgcal.monitoring import SHAPE, RigBelief, RigFilter, RigMonitor, absorb, object_change
+from imgcal.synthesis import PhysicalDrift, simulate_truth
+from imgcal.types import Observations
+from renderers import palette
+
+NOISE = 0.1
+
+
+@pytest.mark.parametrize("fiducial", [2, None])
+@pytest.mark.parametrize("tolerance", [0.0, 0.02])
+def test_a_change_of_the_object_is_told_and_learnt(fiducial: int | None, tolerance: float) -> None:
+    factory, obj, generator = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), torch.Generator().manual_seed(3)
+    if tolerance:
+        obj = replace(obj, tolerance=torch.full((8,), tolerance, dtype=torch.float64), scale_tolerance=1e-4)
+    truth = simulate_truth(factory, obj, 60, generator, PhysicalDrift())
+    monitor, points, told, found = RigMonitor(RigFilter(factory, obj)), obj.points.clone(), [], None
+    for s in range(60):
+        if s == 45 and fiducial is not None:
+            points[fiducial] += torch.tensor([0.6, -0.5, 0.6])
+        elif s == 45:
+            points = points.mean(0) + 1.01 * (points - points.mean(0))
+        image = truth.rig.expand(1).project(truth.rig_from_object[s : s + 1].apply(points))
+        uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
+        there = Observations(uv, torch.full(uv.shape[:-1], NOISE, dtype=torch.float64), image.visible)
+        _, changes = monitor.update(there, truth.rig_from_object[s : s + 1], 1 / 60)
+        told += changes
+        found = monitor.object_change or found
+    assert told == []
+    assert found is not None
+    assert (found.fiducial, found.since) == (fiducial, 45)
+    assert abs(found.size - (0.01 if fiducial is None else 0.985)) < 5 * found.sigma
+    off = monitor.filter.belief.points_object - points
+    assert float((off - off.mean(0)).norm(dim=-1).max()) < 0.1
+
+
+@pytest.mark.parametrize(("seed", "spread"), [(1, 1.0), (2, 1.0), (3, 4.0)])
+def test_another_object_of_the_same_design_is_told_as_that_and_no_camera_is_blamed(seed: int, spread: float) -> None:
+    factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+    generator = torch.Generator().manual_seed(seed)
+    truth = simulate_truth(factory, obj, 40, generator, PhysicalDrift())
+    other = obj.points + spread * torch.randn(8, 3, generator=generator, dtype=torch.float64)
+    monitor, told, found = RigMonitor(RigFilter(factory, obj)), [], []
+    for s in range(40):
+        image = truth.rig.expand(1).project(truth.rig_from_object[s : s + 1].apply(other if s >= 30 else obj.points))
+        uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
+        there = Observations(uv, torch.full(uv.shape[:-1], NOISE, dtype=torch.float64), image.visible)
+        told += monitor.update(there, truth.rig_from_object[s : s + 1], 1 / 60)[1]
+        found += [] if monitor.object_change is None else [monitor.object_change]
+    assert told == []
+    assert found[0].fiducial == SHAPE
+    assert 28 <= found[0].since <= 33
+    assert found[0].size == pytest.approx(_apart(obj.points, other), rel=0.3)
+    assert _apart(monitor.filter.belief.points_object, other) < 0.1
+
+
+def _apart(points: torch.Tensor, others: torch.Tensor) -> float:
+    """RMS distance, a rigid motion taken out."""
+    centred, target = points - points.mean(0), others - others.mean(0)
+    u, _, vh = torch.linalg.svd(centred.mT @ target)
+    turned = centred @ u @ torch.diag(torch.tensor([1.0, 1.0, float(torch.det(u @ vh))]).double()) @ vh
+    return float((turned - target).norm(dim=-1).square().mean().sqrt())
+
+
+def test_a_fiducial_that_never_was_where_the_file_says_is_told() -> None:
+    factory, obj, generator = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), torch.Generator().manual_seed(8)
+    truth, points = simulate_truth(factory, obj, 16, generator, PhysicalDrift()), obj.points.clone()
+    points[5] += torch.tensor([0.6, -0.5, 0.6])
+    monitor, found, told = RigMonitor(RigFilter(factory, obj)), [], []
+    for s in range(16):
+        image = truth.rig.expand(1).project(truth.rig_from_object[s : s + 1].apply(points))
+        uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
+        there = Observations(uv, torch.full(uv.shape[:-1], NOISE, dtype=torch.float64), image.visible)
+        told += monitor.update(there, truth.rig_from_object[s : s + 1], 1 / 60)[1]
+        found += [] if monitor.object_change is None else [monitor.object_change]
+    assert told == []
+    assert [(change.fiducial, change.since) for change in found] == [(5, 0)]
+    assert abs(found[0].size - 0.985) < 5 * found[0].sigma
+
+
+@pytest.mark.parametrize("seed", [2, 4, 6])
+def test_an_object_that_never_was_as_its_file_says_is_told_however_it_is_turned(seed: int) -> None:
+    factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+    generator = torch.Generator().manual_seed(seed)
+    truth = simulate_truth(factory, obj, 16, generator, PhysicalDrift())
+    other = obj.points + 0.15 * torch.randn(8, 3, generator=generator, dtype=torch.float64)
+    monitor, found = RigMonitor(RigFilter(factory, obj)), []
+    for s in range(16):
+        image = truth.rig.expand(1).project(truth.rig_from_object[s : s + 1].apply(other))
+        uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
+        there = Observations(uv, torch.full(uv.shape[:-1], NOISE, dtype=torch.float64), image.visible)
+        monitor.update(there, truth.rig_from_object[s : s + 1], 1 / 60)
+        found += [] if monitor.object_change is None else [monitor.object_change]
+    assert [(change.fiducial, change.since) for change in found] == [(SHAPE, 0)]
+    assert found[0].size == pytest.approx(_apart(obj.points, other), abs=5 * found[0].sigma)
+
+
+def test_few_questions_are_asked_of_a_print(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig, generator = imgcal.load_rig("T4"), torch.Generator().manual_seed(3)
+    across = torch.arange(12.0, dtype=torch.float64)
+    points = torch.stack(torch.meshgrid(across * 20, across * 15, indexing="ij"), -1).flatten(0, 1)
+    obj = imgcal.CalibrationObject(torch.nn.functional.pad(points, (0, 1)), palette(len(points)).double())
+    truth, asked = simulate_truth(rig, obj, 3, generator, PhysicalDrift()), []
+
+    def noted(belief: RigBelief, fiducial: int | None, by: float) -> RigBelief:
+        asked.append(fiducial)
+        return belief  # with more than 400 values of the object, an answer takes seconds
+
+    monkeypatch.setattr(object_change, "free_object", noted)
+    before = RigFilter(rig, obj).belief
+    seen = torch.ones(1, *truth.uv.shape[1:-1], dtype=torch.bool)
+    there = Observations(truth.uv[:1], torch.full(seen.shape, NOISE, dtype=torch.float64), seen)
+    pose = truth.rig_from_object[:1]
+    known = absorb(before, there, pose)
+    object_change.changed_object(before, [(there, pose)], EstimationOptions(), known, 1.0)
+    assert asked == [None]

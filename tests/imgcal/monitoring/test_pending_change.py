@@ -1,0 +1,59 @@
+"""What was seen since a camera changed decides how it changed, and how far."""
+
+import torch
+
+import imgcal
+from imgcal.geometry import RigidTransform
+from imgcal.monitoring import CHANGES, MeasurementUpdate, RigBelief, absorb
+from imgcal.monitoring.pending_change import PendingChange, free_cameras
+from imgcal.synthesis import PhysicalDrift, simulate_truth
+from imgcal.types import CameraRig, Observations
+
+NOISE, ZOOM = 0.1, 10.0
+
+
+def zoomed() -> tuple[RigBelief, MeasurementUpdate, CameraRig]:
+    """What was believed before a focal length changed, what 8 snapshots taught after it, and the rig then."""
+    factory, obj, generator = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), torch.Generator().manual_seed(2)
+    truth = simulate_truth(factory, obj, 32, generator, PhysicalDrift())
+    step = torch.zeros(4, 15, dtype=torch.float64)
+    step[1, CHANGES["focal_length"]] = ZOOM / 2**0.5
+    shift = torch.tensor([100.0, 60.0, 80.0]) * torch.randn(32, 3, generator=generator, dtype=torch.float64)
+    carried = RigidTransform(truth.rig_from_object.rotation, truth.rig_from_object.translation + shift)
+    results, belief = [], RigBelief.of_prior(factory.to(torch.float64), obj)
+    for rig, part in ((truth.rig, slice(0, 24)), (truth.rig.retract(step), slice(24, 32))):
+        poses = carried[part]
+        image = rig.expand(len(poses.translation)).project(poses.apply(obj.points))
+        uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
+        seen = Observations(uv, torch.full(uv.shape[:-1], NOISE, dtype=torch.float64), image.visible)
+        results.append(absorb(belief, seen, poses))
+        belief = free_cameras(results[0].belief, {1: None})
+    return results[0].belief, results[1], truth.rig.retract(step)
+
+
+def test_the_kind_the_size_and_what_is_believed_then() -> None:
+    before, result, rig = zoomed()
+    still = torch.zeros_like(before.unit)
+    since = PendingChange.of(result, before, 0.0, {1: None})
+    assert (since.count, since.due, since.late) == (8, True, False)
+    test = since.test(still)
+    assert since.decided(test, 1, last=False) == ("focal_length", "focal_length")
+    size, sigma = since.size(test, 1, "focal_length")
+    assert abs(size - ZOOM) < 4 * sigma < ZOOM
+    since.kinds[1] = "focal_length"
+    first, belief, information = since.supposed(test)
+    assert torch.allclose(information, belief.factor @ belief.factor.mT)
+    error = belief.rig.local(rig).flatten()
+    assert 0.4 < float(error @ torch.linalg.solve(belief.covariance(), error)) / len(error) < 1.8
+    assert bool((belief.std()[1, :6] <= before.std()[1, :6] * 1.001).all())
+    assert float((first.rig.focal_length - before.rig.focal_length)[1].norm()) > 0.5 * ZOOM
+
+
+def test_a_camera_that_is_let_free_may_be_anywhere_and_no_other() -> None:
+    before, _, _ = zoomed()
+    free, turned = free_cameras(before, {2: None}).std(), free_cameras(before, {2: "rotation"}).std()
+    others = [0, 1, 3]
+    torch.testing.assert_close(free[others], before.std()[others], rtol=1e-4, atol=1e-9)
+    assert bool((free[2] > before.std()[2]).all())
+    assert bool((turned[2, :3] > 2 * before.std()[2, :3]).all())
+    torch.testing.assert_close(turned[2, 3:], before.std()[2, 3:], rtol=1e-4, atol=1e-9)

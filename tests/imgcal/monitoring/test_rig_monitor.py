@@ -1,0 +1,205 @@
+"""A camera is bumped while the rig is in use: which, when, how, how far; and the others stay known."""
+
+import contextlib
+import math
+
+import pytest
+import torch
+
+import imgcal
+from imgcal.errors import RefusedError
+from imgcal.geometry import RigidTransform
+from imgcal.monitoring import CHANGES, Change, RigFilter, RigMonitor
+from imgcal.monitoring.change_search import SIGNIFICANT
+from imgcal.synthesis import PhysicalDrift, simulate_truth
+from imgcal.types import CameraRig, Observations
+from scripts.benchmarks.rig_streams import Bump, Conditions, Stream
+
+NOISE = 0.1
+SIZES = {"rotation": math.radians(0.1), "position": 1.0, "focal_length": 3.0, "principal_point": 1.0}
+
+
+def followed(bumps: dict[int, dict[int, str]], count: int, seed: int) -> tuple[RigMonitor, CameraRig, list[Change]]:
+    """Follow a rig of which cameras are bumped before some snapshots: {snapshot: {camera: kind}}."""
+    factory, obj, generator = (
+        imgcal.load_rig("T4"),
+        imgcal.load_object("asymmetric8"),
+        torch.Generator().manual_seed(seed),
+    )
+    truth = simulate_truth(factory, obj, count, generator, PhysicalDrift())
+    monitor, rig, told = RigMonitor(RigFilter(factory, obj)), truth.rig, []
+    for s in range(count):
+        for camera, kind in bumps.get(s, {}).items():
+            part, step = CHANGES[kind], torch.zeros(4, 15, dtype=torch.float64)
+            direction = torch.randn(part.stop - part.start, generator=generator, dtype=torch.float64)
+            step[camera, part] = SIZES[kind] * direction / direction.norm()
+            rig = rig.retract(step)
+        pose = truth.rig_from_object[s : s + 1]
+        shift = torch.tensor([100.0, 60.0, 80.0]) * torch.randn(3, generator=generator, dtype=torch.float64)
+        pose = RigidTransform(pose.rotation, pose.translation + shift)
+        image = rig.expand(1).project(pose.apply(obj.points))
+        uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
+        seen = image.visible & (torch.rand(image.visible.shape, generator=generator) > 0.1)
+        observations = Observations(uv, torch.full(seen.shape, NOISE, dtype=torch.float64), seen)
+        result, changes = monitor.update(observations, pose, seconds=1 / 60)
+        assert len(result.rig_from_object.translation) == len(result.residual) == 1  # also where it was learnt anew
+        told += changes
+    return monitor, rig, told
+
+
+def normalized_error(monitor: RigMonitor, rig: CameraRig) -> float:
+    """Squared error of the filter per degree of freedom."""
+    belief = monitor.filter.belief
+    error = belief.rig.local(rig).flatten()
+    return float(error @ torch.linalg.solve(belief.covariance(), error)) / len(error)
+
+
+def test_a_steady_rig_gives_no_alarm() -> None:
+    monitor, rig, told = followed({}, 70, seed=4)
+    assert told == []
+    assert 0.6 < normalized_error(monitor, rig) < 1.5
+
+
+@pytest.mark.parametrize(
+    ("kind", "camera"), [("rotation", 0), ("position", 1), ("focal_length", 2), ("principal_point", 3)]
+)
+def test_a_bump_is_told_with_camera_kind_and_size(camera: int, kind: str) -> None:
+    monitor, rig, told = followed({30: {camera: kind}}, 64, seed=10 + camera)
+    alarm, change = told
+    assert (alarm.camera, alarm.kind) == (camera, "unknown")
+    assert abs(alarm.since - 30) <= 3
+    assert (change.camera, change.kind, change.decided) == (camera, kind, True)
+    assert abs(change.size - SIZES[kind]) < 4 * change.sigma < 0.5 * SIZES[kind]
+    assert alarm.evidence >= SIGNIFICANT and change.evidence >= SIGNIFICANT
+    assert 0.5 < normalized_error(monitor, rig) < 1.8
+    assert monitor.open == {}
+
+
+def test_a_camera_that_changes_while_a_change_of_another_is_open_for_longer_than_snapshots_are_kept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monitor, _, _ = followed({30: {1: "focal_length"}}, 33, seed=12)
+    assert monitor._since is not None
+    monkeypatch.setattr(type(monitor._since), "due", False)
+    everything = "imgcal.monitoring.rig_monitor.likeliest_age"
+    monkeypatch.setattr(everything, lambda recent, camera, age: 64 if len(recent) == 64 else age)
+    monitor, _, told = followed({30: {1: "focal_length"}, 94: {2: "focal_length"}}, 100, seed=12)
+    assert monitor.filter.count == 100 and told[0].camera == 1
+
+
+def test_two_cameras_at_once() -> None:
+    _, _, told = followed({30: {1: "rotation", 3: "principal_point"}}, 60, seed=21)
+    assert {change.camera for change in told} == {1, 3}
+    assert {change.camera: change.kind for change in told} == {1: "rotation", 3: "principal_point"}
+
+
+def test_the_others_stay_known() -> None:
+    before, _, _ = followed({}, 30, seed=12)
+    after, _, told = followed({30: {2: "focal_length"}}, 33, seed=12)
+    assert told[0].camera == 2
+    known, now = before.filter.belief.std(), after.filter.belief.std()
+    others = [0, 1, 3]
+    assert (now[others, 6:10] < 1.15 * known[others, 6:10]).all()
+    assert (now[2, 6:8] > 1.05 * known[2, 6:8]).all()
+
+
+@pytest.mark.parametrize("told_before", [False, True])
+def test_a_large_turn_is_learnt_whether_it_was_announced_or_not(told_before: bool) -> None:
+    factory, obj, generator = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), torch.Generator().manual_seed(6)
+    truth = simulate_truth(factory, obj, 26, generator, PhysicalDrift())
+    monitor, rig, told, refused = RigMonitor(RigFilter(factory, obj)), truth.rig, [], 0
+    for s in range(26):
+        if s == 20:
+            step = torch.zeros(4, 15, dtype=torch.float64)
+            step[2, :3] = torch.tensor([0.12, -0.15, 0.05])
+            rig = rig.retract(step)
+        image = rig.expand(1).project(truth.rig_from_object[s : s + 1].apply(obj.points))
+        uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
+        observations = Observations(uv, torch.full(uv.shape[:-1], NOISE, dtype=torch.float64), image.depth > 0)
+        moved = (2,) if told_before and s == 20 else ()
+        try:
+            _, changes = monitor.update(observations, truth.rig_from_object[s : s + 1], 1 / 60, moved)
+        except RefusedError:
+            refused += 1
+            continue
+        told += changes
+    assert refused <= (0 if told_before else 2)
+    assert {change.camera for change in told} == {2}
+    assert told[0].since == 20
+    assert 0.3 < normalized_error(monitor, rig) < 1.8
+
+
+@pytest.mark.parametrize(
+    ("seed", "at", "camera", "kind", "size"),
+    [
+        (12, 5, 0, "rotation", 0.0095),
+        (20, 5, 2, "position", 9.17),
+        (26, 7, 2, "position", 7.55),
+        (23, 14, 2, "rotation", 0.005),
+    ],
+)
+def test_of_a_camera_that_moves_within_the_first_snapshots_no_other_and_no_object_is_blamed(
+    seed: int, at: int, camera: int, kind: str, size: float
+) -> None:
+    seen = Conditions(rate=60.0 if seed == 23 else 1.0, labelled=True)
+    made = Stream(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), seed, seen, [Bump(at, camera, kind, size)])
+    times = torch.arange(50, dtype=torch.float64) / seen.rate
+    made.frequency = made.frequency * seen.rate / 60
+    poses, (observations, rigs) = made.poses_at(times), made.labelled(0, 50)
+    monitor, told = RigMonitor(RigFilter(made.factory, made.obj)), []
+    for s in range(50):
+        one = observations.of_snapshots([s])
+        _, changes = monitor.update(one, poses[s : s + 1], 1 / seen.rate)
+        told += changes
+        assert monitor.object_change is None
+    assert {change.camera for change in told} == {camera}
+    assert monitor.first == at
+    assert 0.5 < normalized_error(monitor, rigs[-1]) < 1.8
+
+
+def test_a_camera_of_which_it_cannot_be_told_yet_is_undecided_until_it_is() -> None:
+    """At 60 snapshots a second the first ones do not tell a camera that has moved from one that always was late."""
+    bump = Bump(4, 2, "rotation", 0.005)
+    conditions = Conditions(labelled=True)
+    made = Stream(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), 23, conditions, [bump])
+    poses, (observations, _) = made.poses_at(torch.arange(90, dtype=torch.float64) / 60), made.labelled(0, 90)
+    monitor, told, undecided = RigMonitor(RigFilter(made.factory, made.obj)), [], []
+    for s in range(90):
+        one = observations.of_snapshots([s])
+        _, changes = monitor.update(one, poses[s : s + 1], 1 / 60)
+        told += [(s, change.camera) for change in changes]
+        undecided.append(set(monitor.undecided))
+    assert told and {camera for _, camera in told} == {2}
+    first = told[0][0]
+    assert undecided[:4] == [set()] * 4 and undecided[first:] == [set()] * (90 - first)
+    assert first > 8 and undecided[6:first] == [{2}] * (first - 6)
+
+
+def watched(stream: Stream, count: int) -> list[tuple[int, int]]:
+    """Follow labelled snapshots: number and camera of each change that was told."""
+    seen, _ = stream.labelled(0, count)
+    rate = stream.conditions.rate
+    poses = stream.poses_at(torch.arange(count, dtype=torch.float64) / rate)
+    monitor, told = RigMonitor(RigFilter(stream.factory, stream.obj)), []
+    for number in range(count):
+        with contextlib.suppress(RefusedError):
+            _, changes = monitor.update(seen.of_snapshots([number]), poses[number : number + 1], 1 / rate)
+            told += [(number, change.camera) for change in changes]
+    return told
+
+
+def test_two_cameras_are_followed_for_as_long_as_drift_is_learnt() -> None:
+    rig, obj = imgcal.load_rig("T4").select([0, 1]), imgcal.load_object("asymmetric8")
+    assert watched(Stream(rig, obj, 1, Conditions(rate=1.0, labelled=True)), 200) == []
+
+
+def test_a_bump_of_which_it_cannot_be_told_yet_is_not_learnt_as_drift() -> None:
+    """One snapshot a second of cameras that tremble: the question is open when a stretch of drift ends."""
+    rig, obj, bump = (
+        imgcal.load_rig("T4"),
+        imgcal.load_object("asymmetric8"),
+        Bump(150, 1, "rotation", math.radians(0.1)),
+    )
+    told = watched(Stream(rig, obj, 5, Conditions(rate=1.0, shake=0.3, labelled=True), [bump]), 180)
+    assert told and {camera for _, camera in told} == {1}
+    assert 150 <= told[0][0] <= 160
