@@ -2,6 +2,7 @@ from . import lm_cpu
 from .accuracy import MAP_DEPTHS, MAP_SIZE, PredictedError, WorkingVolume, predicted_error
 from .blocks import BlockScatter, block_scatter
 from .change_points import CLIP, LEAST_SNAPSHOTS
+from .correlation import autocorrelation, correlation_time, effective_size
 from .covariance import (
     camera_covariance,
     camera_std,
@@ -83,12 +84,15 @@ __all__ = [
     "WorkingVolume",
     "aligned",
     "attach_gradient",
+    "autocorrelation",
     "block_scatter",
     "blocks_of",
     "camera_covariance",
     "camera_std",
     "cold_start",
+    "correlation_time",
     "displaced",
+    "effective_size",
     "encoded",
     "equations_at",
     "error_between",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 from imgcal.errors import RefusedError
 from imgcal.estimation import EstimationOptions
@@ -22,7 +22,8 @@ SUSPECTED = 20.0
 SLOW = {16: 16, 64: 32}
 """Numbers of snapshots that are tested without a suspicion, and after how many each: where little was known before."""
 REMAINING = 20.0
-"""What is left of the significance without the snapshot that speaks most for a change: one wrong label is none."""
+"""What is left of the significance without the episode that speaks most for a change: a wrong label, or an error that
+passes, is none."""
 NEARBY = 4
 """Snapshots around the most significant one among which the first one after a change is looked for."""
 
@@ -30,12 +31,13 @@ MOST_EXCESS = 4.0
 """Chi-squared per degree of freedom up to which a snapshot fits that is else refused."""
 
 
-def changed_before(recent: RecentSnapshots, count: int) -> int | None:
+def changed_before(recent: RecentSnapshots, count: int, episodes: Sequence[int]) -> int | None:
     """Before how many snapshots some camera has surely changed; None = none has.
 
     Args:
         recent: the latest snapshots.
         count: of all snapshots so far.
+        episodes: for each camera the successive snapshots that one passing error may last.
     """
     ages = {age for age, every in SLOW.items() if age <= len(recent) and count % every == 0}
     screened = recent.screened()
@@ -45,8 +47,9 @@ def changed_before(recent: RecentSnapshots, count: int) -> int | None:
         scores = recent.test(age).scores()
         kind = max(scores, key=lambda name: float(scores[name].max()))
         camera = int(scores[kind].argmax())
-        if float(scores[kind][camera]) >= SIGNIFICANT and recent.steady(age, camera, kind) >= REMAINING:
-            return age
+        if float(scores[kind][camera]) >= SIGNIFICANT:
+            if recent.repeated(age, camera, kind, episodes[camera]) >= REMAINING:
+                return age
     return None
 
 

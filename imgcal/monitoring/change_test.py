@@ -46,8 +46,9 @@ LEAST_LEARNT = 1e-6
 """Directions of which less was learnt than this share of the most of their kind do not take part."""
 LEAST_VARIANCE = 1e-3
 """Share of a variance that is left where one is taken away: rounding."""
-MODEL_ERROR = 0.02
-"""Pixels, one standard deviation of each axis: by how much a camera's image may be off in a way that changes slowly."""
+MODEL_ERROR = 0.05
+"""Pixels, one standard deviation of each axis: by how much a camera's image may be off in a way that changes slowly. Ten
+real infrared cameras, well calibrated: 0.05, averaged over a quarter of a second."""
 SLOPE = 0.25
 """Tangent of the angle to the optical axis at which a change of the focal length counts as what it moves there."""
 USUAL_DISTANCE = 1000.0  # mm, of a rig that has no working distance
@@ -94,9 +95,18 @@ class ChangeTest:
     pull: Tensor  # (K C,)
     learnt: Tensor  # (K C, K C) its covariance where nothing has changed
     pixels: Tensor  # (C, K) see `pixel_changes`
+    lasting: Tensor | float = MODEL_ERROR  # px, (C,): errors of each image that may last where nothing has changed
 
     @classmethod
-    def of(cls, information: Tensor, brought: Tensor, pull: Tensor, change: Tensor, pixels: Tensor) -> ChangeTest:
+    def of(
+        cls,
+        information: Tensor,
+        brought: Tensor,
+        pull: Tensor,
+        change: Tensor,
+        pixels: Tensor,
+        lasting: Tensor | float = MODEL_ERROR,
+    ) -> ChangeTest:
         """Prepare the tests.
 
         Args:
@@ -105,6 +115,7 @@ class ChangeTest:
             pull: (D,) of the later snapshots, where what was known before put the rig.
             change: (C, K, K) see `change_of_errors`.
             pixels: (C, K) see `pixel_changes`.
+            lasting: (C,) px, see `NoiseCorrelation.model_error`.
 
         Raises:
             RefusedError: nothing is known of the rig.
@@ -119,7 +130,7 @@ class ChangeTest:
         own = torch.einsum("cij,cik->cjk", change, left.unflatten(0, (cameras, -1)))  # (C, K, K C + 1)
         learnt = own[..., :-1].unflatten(-1, (cameras, -1))
         learnt = torch.einsum("cidj,djk->cidk", learnt, change).reshape(wide, wide)
-        return cls(own[..., -1].flatten(), 0.5 * (learnt + learnt.mT), pixels)
+        return cls(own[..., -1].flatten(), 0.5 * (learnt + learnt.mT), pixels, lasting)
 
     def scores(self) -> dict[str, Tensor]:
         """Test each camera for each kind of change: for each of `CHANGES` (C,).
@@ -131,9 +142,13 @@ class ChangeTest:
         learnt = self.learnt.unflatten(0, (cameras, -1)).unflatten(-1, (cameras, -1))
         own = learnt.diagonal(dim1=0, dim2=2).movedim(-1, 0)  # (C, K, K)
         return {
-            kind: _Own.of(pull[:, part], own[:, part, part]).score((MODEL_ERROR * self.pixels[:, part]).square())
+            kind: _Own.of(pull[:, part], own[:, part, part]).score(self.model_error(kind).square())
             for kind, part in CHANGES.items()
         }
+
+    def model_error(self, kind: str) -> Tensor:
+        """Change of a kind with k numbers of each camera that an error of its model may feign: (C, k)."""
+        return torch.as_tensor(self.lasting, dtype=self.pixels.dtype)[..., None] * self.pixels[:, CHANGES[kind]]
 
     def change(self, kind: str, variance: Tensor) -> tuple[Tensor, Tensor]:
         """What is learnt of a change of each camera of a kind with k numbers, where these wander besides.
@@ -162,7 +177,7 @@ class ChangeTest:
         """Test for others where some cameras may have changed."""
         scaled, factor, pull = self._free(changes, LARGE)
         taken = torch.linalg.solve_triangular(factor, scaled, upper=False)
-        return ChangeTest(self.pull - taken.mT @ pull, self.learnt - taken.mT @ taken, self.pixels)
+        return ChangeTest(self.pull - taken.mT @ pull, self.learnt - taken.mT @ taken, self.pixels, self.lasting)
 
     def jump(self, camera: int, kind: str) -> tuple[Tensor, Tensor]:
         """Estimate a change of a camera of a kind with K numbers, were there no other: (K,) and covariance (K, K)."""

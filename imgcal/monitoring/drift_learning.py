@@ -34,7 +34,7 @@ class DriftLearning:
             self.stretch = None
             return
         if self.stretch is None:
-            self.stretch, self.untold = Stretch.after(follows.belief, follows.waited), 0
+            self.stretch, self.untold = Stretch.after(follows.belief, follows.waited, recent.lasting), 0
             return
         stretch = self.stretch
         stretch.seconds, self.untold = stretch.seconds + seconds, self.untold + 1
@@ -48,4 +48,4 @@ class DriftLearning:
             recent.walk = follows.walk
             if bool(lacking.any()):
                 follows.belief = widened(follows.belief, lacking)
-            self.stretch = Stretch.after(follows.belief, follows.waited)
+            self.stretch = Stretch.after(follows.belief, follows.waited, recent.lasting)

@@ -45,11 +45,13 @@ class Stretch:
     brought: Tensor  # (D, D) information
     pull: Tensor  # (D,) where `before` puts the rig
     seconds: float = 0.0
+    lasting: Tensor | float = MODEL_ERROR  # (C,) px, see `NoiseCorrelation.model_error`
 
     @classmethod
-    def after(cls, before: RigBelief, seconds: float = 0.0) -> Stretch:
+    def after(cls, before: RigBelief, seconds: float = 0.0, lasting: Tensor | float = MODEL_ERROR) -> Stretch:
         """Begin with none; `seconds` of its time have passed."""
-        return cls(before, torch.zeros_like(before.factor), before.factor.new_zeros(len(before.factor)), seconds)
+        none = before.factor.new_zeros(len(before.factor))
+        return cls(before, torch.zeros_like(before.factor), none, seconds, lasting)
 
     def add(self, belief: RigBelief, brought: Tensor, pull: Tensor) -> None:
         """Add snapshots.
@@ -68,7 +70,7 @@ class Stretch:
         before = self.before
         known = age_belief(before, self.seconds, rate).information
         change = change_of_errors(before.rig, before.unit)
-        return ChangeTest.of(known, self.brought, self.pull, change, pixel_changes(before.rig))
+        return ChangeTest.of(known, self.brought, self.pull, change, pixel_changes(before.rig), self.lasting)
 
 
 class DriftPaces:
@@ -141,9 +143,9 @@ class DriftPaces:
     def _model(self, test: ChangeTest, walk: Tensor) -> Tensor:
         """Variance (C, kinds, 3) of errors of camera models, in steps of the walk; zero where nothing wanders."""
         variance = torch.zeros_like(self.pull[0])
-        for number, part in enumerate(CHANGES.values()):
+        for number, (kind, part) in enumerate(CHANGES.items()):
             step = walk[:, part] * (SECONDS / 3600) ** 0.5
-            error = (MODEL_ERROR * test.pixels[:, part] / step.clamp_min(1e-30)).square()
+            error = (test.model_error(kind) / step.clamp_min(1e-30)).square()
             variance[:, number, : part.stop - part.start] = torch.where(step > 0, error, 0.0)
         return variance
 

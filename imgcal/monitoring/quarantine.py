@@ -48,14 +48,24 @@ class Quarantine:
         self.told = True
         return tuple(sorted(self.cameras))
 
-    def take(self, observations: Observations, seconds: float) -> bool:
-        """Keep a snapshot, so long after the one before, and tell whether to ask what has happened to them."""
+    def take(self, observations: Observations, seconds: float, episode: int = 1) -> bool:
+        """Keep a snapshot, and tell whether to ask what has happened to the cameras.
+
+        Args:
+            observations: (1, C, N).
+            seconds: since the one before.
+            episode: successive snapshots that one passing error of these cameras may last. The first so many are no
+                evidence: what is wrong with them may pass.
+        """
         self.seconds += seconds if self.seen else 0.0
         self.seen.append(observations)
         if not bool(observations.seen[:, list(self.cameras)].any()):
             return False
         self.taken += 1
-        return self.taken in ASKED or self.taken % EVERY == 0
+        if self.taken == episode > 1:
+            self.seen.clear()
+        after = self.taken - (episode if episode > 1 else 0)
+        return after in ASKED or (after > 0 and after % EVERY == 0)
 
     def hold_since(
         self,

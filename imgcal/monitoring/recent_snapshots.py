@@ -19,7 +19,7 @@ from torch import Tensor
 from imgcal.errors import RefusedError
 from imgcal.estimation import displaced
 from imgcal.geometry import RigidTransform
-from imgcal.monitoring.change_test import CHANGES, ChangeTest, change_of_errors, pixel_changes
+from imgcal.monitoring.change_test import CHANGES, MODEL_ERROR, ChangeTest, change_of_errors, pixel_changes
 from imgcal.monitoring.recent_screening import add_error, add_row, put, screen
 from imgcal.monitoring.rig_arrays import RigArrays
 from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, error_covariance
@@ -55,15 +55,17 @@ class _Seen:
 class RecentSnapshots:
     """A ring of the latest `OLDEST` snapshots."""
 
-    def __init__(self, belief: RigBelief, walk: Tensor) -> None:
+    def __init__(self, belief: RigBelief, walk: Tensor, lasting: Tensor | float = MODEL_ERROR) -> None:
         """Begin with none.
 
         Args:
             belief: of the filter.
             walk: (C, K) standard deviation of every value after an hour, at which it ages.
+            lasting: (C,) px, see `NoiseCorrelation.model_error`.
         """
         (cameras, free), wide = belief.unit.shape, len(belief.factor)
         self.walk, self._belief = walk, belief
+        self.lasting = lasting
         self._unit = belief.unit.numpy()
         self._carried = np.zeros((OLDEST, 6, wide))
         self._border = np.zeros((OLDEST, wide - cameras * free, wide))
@@ -204,11 +206,20 @@ class RecentSnapshots:
             covariance = torch.cholesky_inverse(_cholesky(information))
             add_blocks(covariance, error_covariance(self._belief, variance))
             information = torch.cholesky_inverse(_cholesky(covariance))
-        return ChangeTest.of(information, brought, pull, self._change, self._pixels)
+        return ChangeTest.of(information, brought, pull, self._change, self._pixels, self.lasting)
 
-    def steady(self, age: int, camera: int, kind: str) -> float:
-        """Score of a change of a camera, all else taken to be known, without the snapshot that speaks most for it."""
+    def repeated(self, age: int, camera: int, kind: str, episode: int) -> float:
+        """Score of a change of a camera, all else taken to be known, without the episode that speaks most for it.
+
+        Args:
+            age: snapshots since the change.
+            camera: its number.
+            kind: of `CHANGES`.
+            episode: successive snapshots that one passing error may last.
+        """
         number, part = self._next - age, CHANGES[kind]
+        if age <= episode:
+            return 0.0
         _, at = self._known(number)
         own, pull = [], []
         row = slice(camera * self._unit.shape[1], (camera + 1) * self._unit.shape[1])
@@ -217,10 +228,9 @@ class RecentSnapshots:
             brought, weighted = self._sums(k, k + 1)
             pull.append(change.mT @ (weighted - brought @ at)[row])
             own.append(change.mT @ brought[row, row] @ change)
-        pulls, blocks = torch.stack(pull), torch.stack(own)
-        left, weight = pulls.sum(0) - pulls, blocks.sum(0) - blocks
-        weight = weight + 1e-9 * torch.diag_embed(blocks.sum(0).diagonal()).clamp_min(1e-30)
-        return float((left * torch.linalg.solve(weight, left[..., None])[..., 0]).sum(-1).min())
+        pulls, blocks = _all_but(torch.stack(pull), episode), _all_but(torch.stack(own), episode)
+        least = 1e-9 * torch.stack(own).sum(0).diagonal().clamp_min(1e-30).diag()
+        return float((pulls * torch.linalg.solve(blocks + least, pulls[..., None])[..., 0]).sum(-1).min())
 
     def belief_before(self, age: int) -> RigBelief:
         """What was believed before the latest `age` snapshots.
@@ -292,6 +302,12 @@ class RecentSnapshots:
         self._rig = rig
         self._at[wide:] = object_offset.numpy()
         return torch.from_numpy(self._at.copy())
+
+
+def _all_but(values: Tensor, width: int) -> Tensor:
+    """Sums of values (S, ...) without each of the S - width + 1 windows of so many successive ones."""
+    sums = torch.cat((torch.zeros_like(values[:1]), values.cumsum(0)))
+    return sums[-1] - (sums[width:] - sums[:-width])
 
 
 def _cholesky(matrix: Tensor) -> Tensor:

@@ -62,6 +62,7 @@ class RigFilter:
         self.rate, self.options = rate or rig.drift_rate or DriftRate(), options
         self.belief = RigBelief.of_prior(rig, obj, prior_std)
         self.count = 0  # snapshots absorbed
+        self.calibrated = False  # it began with what a calibration has found
         self._young = True  # the first snapshots are still kept
         self.pace = torch.ones_like(self.belief.unit)  # (C, K) times the rate at which values are believed to wander
         self._first = self.belief
@@ -115,6 +116,13 @@ class RigFilter:
         else:
             self._early.clear()
         return result
+
+    def rescale(self, ratio: Tensor) -> None:
+        """Change the standard deviations of the snapshots that are still kept by a factor (C,) for each camera."""
+        self._early = [
+            (replace(observations, sigma=observations.sigma * ratio[:, None]), pose)
+            for observations, pose in self._early
+        ]
 
     @property
     def due(self) -> bool:

@@ -23,6 +23,7 @@ from imgcal.monitoring.drift_learning import DriftLearning
 from imgcal.monitoring.drift_pace import DriftPaces
 from imgcal.monitoring.explanations import ExplanationSearch, Suspicion, doubtful_cameras
 from imgcal.monitoring.measurement_update import absorb, stack_snapshots
+from imgcal.monitoring.noise_correlation import NoiseCorrelation
 from imgcal.monitoring.object_change import ObjectChange, changed_object
 from imgcal.monitoring.object_question import Misfit, never_fitted, object_explains
 from imgcal.monitoring.pending_change import Change, PendingChange, free_cameras
@@ -65,6 +66,7 @@ class RigMonitor:
         self.held = Quarantine()  # of which nothing is learnt until it is known why they see the object elsewhere
         self.shaking = ShakeLevel(rig_filter.belief.rig.num_cameras)
         self._misfit = Misfit()
+        self.noise = NoiseCorrelation(rig_filter.belief.rig.num_cameras)
         self._recent = RecentSnapshots(rig_filter.belief, rig_filter.walk)
         self._drifting = DriftLearning(DriftPaces(rig_filter.belief.rig.num_cameras))
         self._since: PendingChange | None = None
@@ -98,13 +100,28 @@ class RigMonitor:
         """
         self.object_change, self.slips, self.apart = None, (), ()
         self.undecided = {camera: left - 1 for camera, left in self.undecided.items() if left > 1}
-        observations = self.shaking.of(observations)
+        given = observations
+        if self.filter.calibrated:
+            self.noise.expect(seconds)
+        observations = self.noise.weigh(self.shaking.of(observations))
         new = [camera for camera in moved if camera not in self.held.cameras]
         if new:
             self.held.hold(new, self.filter.count - self.first < FEW)
         learn = self._beside_held if self.held.cameras else self._followed
         result, changes = learn(observations, rig_from_object, seconds)
-        return result.of_last(), changes
+        last = result.of_last()
+        if not (changes or self.open or self.slips or self.object_change):
+            self._follow_noise(without(given, self.held.cameras), last)
+        return last, changes
+
+    def _follow_noise(self, observations: Observations, result: MeasurementUpdate) -> None:
+        """Measure by a snapshot that nobody doubts how much cameras shake, and how long their errors last."""
+        self.shaking.take(observations, result.residual)
+        before = self.noise.time
+        self.noise.add(observations, result.residual)
+        if self.noise.time is not before:
+            self._recent.lasting = self.noise.model_error
+            self.filter.rescale((self.noise.time / before).sqrt())
 
     def _followed(
         self, observations: Observations, rig_from_object: RigidTransform, seconds: float
@@ -124,7 +141,7 @@ class RigMonitor:
         self._recent.append(result, observations, seconds)
         if self._since is not None:
             self._since.take(result, seconds)
-        found = changed_before(self._recent, self.filter.count)
+        found = changed_before(self._recent, self.filter.count, self.noise.episodes)
         misfit = self._misfit.take(result.chi2, result.dof)
         if found is None and misfit and self._since is None:
             anew = self._learnt_object(misfit)
@@ -142,8 +159,6 @@ class RigMonitor:
                 return anew, ()
             if self._since is not None:
                 self._since = PendingChange.of(result, self._since.before, self._since.seconds, self._since.kinds)
-        if self._since is None:
-            self.shaking.take(observations, result.residual[-1:])
         self._drifting.take(self.filter, self._recent, seconds, quiet=self._since is None and found is None)
         if self._since is not None and self._since.due:
             return result, self._judged(self._since.late)
@@ -157,7 +172,8 @@ class RigMonitor:
         result, changes = self._followed(without(observations, cameras), rig_from_object, seconds)
         if not held.cameras or held.cameras != cameras:  # those that are new have taken it already
             return result, changes
-        if held.take(observations, seconds):
+        episodes = self.noise.episodes
+        if held.take(observations, seconds, max(episodes[camera] for camera in cameras)):
             with contextlib.suppress(RefusedError):  # not yet
                 anew = self._asked_held()
                 if anew is not None:
@@ -214,7 +230,7 @@ class RigMonitor:
         self._moved_early |= free.keys()
         prior = free_cameras(self._prior, dict.fromkeys(sorted(self._moved_early)), JUMPS[-1])
         result = self.filter.restart(prior, snapshots)
-        self._recent = RecentSnapshots(result.belief, self.filter.walk)
+        self._recent = RecentSnapshots(result.belief, self.filter.walk, self.noise.model_error)
         self._recent.took(snapshots, pauses, result)
         self.first = self.filter.count - len(snapshots)
         nan, number = float("nan"), self.first
@@ -300,7 +316,7 @@ class RigMonitor:
             few = self.filter.count - age - self.first < FEW
             snapshots = self.held.hold_since(snapshots, pauses[-len(snapshots) :], cameras, few)
         result = self.filter.restart(before, snapshots)
-        self._recent = RecentSnapshots(result.belief, self.filter.walk)
+        self._recent = RecentSnapshots(result.belief, self.filter.walk, self.noise.model_error)
         self._recent.took(snapshots, pauses[-len(snapshots) :], result)
         self.open, self._since = {}, None
         return result
@@ -399,7 +415,7 @@ class RigMonitor:
         """Go on with an object that is not as it was; its shape is learnt from now on."""
         result = self.filter.restart(before, snapshots)
         self.object_change = replace(change, since=self.filter.count - len(snapshots))
-        self._recent = RecentSnapshots(result.belief, self.filter.walk)
+        self._recent = RecentSnapshots(result.belief, self.filter.walk, self.noise.model_error)
         self._recent.took(snapshots, pauses, result)
         return result
 

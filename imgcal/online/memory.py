@@ -30,6 +30,7 @@ MODULES = frozenset(
         "monitoring.drift_pace",
         "monitoring.quarantine",
         "estimation.map_estimate",
+        "monitoring.noise_correlation",
         "monitoring.object_change",
         "monitoring.object_question",
         "monitoring.pending_change",

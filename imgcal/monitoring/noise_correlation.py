@@ -1,0 +1,120 @@
+"""Follow how long the errors of each camera last, so that evidence counts by its effective sample size.
+
+Errors of real cameras are correlated in time: a marker that is half hidden stays so for some frames, a lens error
+belongs to a place in the image. Snapshots that repeat an error bring no new evidence. With a correlation time of tau
+snapshots, n of them say as much as n / tau independent ones: each is given tau times its variance. A shift of a whole
+image that lasts may also be mistaken for a small move. It is expected to come back, so a change of a camera must move
+the image by clearly more than that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.estimation import correlation_time
+from imgcal.monitoring.change_test import MODEL_ERROR
+from imgcal.monitoring.shaking import shared_shifts
+from imgcal.types import Observations
+
+MEMORY = 1024
+"""Latest snapshots from which correlation times are measured ..."""
+FIRST, EVERY = (48, 64, 96), 128
+"""... after the first of them, and again after as many more."""
+USUAL, USUAL_SECONDS = 0.4, 0.1
+"""Autocorrelation of the errors of infrared cameras at short intervals, and the time (s) after which it has fallen by a
+factor e: what is assumed of a rig that has been calibrated, until its own snapshots say otherwise."""
+FASTEST = 1 / 60
+"""Seconds between snapshots, before anything is known of their rate."""
+EPISODE = 2.0
+"""Correlation times that a passing error may last."""
+LEAST_POINTS = 2
+"""Labels of a camera from which the shift of its image counts."""
+
+
+@dataclass
+class NoiseCorrelation:
+    """How long the errors of each camera last, measured by the shifts of its image that snapshots leave.
+
+    Examples:
+        >>> NoiseCorrelation(2).time
+        tensor([1., 1.], dtype=torch.float64)
+    """
+
+    cameras: int
+    time: Tensor = field(init=False)  # (C,) correlation time in snapshots; 1 = independent
+    lasting: Tensor = field(init=False)  # (C,) px, one standard deviation of a shift of the image that lasts
+    shifts: deque[NDArray[np.float64]] = field(default_factory=lambda: deque(maxlen=MEMORY))  # (C, 2) px
+    taken: int = 0  # snapshots
+
+    measured: bool = False
+
+    def __post_init__(self) -> None:
+        """Begin with errors that are independent from snapshot to snapshot."""
+        self.time = torch.ones(self.cameras, dtype=torch.float64)
+        self.lasting = torch.zeros(self.cameras, dtype=torch.float64)
+
+    def expect(self, seconds: float) -> None:
+        """Assume the usual correlation of snapshots that are so many seconds apart, until it has been measured."""
+        if not self.measured:
+            self.time = torch.full_like(self.time, usual_time(seconds))
+
+    @property
+    def model_error(self) -> Tensor:
+        """By how much each camera's image may be off for a while where nothing has moved: (C,) px."""
+        return self.lasting.clamp_min(MODEL_ERROR)
+
+    @property
+    def episodes(self) -> list[int]:
+        """Successive snapshots of each camera that one passing error may last."""
+        return [1 if time <= 1 else math.ceil(EPISODE * time) for time in self.time.tolist()]
+
+    def weigh(self, observations: Observations) -> Observations:
+        """Give observations (S, C, N) the variance with which their number is an effective sample size."""
+        if not bool((self.time > 1).any()):
+            return observations
+        root = self.time.sqrt()
+        shake = None if observations.shake is None else observations.shake * root
+        return replace(observations, sigma=observations.sigma * root[:, None], shake=shake)
+
+    def add(self, observations: Observations, residual: Tensor) -> None:
+        """Add what a snapshot leaves that nobody doubts.
+
+        Args:
+            observations: (1, C, N).
+            residual: (1, C, N, 2) pixels.
+        """
+        shift = shared_shifts(observations, residual)[0][0]
+        shift[observations.seen[0].sum(1).numpy() < LEAST_POINTS] = np.nan
+        self.shifts.append(shift)
+        self.taken += 1
+        if self.taken in FIRST or self.taken % EVERY == 0:
+            self._measure()
+
+    def _measure(self) -> None:
+        """Measure each camera by itself, and all together: those of which little was seen are taken to be alike."""
+        self.measured = True
+        series = np.stack(self.shifts)
+        seen = np.isfinite(series[..., 0])
+        variance = np.nansum(np.square(series), axis=(0, 2)) / (2 * np.maximum(seen.sum(0), 1))
+        whitened = series / np.sqrt(np.maximum(variance, 1e-12))[:, None]
+        together = float(correlation_time(whitened[:, None])[0])
+        time = np.maximum(correlation_time(series), together)
+        self.time = torch.from_numpy(time)
+        self.lasting = torch.from_numpy(np.sqrt(variance * (1 - 1 / time)))
+
+
+def usual_time(seconds: float) -> float:
+    """Correlation time, in snapshots, of usual errors in snapshots that are so many seconds apart.
+
+    Examples:
+        >>> [round(usual_time(seconds), 2) for seconds in (1 / 60, 0.1, 1.0)]
+        [5.41, 1.47, 1.0]
+    """
+    return 1 + 2 * USUAL / math.expm1(min((seconds or FASTEST) / USUAL_SECONDS, 50.0))
