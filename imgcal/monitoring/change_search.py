@@ -47,9 +47,9 @@ def changed_before(recent: RecentSnapshots, count: int, episodes: Sequence[int])
         scores = recent.test(age).scores()
         kind = max(scores, key=lambda name: float(scores[name].max()))
         camera = int(scores[kind].argmax())
-        if float(scores[kind][camera]) >= SIGNIFICANT:
-            if recent.repeated(age, camera, kind, episodes[camera]) >= REMAINING:
-                return age
+        significant = float(scores[kind][camera]) >= SIGNIFICANT
+        if significant and recent.repeated(age, camera, kind, episodes[camera]) >= REMAINING:
+            return age
     return None
 
 

@@ -34,6 +34,8 @@ FASTEST = 1 / 60
 """Seconds between snapshots, before anything is known of their rate."""
 EPISODE = 2.0
 """Correlation times that a passing error may last."""
+LARGEST, SHORT = 20.0, 3
+"""Times the usual size of lasting errors that one may have; and the snapshots that a larger one, wrong labels, may last."""
 LEAST_POINTS = 2
 """Labels of a camera from which the shift of its image counts."""
 
@@ -69,6 +71,11 @@ class NoiseCorrelation:
     def model_error(self) -> Tensor:
         """By how much each camera's image may be off for a while where nothing has moved: (C,) px."""
         return self.lasting.clamp_min(MODEL_ERROR)
+
+    def episode(self, camera: int, shift: float) -> int:
+        """Successive snapshots that an error of a camera may last which shifts its image by so many pixels."""
+        usual = float(self.model_error[camera])
+        return min(self.episodes[camera], SHORT if shift > LARGEST * usual else math.inf)  # type: ignore[return-value]
 
     @property
     def episodes(self) -> list[int]:

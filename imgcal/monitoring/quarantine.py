@@ -30,7 +30,9 @@ class Quarantine:
 
     cameras: set[int] = field(default_factory=set)
     seen: deque[Observations] = field(default_factory=lambda: deque(maxlen=MOST_WIDE))  # (1, C, N), of all cameras
-    taken: int = 0  # snapshots since they are held in which they see the object
+    elapsed: int = 0  # snapshots since they are held
+    passing: bool = True  # what is wrong with them may still be an error that passes
+    taken: int = 0  # of those that count, the ones in which they see the object
     seconds: float = 0.0  # since then
     wide: bool = False  # it is hardly known where they are
     apart: bool = False  # they see the object at moments of their own, or are shaken ...
@@ -58,14 +60,25 @@ class Quarantine:
                 evidence: what is wrong with them may pass.
         """
         self.seconds += seconds if self.seen else 0.0
+        self.elapsed += 1
         self.seen.append(observations)
-        if not bool(observations.seen[:, list(self.cameras)].any()):
+        if not self._shows(observations):
             return False
         self.taken += 1
-        if self.taken == episode > 1:
-            self.seen.clear()
-        after = self.taken - (episode if episode > 1 else 0)
-        return after in ASKED or (after > 0 and after % EVERY == 0)
+        if self.passing and self.elapsed > episode > 1:
+            self._forget_episode()
+        self.passing = self.elapsed <= episode and episode > 1
+        return not self.passing and (self.taken in ASKED or self.taken % EVERY == 0)
+
+    def _shows(self, observations: Observations) -> bool:
+        return bool(observations.seen[:, list(self.cameras)].any())
+
+    def _forget_episode(self) -> None:
+        """Keep of the first episode the last snapshot that shows the object: what it says must be true of later ones."""
+        shown = [number for number, observations in enumerate(self.seen) if self._shows(observations)]
+        for _ in range(shown[-2] if len(shown) > 1 else 0):
+            self.seen.popleft()
+        self.taken = min(len(shown), 2)
 
     def hold_since(
         self,
@@ -109,5 +122,6 @@ class Quarantine:
     def _begin(self, cameras: set[int], wide: bool) -> None:
         """Hold cameras of which nothing has been seen yet."""
         self.cameras, self.wide = cameras, wide
+        self.elapsed, self.passing = 0, True
         self.taken, self.seconds, self.apart, self.told = 0, 0.0, False, False
         self.seen.clear()

@@ -18,7 +18,7 @@ from imgcal.monitoring.change_search import (
     surest,
 )
 from imgcal.monitoring.change_test import JUMPS
-from imgcal.monitoring.clock_slip import ClockSlip
+from imgcal.monitoring.clock_slip import ClockSlip, image_of
 from imgcal.monitoring.drift_learning import DriftLearning
 from imgcal.monitoring.drift_pace import DriftPaces
 from imgcal.monitoring.explanations import ExplanationSearch, Suspicion, doubtful_cameras
@@ -172,14 +172,23 @@ class RigMonitor:
         result, changes = self._followed(without(observations, cameras), rig_from_object, seconds)
         if not held.cameras or held.cameras != cameras:  # those that are new have taken it already
             return result, changes
-        episodes = self.noise.episodes
-        if held.take(observations, seconds, max(episodes[camera] for camera in cameras)):
+        if held.take(observations, seconds, self._episode(cameras, observations, result)):
             with contextlib.suppress(RefusedError):  # not yet
                 anew = self._asked_held()
                 if anew is not None:
                     return anew[0], (*changes, *anew[1])
         self.apart = held.tell()
         return result, changes
+
+    def _episode(self, cameras: Collection[int], observations: Observations, result: MeasurementUpdate) -> int:
+        """Successive snapshots that what is wrong with cameras may last, if it is an error that passes."""
+        longest = 1
+        for camera in cameras:
+            seen, uv = observations.seen[0, camera], observations.uv[0, camera]
+            off = (uv - image_of(result.belief, result.rig_from_object[-1:], camera)[0])[seen]
+            shift = float(off.median(0).values.norm()) if len(off) else 0.0
+            longest = max(longest, self.noise.episode(camera, shift))
+        return longest
 
     def _asked_held(self) -> tuple[MeasurementUpdate, tuple[Change, ...]] | None:
         """Ask what has happened to the cameras that are held; what was learnt anew where they have moved.
