@@ -124,7 +124,7 @@ OLDER = {"rig": "older", "result": "older"}
 def test_what_is_kept_is_there_whole_after_a_failure_of_any_step(
     error: BaseException, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    kept = {name: "old" for name in NAMES}
+    kept = dict.fromkeys(NAMES, "old")
     (folder / PREVIOUS).mkdir()
     for name, text in OLDER.items():
         (folder / PREVIOUS / name).write_text(text)
@@ -141,7 +141,7 @@ def test_files_are_kept_where_a_file_cannot_have_two_names(folder: Path, monkeyp
 
     monkeypatch.setattr(os, "link", unsupported)
     publish(folder, REFUSED, keeping=True)
-    assert content(folder / PREVIOUS) == {name: "old" for name in NAMES} and content(folder) == REFUSED
+    assert content(folder / PREVIOUS) == dict.fromkeys(NAMES, "old") and content(folder) == REFUSED
 
 
 def test_an_exception_of_the_block_leaves_the_old(folder: Path) -> None:
