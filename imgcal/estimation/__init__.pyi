@@ -57,7 +57,7 @@ from .rig_belief import Absorbed, RigBelief, aged, widened
 from .rig_changes import CHANGES, ChangeTest, change_of_errors, pixel_changes, spread_of
 from .rig_error import displaced, error_between, step_by_error
 from .rig_filter import RigFilter
-from .rig_initialization import K3, ColdStart, cold_start, ordinary_lens
+from .rig_initialization import K3, ColdStart, cold_start, ordinary_lens, poses_alone
 from .rig_monitor import RigMonitor
 from .rig_uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian, rigid_motion, uncertainty_over
 from .robust_losses import squared
@@ -148,6 +148,7 @@ __all__ = [
     "points_at",
     "pose_at",
     "pose_covariance",
+    "poses_alone",
     "predicted_error",
     "relative_covariance",
     "relative_difference",

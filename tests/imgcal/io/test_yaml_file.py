@@ -161,3 +161,12 @@ def test_prose_is_told_from_values(text: str, prose: bool) -> None:
 def test_a_long_word_stops_nobody(text: str) -> None:
     code = f"from imgcal.io import is_prose; n = 1_000_000; is_prose({text})"
     subprocess.run([sys.executable, "-c", code], timeout=60, check=True)
+
+
+@pytest.mark.parametrize(
+    "text", ["'1:' * n + '1'", "'!!int ' + '1:' * n + '1'", "'1:' * n + '1.5'", "'0x' + 'f' * n", "'1_' * n"]
+)
+def test_a_long_number_stops_nobody(text: str) -> None:
+    code = f"from imgcal.io import parse_yaml; n = 1_000_000; parse_yaml({text}, 'x')"
+    done = subprocess.run([sys.executable, "-c", code], timeout=60, check=False, capture_output=True, text=True)
+    assert done.returncode == 0 or "InputError" in done.stderr
