@@ -9,6 +9,7 @@ from math import perm
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 from scipy.stats import chi2
 
 from imgcal.association.hypotheses import Poses
@@ -19,8 +20,13 @@ from imgcal.types import Observations
 
 MOST_LABELLINGS = 400
 FITS = 0.999  # quantile of chi-squared that the right labelling stays below
-LEAST_MARGIN = 8.0  # log odds against the best other labelling: all of them are known, and no hypotheses were chosen
-LEAST_CHANCE = 6.0  # log odds against blobs that fit by chance, beyond those of trying all labellings
+LEAST_MARGIN = 7.0
+"""Log odds against all other labellings together: all of them are known, and no hypotheses were chosen."""
+LEAST_CHANCE = 3.0
+"""Log odds against blobs that fit by chance, beyond those of trying all labellings. A pose and a rig as wide as its
+prior fit four blobs of something else about once in 200 images."""
+MOST_RIVALS, FAR = 64, 60.0
+"""Labellings whose evidence is asked: so many at most, with costs larger than the best one's by so much at most."""
 
 
 @dataclass(frozen=True)
@@ -41,34 +47,42 @@ def few(scene: Scene) -> bool:
 
 
 def compare_all(scene: Scene, options: IdentityOptions) -> Identity:
-    """Accept the labelling that fits if no other one does, and it is not by chance; see `few`."""
+    """Accept the labelling that fits if all others are improbable, and it is not by chance; see `few`.
+
+    Labellings are weighed by their evidence: one that fits only for a pose or rig that must be exactly right, edge-on
+    or with a camera at the end of its prior, is less probable than its residuals look.
+    """
     found = _compare(scene)
-    best, order = int(found.cost.argmin()), len(scene.obj.symmetries)
-    labels = found.fits.labels
+    near = np.argsort(found.cost)[:MOST_RIVALS]
+    near = near[found.cost[near] <= found.cost[near[0]] + FAR]
+    fits = fit(scene, found.fits.select(near))
+    weight = np.nan_to_num(evidence(scene, fits), nan=-np.inf)
+    best, order = int(weight.argmax()), len(scene.obj.symmetries)
+    labels, cost, off = fits.labels, found.cost[near], found.off[near]
     same = np.zeros(len(labels), bool)
     for motion in scene.obj.symmetries:
         same |= (labels[:, :, motion.permutation] == labels[best]).all((1, 2))
-    rival = int(np.where(same, np.inf, found.cost).argmin())
-    margin = float(found.cost[rival] - found.cost[best])
-    chosen = fit(scene, found.fits.select(np.array([best])))
-    rig, pose = rig_and_pose(scene, chosen, 0)
+    rivals = np.where(same, -np.inf, weight)
+    rival = int(rivals.argmax())
+    margin = float(weight[best] - logsumexp(rivals)) if np.isfinite(weight[best]) else 0.0
+    rig, pose = rig_and_pose(scene, fits, best)
     labelled = int((labels[best] >= 0).sum())
     refusal = ""
-    if 2 * found.cost[best] > chi2.ppf(FITS, 2 * labelled - 6):
-        refusal = f"no labelling of the {labelled} blobs fits: the best is {found.off[best]:.2g} px off"
+    if 2 * cost[best] > chi2.ppf(FITS, 2 * labelled - 6):
+        refusal = f"no labelling of the {labelled} blobs fits: the best is {off[best]:.2g} px off"
     elif margin < min(LEAST_MARGIN, options.least_margin):
         refusal = (
-            f"two labellings fit within the rig's prior, chi-squared {2 * found.cost[best]:.1f} and "
-            f"{2 * found.cost[rival]:.1f}: {labelled} blobs are too few"
+            f"two labellings fit within the rig's prior, chi-squared {2 * cost[best]:.1f} and {2 * cost[rival]:.1f}: "
+            f"{labelled} blobs are too few"
         )
-    elif evidence(scene, chosen)[0] < LEAST_CHANCE + np.log(len(labels)):
+    elif weight[best] < LEAST_CHANCE + np.log(len(found.cost)):
         refusal = f"{labelled} blobs are so few that any would fit some labelling"
     if refusal:
         none = np.full(scene.blobs.rows, -1)
         advice = "show more fiducials, to more cameras, or state a narrower prior in the rig if it is that well known"
         return Identity(none, pose, rig, "refused", 0, margin, f"{refusal}; {advice}")
     status: Status = "ambiguous" if order > 1 else "unique"
-    reason = f"fits to {found.off[best]:.2g} px, chi-squared of the next best labelling is {2 * margin:.0f} more"
+    reason = f"fits to {off[best]:.2g} px, log odds against the next best labelling {margin:.0f}"
     return Identity(scene.blobs.to_rows(labels[best]), pose, rig, status, order, margin, reason, 1.0)
 
 

@@ -36,8 +36,10 @@ from imgcal.estimation import Gauge
 from imgcal.extras import advice, missing
 from imgcal.formats import load_cameras
 from imgcal.io import (
+    PREVIOUS,
     Capture,
     RigCovariance,
+    keep_previous,
     load_object,
     open_input,
     publishing,
@@ -60,7 +62,8 @@ from imgcal.pipeline import (
 )
 from imgcal.types import CalibrationObject, CameraRig, Detections, limits
 
-WRITTEN = ("report.html", "rig.yaml", "object.csv", "result.json")
+RIG = "rig.yaml"
+WRITTEN = ("report.html", RIG, "object.csv", "result.json")
 
 
 WORST_STD = 1e6  # in any unit: what is known so badly is not known
@@ -72,8 +75,8 @@ class Calibrate:
 
     Writes OUT/rig.yaml (the recalibrated rig, with the standard deviation of every parameter), OUT/result.json and
     OUT/report.html; where the object's fiducials were estimated, too, also OUT/object.csv. If the data cannot decide,
-    the reason is in result.json and report.html, no rig.yaml is written and the exit code is 3. OUT changes when all is
-    written; any other failure leaves it as it was.
+    the reason is in result.json and report.html, no rig.yaml is written, the exit code is 3, and an earlier calibration
+    in OUT moves to OUT/previous. OUT changes when all is written; any other failure leaves it as it was.
     Examples: imgcal calibrate my_capture --rig factory.yaml --object object.csv --out result
     imgcal calibrate my_capture --cameras cameras.yaml --object wand4 --out result
     """
@@ -163,12 +166,15 @@ class Calibrate:
             outcome = error
         if lacking:
             print(f"note: no report.html, which {advice(lacking)}", file=sys.stderr)
+        earlier = (self.out / RIG).exists()
         with publishing(self.out, WRITTEN, mark="result.json") as out:
             if isinstance(outcome, RefusedError):
+                if earlier:
+                    keep_previous(self.out, out, WRITTEN)
                 result = refused_summary(outcome, detections, rig, seconds)
                 content = describe_refusal(outcome.for_command, detections, rig, obj, frames, seconds)
             else:
-                save_rig(outcome.rig, out / "rig.yaml", covariance, full=self.full_covariance)
+                save_rig(outcome.rig, out / RIG, covariance, full=self.full_covariance)
                 if outcome.shape:
                     save_object(outcome.object, out / "object.csv")
                 found = findings(outcome, self._gauge(outcome), covariance)
@@ -182,6 +188,8 @@ class Calibrate:
             if self.labelled is not None and not isinstance(outcome, RefusedError):
                 save_detections(outcome.labelled_detections, self.labelled)
         if isinstance(outcome, RefusedError):
+            if earlier:
+                print(f"note: the earlier calibration in {self.out} is now in {self.out / PREVIOUS}", file=sys.stderr)
             raise outcome
         for move in outcome.moved:
             print(f"{move}: only the snapshots since then are used")
@@ -192,7 +200,7 @@ class Calibrate:
             print(f"note: {note}; see the report", file=sys.stderr)
 
     def _check_out(self) -> None:
-        """The inputs must survive: a refusal would remove the very rig that it started from."""
+        """The inputs must survive, and what else is in the folder."""
         check_folder(self.out)
         if self.labelled is not None:
             if not self.labelled.parent.is_dir() or self.labelled.is_dir():
@@ -202,10 +210,23 @@ class Calibrate:
                     raise InputError(f"--labelled: {self.labelled} is what {option} reads, expected another file")
             if any(self.labelled.resolve() == (self.out / name).resolve() for name in WRITTEN):
                 raise InputError(f"--labelled: {self.labelled} is written to --out, expected another file")
-        for name in WRITTEN:
+        replaced = list(WRITTEN)
+        if (self.out / RIG).exists():
+            replaced += self._previous()
+        for name in replaced:
             for option, given in self._inputs():
                 if (self.out / name).exists() and given.exists() and (self.out / name).samefile(given):
                     raise InputError(f"--out: {self.out / name} is what {option} reads, expected another folder")
+
+    def _previous(self) -> list[str]:
+        """Files of an earlier run that a refusal would replace by those of the last one."""
+        folder = self.out / PREVIOUS
+        if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+            raise InputError(f"{folder}: found a link or file, expected nothing or the folder of an earlier run")
+        foreign = sorted(path.name for path in folder.glob("*") if path.name not in WRITTEN)
+        if foreign:
+            raise InputError(f"{folder}: found {listed(foreign)}, expected the files of an earlier run only")
+        return [f"{PREVIOUS}/{name}" for name in WRITTEN]
 
     def _inputs(self) -> list[tuple[str, Path]]:
         """What is read, with the names of the options."""

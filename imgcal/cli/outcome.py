@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import imgcal
 from imgcal.cli.counts import blobs_by_camera, counts_by_camera, counts_by_snapshot
 from imgcal.cli.findings import UNKNOWN, Findings
 from imgcal.errors import RefusedError
@@ -29,6 +30,7 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         }
     alternatives = max(snapshots[s].alternatives for s in used)
     return {
+        "version": imgcal.__version__,
         "status": "ok",
         "reason": "",
         "identity": calibration.identity,
@@ -82,6 +84,7 @@ def refused_summary(
     """Say why there is no result, with the same keys."""
     moved = refusal.moved if isinstance(refusal, MovedError) else ()
     return {
+        "version": imgcal.__version__,
         "status": "refused",
         "reason": refusal.for_command,
         "identity": None,

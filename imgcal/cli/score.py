@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +15,7 @@ import tyro
 from imgcal.cli.common import open_rig, progress, read_detections
 from imgcal.detection import DetectionOptions
 from imgcal.io import load_object, open_input
-from imgcal.pipeline import RigScore, rms_length, score
+from imgcal.pipeline import RigScore, rms_length, score, unit_doubt
 from imgcal.types import CameraRig
 
 
@@ -46,6 +47,8 @@ class Score:
             return progress(snapshots, total, "scoring")
 
         print(json.dumps(summary(score(detections, rig, obj, progress=bar), rig), indent=2))
+        if doubt := unit_doubt(rig, obj):
+            print(f"note: {doubt}", file=sys.stderr)
 
 
 def summary(scored: RigScore, rig: CameraRig) -> dict[str, object]:

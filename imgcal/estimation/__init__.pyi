@@ -48,7 +48,7 @@ from .object_shape import SNAPSHOTS_TO_BEND, FiducialOffset, ShapeEvidence, offs
 from .pose_initialization import initial_pose
 from .pose_support import ON_A_LINE, UndeterminedPosesError, require_poses
 from .rig_error import displaced, error_between, step_by_error
-from .rig_initialization import K3, ColdStart, cold_start, ordinary_lens
+from .rig_initialization import K3, ColdStart, cold_start, ordinary_lens, poses_alone
 from .rig_uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian, rigid_motion, uncertainty_over
 from .robust_losses import squared
 from .steady_cameras import Gauge
@@ -121,6 +121,7 @@ __all__ = [
     "points_at",
     "pose_at",
     "pose_covariance",
+    "poses_alone",
     "predicted_error",
     "relative_covariance",
     "relative_difference",

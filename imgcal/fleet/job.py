@@ -7,8 +7,10 @@ import datetime
 import gzip
 import hashlib
 import json
+import os
 import resource
 import signal
+import stat
 import tempfile
 import threading
 import time
@@ -41,6 +43,8 @@ STATUSES: tuple[Status, ...] = (
 TRANSIENT = frozenset({"unreachable", "timed_out", "out_of_memory", "crashed"})
 """What another try may mend."""
 BLOCK = 1 << 20
+REMINDER = 5.0
+"""Seconds until somebody whose code could not be interrupted, a callback for example, is told once more."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +63,8 @@ class Settings:
         return json.dumps(decides, sort_keys=True)
 
 
-class TooLongError(Exception):
-    """The time that a capture may take is over."""
+class TooLongError(BaseException):
+    """The time that a capture may take is over: nobody but `processed` is to catch it."""
 
 
 def item_of(item: Item) -> str:
@@ -132,6 +136,7 @@ def fetched(url: str, folder: Path) -> Path:
         _Unreachable: anything else that stands between.
     """
     if "://" not in url:
+        _stat(url, "a capture folder or a detections file", folder=True)
         return Path(url)
     import fsspec
 
@@ -139,8 +144,6 @@ def fetched(url: str, folder: Path) -> Path:
         system, path = fsspec.core.url_to_fs(url)
         name = path.rstrip("/").rsplit("/", 1)[-1]
         system.get(path.rstrip("/"), str(folder / name), recursive=system.isdir(path))
-    except TooLongError:
-        raise
     except Exception as error:
         raise _Unreachable(f"{url}: cannot be read: {reason_of(error)}") from error
     return folder / name
@@ -152,15 +155,15 @@ def content_key(path: Path, item: Item, settings: Settings) -> str:
     digest.update(f"{settings.key()}\n{item_of(item)}\n".encode())
     for url in (item.rig, item.object):
         digest.update(_content_of(url))
-    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
-    for file in files:
-        digest.update(f"{file.relative_to(path)}\n".encode())
-        try:
+    try:
+        files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+        for file in files:
+            digest.update(f"{file.relative_to(path)}\n".encode(errors="surrogateescape"))
             with open(file, "rb") as stream:
                 while block := stream.read(BLOCK):
                     digest.update(block)
-        except OSError as error:
-            raise InputError(f"{file}: cannot be read: {error.strerror or error}") from error
+    except OSError as error:
+        raise InputError(f"{error.filename or path}: cannot be read: {error.strerror or error}") from error
     return digest.hexdigest()
 
 
@@ -177,11 +180,24 @@ def _stamp(url: str) -> str:
     """Something that changes when a file does, without reading it where that can be."""
     if "://" in url:
         return str(int(time.time()) // 60)  # asked for again every minute
-    try:
-        found = Path(url).stat()
-    except OSError as error:
-        raise InputError(f"{url}: cannot be read: {error.strerror}") from error
+    found = _stat(url, "a file")
     return f"{found.st_mtime_ns} {found.st_size} {found.st_ino}"
+
+
+def _stat(path: str, expected: str, *, folder: bool = False) -> os.stat_result:
+    """Ask for a file, or a folder: reading a device or a pipe may wait for ever.
+
+    Raises:
+        InputError: there is none, or it is something else.
+    """
+    try:
+        found = Path(path).stat()
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read: {reason_of(error)}") from error
+    if not (stat.S_ISREG(found.st_mode) or (folder and stat.S_ISDIR(found.st_mode))):
+        kind = "a folder" if stat.S_ISDIR(found.st_mode) else "a device or pipe"
+        raise InputError(f"{path}: found {kind}, expected {expected}")
+    return found
 
 
 @lru_cache(maxsize=256)
@@ -271,7 +287,7 @@ def _limited(settings: Settings) -> Iterator[None]:
     try:
         if timed:
             old = signal.signal(signal.SIGALRM, over)
-            signal.setitimer(signal.ITIMER_REAL, settings.seconds)
+            signal.setitimer(signal.ITIMER_REAL, settings.seconds, REMINDER)
         if pages:
             resource.setrlimit(resource.RLIMIT_AS, (limit, before[1]))
         yield

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import csv
 import datetime
 import math
 import posixpath
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +19,16 @@ from imgcal.messages import listed, quoted
 REQUIRED = ("capture",)
 PARQUET = (".parquet", ".pq")
 KNOWN = ("capture", "rig", "object", "device", "time")
+EARLIEST, LATEST = -2_208_988_800.0, 7_258_118_400.0  # s since 1970: the years 1900 and 2200
+PROBLEMS = (
+    (r"Empty CSV file|file size is 0 bytes", "found an empty file"),
+    (r"Row #(\d+): Expected (\d+) columns, got (\d+)", r"found \3 cells in line \1, expected \2 as in the first line"),
+    (r"Row #(\d+):.*invalid UTF8", r"found bytes in line \1 that are not UTF-8 text"),
+    (r"invalid UTF8", "found bytes that are not UTF-8 text"),
+    (r"straddl", "found a line of a megabyte or more"),
+    (r"magic bytes not found", "found another kind of file, or the end is missing"),
+)
+"""What Arrow says, and what that means."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +58,7 @@ class Manifest:
         import pyarrow.parquet
 
         if self.url.endswith(PARQUET):
-            with opened(self.url) as file:
+            with self._read() as file:
                 return int(pyarrow.parquet.ParquetFile(file).metadata.num_rows)
         if "://" in self.url:
             return None
@@ -89,40 +102,61 @@ class Manifest:
         import pyarrow.csv
         import pyarrow.parquet
 
-        try:
-            with opened(self.url) as file:
-                if self.url.endswith(PARQUET):
-                    batches: Any = pa.parquet.ParquetFile(file).iter_batches(4096)
-                else:
-                    as_text = {name: pa.string() for name in KNOWN}
-                    batches = pa.csv.open_csv(
-                        file,
-                        read_options=pa.csv.ReadOptions(use_threads=False),
-                        convert_options=pa.csv.ConvertOptions(column_types=as_text, strings_can_be_null=True),
-                    )
-                yield from batches
-        except pa.ArrowInvalid as error:
-            kind = "Parquet" if self.url.endswith(PARQUET) else "CSV"
-            raise InputError(f"{self.url}: no {kind} table: {quoted(str(error))}") from error
+        # A cell that is no number must not end a fleet: all cells of a CSV file are text here, and read one by one.
+        as_text = {} if self.url.endswith(PARQUET) else dict.fromkeys(self._header(), pa.string())
+        with self._read() as file:
+            if self.url.endswith(PARQUET):
+                batches: Any = pa.parquet.ParquetFile(file).iter_batches(4096)
+            else:
+                batches = pa.csv.open_csv(
+                    file,
+                    read_options=pa.csv.ReadOptions(use_threads=False),
+                    convert_options=pa.csv.ConvertOptions(column_types=as_text, strings_can_be_null=True),
+                )
+            yield from batches
+
+    def _header(self) -> list[str]:
+        with self._read() as file:
+            line = file.read(1 << 20).partition(b"\n")[0].decode("utf-8-sig", errors="replace")
+        return next(csv.reader([line.rstrip("\r")]), [])
+
+    @contextlib.contextmanager
+    def _read(self) -> Iterator[Any]:
+        """Open the file; what Arrow has against it is an `InputError`."""
+        import pyarrow as pa
+
+        with opened(self.url) as file:
+            try:
+                yield file
+            except (pa.ArrowException, OSError, csv.Error) as error:
+                kind = "Parquet" if self.url.endswith(PARQUET) else "CSV"
+                raise InputError(f"{self.url}: {_problem(str(error))}, expected a {kind} table") from error
 
     def _item(self, row: int, values: dict[str, Any]) -> Item:
-        text = {name: str(values[name]) if values.get(name) else None for name in KNOWN}
+        given = tuple((n, number) for n, v in values.items() if n not in KNOWN and (number := _number(v)) is not None)
+        faults = [
+            f"found {name} {quoted(repr(values[name]))}, expected text"
+            for name in KNOWN[:-1]
+            if not isinstance(values.get(name), str | int | float | None)
+        ]
+        text = {name: str(values[name]) if values.get(name) else None for name in KNOWN[:-1]}
         named = {
             "capture": text["capture"] and self._beside(text["capture"]),
             "rig": self._beside(text["rig"]) if text["rig"] else self.rig,
             "object": self._beside(text["object"]) if text["object"] else self.object,
         }
-        lacking = next((name for name, value in named.items() if not value), None)
-        fault = (
-            f"row {row}: found no {lacking}, expected one in its column, or for all by an option" if lacking else None
-        )
+        faults += [
+            f"found no {name}, expected one in its column, or for all by an option"
+            for name, value in named.items()
+            if not value
+        ]
         moment = None
         try:
             moment = _seconds(values.get("time"))
         except ValueError as error:
-            fault = f"row {row}: {error}"
-        given = tuple((n, float(v)) for n, v in values.items() if n not in KNOWN and _is_number(v))
+            faults.append(str(error))
         paths = {name: value or "" for name, value in named.items()}
+        fault = f"row {row}: {faults[0]}" if faults else None
         return Item(row, paths["capture"], paths["rig"], paths["object"], text["device"] or "", moment, given, fault)
 
     def _beside(self, path: str) -> str:
@@ -132,7 +166,11 @@ class Manifest:
         if "://" in self.url:
             return posixpath.join(posixpath.dirname(self.url), path)
         found = Path(self.url).parent / path
-        return str(found) if found.exists() or "/" in path or "." in path else path
+        try:
+            is_file = "/" in path or "." in path or found.exists()
+        except (OSError, ValueError):  # too long for a name, or no text: whoever opens it says so
+            is_file = True
+        return str(found) if is_file else path
 
 
 def opened(url: str) -> Any:
@@ -155,26 +193,49 @@ def reason_of(error: BaseException) -> str:
     return quoted(" ".join(str(text).split()))
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+def _problem(text: str) -> str:
+    """Say in plain words what Arrow has against a table."""
+    for pattern, meaning in PROBLEMS:
+        if match := re.search(pattern, text, re.DOTALL):
+            return match.expand(meaning)
+    return "found something else, or damage"
+
+
+def _number(value: Any) -> float | None:
+    """The finite number that a cell holds; None where it holds something else."""
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        return None
+    try:
+        number = float(value)
+    except (ValueError, OverflowError):
+        return None
+    return number if math.isfinite(number) else None
 
 
 def _seconds(value: Any) -> float | None:
-    """Seconds since 1970 of a time stamp, an ISO date, or a number."""
+    """Seconds since 1970 of a time stamp, an ISO date, or a number.
+
+    Raises:
+        ValueError: it is none of these, or not in the years 1900 to 2200.
+    """
     if value is None or value == "":
         return None
-    if not isinstance(value, datetime.datetime):
-        try:
-            return float(value)
-        except ValueError:
-            pass
-        try:
-            value = datetime.datetime.fromisoformat(str(value))
-        except ValueError as error:
-            raise ValueError(
-                f"found time {quoted(repr(value))}, expected 2026-01-31T12:00:00 (UTC without an offset) or seconds"
-            ) from error
-    return (value if value.tzinfo else value.replace(tzinfo=datetime.UTC)).timestamp()
+    moment = value
+    try:
+        if not isinstance(value, datetime.datetime):
+            try:
+                moment = float(value)
+            except (TypeError, ValueError):
+                moment = datetime.datetime.fromisoformat(str(value))
+        if isinstance(moment, datetime.datetime):
+            moment = (moment if moment.tzinfo else moment.replace(tzinfo=datetime.UTC)).timestamp()
+    except (ValueError, OverflowError) as error:
+        raise ValueError(
+            f"found time {quoted(repr(value))}, expected 2026-01-31T12:00:00 (UTC without an offset) or seconds"
+        ) from error
+    if not EARLIEST <= moment <= LATEST:
+        raise ValueError(f"found time {quoted(str(value))}, expected seconds since 1970, in the years 1900 to 2200")
+    return float(moment)
 
 
 def write_manifest(path: Path, rows: Sequence[dict[str, Any]]) -> None:

@@ -9,7 +9,7 @@ from .metrics import read_metrics
 from .names import MODEL, find_file, is_file_name, model_file, model_name, natural_key, nearest, title_of
 from .object_csv import load_object, object_from_text, object_text, save_object
 from .own_folder import holding
-from .publication import publishing
+from .publication import PREVIOUS, keep_previous, publishing
 from .resources import data_path, shipped_names
 from .rig_yaml import RigCovariance, load_rig, load_rig_covariance, rig_from_text, rig_text, save_rig
 from .safetensors_file import read_tensors, read_texts, write_tensors
@@ -30,6 +30,7 @@ __all__ = [
     "IMAGE_SUFFIXES",
     "MARGIN",
     "MODEL",
+    "PREVIOUS",
     "VIDEO_SUFFIXES",
     "Capture",
     "Flow",
@@ -46,6 +47,7 @@ __all__ = [
     "holding",
     "is_file_name",
     "is_prose",
+    "keep_previous",
     "keys_of",
     "load_cameras",
     "load_detections",

@@ -18,6 +18,8 @@ from pathlib import Path
 from imgcal.errors import InputError
 
 PREFIX, OLD = ".unfinished-", ".old"
+PREVIOUS = "previous"
+"""Folder beside the files of a run without a result: what the last run with one wrote, one generation."""
 
 DEAD_AFTER = 3600.0  # s without a new file: the run that was filling the folder has been killed
 
@@ -61,6 +63,22 @@ def publishing(folder: str | Path, names: Sequence[str], mark: str) -> Iterator[
                 folder.rmdir()  # only where nothing came of it
 
 
+def keep_previous(folder: Path, stage: Path, names: Sequence[str]) -> None:
+    """Keep the files of an earlier run, which those of the stage will replace, in the subfolder `previous`.
+
+    They are published before anything is replaced: wherever the power fails, they are in the folder or below it.
+
+    Args:
+        folder: as for `publishing`.
+        stage: what it yielded.
+        names: files to keep, those that are there; what the subfolder held before is removed.
+    """
+    (stage / PREVIOUS).mkdir()
+    for name in names:
+        if (folder / name).is_file():
+            _link(folder / name, stage / PREVIOUS / name)
+
+
 def is_unfinished(folder: Path) -> bool:
     """Tell whether a run that was to fill this folder is at it still, or was killed."""
     return any(folder.glob(f"{PREFIX}*"))
@@ -68,7 +86,7 @@ def is_unfinished(folder: Path) -> bool:
 
 def _exchange(folder: Path, stage: Path, names: Sequence[str], mark: str) -> None:
     """Move the old content out of the way and the new one in; on a failure put everything back."""
-    others = sorted({path.name for path in stage.iterdir()} - {*names})
+    others = sorted({path.name for path in stage.iterdir()} - {*names, PREVIOUS})
     ordered = [*others, *(name for name in names if name != mark), mark]
     for name in ordered:
         if (folder / name).exists() and not (folder / name).is_file():
@@ -76,6 +94,9 @@ def _exchange(folder: Path, stage: Path, names: Sequence[str], mark: str) -> Non
     (stage / OLD).mkdir()
     away = [(folder / name, stage / OLD / name) for name in reversed(ordered) if os.path.lexists(folder / name)]
     moves = away + [(stage / name, folder / name) for name in ordered if (stage / name).exists()]
+    if (stage / PREVIOUS).exists():
+        kept = folder / PREVIOUS
+        moves = [*([(kept, stage / OLD / PREVIOUS)] if kept.exists() else []), (stage / PREVIOUS, kept), *moves]
     begun: list[tuple[Path, Path]] = []
     try:
         for source, target in moves:
@@ -86,6 +107,14 @@ def _exchange(folder: Path, stage: Path, names: Sequence[str], mark: str) -> Non
         if isinstance(error, OSError):
             raise InputError(f"{target}: cannot be written: {error.strerror or error}") from error
         raise
+
+
+def _link(file: Path, target: Path) -> None:
+    """Give a file a second name; a copy where the file system knows no such thing."""
+    try:
+        os.link(file, target)
+    except OSError:
+        shutil.copy2(file, target)
 
 
 def _undo(moves: list[tuple[Path, Path]], stage: Path) -> None:

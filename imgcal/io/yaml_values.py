@@ -16,6 +16,7 @@ _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 MOST_DEPTH = 32
 MOST_VALUES = 3_000_000  # with everything that aliases and merge keys repeat; a hundred cameras' covariance fits
+LONGEST_NUMBER = 1000  # characters; 1:1:1... is one to the base of 60, and takes the square of its length
 
 CORE = "tag:yaml.org,2002:"
 SCALARS = frozenset(CORE + name for name in ("str", "int", "float", "bool", "null"))
@@ -181,6 +182,8 @@ class _Builder:
         if tag not in SCALARS or tag == CORE + "str":
             return text  # dates, and signs that mean something elsewhere
         try:
+            if len(text) > LONGEST_NUMBER:
+                raise ValueError
             return self.loader.construct_object(yaml.ScalarNode(tag, text, event.start_mark, event.end_mark))
         except (ValueError, KeyError, IndexError):
             _fail(f"found {text[:40]!r}, expected a value of type {tag.removeprefix(CORE)}", event.start_mark)

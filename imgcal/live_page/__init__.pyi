@@ -2,12 +2,14 @@ from .address import Address, parse_address
 from .commands import Action, Command
 from .demonstration import Demonstration
 from .live_page import LivePage
+from .security import Gate
 
 __all__ = [
     "Action",
     "Address",
     "Command",
     "Demonstration",
+    "Gate",
     "LivePage",
     "parse_address",
 ]

@@ -74,7 +74,7 @@ class Quarantine:
         return bool(observations.seen[:, list(self.cameras)].any())
 
     def _forget_episode(self) -> None:
-        """Keep of the first episode the last snapshot that shows the object: what it says must be true of later ones."""
+        """Keep of the first episode the last snapshot that shows the object: later ones must agree with it."""
         shown = [number for number, observations in enumerate(self.seen) if self._shows(observations)]
         for _ in range(shown[-2] if len(shown) > 1 else 0):
             self.seen.popleft()

@@ -30,8 +30,9 @@ from imgcal.estimation import K3, ColdStart, cold_start, ordinary_lens
 from imgcal.messages import listed
 from imgcal.pipeline.calibration import Calibration
 from imgcal.pipeline.fitting import fit_steady
-from imgcal.pipeline.recalibration import late_cameras, require_same_moments, require_units
+from imgcal.pipeline.recalibration import late_cameras, require_same_moments
 from imgcal.pipeline.sources import Frames, blobs_of
+from imgcal.pipeline.units import require_solvable, require_units
 from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior, Volume
 
 ALONE = RigPrior(focal_length=0.05, principal_point=10.0, distortion=0.02, rotation=0.01, position=10.0)
@@ -99,14 +100,12 @@ def calibrate_from_scratch(
     placed = replace(first.rig, prior=PLACED)
     labelled: Associations | None = None
     try:
-        labelled = associate(detections, placed, obj, options, progress)
-        identified = time.perf_counter()
-        fit = _fit(labelled, first.rig, cameras, obj, options)
-    except np.linalg.LinAlgError as error:  # lengths of a size that nobody has thought of
-        require_units(RefusedError("nothing can be computed"), placed, obj, from_scratch=True)
-        raise RefusedError("estimation: the equations cannot be solved: the data say next to nothing") from error
+        with require_solvable():
+            labelled = associate(detections, placed, obj, options, progress)
+            identified = time.perf_counter()
+            fit = _fit(labelled, first.rig, cameras, obj, options)
     except RefusedError as error:
-        require_units(error, placed, obj, from_scratch=True)
+        require_units(error, detections, placed, obj, from_scratch=True)
         if labelled is not None:
             require_same_moments(error, alone, labelled, placed, obj, options)
         raise

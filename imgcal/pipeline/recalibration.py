@@ -24,7 +24,7 @@ from imgcal.pipeline.lateness import LateCamera, late_camera, suspects
 from imgcal.pipeline.measuring import LearnedMeasurer
 from imgcal.pipeline.sources import Detector, Frames, blobs_of, checked_frames, sight_of
 from imgcal.pipeline.tally import Tally, tally
-from imgcal.pipeline.units import unit_doubt
+from imgcal.pipeline.units import require_solvable, require_units
 from imgcal.types import (
     CalibrationObject,
     CameraRig,
@@ -82,10 +82,11 @@ def calibrate(
     sight = sight_of(detector, source, detection, measurer)
     labelled: Associations | None = None
     try:
-        labelled = associate(detections, rig, obj, options, progress, sight)
-        identified = time.perf_counter()
-        given = detections if sight is None else _as_given(labelled)
-        fit = fit_steady(labelled, given, rig, obj, options, initializer)
+        with require_solvable():
+            labelled = associate(detections, rig, obj, options, progress, sight)
+            identified = time.perf_counter()
+            given = detections if sight is None else _as_given(labelled)
+            fit = fit_steady(labelled, given, rig, obj, options, initializer)
     except RefusedError as error:
         if sight is not None and labelled is not None and sight.where_blobs_fail and _by_blobs(labelled):
             # They told the pose, and failed all the same.
@@ -94,7 +95,7 @@ def calibrate(
                 return calibrate(
                     detections, rig, obj, options, initializer=initializer, progress=progress, detector=sight
                 )
-        require_units(error, rig, obj)
+        require_units(error, detections, rig, obj)
         if labelled is not None:
             require_same_moments(error, detections, labelled, rig, obj, options)
         raise
@@ -111,12 +112,6 @@ def _by_blobs(labelled: Associations) -> bool:
     """Tell whether blobs decided about some snapshot, of which nobody has looked at the frames then."""
     snapshots = (labelled.snapshots[number] for number in labelled.used)
     return any(snapshot.found_by == "classical" and snapshot.status != "coded" for snapshot in snapshots)
-
-
-def require_units(error: RefusedError, rig: CameraRig, obj: CalibrationObject, from_scratch: bool = False) -> None:
-    """Raise a refusal anew with what lies behind it where lengths seem to be of another unit."""
-    if doubt := unit_doubt(rig, obj, from_scratch):
-        raise RefusedError(f"{doubt}; so {error.reason}") from error
 
 
 def require_same_moments(

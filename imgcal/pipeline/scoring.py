@@ -12,6 +12,7 @@ from imgcal.detection import DetectionOptions
 from imgcal.errors import RefusedError
 from imgcal.estimation import estimate
 from imgcal.pipeline.sources import Frames, blobs_of
+from imgcal.pipeline.units import require_solvable, require_units
 from imgcal.types import CalibrationObject, CameraRig, Detections
 
 OUTLYING = 10.0
@@ -101,7 +102,17 @@ def score(
         True
     """
     rig = rig.to(torch.float64)
-    labelled = associate(blobs_of(source, rig, obj, detection), rig, obj, options, progress)
+    detections = blobs_of(source, rig, obj, detection)
+    try:
+        with require_solvable():
+            return _scored(associate(detections, rig, obj, options, progress), rig, obj, options)
+    except RefusedError as error:
+        require_units(error, detections, rig, obj)
+        raise
+
+
+def _scored(labelled: Associations, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions) -> RigScore:
+    """Fit a pose in each labelled snapshot."""
     observations, poses = observations_of(labelled, rig, obj)
     fixed = torch.zeros(*rig.distortion.shape[:-1], rig.num_parameters, dtype=rig.distortion.dtype)
     # What is reported is an RMS in pixels: centres count alike, however well each was measured.

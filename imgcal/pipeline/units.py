@@ -1,20 +1,49 @@
-"""Whether a rig and an object are in millimetres, as all files are to be: lengths that no camera or marker has."""
+"""Whether a rig and an object are in millimetres, radians and pixels, as all files are to be.
+
+Lengths that no camera or marker has say it at once. Where an estimate has failed, images with labels say more: each
+camera by itself knows where it is to the object, and two of them how far they are apart in the object's unit.
+"""
 
 from __future__ import annotations
 
-import torch
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 
-from imgcal.types import CalibrationObject, CameraRig
+import numpy as np
+import torch
+from torch.nn.functional import normalize
+
+from imgcal.association import to_observations
+from imgcal.errors import RefusedError
+from imgcal.estimation import poses_alone
+from imgcal.geometry import vector_from_rotation
+from imgcal.types import CalibrationObject, CameraRig, Detections
 
 LEAST_IMAGE, LARGEST_IMAGE = 3.0, 5.0
 """An object whose image would be smaller (pixels) or larger (times the width of a frame) is of another unit."""
 LEAST_DISTANCE, LEAST_SIZE = 20.0, 2.0
 """Millimetres: what is nearer and smaller than this is in metres."""
+LARGEST_DISTANCE, LARGEST_SIZE = 200_000.0, 20_000.0
+"""Millimetres: what is farther and larger than this is in micrometres."""
 THOUSAND = 1000.0
+LEAST_FOCAL = 0.05
+"""Of the width of an image; a fisheye that sees all around has 0.16."""
+LENGTHS = {"centimetres": 10.0, "inches": 25.4, "feet": 304.8, "metres": THOUSAND}
+SAME_UNIT = 1.3
+"""Factor by which a ratio of lengths may differ from that of a unit."""
+LEAST_RATIO, LEAST_LOOKS = 3.0, 6.0
+"""Of lengths, from which on they are of different units: between cameras with labels, and of images without."""
+LEAST_TURN = math.radians(20)
+"""By which most pairs of cameras are turned otherwise than a rig says whose rotations are in degrees."""
+LEAST_BLOBS = 3
+"""Of a camera whose direction is asked."""
+MOST_ASKED = 8
+"""Snapshots that are looked at."""
 
 
 def unit_doubt(rig: CameraRig, obj: CalibrationObject, from_scratch: bool = False) -> str:
-    """Say which of a rig and an object seems to be in metres; empty where nothing does.
+    """Say which of a rig and an object seems to be in another unit; empty where nothing does.
 
     Nothing is made of it but words: images alone cannot tell.
 
@@ -32,6 +61,8 @@ def unit_doubt(rig: CameraRig, obj: CalibrationObject, from_scratch: bool = Fals
         >>> unit_doubt(rig, replace(obj, points=obj.points / 1000))
         'the object seems to be in metres, expected millimetres: it is 0.108 mm large, and 850 mm from the cameras'
     """
+    if doubt := _focal_doubt(rig):
+        return doubt
     distance = _distance(rig)
     if distance is None:
         return ""
@@ -46,11 +77,170 @@ def unit_doubt(rig: CameraRig, obj: CalibrationObject, from_scratch: bool = Fals
         return f"the object seems to be in metres, expected millimetres: {seen}"
     if not plausible(image) and image > LARGEST_IMAGE * width and plausible(image / THOUSAND):
         return f"the rig seems to be in metres, expected millimetres: the object is {seen.removeprefix('it is ')}"
+    other = ""
     if distance < LEAST_DISTANCE and size < LEAST_SIZE:
-        if from_scratch:
-            return f"the object seems to be in metres, expected millimetres: {seen}"
-        return f"rig and object seem to be in metres, expected millimetres: the object is {seen.removeprefix('it is ')}"
+        other = "metres"
+    elif distance > LARGEST_DISTANCE and size > LARGEST_SIZE:
+        other = "micrometres"
+    if other and from_scratch:
+        return f"the object seems to be in {other}, expected millimetres: {seen}"
+    if other:
+        return (
+            f"rig and object seem to be in {other}, expected millimetres: the object is {seen.removeprefix('it is ')}"
+        )
     return ""
+
+
+def image_doubt(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> str:
+    """Say what the images have against the units of a rig and an object; empty where they have nothing.
+
+    Meant for an estimate that has failed: an object far from where it is expected looks the same.
+
+    Args:
+        detections: blobs. With labels each camera by itself says where it is to the object; without, how large the
+            object looks.
+        rig: the factory calibration.
+        obj: the calibration object.
+    """
+    if (detections.fiducial >= 0).any():
+        return _doubt_by_poses(detections, rig, obj)
+    return _doubt_by_directions(detections, rig) or _doubt_by_size(detections, rig, obj)
+
+
+def require_units(
+    error: RefusedError, detections: Detections, rig: CameraRig, obj: CalibrationObject, from_scratch: bool = False
+) -> None:
+    """Raise a refusal anew with what lies behind it where values seem to be of another unit.
+
+    Args:
+        error: the refusal.
+        detections: the blobs it is about.
+        rig: the factory calibration.
+        obj: the calibration object.
+        from_scratch: the rig's lengths are those of the object.
+
+    Raises:
+        RefusedError: a unit is in doubt.
+    """
+    by_images = "" if from_scratch or _focal_doubt(rig) else image_doubt(detections, rig, obj)
+    if doubt := by_images or unit_doubt(rig, obj, from_scratch):
+        raise RefusedError(f"{doubt}; so {error.reason}") from error
+
+
+@contextmanager
+def require_solvable() -> Iterator[None]:
+    """Refuse where equations cannot be solved within the block: values of a size that belongs to no camera or object.
+
+    Raises:
+        RefusedError: instead of a fault of linear algebra.
+    """
+    try:
+        yield
+    except (np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:
+        raise RefusedError(
+            "estimation: the equations cannot be solved: rig, object and blobs do not belong together, or their units "
+            "are not millimetres, radians and pixels"
+        ) from error
+
+
+def _focal_doubt(rig: CameraRig) -> str:
+    share = rig.focal_length.double().mean(-1) / rig.image_size[:, 0]
+    if not bool((share < LEAST_FOCAL).any()):
+        return ""
+    camera = int(share.argmin())
+    focal, width = float(rig.focal_length[camera].mean()), int(rig.image_size[camera, 0])
+    unit = "relative to the width" if focal < 3 else "in millimetres"
+    return (
+        f"the focal length of camera {rig.camera_names[camera]} seems to be {unit}, expected pixels: it is "
+        f"{focal:.3g}, and images are {width} pixels wide"
+    )
+
+
+def _doubt_by_poses(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> str:
+    """Compare where cameras are to each other, by the object in the images of each alone, with what the rig says."""
+    rows = np.flatnonzero((detections.fiducial >= 0) & detections.usable)
+    snapshots = np.unique(detections.snapshot[rows])[:MOST_ASKED]
+    seen = to_observations(detections.select(rows[np.isin(detections.snapshot[rows], snapshots)]), rig, obj)
+    placed, known = poses_alone(seen, rig, obj)
+    lengths, turns = [], []
+    for first in range(rig.num_cameras):
+        for second in range(first):
+            both = known[:, first] & known[:, second]
+            if both.any():
+                said = rig.cam_from_rig[second] @ rig.cam_from_rig[first].inverse()
+                found = placed[both, second] @ placed[both, first].inverse()
+                turns.append(vector_from_rotation(found.rotation @ said.rotation.mT).norm(dim=-1))
+                lengths.append(found.translation.norm(dim=-1) / said.translation.norm().clamp_min(1e-12))
+    if not lengths:
+        return ""
+    turn, ratio = float(torch.cat(turns).median()), float(torch.cat(lengths).median())
+    if turn > LEAST_TURN:
+        return (
+            f"the images show cameras turned to each other by {math.degrees(turn):.0f} deg more or less than the rig "
+            "says; expected rotations in radians that take the rig to the camera (cam_from_rig)"
+        )
+    return _smaller(ratio, LEAST_RATIO)
+
+
+def _doubt_by_directions(detections: Detections, rig: CameraRig) -> str:
+    """Ask how far directions in which pairs of cameras see something pass each other: the epipolar constraint."""
+    missed = []
+    for snapshot in np.unique(detections.snapshot)[:MOST_ASKED]:
+        mine = (detections.snapshot == snapshot) & detections.usable
+        cameras = np.flatnonzero(np.bincount(detections.camera[mine], minlength=rig.num_cameras) >= LEAST_BLOBS)
+        if len(cameras) < 2:
+            continue
+        middle = np.stack([np.median(detections.uv[mine & (detections.camera == c)], axis=0) for c in cameras])
+        seen = rig.select(cameras.tolist()).to(torch.float64)
+        xy = (torch.from_numpy(middle).double() - seen.principal_point) / seen.focal_length
+        rays = normalize(
+            seen.cam_from_rig.rotation.mT @ torch.cat((xy, torch.ones_like(xy[:, :1])), 1)[..., None], dim=1
+        )
+        first, second = torch.triu_indices(len(cameras), len(cameras), 1)
+        planes = torch.linalg.cross(rays[first, :, 0], seen.positions[second] - seen.positions[first])
+        missed.append((normalize(planes) * rays[second, :, 0]).sum(1).abs().asin())
+    if not missed or float(torch.cat(missed).median()) < LEAST_TURN:
+        return ""
+    return (
+        "the directions in which cameras see the object pass each other by "
+        f"{math.degrees(float(torch.cat(missed).median())):.0f} deg, as the rig has them turned; expected rotations in "
+        "radians that take the rig to the camera (cam_from_rig)"
+    )
+
+
+def _doubt_by_size(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> str:
+    """Compare how large the object looks where hardly anything else is seen with how large it should."""
+    distance = _distance(rig)
+    if distance is None:
+        return ""
+    sizes = []
+    for snapshot in np.unique(detections.snapshot)[:MOST_ASKED]:
+        for camera in range(rig.num_cameras):
+            mine = (detections.snapshot == snapshot) & (detections.camera == camera) & detections.usable
+            if 3 <= int(mine.sum()) <= obj.num_fiducials:
+                uv = detections.uv[mine]
+                extent = float(np.linalg.norm(uv - uv.mean(0), axis=1).max())
+                sizes.append(extent / float(rig.focal_length[camera].mean()))
+    if not sizes:
+        return ""
+    centred = obj.points.double() - obj.points.double().mean(0)
+    expected = float(centred.norm(dim=-1).max()) / distance
+    ratio = expected / max(float(np.median(sizes)), 1e-12)
+    return _smaller(ratio, LEAST_LOOKS)
+
+
+def _smaller(ratio: float, least: float) -> str:
+    """Say which of rig (ratio > 1) and object is too small for the other, and as if in which unit."""
+    factor = max(ratio, 1 / max(ratio, 1e-12))
+    if factor < least:
+        return ""
+    unit = min(LENGTHS, key=lambda name: abs(math.log(factor / LENGTHS[name])))
+    same = 1 / SAME_UNIT < factor / LENGTHS[unit] < SAME_UNIT
+    small, other = ("rig", "object") if ratio > 1 else ("object", "rig")
+    known = unit if same else "another unit"
+    return (
+        f"the {small} is {factor:.3g} times too small for the {other}, as if it were in {known}; expected millimetres"
+    )
 
 
 def _distance(rig: CameraRig) -> float | None:

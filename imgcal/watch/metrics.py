@@ -5,11 +5,12 @@ from __future__ import annotations
 import bisect
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from imgcal.errors import InputError
+from imgcal.live_page import Address, Gate
 from imgcal.online import EVENT_KINDS, RigState
 from imgcal.watch.hook import Hook
 from imgcal.watch.intake import Intake
@@ -17,6 +18,8 @@ from imgcal.watch.intake import Intake
 if TYPE_CHECKING:
     from prometheus_client import Metric
 
+Application = Callable[[dict[str, Any], Callable[..., Any]], Iterable[bytes]]
+"""Of WSGI."""
 BUCKETS = (0.001, 0.002, 0.003, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 5.0)
 """Seconds of an update."""
 
@@ -78,6 +81,7 @@ class Metrics:
         host, port = self._address
         try:
             self._server, self._thread = start_http_server(port, host, registry)
+            self._server.set_app(_guarded(self._server.get_app(), Gate(Address(host, port), "")))
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
             raise InputError(f"--metrics: {host}:{port} cannot be listened on: {reason}") from error
@@ -171,6 +175,18 @@ def _of_cameras(state: RigState) -> Iterator[Metric]:
             if math.isfinite(value):
                 family.add_metric([camera], value)
         yield family
+
+
+def _guarded(serve: Application, gate: Gate) -> Application:
+    """Serve only who asks for this machine by its own name: another site's may be pointed here (DNS rebinding)."""
+
+    def answer(environ: dict[str, Any], start_response: Callable[..., Any]) -> Iterable[bytes]:
+        if gate.knows(environ.get("HTTP_HOST", "")):
+            return serve(environ, start_response)
+        start_response("421 Misdirected Request", [("Content-Type", "text/plain")])
+        return [b"this is not the server of that name; ask by its address\n"]
+
+    return answer
 
 
 def _counter(name: str, words: str, value: float) -> Metric:

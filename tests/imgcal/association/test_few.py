@@ -14,6 +14,7 @@ from imgcal.types.observations import Detections
 from imgcal.types.rig import RigPrior
 
 FLAT = np.array([[0.0, 0, 0], [220, 30, 0], [180, 190, 0], [-40, 140, 0]])
+SKEW = np.array([[0.0, 0, 0], [240, 0, 0], [90, 130, 0], [-60, 60, 0]])
 KNOWN = RigPrior(focal_length=0.003, principal_point=2.0, distortion=0.005, rotation=0.001, position=1.0)
 
 
@@ -70,6 +71,18 @@ def test_what_a_wide_prior_leaves_open_is_refused_in_words(extra, o10):
         reasons += [] if found.accepted else [found.reason]
     assert wrong == 0 and accepted < 12
     assert all("show more" in reason and "0 %" not in reason for reason in reasons)
+
+
+@pytest.mark.parametrize(("extra", "least"), [(0, 28), (1, 22)])
+def test_four_fiducials_are_told_by_one_camera_with_the_usual_prior(extra, least, o10):
+    """Drift is drawn from the prior: what is wide open stays refused, most is not."""
+    accepted, obj = 0, four(SKEW)
+    for seed in range(30):
+        rig, blobs, truth = seen_by_one(o10, obj, RigPrior(), seed, extra)
+        found = relocalize(blobs, rig, obj, RigPrior().std(rig))
+        accepted += found.accepted
+        assert not found.accepted or (found.status == "unique" and (found.labels == truth).all())
+    assert accepted >= least
 
 
 def test_four_blobs_of_something_else_are_refused(o10):

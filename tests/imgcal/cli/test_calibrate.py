@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+import imgcal
 from imgcal.cli.main import main
 from imgcal.errors import InputError
 from imgcal.estimation import relative_difference
@@ -26,7 +27,7 @@ from imgcal.types.observations import Detections
 from tests.imgcal.cli.calibrating import calibrate, one_line
 
 KEYS = {
-    "status", "reason", "identity", "rms_px_before", "rms_px_after", "chi2_per_dof", "snapshots_used",
+    "version", "status", "reason", "identity", "rms_px_before", "rms_px_after", "chi2_per_dof", "snapshots_used",
     "snapshots_rejected", "per_camera", "predicted_error", "motion", "knowledge", "seconds",
 }  # fmt: skip
 
@@ -300,7 +301,7 @@ def test_leaving_out_all_cameras_is_one_line(workplace, tmp_path, capsys):
 
 
 def contents(folder):
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
 
 
 @pytest.fixture
@@ -330,15 +331,46 @@ def test_a_report_that_cannot_be_written_leaves_the_earlier_result(workplace, bl
     assert not (tmp_path / "new").exists()
 
 
-def test_nothing_of_an_earlier_result_stays_beside_a_later_one(workplace, blind, tmp_path):
+def test_a_refusal_moves_an_earlier_calibration_to_previous(workplace, blind, tmp_path, capsys):
     out = tmp_path / "out"
     assert calibrate(workplace, workplace.capture, out) == 0
-    assert calibrate(workplace, blind, out) == 3
-    assert set(contents(out)) == {"report.html", "result.json"}
-    assert json.loads((out / "result.json").read_text())["status"] == "refused"
+    earlier = contents(out)
+    for again in range(2):  # a second refusal must not displace the good calibration by the first one's reason
+        capsys.readouterr()
+        assert calibrate(workplace, blind, out) == 3
+        moved = [line for line in capsys.readouterr().err.splitlines() if str(out / "previous") in line]
+        assert len(moved) == (0 if again else 1)
+        assert set(contents(out)) == {"report.html", "result.json"}
+        assert contents(out / "previous") == earlier
+    result = json.loads((out / "result.json").read_text())
+    assert result["status"] == "refused" and result["version"] == imgcal.__version__
     assert "cam02" in (out / "report.html").read_text()
     assert calibrate(workplace, workplace.capture, out, "--no-report") == 0
     assert set(contents(out)) == {"rig.yaml", "result.json"}
+    assert contents(out / "previous") == earlier
+    assert calibrate(workplace, blind, out, "--no-report") == 3
+    assert set(contents(out / "previous")) == {"rig.yaml", "result.json"}
+
+
+def test_a_folder_of_somebody_elses_named_previous_is_left_alone(workplace, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert calibrate(workplace, workplace.capture, out, "--no-report") == 0
+    (out / "previous").mkdir()
+    (out / "previous" / "notes.txt").write_text("mine")
+    assert calibrate(workplace, workplace.capture, out, "--no-report") == 2
+    assert f"{out / 'previous'}: found notes.txt" in one_line(capsys)
+    assert contents(out / "previous") == {"notes.txt": b"mine"}
+
+
+def test_the_previous_rig_may_be_the_one_to_start_from(workplace, blind, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert calibrate(workplace, workplace.capture, out, "--no-report") == 0
+    assert calibrate(workplace, blind, out, "--no-report") == 3
+    arguments = ["--rig", str(out / "previous" / "rig.yaml"), "--object", str(workplace.object), "--no-report"]
+    assert main(["calibrate", str(workplace.capture), *arguments, "--out", str(out)]) == 0
+    capsys.readouterr()
+    assert main(["calibrate", str(workplace.capture), *arguments, "--out", str(out)]) == 2
+    assert "previous/rig.yaml is what --rig reads" in one_line(capsys)
 
 
 def test_the_rig_to_start_from_is_not_overwritten(workplace, blind, tmp_path, capsys):

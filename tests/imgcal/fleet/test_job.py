@@ -1,4 +1,6 @@
+import os
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -77,3 +79,27 @@ def test_captures_that_hang_or_grow(
     row = processed(item(capture), Settings(seconds=0.5, memory_mb=500))
     assert row is not None and row["status"] == status
     assert row["seconds"] < 10 and row["key"]
+
+
+def test_devices_and_pipes_are_not_waited_for(capture: Path, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    started = time.perf_counter()
+    for place in ("/dev/zero", str(tmp_path / "pipe")):
+        for changes in ({"capture": place}, {"rig": place}, {"object": place}):
+            row = processed(replace(item(capture), **changes), Settings(seconds=5.0))
+            assert row is not None and row["status"] == "unusable"
+            assert row["reason"].startswith(f"{place}: found a device or pipe, expected")
+    assert time.perf_counter() - started < 5.0
+
+
+def test_the_limit_holds_where_every_exception_is_caught(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stubborn(*_: object, **__: object) -> None:
+        while True:
+            try:
+                time.sleep(60)
+            except Exception:
+                continue
+
+    monkeypatch.setattr(jobs, "calibrate", stubborn)
+    row = processed(item(capture), Settings(seconds=0.5))
+    assert row is not None and row["status"] == "timed_out" and row["seconds"] < 30

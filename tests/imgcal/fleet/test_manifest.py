@@ -6,7 +6,8 @@ import pyarrow.parquet
 import pytest
 
 import imgcal
-from imgcal.fleet import Manifest, write_manifest
+from imgcal.fleet import Manifest, Settings, write_manifest
+from imgcal.fleet.job import processed
 
 
 def items(path: Path, **kwargs: str) -> list[object]:
@@ -53,14 +54,65 @@ def test_a_row_that_cannot_be_used_says_so_and_ends_nothing(tmp_path: Path) -> N
     ("name", "content", "expected"),
     [
         ("m.csv", b"frames,rig\na,b\n", "expected capture among them"),
-        ("m.csv", b"capture,rig\na,b,c\n", "no CSV table"),
-        ("m.parquet", b"capture\na\n", "no Parquet table"),
+        ("m.csv", b"capture,rig\na,b\na,b,c\n", "found 3 cells in line 3, expected 2 as in the first line"),
+        ("m.csv", b"", "found an empty file, expected a CSV table"),
+        ("m.csv", b"capture\nM\xfcller.csv\n", "found bytes in line 2 that are not UTF-8 text"),
+        ("m.csv", b"capture,x\na," + b"x" * 3_000_000 + b"\n", "found a line of a megabyte or more"),
+        ("m.parquet", b"capture\na\n", "found another kind of file, or the end is missing, expected a Parquet table"),
+        ("m.parquet", b"", "found an empty file, expected a Parquet table"),
     ],
 )
 def test_a_table_that_is_none(tmp_path: Path, name: str, content: bytes, expected: str) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(imgcal.InputError, match=expected):
         items(tmp_path / name)
+    if name.endswith(".parquet"):
+        with pytest.raises(imgcal.InputError, match=expected):
+            Manifest(str(tmp_path / name)).count()
+
+
+def test_damage_within_a_parquet_table_is_one_line(tmp_path: Path) -> None:
+    pyarrow.parquet.write_table(pa.table({"capture": ["a"] * 100_000}), tmp_path / "m.parquet")
+    content = bytearray((tmp_path / "m.parquet").read_bytes())
+    content[50:80] = b"\xff" * 30
+    (tmp_path / "m.parquet").write_bytes(content)
+    with pytest.raises(imgcal.InputError, match="found something else, or damage, expected a Parquet table"):
+        items(tmp_path / "m.parquet")
+
+
+def test_a_cell_that_is_no_number_ends_nothing_however_late_it_comes(tmp_path: Path) -> None:
+    (tmp_path / "m.csv").write_text("capture,temperature\n" + "a.csv,20.5\n" * 200_000 + "b.csv,hot\n")
+    found = items(tmp_path / "m.csv", rig="T4", object="cube8")
+    assert len(found) == 200_001 and found[199_999].given == (("temperature", 20.5),)
+    assert found[-1].given == () and found[-1].fault is None
+
+
+@pytest.mark.parametrize("time", ["inf", "-inf", "1e18", "-1e14", "99999999999999999999999", "2026-13-01"])
+def test_a_time_out_of_range_is_a_fault_of_its_row(time: str, tmp_path: Path) -> None:
+    (tmp_path / "m.csv").write_text(f"capture,time\na.csv,{time}\nb.csv,2026-01-02\n")
+    one, two = items(tmp_path / "m.csv", rig="T4", object="cube8")
+    assert one.fault.startswith("row 0: found time") and one.time is None
+    assert two.fault is None
+    assert processed(one, Settings())["status"] == "unusable"
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "fault"),
+    [
+        ("time", datetime.date(2026, 1, 2), None),
+        ("time", datetime.timedelta(3), "found time"),
+        ("time", {"a": 1}, "found time"),
+        ("capture", b"a\xff", "found capture"),
+        ("device", ["a"], "found device"),
+        ("capture", "a" * 5000 + ".csv", None),
+        ("capture", "a\0b", None),
+    ],
+)
+def test_a_value_of_any_type_ends_nothing(column: str, value: object, fault: str | None, tmp_path: Path) -> None:
+    pyarrow.parquet.write_table(pa.table({"capture": ["a"]} | {column: [value]}), tmp_path / "m.parquet")
+    (item,) = items(tmp_path / "m.parquet", rig="T4", object="cube8")
+    assert (item.fault is None) == (fault is None) and (fault or "") in (item.fault or "")
+    assert processed(item, Settings())["status"] == "unusable"
 
 
 def test_a_missing_manifest(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from imgcal.errors import InputError
 from imgcal.io.atomic import write_text
-from imgcal.io.publication import DEAD_AFTER, PREFIX, is_unfinished, publishing
+from imgcal.io.publication import DEAD_AFTER, PREFIX, PREVIOUS, is_unfinished, keep_previous, publishing
 
 NAMES = ("report", "rig", "result")
 OLD = {"report": "old", "rig": "old", "result": "old", "mine": "untouched"}
@@ -20,11 +20,13 @@ REFUSED = {"report": "new", "result": "new", "mine": "untouched"}
 
 def content(folder: Path) -> dict[str, str]:
     """What a reader sees: hidden entries are nobody's result."""
-    return {path.name: path.read_text() for path in folder.iterdir() if not path.name.startswith(".")}
+    return {path.name: path.read_text() for path in folder.iterdir() if path.is_file() and path.name[0] != "."}
 
 
-def publish(folder: Path, wanted: dict[str, str]) -> None:
+def publish(folder: Path, wanted: dict[str, str], keeping: bool = False) -> None:
     with publishing(folder, NAMES, mark="result") as stage:
+        if keeping:
+            keep_previous(folder, stage, NAMES)
         for name in NAMES:
             if name in wanted:
                 write_text(stage / name, wanted[name])
@@ -58,13 +60,22 @@ def failing(monkeypatch: pytest.MonkeyPatch, at: int, error: BaseException, for_
         return wrapper
 
     with monkeypatch.context() as patch:
-        for module, name in ((os, "replace"), (os, "fsync"), (os, "mkdir"), (os, "unlink"), (os, "rmdir")):
+        for module, name in (
+            (os, "replace"),
+            (os, "fsync"),
+            (os, "mkdir"),
+            (os, "unlink"),
+            (os, "rmdir"),
+            (os, "link"),
+        ):
             patch.setattr(module, name, spoiled(getattr(module, name)))
         patch.setattr(shutil, "rmtree", spoiled(shutil.rmtree))
         yield done
 
 
-def attempts(folder: Path, error: BaseException, for_good: bool, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict]:
+def attempts(
+    folder: Path, error: BaseException, for_good: bool, monkeypatch: pytest.MonkeyPatch, keeping: bool = False
+) -> Iterator[dict]:
     """Publish, with every single step failing in turn; yields what is there afterwards."""
     spare = folder.with_name("spare")
     shutil.copytree(folder, spare)
@@ -74,7 +85,7 @@ def attempts(folder: Path, error: BaseException, for_good: bool, monkeypatch: py
             shutil.copytree(spare, folder)
             expected = suppress(InputError, OSError, KeyboardInterrupt, Killed)
             with failing(monkeypatch, at, error, for_good) as done, expected:
-                publish(folder, wanted)
+                publish(folder, wanted, keeping)
             if done[0] < at:
                 assert at > 10 and content(folder) == wanted
                 break
@@ -104,6 +115,33 @@ def test_a_kill_at_any_step_leaves_no_mark_beside_what_does_not_belong_to_it(
             unclaimed += 1
             assert state["left"]
     assert unclaimed > 4
+
+
+OLDER = {"rig": "older", "result": "older"}
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), Killed()])
+def test_what_is_kept_is_there_whole_after_a_failure_of_any_step(
+    error: BaseException, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = dict.fromkeys(NAMES, "old")
+    (folder / PREVIOUS).mkdir()
+    for name, text in OLDER.items():
+        (folder / PREVIOUS / name).write_text(text)
+    for state in attempts(folder, error, isinstance(error, Killed), monkeypatch, keeping=True):
+        previous = content(folder / PREVIOUS) if (folder / PREVIOUS).exists() else None
+        assert previous in (OLDER, kept, None)
+        assert previous == kept or state["found"] == OLD
+    assert content(folder / PREVIOUS) == kept and content(folder) == REFUSED
+
+
+def test_files_are_kept_where_a_file_cannot_have_two_names(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def unsupported(*_: object) -> None:
+        raise OSError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", unsupported)
+    publish(folder, REFUSED, keeping=True)
+    assert content(folder / PREVIOUS) == dict.fromkeys(NAMES, "old") and content(folder) == REFUSED
 
 
 def test_an_exception_of_the_block_leaves_the_old(folder: Path) -> None:

@@ -1,5 +1,7 @@
 """Strict YAML: what is written comes back, and what is wrong is told in one line with its place."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -9,7 +11,7 @@ from hypothesis import strategies as st
 
 from imgcal.errors import InputError
 from imgcal.io import StrictModel
-from imgcal.io.yaml_file import Flow, FlowMap, parse_yaml, read_yaml, yaml_text
+from imgcal.io.yaml_file import Flow, FlowMap, is_prose, parse_yaml, read_yaml, yaml_text
 
 
 class Lens(StrictModel):
@@ -134,3 +136,37 @@ def test_a_value_that_is_none_says_where_it_was(tmp_path: Path) -> None:
     assert parse_yaml("{a: [1, 2]}", "--set") == {"a": [1, 2]}
     with pytest.raises(InputError, match=r"--set: found '\{a: ', expected a value in YAML"):
         parse_yaml("{a: ", "--set")
+
+
+@pytest.mark.parametrize(
+    ("text", "prose"),
+    [
+        ("This tool recalibrates several cameras.\n", True),
+        ("(Please read this first!)\n\n=====\n", True),
+        ("# The camera's place, roughly\nformat: x\n", True),
+        ("format: imgcal-rig/1\nname: a rig of ours\ncameras: []\n", False),
+        ("a b c d e f\n", False),
+        ("left 1 right 2 left 3 right 4\n", False),
+        ("one two three\nfour five six\n", False),
+        ("", False),
+    ],
+)
+def test_prose_is_told_from_values(text: str, prose: bool) -> None:
+    assert is_prose(text) is prose
+
+
+@pytest.mark.parametrize(
+    "text", ["'a' * n + ': ['", "'abc ' * n + ': ['", "'ab.' * n", "'ab, ' * n + ' - ['", "'a\u2019' * n"]
+)
+def test_a_long_word_stops_nobody(text: str) -> None:
+    code = f"from imgcal.io import is_prose; n = 1_000_000; is_prose({text})"
+    subprocess.run([sys.executable, "-c", code], timeout=60, check=True)
+
+
+@pytest.mark.parametrize(
+    "text", ["'1:' * n + '1'", "'!!int ' + '1:' * n + '1'", "'1:' * n + '1.5'", "'0x' + 'f' * n", "'1_' * n"]
+)
+def test_a_long_number_stops_nobody(text: str) -> None:
+    code = f"from imgcal.io import parse_yaml; n = 1_000_000; parse_yaml({text}, 'x')"
+    done = subprocess.run([sys.executable, "-c", code], timeout=60, check=False, capture_output=True, text=True)
+    assert done.returncode == 0 or "InputError" in done.stderr

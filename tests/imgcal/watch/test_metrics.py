@@ -65,6 +65,19 @@ def test_only_this_machine_may_read_it_and_the_address_may_be_taken(tmp_path):
         urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=2)
 
 
+def test_who_asks_for_another_name_is_not_served():
+    """A page of another site may let its name point to this machine."""
+    with Metrics(Tally(), Intake(Given(), RIG), None, ("127.0.0.1", 0)) as metrics:
+        address = f"http://127.0.0.1:{metrics.port}/metrics"
+        for host in ("evil.example", "evil.example:9100", "127.0.0.1.evil.example", ""):
+            with pytest.raises(urllib.error.HTTPError, match="421") as caught:
+                urllib.request.urlopen(urllib.request.Request(address, headers={"Host": host}), timeout=10)
+            assert b"imgcal_" not in caught.value.read()
+        for host in (f"127.0.0.1:{metrics.port}", "localhost:9100", "[::1]:9100"):
+            with urllib.request.urlopen(urllib.request.Request(address, headers={"Host": host}), timeout=10) as reply:
+                assert b"imgcal_snapshots_total" in reply.read()
+
+
 def test_times_are_counted_by_their_limits():
     tally = Tally()
     for seconds in (0.0005, BUCKETS[0], 0.0011, 100.0):
