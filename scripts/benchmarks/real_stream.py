@@ -70,7 +70,7 @@ def untouched(stride: int) -> dict[str, Any]:
     with start(known.calibration) as keeper:
         for count, number in enumerate(FOLLOWED[::stride]):
             state = keeper.update(given.frame(number), time=number / RATE)
-            events += [_event(event, number) for event in state.events]
+            events += [plain(event, number) for event in state.events]
             if state.refused is not None:
                 refused[state.refused.partition(":")[0]] += 1
             if count % max(SCORE_EVERY // stride, 1) == 0:
@@ -112,34 +112,51 @@ def bumped(case: Case) -> dict[str, Any]:
             blobs = given.frame(number)
             if number >= BUMPED:
                 blobs = turned(blobs, known.calibration.rig, case.camera, case.degrees)
-            events += [_event(e, number) for e in keeper.update(blobs, time=number / RATE).events]
-    loud = [event for event in events if event["event"] not in QUIET]
-    before, after = ([e for e in loud if (e["frame"] >= BUMPED) is late] for late in (False, True))
-    moves = [e for e in after if e["event"] == "moved"]
-    own = [e for e in moves if e["camera"] == name]
-    sized = [e for e in own if e["size"] is not None]
-    delay = (own[0]["frame"] - first) / RATE if own else None
+            events += [plain(e, number) for e in keeper.update(blobs, time=number / RATE).events]
     limit = LIMITS.get(case.degrees, LIMIT)
-    kind = sized[-1]["change"] if sized else None
     return {
         "stride": case.stride,
-        "camera": name,
         "degrees": case.degrees,
-        "seen_again_frame": first,
+        **judge(events, name, "rotation", BUMPED, first, limit),
         "frames_seen_in_time": sum(number <= first + limit * RATE for number in seeing),
-        "delay_s": delay,
-        "in_time": delay is not None and delay <= limit,
-        "kind": kind,
-        "right_kind": kind == "rotation",
-        "size_deg": [sized[-1]["size"], sized[-1]["sigma"]] if sized else None,
-        "others_blamed": sorted({e["camera"] for e in moves} - {name}),
-        "other_events": dict(Counter(e["event"] for e in after if e["event"] not in ("moved", "relearnt"))),
-        "false_before": len(before),
-        "events": [e for e in events if e["frame"] >= BUMPED and e["event"] not in QUIET],
     }
 
 
-def _event(event: imgcal.Event, frame: int) -> dict[str, Any]:
+def judge(events: list[dict[str, Any]], camera: str, kind: str, since: int, seen: int, limit: float) -> dict[str, Any]:
+    """Say whether a bump was reported in time, and what else was.
+
+    Args:
+        events: as `plain` gives them.
+        camera: that was bumped.
+        kind: how.
+        since: frame from which on it was.
+        seen: first frame from then on in which the camera sees the object.
+        limit: seconds from there.
+    """
+    loud = [event for event in events if event["event"] not in QUIET]
+    before, after = ([e for e in loud if (e["frame"] >= since) is late] for late in (False, True))
+    moves = [e for e in after if e["event"] == "moved"]
+    own = [e for e in moves if e["camera"] == camera]
+    sized = [e for e in own if e["size"] is not None]
+    delay = (own[0]["frame"] - seen) / RATE if own else None
+    found = sized[-1]["change"] if sized else None
+    return {
+        "camera": camera,
+        "seen_frame": seen,
+        "delay_s": delay,
+        "in_time": delay is not None and delay <= limit,
+        "kind": found,
+        "right_kind": found == kind,
+        "size": [sized[-1]["size"], sized[-1]["sigma"]] if sized else None,
+        "others_blamed": sorted({e["camera"] for e in moves} - {camera}),
+        "other_events": dict(Counter(e["event"] for e in after if e["event"] not in ("moved", "relearnt"))),
+        "false_before": len(before),
+        "events": after,
+    }
+
+
+def plain(event: imgcal.Event, frame: int) -> dict[str, Any]:
+    """Take an event apart into plain values."""
     return {
         "frame": frame, "event": event.kind, "camera": event.camera, "change": event.change, "size": event.size,
         "sigma": event.sigma, "unit": event.unit, "message": event.message,
@@ -249,7 +266,7 @@ def main() -> None:
 
 
 def _brief(row: dict[str, Any]) -> str:
-    keys = ("false", "lost", "final_px", "final_to_batch", "worst_to_start", "delay_s", "in_time", "kind", "size_deg",
+    keys = ("false", "lost", "final_px", "final_to_batch", "worst_to_start", "delay_s", "in_time", "kind", "size",
             "others_blamed", "other_events", "false_before")  # fmt: skip
     return ", ".join(f"{key} {row[key]}" for key in keys if key in row)
 
