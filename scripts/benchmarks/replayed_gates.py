@@ -121,12 +121,12 @@ def _calibration_nees(calibration: Any, stream: ReplayedStream) -> float:
         return float(distance(keeper.belief, stream.place.truth).median() / VALUES)
 
 
-def items() -> Iterator[Item]:
-    """Items without end: two bumps for each quiet one."""
+def items(snapshots: int = LONG) -> Iterator[Item]:
+    """Items without end: two bumps for each quiet one of so many snapshots."""
     kinds, number = tuple(BUMPS), 0
     while True:
         place = PLACES[number % len(PLACES)]
-        yield Item(place, number)
+        yield Item(place, number, snapshots=snapshots)
         yield Item(place, 100_000 + 2 * number, kinds[2 * number % len(kinds)])
         yield Item(place, 100_001 + 2 * number, kinds[(2 * number + 1) % len(kinds)])
         number += 1
@@ -214,6 +214,7 @@ class Options:
 
     minutes: float = 60.0  #: begin no item later than this; the next run goes on
     count: int = 10_000  #: items at most
+    snapshots: int = LONG  #: of an item without a bump
     cores: int = 1
     out: Path = RESULT
 
@@ -225,7 +226,9 @@ def main() -> None:
     modules = (__file__, real_stream.__file__, replayed_noise.__file__, replayed_stream.__file__)
     kept = Kept(WORK / "replayed_gates", "\n".join(Path(str(name)).read_text("utf-8") for name in modules))
     until = time.monotonic() + 60 * options.minutes
-    some = takewhile(lambda pair: pair[0] < options.count and time.monotonic() < until, enumerate(items()))
+    some = takewhile(
+        lambda pair: pair[0] < options.count and time.monotonic() < until, enumerate(items(options.snapshots))
+    )
     with workers(None, options.cores, kept) as mapped:
         rows = []
         for row in mapped(run, (item for _, item in some)):

@@ -25,6 +25,8 @@ BRIDGED = 10
 """Frames without a camera's residuals that are filled; a longer gap ends a run."""
 LEAST_RUN = 60
 """Frames of the shortest run that blocks are taken from."""
+SHARING = 3
+"""Markers of a frame, at least, from which the shift that they share is taken."""
 LAGS = (1, 5, 20, 60)
 """Frames between residuals whose correlation is reported."""
 POSE = 6
@@ -59,10 +61,10 @@ def series_of(residual: Floats, generator: np.random.Generator) -> Series:
         generator: draws the deviations.
     """
     known = ~np.isnan(residual[..., 0])
-    frames = np.flatnonzero(known.any(1))
+    frames = np.flatnonzero(known.sum(1) >= min(SHARING, residual.shape[1]))
     shift = np.full((len(residual), 2), np.nan)
     shift[frames] = np.nanmean(residual[frames], 1)
-    deviations = (residual - shift[:, None])[known & (known.sum(1) > 1)[:, None]]
+    deviations = (residual - shift[:, None])[known & ~np.isnan(shift[:, :1])]
     runs = []
     for run in np.split(frames, np.flatnonzero(np.diff(frames) > BRIDGED + 1) + 1):
         if len(run) == 0 or run[-1] - run[0] + 1 < LEAST_RUN:
@@ -101,7 +103,7 @@ class Replay:
         return np.concatenate(parts)
 
     def _block(self, camera: int) -> Floats:
-        """Draw a block (F, N, 2) of one camera: every start in its runs is as probable."""
+        """Draw a block (F, N, 2) of one camera: a run is as probable as it is long."""
         block = self._piece(camera, int(self.generator.integers(*BLOCK)))
         count = self.markers - block.shape[1]
         if count <= 0:
@@ -113,9 +115,9 @@ class Replay:
 
     def _piece(self, camera: int, length: int) -> Floats:
         runs = self.sources[camera].runs
-        starts = np.array([len(run) - LEAST_RUN + 1 for run in runs])
-        run = int(self.generator.choice(len(runs), p=starts / starts.sum()))
-        begin = int(self.generator.integers(starts[run]))
+        lengths = np.array([len(run) for run in runs])
+        run = int(self.generator.choice(len(runs), p=lengths / lengths.sum()))
+        begin = int(self.generator.integers(lengths[run] - LEAST_RUN + 1))
         return runs[run][begin : begin + length]
 
 
@@ -131,7 +133,7 @@ def statistics(residual: Floats) -> dict[str, Any]:
         `LAGS` frames apart.
     """
     known = ~np.isnan(residual[..., 0])
-    several = known.sum(1) >= 3
+    several = known.sum(1) >= SHARING
     shift = np.full((len(residual), 2), np.nan)
     shift[several] = np.nanmean(residual[several], 1)
     share = np.nanmean(1 / known.sum(1)[several])
