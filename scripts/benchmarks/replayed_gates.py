@@ -27,6 +27,7 @@ from scripts.benchmarks.real_stream import LIMIT, QUIET, RATE, SEEN, judge, plai
 from scripts.benchmarks.replayed_noise import recorded_residuals, recorded_series, statistics
 from scripts.benchmarks.replayed_stream import PLACES, TEACHING, ReplayedStream, calibrated_stream
 from scripts.benchmarks.rig_streams import Bump
+from scripts.benchmarks.wand_recording import calibrated
 from scripts.output import ROOT, WORK, command, markdown, surroundings, write_json
 
 RESULT = ROOT / "docs" / "benchmarks" / "replayed_noise.json"
@@ -216,12 +217,16 @@ class Options:
     count: int = 10_000  #: items at most
     snapshots: int = LONG  #: of an item without a bump
     cores: int = 1
+    fresh: bool = False  #: calibrate the recording and take its residuals again, though they are kept
     out: Path = RESULT
 
 
 def main() -> None:
     """Run, count, write, print."""
     options = tyro.cli(Options, description=__doc__)
+    if options.fresh:
+        calibrated(anew=True)
+        replayed_noise.CACHE.unlink(missing_ok=True)
     noise = compared()
     modules = (__file__, real_stream.__file__, replayed_noise.__file__, replayed_stream.__file__)
     kept = Kept(WORK / "replayed_gates", "\n".join(Path(str(name)).read_text("utf-8") for name in modules))

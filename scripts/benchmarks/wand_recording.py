@@ -20,7 +20,7 @@ import imgcal
 from imgcal.association import observations_of
 from imgcal.errors import InputError
 from imgcal.estimation import estimate
-from imgcal.geometry import RigidTransform, rotation_from_vector
+from imgcal.geometry import RigidTransform, rotation_from_vector, undistort
 from imgcal.pipeline import RigScore, rms_length
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
 from scripts.output import WORK, make_folder
@@ -169,7 +169,7 @@ def turned(blobs: Detections, rig: CameraRig, camera: int, degrees: float) -> De
     vector = torch.tensor([math.cos(way), math.sin(way), 0.0], dtype=torch.float64) * math.radians(degrees)
     alone = rig.select([camera])
     xy = (torch.from_numpy(blobs.uv[rows]) - alone.principal_point) / alone.focal_length
-    straight, good = imgcal.geometry.undistort(xy[None], alone.distortion, alone.lens_model)
+    straight, good = undistort(xy[None], alone.distortion, alone.lens_model)
     rays = torch.cat((straight[0], torch.ones(len(rows), 1, dtype=torch.float64)), 1) @ rotation_from_vector(vector).T
     still = replace(alone, cam_from_rig=RigidTransform.identity(dtype=torch.float64).reshape(1))
     image = still.project(1000.0 * rays)
