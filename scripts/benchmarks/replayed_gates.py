@@ -33,7 +33,7 @@ from scripts.output import ROOT, WORK, command, markdown, surroundings, write_js
 RESULT = ROOT / "docs" / "benchmarks" / "replayed_noise.json"
 LONG = 6000
 """Snapshots of an item without a bump."""
-BEFORE, AFTER = 600, 480
+BEFORE, AFTER = 300, 480
 """Snapshots before a bump, and after the camera has seen the object."""
 BUMPS = {"rotation": math.radians(0.3), "position": 20.0, "focal_length": 20.0, "principal_point": 5.0}
 """Rad, mm, px: each some five pixels in the rigs of a room."""

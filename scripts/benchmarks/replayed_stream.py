@@ -86,7 +86,8 @@ class ReplayedStream(Stream):
     length: int = 6000  # snapshots at most
     given: Disturbances = Disturbances()
     _first: int = field(default=0, init=False)
-    _ahead: int = field(default=0, init=False)  # snapshots that are simulated already
+    _ahead: int = field(default=0, init=False)  # the first one that is not simulated yet
+    _rigs_ahead: CameraRig = field(init=False, repr=False)  # (S,) true rigs of these, since `_first`
 
     def __post_init__(self) -> None:
         assert self.place is not None
