@@ -17,6 +17,8 @@ from imgcal.monitoring import CHANGES
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import CameraRig, Detections, DriftRate, Observations
 
+Blobs = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]
+
 
 @dataclass(frozen=True)
 class Conditions:
@@ -28,6 +30,7 @@ class Conditions:
     lens: float = 0.0  # px RMS of each axis, that lenses bend an image and nobody knows, over 300 to 900 px
     hidden: float = 0.1  # share of fiducials
     clutter: float = 0.5  # false blobs a camera and snapshot
+    radius: float = 5.0  # px, of each blob; nan = unknown
     rate: float = 60.0  # snapshots/s
     drift: DriftRate = DriftRate(0.0, 0.0, 0.0, 0.0, 0.0)
     reach: tuple[float, float, float] = (90.0, 60.0, 60.0)  # mm, how far the object goes from the middle
@@ -97,13 +100,40 @@ class Stream:
     def snapshot(self, number: int) -> Detections:
         """Blobs of a snapshot; `self.rig` and `self.pose` are then the truth of it."""
         given, noise = self.conditions, self.noise
+        self._advance(number)
+        cameras, spots, fiducials = self._blobs(number)
+        false = noise.poisson(given.clutter, self.rig.num_cameras)
+        where = np.repeat(np.arange(self.rig.num_cameras), false)
+        wrong = noise.random((len(where), 2)) * self.rig.image_size.numpy()[where]
+        camera = np.concatenate((cameras, where))
+        labels = np.concatenate((fiducials if given.labelled else np.full(len(cameras), -1), np.full(len(where), -1)))
+        rows = noise.permutation(len(camera))
+        rows = rows[[not self._is_out(int(camera[r]), number) for r in rows]]
+        return Detections(
+            uv=np.concatenate((spots, wrong))[rows],
+            sigma=np.full(len(rows), given.noise),
+            camera=camera[rows].astype(np.int64),
+            snapshot=np.zeros(len(rows), dtype=np.int64),
+            fiducial=labels[rows].astype(np.int64),
+            radius=np.full(len(rows), given.radius),
+            flags=np.zeros(len(rows), dtype=np.uint8),
+            camera_names=self.rig.camera_names,
+            snapshot_names=(str(number),),
+        )
+
+    def _advance(self, number: int) -> None:
+        """Let the rig wander, and bump what is bumped before a snapshot."""
         if number:
-            walk = given.drift.std(self.rig) * math.sqrt(1 / given.rate / 3600)
+            walk = self.conditions.drift.std(self.rig) * math.sqrt(1 / self.conditions.rate / 3600)
             if walk.any():
-                self.rig = self.rig.retract(walk * torch.from_numpy(noise.standard_normal(walk.shape)))
+                self.rig = self.rig.retract(walk * torch.from_numpy(self.noise.standard_normal(walk.shape)))
         for bump in self.bumps:
             if bump.snapshot == number:
                 self.rig = self.changed(bump)
+
+    def _blobs(self, number: int) -> Blobs:
+        """Blobs of fiducials in a snapshot: cameras (M,), pixels (M, 2), fiducials (M,)."""
+        given, noise = self.conditions, self.noise
         uv, visible = self._images(torch.tensor([number]), self.rig.expand(1))
         uv, seen = uv[0], visible[0]
         uv = uv + given.noise * noise.standard_normal(uv.shape) + self._shaken(uv[:, :1])
@@ -114,24 +144,7 @@ class Stream:
         if any(first <= number < last for first, last in self.absent):
             seen[:] = False
         cameras, fiducials = np.nonzero(seen)
-        false = noise.poisson(given.clutter, self.rig.num_cameras)
-        where = np.repeat(np.arange(self.rig.num_cameras), false)
-        wrong = noise.random((len(where), 2)) * self.rig.image_size.numpy()[where]
-        camera = np.concatenate((cameras, where))
-        labels = np.concatenate((fiducials if given.labelled else np.full(len(cameras), -1), np.full(len(where), -1)))
-        rows = noise.permutation(len(camera))
-        rows = rows[[not self._is_out(int(camera[r]), number) for r in rows]]
-        return Detections(
-            uv=np.concatenate((uv[cameras, fiducials], wrong))[rows],
-            sigma=np.full(len(rows), given.noise),
-            camera=camera[rows].astype(np.int64),
-            snapshot=np.zeros(len(rows), dtype=np.int64),
-            fiducial=labels[rows].astype(np.int64),
-            radius=np.full(len(rows), 5.0),
-            flags=np.zeros(len(rows), dtype=np.uint8),
-            camera_names=self.rig.camera_names,
-            snapshot_names=(str(number),),
-        )
+        return cameras, uv[cameras, fiducials], fiducials
 
     def labelled(self, first: int, last: int) -> tuple[Observations, CameraRig]:
         """Fiducials (S, C, N) of many snapshots at once, without false blobs, and the true rigs (S,).

@@ -1,0 +1,275 @@
+"""Gates of a running rig on the real stream: left alone, and with one camera turned.
+
+Run as `python -m scripts.benchmarks.real_stream`. Frames 0-2399, every eighth, are calibrated; the keeper starts from
+that and follows frames 2400-4799. Nothing moved in this recording, so every event but a loss of the wand is false. What
+has been run with the same code is not run again (`out/work/real_stream`).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+import imgcal
+from imgcal.fleet import Kept, workers
+from scripts.benchmarks import wand_recording
+from scripts.benchmarks.wand_recording import FOLLOWED, RATE, SEEN, calibrated, recording, turned
+from scripts.output import ROOT, WORK, command, markdown, surroundings, write_json
+
+RESULT = ROOT / "docs" / "benchmarks" / "real_stream.json"
+QUIET = ("camera_lost", "camera_back")
+"""Events that are true: cameras lose the wand. Each is to be reported once."""
+BUMPED = 3000
+"""Frame from which on a camera is turned."""
+AFTER = 8.0
+"""Seconds that a turned camera is followed for once it sees the wand."""
+LIMITS = {0.1: 5.0}
+"""Seconds within which a turn (degrees) must be reported; others: `LIMIT`."""
+LIMIT = 1.0
+SCORE_EVERY = 100
+"""Frames between scores."""
+WORST_FINAL, WORST_ON_THE_WAY = 1.0, 1.2
+"""Gates: final rig to the calibration, and any rig on the way to that which it started from."""
+
+
+def start(calibration: imgcal.Calibration) -> imgcal.RigKeeper:
+    """Begin to keep a rig that has just been calibrated."""
+    return imgcal.RigKeeper(calibration.rig, calibration.obj)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One run through the stream."""
+
+    stride: int  # every which frame
+    camera: int | None = None  # that is turned; None = nothing is touched
+    degrees: float = 0.0
+
+    @property
+    def key(self) -> str:
+        """What its result is found by."""
+        return f"stride {self.stride}, camera {self.camera}, {self.degrees} degrees"
+
+
+def run(case: Case) -> dict[str, Any]:
+    """Run one case."""
+    return untouched(case.stride) if case.camera is None else bumped(case)
+
+
+def untouched(stride: int) -> dict[str, Any]:
+    """Follow the stream as it is; list all events, score the rig on the way."""
+    given, known = recording(), calibrated()
+    batch, batch_median = known.score(known.calibration.rig)
+    events, scores, refused, began = [], [], Counter[str](), time.process_time()
+    with start(known.calibration) as keeper:
+        for count, number in enumerate(FOLLOWED[::stride]):
+            state = keeper.update(given.frame(number), time=number / RATE)
+            events += [plain(event, number) for event in state.events]
+            if state.refused is not None:
+                refused[state.refused.partition(":")[0]] += 1
+            if count % max(SCORE_EVERY // stride, 1) == 0:
+                scores.append([number, *known.score(state.rig)])
+    seconds = time.process_time() - began
+    final, final_median = known.score(state.rig)
+    false = [event for event in events if event["event"] not in QUIET]
+    return {
+        "stride": stride,
+        "frames": count + 1,
+        "false": len(false),
+        "false_by_kind": dict(Counter(event["event"] for event in false)),
+        "lost": sum(event["event"] == "camera_lost" for event in events),
+        "lost_twice": _lost_twice(events),
+        "batch_px": [batch, batch_median],
+        "final_px": [final, final_median],
+        "final_to_batch": final / batch,
+        "worst_to_start": max(score[1] for score in scores) / batch,
+        "at_end": dict(Counter(state.cameras.values())),
+        "refused": dict(refused),
+        "scores_px": scores,
+        "events": events,
+        "ms_a_frame": 1000 * seconds / (count + 1),
+    }
+
+
+def bumped(case: Case) -> dict[str, Any]:
+    """Turn one camera; follow it until it has seen the wand for a while."""
+    given, known = recording(), calibrated()
+    assert case.camera is not None
+    name = given.factory.camera_names[case.camera]
+    seeing = [n for n in FOLLOWED[:: case.stride] if n >= BUMPED and given.counts[n, case.camera] >= SEEN]
+    first = seeing[0]
+    events = []
+    with start(known.calibration) as keeper:
+        for number in FOLLOWED[:: case.stride]:
+            if number > first + AFTER * RATE:
+                break
+            blobs = given.frame(number)
+            if number >= BUMPED:
+                blobs = turned(blobs, known.calibration.rig, case.camera, case.degrees)
+            events += [plain(e, number) for e in keeper.update(blobs, time=number / RATE).events]
+    limit = LIMITS.get(case.degrees, LIMIT)
+    return {
+        "stride": case.stride,
+        "degrees": case.degrees,
+        **judge(events, name, "rotation", BUMPED, first, limit),
+        "frames_seen_in_time": sum(number <= first + limit * RATE for number in seeing),
+    }
+
+
+def judge(events: list[dict[str, Any]], camera: str, kind: str, since: int, seen: int, limit: float) -> dict[str, Any]:
+    """Say whether a bump was reported in time, and what else was.
+
+    Args:
+        events: as `plain` gives them.
+        camera: that was bumped.
+        kind: how.
+        since: frame from which on it was.
+        seen: first frame from then on in which the camera sees the object.
+        limit: seconds from there.
+    """
+    loud = [event for event in events if event["event"] not in QUIET]
+    before, after = ([e for e in loud if (e["frame"] >= since) is late] for late in (False, True))
+    moves = [e for e in after if e["event"] == "moved"]
+    own = [e for e in moves if e["camera"] == camera]
+    sized = [e for e in own if e["size"] is not None]
+    delay = (own[0]["frame"] - seen) / RATE if own else None
+    found = sized[-1]["change"] if sized else None
+    return {
+        "camera": camera,
+        "seen_frame": seen,
+        "delay_s": delay,
+        "in_time": delay is not None and delay <= limit,
+        "kind": found,
+        "right_kind": found == kind,
+        "size": [sized[-1]["size"], sized[-1]["sigma"]] if sized else None,
+        "others_blamed": sorted({e["camera"] for e in moves} - {camera}),
+        "other_events": dict(Counter(e["event"] for e in after if e["event"] not in ("moved", "relearnt"))),
+        "false_before": len(before),
+        "events": after,
+    }
+
+
+def plain(event: imgcal.Event, frame: int) -> dict[str, Any]:
+    """Take an event apart into plain values."""
+    return {
+        "frame": frame, "event": event.kind, "camera": event.camera, "change": event.change, "size": event.size,
+        "sigma": event.sigma, "unit": event.unit, "message": event.message,
+    }  # fmt: skip
+
+
+def _lost_twice(events: list[dict[str, Any]]) -> int:
+    """Count losses of cameras that had not come back since their last one."""
+    gone, twice = set(), 0
+    for event in events:
+        if event["event"] == "camera_lost":
+            twice += event["camera"] in gone
+            gone.add(event["camera"])
+        if event["event"] == "camera_back":
+            gone.discard(event["camera"])
+    return twice
+
+
+def summarize(bumps: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Count what came of the bumps of one size and stride."""
+    groups: dict[tuple[int, float], list[dict[str, Any]]] = {}
+    for bump in bumps:
+        groups.setdefault((bump["stride"], bump["degrees"]), []).append(bump)
+    rows = []
+    for (stride, degrees), group in sorted(groups.items()):
+        delays = sorted(bump["delay_s"] for bump in group if bump["in_time"])
+        rows.append(
+            {
+                "stride": stride,
+                "degrees": degrees,
+                "bumps": len(group),
+                "in_time": len(delays),
+                "right": sum(b["in_time"] and b["right_kind"] and not b["others_blamed"] for b in group),
+                "others_blamed": sum(bool(bump["others_blamed"]) for bump in group),
+                "median_delay_s": delays[len(delays) // 2] if delays else None,
+                "false_before": sum(bump["false_before"] for bump in group),
+            }
+        )
+    return rows
+
+
+def tables(result: dict[str, Any]) -> dict[str, str]:
+    """Markdown, by name."""
+    quiet = [
+        [
+            str(row["stride"]), str(row["false"]), ", ".join(f"{n} {k}" for k, n in row["false_by_kind"].items()),
+            f"{row['lost']} ({row['lost_twice']})", f"{row['final_px'][0]:.3f}", f"{row['final_to_batch']:.2f}",
+            f"{row['worst_to_start']:.2f}", f"{row['ms_a_frame']:.1f}",
+        ]
+        for row in result["untouched"]
+    ]  # fmt: skip
+    turns = [
+        [
+            str(row["stride"]), f"{row['degrees']:g}", f"{row['in_time']} of {row['bumps']}",
+            f"{row['right']} of {row['bumps']}", str(row["others_blamed"]),
+            "-" if row["median_delay_s"] is None else f"{row['median_delay_s']:.2f}", str(row["false_before"]),
+        ]
+        for row in result["bumps"]
+    ]  # fmt: skip
+    head = ["every", "false events", "which", "losses (reported twice)", "final px", "to calibration", "worst to start",
+            "ms a frame"]  # fmt: skip
+    turn = ["every", "degrees", "in time", "and right", "others blamed", "median delay, s", "false before"]
+    return {"real stream untouched": markdown(head, quiet), "real stream bumps": markdown(turn, turns)}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Follow the recorded wand, as it is and with one camera turned."""
+
+    strides: tuple[int, ...] = (1, 2, 3, 4, 8)  #: every which frame is followed, untouched
+    bumps: tuple[float, ...] = (0.1, 0.3, 1.0)  #: degrees
+    bump_strides: tuple[int, ...] = (1,)  #: every which frame is followed where a camera is turned
+    cameras: tuple[int, ...] = tuple(range(10))  #: that are turned, each in a run of its own
+    cores: int = 1
+    fresh: bool = False  #: calibrate again, though the last calibration is kept
+    out: Path = RESULT
+
+
+def main() -> None:
+    """Run, count, write, print."""
+    options = tyro.cli(Options, description=__doc__)
+    known = calibrated(options.fresh)
+    texts = [Path(str(module)).read_text("utf-8") for module in (__file__, wand_recording.__file__)]
+    rms = float(known.calibration.rms)
+    cases = [Case(stride) for stride in options.strides] + [
+        Case(stride, camera, degrees)
+        for stride in options.bump_strides
+        for degrees in options.bumps
+        for camera in options.cameras
+    ]
+    with workers(None, options.cores, Kept(WORK / "real_stream", f"{rms!r}\n" + "\n".join(texts))) as mapped:
+        found = []
+        for case, row in zip(cases, mapped(run, cases), strict=True):
+            found.append(row)
+            print(case.key, _brief(row), flush=True)
+    runs = [row for row in found if "degrees" in row]
+    result = {
+        **surroundings(),
+        "calibration_rms_px": math.sqrt(2) * rms,
+        "gates": {"final_to_batch": WORST_FINAL, "worst_to_start": WORST_ON_THE_WAY, "false": 0},
+        "untouched": [row for row in found if "degrees" not in row],
+        "bumps": summarize(runs),
+        "bump_runs": runs,
+    }
+    write_json(options.out, result)
+    print("\n\n".join(tables(result).values()))
+
+
+def _brief(row: dict[str, Any]) -> str:
+    keys = ("false", "lost", "final_px", "final_to_batch", "worst_to_start", "delay_s", "in_time", "kind", "size",
+            "others_blamed", "other_events", "false_before")  # fmt: skip
+    return ", ".join(f"{key} {row[key]}" for key in keys if key in row)
+
+
+if __name__ == "__main__":
+    command(main)

@@ -1,0 +1,210 @@
+"""Residuals of real cameras, replayed: a block bootstrap that keeps how they go together in time and among markers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from imgcal.association import associate, observations_of
+from imgcal.errors import InputError
+from imgcal.estimation import estimate
+from scripts.benchmarks.wand_recording import CALIBRATED, calibrated, recording
+from scripts.output import WORK, make_folder
+
+Floats = NDArray[np.float64]
+
+BLOCK = (60, 240)
+"""Frames of a block: beyond 60 no correlation is left in the recording."""
+BRIDGED = 10
+"""Frames without a camera's residuals that are filled; a longer gap ends a run."""
+LEAST_RUN = 60
+"""Frames of the shortest run that blocks are taken from."""
+SHARING = 3
+"""Markers of a frame, at least, from which the shift that they share is taken."""
+LAGS = (1, 5, 20, 60)
+"""Frames between residuals whose correlation is reported."""
+POSE = 6
+"""Values that are fitted to a frame, and take their share out of its residuals."""
+CACHE = WORK / "wand_residuals.npz"
+
+
+@dataclass(frozen=True)
+class Series:
+    """Residuals of one camera in consecutive frames, without gaps."""
+
+    runs: Sequence[Floats]  # (F, N, 2) pixels each, N markers
+
+    def __post_init__(self) -> None:
+        """Refuse a camera that has nothing to be replayed.
+
+        Raises:
+            InputError: there is no run.
+        """
+        if not self.runs:
+            raise InputError(f"residuals: found no run of {LEAST_RUN} frames, expected one")
+
+
+def series_of(residual: Floats, generator: np.random.Generator) -> Series:
+    """Fill the gaps of a camera's residuals, and cut them where it saw nothing for long.
+
+    What a frame lacks is made of the shift that its markers share, interpolated where it is not known, and of a
+    deviation from that shift that some other marker had at some other time.
+
+    Args:
+        residual: (F, N, 2) pixels, nan where a marker was not seen.
+        generator: draws the deviations.
+    """
+    known = ~np.isnan(residual[..., 0])
+    frames = np.flatnonzero(known.sum(1) >= min(SHARING, residual.shape[1]))
+    shift = np.full((len(residual), 2), np.nan)
+    shift[frames] = np.nanmean(residual[frames], 1)
+    deviations = (residual - shift[:, None])[known & ~np.isnan(shift[:, :1])]
+    runs = []
+    for run in np.split(frames, np.flatnonzero(np.diff(frames) > BRIDGED + 1) + 1):
+        if len(run) == 0 or run[-1] - run[0] + 1 < LEAST_RUN:
+            continue
+        every = np.arange(run[0], run[-1] + 1)
+        there = np.stack([np.interp(every, run, shift[run, axis]) for axis in range(2)], -1)
+        drawn = deviations[generator.integers(len(deviations), size=(len(every), residual.shape[1]))]
+        runs.append(np.where(known[every][..., None], residual[every], there[:, None] + drawn))
+    return Series(runs)
+
+
+@dataclass
+class Replay:
+    """Residuals without end for the cameras of a rig, each replaying one real camera, in blocks of random length."""
+
+    sources: Sequence[Series]  # C
+    markers: int  # of the object; more than the series have share their camera's shift
+    generator: np.random.Generator
+    _left: list[Floats] = field(default_factory=list, repr=False)  # what is left of each camera's block
+
+    def __post_init__(self) -> None:
+        self._left = [self._block(camera) for camera in range(len(self.sources))]
+
+    def draw(self, frames: int) -> Floats:
+        """Go on for some frames: (F, C, N, 2) pixels."""
+        return np.stack([self._drawn(camera, frames) for camera in range(len(self.sources))], 1)
+
+    def _drawn(self, camera: int, frames: int) -> Floats:
+        parts, missing = [], frames
+        while missing:
+            if not len(self._left[camera]):
+                self._left[camera] = self._block(camera)
+            parts.append(self._left[camera][:missing])
+            self._left[camera] = self._left[camera][missing:]
+            missing -= len(parts[-1])
+        return np.concatenate(parts)
+
+    def _block(self, camera: int) -> Floats:
+        """Draw a block (F, N, 2) of one camera: a run is as probable as it is long."""
+        block = self._piece(camera, int(self.generator.integers(*BLOCK)))
+        count = self.markers - block.shape[1]
+        if count <= 0:
+            return block[:, : self.markers]
+        other = self._piece(camera, len(block))
+        own = other[np.arange(len(block)) % len(other)]
+        more = (own - own.mean(1, keepdims=True))[:, np.arange(count) % own.shape[1]] + block.mean(1, keepdims=True)
+        return np.concatenate((block, more), 1)
+
+    def _piece(self, camera: int, length: int) -> Floats:
+        runs = self.sources[camera].runs
+        lengths = np.array([len(run) for run in runs])
+        run = int(self.generator.choice(len(runs), p=lengths / lengths.sum()))
+        begin = int(self.generator.integers(lengths[run] - LEAST_RUN + 1))
+        return runs[run][begin : begin + length]
+
+
+def statistics(residual: Floats) -> dict[str, Any]:
+    """How the residuals of one camera go together.
+
+    Args:
+        residual: (F, N, 2) pixels, nan where not seen.
+
+    Returns:
+        RMS of an axis and standard deviation of the shift that all markers share, in pixels, a tenth at each end being
+        left out; what independent markers would give for the latter; correlation of shifts and of single markers
+        `LAGS` frames apart.
+    """
+    known = ~np.isnan(residual[..., 0])
+    several = known.sum(1) >= SHARING
+    shift = np.full((len(residual), 2), np.nan)
+    shift[several] = np.nanmean(residual[several], 1)
+    share = np.nanmean(1 / known.sum(1)[several])
+    spread = _spread(residual[known])
+    own = (residual - shift[:, None])[known & several[:, None]]
+    unbiased = np.sqrt(1 / max(1 - share, 1e-9))  # their mean took a share of each marker
+    return {
+        "spread_px": spread,
+        "shift_px": _spread(shift[several]),
+        "independent_px": float(_spread(own) * unbiased * np.sqrt(share)),
+        "shift_correlation": {str(lag): _correlation(shift, lag) for lag in LAGS},
+        "marker_correlation": {
+            str(lag): float(np.nanmean([_correlation(residual[:, n], lag) for n in range(residual.shape[1])]))
+            for lag in LAGS
+        },
+    }
+
+
+def _spread(values: Floats) -> float:
+    """Standard deviation by the range of the middle four fifths of normal values."""
+    low, high = np.quantile(values, (0.1, 0.9))
+    return float((high - low) / 2.5631)
+
+
+def _correlation(series: Floats, lag: int) -> float:
+    """Correlation (of both axes) of a series (F, 2), nan where unknown, with itself some frames later."""
+    limit = 4 * _spread(series[~np.isnan(series)])
+    clean = np.clip(series - np.nanmedian(series, 0), -limit, limit)
+    first, second = clean[:-lag], clean[lag:]
+    both = ~np.isnan(first[:, 0]) & ~np.isnan(second[:, 0])
+    if both.sum() < 30:
+        return float("nan")
+    return float((first[both] * second[both]).mean() / np.nanmean(clean**2))
+
+
+@lru_cache(maxsize=1)
+def recorded_residuals() -> Floats:
+    """Residuals (F, C, N, 2) px of the recorded wand in consecutive frames, nan where not seen; kept in `out/work`.
+
+    The rig is held as calibrated, the poses are fitted; what six fitted values take out of a frame is put back.
+    """
+    if CACHE.is_file():
+        with np.load(CACHE) as file:
+            kept: Floats = file["residual"]
+        return kept
+    given, known = recording(), calibrated()
+    calibration, frames = known.calibration, range(CALIBRATED.stop)
+    labelled = associate(given.chosen(frames), calibration.rig, calibration.object)
+    observations, poses = observations_of(labelled, calibration.rig, calibration.object)
+    fixed = torch.zeros(calibration.rig.num_cameras, calibration.rig.num_parameters, dtype=torch.float64)
+    fit = estimate(observations, calibration.rig, calibration.object, poses, prior_std=fixed)
+    seen = observations.seen.numpy()
+    values = 2.0 * seen.sum((1, 2))
+    back = np.sqrt(values / np.maximum(values - POSE, 1.0))
+    sound = values >= 4 * POSE  # the pose is not bent to a few markers
+    numbers = np.array([int(labelled.snapshots[s].name) for s in labelled.used])
+    residual = np.full((len(frames), *seen.shape[1:], 2), np.nan)
+    seen &= sound[:, None, None]
+    residual[numbers] = np.where(seen[..., None], fit.residual.numpy() * back[:, None, None, None], np.nan)
+    make_folder(CACHE.parent)
+    np.savez_compressed(CACHE, residual=residual)
+    return residual
+
+
+def recorded_series(seed: int = 0) -> list[Series]:
+    """One series for each camera of the recorded wand that has long runs."""
+    residual, generator = recorded_residuals(), np.random.default_rng(seed)
+    found = []
+    for camera in range(residual.shape[1]):
+        try:
+            found.append(series_of(residual[:, camera], generator))
+        except InputError:
+            continue
+    return found

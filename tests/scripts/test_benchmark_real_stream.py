@@ -1,0 +1,55 @@
+"""How bumps of the real stream are made, and how reports of them are judged."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import imgcal
+from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
+from scripts.benchmarks.real_stream import judge, summarize
+from scripts.benchmarks.wand_recording import turned
+
+
+def event(frame, kind="moved", camera="cam02", change="unknown", size=None):
+    return {"frame": frame, "event": kind, "camera": camera, "change": change, "size": size, "sigma": 0.01}
+
+
+def test_what_a_turned_camera_sees_is_what_it_would_see():
+    factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+    truth = simulate_truth(factory, obj, 1, torch.Generator().manual_seed(1), PhysicalDrift())
+    blobs = true_detections(truth)
+    found = turned(blobs, truth.rig, 1, 0.3)
+    angle = math.radians(0.3)
+    way = torch.tensor([math.cos(2.4), math.sin(2.4), 0.0], dtype=torch.float64) * angle
+    step = torch.zeros(4, 15, dtype=torch.float64)
+    step[1, :3] = way
+    image = truth.rig.retract(step).expand(1).project(truth.rig_from_object.apply(obj.points), obj.radius)
+    expected = image.uv[0].numpy()[found.camera, found.fiducial]
+    assert np.abs(found.uv - expected).max() < 0.01  # apparent centres of spheres turn almost as points do
+    others = blobs.camera != 1
+    np.testing.assert_array_equal(found.uv[found.camera != 1], blobs.uv[others])
+    assert len(turned(blobs.select(others), truth.rig, 1, 0.3)) == others.sum()
+
+
+def test_points_that_are_turned_out_of_the_image_are_gone():
+    factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+    blobs = true_detections(simulate_truth(factory, obj, 1, torch.Generator().manual_seed(1), PhysicalDrift()))
+    assert not (turned(blobs, factory, 1, 80.0).camera == 1).any()
+
+
+def test_a_bump_is_right_only_in_time_and_where_it_was():
+    judged = judge([event(130), event(150, change="rotation", size=0.3)], "cam02", "rotation", 100, 120, 1.0)
+    assert (judged["in_time"], judged["right_kind"], judged["others_blamed"]) == (True, True, [])
+    assert judged["delay_s"] == pytest.approx(10 / 60)
+    late = judge([event(190)], "cam02", "rotation", 100, 120, 1.0)
+    assert (late["in_time"], late["right_kind"]) == (False, False)
+    wrong = judge([event(130, camera="cam03"), event(80), event(140, "drift")], "cam02", "rotation", 100, 120, 1.0)
+    assert (wrong["delay_s"], wrong["others_blamed"], wrong["false_before"]) == (None, ["cam03"], 1)
+    assert wrong["other_events"] == {"drift": 1}
+    quiet = judge([event(50, "camera_lost"), event(130, "camera_back")], "cam02", "rotation", 100, 120, 1.0)
+    assert (quiet["false_before"], quiet["other_events"]) == (0, {})
+    rows = [{"stride": 1, "degrees": 0.3, **found} for found in (judged, late, wrong)]
+    (row,) = summarize(rows)
+    assert (row["bumps"], row["in_time"], row["right"], row["others_blamed"]) == (3, 1, 1, 1)
