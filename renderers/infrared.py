@@ -11,7 +11,8 @@ from torch import Tensor
 from renderers.clutter import Clutter
 from renderers.compositing import Canvas, composite_windows, window_starts
 from renderers.coverage import Windows, ellipse_coverage, smeared
-from renderers.sensor import SensorModel, expose
+from renderers.sensor import expose
+from renderers.sensor_model import SensorModel
 from renderers.spots import Spots
 
 # Windows reach this many standard deviations of the blur beyond the ellipse: 3e-7 of the light lies outside.

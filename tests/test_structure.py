@@ -48,6 +48,7 @@ def test_private_names_stay_where_they_are() -> None:
 TESTED_ELSEWHERE = {
     "imgcal/association/options.py": "values only",
     "imgcal/association/result.py": "values only",
+    "imgcal/cli/arguments.py": "values only; test_imports, cli/test_help",
     "imgcal/cli/describe.py": "cli/test_calibrate reads the reports that it makes",
     "imgcal/cli/detect.py": "cli/test_main, test_warmup",
     "imgcal/pipeline/calibration.py": "pipeline/test_recalibration",
@@ -57,15 +58,22 @@ TESTED_ELSEWHERE = {
     "imgcal/cli/training_folder.py": "training/test_engine, cli/test_train",
     "imgcal/cli/warmup.py": "online/test_warmup",
     "imgcal/formats/format.py": "values only",
+    "imgcal/formats/limits.py": "values only",
     "imgcal/evaluation/plots.py": "evaluation/test_tables",
     "imgcal/evaluation/summary.py": "evaluation/test_tables",
     "imgcal/online/sequential_test.py": "a protocol; online/test_keeper",
     "imgcal/live_page/process.py": "live_page/test_server, test_live_page: a process of its own",
     "imgcal/geometry/lens_model.py": "values only",
     "imgcal/pipeline/arrangement.py": "pipeline/test_recalibration, test_steadiness",
+    "imgcal/synthesis/hand_held.py": "values only; synthesis/test_volumes",
+    "imgcal/synthesis/lens.py": "values only; synthesis/test_arrangements",
+    "imgcal/synthesis/physical_drift.py": "synthesis/test_rigs, beside the paper's drift",
     "imgcal/training/callbacks.py": "training/test_engine",
     "imgcal/training/continuation.py": "training/test_engine, test_processes",
     "imgcal/training/run.py": "values only; training/test_engine",
+    "imgcal/watch/timing.py": "values only; watch/test_synchronization",
+    "renderers/clutter_model.py": "values only; test_clutter",
+    "renderers/sensor_model.py": "values only; test_sensor, test_infrared",
 }
 
 

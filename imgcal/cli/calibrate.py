@@ -6,16 +6,14 @@ import json
 import sys
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
 
 import torch
-import tyro
 
 from imgcal.association import PipelineOptions
+from imgcal.cli import arguments
 from imgcal.cli.common import (
-    StartPose,
     check_folder,
     only_cameras,
     open_rig,
@@ -30,7 +28,6 @@ from imgcal.cli.describe import describe, describe_refusal
 from imgcal.cli.findings import findings
 from imgcal.cli.memory import keep_memory
 from imgcal.cli.outcome import print_outcome, refused_summary, summary
-from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import Gauge
 from imgcal.extras import advice, missing
@@ -52,7 +49,6 @@ from imgcal.messages import listed, shortened
 from imgcal.pipeline import (
     Calibration,
     Detector,
-    DetectorName,
     LearnedMeasurer,
     calibrate,
     calibrate_from_scratch,
@@ -69,57 +65,8 @@ WRITTEN = ("report.html", RIG, "object.csv", "result.json")
 WORST_STD = 1e6  # in any unit: what is known so badly is not known
 
 
-@dataclass(frozen=True)
-class Calibrate:
-    """Recalibrate a rig from captured frames (or a table of blobs) of a known object.
-
-    Writes OUT/rig.yaml (the recalibrated rig, with the standard deviation of every parameter), OUT/result.json and
-    OUT/report.html; where the object's fiducials were estimated, too, also OUT/object.csv. If the data cannot decide,
-    the reason is in result.json and report.html, no rig.yaml is written, the exit code is 3, and an earlier calibration
-    in OUT moves to OUT/previous. OUT changes when all is written; any other failure leaves it as it was.
-    Examples: imgcal calibrate my_capture --rig factory.yaml --object object.csv --out result
-    imgcal calibrate my_capture --cameras cameras.yaml --object wand4 --out result
-    """
-
-    input: Annotated[Path, tyro.conf.Positional]  #: capture folder or detections file
-    object: str  #: object: file, or the name of a shipped one
-    out: Path  #: folder to write
-    rig: str | None = None  #: factory rig: file, or the name of a shipped one
-    cameras: Path | None = None
-    """instead of --rig, where there is no factory calibration: cameras of which only the size of the images and a rough
-    focal length or field of view is known (imgcal rig cameras writes such a file), or a calibration whose places do not
-    count; carry the whole object through what neighbouring cameras see together; the rig's frame is that of its first
-    camera"""
-    snapshots: str | None = None  #: A:B, numbers in file order from 0, B excluded
-    videos_differ: bool = False  #: accept videos whose lengths or time stamps differ: frames go together by number
-    detector: DetectorName = "classical"
-    """who finds the fiducials in frames: classical (blobs), matched (the whole pattern at once, for frames too dim,
-    blurred or cluttered for blobs; slower), auto (blobs, and the pattern where these decide nothing), learned (a
-    network for any rig and object), both (blobs, and the network where these decide nothing), or the network's file or
-    run"""
-    measurer: str | None = None
-    """network that measures blobs again, and what learned finds: a file, the folder of a run, or a shipped name"""
-    first_guess: str = "none"  #: where to start: none (factory rig), points, vit, cnn (shipped), a file or run
-    trust: tuple[str, ...] = ()  #: encoders of yours, package.module:Class, that its file may name: their code runs
-    without: tuple[str, ...] = ()  #: cameras to leave out
-    blind_cameras: bool = False  #: accept cameras that see nothing; they keep their factory values
-    after_last_move: bool = False  #: where a camera moved during the capture, use the snapshots since then
-    labelled: Path | None = None
-    """file for all blobs with the labels that they got, a table like the input; labels that do not fit have flag 16"""
-    start_pose: StartPose | None = None
-    """rig_from_object of the first snapshot, roughly: rotation vector (3 numbers, rad) and translation (3, mm); decides
-    which way round a symmetric object is"""
-    object_tolerance: float = 0.0
-    """mm: how far each fiducial may be from its place in the object file (one standard deviation of each coordinate),
-    where that has no column `tolerance`; 0 = exact, unless the images say otherwise"""
-    object_scale_tolerance: float = 0.0
-    """how far all distances of the object may be off together, one standard deviation (0.01 is 1 %); 0 = exact"""
-    full_covariance: bool = False  #: write the whole covariance matrix to rig.yaml, too
-    report: bool = True  #: write report.html
-    reference: str | None = None
-    """camera that positions and rotations are relative to, in rig.yaml's uncertainty (default: the first) and in the
-    report (default: most cameras are taken to have stood still)"""
-    detection: Annotated[DetectionOptions, tyro.conf.arg(name="")] = field(default_factory=DetectionOptions)
+class Calibrate(arguments.Calibrate):
+    """Run `imgcal calibrate`."""
 
     def run(self) -> None:
         """Calibrate and write."""

@@ -18,6 +18,7 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from imgcal.cli.arguments import StartPose
 from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError
 from imgcal.formats import format_named, is_foreign, load_rig, read_foreign_rig
@@ -102,9 +103,6 @@ def progress(items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
         return
     with Progress(*columns, console=console, transient=True) as bar:
         yield from bar.track(items, total=total, description=label)
-
-
-StartPose = tuple[float, float, float, float, float, float]
 
 
 def start_pose(values: StartPose | None) -> RigidTransform | None:

@@ -8,12 +8,12 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 
+from imgcal.cli import arguments
 from imgcal.cli.common import check_folder, counted, open_rig
 from imgcal.errors import InputError
 from imgcal.fleet import Kept
@@ -32,30 +32,9 @@ SHIPPED_NETWORKS = ("learned", "both")
 SEED = re.compile(r"(.+)-seed(\d+)")
 
 
-@dataclass(frozen=True)
-class Captures:
-    """What captures are simulated."""
-
-    captures: int = 0  #: so many a difficulty: compare detectors on captured frames instead of networks on points
-    difficulty: tuple[str, ...] = ()  #: names as of `imgcal simulate --difficulty`; default: all
-    snapshots: int = 4  #: of a capture
-
-    def check(self) -> None:
-        """Raise InputError where a number is out of its limits, or a difficulty is not known."""
-        from imgcal.synthesis import DIFFICULTIES
-
-        for name, most in LIMITS.items():
-            if not 1 <= getattr(self, name) <= most:
-                raise InputError(f"--{name}: found {getattr(self, name)}, expected 1 to {most}")
-        for name in self.difficulty:
-            if name not in DIFFICULTIES:
-                known = nearest(name, DIFFICULTIES)
-                raise InputError(f"--difficulty: found {name!r:.80}, expected some of {', '.join(DIFFICULTIES)}{known}")
-
-
 def compare_captures(
     detectors: Sequence[Path],
-    chosen: Captures,
+    chosen: arguments.Captures,
     rig: str,
     obj: str,
     seed: int,
@@ -80,7 +59,7 @@ def compare_captures(
     from imgcal.pipeline import proposer_of
     from imgcal.synthesis import DIFFICULTIES, FrameModel
 
-    chosen.check()
+    _check(chosen)
     if out is not None:
         check_folder(out)
     names = chosen.difficulty or tuple(DIFFICULTIES)
@@ -140,3 +119,16 @@ def describe(scene: Scene, captures: int, seed: int) -> str:
         f"Rig {scene.rig.name}, object {scene.obj.name}, {captures} captures a difficulty of {scene.snapshots} "
         f"snapshots, seed {seed}; drift of all values, standard deviations: {drift}."
     )
+
+
+def _check(chosen: arguments.Captures) -> None:
+    """Raise InputError where a number is out of its limits, or a difficulty is not known."""
+    from imgcal.synthesis import DIFFICULTIES
+
+    for name, most in LIMITS.items():
+        if not 1 <= getattr(chosen, name) <= most:
+            raise InputError(f"--{name}: found {getattr(chosen, name)}, expected 1 to {most}")
+    for name in chosen.difficulty:
+        if name not in DIFFICULTIES:
+            known = nearest(name, DIFFICULTIES)
+            raise InputError(f"--difficulty: found {name!r:.80}, expected some of {', '.join(DIFFICULTIES)}{known}")

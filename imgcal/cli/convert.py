@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
-import tyro
-
+from imgcal.cli import arguments
 from imgcal.errors import InputError
 from imgcal.formats import (
     FORMATS,
-    LIMIT,
     OURS,
     ForeignRig,
     Written,
@@ -29,35 +25,8 @@ from imgcal.io import load_rig, load_rig_covariance, publishing, write_bytes
 from imgcal.messages import listed, shortened
 
 
-@dataclass(frozen=True)
-class Convert:
-    """Convert the calibration of a rig: another tool's to ours, ours to another tool's, or one tool's to another's.
-
-    What SOURCE is, its content says. What is written is read back and compared on known points in every camera; nothing
-    is guessed, and what had to be assumed is printed. docs/formats.md has the formats.
-    Example: imgcal convert camchain.yaml --out rig.yaml
-    """
-
-    source: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """a file, a folder, or the files that are one calibration together; a rig file of ours, or a shipped rig"""
-    out: Path
-    """file to write; a folder where the format has several files"""
-    source_format: Annotated[str | None, tyro.conf.arg(name="from")] = None
-    """format of SOURCE by name, where its content is not to decide"""
-    to: str | None = None
-    """format to write by name (default: imgcal, where --out ends in .yaml)"""
-    unit: str | None = None
-    """unit of SOURCE, where its format does not say: mm, cm, m, inch, or the length of one unit, such as 417.2mm"""
-    distance: tuple[str, str, float] | None = None
-    """two cameras, and how many mm they are apart, where the unit is not known"""
-    image_size: tuple[str, ...] = ()
-    """WIDTHxHEIGHT of all cameras, or NAME=WIDTHxHEIGHT of one, where SOURCE does not say"""
-    cameras: tuple[str, ...] = ()
-    """names of the cameras to keep, in the order to write them (default: all)"""
-    out_unit: str | None = None
-    """unit to write, where the format leaves that to its user"""
-    fit_limit: float = LIMIT
-    """px that a lens may be off, anywhere in its image, where another model takes its place by a fit"""
+class Convert(arguments.Convert):
+    """Run `imgcal convert`."""
 
     def run(self) -> None:
         """Read, convert, verify, write."""

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Literal
-
-import tyro
-
+from imgcal.cli import arguments
 from imgcal.cli.common import open_rig
 from imgcal.errors import InputError
 from imgcal.io import load_object
@@ -15,20 +11,8 @@ from imgcal.live_page import Demonstration, parse_address
 MOST_RATE = 100.0
 
 
-@dataclass(frozen=True)
-class Demo:
-    """See it at work: a simulated rig that is kept calibrated, on a page with buttons that bump and cover its cameras.
-
-    Open the address that is printed. Ctrl+C ends it.
-    Example: imgcal demo live
-    """
-
-    what: Annotated[Literal["live"], tyro.conf.Positional]  #: the live page
-    rig: str = "O10"  #: rig: file, or the name of a shipped one (O10, O6, U7, T4, room10)
-    object: str = "asymmetric8"  #: object: file, or the name of a shipped one
-    serve: str | None = None  #: HOST:PORT to listen on; 127.0.0.1:8765, for this machine alone, where it is not given
-    token: str | None = None  #: that others need who look on from elsewhere; a new one where it is not given
-    rate: float = 15.0  #: snapshots a second
+class Demo(arguments.Demo):
+    """Run `imgcal demo`."""
 
     def run(self) -> None:
         """Run until interrupted."""

@@ -6,16 +6,17 @@ import hashlib
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING
 
-import tyro
 from rich.console import Console
 
+from imgcal.cli import arguments
+from imgcal.cli.arguments import Setting
 from imgcal.cli.common import check_folder, counted, open_rig
-from imgcal.cli.compare_captures import WORK, Captures, compare_captures
+from imgcal.cli.compare_captures import WORK, compare_captures
 from imgcal.errors import InputError
 from imgcal.extras import advice, missing
 from imgcal.fleet import Kept, workers
@@ -26,9 +27,6 @@ if TYPE_CHECKING:
     from imgcal.fleet import Mapped
     from imgcal.types import CameraRig
 
-Axis = Literal["kappa", "phi", "noise", "missing", "swapped", "false"]
-
-
 CHECKED_RIGS = 32
 """On which encoders are checked."""
 FEW = 8
@@ -37,78 +35,16 @@ OF_BOTH = ("rig", "object", "seed", "address", "cores")
 """What a comparison of captures reads of a `Setting`, too."""
 
 
-@dataclass(frozen=True)
-class Setting:
-    """What the random rigs are."""
-
-    rig: str | None = None  #: factory rig: file, or the name of a shipped one; default: the first model's
-    object: str | None = None  #: object: file, or the name of a shipped one; default: the first model's
-    kappa: float | None = None  #: perturbation of all parameters, 0.025 = 2.5 %; default: the first model's drift
-    phi: tuple[float, float] | None = None  #: angles from the zenith in degrees; default: the first model's
-    noise: float = 0.0  #: px, standard deviation of each axis
-    missing: float = 0.0  #: share of fiducials that are not seen
-    swapped: float = 0.0  #: share of labels exchanged within a camera
-    false: float = 0.0  #: share of fiducials found somewhere else in the image
-    level: int | None = None
-    """instead of these, points and images as hard as a level of `imgcal.synthesis.LEVELS`: 0 to 4"""
-    count: int = 20_000  #: rigs a trial
-    trials: int = 3  #: each with other rigs
-    seed: int = 0  #: same seed, same rigs
-    sweep: tuple[Axis, ...] = ()  #: draw the error against these, without the slow baselines
-    sweep_count: int = 1000  #: rigs at every point of a sweep
-    trust: tuple[str, ...] = ()  #: encoders of yours, package.module:Class, that models may name: their code runs
-    device: Literal["auto", "cpu"] = "auto"  #: where networks run; "auto" = on a GPU if there is one
-    address: str | None = None  #: running Ray cluster that does the work, on its cores; none = this machine
-    cores: int | None = None  #: of this machine; 1 = this process alone; none = all, if that is worth a start of Ray
-
-
-@dataclass(frozen=True)
-class Evaluate:
-    """Measure networks and classical methods on random rigs, alone and refined.
-
-    RE is the paper's error: per rig the root mean square over cameras, fiducials and both axes, averaged over the rigs
-    of a trial; mean and spread over trials. What the paper reports is one pass of a network. Held-out: the same on
-    points that took no part. Levenberg-Marquardt steps from the factory rig stand beside every network; slow baselines
-    get the first few rigs of every trial (last column). With
-    --out: evaluation.json, evaluation.md and plots. Examples:
-    imgcal evaluate out/row01 --out result
-    imgcal evaluate --rig O10 --object cube8 --kappa 0.025 --count 2000 --noise 0.1 --missing 0.2 --swapped 0.1
-    """
-
-    models: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
-    """trained networks: *.safetensors, or folders of training runs; none = baselines alone"""
-    setting: Annotated[Setting, tyro.conf.arg(name="")] = field(default_factory=Setting)
-    baselines: bool = True  #: the slow classical methods in the same table, too
-    out: Path | None = None  #: folder to write; default: nothing is written
+class Evaluate(arguments.Evaluate):
+    """Run `imgcal evaluate`."""
 
     def run(self) -> None:
         """Evaluate, print and write."""
         _run(self.models, self.setting, self.baselines, self.out)
 
 
-@dataclass(frozen=True)
-class Compare:
-    """Compare networks side by side on the same random rigs: accuracy alone and refined, time, parameters, size.
-
-    All must be for the same rig and object; poses and drift are those of the first unless said otherwise. Training runs
-    of one experiment with different seeds share a line: mean and spread over the seeds. What an encoder says is
-    shuffled, zeroed and replaced by noise: where that does not hurt, the network does not use it. With
-    --out: evaluation.json, evaluation.md and plots (latency against accuracy, training curves).
-    Example: imgcal compare out/vit out/cnn --out comparison --count 2000
-
-    With --captures, detectors instead: each calibrates the same simulated captures from their frames, at every
-    difficulty; the table says how many it calibrates, refuses, and gets wrong (more than 1 px over the working volume,
-    and more than 5 times what it claims). Writes captures.json and captures.md.
-    Example: imgcal compare classical matched --captures 20 --difficulty low-light clutter
-    """
-
-    models: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """two trained networks or more: *.safetensors, or folders of training runs; with --captures one detector or more:
-    what `imgcal calibrate --detector` takes"""
-    out: Path | None = None  #: folder to write; default: nothing is written
-    setting: Annotated[Setting, tyro.conf.arg(name="")] = field(default_factory=Setting)
-    baselines: bool = False  #: the slow classical methods in the same table, too
-    captured: Annotated[Captures, tyro.conf.arg(name="")] = field(default_factory=Captures)
+class Compare(arguments.Compare):
+    """Run `imgcal compare`."""
 
     def run(self) -> None:
         """Compare, print and write."""
@@ -136,7 +72,7 @@ class Compare:
         Raises:
             InputError: names the first of them, and what it is for.
         """
-        unread: list[tuple[Setting | Compare | Captures, str]]
+        unread: list[tuple[Setting | Compare | arguments.Captures, str]]
         if self.captured.captures:
             how, meant = "with", "networks are compared on points"
             unread = [(self.setting, name) for name in vars(self.setting) if name not in OF_BOTH]

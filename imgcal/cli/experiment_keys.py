@@ -4,24 +4,15 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Annotated, Literal
 
-import tyro
-
+from imgcal.cli import arguments
 from imgcal.io import Key, keys_of
 
 WIDTH = 120
 
 
-@dataclass(frozen=True)
-class Describe:
-    """List every key of an experiment file: type, default and meaning.
-
-    Example: imgcal describe experiments
-    """
-
-    what: Annotated[Literal["experiments"], tyro.conf.Positional]  #: the kind of file
+class Describe(arguments.Describe):
+    """Run `imgcal describe`."""
 
     def run(self) -> None:
         """Print the keys of every task, and what each kind of network lets change."""

@@ -7,54 +7,27 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Annotated, Any
+from dataclasses import asdict
+from typing import Any
 
-import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from imgcal.cli import arguments
 from imgcal.cli.common import check_folder, open_rig
 from imgcal.errors import InputError, RefusedError
 from imgcal.extras import advice, missing
 from imgcal.fleet import Dataset, Engine, FleetCount, KindOfRig, LearntPrior, Manifest, Settings, kinds_of_rigs
 from imgcal.fleet import recalibrate_fleet as recalibrate
 from imgcal.io import load_object, write_text, yaml_text
-from imgcal.pipeline import DetectorName
 from imgcal.types import RigPrior
 
 EVERY = 60.0  # s between lines where nobody looks at a terminal
 NEEDED = ("ray", "pyarrow", "fsspec", "filelock")
 
 
-@dataclass(frozen=True)
-class Fleet:
-    """Recalibrate every capture of a table, on all cores of this machine or on a cluster, and learn from all of them.
-
-    MANIFEST is a CSV or Parquet file with a column `capture` (folder or table of blobs; a path beside the manifest, or
-    a URL) and, where they are known, `rig`, `object`, `device`, `time`, `hours` since the factory calibration, and
-    further columns of numbers such as `temperature`. OUT/results is a Parquet dataset with a row a capture, also for
-    those that were refused, are damaged, hang or crash; a rerun does what is missing or has changed. OUT/prior.yaml is
-    the drift prior that the fleet teaches, for rig files; OUT/report.html shows it, and the cameras that do not belong.
-    Example: imgcal fleet captures.csv --rig rig.yaml --object object.csv --out fleet
-    """
-
-    manifest: Annotated[str, tyro.conf.Positional]  #: table of captures: a file or URL
-    out: Path  #: folder of the results
-    rig: str | None = None  #: factory rig of rows that name none: file, or the name of a shipped one
-    object: str | None = None  #: object of rows that name none: file, or the name of a shipped one
-    address: str | None = None  #: running Ray cluster to join; none = this machine's cores
-    cores: int | None = None  #: of this machine; none = all
-    detector: DetectorName = "classical"  #: who finds the fiducials in frames, as for `imgcal calibrate`
-    blind_cameras: bool = False  #: accept cameras that see nothing; they keep their factory values
-    seconds: float = 300.0  #: that a capture may take
-    memory_mb: float = 4096.0  #: that a capture may take, beyond what a process needs anyway
-    keep_rigs: bool = False  #: write the recalibrated rig file of every capture to OUT/rigs, too
-    again: bool = False  #: try once more what timed out, crashed or ran out of memory
-    covariates: tuple[str, ...] = ()  #: columns that drift may depend on, temperature for example
-    by_camera: bool = False  #: learn a spread for each camera, not one for all
-    batch: int = 32  #: captures that travel together
+class Fleet(arguments.Fleet):
+    """Run `imgcal fleet`."""
 
     def run(self) -> None:
         """Recalibrate, then learn."""

@@ -80,7 +80,7 @@ COMMANDS = {
     ),
     "warmup": ("imgcal.cli.warmup", "Compile ahead of time what the first calibration would wait for"),
 }
-"""Module and summary of each command; the class has the command's name. Imported only when it is asked for."""
+"""Module and summary of each command; the class has the command's name, here and among the arguments."""
 
 DESCRIPTION = """Recalibrate infrared multi-camera rigs from images of a known calibration object.
 
@@ -120,7 +120,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def parse(arguments: list[str]) -> Runnable:
-    """Turn a command line into its command; imports that command alone.
+    """Turn a command line into its command; imports that command alone, once its arguments are understood.
 
     Raises:
         InputError: the command line is not understood.
@@ -144,17 +144,18 @@ def _understood(arguments: list[str]) -> Runnable:
         print(f"imgcal {imgcal.__version__}")
         raise SystemExit(DONE)
     if first in COMMANDS:
+        given = tyro.cli(_arguments(first), prog=f"imgcal {first}", args=arguments[1:])
         with ends_at_once():  # imports take a while
-            command = _load(first)
-        return tyro.cli(command, prog=f"imgcal {first}", args=arguments[1:])
+            command = getattr(import_module(COMMANDS[first][0]), first.capitalize())
+        return command(**vars(given))
     # The shell's completion knows the options of every command; all else ends here, and names and summaries will do.
-    load = _load if first.startswith("--tyro-") else _summary
+    load = _arguments if first.startswith("--tyro-") else _summary
     commands: Any = Union[tuple(Annotated[load(name), tyro.conf.subcommand(name)] for name in COMMANDS)]  # noqa: UP007
     return tyro.cli(commands, prog="imgcal", description=DESCRIPTION, args=arguments)
 
 
-def _load(name: str) -> Any:
-    return getattr(import_module(COMMANDS[name][0]), name.capitalize())
+def _arguments(name: str) -> Any:
+    return getattr(import_module("imgcal.cli.arguments"), name.capitalize())
 
 
 def _summary(name: str) -> Any:

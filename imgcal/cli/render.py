@@ -4,39 +4,20 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import torch
-import tyro
 
 from imgcal.association import associate, matched_to_rig, to_observations
+from imgcal.cli import arguments
 from imgcal.cli.common import check_folder, open_rig, progress, read_detections
-from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError
 from imgcal.io import load_object, open_input, publishing, write_image
 from imgcal.synthesis import GREY_LEVELS, ImageOptions, render_views
 
 
-@dataclass(frozen=True)
-class Render:
-    """Redraw captured frames as colour-coded images: every fiducial a soft dot in its own colour, nothing else.
-
-    Blobs are found and identified first; what has no certain identity is not drawn. Writes OUT/<camera>/<snapshot>.png.
-    Example: imgcal render my_capture --rig O10 --object asymmetric8 --out coded --size 224
-    """
-
-    input: Annotated[Path, tyro.conf.Positional]  #: capture folder or detections file
-    rig: str  #: rig file, or the name of a shipped rig
-    object: str  #: object file, or the name of a shipped object
-    out: Path  #: folder to write
-    size: int = 224  #: width and height of the images, pixels
-    dot: float = 1.5  #: standard deviation of a dot, pixels of the output
-    snapshots: str | None = None  #: A:B, numbers in file order from 0, B excluded
-    videos_differ: bool = False  #: accept videos whose lengths or time stamps differ: frames go together by number
-    detection: Annotated[DetectionOptions, tyro.conf.arg(name="")] = field(default_factory=DetectionOptions)
+class Render(arguments.Render):
+    """Run `imgcal render`."""
 
     def run(self) -> None:
         """Render and write."""

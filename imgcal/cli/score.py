@@ -5,37 +5,18 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterable
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Annotated
 
 import torch
-import tyro
 
+from imgcal.cli import arguments
 from imgcal.cli.common import open_rig, progress, read_detections
-from imgcal.detection import DetectionOptions
 from imgcal.io import load_object, open_input
 from imgcal.pipeline import RigScore, rms_length, score, unit_doubt
 from imgcal.types import CameraRig
 
 
-@dataclass(frozen=True)
-class Score:
-    """Measure the reprojection error of a rig that is held fixed; only the object's pose is fitted in each snapshot.
-
-    Prints JSON: median_px, p95_px, rms_px, outliers, rms_px_with_outliers, points, snapshots_used, snapshots_rejected,
-    per_camera. All are of distances in the image; the RMS is that of OpenCV's calibrateCamera, sqrt(2) times the
-    paper's RE. Outliers are much farther off than most of their camera, as
-    half-hidden markers are; they count in median_px and p95_px.
-    Example: imgcal score my_capture --rig out/rig.yaml --object object.csv
-    """
-
-    input: Annotated[Path, tyro.conf.Positional]  #: capture folder or detections file
-    rig: str  #: rig file, or the name of a shipped rig
-    object: str  #: object file, or the name of a shipped object
-    snapshots: str | None = None  #: A:B, numbers in file order from 0, B excluded
-    videos_differ: bool = False  #: accept videos whose lengths or time stamps differ: frames go together by number
-    detection: Annotated[DetectionOptions, tyro.conf.arg(name="")] = field(default_factory=DetectionOptions)
+class Score(arguments.Score):
+    """Run `imgcal score`."""
 
     def run(self) -> None:
         """Score and print."""

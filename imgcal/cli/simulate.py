@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
 
 import torch
-import tyro
 
+from imgcal.cli import arguments
 from imgcal.cli.common import check_folder, open_rig, progress
 from imgcal.errors import InputError
 from imgcal.geometry import vector_from_rotation
@@ -28,8 +27,6 @@ from imgcal.synthesis import (
     DIFFICULTIES,
     Drift,
     FrameModel,
-    HandHeld,
-    PhysicalDrift,
     PoseRange,
     RelativeDrift,
     Truth,
@@ -39,51 +36,14 @@ from imgcal.synthesis import (
     true_detections,
 )
 from imgcal.types import FIDUCIAL_RADIUS, CalibrationObject, CameraRig
-from renderers import ClutterModel, SensorModel
 
-Level = Literal["clean", "low-light", "motion-blur", "clutter", "defocus", "combined", "half-hidden", "uneven"]
 WRITTEN = ("capture.yaml", "rig.yaml", "object.csv", "truth", "frames")
 
 MOST_SNAPSHOTS = 100_000
 
 
-@dataclass(frozen=True)
-class Simulate:
-    """Make a capture: one rig that has drifted from its factory calibration, seen through realistic infrared frames.
-
-    Writes OUT/frames/<camera>/<snapshot>.png, the factory rig and the object beside them, and OUT/truth/ with the
-    drifted rig, the exact image points (labelled), the object's poses and how much of each marker is seen (seen.csv).
-    --difficulty makes frames that are hard: dim, blurred by motion, out of focus, cluttered, with half-hidden markers.
-    Without other options, the rig drifts by half a degree, 2 mm, 1 % and 5 px (one standard deviation: --physical.*).
-    Examples: imgcal simulate --rig O10 --object asymmetric8 --out my_capture --snapshots 20
-    imgcal simulate --rig room10 --object wand4 --out wand --snapshots 100 --poses hand-held --exposure-ms 2
-    """
-
-    rig: str  #: factory rig: file, or the name of a shipped one (O10, O6, U7, T4, room10)
-    object: str  #: object: file, or the name of a shipped one (asymmetric8, cube8, cube27, sphere64, wand4)
-    out: Path  #: folder to write; must not hold a capture yet
-    snapshots: int = 10  #: number of poses of the object
-    seed: int = 0  #: the same seed gives the same capture
-    drift: Literal["physical", "relative", "none"] | None = None
-    """physical = degrees, mm and pixels, the default; relative = the paper's value * (1 + delta), as with --kappa"""
-    kappa: float | None = None
-    """the paper's drift: the largest relative change of intrinsics, positions and Euler angles, 0.025 with --drift
-    relative alone; of cameras that face each other, some Euler angles are large, and such cameras turn far"""
-    physical: PhysicalDrift = field(default_factory=PhysicalDrift)  # standard deviations for --drift physical
-    poses: Literal["hemisphere", "volume", "hand-held"] | None = None
-    """where the object is: hemisphere = always at the rig's working_distance, turned, and in view of every camera (the
-    paper's); volume = anywhere in the rig's volume, in view of some; hand-held = on a smooth way through it. Default:
-    volume where the rig file has one or has no working_distance, and hemisphere elsewhere"""
-    hand: Annotated[HandHeld, tyro.conf.arg(name="")] = field(default_factory=HandHeld)
-    exposure_ms: float = 0.0  #: ms, during which the markers of a hand-held object are smeared, as fast as they move
-    theta_deg: tuple[float, float] = (0.0, 360.0)  #: azimuth of the rig around the object, on the hemisphere
-    phi_deg: tuple[float, float] = (0.0, 90.0)  #: angle of the rig from the object's z axis, on the hemisphere
-    alpha_deg: tuple[float, float] = (0.0, 360.0)  #: roll of the rig, on the hemisphere
-    marker_radius: float = 6.0  #: mm, for objects whose file gives no radius
-    clutter: bool = True  #: reflections, false blobs, partly hidden markers
-    difficulty: Level | None = None  #: a named level; its light and clutter replace those of the options below
-    sensor: SensorModel = field(default_factory=SensorModel)
-    clutter_model: ClutterModel = field(default_factory=ClutterModel)
+class Simulate(arguments.Simulate):
+    """Run `imgcal simulate`."""
 
     def run(self) -> None:
         """Simulate and write."""

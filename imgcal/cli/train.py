@@ -6,36 +6,18 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from pathlib import Path
 from time import monotonic
 from types import FrameType
-from typing import Annotated
 
-import tyro
-
+from imgcal.cli import arguments
 from imgcal.cli.common import check_folder
 from imgcal.errors import InputError
 
 PATIENCE = 2.0  # s, between two signals that are not one and the same
 
 
-@dataclass(frozen=True)
-class Train:
-    """Train a network as an experiment file says.
-
-    Writes OUT/model.safetensors, resolved.yaml, metrics.jsonl and TensorBoard's files.
-    Ctrl-C saves the state first; so do steps on the way, and --resume goes on from there, with the same result.
-    Several processes: torchrun --nproc-per-node 2 -m imgcal train ...; on GPUs also accelerate launch -m imgcal ...
-    Example: imgcal train table1-row01 --out out/row01
-    """
-
-    experiment: Annotated[str, tyro.conf.Positional]  #: experiment file, or the name of a shipped experiment
-    out: Path  #: folder to write
-    resume: bool = False  #: go on with the training in OUT
-    set: Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="KEY=VALUE ...")] = ()
-    """values of the experiment to change, such as training.steps=100"""
-    minutes: float | None = None  #: train so long; the same as --set training.minutes=...
+class Train(arguments.Train):
+    """Run `imgcal train`."""
 
     def run(self) -> None:
         """Train and write."""

@@ -9,24 +9,21 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-import tyro
 from rich.console import Console
 
+from imgcal.cli import arguments
 from imgcal.cli.common import check_folder, open_rig
 from imgcal.cli.watch_display import Display
-from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError, RefusedError
 from imgcal.extras import advice, missing
 from imgcal.io import holding, load_object, open_input
 from imgcal.messages import shortened
 from imgcal.online import Event, RigKeeper
-from imgcal.pipeline import DetectorName
 from imgcal.types import CalibrationObject, CameraRig, Detections, object_difference, rig_difference
 from imgcal.watch import (
     CURRENT,
@@ -64,41 +61,8 @@ ONLY_FOR = {
 }
 
 
-@dataclass(frozen=True)
-class Watch:
-    """Keep a running rig calibrated: every snapshot is learnt from, and what moves is told.
-
-    INPUT is what the cameras write or send:
-    a folder that is being filled with frames/<camera>/<snapshot>.png, or that holds a video a camera;
-    tcp://host:port or ipc://path, frames or blobs from another process through ZeroMQ;
-    - for blobs on standard input, a line of JSON each: {"camera": "cam01", "time": 12.5, "uv": [[u, v], ...]};
-    a rosbag2 folder or .mcap file; a table of blobs (.csv, .csv.gz).
-
-    OUT gets rig.yaml (the rig as it is now, replaced in one step), history/ (as it was), events.jsonl (what happened:
-    a line of JSON each) and state.json, from which the same command goes on after any end, even a power failure.
-    Ends with the input, or at Ctrl-C. Example: imgcal watch tcp://127.0.0.1:5555 --rig factory.yaml --object
-    object.csv --out out/watch
-    """
-
-    input: Annotated[str, tyro.conf.Positional]  #: folder, address, file or -
-    rig: str  #: factory rig: file, or the name of a shipped one
-    object: str  #: object: file, or the name of a shipped one
-    out: Path  #: folder to write
-    fresh: bool = False  #: forget what an earlier run left in OUT, begin from the factory rig
-    tolerance: float = Timing.tolerance  #: s that the time stamps of one snapshot may be apart
-    patience: float = Timing.patience  #: s that a camera is waited for
-    keep_all: bool = False  #: drop no snapshot where they come faster than worked on: for recordings that come live
-    rate: float | None = None  #: snapshots a second of a table of blobs (30)
-    topic: tuple[str, ...] = ()  #: CAMERA=TOPIC of a recording, where the topic does not name the camera
-    videos_differ: bool = False  #: accept videos whose lengths or time stamps differ: frames go together by time
-    until_idle: float | None = None  #: end when a folder has got no new frame for so many seconds
-    remove: bool = False  #: delete the frames of a folder once what they taught is saved
-    metrics: str | None = None  #: [HOST:]PORT for Prometheus; the host is 127.0.0.1 if not given
-    serve: str | None = None  #: [HOST:]PORT of the live page; the host is 127.0.0.1 if not given
-    hook: str | None = None
-    """command to run for each event, without a shell; the event is its standard input, a line of JSON"""
-    detector: DetectorName = "classical"  #: who finds the fiducials in frames, as for imgcal calibrate
-    detection: Annotated[DetectionOptions, tyro.conf.arg(name="")] = field(default_factory=DetectionOptions)
+class Watch(arguments.Watch):
+    """Run `imgcal watch`."""
 
     def run(self) -> None:
         """Watch until the end."""

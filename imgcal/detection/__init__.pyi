@@ -1,6 +1,7 @@
 from .centroids import Blobs, to_detections
+from .checks import Frame
 from .detector import detect, detect_frame, detect_snapshot
-from .options import DetectionOptions, Frame
+from .options import DetectionOptions
 from .populations import without_dim
 
 __all__ = [

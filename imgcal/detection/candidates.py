@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from imgcal.detection.options import DetectionOptions, Frame
+from imgcal.detection.checks import Frame
+from imgcal.detection.options import DetectionOptions
 from renderers.compiling import njit
 
 BLOCK = 4  # px, side of a block; a 4 x 4 mean is close to the matched filter of a small blob

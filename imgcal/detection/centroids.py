@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.detection.candidates import Candidates
+from imgcal.detection.checks import Frame
 from imgcal.detection.kernels import measure_all
-from imgcal.detection.options import DetectionOptions, Frame
+from imgcal.detection.options import DetectionOptions
 from imgcal.types import Detections
 
 

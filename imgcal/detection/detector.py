@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from imgcal.detection.candidates import block_means, outline, screen
 from imgcal.detection.centroids import Blobs, measure, to_detections
-from imgcal.detection.options import DetectionOptions, Frame, checked_frame, checked_mask, full_scale
+from imgcal.detection.checks import Frame, checked_frame, checked_mask, full_scale
+from imgcal.detection.options import DetectionOptions
 from imgcal.detection.populations import DIMMER, usable, usual_size, without_dim
 from imgcal.errors import InputError
 from imgcal.types import BlobFlag, Detections

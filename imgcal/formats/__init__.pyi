@@ -1,8 +1,9 @@
-from .conversion import LIMIT, Held, describe_lens, from_camera_rig, held_by, to_camera_rig, with_image_sizes
+from .conversion import Held, describe_lens, from_camera_rig, held_by, to_camera_rig, with_image_sizes
 from .fitting import Fit, Holds
 from .foreign_rig import ForeignCamera, ForeignRig
 from .format import Format
 from .lens import Lens
+from .limits import LIMIT
 from .loading import load_cameras, load_rig
 from .registry import FORMATS, format_named, is_foreign, read_foreign_rig
 from .units import in_millimetres, millimetres

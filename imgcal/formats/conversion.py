@@ -13,12 +13,12 @@ from imgcal.errors import InputError, RefusedError
 from imgcal.formats.fitting import Fit, Holds, fitted
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig
 from imgcal.formats.lens import Lens
+from imgcal.formats.limits import LIMIT
 from imgcal.formats.values import named
 from imgcal.geometry import LENS_MODELS, RigidTransform, lens_width, named_lenses
 from imgcal.io import RigCovariance
 from imgcal.types import CameraRig, check_rig
 
-LIMIT = 0.05  # px, anywhere in the image, that another lens model may be off
 BROWN, RATIONAL, FISHEYE = "brown_conrady", "rational", "equidistant"
 NATIVE = Holds(tuple(len(LENS_MODELS[name].coefficients) for name in (BROWN, RATIONAL)), fisheye=True)
 """Lenses of a `CameraRig`."""

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from imgcal import io
 from imgcal.errors import InputError
-from imgcal.formats.conversion import LIMIT, NATIVE, held_by, to_camera_rig, with_image_sizes
+from imgcal.formats.conversion import NATIVE, held_by, to_camera_rig, with_image_sizes
 from imgcal.formats.foreign_rig import ForeignRig
+from imgcal.formats.limits import LIMIT
 from imgcal.formats.registry import is_foreign, read_foreign_lenses, read_foreign_rig
 from imgcal.formats.units import in_millimetres
 from imgcal.types import CameraRig

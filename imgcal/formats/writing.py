@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from imgcal.errors import InputError
-from imgcal.formats.conversion import LIMIT, NATIVE, Held, describe_lens, from_camera_rig, held_by, to_camera_rig
+from imgcal.formats.conversion import NATIVE, Held, describe_lens, from_camera_rig, held_by, to_camera_rig
 from imgcal.formats.foreign_rig import ForeignRig, FormatError
 from imgcal.formats.format import Files, Format
+from imgcal.formats.limits import LIMIT
 from imgcal.formats.registry import FORMATS, format_named, read_foreign_rig
 from imgcal.formats.units import in_millimetres, millimetres
 from imgcal.formats.verification import worst_difference

@@ -35,7 +35,7 @@ FASTEST = 1 / 60
 EPISODE = 2.0
 """Correlation times that a passing error may last."""
 LARGEST, SHORT = 20.0, 3
-"""Times the usual size of lasting errors that one may have; and the snapshots that a larger one (wrong labels) lasts."""
+"""Times the usual size of lasting errors that one may have; the snapshots that a larger one (wrong labels) lasts."""
 LEAST_POINTS = 2
 """Labels of a camera from which the shift of its image counts."""
 

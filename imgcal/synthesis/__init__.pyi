@@ -1,4 +1,4 @@
-from .arrangements import Lens, Shape, arranged_positions, arranged_rig, look_at
+from .arrangements import arranged_positions, arranged_rig, look_at
 from .captures import (
     FrameModel,
     Frames,
@@ -15,11 +15,13 @@ from .corruption import Corrupted, Corruption
 from .crops import CropTruth, Scenes, render_crops, sample_scenes, second_look
 from .difficulty import DIFFICULTIES, Difficulty
 from .drawing import host_generator
+from .hand_held import HandHeld
+from .lens import Lens, Shape
 from .levels import LEVELS, Degradation
 from .patches import Patches, expose_patches, render_patches
+from .physical_drift import PhysicalDrift
 from .rigs import (
     Drift,
-    PhysicalDrift,
     PoseRange,
     RelativeDrift,
     Snapshots,
@@ -28,7 +30,7 @@ from .rigs import (
     synthesize_at_once,
 )
 from .simulated_rig import SimulatedRig
-from .volumes import HandHeld, sample_volume, seen_volume, simulate_volume
+from .volumes import sample_volume, seen_volume, simulate_volume
 
 __all__ = [
     "DIFFICULTIES",

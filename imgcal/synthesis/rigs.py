@@ -18,11 +18,11 @@ from imgcal.errors import InputError, RefusedError
 from imgcal.geometry import Projection, RigidTransform, euler_from_rotation, rotate, rotation_from_euler
 from imgcal.io import StrictRecord
 from imgcal.messages import shortened
-from imgcal.types import CalibrationObject, CameraRig, RigPrior
+from imgcal.synthesis.physical_drift import PhysicalDrift
+from imgcal.types import CalibrationObject, CameraRig
 
 Angle = Annotated[float, Field(ge=-360, le=360)]
 Kappa = Annotated[float, Field(ge=0, lt=1)]
-Spread = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
 
 
 def _pair(values: Any) -> Any:
@@ -125,34 +125,6 @@ class RelativeDrift(StrictRecord):
             ),
             dim=-1,
         )
-
-
-@dataclass(frozen=True)
-class PhysicalDrift(StrictRecord):
-    """Gaussian drift in physical units, for real rigs; each number is one standard deviation.
-
-    Examples:
-        >>> import imgcal
-        >>> PhysicalDrift(position=2.0).std(imgcal.load_rig("T4"))[0, 3:6]  # mm
-        tensor([2., 2., 2.], dtype=torch.float64)
-    """
-
-    rotation_deg: Spread = 0.5  # each axis; physical units exclude kappas, and what a file does not name does not drift
-    position: Spread = 2.0  # mm, each axis
-    focal_length: Spread = 0.01  # relative
-    principal_point: Spread = 5.0  # pixels
-    distortion: Spread = 0.005  # absolute
-
-    def apply(self, rig: CameraRig, generator: torch.Generator, *batch: int) -> CameraRig:
-        """Disturb every parameter of every camera independently: (*batch, *B) rigs."""
-        return rig.retract(_parameters_first(torch.randn, rig, generator, batch) * self.std(rig))
-
-    def std(self, rig: CameraRig) -> Tensor:
-        """Standard deviation of each parameter: (*B, C, 15)."""
-        as_prior = RigPrior(
-            self.focal_length, self.principal_point, self.distortion, math.radians(self.rotation_deg), self.position
-        )
-        return as_prior.std(rig)
 
 
 def drift_of(block: Any) -> Any:

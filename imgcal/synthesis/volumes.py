@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Annotated
+from dataclasses import replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from imgcal.errors import InputError
 from imgcal.geometry import RigidTransform
-from imgcal.io import StrictRecord
 from imgcal.synthesis.captures import Motion, Truth
+from imgcal.synthesis.hand_held import HandHeld
 from imgcal.synthesis.rigs import Drift
 from imgcal.types import CalibrationObject, CameraRig, Volume
 
@@ -38,45 +36,29 @@ OUTER = 0.05
 """Share of what is seen that is left out at each side of a volume that is looked for."""
 
 
-@dataclass(frozen=True)
-class HandHeld(StrictRecord):
-    """How a hand carries an object: one way through all of the volume, without jerks, as fast as is said on average.
+def sample_path(
+    hand: HandHeld, volume: Volume, count: int, generator: torch.Generator
+) -> tuple[RigidTransform, Motion]:
+    """Draw a path through a volume and sample it.
 
-    The path is a cubic B-spline between places and turns that are drawn at random: it stays in a convex volume, and
-    shakes of more than about one cycle in the time from place to place are as good as absent from its spectrum.
-
-    Examples:
-        >>> HandHeld(speed=800.0, rate=30.0).speed
-        800.0
+    Returns:
+        rig_from_object (S,) of an object with its centroid in the origin, in each of `count` snapshots, and its
+        motion there.
     """
+    duration = (count - 1) / hand.rate
 
-    speed: Annotated[float, Field(gt=0, le=20_000)] = 500.0  #: mm/s, mean speed of the object
-    turning: Annotated[float, Field(gt=0, le=2000)] = 45.0  #: degrees/s, mean
-    rate: Annotated[float, Field(gt=0, le=10_000)] = 5.0  #: snapshots a second
+    def drawn_turns(number: int) -> Floats:
+        return TURNS * torch.randn(number, 3, generator=generator, dtype=torch.float64).numpy()
 
-    def path(self, volume: Volume, count: int, generator: torch.Generator) -> tuple[RigidTransform, Motion]:
-        """Draw a path and sample it.
+    places = _spline(lambda number: sample_volume(volume, number, generator).numpy(), _lengths, hand.speed, duration)
+    turns = _spline(drawn_turns, _angles, math.radians(hand.turning), duration)
+    times = np.arange(count) / hand.rate
 
-        Returns:
-            rig_from_object (S,) of an object with its centroid in the origin, in each of `count` snapshots, and its
-            motion there.
-        """
-        duration = (count - 1) / self.rate
+    def at(times: Floats) -> RigidTransform:
+        rotation = Rotation.from_rotvec(turns(times)).as_matrix()
+        return RigidTransform(torch.from_numpy(rotation), torch.from_numpy(places(times)))
 
-        def drawn_turns(number: int) -> Floats:
-            return TURNS * torch.randn(number, 3, generator=generator, dtype=torch.float64).numpy()
-
-        places = _spline(
-            lambda number: sample_volume(volume, number, generator).numpy(), _lengths, self.speed, duration
-        )
-        turns = _spline(drawn_turns, _angles, math.radians(self.turning), duration)
-        times = np.arange(count) / self.rate
-
-        def at(times: Floats) -> RigidTransform:
-            rotation = Rotation.from_rotvec(turns(times)).as_matrix()
-            return RigidTransform(torch.from_numpy(rotation), torch.from_numpy(places(times)))
-
-        return at(times), Motion(at(times - MOMENT / 2), at(times + MOMENT / 2), MOMENT)
+    return at(times), Motion(at(times - MOMENT / 2), at(times + MOMENT / 2), MOMENT)
 
 
 def simulate_volume(
@@ -120,7 +102,7 @@ def simulate_volume(
         quaternion = torch.randn(snapshots, 4, generator=generator, dtype=torch.float64)
         poses = RigidTransform(torch.from_numpy(Rotation.from_quat(quaternion.numpy()).as_matrix()), places)
     else:
-        poses, motion = hand.path(volume, snapshots, generator)
+        poses, motion = sample_path(hand, volume, snapshots, generator)
         motion = replace(motion, before=_about(centroid, motion.before), after=_about(centroid, motion.after))
     poses = _about(centroid, poses)
     seen = true_rig.expand(snapshots).project(poses.apply(points), obj.radius)

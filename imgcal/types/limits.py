@@ -6,18 +6,19 @@ arithmetic that overflows.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NoReturn
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NoReturn
 
-from torch import Tensor
-
+from imgcal import geometry
 from imgcal.errors import InputError
-from imgcal.geometry import LENS_MODELS, lens_width
 from imgcal.messages import shortened
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.observations import Observations
-from imgcal.types.rig import CameraRig
-from imgcal.types.volume import Volume
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from imgcal.types.calibration_object import CalibrationObject
+    from imgcal.types.observations import Observations
+    from imgcal.types.rig import CameraRig
 
 
 @dataclass(frozen=True)
@@ -62,11 +63,12 @@ PRIOR_POSITION = Range(1e-9, 1e7, "mm")
 
 def check_rig(rig: CameraRig) -> None:
     """Raise `InputError` where a rig holds values that no rig has; files are checked when they are read."""
-    unknown = [name for name in rig.lens_models if name not in LENS_MODELS]
+    unknown = [name for name in rig.lens_models if name not in geometry.LENS_MODELS]
     if unknown or len(rig.lens_models) != rig.num_cameras:
         found = f"the lens model {unknown[0]}" if unknown else f"{len(rig.lens_models)} lens models"
-        raise InputError(f"rig {rig.name}: found {found}, expected {', '.join(LENS_MODELS)} for all cameras or each")
-    width = lens_width(rig.lens_model)
+        known = ", ".join(geometry.LENS_MODELS)
+        raise InputError(f"rig {rig.name}: found {found}, expected {known} for all cameras or each")
+    width = geometry.lens_width(rig.lens_model)
     if rig.distortion.shape[-1] < width:
         found = f"distortion of width {rig.distortion.shape[-1]}"
         raise InputError(f"rig {rig.name}: found {found}, expected {width} for {rig.lens_model}")
@@ -85,7 +87,7 @@ def check_rig(rig: CameraRig) -> None:
             camera = shortened(rig.camera_names[place[-2]])
             _fail(f"rig {rig.name}: camera {camera}: {name}", float(tensor[tuple(place)]), plausible)
     if rig.volume is not None:
-        Volume(rig.volume.points)  # checks them
+        replace(rig.volume)  # checks its points
 
 
 def check_object(obj: CalibrationObject) -> None:

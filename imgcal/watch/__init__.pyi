@@ -9,7 +9,8 @@ from .loop import EVENTS, STATE, Keeper, Page, Progress, Watch
 from .metrics import Metrics, Tally
 from .recordings import BlobTable, Videos, holds_videos
 from .rig_files import CURRENT, RigFiles, put_aside
-from .synchronization import COUNTS, Synchronizer, TimedSnapshot, Timing
+from .synchronization import COUNTS, Synchronizer, TimedSnapshot
+from .timing import Timing
 from .zeromq import ZeroMQ
 
 __all__ = [

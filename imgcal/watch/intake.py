@@ -13,7 +13,8 @@ from imgcal.errors import InputError
 from imgcal.messages import one_line
 from imgcal.types import CameraRig
 from imgcal.watch.exposures import CameraBlobs, Exposure, Item, Source, Unreadable, checked
-from imgcal.watch.synchronization import Synchronizer, TimedSnapshot, Timing
+from imgcal.watch.synchronization import Synchronizer, TimedSnapshot
+from imgcal.watch.timing import Timing
 
 MOST_WAITING = 8
 """Snapshots that wait; more, and the oldest is dropped where the source is live. Otherwise the source waits."""

@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from imgcal.errors import InputError
 from imgcal.io import Frame
 from imgcal.types import Detections
 from imgcal.watch.exposures import CameraBlobs, Exposure
+from imgcal.watch.timing import LEAP, Timing
 
 MOST_PENDING = 32
 """Snapshots that are waited for at a time; beyond, the oldest goes on as it is."""
@@ -30,8 +30,6 @@ ALONE = 30
 """Snapshots in a row in which a camera is alone while others come together, from which its time stamps are told."""
 NEIGHBOUR = 1.1
 """Of its usual rest, within which others must have exposed: one that sends more often than they is alone by right."""
-LEAP = 10.0
-"""Seconds by which a clock may not leap: the exposure is left out, unless the other cameras' clocks did the same."""
 LONGEST_ASTRAY = 100
 """Exposures in a row by clocks that have leapt, after which these are believed."""
 REMEMBERED = 4096
@@ -45,20 +43,6 @@ second of a snapshot. `astray`: its clock is more than `LEAP` off. `beside`: its
 the others for long. These four are left out. `out_of_order`: earlier
 than one before; used where its snapshot has not gone on.
 """
-
-
-@dataclass(frozen=True)
-class Timing:
-    """When exposures belong together, and how long the missing ones are waited for."""
-
-    tolerance: float = 0.005  # s between the earliest and the latest time stamp of a snapshot, at most
-    patience: float = 0.1  # s that missing exposures are waited for
-
-    def __post_init__(self) -> None:
-        for name in ("tolerance", "patience"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and 0 <= value <= LEAP / 2):
-                raise InputError(f"{name}: found {value:g}, expected 0 to {LEAP / 2:g} s")
 
 
 @dataclass(frozen=True)

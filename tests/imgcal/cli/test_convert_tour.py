@@ -14,8 +14,18 @@ import torch
 from numpy.typing import NDArray
 
 from imgcal.cli.main import main
-from imgcal.formats import FORMATS, OURS, ForeignCamera, ForeignRig, Format, in_millimetres, load_rig, with_image_sizes
-from imgcal.formats.conversion import LIMIT, NATIVE
+from imgcal.formats import (
+    FORMATS,
+    LIMIT,
+    OURS,
+    ForeignCamera,
+    ForeignRig,
+    Format,
+    in_millimetres,
+    load_rig,
+    with_image_sizes,
+)
+from imgcal.formats.conversion import NATIVE
 from imgcal.formats.fitting import fitted
 from imgcal.formats.registry import read_foreign_rig
 from tests.imgcal.formats.test_registry import SAMPLES

@@ -6,8 +6,8 @@ from typing import get_args
 import numpy as np
 import pytest
 
+from imgcal.cli.arguments import Level
 from imgcal.cli.main import main
-from imgcal.cli.simulate import Level
 from imgcal.io import load_detections, load_rig, read_frame
 from imgcal.synthesis import DIFFICULTIES
 
@@ -96,7 +96,7 @@ KILLED = """
 import os, signal, sys
 from imgcal.cli import simulate
 from imgcal.cli.main import main
-from imgcal.cli.simulate import Level
+from imgcal.cli.arguments import Level
 
 written = []
 

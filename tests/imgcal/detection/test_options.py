@@ -1,7 +1,6 @@
-import numpy as np
 import pytest
 
-from imgcal.detection.options import DetectionOptions, checked_frame, checked_mask, full_scale
+from imgcal.detection.options import DetectionOptions
 from imgcal.errors import InputError
 
 
@@ -27,47 +26,3 @@ def test_settings_that_cannot_be_are_named(change, message) -> None:
 
 def test_what_is_said_of_the_radius_limits_it() -> None:
     assert DetectionOptions().radius_limit == 16.0 and DetectionOptions(max_radius=40.0).radius_limit == 40.0
-
-
-@pytest.mark.parametrize(
-    ("frame", "message"),
-    [
-        ([[1, 2]], "found a list, expected a NumPy array"),
-        (np.zeros((20, 20, 2), np.uint8), r"frame of shape \(20, 20, 2\), expected grey"),
-        (np.zeros((20, 20), np.float32), "found float32 grey values"),
-        (np.zeros((15, 200), np.uint8), "frame of 200 x 15, expected at least 16 x 16"),
-    ],
-)
-def test_frames_that_cannot_be_are_named(frame, message) -> None:
-    with pytest.raises(InputError, match=f"camera left: .*{message}"):
-        checked_frame(frame, "left")
-
-
-def test_frames_are_taken_as_they_are_and_masks_as_bits() -> None:
-    frame = np.zeros((16, 20), np.uint16)
-    assert checked_frame(frame, "left") is frame
-    mask = np.zeros((16, 20), np.uint8)
-    mask[3, 4] = 255
-    found = checked_mask(mask, frame, "left")
-    assert found.dtype == np.bool_ and found.sum() == 1 and found[3, 4]
-    assert checked_mask(found, frame, "left") is found
-    for wrong in (mask[:8], "mask"):
-        with pytest.raises(InputError, match="camera left: found a mask of"):
-            checked_mask(wrong, frame, "left")
-
-
-@pytest.mark.parametrize(("brightest", "expected"), [(0, 1023), (1023, 1023), (1024, 4095), (4096, 65535)])
-def test_the_brightest_pixel_tells_the_depth_of_16_bit_frames(brightest: int, expected: int) -> None:
-    frame = np.zeros((16, 16), np.uint16)
-    frame[2, 2] = brightest
-    assert full_scale(frame, None, "left") == expected
-
-
-def test_a_given_depth_must_fit_the_frame() -> None:
-    frame = np.full((16, 16), 4000, np.uint16)
-    assert full_scale(frame, 12, "left") == 4095
-    assert full_scale(frame.astype(np.uint8), None, "left") == full_scale(frame.astype(np.uint8), 8, "left") == 255
-    with pytest.raises(InputError, match=r"grey value of 4000, expected at most 1023 \(10 bit\)"):
-        full_scale(frame, 10, "left")
-    with pytest.raises(InputError, match="found a frame of 8 bit, expected 12 bit"):
-        full_scale(frame.astype(np.uint8), 12, "left")

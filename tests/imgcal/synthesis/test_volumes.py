@@ -10,7 +10,7 @@ from imgcal.pipeline import score
 from imgcal.synthesis.arrangements import look_at
 from imgcal.synthesis.captures import true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
-from imgcal.synthesis.volumes import HandHeld, sample_volume, seen_volume, simulate_volume
+from imgcal.synthesis.volumes import HandHeld, sample_path, sample_volume, seen_volume, simulate_volume
 from imgcal.types import Volume
 
 CORNER = Volume(((0, 0, 0), (900, 0, 0), (0, 900, 0), (0, 0, 900)))
@@ -37,7 +37,7 @@ def test_places_are_even_in_the_volume():
 @pytest.mark.parametrize("volume", [CORNER, Volume.box((-500, -500, 0), (500, 500, 2000))])
 def test_a_hand_is_as_fast_as_said_smooth_and_stays_inside(volume):
     hand = HandHeld(speed=600.0, turning=90.0, rate=100.0)
-    poses, motion = hand.path(volume, 6000, torch.Generator().manual_seed(3))
+    poses, motion = sample_path(hand, volume, 6000, torch.Generator().manual_seed(3))
     places = poses.translation.numpy()
     assert volume.contains(places).all()
     step = np.linalg.norm(np.diff(places, axis=0), axis=1) * hand.rate
