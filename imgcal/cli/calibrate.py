@@ -59,7 +59,7 @@ from imgcal.pipeline import (
 from imgcal.types import CalibrationObject, CameraRig, Detections, limits
 
 RIG = "rig.yaml"
-WRITTEN = ("report.html", RIG, "object.csv", "result.json")
+WRITTEN = ("report.html", RIG, "rig.posterior.safetensors", "object.csv", "result.json")
 
 
 WORST_STD = 1e6  # in any unit: what is known so badly is not known
@@ -121,7 +121,8 @@ class Calibrate(arguments.Calibrate):
                 result = refused_summary(outcome, detections, rig, seconds)
                 content = describe_refusal(outcome.for_command, detections, rig, obj, frames, seconds)
             else:
-                save_rig(outcome.rig, out / RIG, covariance, full=self.full_covariance)
+                posterior = replace(outcome.posterior(), time=time.time())
+                save_rig(outcome.rig, out / RIG, covariance, self.full_covariance, posterior)
                 if outcome.shape:
                     save_object(outcome.object, out / "object.csv")
                 found = findings(outcome, self._gauge(outcome), covariance)

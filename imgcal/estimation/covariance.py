@@ -27,6 +27,8 @@ from imgcal.types import CameraRig
 from renderers.compiling import njit
 
 UNDETERMINED = "covariance: the observations do not determine the object's pose in every snapshot"
+LEAST_STD = 1e-9
+"""Prior standard deviation (rad, mm, pixels, 1) of what is fixed, where it is divided by."""
 FEW_SNAPSHOTS = 10
 """Up to which `remaining_variance` eliminates the cameras of an exact object, not the poses."""
 
@@ -82,6 +84,40 @@ def whitened_covariance(solution: Solution) -> Tensor:
     blocks = covariance.unflatten(1, (cameras, -1)).unflatten(-1, (cameras, -1))
     blocks.diagonal(dim1=1, dim2=3).add_(inverse.permute(0, 2, 3, 1))
     return covariance
+
+
+def joint_information(estimate: Estimate) -> Tensor:
+    """Joint information of the cameras' parameters and of the object's offset, the poses let free.
+
+    Args:
+        estimate: without batch axes.
+
+    Returns:
+        (D, D), D = K C + M: inverse covariance in the units and order of `CameraRig.parameter_names`, camera after
+        camera, then of the object's offset in standard deviations of its prior. What is fixed has the information of
+        `LEAST_STD`. As wide as the scatter between blocks of snapshots, where that was larger than the noise says.
+
+    Raises:
+        RefusedError: the information is singular.
+    """
+    problem, equations = estimate.problem, estimate.solution.equations
+    reduced = factorize(equations, cameras_first=False).reduced
+    if bool(reduced.failed.any()):
+        raise RefusedError(UNDETERMINED)
+    information = (reduced.kept @ reduced.kept.mT)[0]
+    prior = torch.eye(len(information), dtype=information.dtype)
+    information = prior + (information - prior) / estimate.inflation**2
+    by_step = torch.linalg.inv(_unwhitening(_with_least_std(estimate, LEAST_STD))[0])  # whitened offsets by parameters
+    cameras, wide = len(by_step), problem.prior_std[0].numel()
+    whole = prior.clone()
+    whole[:wide, :wide] = torch.block_diag(*by_step) if cameras else prior
+    return whole.mT @ information @ whole
+
+
+def _with_least_std(estimate: Estimate, least: float) -> Estimate:
+    """The same estimate, its prior's standard deviations at least so large that they can be divided by."""
+    problem = estimate.problem
+    return replace(estimate, problem=replace(problem, prior_std=problem.prior_std.clamp_min(least)))
 
 
 def camera_std(estimate: Estimate) -> Tensor:

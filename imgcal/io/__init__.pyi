@@ -9,6 +9,7 @@ from .metrics import read_metrics
 from .names import MODEL, find_file, is_file_name, model_file, model_name, natural_key, nearest, title_of
 from .object_csv import load_object, object_from_text, object_text, save_object
 from .own_folder import holding
+from .posterior_file import read_posterior, write_posterior
 from .publication import PREVIOUS, keep_previous, publishing
 from .resources import data_path, shipped_names
 from .rig_yaml import RigCovariance, load_rig, load_rig_covariance, rig_from_text, rig_text, save_rig
@@ -69,6 +70,7 @@ __all__ = [
     "read_frame",
     "read_json",
     "read_metrics",
+    "read_posterior",
     "read_tensors",
     "read_texts",
     "read_yaml",
@@ -88,6 +90,7 @@ __all__ = [
     "write_bytes",
     "write_frame",
     "write_image",
+    "write_posterior",
     "write_tensors",
     "write_text",
     "yaml_text",

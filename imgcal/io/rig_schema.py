@@ -192,6 +192,7 @@ class RigFile(StrictModel):
     drift_rate: _DriftRate | None = None
     volume: _Volume | None = None
     covariance: _Covariance | None = None
+    posterior: Name | None = None  # the file beside it, of all that the calibration knows
 
     @model_validator(mode="after")
     def _consistent(self) -> RigFile:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,15 @@ from imgcal.geometry import (
     vector_from_rotation,
 )
 from imgcal.io.atomic import write_text
-from imgcal.io.names import find_file, title_of
+from imgcal.io.names import find_file, is_file_name, title_of
+from imgcal.io.posterior_file import read_posterior, write_posterior
 from imgcal.io.rig_schema import ENTRY_NAMES, FORMAT, CameraEntry, RigFile, Std, std_of
 from imgcal.io.validation import validated
 from imgcal.io.yaml_file import Flow, FlowMap, read_yaml, record_from_yaml, yaml_text
-from imgcal.types import CameraRig, DriftRate, RigPrior, Volume, parameter_names
+from imgcal.types import CameraRig, DriftRate, RigPosterior, RigPrior, Volume, parameter_names
+
+POSTERIOR = ".posterior.safetensors"
+"""Behind the stem of a rig's file: where all that its calibration knows is kept."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +65,11 @@ def load_rig(path: str | Path) -> CameraRig:
         ('O10', 10, 850.14)
     """
     content, path = _read(path)
-    return _rig_of(content, title_of(path))
+    rig = _rig_of(content, title_of(path))
+    if content.posterior is None or not is_file_name(content.posterior):
+        return rig
+    beside = path.with_name(content.posterior)
+    return replace(rig, posterior=partial(read_posterior, beside, rig)) if beside.is_file() else rig
 
 
 def rig_from_text(text: str, where: str) -> CameraRig:
@@ -85,7 +94,13 @@ def load_rig_covariance(path: str | Path) -> RigCovariance | None:
     return RigCovariance.from_matrix(matrix, len(content.cameras), reference_camera)
 
 
-def save_rig(rig: CameraRig, path: str | Path, covariance: RigCovariance | None = None, full: bool = False) -> None:
+def save_rig(
+    rig: CameraRig,
+    path: str | Path,
+    covariance: RigCovariance | None = None,
+    full: bool = False,
+    posterior: RigPosterior | None = None,
+) -> None:
     """Write a rig in one step; every number in its shortest exact form.
 
     Args:
@@ -93,6 +108,7 @@ def save_rig(rig: CameraRig, path: str | Path, covariance: RigCovariance | None 
         path: the file to write.
         covariance: one standard deviation of every parameter goes to its camera, to 6 digits; None = not written.
         full: write the whole covariance matrix, too (half a megabyte for 10 cameras).
+        posterior: goes to a file beside it, from which `load_rig` attaches it to the rig; None = not written.
 
     Raises:
         InputError: the file cannot be written, or the rig could not be read again (NaN, for example).
@@ -103,7 +119,13 @@ def save_rig(rig: CameraRig, path: str | Path, covariance: RigCovariance | None 
         >>> imgcal.load_rig("pair.yaml").camera_names
         ('cam01', 'cam02')
     """
-    write_text(path, rig_text(rig, path, covariance, full))
+    path = Path(path)
+    text = rig_text(rig, path, covariance, full)
+    if posterior is not None:
+        beside = path.with_name(f"{path.stem}{POSTERIOR}")
+        write_posterior(beside, posterior)
+        text += yaml_text({"posterior": beside.name})
+    write_text(path, text)
 
 
 def rig_text(

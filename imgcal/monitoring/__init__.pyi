@@ -5,6 +5,7 @@ from .measurement_update import absorb
 from .object_change import SHAPE, ObjectChange, changed_object
 from .object_motion import ObjectMotion
 from .pending_change import Change
+from .posterior import belief_of, calibration_of, posterior_of
 from .recent_snapshots import RecentSnapshots
 from .rig_belief import MeasurementUpdate, RigBelief, age_belief, widened
 from .rig_filter import RigFilter
@@ -29,11 +30,14 @@ __all__ = [
     "SnapshotInformation",
     "absorb",
     "age_belief",
+    "belief_of",
+    "calibration_of",
     "change_of_errors",
     "changed_object",
     "cusum_threshold",
     "image_of",
     "pixel_changes",
+    "posterior_of",
     "shared_shifts",
     "spread_of",
     "widened",

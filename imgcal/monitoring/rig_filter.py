@@ -49,6 +49,7 @@ class RigFilter:
         rate: DriftRate | None = None,
         options: EstimationOptions = EstimationOptions(),
         prior_std: Tensor | None = None,
+        start: tuple[RigBelief, int] | None = None,
     ) -> None:
         """Begin with the factory calibration.
 
@@ -58,12 +59,12 @@ class RigFilter:
             rate: how fast the rig wanders; None = as the rig says.
             options: how to minimize.
             prior_std: (C, K) how far the factory values may be off; None = as the rig says.
+            start: what a calibration has found, and from how many snapshots; None = nothing.
         """
         self.rate, self.options = rate or rig.drift_rate or DriftRate(), options
-        self.belief = RigBelief.of_prior(rig, obj, prior_std)
-        self.count = 0  # snapshots absorbed
-        self.calibrated = False  # it began with what a calibration has found
-        self._young = True  # the first snapshots are still kept
+        self.calibrated = start is not None  # it began with what a calibration has found
+        self.belief, self.count = start or (RigBelief.of_prior(rig, obj, prior_std), 0)  # and snapshots absorbed
+        self._young = start is None  # the first snapshots are still kept
         self.pace = torch.ones_like(self.belief.unit)  # (C, K) times the rate at which values are believed to wander
         self._first = self.belief
         self._early: list[tuple[Observations, RigidTransform]] = []

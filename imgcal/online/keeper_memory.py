@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from imgcal.association import PipelineOptions, to_observations
 from imgcal.geometry import RigidTransform
-from imgcal.monitoring import RigBelief, RigFilter, RigMonitor
+from imgcal.monitoring import RigBelief, RigFilter, RigMonitor, belief_of, calibration_of
 from imgcal.online.drift_watch import DriftWatch
 from imgcal.online.events import Event
 from imgcal.online.late_cameras import POSES
@@ -38,6 +38,8 @@ from imgcal.types import (
 
 UNUSUAL = 5.0
 """Times as far off as most cameras usually are, from which it is not the cameras but labels or pose that are wrong."""
+LEAST_LOOKS = 8
+"""Snapshots of a camera, from where it stands, from which its values say where its labels must be."""
 LEAST_USUAL = 8
 """Snapshots that say how far off most cameras usually are."""
 
@@ -78,14 +80,20 @@ class KeeperMemory:
     ) -> KeeperMemory:
         """Begin with a factory calibration."""
         rig = rig.to(torch.float64)
-        monitor = RigMonitor(RigFilter(rig, obj, drift, options.estimation))
-        return cls(
+        calibration, rig = calibration_of(rig), replace(rig, posterior=None)
+        start = None if calibration is None else (belief_of(calibration, obj), calibration.snapshots)
+        monitor = RigMonitor(RigFilter(rig, obj, drift, options.estimation, start=start))
+        memory = cls(
             options=options, factory=rig, obj=obj, drift=drift, prior=rig, monitor=monitor,
             noise=NoiseLevel(rig, obj, options), sightings=Sightings(rig.camera_names),
             relearning=Relearning(rig.camera_names), drift_watch=DriftWatch(rig.camera_names),
             doubts=ObjectDoubts(obj.num_fiducials), search=Search(rig.num_cameras),
             looks=np.zeros(rig.num_cameras, dtype=np.int64), before=monitor.filter.belief,
         )  # fmt: skip
+        if calibration is not None:
+            memory.looks[:], memory.learnt = LEAST_LOOKS, calibration.time
+            memory.noise.trust()
+        return memory
 
     def begin_anew(self) -> None:
         """Forget everything but the factory calibration."""

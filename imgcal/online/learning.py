@@ -8,12 +8,9 @@ import numpy as np
 
 from imgcal.monitoring import Change, MeasurementUpdate, RigFilter, RigMonitor
 from imgcal.online.drift_watch import DriftWatch
-from imgcal.online.keeper_memory import KeeperMemory
+from imgcal.online.keeper_memory import LEAST_LOOKS, KeeperMemory
 from imgcal.online.label_checks import Checked
 from imgcal.online.object_doubts import ObjectDoubts
-
-LEAST_LOOKS = 8
-"""Snapshots of a camera, from where it stands, from which its values say where its labels must be."""
 
 
 def learnt_from(memory: KeeperMemory, checked: Checked) -> tuple[MeasurementUpdate, tuple[Change, ...]]:

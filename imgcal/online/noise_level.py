@@ -35,6 +35,10 @@ class NoiseLevel:
         self.additive = np.zeros(rig.num_cameras)  # (C,) px
         self.restart()
 
+    def trust(self) -> None:
+        """Ask no first snapshots: the rig is known, and each snapshot shows its noise by what it leaves."""
+        self._asking = False
+
     def restart(self) -> None:
         """Ask first snapshots again."""
         self._early: list[Kept] = []

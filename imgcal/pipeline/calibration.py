@@ -20,6 +20,7 @@ from imgcal.estimation import (
     predicted_error,
 )
 from imgcal.geometry import RigidTransform
+from imgcal.monitoring import posterior_of
 from imgcal.pipeline.initialization import Initialization
 from imgcal.pipeline.lateness import LateCamera
 from imgcal.pipeline.object_checks import displaced, lost_fiducials
@@ -31,6 +32,7 @@ from imgcal.types import (
     Detections,
     MovedCamera,
     Observations,
+    RigPosterior,
 )
 
 
@@ -78,10 +80,18 @@ class Calibration:
             f"{float(self.chi2_per_dof):.2f}, identity {self.identity}, {used})"
         )
 
-    @property
+    @cached_property
     def rig(self) -> CameraRig:
-        """The recalibrated rig."""
-        return self.estimate.rig
+        """The recalibrated rig, with how well it is known: what a running rig begins with (`RigKeeper`)."""
+        return replace(self.estimate.rig, posterior=self.posterior)
+
+    def posterior(self) -> RigPosterior:
+        """The joint posterior of the rig's values and the object's shape.
+
+        Raises:
+            RefusedError: the observations do not determine the poses.
+        """
+        return posterior_of(self.estimate, self.obj)
 
     @property
     def rig_from_object(self) -> RigidTransform:

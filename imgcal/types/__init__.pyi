@@ -5,6 +5,7 @@ from .moved_camera import Kind, MovedCamera, MovedError
 from .observations import UNUSABLE, BlobFlag, BlobKind, Detections, Observations
 from .packing import pack21, unpack18, unpack21
 from .placement import CROP_MARGIN, PATCH_SIZE, CropPlacement
+from .posterior import RigPosterior
 from .prediction import Prediction, Views
 from .rig import (
     PARAMETER_NAMES,
@@ -42,6 +43,7 @@ __all__ = [
     "Observations",
     "Prediction",
     "Range",
+    "RigPosterior",
     "RigPrior",
     "Symmetry",
     "Views",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import zip_longest
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -27,6 +28,9 @@ from imgcal.geometry import (
 )
 from imgcal.types.volume import Volume
 from renderers import is_traced
+
+if TYPE_CHECKING:
+    from imgcal.types.posterior import RigPosterior
 
 PINHOLE = (
     "rotation_x", "rotation_y", "rotation_z", "position_x", "position_y", "position_z", "fx", "fy", "cx", "cy",
@@ -145,6 +149,7 @@ class CameraRig:
     drift_rate: DriftRate | None = None  # None = the defaults
     volume: Volume | None = None  # where it is used, in the rig frame
     lens_model: ModelNames = "brown_conrady"  # a name of `geometry.LENS_MODELS` for all cameras, or one for each
+    posterior: Callable[[], RigPosterior] | None = None  # how well a calibration knows these values, if one made them
 
     def __repr__(self) -> str:
         """Say what it is: `CameraRig('O10': 10 cameras, cam01 to cam10)`; `print` shows the values of each camera."""

@@ -1,0 +1,64 @@
+"""The posterior of a calibrated rig in a file beside it: arrays that nobody edits by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from imgcal.errors import InputError
+from imgcal.io.safetensors_file import read_tensors, write_tensors
+from imgcal.types import CameraRig, RigPosterior
+
+FORMAT = "imgcal-posterior/1"
+RIG = ("focal_length", "principal_point", "distortion")
+OWN = ("points", "tolerance", "object_offset", "factor", "unit")
+
+
+def write_posterior(path: str | Path, posterior: RigPosterior) -> None:
+    """Write a posterior in one step.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    rig = posterior.rig
+    tensors = {name: getattr(rig, name) for name in RIG} | {name: getattr(posterior, name) for name in OWN}
+    tensors |= {"rotation": rig.cam_from_rig.rotation, "translation": rig.cam_from_rig.translation}
+    texts = {"snapshots": str(posterior.snapshots), "scale_tolerance": repr(posterior.scale_tolerance)}
+    if posterior.time is not None:
+        texts["time"] = repr(posterior.time)
+    write_tensors(path, tensors, FORMAT, texts)
+
+
+def read_posterior(path: str | Path, rig: CameraRig) -> RigPosterior:
+    """Read what `write_posterior` wrote.
+
+    Args:
+        path: the file.
+        rig: the one that it stands beside: names, image sizes and lenses are its own.
+
+    Raises:
+        InputError: one line with the file, what was found and what was expected.
+    """
+    tensors, texts = read_tensors(path, FORMAT)
+    try:
+        cam_from_rig = replace(rig.cam_from_rig, rotation=tensors["rotation"], translation=tensors["translation"])
+        values = {name: tensors[name] for name in RIG}
+        posterior = RigPosterior(
+            replace(rig, cam_from_rig=cam_from_rig, posterior=None, **values),
+            snapshots=int(texts["snapshots"]),
+            scale_tolerance=float(texts["scale_tolerance"]),
+            time=float(texts["time"]) if "time" in texts else None,
+            **{name: tensors[name] for name in OWN},
+        )
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{path}: found no {error}, expected {FORMAT}") from error
+    wide = posterior.unit.numel() + len(posterior.object_offset)
+    expected = rig.num_cameras, rig.num_parameters
+    if tuple(posterior.unit.shape) != expected or tuple(posterior.factor.shape) != (wide, wide):
+        found = f"{tuple(posterior.unit.shape)} and {tuple(posterior.factor.shape)}"
+        raise InputError(f"{path}: found arrays {found}, expected {expected} and {(wide, wide)} for this rig")
+    if not bool(torch.isfinite(posterior.factor).all() & (posterior.factor.diagonal() > 0).all()):
+        raise InputError(f"{path}: expected a finite, positive-definite Cholesky factor")
+    return posterior
