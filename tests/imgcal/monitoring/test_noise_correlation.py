@@ -1,0 +1,84 @@
+"""How long errors last: white noise stays as it is, errors that last count by their effective number."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from imgcal.monitoring.noise_correlation import FASTEST, FIRST, MEMORY, NoiseCorrelation, usual_time
+from imgcal.types import Observations
+
+SIGMA = 0.1
+
+
+def observations(cameras: int = 2, fiducials: int = 5) -> Observations:
+    shape = (1, cameras, fiducials)
+    return Observations(
+        torch.zeros(*shape, 2, dtype=torch.float64),
+        torch.full(shape, SIGMA, dtype=torch.float64),
+        torch.ones(shape, dtype=torch.bool),
+    )
+
+
+def follow(remain: list[float], count: int = 1200, seed: int = 1) -> NoiseCorrelation:
+    """Follow cameras with noise of each point, and a shift of the image of which a part remains in the next snapshot."""
+    rng, noise = np.random.default_rng(seed), NoiseCorrelation(len(remain))
+    shift, keep = np.zeros((len(remain), 2)), np.array(remain)[:, None]
+    for _ in range(count):
+        shift = keep * shift + np.sqrt(1 - keep**2) * rng.normal(0, SIGMA, shift.shape)
+        residual = np.where(keep > 0, shift, 0.0)[:, None] + rng.normal(0, SIGMA, (len(remain), 5, 2))
+        noise.add(observations(len(remain)), torch.from_numpy(residual)[None])
+    return noise
+
+
+def test_white_noise_counts_as_it_is() -> None:
+    noise = follow([0.0, 0.0, 0.0])
+    assert noise.measured
+    assert noise.time.tolist() == [1.0, 1.0, 1.0]
+    seen = observations(3)
+    assert noise.weigh(seen) is seen
+    assert noise.episodes == [1, 1, 1]
+    assert float(noise.lasting.max()) == 0.0
+
+
+def test_errors_that_last_count_by_their_effective_number() -> None:
+    noise = follow([0.9, 0.0], count=MEMORY)
+    # The shift has 5/6 of the variance of the mean of five points; its correlation time is (1 + r) / (1 - r).
+    expected = 1 + 2 * (5 / 6) * 0.9 / 0.1
+    assert 0.5 * expected < float(noise.time[0]) < 1.6 * expected
+    weighed = noise.weigh(observations())
+    assert torch.allclose(weighed.sigma[0, 0], SIGMA * noise.time[0].sqrt())
+    assert 0.7 * SIGMA < float(noise.lasting[0]) < 1.3 * SIGMA
+    assert noise.episodes[0] == math.ceil(2 * float(noise.time[0]))
+
+
+def test_a_large_error_is_no_passing_one() -> None:
+    noise = follow([0.9, 0.9])
+    usual = float(noise.model_error[0])
+    assert noise.episode(0, 3 * usual) == noise.episodes[0] > 3
+    assert noise.episode(0, 30 * usual) == 3
+
+
+def test_until_it_is_measured_a_calibrated_rig_expects_what_is_usual() -> None:
+    noise = NoiseCorrelation(2)
+    noise.expect(0.0)
+    assert noise.time.tolist() == [usual_time(FASTEST)] * 2
+    noise.expect(1.0)
+    assert noise.time.tolist() == pytest.approx([1.0, 1.0], abs=1e-3)
+    for _ in range(FIRST[0]):
+        noise.add(observations(), torch.randn(1, 2, 5, 2, dtype=torch.float64))
+    assert noise.measured
+    noise.expect(0.001)
+    assert float(noise.time.max()) < 3
+
+
+def test_a_camera_that_sees_nothing_for_long_has_the_noise_of_the_others() -> None:
+    noise, rng, shift = NoiseCorrelation(3), np.random.default_rng(3), np.zeros((3, 2))
+    seen = observations(3)
+    seen.seen[0, 2] = False
+    for _ in range(700):
+        shift = 0.9 * shift + rng.normal(0, 0.044, shift.shape)
+        residual = shift[:, None] + rng.normal(0, SIGMA / 3, (3, 5, 2))
+        noise.add(seen, torch.from_numpy(np.where(seen.seen[0].numpy()[..., None], residual, 0.0))[None])
+    assert float(noise.time[2]) > 3

@@ -1,0 +1,60 @@
+"""What a running rig begins with is what the calibration knows, no more and no less."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+import imgcal
+from imgcal.estimation import camera_covariance, error_between
+from imgcal.monitoring import belief_of, calibration_of, posterior_of
+from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
+from tests.imgcal.monitoring.made_snapshots import batch, made_snapshots
+
+
+@pytest.fixture(scope="module")
+def made():
+    return made_snapshots()
+
+
+@pytest.mark.parametrize("loose", [False, True])
+def test_the_belief_has_the_covariance_of_the_estimate(made, loose: bool) -> None:
+    _, obj, _, _ = made
+    if loose:
+        obj = replace(obj, tolerance=torch.full((8,), 0.3, dtype=torch.float64), scale_tolerance=1e-3)
+    fit = batch(made, 6, obj)
+    belief = belief_of(posterior_of(fit, obj), obj)
+    expected = camera_covariance(fit, curved=False)
+    scale = expected.diagonal().sqrt()
+    assert torch.allclose(belief.covariance() / scale / scale[:, None], expected / scale / scale[:, None], atol=1e-6)
+    assert float(error_between(belief.rig, fit.rig).abs().max()) < 1e-12
+    torch.testing.assert_close(belief.points_object, fit.points_object, atol=1e-9, rtol=0)
+
+
+def test_of_another_object_it_says_what_it_knows_of_the_cameras(made) -> None:
+    _, obj, _, _ = made
+    loose = replace(obj, tolerance=torch.full((8,), 0.3, dtype=torch.float64))
+    posterior = posterior_of(batch(made, 6, loose), loose)
+    other = replace(obj, points=obj.points + torch.tensor([5.0, 0.0, 0.0]))
+    known, belief = belief_of(posterior, loose), belief_of(posterior, other)
+    assert len(belief.object_offset) == 0
+    assert torch.allclose(belief.std(), known.std(), rtol=1e-6)
+
+
+def test_a_scattered_estimate_starts_a_wider_belief(made) -> None:
+    _, obj, _, _ = made
+    fit = batch(made, 6)
+    std = belief_of(posterior_of(fit, obj), obj).std()
+    wider = belief_of(posterior_of(replace(fit, inflation=2.0), obj), obj).std()
+    assert 1.3 < float((wider / std)[:, 6].median()) < 2.001
+
+
+def test_a_rig_that_was_changed_has_no_posterior() -> None:
+    factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+    truth = simulate_truth(factory, obj, 4, torch.Generator().manual_seed(1), PhysicalDrift())
+    result = imgcal.calibrate(true_detections(truth), factory, obj)
+    posterior = calibration_of(result.rig)
+    assert posterior is not None
+    assert posterior.snapshots == 4
+    assert calibration_of(replace(result.rig, focal_length=result.rig.focal_length + 0.1)) is None
+    assert calibration_of(factory) is None
