@@ -35,14 +35,14 @@ class Disturbances:
     merged: float = 5.0  # px between centres below which two markers are one blob, at their middle
     wrong: float = 0.002  # share of images with a blob that is not where its marker is, for one snapshot ...
     wrong_by: tuple[float, float] = (3.0, 30.0)  # px ... by so much
-    people_every: float = 30.0  # s, mean time from person to person in front of a camera ...
+    people_every: float = 10.0  # s, mean time from person to person in front of a camera ...
     people_for: tuple[float, float] = (0.5, 6.0)  # s ... each as long
     whole: float = 0.5  # share of people who hide the whole image; others hide one side of a line across it
     away_every: float = 60.0  # s, mean time from one absence of the object to the next ...
     away_for: tuple[float, float] = (2.0, 10.0)  # s
     off: tuple[float, float] = (0.2, 0.6)  # mm from where the object's file has each marker
-    speed: float = 1200.0  # mm/s
-    turning: float = 90.0  # degrees/s
+    speed: float = 2500.0  # mm/s: some 9 px a frame, as in the recording
+    turning: float = 150.0  # degrees/s
 
 
 @dataclass(frozen=True)
