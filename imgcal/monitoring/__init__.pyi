@@ -8,7 +8,7 @@ from .pending_change import Change
 from .recent_snapshots import RecentSnapshots
 from .rig_belief import MeasurementUpdate, RigBelief, age_belief, widened
 from .rig_filter import RigFilter
-from .rig_monitor import RigMonitor
+from .rig_monitor import MonitorUpdate, RigMonitor
 from .shaking import shared_shifts
 from .snapshot_information import SnapshotInformation
 
@@ -20,6 +20,7 @@ __all__ = [
     "ClockSlip",
     "Cusum",
     "MeasurementUpdate",
+    "MonitorUpdate",
     "ObjectChange",
     "ObjectMotion",
     "RecentSnapshots",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from imgcal.errors import RefusedError
@@ -43,6 +43,18 @@ DOUBT = 16
 """Snapshots for which a camera is in doubt that seemed to have moved, and of which nothing could be told."""
 
 
+@dataclass(frozen=True)
+class MonitorUpdate:
+    """What a snapshot taught, and what became known with it."""
+
+    update: MeasurementUpdate  # with the pose (1,) and the residual (1, C, N, 2) of the latest snapshot
+    changes: tuple[Change, ...] = ()  # of cameras: first that there is one, then of which kind it is
+    slips: tuple[ClockSlip, ...] = ()
+    unsynchronized: tuple[int, ...] = ()  # cameras that see the object at moments of their own
+    object_change: ObjectChange | None = None
+    restarted: bool = False  # nothing that was known before a change counts any more
+
+
 class RigMonitor:
     """A `RigFilter` whose cameras may be bumped.
 
@@ -57,9 +69,6 @@ class RigMonitor:
         """Watch over a filter, which is to be updated by this monitor alone from now on."""
         self.filter = rig_filter
         self.open: dict[int, Change] = {}  # changes whose kind is not decided yet, by camera
-        self.object_change: ObjectChange | None = None  # that became known with the latest snapshot
-        self.slips: tuple[ClockSlip, ...] = ()  # that became known with the latest snapshot
-        self.apart: tuple[int, ...] = ()  # cameras of which it became known that they have moments of their own
         self.undecided: dict[int, int] = {}  # cameras that seem to have moved, and for how many snapshots yet
         self._clocks = ExplanationSearch()
         self.held = Quarantine()  # of which nothing is learnt until it is known why they see the object elsewhere
@@ -69,7 +78,7 @@ class RigMonitor:
         self._drifting = DriftLearning(DriftPaces(rig_filter.belief.rig.num_cameras))
         self._since: PendingChange | None = None
         self._prior = rig_filter.belief
-        self.first = 0  # number of the first snapshot of which something is known
+        self.known_since = 0  # number of the first snapshot that what is known rests on
         self._moved_early: set[int] = set()  # cameras of which the factory knows nothing more
         self._suspect: int | None = None  # the camera without which the last snapshot would not have been refused
 
@@ -79,7 +88,7 @@ class RigMonitor:
         rig_from_object: RigidTransform,
         seconds: float = 0.0,
         moved: Collection[int] = (),
-    ) -> tuple[MeasurementUpdate, tuple[Change, ...]]:
+    ) -> MonitorUpdate:
         """Learn from a snapshot.
 
         Args:
@@ -89,26 +98,23 @@ class RigMonitor:
             moved: cameras that are known to have moved before this snapshot, how far they may.
 
         Returns:
-            What was learnt, with the pose and the residual of this snapshot, and the changes that became known with it:
-            first that there is one, then, once that is decided, of which kind it is.
+            What was learnt, and what became known.
 
         Raises:
             RefusedError: see `absorb`. What no minimum is found for, but for one camera, is refused once; if the next
                 snapshot says the same, that camera has moved.
         """
-        self.object_change, self.slips, self.apart = None, (), ()
         self.undecided = {camera: left - 1 for camera, left in self.undecided.items() if left > 1}
         observations = self.shaking.of(observations)
         new = [camera for camera in moved if camera not in self.held.cameras]
         if new:
-            self.held.hold(new, self.filter.count - self.first < FEW)
+            self.held.hold(new, self.filter.count - self.known_since < FEW)
+        known_since = self.known_since
         learn = self._beside_held if self.held.cameras else self._followed
-        result, changes = learn(observations, rig_from_object, seconds)
-        return result.of_last(), changes
+        found = learn(observations, rig_from_object, seconds)
+        return replace(found, update=found.update.of_last(), restarted=self.known_since != known_since)
 
-    def _followed(
-        self, observations: Observations, rig_from_object: RigidTransform, seconds: float
-    ) -> tuple[MeasurementUpdate, tuple[Change, ...]]:
+    def _followed(self, observations: Observations, rig_from_object: RigidTransform, seconds: float) -> MonitorUpdate:
         """Learn from a snapshot of which nobody knows that something has moved before it."""
         try:
             result = self.filter.follow(observations, rig_from_object, seconds)
@@ -117,7 +123,7 @@ class RigMonitor:
             self._suspect = contradicting(belief, observations, rig_from_object, self.filter.options)
             if last is None or last != self._suspect:
                 raise
-            self.held.hold((last,), self.filter.count - self.first < FEW)
+            self.held.hold((last,), self.filter.count - self.known_since < FEW)
             self._suspect = None
             return self._beside_held(observations, rig_from_object, seconds)
         self._suspect = None
@@ -129,7 +135,7 @@ class RigMonitor:
         if found is None and misfit and self._since is None:
             anew = self._learnt_object(misfit)
             if anew is not None:
-                return anew, ()
+                return anew
         if found is not None:
             with contextlib.suppress(RefusedError):  # what cannot be told or learnt is tested with the next snapshot
                 told = self._alarmed(found)
@@ -139,33 +145,30 @@ class RigMonitor:
             result = self.filter.relinearize()
             self._recent.relinearized(result)
             if (anew := self._learnt_first_object(result)) is not None:
-                return anew, ()
+                return anew
             if self._since is not None:
                 self._since = PendingChange.of(result, self._since.before, self._since.seconds, self._since.kinds)
         if self._since is None:
             self.shaking.take(observations, result.residual[-1:])
         self._drifting.take(self.filter, self._recent, seconds, quiet=self._since is None and found is None)
         if self._since is not None and self._since.due:
-            return result, self._judged(self._since.late)
-        return result, ()
+            return MonitorUpdate(result, self._judged(self._since.late))
+        return MonitorUpdate(result)
 
     def _beside_held(
         self, observations: Observations, rig_from_object: RigidTransform, seconds: float
-    ) -> tuple[MeasurementUpdate, tuple[Change, ...]]:
+    ) -> MonitorUpdate:
         """Learn from a snapshot without the cameras that are held, and ask what has happened to these."""
         held, cameras = self.held, set(self.held.cameras)
-        result, changes = self._followed(without(observations, cameras), rig_from_object, seconds)
+        found = self._followed(without(observations, cameras), rig_from_object, seconds)
         if not held.cameras or held.cameras != cameras:  # those that are new have taken it already
-            return result, changes
+            return found
         if held.take(observations, seconds):
             with contextlib.suppress(RefusedError):  # not yet
-                anew = self._asked_held()
-                if anew is not None:
-                    return anew[0], (*changes, *anew[1])
-        self.apart = held.tell()
-        return result, changes
+                found = self._asked_held(found)
+        return replace(found, unsynchronized=held.tell())
 
-    def _asked_held(self) -> tuple[MeasurementUpdate, tuple[Change, ...]] | None:
+    def _asked_held(self, found: MonitorUpdate) -> MonitorUpdate:
         """Ask what has happened to the cameras that are held; what was learnt anew where they have moved.
 
         Raises:
@@ -177,14 +180,14 @@ class RigMonitor:
         answer = self._clocks.ask(suspicion, since, self.filter.options, patient)
         held.apart = answer.kind == "apart"
         if held.apart:
-            return None
+            return found
         held.release()
         if answer.kind == "moved":
-            return self._restarted(suspicion, self._judged(last=True))
-        self.slips = () if answer.slipped is None else answer.slipped.slips
-        return None
+            anew = self._restarted(suspicion, self._judged(last=True))
+            return replace(anew, changes=(*found.changes, *anew.changes))
+        return found if answer.slipped is None else replace(found, slips=answer.slipped.slips)
 
-    def _restarted(self, moved: Suspicion, told: Sequence[Change]) -> tuple[MeasurementUpdate, tuple[Change, ...]]:
+    def _restarted(self, moved: Suspicion, told: Sequence[Change]) -> MonitorUpdate:
         """Learn the latest snapshots, which the filter has absorbed otherwise, with cameras that have moved before.
 
         Raises:
@@ -192,11 +195,11 @@ class RigMonitor:
         """
         count, free = moved.count, dict(moved.cameras)
         snapshots, pauses = moved.snapshots[-count:], moved.pauses[-count:]
-        if self.filter.count - count - self.first < FEW:
+        if self.filter.count - count - self.known_since < FEW:
             return self._begin_again(free, snapshots, pauses, {}, told)
         result = self.filter.restart(free_cameras(moved.before, free, JUMPS[-1]), snapshots)
         self._recent.took(snapshots, pauses, result)
-        return result, (*told, *self._begin(free, result, moved.before, sum(pauses)))
+        return MonitorUpdate(result, (*told, *self._begin(free, result, moved.before, sum(pauses))))
 
     def _begin_again(
         self,
@@ -205,7 +208,7 @@ class RigMonitor:
         pauses: Sequence[float],
         evidence: Mapping[int, float],
         told: Sequence[Change],
-    ) -> tuple[MeasurementUpdate, tuple[Change, ...]]:
+    ) -> MonitorUpdate:
         """Learn from the snapshots since a change alone: before it, hardly anything had been learnt.
 
         Raises:
@@ -216,12 +219,12 @@ class RigMonitor:
         result = self.filter.restart(prior, snapshots)
         self._recent = RecentSnapshots(result.belief, self.filter.walk)
         self._recent.took(snapshots, pauses, result)
-        self.first = self.filter.count - len(snapshots)
-        nan, number = float("nan"), self.first
+        self.known_since = self.filter.count - len(snapshots)
+        nan, number = float("nan"), self.known_since
         since = {camera: self.open[camera].since if camera in self.open else number for camera in free}
         new = [Change(c, since[c], "unknown", nan, nan, True, evidence.get(c, nan)) for c in free]
         self.open, self._since, self._suspect = {}, None, None
-        return result, (*told, *new)
+        return MonitorUpdate(result, (*told, *new))
 
     def _begin(
         self,
@@ -241,7 +244,7 @@ class RigMonitor:
         self._since = PendingChange.of(result, before, seconds, free)
         return told
 
-    def _alarmed(self, age: int) -> tuple[MeasurementUpdate, tuple[Change, ...]]:
+    def _alarmed(self, age: int) -> MonitorUpdate:
         """Let cameras free that have changed, the surest first, until what has been seen since then is explained."""
         told: list[Change] = []
         free: dict[int, str | None] = {}
@@ -260,19 +263,17 @@ class RigMonitor:
         self.undecided |= dict.fromkeys(free, DOUBT)
         snapshots = self._recent.snapshots(age)
         if (in_time := self._in_time_since(before, age, free)) is not None:
-            return in_time, tuple(told)
-        if self.filter.count - age - self.first < FEW:
+            return replace(in_time, changes=tuple(told))
+        if self.filter.count - age - self.known_since < FEW:
             return self._begin_again(free, snapshots, self._recent.pauses(age), evidence, told)
         moved = absorb(free_cameras(before, free), *stack_snapshots(snapshots), self.filter.options)
         if not known and (found := changed_object(before, snapshots, self.filter.options, moved)) is not None:
-            return self._learn_object(*found, snapshots, self._recent.pauses(age)), tuple(told)
+            return replace(self._learn_object(*found, snapshots, self._recent.pauses(age)), changes=tuple(told))
         result = self.filter.restart(free_cameras(before, free), snapshots)
         self._recent.restarted(result, age)
-        return result, (*told, *self._begin(free, result, before, seconds, evidence))
+        return MonitorUpdate(result, (*told, *self._begin(free, result, before, seconds, evidence)))
 
-    def _in_time_since(
-        self, before: RigBelief, age: int, cameras: Mapping[int, str | None]
-    ) -> MeasurementUpdate | None:
+    def _in_time_since(self, before: RigBelief, age: int, cameras: Mapping[int, str | None]) -> MonitorUpdate | None:
         """Learn the latest snapshots anew as cameras had seen them in time, or at rest, or without them.
 
         Returns:
@@ -283,42 +284,42 @@ class RigMonitor:
         """
         count = len(self._recent)
         snapshots, pauses = self._recent.snapshots(count), self._recent.pauses(count)
-        everything = self.filter.count - self.first == count
+        everything = self.filter.count - self.known_since == count
         first = free_cameras(self._prior, dict.fromkeys(sorted(self._moved_early)), JUMPS[-1]) if everything else None
         suspicion = Suspicion(before, snapshots, pauses, age, cameras, first)
         answer = self._clocks.ask(suspicion, self.filter.count - age, self.filter.options, self._since is None)
         if answer.kind == "moved":
             return None
+        slips = () if answer.slipped is None else answer.slipped.slips
         if answer.slipped is not None:
-            self.slips = answer.slipped.slips
             before, snapshots = answer.slipped.before, answer.slipped.snapshots
         elif answer.shaken is not None:
             self.shaking.believe(answer.shaken.shake)
             before, snapshots = answer.shaken.before, answer.shaken.snapshots
         else:
             before, snapshots = (before, snapshots[-age:]) if first is None else (first, snapshots)
-            few = self.filter.count - age - self.first < FEW
+            few = self.filter.count - age - self.known_since < FEW
             snapshots = self.held.hold_since(snapshots, pauses[-len(snapshots) :], cameras, few)
         result = self.filter.restart(before, snapshots)
         self._recent = RecentSnapshots(result.belief, self.filter.walk)
         self._recent.took(snapshots, pauses[-len(snapshots) :], result)
         self.open, self._since = {}, None
-        return result
+        return MonitorUpdate(result, slips=slips)
 
-    def _learnt_object(self, age: int) -> MeasurementUpdate | None:
+    def _learnt_object(self, age: int) -> MonitorUpdate | None:
         """Learn the object anew where snapshots fit worse because it has changed."""
         age = min(age, len(self._recent))
-        if self.filter.count - age - self.first < UNSURE:
+        if self.filter.count - age - self.known_since < UNSURE:
             return None
         with contextlib.suppress(RefusedError):
             before = self._recent.belief_before(age)
             return self._asked_object(before, self._recent.snapshots(age), self._recent.pauses(age))
         return None
 
-    def _learnt_first_object(self, result: MeasurementUpdate) -> MeasurementUpdate | None:
+    def _learnt_first_object(self, result: MeasurementUpdate) -> MonitorUpdate | None:
         """Learn the object anew where it never was as its file says, and so the first snapshots do not fit."""
         count = self.filter.count
-        asked = not self.first and self._since is None and len(self._recent) == count
+        asked = not self.known_since and self._since is None and len(self._recent) == count
         if not asked or not never_fitted(result, count):
             return None
         with contextlib.suppress(RefusedError):
@@ -327,8 +328,8 @@ class RigMonitor:
 
     def ask_object(
         self, snapshots: Sequence[tuple[Observations, RigidTransform]], pauses: Sequence[float], learnt: bool
-    ) -> MeasurementUpdate | None:
-        """Ask whether it is the object that has changed where labels do not fit; `object_change` says how.
+    ) -> MonitorUpdate | None:
+        """Ask whether it is the object that has changed where labels do not fit.
 
         Args:
             snapshots: observations (1, C, N), with those labels, and poses (1,): the latest ones.
@@ -336,22 +337,18 @@ class RigMonitor:
             learnt: they have been learnt without those labels; else not at all.
 
         Returns:
-            What they taught, with pose and residual of the last one; None = the object is as it was.
+            What they taught, and how it has changed; None = the object is as it was.
         """
-        self.object_change = None
         if self._since is not None or (learnt and len(self._recent) < len(snapshots)):
             return None
-        unlearnt, found = 0 if learnt else len(snapshots), None
-        self.filter.count += unlearnt
         with contextlib.suppress(RefusedError):
             if learnt:
                 before = self._recent.belief_before(len(snapshots))
             else:
                 before = age_belief(self.filter.belief, self.filter.waited + pauses[0], self.filter.walk)
-            found = self._asked_object(before, snapshots, pauses)
-        if found is None:
-            self.filter.count -= unlearnt
-        return None if found is None else found.of_last()
+            found = self._asked_object(before, snapshots, pauses, new=not learnt)
+            return None if found is None else replace(found, update=found.update.of_last())
+        return None
 
     def ask_clocks(
         self, snapshots: Sequence[tuple[Observations, RigidTransform]], pauses: Sequence[float]
@@ -371,7 +368,7 @@ class RigMonitor:
         found, sure = doubtful_cameras(before, snapshots, self.filter.options)
         new = tuple(sorted(set(found) - self.held.cameras))
         if new:
-            self.held.hold(new, self.filter.count - self.first < FEW)
+            self.held.hold(new, self.filter.count - self.known_since < FEW)
             self.held.apart, self.held.seconds = sure, sum(pauses[1:])
         return new
 
@@ -380,14 +377,15 @@ class RigMonitor:
         before: RigBelief,
         snapshots: Sequence[tuple[Observations, RigidTransform]],
         pauses: Sequence[float],
-    ) -> MeasurementUpdate | None:
-        """Learn the object anew where that explains some snapshots.
+        new: bool = False,
+    ) -> MonitorUpdate | None:
+        """Learn the object anew where that explains some snapshots, which the filter has absorbed or are new to it.
 
         Raises:
             RefusedError: see `absorb`.
         """
         found = object_explains(before, snapshots, self.filter.options)
-        return None if found is None else self._learn_object(*found, snapshots, pauses)
+        return None if found is None else self._learn_object(*found, snapshots, pauses, new)
 
     def _learn_object(
         self,
@@ -395,13 +393,13 @@ class RigMonitor:
         before: RigBelief,
         snapshots: Sequence[tuple[Observations, RigidTransform]],
         pauses: Sequence[float],
-    ) -> MeasurementUpdate:
+        new: bool = False,
+    ) -> MonitorUpdate:
         """Go on with an object that is not as it was; its shape is learnt from now on."""
-        result = self.filter.restart(before, snapshots)
-        self.object_change = replace(change, since=self.filter.count - len(snapshots))
+        result = self.filter.restart(before, snapshots, new=len(snapshots) if new else 0)
         self._recent = RecentSnapshots(result.belief, self.filter.walk)
         self._recent.took(snapshots, pauses, result)
-        return result
+        return MonitorUpdate(result, object_change=replace(change, since=self.filter.count - len(snapshots)))
 
     def _judged(self, last: bool) -> tuple[Change, ...]:
         """Decide what kind of change each open one is, where the snapshots since can tell, or it is time."""

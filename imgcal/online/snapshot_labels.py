@@ -65,9 +65,8 @@ def labelled_snapshot(
     checked = _checked(memory, blobs, pose.reshape(1))
     if checked.usual > memory.most_usual and memory.doubts.due and ask_clocks(memory):
         checked = _checked(memory, blobs, pose.reshape(1))
-    if checked.usual > memory.most_usual and memory.doubts.due and ask_object(memory, learnt=False) is not None:
-        change = memory.monitor.object_change
-        assert change is not None
+    changed = checked.usual > memory.most_usual and memory.doubts.due and ask_object(memory, learnt=False)
+    if changed and (change := changed.object_change) is not None:
         memory.pending.append(object_event(change, memory.since(change.since), memory.time, memory.count - 1))
         checked = _checked(memory, blobs, pose.reshape(1))
     if checked.usual > memory.most_usual:

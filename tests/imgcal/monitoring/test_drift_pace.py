@@ -90,7 +90,7 @@ def crept(turn: float, seconds: int, seed: int) -> tuple[RigMonitor, CameraRig, 
         observations, _ = made.labelled(first, last)
         for row in range(last - first):
             one = observations.of_snapshots([row])
-            told += len(monitor.update(one, poses[row : row + 1], 1 / RATE)[1])
+            told += len(monitor.update(one, poses[row : row + 1], 1 / RATE).changes)
         made.creep = creep
     return monitor, made.rig, told
 

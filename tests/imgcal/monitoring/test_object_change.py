@@ -31,9 +31,9 @@ def test_a_change_of_the_object_is_told_and_learnt(fiducial: int | None, toleran
         image = truth.rig.expand(1).project(truth.rig_from_object[s : s + 1].apply(points))
         uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
         there = Observations(uv, torch.full(uv.shape[:-1], NOISE, dtype=torch.float64), image.visible)
-        _, changes = monitor.update(there, truth.rig_from_object[s : s + 1], 1 / 60)
-        told += changes
-        found = monitor.object_change or found
+        update = monitor.update(there, truth.rig_from_object[s : s + 1], 1 / 60)
+        told += update.changes
+        found = update.object_change or found
     assert told == []
     assert found is not None
     assert (found.fiducial, found.since) == (fiducial, 45)
@@ -53,8 +53,9 @@ def test_another_object_of_the_same_design_is_told_as_that_and_no_camera_is_blam
         image = truth.rig.expand(1).project(truth.rig_from_object[s : s + 1].apply(other if s >= 30 else obj.points))
         uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
         there = Observations(uv, torch.full(uv.shape[:-1], NOISE, dtype=torch.float64), image.visible)
-        told += monitor.update(there, truth.rig_from_object[s : s + 1], 1 / 60)[1]
-        found += [] if monitor.object_change is None else [monitor.object_change]
+        update = monitor.update(there, truth.rig_from_object[s : s + 1], 1 / 60)
+        told += update.changes
+        found += [] if update.object_change is None else [update.object_change]
     assert told == []
     assert found[0].fiducial == SHAPE
     assert 28 <= found[0].since <= 33
@@ -79,8 +80,9 @@ def test_a_fiducial_that_never_was_where_the_file_says_is_told() -> None:
         image = truth.rig.expand(1).project(truth.rig_from_object[s : s + 1].apply(points))
         uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
         there = Observations(uv, torch.full(uv.shape[:-1], NOISE, dtype=torch.float64), image.visible)
-        told += monitor.update(there, truth.rig_from_object[s : s + 1], 1 / 60)[1]
-        found += [] if monitor.object_change is None else [monitor.object_change]
+        update = monitor.update(there, truth.rig_from_object[s : s + 1], 1 / 60)
+        told += update.changes
+        found += [] if update.object_change is None else [update.object_change]
     assert told == []
     assert [(change.fiducial, change.since) for change in found] == [(5, 0)]
     assert abs(found[0].size - 0.985) < 5 * found[0].sigma
@@ -97,8 +99,8 @@ def test_an_object_that_never_was_as_its_file_says_is_told_however_it_is_turned(
         image = truth.rig.expand(1).project(truth.rig_from_object[s : s + 1].apply(other))
         uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
         there = Observations(uv, torch.full(uv.shape[:-1], NOISE, dtype=torch.float64), image.visible)
-        monitor.update(there, truth.rig_from_object[s : s + 1], 1 / 60)
-        found += [] if monitor.object_change is None else [monitor.object_change]
+        update = monitor.update(there, truth.rig_from_object[s : s + 1], 1 / 60)
+        found += [] if update.object_change is None else [update.object_change]
     assert [(change.fiducial, change.since) for change in found] == [(SHAPE, 0)]
     assert found[0].size == pytest.approx(_apart(obj.points, other), abs=5 * found[0].sigma)
 

@@ -41,9 +41,10 @@ def followed(bumps: dict[int, dict[int, str]], count: int, seed: int) -> tuple[R
         uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
         seen = image.visible & (torch.rand(image.visible.shape, generator=generator) > 0.1)
         observations = Observations(uv, torch.full(seen.shape, NOISE, dtype=torch.float64), seen)
-        result, changes = monitor.update(observations, pose, seconds=1 / 60)
-        assert len(result.rig_from_object.translation) == len(result.residual) == 1  # also where it was learnt anew
-        told += changes
+        found = monitor.update(observations, pose, seconds=1 / 60)
+        one = found.update
+        assert len(one.rig_from_object.translation) == len(one.residual) == 1  # also where it was learnt anew
+        told += found.changes
     return monitor, rig, told
 
 
@@ -118,11 +119,11 @@ def test_a_large_turn_is_learnt_whether_it_was_announced_or_not(told_before: boo
         observations = Observations(uv, torch.full(uv.shape[:-1], NOISE, dtype=torch.float64), image.depth > 0)
         moved = (2,) if told_before and s == 20 else ()
         try:
-            _, changes = monitor.update(observations, truth.rig_from_object[s : s + 1], 1 / 60, moved)
+            found = monitor.update(observations, truth.rig_from_object[s : s + 1], 1 / 60, moved)
         except RefusedError:
             refused += 1
             continue
-        told += changes
+        told += found.changes
     assert refused <= (0 if told_before else 2)
     assert {change.camera for change in told} == {2}
     assert told[0].since == 20
@@ -146,14 +147,15 @@ def test_of_a_camera_that_moves_within_the_first_snapshots_no_other_and_no_objec
     times = torch.arange(50, dtype=torch.float64) / seen.rate
     made.frequency = made.frequency * seen.rate / 60
     poses, (observations, rigs) = made.poses_at(times), made.labelled(0, 50)
-    monitor, told = RigMonitor(RigFilter(made.factory, made.obj)), []
+    monitor, told, restarts = RigMonitor(RigFilter(made.factory, made.obj)), [], 0
     for s in range(50):
         one = observations.of_snapshots([s])
-        _, changes = monitor.update(one, poses[s : s + 1], 1 / seen.rate)
-        told += changes
-        assert monitor.object_change is None
+        found = monitor.update(one, poses[s : s + 1], 1 / seen.rate)
+        told += found.changes
+        restarts += found.restarted
+        assert found.object_change is None
     assert {change.camera for change in told} == {camera}
-    assert monitor.first == at
+    assert monitor.known_since == at and restarts == 1
     assert 0.5 < normalized_error(monitor, rigs[-1]) < 1.8
 
 
@@ -166,8 +168,7 @@ def test_a_camera_of_which_it_cannot_be_told_yet_is_undecided_until_it_is() -> N
     monitor, told, undecided = RigMonitor(RigFilter(made.factory, made.obj)), [], []
     for s in range(90):
         one = observations.of_snapshots([s])
-        _, changes = monitor.update(one, poses[s : s + 1], 1 / 60)
-        told += [(s, change.camera) for change in changes]
+        told += [(s, change.camera) for change in monitor.update(one, poses[s : s + 1], 1 / 60).changes]
         undecided.append(set(monitor.undecided))
     assert told and {camera for _, camera in told} == {2}
     first = told[0][0]
@@ -183,8 +184,8 @@ def watched(stream: Stream, count: int) -> list[tuple[int, int]]:
     monitor, told = RigMonitor(RigFilter(stream.factory, stream.obj)), []
     for number in range(count):
         with contextlib.suppress(RefusedError):
-            _, changes = monitor.update(seen.of_snapshots([number]), poses[number : number + 1], 1 / rate)
-            told += [(number, change.camera) for change in changes]
+            found = monitor.update(seen.of_snapshots([number]), poses[number : number + 1], 1 / rate)
+            told += [(number, change.camera) for change in found.changes]
     return told
 
 
