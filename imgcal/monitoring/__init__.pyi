@@ -1,8 +1,8 @@
+from .case import SHAPE, ClockSlip, ObjectChange
 from .change_test import CHANGES, ChangeTest, change_of_errors, pixel_changes, spread_of
-from .clock_slip import ClockSlip, image_of
+from .clock_slip import image_of
 from .cusum import Cusum, cusum_threshold
 from .measurement_update import absorb
-from .object_change import SHAPE, ObjectChange, changed_object
 from .object_motion import ObjectMotion
 from .pending_change import Change
 from .recent_snapshots import RecentSnapshots
@@ -31,7 +31,6 @@ __all__ = [
     "absorb",
     "age_belief",
     "change_of_errors",
-    "changed_object",
     "cusum_threshold",
     "image_of",
     "pixel_changes",

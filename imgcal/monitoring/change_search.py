@@ -45,7 +45,7 @@ def changed_before(recent: RecentSnapshots, count: int) -> int | None:
         scores = recent.test(age).scores()
         kind = max(scores, key=lambda name: float(scores[name].max()))
         camera = int(scores[kind].argmax())
-        if float(scores[kind][camera]) >= SIGNIFICANT and recent.steady(age, camera, kind) >= REMAINING:
+        if float(scores[kind][camera]) >= SIGNIFICANT and recent.score_without_best(age, camera, kind) >= REMAINING:
             return age
     return None
 

@@ -21,7 +21,9 @@ from torch import Tensor
 
 from imgcal.estimation import error_between
 from imgcal.monitoring.change_test import CHANGES, MODEL_ERROR, ChangeTest, change_of_errors, pixel_changes
-from imgcal.monitoring.rig_belief import RigBelief, age_belief
+from imgcal.monitoring.recent_snapshots import RecentSnapshots
+from imgcal.monitoring.rig_belief import RigBelief, age_belief, widened
+from imgcal.monitoring.rig_filter import RigFilter
 from imgcal.types import DriftRate
 
 SECONDS = 20.0
@@ -35,6 +37,8 @@ DOUBT = 6.0
 """Log odds against each of them, before anything is seen."""
 LEARNING = 133.0
 """Seconds in which a random walk goes as far as the ramp that it stands for."""
+ADDED_TOGETHER = 32
+"""Snapshots whose information is added up at once."""
 
 
 @dataclass
@@ -157,6 +161,44 @@ class DriftPaces:
         error = (model / last.square()[:, None, None, None])[..., None, :]  # of a speed
         steady = _log_evidence(information, pull, error)
         return _log_evidence(information, pull, error + SPEEDS.square()[:, None]) - steady
+
+
+@dataclass
+class DriftLearning:
+    """Learns how fast a filter's cameras drift while nothing else is the matter; it knows less of those that do."""
+
+    paces: DriftPaces
+    stretch: Stretch | None = None  # of snapshots ...
+    waiting: int = 0  # ... and the latest of them, which are not added yet
+
+    def take(self, follows: RigFilter, recent: RecentSnapshots, seconds: float, quiet: bool) -> None:
+        """Take the latest snapshot, and change what the filter believes.
+
+        Args:
+            follows: the filter that has learnt from it.
+            recent: the latest snapshots, this one included.
+            seconds: since the one before.
+            quiet: no camera has changed of late.
+        """
+        if follows.young or not quiet:
+            self.stretch = None
+            return
+        if self.stretch is None:
+            self.stretch, self.waiting = Stretch.after(follows.belief, follows.waited), 0
+            return
+        stretch = self.stretch
+        stretch.seconds, self.waiting = stretch.seconds + seconds, self.waiting + 1
+        done = stretch.seconds >= SECONDS
+        if done or self.waiting == ADDED_TOGETHER:
+            stretch.add(follows.belief, *recent.information(self.waiting))
+            self.waiting = 0
+        if done:
+            lacking = self.paces.take(stretch, follows.rate.std(follows.belief.rig))
+            follows.pace = self.paces.of_parameters(follows.pace.shape[1])
+            recent.walk = follows.walk
+            if bool(lacking.any()):
+                follows.belief = widened(follows.belief, lacking)
+            self.stretch = Stretch.after(follows.belief, follows.waited)
 
 
 def _log_evidence(information: Tensor, pull: Tensor, variance: Tensor) -> Tensor:

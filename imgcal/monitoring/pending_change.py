@@ -1,4 +1,4 @@
-"""Cameras that have changed, nobody knows how yet: what was seen since then decides which kind of change it was."""
+"""Cameras that have changed in a way that is not known yet: what they see since then decides its kind."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class PendingChange:
         """Tell whether the kind is to be asked for now."""
         return self.late or self.count in JUDGED
 
-    def take(self, result: MeasurementUpdate, seconds: float) -> None:
+    def add(self, result: MeasurementUpdate, seconds: float) -> None:
         """Add what a snapshot has brought."""
         brought = result.brought
         information = brought.information()
@@ -103,7 +103,7 @@ class PendingChange:
         change = change_of_errors(before.rig, before.unit)
         return ChangeTest.of(known, self.brought, pull, change, pixel_changes(before.rig))
 
-    def decided(self, test: ChangeTest, camera: int, last: bool) -> tuple[str | None, str | None] | None:
+    def decide(self, test: ChangeTest, camera: int, last: bool) -> tuple[str | None, str | None] | None:
         """Decide how a camera has changed.
 
         Args:
@@ -124,7 +124,7 @@ class PendingChange:
         # Told as what it most probably is, and believed to be anything.
         return None, max(CHANGES, key=lambda kind: odds[kind]) if self.late else None
 
-    def judged(
+    def decide_kinds(
         self, test: ChangeTest, changes: Mapping[int, Change], last: bool
     ) -> tuple[tuple[Change, ...], dict[int, str | None]]:
         """Decide of which kind open changes are, by camera, where that can be told, or it is time.
@@ -132,17 +132,17 @@ class PendingChange:
         Returns:
             What is told of them, and what is believed of the cameras that are decided.
         """
-        told, kinds = [], dict[int, str | None]()
+        decided, kinds = [], dict[int, str | None]()
         for camera, change in changes.items():
-            decided = self.decided(test, camera, last)
-            if decided is None:
+            found = self.decide(test, camera, last)
+            if found is None:
                 continue
-            kinds[camera], kind = decided
+            kinds[camera], kind = found
             size = (math.nan, math.nan) if kind is None else self.size(test, camera, kind)
             scores = test.given(self.others(camera)).scores()
             evidence = max(float(scores[name][camera]) for name in ([kind] if kind else CHANGES))
-            told.append(Change(camera, change.since, kind or "unknown", *size, decided=True, evidence=evidence))
-        return tuple(told), kinds
+            decided.append(Change(camera, change.since, kind or "unknown", *size, decided=True, evidence=evidence))
+        return tuple(decided), kinds
 
     def size(self, test: ChangeTest, camera: int, kind: str) -> tuple[float, float]:
         """How far a camera went, were it of this kind alone, and the standard deviation of that."""
@@ -151,7 +151,7 @@ class PendingChange:
         along = change / max(size, 1e-30)
         return size, float((along @ covariance @ along).clamp_min(0).sqrt())
 
-    def supposed(self, test: ChangeTest) -> tuple[RigBelief, RigBelief, Tensor]:
+    def adopt_kinds(self, test: ChangeTest) -> tuple[RigBelief, RigBelief, Tensor]:
         """Believe that cameras have changed in the `kinds` only.
 
         What was believed is moved along with them first: a large turn is no small one times a number.

@@ -110,7 +110,7 @@ class RecentSnapshots:
         self._follow(result.belief)
         self._aged = False
 
-    def relinearized(self, result: MeasurementUpdate) -> None:
+    def relinearize(self, result: MeasurementUpdate) -> None:
         """Take the same snapshots, and any number before them, as they are where they lead together."""
         brought, before, seen = result.brought, result.before, self._seen
         self._begin(brought.rig, brought.object_offset)
@@ -128,17 +128,13 @@ class RecentSnapshots:
             self._seen.append(entry)
         self._follow(result.belief)
 
-    def restarted(self, result: MeasurementUpdate, last: int) -> None:
+    def restart(self, result: MeasurementUpdate, last: int) -> None:
         """Forget all but the last snapshots, which were absorbed together."""
         while len(self._seen) > last:
             self._seen.popleft()
-        self.relinearized(result)
+        self.relinearize(result)
 
-    def began(self, result: MeasurementUpdate, observations: Observations, seconds: float) -> None:
-        """Forget all snapshots, and take one that another belief than the last one has absorbed."""
-        self.took([(observations, result.rig_from_object)], [seconds], result)
-
-    def took(
+    def replace(
         self,
         snapshots: Sequence[tuple[Observations, RigidTransform]],
         pauses: Sequence[float],
@@ -152,9 +148,9 @@ class RecentSnapshots:
             result: what they taught.
         """
         self._seen = deque(_Seen(*snapshot, pause) for snapshot, pause in zip(snapshots, pauses, strict=True))
-        self.relinearized(result)
+        self.relinearize(result)
 
-    def rebased(self, belief: RigBelief, information: Tensor) -> None:
+    def rebase(self, belief: RigBelief, information: Tensor) -> None:
         """Believe something else, of which these snapshots brought a part.
 
         Args:
@@ -206,8 +202,8 @@ class RecentSnapshots:
             information = torch.cholesky_inverse(_cholesky(covariance))
         return ChangeTest.of(information, brought, pull, self._change, self._pixels)
 
-    def steady(self, age: int, camera: int, kind: str) -> float:
-        """Score of a change of a camera, all else taken to be known, without the snapshot that speaks most for it."""
+    def score_without_best(self, age: int, camera: int, kind: str) -> float:
+        """Score a change of a camera, all else taken to be known, without the snapshot that speaks most for it."""
         number, part = self._next - age, CHANGES[kind]
         _, at = self._known(number)
         own, pull = [], []
@@ -234,7 +230,7 @@ class RecentSnapshots:
         rig = displaced(self._belief.rig, error * self._belief.unit)
         return replace(self._belief, rig=rig, object_offset=at[wide:], factor=_cholesky(information))
 
-    def brought(self, count: int) -> tuple[Tensor, Tensor]:
+    def information(self, count: int) -> tuple[Tensor, Tensor]:
         """Information (D, D) of the latest snapshots, and their pull (D,) at what is believed now."""
         information, weighted = self._sums(self._next - count, self._next)
         return information, weighted - information @ torch.from_numpy(self._at)

@@ -262,7 +262,7 @@ class RigKeeper:
             events.append(apart_event(names[camera], memory.off.get(camera, time), time, number))
         silent = (camera for camera, name in enumerate(names) if name in out)
         # A camera with moments of its own has not moved far.
-        astray = frozenset() if labelled is None else labelled.astray - memory.monitor.held.cameras
+        astray = frozenset() if labelled is None else labelled.astray - memory.monitor.quarantine.cameras
         look = Look(time, number, state.detections, state.predicted, astray, frozenset(silent))
         events += memory.sightings.take(state.rig, look)
         events += memory.relearning.learnt(memory.belief, frozenset(memory.monitor.open), time, number)

@@ -14,7 +14,7 @@ from imgcal.online.events import iso_time, snapshot_name
 from imgcal.online.memory import Frozen, Thawed
 from imgcal.types import CalibrationObject, CameraRig
 
-FORMAT = "imgcal-keeper/4"
+FORMAT = "imgcal-keeper/5"
 """Another number whenever what is remembered is laid out anew: nobody can go on from a state of another version."""
 MOST_BYTES = 2**28
 

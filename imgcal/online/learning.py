@@ -80,7 +80,7 @@ def ask_object(memory: KeeperMemory, learnt: bool) -> MonitorUpdate | None:
     doubted = memory.doubts.learnt if learnt else memory.doubts.refused
     snapshots = [(memory.observed(one.blobs), one.rig_from_object) for one in doubted]
     first = memory.monitor.filter.count
-    found = memory.monitor.ask_object(snapshots, [one.seconds for one in doubted], learnt)
+    found = memory.monitor.diagnose_object(snapshots, [one.seconds for one in doubted], learnt)
     if found is not None and not learnt:
         memory.times.extend((first + n, one.time) for n, one in enumerate(doubted))
         memory.learnt = doubted[-1].time
@@ -92,7 +92,7 @@ def ask_clocks(memory: KeeperMemory) -> bool:
     """Ask whether labels fit in no camera because of some that are to be held then."""
     doubted = memory.doubts.refused
     snapshots = [(memory.observed(one.blobs), one.rig_from_object) for one in doubted]
-    held = memory.monitor.ask_clocks(snapshots, [one.seconds for one in doubted])
+    held = memory.monitor.quarantine_doubtful(snapshots, [one.seconds for one in doubted])
     if held:
         memory.off |= dict.fromkeys(held, doubted[0].time)
         memory.doubts = ObjectDoubts(memory.obj.num_fiducials)

@@ -112,13 +112,13 @@ def _checked(memory: KeeperMemory, named: Detections, pose: RigidTransform) -> C
     """See which labels fit; cameras with moments of their own have no say in where the object is."""
     given = memory.belief.rig, memory.obj_now, pose, memory.options
     every = check_labels(named, *given)
-    if not memory.monitor.held.cameras:
+    if not memory.monitor.quarantine.cameras:
         return every
-    held = np.isin(named.camera, list(memory.monitor.held.cameras))
+    held = np.isin(named.camera, list(memory.monitor.quarantine.cameras))
     others = check_labels(replace(named, fiducial=np.where(held, -1, named.fiducial)), *given)
     fiducial = np.where(held, every.blobs.fiducial, others.blobs.fiducial)
     blobs, labels = replace(others.blobs, fiducial=fiducial), int((fiducial >= 0).sum())
-    off = others.off | every.off & np.isin(np.arange(len(every.off)), list(memory.monitor.held.cameras))
+    off = others.off | every.off & np.isin(np.arange(len(every.off)), list(memory.monitor.quarantine.cameras))
     return replace(others, blobs=blobs, given=every.given, off=off, labels=labels)
 
 

@@ -7,9 +7,10 @@ import torch
 
 import imgcal
 from imgcal.monitoring import CHANGES, ChangeTest, RigBelief, RigFilter, RigMonitor, change_of_errors, pixel_changes
-from imgcal.monitoring.drift_pace import SECONDS, DriftPaces, Stretch
+from imgcal.monitoring.drift_pace import ADDED_TOGETHER, SECONDS, DriftLearning, DriftPaces, Stretch
 from imgcal.types import CameraRig, DriftRate
 from scripts.benchmarks.rig_streams import Conditions, Stream
+from tests.imgcal.monitoring.followed import Followed, followed
 
 STEADY = DriftRate(0.0, 0.0, 0.0, 0.0, 0.0)
 RATE = 10.0  # snapshots/s
@@ -106,3 +107,36 @@ def test_a_camera_that_turns_slowly_is_followed_without_alarm_and_known_to_be(tu
     assert 0.4 < squared < 1.8
     assert float(pace[[0, 1, 3]].max()) < 1.5
     assert (float(pace[2, :3].max()) > 1.7) == (turn > 0)
+
+
+def grown_up() -> Followed:
+    """A filter whose first snapshots are no longer kept."""
+    made = followed(40)
+    made.filter._young = False
+    return made
+
+
+def test_it_begins_once_the_filter_has_grown_up_and_nothing_has_changed() -> None:
+    made, learning = followed(20), DriftLearning(DriftPaces(4))
+    learning.take(made.filter, made.recent, 1 / 60, quiet=True)
+    assert learning.stretch is None  # young
+    made = grown_up()
+    learning.take(made.filter, made.recent, 1 / 60, quiet=True)
+    assert learning.stretch is not None
+    learning.take(made.filter, made.recent, 1 / 60, quiet=False)
+    assert learning.stretch is None
+
+
+def test_snapshots_are_added_to_the_stretch_and_a_stretch_to_the_paces() -> None:
+    made, learning = grown_up(), DriftLearning(DriftPaces(4))
+    for _ in range(ADDED_TOGETHER):
+        learning.take(made.filter, made.recent, 0.1, quiet=True)
+    assert learning.stretch is not None and learning.waiting == ADDED_TOGETHER - 1
+    assert not learning.stretch.brought.any()
+    learning.take(made.filter, made.recent, 0.1, quiet=True)
+    assert learning.waiting == 0 and bool(learning.stretch.brought.any())
+    known = learning.stretch
+    learning.paces.squared[1] = 9.0
+    learning.take(made.filter, made.recent, 20.0, quiet=True)
+    assert learning.stretch is not known and learning.stretch.seconds < 20.0
+    assert torch.equal(made.filter.pace, learning.paces.of_parameters(15))
