@@ -1,12 +1,13 @@
-"""What an explanation is asked, and what it answers: `Case`, `Variant`, `Finding`."""
+"""Snapshots that want an explanation (`Case`), and what an explanation says of them (`Variant`, `Finding`)."""
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Protocol
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -161,22 +162,24 @@ class Explained:
         return self.explanation.name
 
 
-class Explanation(Protocol):
+class Explanation(ABC):
     """Something that may have happened."""
 
-    name: str
-    log_prior: float
+    name: ClassVar[str]
+    log_prior: ClassVar[float] = 0.0
     """Log probability before anything is seen, up to what is the same for all."""
 
+    @abstractmethod
     def variants(self, case: Case) -> Sequence[Callable[[], Variant]]:
         """List the ways in which it may hold, each as probable as the others.
 
         Raises:
-            RefusedError: it cannot be asked of this case; a variant may raise it, too.
+            RefusedError: it does not apply to this case; a variant may raise it, too.
         """
 
     def premature(self, case: Case, found: Explained) -> str | None:
         """Say why more snapshots are needed before it is believed, though it is most probable; None = they are not."""
+        return None
 
 
 def mean_evidence(evidences: Sequence[float], count: int) -> float:

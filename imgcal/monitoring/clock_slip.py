@@ -17,7 +17,7 @@ from torch import Tensor
 from imgcal.errors import RefusedError
 from imgcal.estimation import EstimationOptions
 from imgcal.geometry import RigidTransform
-from imgcal.monitoring.case import Case, ClockSlip, Explained, Finding, Snapshot, Start, Variant
+from imgcal.monitoring.case import Case, ClockSlip, Explained, Explanation, Finding, Snapshot, Start, Variant
 from imgcal.monitoring.measurement_update import absorb, stack_snapshots
 from imgcal.monitoring.object_motion import ObjectMotion
 from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief
@@ -43,10 +43,10 @@ VAGUE_SLIP = 5e-4
 """Seconds, one standard deviation, above which a slip is not believed of a camera of which hardly anything is known."""
 
 
-class ClockSlipped:
+class ClockSlipped(Explanation):
     """The clocks of the suspected cameras, or of the surest alone, have slipped."""
 
-    name, log_prior = "clock slip", 0.0
+    name = "clock slip"
 
     def variants(self, case: Case) -> Sequence[Callable[[], Variant]]:
         """Put the blobs of the cameras where they would have been in time."""

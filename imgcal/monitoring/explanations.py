@@ -31,24 +31,20 @@ PATIENCE = 16
 """... and the snapshots for which that is waited for, before the most probable one is believed anyway."""
 
 
-class Steady:
+class Steady(Explanation):
     """Nothing has happened."""
 
-    name, log_prior = "steady", 0.0
+    name = "steady"
 
     def variants(self, case: Case) -> Sequence[Callable[[], Variant]]:
         """Believe what was believed."""
         return [partial(Variant, case.before, case.latest)]
 
-    def premature(self, case: Case, found: Explained) -> str | None:
-        """Need nothing more."""
-        return None
 
-
-class Moved:
+class Moved(Explanation):
     """The suspected cameras have changed, nobody knows how: by each of `JUMPS`."""
 
-    name, log_prior = "moved", 0.0
+    name = "moved"
 
     def variants(self, case: Case) -> Sequence[Callable[[], Variant]]:
         """Let the cameras free."""

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from imgcal.errors import RefusedError
 from imgcal.estimation import object_prior_std
-from imgcal.monitoring.case import SHAPE, Case, Explained, Finding, ObjectChange, Variant
+from imgcal.monitoring.case import SHAPE, Case, Explanation, Finding, ObjectChange, Variant
 from imgcal.monitoring.cusum import Cusum, RunningMedian
 from imgcal.monitoring.measurement_update import absorb, stack_snapshots
 from imgcal.monitoring.pending_change import free_cameras
@@ -79,10 +79,10 @@ def _rows(known: int, fiducial: int | None) -> Tensor:
     return rows[:-1] if fiducial == SHAPE else rows[3 * fiducial : 3 * fiducial + 3]
 
 
-class ObjectChanged:
+class ObjectChanged(Explanation):
     """A fiducial is elsewhere, all of them are, or the object has another scale; the cameras stand still."""
 
-    name, log_prior = "object changed", 0.0
+    name = "object changed"
 
     def variants(self, case: Case) -> Sequence[Callable[[], Variant]]:
         """Let a part of the object free: each question takes as long as all that is known of the object."""
@@ -91,10 +91,6 @@ class ObjectChanged:
             return [partial(_free_part, case, *known)]
         parts = [known, (SHAPE, ALL_MM), (SHAPE, ONE_MM), *((n, ONE_MM) for n in _suspected_fiducials(case))]
         return [partial(_free_part, case, *part) for part in parts]
-
-    def premature(self, case: Case, found: Explained) -> str | None:
-        """Need nothing more."""
-        return None
 
 
 def _free_part(case: Case, fiducial: int | None, by: float) -> Variant:

@@ -42,7 +42,7 @@ class _Base:
     number: int  # of the snapshot
     information: Tensor  # (D, D)
     weighted: Tensor  # (D,) information times the error of what was most probable
-    own: bool = False  # nobody else has these numbers
+    own: bool = False  # no belief shares these numbers
 
 
 @dataclass(frozen=True)
@@ -127,12 +127,6 @@ class RecentSnapshots:
             self._put(brought, first + s, origin)
             self._seen.append(entry)
         self._follow(result.belief)
-
-    def restart(self, result: MeasurementUpdate, last: int) -> None:
-        """Forget all but the last snapshots, which were absorbed together."""
-        while len(self._seen) > last:
-            self._seen.popleft()
-        self.relinearize(result)
 
     def replace(
         self,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -18,7 +19,7 @@ from imgcal.monitoring.change_search import (
     likeliest_age,
     surest,
 )
-from imgcal.monitoring.change_test import JUMPS
+from imgcal.monitoring.change_test import JUMPS, LARGE
 from imgcal.monitoring.drift_pace import DriftLearning, DriftPaces
 from imgcal.monitoring.explanations import Diagnosis, Moved, Steady, Verdict, doubtful_cameras, weigh
 from imgcal.monitoring.object_change import MISFIT_LEAD, Misfit, ObjectChanged, never_fitted
@@ -74,7 +75,7 @@ class RigMonitor:
         self._misfit = Misfit()
         self._recent = RecentSnapshots(rig_filter.belief, rig_filter.walk)
         self._drifting = DriftLearning(DriftPaces(rig_filter.belief.rig.num_cameras))
-        self._since: PendingChange | None = None
+        self._pending: PendingChange | None = None
         self._prior = rig_filter.belief
         self._moved_early: set[int] = set()  # cameras of which the factory knows nothing more
         self._suspect: int | None = None  # the camera without which the last snapshot would not have been refused
@@ -105,16 +106,15 @@ class RigMonitor:
         observations = self.shaking.of(observations)
         new = [camera for camera in moved if camera not in self.quarantine.cameras]
         if new:
-            self.quarantine.add(new, self._is_new)
+            self.quarantine.add(new, self._is_new())
         known_since = self.known_since
         follow = self._follow_beside_quarantine if self.quarantine.cameras else self._follow
         found = follow(observations, rig_from_object, seconds)
         return replace(found, update=found.update.of_last(), restarted=self.known_since != known_since)
 
-    @property
-    def _is_new(self) -> bool:
-        """Tell whether hardly anything is known of the rig yet."""
-        return self.filter.count - self.known_since < FEW_SNAPSHOTS
+    def _is_new(self, age: int = 0) -> bool:
+        """Tell whether hardly anything was known of the rig before the latest `age` snapshots."""
+        return self.filter.count - age - self.known_since < FEW_SNAPSHOTS
 
     def _follow(self, observations: Observations, rig_from_object: RigidTransform, seconds: float) -> MonitorUpdate:
         """Learn from a snapshot, and test whether something has changed before it.
@@ -129,16 +129,16 @@ class RigMonitor:
             self._suspect = contradicting(belief, observations, rig_from_object, self.filter.options)
             if last is None or last != self._suspect:
                 raise
-            self.quarantine.add((last,), self._is_new)
+            self.quarantine.add((last,), self._is_new())
             self._suspect = None
             return self._follow_beside_quarantine(observations, rig_from_object, seconds)
         self._suspect = None
         self._recent.append(result, observations, seconds)
-        if self._since is not None:
-            self._since.add(result, seconds)
+        if self._pending is not None:
+            self._pending.add(result, seconds)
         alarm = changed_before(self._recent, self.filter.count)
         misfit = self._misfit.update(result.chi2, result.dof)
-        if alarm is None and misfit and self._since is None and (anew := self._diagnose_misfit(misfit)) is not None:
+        if alarm is None and misfit and self._pending is None and (anew := self._diagnose_misfit(misfit)) is not None:
             return anew
         changes: list[Change] = []
         if alarm is not None:
@@ -151,13 +151,15 @@ class RigMonitor:
             self._recent.relinearize(result)
             if (anew := self._diagnose_first_misfit(result)) is not None:
                 return replace(anew, changes=tuple(changes))
-            if self._since is not None:
-                self._since = PendingChange.of(result, self._since.before, self._since.seconds, self._since.kinds)
-        if self._since is None:
+            if self._pending is not None:
+                self._pending = PendingChange.of(
+                    result, self._pending.before, self._pending.seconds, self._pending.kinds
+                )
+        if self._pending is None:
             self.shaking.take(observations, result.residual[-1:])
-        self._drifting.take(self.filter, self._recent, seconds, quiet=self._since is None and alarm is None)
-        if self._since is not None and self._since.due:
-            changes += self._decide_kinds(self._since.late)
+        self._drifting.take(self.filter, self._recent, seconds, quiet=self._pending is None and alarm is None)
+        if self._pending is not None and self._pending.due:
+            changes += self._decide_kinds(self._pending.late)
         return MonitorUpdate(result, tuple(changes))
 
     def _follow_beside_quarantine(
@@ -185,14 +187,14 @@ class RigMonitor:
         """
         quarantine, case = self.quarantine, self.quarantine.case(self._recent, self.filter.options)
         quarantine.unsynchronized = False
-        verdict = self._diagnosis.decide(case, patient=self._since is None)
+        verdict = self._diagnosis.decide(case, patient=self._pending is None)
         quarantine.unsynchronized = bool(verdict.best.finding.unsynchronized)
         if quarantine.unsynchronized:
             return found
         quarantine.release()
         if verdict.best.name == Moved.name:
             decided = self._decide_kinds(last=True)
-            anew = self._restart_moved(case)
+            anew = self._learn_moved(case, dict.fromkeys(case.cameras), JUMPS[-1], sum(case.pauses[-case.count :]))
             return replace(anew, changes=(*found.changes, *decided, *anew.changes))
         return replace(found, slips=self._slips_of(verdict))
 
@@ -207,33 +209,28 @@ class RigMonitor:
             RefusedError: it cannot be decided yet, or learnt.
         """
         free: dict[int, str | None] = {}
-        since, test = self._since, self._recent.test(age)
+        pending, test = self._pending, self._recent.test(age)
         age = likeliest_age(self._recent, surest(test), age)
-        if since is not None and age >= since.count - NEARBY:  # it was then that the open ones changed
-            again = surest(self._recent.test(age)) in since.kinds
+        if pending is not None and age >= pending.count - NEARBY:  # it was then that the open ones changed
+            again = surest(self._recent.test(age)) in pending.kinds
             # Again: the first snapshots were from the old place.
-            age = age if again else min(since.count, len(self._recent))
-            before, seconds, free = since.before, since.seconds, dict(since.kinds)
+            age = age if again else min(pending.count, len(self._recent))
+            before, seconds, free = pending.before, pending.seconds, dict(pending.kinds)
         else:
             changes += self._decide_kinds(last=True)
             before, seconds = self._recent.belief_before(age), self._recent.seconds(age)
         excluded = {Steady.name: "a test of every camera has excluded it"}
-        if since is not None and free:
+        if pending is not None and free:
             excluded[ObjectChanged.name] = "a change of a camera is open"
         free, evidence = changed_cameras(self._recent.test(age), free)
         self.undecided |= dict.fromkeys(free, UNDECIDED_SNAPSHOTS)
-        few = self.filter.count - age - self.known_since < FEW_SNAPSHOTS
-        if few:
+        if self._is_new(age):
             excluded[ObjectChanged.name] = "too little was known before"
         case = self._case(before, age, tuple(free), excluded)
-        verdict = self._diagnosis.decide(case, patient=self._since is None)
+        verdict = self._diagnosis.decide(case, patient=self._pending is None)
         if verdict.best.name != Moved.name:
             return self._adopt(case, verdict)
-        if few:
-            return self._forget_before(free, case.latest, self._recent.pauses(age), evidence)
-        result = self.filter.restart(free_cameras(before, free), case.latest)
-        self._recent.restart(result, age)
-        return MonitorUpdate(result, self._open_changes(free, result, before, seconds, evidence))
+        return self._learn_moved(case, free, LARGE, seconds, evidence)
 
     def _case(self, before: RigBelief, age: int, cameras: tuple[int, ...], excluded: Mapping[str, str]) -> Case:
         """Put together a case of cameras that seem to have moved before the latest `age` snapshots."""
@@ -257,16 +254,14 @@ class RigMonitor:
             RefusedError: see `absorb`.
         """
         best, count = verdict.best, len(verdict.best.snapshots)
-        few = self.filter.count - count - self.known_since < FEW_SNAPSHOTS
         pauses, finding = case.pauses[-count:], best.finding
-        result = self.filter.restart(best.before, best.snapshots, new=count if new else 0)
-        self._recent = RecentSnapshots(result.belief, self.filter.walk)
-        self._recent.replace(best.snapshots, pauses, result)
-        self.open, self._since = {}, None
+        result = self._restart(best.before, best.snapshots, pauses, new)
+        self.open, self._pending = {}, None
         if finding.shake is not None:
             self.shaking.believe(finding.shake)
         if finding.unsynchronized:
-            self.quarantine.add_unsynchronized(case.snapshots[-count:], pauses, finding.unsynchronized, few)
+            snapshots, uncertain = case.snapshots[-count:], self._is_new(count)
+            self.quarantine.add_unsynchronized(snapshots, pauses, finding.unsynchronized, uncertain)
         change = finding.object_change
         if change is not None:
             change = replace(change, since=self.filter.count - count, odds=verdict.lead)
@@ -277,61 +272,66 @@ class RigMonitor:
         since = self.filter.count - len(verdict.best.snapshots)
         return tuple(replace(slip, since=since, odds=verdict.lead) for slip in verdict.best.finding.slips)
 
-    def _restart_moved(self, case: Case) -> MonitorUpdate:
-        """Learn the latest snapshots, which the filter has absorbed otherwise, with cameras that have moved before.
-
-        Raises:
-            RefusedError: see `absorb`.
-        """
-        free: dict[int, str | None] = dict.fromkeys(case.cameras)
-        snapshots, pauses = case.latest, case.pauses[-case.count :]
-        if self.filter.count - case.count - self.known_since < FEW_SNAPSHOTS:
-            return self._forget_before(free, snapshots, pauses)
-        result = self.filter.restart(free_cameras(case.before, free, JUMPS[-1]), snapshots)
-        self._recent.replace(snapshots, pauses, result)
-        return MonitorUpdate(result, self._open_changes(free, result, case.before, sum(pauses)))
-
-    def _forget_before(
+    def _learn_moved(
         self,
+        case: Case,
         free: Mapping[int, str | None],
-        snapshots: Sequence[Snapshot],
-        pauses: Sequence[float],
+        jump: float,
+        seconds: float,
         evidence: Mapping[int, float] = MappingProxyType({}),
     ) -> MonitorUpdate:
-        """Learn from the snapshots since a change alone: before it, hardly anything had been learnt.
+        """Learn the latest snapshots of a case anew, with cameras that have moved before them.
+
+        Where hardly anything had been learnt before, only what the factory says is kept of that time.
+
+        Args:
+            case: those snapshots, and what was believed before them.
+            free: the cameras, and how they moved, None = in any way.
+            jump: pixels by which they may have.
+            seconds: since the snapshot before.
+            evidence: chi-squared of each camera that has not moved.
 
         Raises:
             RefusedError: see `absorb`; the monitor stays as it was.
         """
-        self._moved_early |= free.keys()
-        prior = free_cameras(self._prior, dict.fromkeys(sorted(self._moved_early)), JUMPS[-1])
-        result = self.filter.restart(prior, snapshots)
+        forget, nan = self._is_new(case.count), math.nan
+        early = self._moved_early | free.keys()
+        if forget:
+            before = free_cameras(self._prior, dict.fromkeys(sorted(early)), JUMPS[-1])
+        else:
+            before = free_cameras(case.before, free, jump)
+        result = self._restart(before, case.latest, case.pauses[-case.count :])
+        number, new = self.filter.count - case.count, dict[int, Change]()
+        for camera, kind in free.items():
+            if forget or (kind is None and camera not in self.open):
+                since = self.open[camera].since if camera in self.open else number
+                new[camera] = Change(camera, since, "unknown", nan, nan, forget, evidence.get(camera, nan))
+        if forget:
+            self._moved_early, self.known_since = early, number
+            self.open, self._pending, self._suspect = {}, None, None
+        else:
+            self.open |= new
+            self._pending = PendingChange.of(result, case.before, seconds, dict(free))
+        return MonitorUpdate(result, tuple(new.values()))
+
+    def _restart(
+        self, before: RigBelief, snapshots: Sequence[Snapshot], pauses: Sequence[float], new: bool = False
+    ) -> MeasurementUpdate:
+        """Restart the filter with the latest snapshots.
+
+        Args:
+            before: what was believed before them.
+            snapshots: observations (1, C, N) and the object's pose (1,) of each.
+            pauses: s before each of them.
+            new: the filter has not absorbed them before.
+
+        Raises:
+            RefusedError: see `absorb`; the monitor stays as it was.
+        """
+        result = self.filter.restart(before, snapshots, new=len(snapshots) if new else 0)
         self._recent = RecentSnapshots(result.belief, self.filter.walk)
         self._recent.replace(snapshots, pauses, result)
-        self.known_since = self.filter.count - len(snapshots)
-        nan, number = float("nan"), self.known_since
-        since = {camera: self.open[camera].since if camera in self.open else number for camera in free}
-        new = [Change(c, since[c], "unknown", nan, nan, True, evidence.get(c, nan)) for c in free]
-        self.open, self._since, self._suspect = {}, None, None
-        return MonitorUpdate(result, tuple(new))
-
-    def _open_changes(
-        self,
-        free: dict[int, str | None],
-        result: MeasurementUpdate,
-        before: RigBelief,
-        seconds: float,
-        evidence: Mapping[int, float] = MappingProxyType({}),
-    ) -> tuple[Change, ...]:
-        """Open changes of cameras, and return those that are new."""
-        new, nan = [], float("nan")
-        for camera, kind in free.items():
-            if kind is None and camera not in self.open:
-                number = self.filter.count - len(result.brought)
-                self.open[camera] = Change(camera, number, "unknown", nan, nan, evidence=evidence.get(camera, nan))
-                new.append(self.open[camera])
-        self._since = PendingChange.of(result, before, seconds, free)
-        return tuple(new)
+        return result
 
     def _diagnose_misfit(self, age: int) -> MonitorUpdate | None:
         """Learn the object anew where the latest snapshots fit worse because it has changed."""
@@ -346,7 +346,7 @@ class RigMonitor:
     def _diagnose_first_misfit(self, result: MeasurementUpdate) -> MonitorUpdate | None:
         """Learn the object anew where it never was as its file says, and so the first snapshots do not fit."""
         count = self.filter.count
-        first = not self.known_since and self._since is None and len(self._recent) == count
+        first = not self.known_since and self._pending is None and len(self._recent) == count
         if not first or not never_fitted(result, count):
             return None
         return self._adopt_object(self._prior, self._recent.snapshots(count), self._recent.pauses(count))
@@ -364,7 +364,7 @@ class RigMonitor:
         Returns:
             What they taught, and how it has changed; None = the object is as it was.
         """
-        if self._since is not None or (learnt and len(self._recent) < len(snapshots)):
+        if self._pending is not None or (learnt and len(self._recent) < len(snapshots)):
             return None
         found = None
         with contextlib.suppress(RefusedError):  # nothing was known of the rig
@@ -385,7 +385,7 @@ class RigMonitor:
         Returns:
             Those that are new there.
         """
-        if self._since is not None:
+        if self._pending is not None:
             return ()
         before = age_belief(self.filter.belief, self.filter.waited + pauses[0], self.filter.walk)
         try:
@@ -394,7 +394,7 @@ class RigMonitor:
             return ()
         new = tuple(sorted(set(found) - self.quarantine.cameras))
         if new:
-            self.quarantine.add(new, self._is_new)
+            self.quarantine.add(new, self._is_new())
             self.quarantine.unsynchronized, self.quarantine.seconds = sure, sum(pauses[1:])
         return new
 
@@ -416,17 +416,17 @@ class RigMonitor:
 
     def _decide_kinds(self, last: bool) -> tuple[Change, ...]:
         """Decide what kind of change each open one is, where the snapshots since can tell, or it is time."""
-        since = self._since
-        if since is None:
+        pending = self._pending
+        if pending is None:
             return ()
-        test = since.test(self.filter.walk)
-        decided, kinds = since.decide_kinds(test, self.open, last)
-        since.kinds.update(kinds)
+        test = pending.test(self.filter.walk)
+        decided, kinds = pending.decide_kinds(test, self.open, last)
+        pending.kinds.update(kinds)
         if any(kind is not None for kind in kinds.values()):
-            first, belief, information = since.adopt_kinds(test)
-            self.filter.suppose(first, age_belief(belief, since.seconds, self.filter.walk))
+            first, belief, information = pending.adopt_kinds(test)
+            self.filter.suppose(first, age_belief(belief, pending.seconds, self.filter.walk))
             self._recent.rebase(belief, information)
         self.open = {camera: change for camera, change in self.open.items() if camera not in kinds}
         if not self.open:
-            self._since = None
+            self._pending = None
         return decided

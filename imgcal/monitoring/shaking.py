@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.errors import RefusedError
-from imgcal.monitoring.case import Case, Explained, Finding, Start, Variant
+from imgcal.monitoring.case import Case, Explained, Explanation, Finding, Start, Variant
 from imgcal.monitoring.measurement_update import stack_snapshots
 from imgcal.monitoring.rig_belief import MeasurementUpdate
 from imgcal.types import Observations
@@ -36,10 +36,10 @@ LEAST_SHIFTS, SMOOTH = 4, 0.7
 Neumann's ratio (2 where each is drawn by itself) below which they do."""
 
 
-class Shaking:
+class Shaking(Explanation):
     """All cameras shake, or the suspected ones: by each of `SHAKES`."""
 
-    name, log_prior = "shaking", 0.0
+    name = "shaking"
 
     def variants(self, case: Case) -> Sequence[Callable[[], Variant]]:
         """Let all that a camera sees in a snapshot be shifted alike."""

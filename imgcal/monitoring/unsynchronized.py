@@ -17,7 +17,7 @@ from torch import Tensor
 from imgcal.errors import RefusedError
 from imgcal.estimation import EstimationOptions
 from imgcal.geometry import RigidTransform, rotation_from_vector, vector_from_rotation
-from imgcal.monitoring.case import Case, Explained, Finding, Start, Variant
+from imgcal.monitoring.case import Case, Explanation, Finding, Start, Variant
 from imgcal.monitoring.measurement_update import absorb, stack_snapshots
 from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief
 from imgcal.types import Observations
@@ -30,20 +30,16 @@ LEAST_SNAPSHOTS = 2
 """Snapshots that tell a camera that has moved from one with moments of its own: one explains any pose of the object."""
 
 
-class Unsynchronized:
+class Unsynchronized(Explanation):
     """The suspected cameras, or the surest alone, see the object at moments of their own."""
 
-    name, log_prior = "unsynchronized", 0.0
+    name = "unsynchronized"
 
     def variants(self, case: Case) -> Sequence[Callable[[], Variant]]:
         """Let the cameras see the object in poses of their own."""
         if case.count < LEAST_SNAPSHOTS:
             raise RefusedError("a single snapshot is explained by a move as well")
         return [partial(_unsynchronize, case, start, cameras) for start in case.starts for cameras in case.camera_sets]
-
-    def premature(self, case: Case, found: Explained) -> str | None:
-        """Need nothing more."""
-        return None
 
 
 def _unsynchronize(case: Case, start: Start, cameras: tuple[int, ...]) -> Variant:

@@ -30,7 +30,7 @@ def case_of(made: Followed, rate: float = 60.0, **more) -> Case:
 
 
 @dataclass(frozen=True)
-class Known:
+class Known(Explanation):
     """An explanation whose evidence is known, and whose variants give it or fail."""
 
     name: str

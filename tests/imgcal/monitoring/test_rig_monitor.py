@@ -80,8 +80,8 @@ def test_a_camera_that_changes_while_a_change_of_another_is_open_for_longer_than
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monitor, _, _ = followed({30: {1: "focal_length"}}, 33, seed=12)
-    assert monitor._since is not None
-    monkeypatch.setattr(type(monitor._since), "due", False)
+    assert monitor._pending is not None
+    monkeypatch.setattr(type(monitor._pending), "due", False)
     everything = "imgcal.monitoring.rig_monitor.likeliest_age"
     monkeypatch.setattr(everything, lambda recent, camera, age: 64 if len(recent) == 64 else age)
     monitor, _, told = followed({30: {1: "focal_length"}, 94: {2: "focal_length"}}, 100, seed=12)
