@@ -24,22 +24,24 @@ from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief
 from imgcal.monitoring.unsynchronized import drop_cameras
 from imgcal.types import Observations
 
-USUAL_SLIP = 0.03
-"""Seconds, one standard deviation of a slip before anything is known of it: a frame or two ..."""
-MOST_SLIP = 0.15
-"""... and the most: over more, nobody knows how an object moves."""
-ROUNDS = 4
+# What is known of a slip before anything is seen.
+SLIP_SECONDS = 0.03
+"""One standard deviation: a frame or two ..."""
+MOST_SLIP_SECONDS = 0.15
+"""... and the most: over a longer time the motion of an object is not known."""
+# How a slip is found.
+SEARCH_ROUNDS = 4
 """In which a slip is found of a camera that is where it was; each leaves a hundredth of what was left."""
-STEPS = (8e-3, 1e-3)
-"""Seconds around a slip at which it is asked how probable it is, the camera's place being learnt with it; the first
-where nothing is known of that place."""
-MOMENT = 1e-3
+SEARCH_STEPS = (8e-3, 1e-3)
+"""Seconds around a slip at which its evidence is taken, the camera's place being learnt with it; the first only where
+nothing is known of that place."""
+VELOCITY_SECONDS = 1e-3
 """Seconds over which the velocity of an image is taken."""
 INEXACT = 0.03
 """Share of the way that a camera is behind by which blobs may be off that are put where they were in time."""
 
 
-VAGUE_SLIP = 5e-4
+VAGUE_SLIP_SECONDS = 5e-4
 """Seconds, one standard deviation, above which a slip is not believed of a camera of which hardly anything is known."""
 
 
@@ -55,7 +57,7 @@ class ClockSlipped(Explanation):
     def premature(self, case: Case, found: Explained) -> str | None:
         """Wait where the slip of a camera that is hardly known is itself hardly known."""
         uncertain = case.uncertain or len(found.snapshots) > case.count
-        vague = uncertain and any(slip.sigma > VAGUE_SLIP for slip in found.finding.slips)
+        vague = uncertain and any(slip.sigma > VAGUE_SLIP_SECONDS for slip in found.finding.slips)
         return "the slip is hardly known" if vague else None
 
 
@@ -82,7 +84,7 @@ def _slip(case: Case, start: Start, cameras: Sequence[int]) -> Variant:
     cases = _Late(start.before, given, there, motion, seconds[-count:], case.options)
     late = dict.fromkeys(cameras, 0.0) if uncertain else {camera: cases.rough_slip(camera) for camera in cameras}
     sigma = dict.fromkeys(cameras, math.nan)
-    for step in STEPS[0 if uncertain else 1 :]:
+    for step in SEARCH_STEPS[0 if uncertain else 1 :]:
         for camera in cameras:
             three = [cases.evidence({**late, camera: late[camera] + way}) for way in (-step, 0.0, step)]
             curvature = (2 * three[1] - three[0] - three[2]) / step**2
@@ -90,10 +92,10 @@ def _slip(case: Case, start: Start, cameras: Sequence[int]) -> Variant:
                 raise RefusedError("no slip is more probable than others")
             late[camera] += (three[2] - three[0]) / (2 * step) / curvature
             sigma[camera] = curvature**-0.5
-            if not abs(late[camera]) < MOST_SLIP:
-                raise RefusedError(f"the slip would be longer than {MOST_SLIP:g} s")
+            if not abs(late[camera]) < MOST_SLIP_SECONDS:
+                raise RefusedError(f"the slip would be longer than {MOST_SLIP_SECONDS:g} s")
     corrected, log_prior = cases.correct(late)
-    log_prior += sum(math.log(spread / USUAL_SLIP) for spread in sigma.values())  # of all slips, not the best alone
+    log_prior += sum(math.log(spread / SLIP_SECONDS) for spread in sigma.values())  # of all slips, not the best alone
     spreads = {camera: math.hypot(sigma[camera], INEXACT * late[camera]) for camera in cameras}
     slips = tuple(ClockSlip(camera, 0, late[camera], spreads[camera], math.nan) for camera in cameras)
     return Variant(start.before, corrected, start.log_prior + log_prior, find=lambda _: Finding(slips=slips))
@@ -125,12 +127,14 @@ class _Late:
         given, late = self.given, 0.0
         seen = given.seen[:, camera]
         weight = torch.where(seen, given.sigma[:, camera].square().reciprocal(), 0.0)[..., None]
-        for _ in range(ROUNDS):
-            velocity = (self.image(camera, late + MOMENT) - self.image(camera, late - MOMENT)) / (2 * MOMENT)
+        for _ in range(SEARCH_ROUNDS):
+            velocity = (self.image(camera, late + VELOCITY_SECONDS) - self.image(camera, late - VELOCITY_SECONDS)) / (
+                2 * VELOCITY_SECONDS
+            )
             rest = torch.where(seen[..., None], given.uv[:, camera] - self.image(camera, late), 0.0)
-            power = float((weight * velocity.square()).sum()) + USUAL_SLIP**-2
-            late += (float((weight * velocity * rest).sum()) - late * USUAL_SLIP**-2) / power
-            late = min(max(late, -MOST_SLIP), MOST_SLIP)
+            power = float((weight * velocity.square()).sum()) + SLIP_SECONDS**-2
+            late += (float((weight * velocity * rest).sum()) - late * SLIP_SECONDS**-2) / power
+            late = min(max(late, -MOST_SLIP_SECONDS), MOST_SLIP_SECONDS)
         return late
 
     def correct(self, late: Mapping[int, float]) -> tuple[list[Snapshot], float]:
@@ -141,7 +145,7 @@ class _Late:
             uv[:, camera] -= behind
             sigma[:, camera] = torch.hypot(sigma[:, camera], INEXACT * behind.norm(dim=-1))
         log_prior = -2 * float((sigma / self.given.sigma).log()[seen].sum())
-        log_prior -= sum(0.5 * (seconds / USUAL_SLIP) ** 2 for seconds in late.values())
+        log_prior -= sum(0.5 * (seconds / SLIP_SECONDS) ** 2 for seconds in late.values())
         given, poses = Observations(uv, sigma, seen, self.given.shake), self.there.rig_from_object
         return [(given.of_snapshots([s]), poses[s : s + 1]) for s in range(len(uv))], log_prior
 

@@ -42,7 +42,7 @@ class Steady(Explanation):
 
 
 class Moved(Explanation):
-    """The suspected cameras have changed, nobody knows how: by each of `JUMPS`."""
+    """The suspected cameras have changed, it is not known how: by each of `JUMPS`."""
 
     name = "moved"
 

@@ -15,12 +15,13 @@ from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, age_belie
 from imgcal.monitoring.rig_filter import YOUNG_SECONDS
 from imgcal.types import CameraRig
 
-DECIDED = 5.0
-"""Log odds of a kind of change against every other, from which it is told ..."""
-ALONE, MIXED = 3.0, 15.0
+# Log odds from which the kind of a change is believed.
+KIND_LEAD = 5.0
+"""Of one kind against every other; ..."""
+SINGLE_KIND_LEAD, ALL_KINDS_LEAD = 3.0, 15.0
 """... against a change of all kinds at once, and of that against each: what is believed wrongly does no harm then."""
-JUDGED = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
-"""Numbers of snapshots since a change at which its kind is asked for."""
+DECIDE_AFTER = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
+"""Numbers of snapshots since a change at which its kind is decided, if it can be."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class Change:
     size: float  # rad, mm or pixels; nan where the kind is not known
     sigma: float  # one standard deviation of it
     decided: bool = False  # the last that will be said of it
-    evidence: float = math.nan  # chi-squared of its having stood still; nan = it was told that it moved
+    evidence: float = math.nan  # chi-squared of its having stood still; nan = not tested
 
 
 @dataclass
@@ -49,9 +50,9 @@ class PendingChange:
     kinds: dict[int, str | None]  # of the cameras that changed; None = not decided
 
     @property
-    def late(self) -> bool:
+    def overdue(self) -> bool:
         """Tell whether more snapshots are not worth waiting for."""
-        return self.count >= JUDGED[-1] or self.seconds > YOUNG_SECONDS
+        return self.count >= DECIDE_AFTER[-1] or self.seconds > YOUNG_SECONDS
 
     def distance(self, belief: RigBelief) -> Tensor:
         """Error (D,) in the chart of what was believed at some time.
@@ -76,8 +77,8 @@ class PendingChange:
 
     @property
     def due(self) -> bool:
-        """Tell whether the kind is to be asked for now."""
-        return self.late or self.count in JUDGED
+        """Tell whether to decide the kind now, if that can be."""
+        return self.overdue or self.count in DECIDE_AFTER
 
     def add(self, result: MeasurementUpdate, seconds: float) -> None:
         """Add what a snapshot has brought."""
@@ -112,25 +113,25 @@ class PendingChange:
             last: it is to be decided now.
 
         Returns:
-            What is believed, None = any kind, and what is told, None = nothing; None = it cannot be told yet.
+            What is believed, None = any kind, and what is reported, None = no kind; None = it cannot be decided yet.
         """
         odds = {kind: test.odds({**self.others(camera), camera: kind}) for kind in (*CHANGES, None)}
         best, second = sorted(odds, key=lambda kind: -odds[kind])[:2]
-        least = MIXED if best is None else ALONE if second is None else DECIDED
+        least = ALL_KINDS_LEAD if best is None else SINGLE_KIND_LEAD if second is None else KIND_LEAD
         if odds[best] - odds[second] >= least:
             return best, best
         if not last:
             return None
         # Told as what it most probably is, and believed to be anything.
-        return None, max(CHANGES, key=lambda kind: odds[kind]) if self.late else None
+        return None, max(CHANGES, key=lambda kind: odds[kind]) if self.overdue else None
 
     def decide_kinds(
         self, test: ChangeTest, changes: Mapping[int, Change], last: bool
     ) -> tuple[tuple[Change, ...], dict[int, str | None]]:
-        """Decide of which kind open changes are, by camera, where that can be told, or it is time.
+        """Decide of which kind open changes are, by camera, where that can be decided, or it is time.
 
         Returns:
-            What is told of them, and what is believed of the cameras that are decided.
+            What is reported of them, and what is believed of the cameras that are decided.
         """
         decided, kinds = [], dict[int, str | None]()
         for camera, change in changes.items():

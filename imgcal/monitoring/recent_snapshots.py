@@ -26,11 +26,11 @@ from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, error_cov
 from imgcal.monitoring.snapshot_information import SnapshotInformation, add_blocks
 from imgcal.types import CameraRig, Observations
 
-OLDEST = 64
+KEPT_SNAPSHOTS = 64
 """Snapshots within which a change must show: one second at 60 a second."""
 MOST_BASES = 8
 """How often the belief may have aged within them."""
-SCREENED = np.array((2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64))
+SCREENED_AGES = np.array((2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64))
 """Numbers of snapshots that are screened."""
 PARTS = np.array([(part.start, part.stop) for part in CHANGES.values()])
 
@@ -53,7 +53,7 @@ class _Seen:
 
 
 class RecentSnapshots:
-    """A ring of the latest `OLDEST` snapshots."""
+    """A ring of the latest `KEPT_SNAPSHOTS` snapshots."""
 
     def __init__(self, belief: RigBelief, walk: Tensor) -> None:
         """Begin with none.
@@ -65,11 +65,11 @@ class RecentSnapshots:
         (cameras, free), wide = belief.unit.shape, len(belief.factor)
         self.walk, self._belief = walk, belief
         self._unit = belief.unit.numpy()
-        self._carried = np.zeros((OLDEST, 6, wide))
-        self._border = np.zeros((OLDEST, wide - cameras * free, wide))
-        self._weighted = np.zeros((OLDEST, wide))  # pull, as it would be at the chart's origin
+        self._carried = np.zeros((KEPT_SNAPSHOTS, 6, wide))
+        self._border = np.zeros((KEPT_SNAPSHOTS, wide - cameras * free, wide))
+        self._weighted = np.zeros((KEPT_SNAPSHOTS, wide))  # pull, as it would be at the chart's origin
         self._ring = (self._carried, self._border, self._weighted)
-        blocks = (OLDEST + 1, cameras, free, free)
+        blocks = (KEPT_SNAPSHOTS + 1, cameras, free, free)
         self._totals = (np.zeros(blocks), np.zeros(blocks))  # rounded by 10^-7 of a snapshot after a year
         self._pixels = pixel_changes(belief.rig)
         self._begin(belief.rig, belief.object_offset)
@@ -98,7 +98,7 @@ class RecentSnapshots:
             observations: (1, C, N).
             seconds: since the snapshot before.
         """
-        while len(self._seen) >= OLDEST or len(self._bases) >= MOST_BASES:
+        while len(self._seen) >= KEPT_SNAPSHOTS or len(self._bases) >= MOST_BASES:
             self._drop()
         if self._aged or self._belief is not result.before:
             before = self._error(result.before.arrays, result.before.object_offset)
@@ -169,10 +169,10 @@ class RecentSnapshots:
         return [entry.seconds for entry in list(self._seen)[-age:]]
 
     def screened(self) -> NDArray[np.float64]:
-        """Score each camera since each of `SCREENED`: (ages, C); see `screen`."""
-        scores = np.empty((len(SCREENED), len(self._change)))
+        """Score each camera since each of `SCREENED_AGES`: (ages, C); see `screen`."""
+        scores = np.empty((len(SCREENED_AGES), len(self._change)))
         known = (self._at, self._change.numpy(), PARTS)
-        screen(self._ring, self._totals, self._next, len(self), *known, SCREENED, scores)
+        screen(self._ring, self._totals, self._next, len(self), *known, SCREENED_AGES, scores)
         return scores
 
     def test(self, age: int, aged: bool = True) -> ChangeTest:
@@ -240,7 +240,7 @@ class RecentSnapshots:
     def _sums(self, first: int, last: int) -> tuple[Tensor, Tensor]:
         """Information (D, D) and weighted errors (D,) of some snapshots."""
         first = max(first, self._next - len(self))
-        rows = np.arange(first, last) % OLDEST
+        rows = np.arange(first, last) % KEPT_SNAPSHOTS
         carried = torch.from_numpy(self._carried[rows].reshape(-1, self._at.size))
         information = -(carried.mT @ carried)
         total = self._totals[0]

@@ -12,12 +12,12 @@ from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
 from imgcal.monitoring.case import Case, ClockSlip, ObjectChange, Snapshot
 from imgcal.monitoring.change_search import (
-    NEARBY,
-    changed_before,
+    NEARBY_SNAPSHOTS,
     changed_cameras,
-    contradicting,
+    contradicting_camera,
+    find_alarm,
     likeliest_age,
-    surest,
+    likeliest_camera,
 )
 from imgcal.monitoring.change_test import JUMPS, LARGE
 from imgcal.monitoring.drift_pace import DriftLearning, DriftPaces
@@ -126,7 +126,7 @@ class RigMonitor:
             result = self.filter.follow(observations, rig_from_object, seconds)
         except RefusedError:
             last, belief = self._suspect, self.filter.belief
-            self._suspect = contradicting(belief, observations, rig_from_object, self.filter.options)
+            self._suspect = contradicting_camera(belief, observations, rig_from_object, self.filter.options)
             if last is None or last != self._suspect:
                 raise
             self.quarantine.add((last,), self._is_new())
@@ -136,7 +136,7 @@ class RigMonitor:
         self._recent.append(result, observations, seconds)
         if self._pending is not None:
             self._pending.add(result, seconds)
-        alarm = changed_before(self._recent, self.filter.count)
+        alarm = find_alarm(self._recent, self.filter.count)
         misfit = self._misfit.update(result.chi2, result.dof)
         if alarm is None and misfit and self._pending is None and (anew := self._diagnose_misfit(misfit)) is not None:
             return anew
@@ -159,7 +159,7 @@ class RigMonitor:
             self.shaking.take(observations, result.residual[-1:])
         self._drifting.take(self.filter, self._recent, seconds, quiet=self._pending is None and alarm is None)
         if self._pending is not None and self._pending.due:
-            changes += self._decide_kinds(self._pending.late)
+            changes += self._decide_kinds(self._pending.overdue)
         return MonitorUpdate(result, tuple(changes))
 
     def _follow_beside_quarantine(
@@ -210,9 +210,9 @@ class RigMonitor:
         """
         free: dict[int, str | None] = {}
         pending, test = self._pending, self._recent.test(age)
-        age = likeliest_age(self._recent, surest(test), age)
-        if pending is not None and age >= pending.count - NEARBY:  # it was then that the open ones changed
-            again = surest(self._recent.test(age)) in pending.kinds
+        age = likeliest_age(self._recent, likeliest_camera(test), age)
+        if pending is not None and age >= pending.count - NEARBY_SNAPSHOTS:  # it was then that the open ones changed
+            again = likeliest_camera(self._recent.test(age)) in pending.kinds
             # Again: the first snapshots were from the old place.
             age = age if again else min(pending.count, len(self._recent))
             before, seconds, free = pending.before, pending.seconds, dict(pending.kinds)

@@ -24,9 +24,9 @@ from imgcal.monitoring.rig_belief import MeasurementUpdate
 from imgcal.types import Observations
 
 SHAKES = (0.15, 0.5, 1.5)
-"""Pixels, one standard deviation: by how much cameras are supposed to shake. What shakes by more is told as moved."""
+"""Pixels, one standard deviation: by how much cameras may shake. What shakes by more counts as moved."""
 EVERY = 64
-"""Snapshots of which it is asked how much cameras shake."""
+"""Snapshots after which the level is estimated anew."""
 OTHER = 2.0
 """Factor between two variances that are told apart; 1.3 comes by chance."""
 LEAST_POINTS = 3
@@ -122,7 +122,7 @@ class ShakeLevel:
         self.latest.clear()
 
     def take(self, observations: Observations, residual: Tensor) -> None:
-        """Take what a snapshot that nobody doubts has left: (1, C, N) and pixels (1, C, N, 2)."""
+        """Take what a snapshot without any suspicion has left: (1, C, N) and pixels (1, C, N, 2)."""
         (shift,), (variance,) = shared_shifts(observations, residual)
         both = np.concatenate((shift.T, variance[None]))
         both[:, observations.seen[0].sum(1).numpy() < LEAST_POINTS] = np.nan

@@ -7,7 +7,7 @@ import torch
 
 import imgcal
 from imgcal.monitoring import CHANGES, ChangeTest, RigBelief, RigFilter, RigMonitor, change_of_errors, pixel_changes
-from imgcal.monitoring.drift_pace import ADDED_TOGETHER, SECONDS, DriftLearning, DriftPaces, Stretch
+from imgcal.monitoring.drift_pace import ADDED_TOGETHER, STRETCH_SECONDS, DriftLearning, DriftPaces, Stretch
 from imgcal.types import CameraRig, DriftRate
 from scripts.benchmarks.rig_streams import Conditions, Stream
 from tests.imgcal.monitoring.followed import Followed, followed
@@ -25,7 +25,7 @@ def known(sigma: float = 0.01) -> RigBelief:
 def drifted(belief: RigBelief, step: torch.Tensor, generator: torch.Generator) -> Stretch:
     """A stretch that measured every value, twice as well as it was known, of a rig that went by a step (C, K)."""
     stretch = Stretch.after(belief)
-    stretch.seconds = SECONDS
+    stretch.seconds = STRETCH_SECONDS
     brought = 4 * belief.information
     error = torch.einsum("cij,cj->ci", change_of_errors(belief.rig, belief.unit), step).flatten()
     noise = torch.linalg.cholesky(brought) @ torch.randn(len(brought), generator=generator, dtype=torch.float64)
@@ -38,7 +38,7 @@ def test_a_pace_is_learnt_of_its_camera_and_kind_and_forgotten() -> None:
     walk = DriftRate().std(belief.rig)
     noise = belief.std()  # and no more: what is known leaves room for nothing but drift
     step = torch.zeros(4, 15, dtype=torch.float64)
-    step[2, 6:8] = 10 * walk[2, 6:8] * math.sqrt(SECONDS / 3600) + 3 * noise[2, 6:8]
+    step[2, 6:8] = 10 * walk[2, 6:8] * math.sqrt(STRETCH_SECONDS / 3600) + 3 * noise[2, 6:8]
     lacking = sum(paces.take(drifted(belief, step, generator), walk) for _ in range(8))
     pace = paces.squared.sqrt()
     assert pace[2, 2] > 10
@@ -57,7 +57,7 @@ def test_what_is_added_up_is_what_the_snapshots_say() -> None:
     there = RigBelief.of_prior(belief.rig.retract(0.5 * step), belief.obj, belief.unit)
     error = torch.einsum("cij,cj->ci", change_of_errors(belief.rig, belief.unit), 0.5 * step).flatten()
     other.add(there, whole.brought, whole.pull - whole.brought @ error)  # the same from another place
-    other.seconds = SECONDS
+    other.seconds = STRETCH_SECONDS
     torch.testing.assert_close(other.pull, whole.pull, rtol=1e-4, atol=1e-6 * float(whole.pull.abs().max()))
     test = other.test(STEADY)
     assert torch.allclose(test.learnt, whole.test(STEADY).learnt)

@@ -35,7 +35,7 @@ def test_the_kind_the_size_and_what_is_believed_then() -> None:
     before, result, rig = zoomed()
     still = torch.zeros_like(before.unit)
     since = PendingChange.of(result, before, 0.0, {1: None})
-    assert (since.count, since.due, since.late) == (8, True, False)
+    assert (since.count, since.due, since.overdue) == (8, True, False)
     test = since.test(still)
     assert since.decide(test, 1, last=False) == ("focal_length", "focal_length")
     size, sigma = since.size(test, 1, "focal_length")

@@ -10,7 +10,9 @@ import imgcal
 from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
 from imgcal.monitoring import CHANGES, Change, RigFilter, RigMonitor
-from imgcal.monitoring.change_search import SIGNIFICANT
+from imgcal.monitoring.change_search import ALARM_CHI2
+from imgcal.monitoring.explanations import Diagnosis
+from imgcal.monitoring.pending_change import PendingChange
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import CameraRig, Observations
 from scripts.benchmarks.rig_streams import Bump, Conditions, Stream
@@ -71,7 +73,7 @@ def test_a_bump_is_told_with_camera_kind_and_size(camera: int, kind: str) -> Non
     assert abs(alarm.since - 30) <= 3
     assert (change.camera, change.kind, change.decided) == (camera, kind, True)
     assert abs(change.size - SIZES[kind]) < 4 * change.sigma < 0.5 * SIZES[kind]
-    assert alarm.evidence >= SIGNIFICANT and change.evidence >= SIGNIFICANT
+    assert alarm.evidence >= ALARM_CHI2 and change.evidence >= ALARM_CHI2
     assert 0.5 < normalized_error(monitor, rig) < 1.8
     assert monitor.open == {}
 
@@ -86,6 +88,22 @@ def test_a_camera_that_changes_while_a_change_of_another_is_open_for_longer_than
     monkeypatch.setattr(everything, lambda recent, camera, age: 64 if len(recent) == 64 else age)
     monitor, _, told = followed({30: {1: "focal_length"}, 94: {2: "focal_length"}}, 100, seed=12)
     assert monitor.filter.count == 100 and told[0].camera == 1
+
+
+def test_a_change_that_is_decided_is_reported_though_the_next_one_cannot_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, own = [], Diagnosis.decide
+
+    def decide_first(self, case, *rest):
+        asked.append(case.cameras)
+        if asked[0] != case.cameras:
+            raise RefusedError("not yet")
+        return own(self, case, *rest)
+
+    monkeypatch.setattr(Diagnosis, "decide", lambda self, case, patient: decide_first(self, case, patient))
+    monkeypatch.setattr(PendingChange, "due", False)
+    monitor, _, told = followed({30: {1: "focal_length"}, 50: {2: "rotation"}}, 60, seed=12)
+    assert (2,) in asked and 2 in monitor.undecided
+    assert [(change.camera, change.decided) for change in told] == [(1, False), (1, True)]
 
 
 def test_two_cameras_at_once() -> None:
