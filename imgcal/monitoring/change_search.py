@@ -79,7 +79,7 @@ def likeliest_camera(test: ChangeTest, known: Collection[int] = ()) -> int:
 
 
 def changed_cameras(test: ChangeTest, known: dict[int, str | None]) -> tuple[dict[int, str | None], dict[int, float]]:
-    """Let cameras free that have changed, the likeliest_camera first, until what has been seen since then is explained.
+    """Let cameras free that have changed, the likeliest first, until what has been seen since then is explained.
 
     Args:
         test: what has been seen since then.
