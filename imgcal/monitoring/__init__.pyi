@@ -1,15 +1,15 @@
+from .case import SHAPE, ClockSlip, ObjectChange
 from .change_test import CHANGES, ChangeTest, change_of_errors, pixel_changes, spread_of
-from .clock_slip import ClockSlip, image_of
+from .clock_slip import image_of
 from .cusum import Cusum, cusum_threshold
 from .measurement_update import absorb
-from .object_change import SHAPE, ObjectChange, changed_object
 from .object_motion import ObjectMotion
 from .pending_change import Change
 from .posterior import belief_of, calibration_of, posterior_of
 from .recent_snapshots import RecentSnapshots
 from .rig_belief import MeasurementUpdate, RigBelief, age_belief, widened
 from .rig_filter import RigFilter
-from .rig_monitor import RigMonitor
+from .rig_monitor import MonitorUpdate, RigMonitor
 from .shaking import shared_shifts
 from .snapshot_information import SnapshotInformation
 
@@ -21,6 +21,7 @@ __all__ = [
     "ClockSlip",
     "Cusum",
     "MeasurementUpdate",
+    "MonitorUpdate",
     "ObjectChange",
     "ObjectMotion",
     "RecentSnapshots",
@@ -33,7 +34,6 @@ __all__ = [
     "belief_of",
     "calibration_of",
     "change_of_errors",
-    "changed_object",
     "cusum_threshold",
     "image_of",
     "pixel_changes",

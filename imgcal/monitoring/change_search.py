@@ -11,50 +11,52 @@ from imgcal.geometry import RigidTransform
 from imgcal.monitoring.change_test import JUMPS, ChangeTest
 from imgcal.monitoring.measurement_update import absorb
 from imgcal.monitoring.pending_change import free_cameras
-from imgcal.monitoring.recent_snapshots import SCREENED, RecentSnapshots
+from imgcal.monitoring.recent_snapshots import SCREENED_AGES, RecentSnapshots
 from imgcal.monitoring.rig_belief import RigBelief
 from imgcal.types import Observations
 
-SIGNIFICANT = 60.0
-"""Chi-squared (two or three degrees of freedom) that a camera which stands still exceeds once in 10^12 tests."""
-SUSPECTED = 20.0
-"""The same of the quick test, from which the other one is asked: a third of it where half of what is known is new."""
-SLOW = {16: 16, 64: 32}
+# Chi-squared of a change of a camera, all of two or three degrees of freedom.
+ALARM_CHI2 = 60.0
+"""That a camera which stands still exceeds once in 10^12 tests."""
+SCREEN_CHI2 = 20.0
+"""Of the quick test (`screen`), from which on the exact one is made: a third of it where half of the knowledge is new."""
+REMAINING_CHI2 = 20.0
+"""What is left without the episode that speaks most for a change: a wrong label, or an error that passes, is none."""
+
+# Numbers of snapshots.
+SLOW_TESTS = {16: 16, 64: 32}
 """Numbers of snapshots that are tested without a suspicion, and after how many each: where little was known before."""
-REMAINING = 20.0
-"""What is left of the significance without the episode that speaks most for a change: a wrong label, or an error that
-passes, is none."""
-NEARBY = 4
+NEARBY_SNAPSHOTS = 4
 """Snapshots around the most significant one among which the first one after a change is looked for."""
 
-MOST_EXCESS = 4.0
+FIT_CHI2_PER_DOF = 4.0
 """Chi-squared per degree of freedom up to which a snapshot fits that is else refused."""
 
 
-def changed_before(recent: RecentSnapshots, count: int, episodes: Sequence[int]) -> int | None:
-    """Before how many snapshots some camera has surely changed; None = none has.
+def find_alarm(recent: RecentSnapshots, count: int, episodes: Sequence[int]) -> int | None:
+    """Find the number of latest snapshots before which some camera has surely changed; None = none has.
 
     Args:
         recent: the latest snapshots.
         count: of all snapshots so far.
         episodes: for each camera the successive snapshots that one passing error may last.
     """
-    ages = {age for age, every in SLOW.items() if age <= len(recent) and count % every == 0}
+    ages = {age for age, every in SLOW_TESTS.items() if age <= len(recent) and count % every == 0}
     screened = recent.screened()
-    if screened.max() >= SUSPECTED:
-        ages.add(int(SCREENED[int(screened.max(1).argmax())]))
+    if screened.max() >= SCREEN_CHI2:
+        ages.add(int(SCREENED_AGES[int(screened.max(1).argmax())]))
     for age in sorted(ages):
         scores = recent.test(age).scores()
         kind = max(scores, key=lambda name: float(scores[name].max()))
         camera = int(scores[kind].argmax())
-        significant = float(scores[kind][camera]) >= SIGNIFICANT
-        if significant and recent.repeated(age, camera, kind, episodes[camera]) >= REMAINING:
+        significant = float(scores[kind][camera]) >= ALARM_CHI2
+        if significant and recent.score_without_episode(age, camera, kind, episodes[camera]) >= REMAINING_CHI2:
             return age
     return None
 
 
 def likeliest_age(recent: RecentSnapshots, camera: int, age: int) -> int:
-    """Number of snapshots since a camera changed, by how probable that is; `age` is asked first."""
+    """Number of snapshots since a camera most probably changed; `age` is tried first."""
     found: dict[int, float] = {}
 
     def ask(candidates: set[int]) -> int:
@@ -63,40 +65,40 @@ def likeliest_age(recent: RecentSnapshots, camera: int, age: int) -> int:
                 found[candidate] = recent.test(candidate, aged=False).odds({camera: None})
         return max(found, key=lambda candidate: found[candidate])
 
-    best = ask({int(n) for n in SCREENED} | {age, 1})
-    for _ in range(NEARBY):
-        nearest = ask(set(range(best - NEARBY, best + NEARBY + 1)))
+    best = ask({int(n) for n in SCREENED_AGES} | {age, 1})
+    for _ in range(NEARBY_SNAPSHOTS):
+        nearest = ask(set(range(best - NEARBY_SNAPSHOTS, best + NEARBY_SNAPSHOTS + 1)))
         if nearest == best:
             break
         best = nearest
     return best
 
 
-def surest(test: ChangeTest, known: Collection[int] = ()) -> int:
+def likeliest_camera(test: ChangeTest, known: Collection[int] = ()) -> int:
     """The camera whose change, of any kind, is most probable; of those that are not known to have changed."""
     odds = {camera: test.odds({camera: None}) for camera in range(len(test.pixels)) if camera not in known}
     return max(odds, key=lambda camera: odds[camera])
 
 
 def changed_cameras(test: ChangeTest, known: dict[int, str | None]) -> tuple[dict[int, str | None], dict[int, float]]:
-    """Let cameras free that have changed, the surest first, until what has been seen since then is explained.
+    """Let cameras free that have changed, the likeliest first, until what has been seen since then is explained.
 
     Args:
         test: what has been seen since then.
         known: cameras that are known to have changed already, and how.
 
     Returns:
-        Cameras that have changed, at least one, and how (None = nobody knows); and the chi-squared of each new one.
+        Cameras that have changed, at least one, and how (None = in any way); and the chi-squared of each new one.
     """
     free, evidence = dict(known), dict[int, float]()
-    while not free or _worst(test.given(free), free) >= SIGNIFICANT:
+    while not free or _worst(test.given(free), free) >= ALARM_CHI2:
         given = test.given(free)
-        camera = surest(given, free)
+        camera = likeliest_camera(given, free)
         free[camera], evidence[camera] = None, max(float(score[camera]) for score in given.scores().values())
     return free, evidence
 
 
-def contradicting(
+def contradicting_camera(
     belief: RigBelief, observations: Observations, rig_from_object: RigidTransform, options: EstimationOptions
 ) -> int | None:
     """The camera that may have moved where a snapshot is refused; None = no single one.
@@ -111,7 +113,7 @@ def contradicting(
     for camera in observations.seen[0].any(-1).nonzero()[:, 0].tolist():
         with contextlib.suppress(RefusedError):
             result = absorb(free_cameras(belief, {camera: None}, JUMPS[-1]), observations, rig_from_object, options)
-            if result.chi2 <= MOST_EXCESS * max(result.dof, 1):
+            if result.chi2 <= FIT_CHI2_PER_DOF * max(result.dof, 1):
                 found[camera] = result.evidence
     return max(found, key=lambda camera: found[camera], default=None)
 

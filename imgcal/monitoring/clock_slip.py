@@ -7,108 +7,98 @@ shifts the image alike wherever the object goes, a slip along its motion, and no
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
 
+from imgcal.errors import RefusedError
 from imgcal.estimation import EstimationOptions
 from imgcal.geometry import RigidTransform
+from imgcal.monitoring.case import Case, ClockSlip, Explained, Explanation, Finding, Snapshot, Start, Variant
 from imgcal.monitoring.measurement_update import absorb, stack_snapshots
 from imgcal.monitoring.object_motion import ObjectMotion
 from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief
+from imgcal.monitoring.unsynchronized import drop_cameras
 from imgcal.types import Observations
 
-USUAL_SLIP = 0.03
-"""Seconds, one standard deviation of a slip before anything is known of it: a frame or two ..."""
-MOST_SLIP = 0.15
-"""... and the most: over more, nobody knows how an object moves."""
-ROUNDS = 4
+# What is known of a slip before anything is seen.
+SLIP_SECONDS = 0.03
+"""One standard deviation: a frame or two ..."""
+MOST_SLIP_SECONDS = 0.15
+"""... and the most: over a longer time the motion of an object is not known."""
+# How a slip is found.
+SEARCH_ROUNDS = 4
 """In which a slip is found of a camera that is where it was; each leaves a hundredth of what was left."""
-STEPS = (8e-3, 1e-3)
-"""Seconds around a slip at which it is asked how probable it is, the camera's place being learnt with it; the first
-where nothing is known of that place."""
-MOMENT = 1e-3
+SEARCH_STEPS = (8e-3, 1e-3)
+"""Seconds around a slip at which its evidence is taken, the camera's place being learnt with it; the first only where
+nothing is known of that place."""
+VELOCITY_SECONDS = 1e-3
 """Seconds over which the velocity of an image is taken."""
 INEXACT = 0.03
 """Share of the way that a camera is behind by which blobs may be off that are put where they were in time."""
 
 
-@dataclass(frozen=True)
-class ClockSlip:
-    """A camera that exposes at another time than before."""
-
-    camera: int
-    since: int  # number of the first snapshot, counted from 0, that saw it so
-    seconds: float  # by which it exposes later
-    sigma: float  # one standard deviation of it
-    odds: float  # log odds against that the camera has moved
+VAGUE_SLIP_SECONDS = 5e-4
+"""Seconds, one standard deviation, above which a slip is not believed of a camera of which hardly anything is known."""
 
 
-@dataclass(frozen=True)
-class Slipped:
-    """Some snapshots, if clocks of cameras have slipped before them."""
+class ClockSlipped(Explanation):
+    """The clocks of the suspected cameras, or of the surest alone, have slipped."""
 
-    before: RigBelief
-    slips: tuple[ClockSlip, ...]
-    snapshots: list[tuple[Observations, RigidTransform]]  # as the cameras had seen them in time
-    evidence: float  # log probability, to compare with that of `MeasurementUpdate`
+    name = "clock slip"
+
+    def variants(self, case: Case) -> Sequence[Callable[[], Variant]]:
+        """Put the blobs of the cameras where they would have been in time."""
+        return [partial(_slip, case, start, cameras) for start in case.starts for cameras in case.camera_sets]
+
+    def premature(self, case: Case, found: Explained) -> str | None:
+        """Wait where the slip of a camera that is hardly known is itself hardly known."""
+        uncertain = case.uncertain or len(found.snapshots) > case.count
+        vague = uncertain and any(slip.sigma > VAGUE_SLIP_SECONDS for slip in found.finding.slips)
+        return "the slip is hardly known" if vague else None
 
 
-def slipped(
-    before: RigBelief,
-    snapshots: Sequence[tuple[Observations, RigidTransform]],
-    pauses: Sequence[float],
-    count: int,
-    cameras: Sequence[int],
-    options: EstimationOptions,
-    wide: bool = False,
-) -> Slipped | None:
-    """Suppose that clocks of cameras have slipped before the last `count` snapshots.
+def _slip(case: Case, start: Start, cameras: Sequence[int]) -> Variant:
+    """Find the most probable slips of clocks.
 
     Args:
-        before: what was believed before them.
-        snapshots: observations (1, C, N) and the object's pose (1,) of each; also earlier ones, which say how it moves.
-        pauses: s before each of them.
-        count: snapshots since the slip.
-        cameras: those whose clocks may have slipped.
-        options: how to minimize.
-        wide: it is hardly known where the cameras are.
-
-    Returns:
-        What that makes of the snapshots; None = nobody knows how the object moved, or no slip explains anything.
+        case: its earlier snapshots say how the object moves, too.
+        start: since when clocks may have slipped.
+        cameras: whose clocks.
 
     Raises:
-        RefusedError: the other cameras do not see enough of the object.
+        RefusedError: the other cameras do not see enough of the object, it is not known how it moves, or no slip is
+            more probable than others.
     """
-    given, start = stack_snapshots(snapshots[-count:])
-    others = given.seen.clone()
-    others[:, list(cameras)] = False
-    there = absorb(before, replace(given, seen=others), start, options)
-    seconds = torch.tensor(pauses, dtype=torch.float64).cumsum(0)
-    poses = [*(pose for _, pose in snapshots[:-count]), there.rig_from_object]
-    motion = ObjectMotion.of(RigidTransform.cat(poses), seconds)
+    count, uncertain = len(start.snapshots), case.uncertain or start is not case.starts[0]
+    given, poses = stack_snapshots(start.snapshots)
+    there = absorb(start.before, drop_cameras(given, cameras), poses, case.options)
+    seconds = torch.tensor(case.pauses, dtype=torch.float64).cumsum(0)
+    way = [*(pose for _, pose in case.snapshots[:-count]), there.rig_from_object]
+    motion = ObjectMotion.of(RigidTransform.cat(way), seconds)
     if not bool(motion.known[-count:].all()):
-        return None
-    cases = _Late(before, given, there, motion, seconds[-count:], options)
-    late = dict.fromkeys(cameras, 0.0) if wide else {camera: cases.rough(camera) for camera in cameras}
+        raise RefusedError("it is not known how the object moves")
+    cases = _Late(start.before, given, there, motion, seconds[-count:], case.options)
+    late = dict.fromkeys(cameras, 0.0) if uncertain else {camera: cases.rough_slip(camera) for camera in cameras}
     sigma = dict.fromkeys(cameras, math.nan)
-    for step in STEPS[0 if wide else 1 :]:
+    for step in SEARCH_STEPS[0 if uncertain else 1 :]:
         for camera in cameras:
-            three = [cases.supposed({**late, camera: late[camera] + way})[1] for way in (-step, 0.0, step)]
+            three = [cases.evidence({**late, camera: late[camera] + way}) for way in (-step, 0.0, step)]
             curvature = (2 * three[1] - three[0] - three[2]) / step**2
             if not curvature > 0:
-                return None
+                raise RefusedError("no slip is more probable than others")
             late[camera] += (three[2] - three[0]) / (2 * step) / curvature
             sigma[camera] = curvature**-0.5
-            if not abs(late[camera]) < MOST_SLIP:
-                return None
-    corrected, evidence = cases.supposed(late)
-    evidence += sum(math.log(spread / USUAL_SLIP) for spread in sigma.values())
+            if not abs(late[camera]) < MOST_SLIP_SECONDS:
+                raise RefusedError(f"the slip would be longer than {MOST_SLIP_SECONDS:g} s")
+    corrected, log_prior = cases.correct(late)
+    log_prior += sum(math.log(spread / SLIP_SECONDS) for spread in sigma.values())  # of all slips, not the best alone
     spreads = {camera: math.hypot(sigma[camera], INEXACT * late[camera]) for camera in cameras}
     slips = tuple(ClockSlip(camera, 0, late[camera], spreads[camera], math.nan) for camera in cameras)
-    return Slipped(before, slips, corrected, evidence)
+    return Variant(start.before, corrected, start.log_prior + log_prior, find=lambda _: Finding(slips=slips))
 
 
 def image_of(belief: RigBelief, rig_from_object: RigidTransform, camera: int) -> Tensor:
@@ -132,34 +122,38 @@ class _Late:
         """Where a camera sees the fiducials, so much later: (S, N, 2) pixels."""
         return image_of(self.there.belief, self.motion.at(self.seconds + late), camera)
 
-    def rough(self, camera: int) -> float:
+    def rough_slip(self, camera: int) -> float:
         """How late (s) a camera exposes if it is where it was."""
         given, late = self.given, 0.0
         seen = given.seen[:, camera]
         weight = torch.where(seen, given.sigma[:, camera].square().reciprocal(), 0.0)[..., None]
-        for _ in range(ROUNDS):
-            velocity = (self.image(camera, late + MOMENT) - self.image(camera, late - MOMENT)) / (2 * MOMENT)
+        for _ in range(SEARCH_ROUNDS):
+            velocity = (self.image(camera, late + VELOCITY_SECONDS) - self.image(camera, late - VELOCITY_SECONDS)) / (
+                2 * VELOCITY_SECONDS
+            )
             rest = torch.where(seen[..., None], given.uv[:, camera] - self.image(camera, late), 0.0)
-            power = float((weight * velocity.square()).sum()) + USUAL_SLIP**-2
-            late += (float((weight * velocity * rest).sum()) - late * USUAL_SLIP**-2) / power
-            late = min(max(late, -MOST_SLIP), MOST_SLIP)
+            power = float((weight * velocity.square()).sum()) + SLIP_SECONDS**-2
+            late += (float((weight * velocity * rest).sum()) - late * SLIP_SECONDS**-2) / power
+            late = min(max(late, -MOST_SLIP_SECONDS), MOST_SLIP_SECONDS)
         return late
 
-    def supposed(self, late: Mapping[int, float]) -> tuple[list[tuple[Observations, RigidTransform]], float]:
-        """Suppose that cameras expose later: what they had seen in time, and how probable that all is.
-
-        Raises:
-            RefusedError: see `absorb`.
-        """
+    def correct(self, late: Mapping[int, float]) -> tuple[list[Snapshot], float]:
+        """Put blobs where they would have been in time, less surely; and the log probability of these slips."""
         uv, sigma, seen = self.given.uv.clone(), self.given.sigma.clone(), self.given.seen
         for camera, seconds in late.items():
             behind = self.image(camera, seconds) - self.image(camera, 0.0)
             uv[:, camera] -= behind
             sigma[:, camera] = torch.hypot(sigma[:, camera], INEXACT * behind.norm(dim=-1))
-        observations = Observations(uv, sigma, seen, self.given.shake)
-        result = absorb(self.before, observations, self.there.rig_from_object, self.options)
-        unlikely = 2 * float((sigma / self.given.sigma).log()[seen].sum())
-        unlikely += sum(0.5 * (seconds / USUAL_SLIP) ** 2 for seconds in late.values())
-        rows = range(len(uv))
-        parts = [observations.of_snapshots([s]) for s in rows]
-        return [(parts[s], result.rig_from_object[s : s + 1]) for s in rows], result.evidence - unlikely
+        log_prior = -2 * float((sigma / self.given.sigma).log()[seen].sum())
+        log_prior -= sum(0.5 * (seconds / SLIP_SECONDS) ** 2 for seconds in late.values())
+        given, poses = Observations(uv, sigma, seen, self.given.shake), self.there.rig_from_object
+        return [(given.of_snapshots([s]), poses[s : s + 1]) for s in range(len(uv))], log_prior
+
+    def evidence(self, late: Mapping[int, float]) -> float:
+        """Log probability of the snapshots where cameras expose later.
+
+        Raises:
+            RefusedError: see `absorb`.
+        """
+        corrected, log_prior = self.correct(late)
+        return absorb(self.before, *stack_snapshots(corrected), self.options).evidence + log_prior

@@ -21,20 +21,24 @@ from torch import Tensor
 
 from imgcal.estimation import error_between
 from imgcal.monitoring.change_test import CHANGES, MODEL_ERROR, ChangeTest, change_of_errors, pixel_changes
-from imgcal.monitoring.rig_belief import RigBelief, age_belief
+from imgcal.monitoring.recent_snapshots import RecentSnapshots
+from imgcal.monitoring.rig_belief import RigBelief, age_belief, widened
+from imgcal.monitoring.rig_filter import RigFilter
 from imgcal.types import DriftRate
 
-SECONDS = 20.0
+STRETCH_SECONDS = 20.0
 """Time of a stretch."""
 WINDOWS = (1, 2, 3, 4, 6, 8, 12, 16)
 """Numbers of latest stretches that are asked together."""
 SPEEDS = torch.tensor((1.0, 2.0, 4.0, 8.0), dtype=torch.float64)
 """Standard deviations of a stretch's random walk, at the rate that is taken for granted, by which a value may go in
 each stretch instead."""
-DOUBT = 6.0
+PACE_DOUBT = 6.0
 """Log odds against each of them, before anything is seen."""
-LEARNING = 133.0
+LEARNING_SECONDS = 133.0
 """Seconds in which a random walk goes as far as the ramp that it stands for."""
+ADDED_TOGETHER = 32
+"""Snapshots whose information is added up at once."""
 
 
 @dataclass
@@ -119,8 +123,10 @@ class DriftPaces:
         self.information[0, others], self.pull[0, others] = rest[0][others], rest[1][others]
         ratios, was = self._ratios(model), self.squared
         best, window = ratios.amax(0).max(-1).values, ratios.amax(-1).argmax(0)
-        weight = (ratios.amax(0) - DOUBT).exp()
-        self.squared = 1 + (weight * SPEEDS.square()).sum(-1) / (1 + weight.sum(-1)) * (LEARNING / SECONDS)
+        weight = (ratios.amax(0) - PACE_DOUBT).exp()
+        self.squared = 1 + (weight * SPEEDS.square()).sum(-1) / (1 + weight.sum(-1)) * (
+            LEARNING_SECONDS / STRETCH_SECONDS
+        )
         lasted = torch.where(best > 0, torch.tensor(WINDOWS)[window], 0)
         lacking = (self.squared - was).clamp_min(0) * lasted
         variance = torch.zeros_like(walk)
@@ -135,7 +141,7 @@ class DriftPaces:
             size = part.stop - part.start
             wandered = walk[:, part].square() * (seconds / 3600)
             found = test.change(kind, (1 - self.squared[:, number, None]) * wandered)
-            step = walk[:, part] * (SECONDS / 3600) ** 0.5 * (seconds / SECONDS)
+            step = walk[:, part] * (STRETCH_SECONDS / 3600) ** 0.5 * (seconds / STRETCH_SECONDS)
             information[:, number, :size, :size] = found[0] * step[:, :, None] * step[:, None, :]
             pull[:, number, :size] = found[1] * step
         return information, pull
@@ -144,7 +150,7 @@ class DriftPaces:
         """Variance (C, kinds, 3) of errors of camera models, in steps of the walk; zero where nothing wanders."""
         variance = torch.zeros_like(self.pull[0])
         for number, (kind, part) in enumerate(CHANGES.items()):
-            step = walk[:, part] * (SECONDS / 3600) ** 0.5
+            step = walk[:, part] * (STRETCH_SECONDS / 3600) ** 0.5
             error = (test.model_error(kind) / step.clamp_min(1e-30)).square()
             variance[:, number, : part.stop - part.start] = torch.where(step > 0, error, 0.0)
         return variance
@@ -159,6 +165,44 @@ class DriftPaces:
         error = (model / last.square()[:, None, None, None])[..., None, :]  # of a speed
         steady = _log_evidence(information, pull, error)
         return _log_evidence(information, pull, error + SPEEDS.square()[:, None]) - steady
+
+
+@dataclass
+class DriftLearning:
+    """Learns how fast a filter's cameras drift while nothing else is the matter; it knows less of those that do."""
+
+    paces: DriftPaces
+    stretch: Stretch | None = None  # of snapshots ...
+    waiting: int = 0  # ... and the latest of them, which are not added yet
+
+    def take(self, follows: RigFilter, recent: RecentSnapshots, seconds: float, quiet: bool) -> None:
+        """Take the latest snapshot, and change what the filter believes.
+
+        Args:
+            follows: the filter that has learnt from it.
+            recent: the latest snapshots, this one included.
+            seconds: since the one before.
+            quiet: no camera has changed of late.
+        """
+        if follows.young or not quiet:
+            self.stretch = None
+            return
+        if self.stretch is None:
+            self.stretch, self.waiting = Stretch.after(follows.belief, follows.waited, recent.lasting), 0
+            return
+        stretch = self.stretch
+        stretch.seconds, self.waiting = stretch.seconds + seconds, self.waiting + 1
+        done = stretch.seconds >= STRETCH_SECONDS
+        if done or self.waiting == ADDED_TOGETHER:
+            stretch.add(follows.belief, *recent.information(self.waiting))
+            self.waiting = 0
+        if done:
+            lacking = self.paces.take(stretch, follows.rate.std(follows.belief.rig))
+            follows.pace = self.paces.of_parameters(follows.pace.shape[1])
+            recent.walk = follows.walk
+            if bool(lacking.any()):
+                follows.belief = widened(follows.belief, lacking)
+            self.stretch = Stretch.after(follows.belief, follows.waited, recent.lasting)
 
 
 def _log_evidence(information: Tensor, pull: Tensor, variance: Tensor) -> Tensor:

@@ -40,7 +40,7 @@ DAMPED, STALLED = 1e-3, 10.0
 """Damping up to which a step that is as short as the tolerance shows that this is the minimum; the second where lightly
 damped steps have failed: their direction is approximate where the belief is far away."""
 
-PATIENCE, LOOSER = 12, 1.5
+LOOSEN_AFTER, LOOSER = 12, 1.5
 """Iterations after which, and factor by which in each, the tolerance grows: where snapshots contradict a belief, steps
 are slow to become small."""
 
@@ -136,7 +136,7 @@ def _absorb(shared, seen, known_rig, known, rigs, states, blocks, matrices, brou
     cost = _evaluate(shared, seen, known_rig, known, rigs, states, blocks, distance, 0, loss, threshold)
     fresh = True
     for iteration in range(most):
-        enough = tolerance * LOOSER ** max(0, iteration - PATIENCE)
+        enough = tolerance * LOOSER ** max(0, iteration - LOOSEN_AFTER)
         b, t = best, 1 - best
         if fresh:
             status = _gather(unit, known, rigs, states, blocks, gathered, half, pull, b)

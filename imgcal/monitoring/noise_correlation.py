@@ -78,6 +78,11 @@ class NoiseCorrelation:
         return min(self.episodes[camera], SHORT if shift > LARGEST * usual else math.inf)  # type: ignore[return-value]
 
     @property
+    def correlated(self) -> Tensor | None:
+        """The same of cameras whose errors last: (C,) px; None = the errors of all are independent."""
+        return self.model_error if bool((self.time > 1).any()) else None
+
+    @property
     def episodes(self) -> list[int]:
         """Successive snapshots of each camera that one passing error may last."""
         return [1 if time <= 1 else math.ceil(EPISODE * time) for time in self.time.tolist()]

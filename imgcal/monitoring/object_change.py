@@ -2,55 +2,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from imgcal.errors import RefusedError
-from imgcal.estimation import EstimationOptions, object_prior_std
-from imgcal.geometry import RigidTransform
+from imgcal.estimation import object_prior_std
+from imgcal.monitoring.case import SHAPE, Case, Explanation, Finding, ObjectChange, Variant
+from imgcal.monitoring.cusum import Cusum, RunningMedian
 from imgcal.monitoring.measurement_update import absorb, stack_snapshots
-from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief
-from imgcal.types import Observations
+from imgcal.monitoring.pending_change import free_cameras
+from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, cholesky_factor
 
-BENT = 3.0
-"""Millimetres, one standard deviation of each axis: how far a fiducial may be off that is."""
-ROUGH = 0.2
-"""The same of fiducials that are all off by a little, since the object was made or measured less well than is said."""
-SCALED = 0.1
-"""The same of the object's scale, relative."""
-MOST_ASKED = 8
-"""Fiducials that are asked whether they are off: those whose residuals are the largest."""
+# Prior spread, one standard deviation, of what may have changed: before anything is known of it.
+ONE_MM = 3.0
+"""Millimetres of each axis: a fiducial that was bent or put elsewhere."""
+ALL_MM = 0.2
+"""The same of all fiducials, of an object that was made or measured less well than is said."""
+SCALE = 0.1
+"""Of the object's scale, relative."""
+
+# What is asked of an object, and how surely it must have changed.
+ASKED_FIDUCIALS = 8
+"""Fiducials that may be elsewhere at most: of more, those whose residuals are the largest."""
+PRINT_FIDUCIALS = 64
+"""Fiducials of an object above which it is a print: none of them goes anywhere by itself."""
 LEAST_SIGMAS = 3.0
 """Standard deviations by which it must have changed."""
-MANY = 64
-"""Fiducials of an object that is a print, from here on: none of them goes anywhere by itself."""
+MISFIT_LEAD = 30.0
+"""Log odds against the next best explanation from which the object has changed where no camera is suspected: snapshots
+that fit badly have many causes."""
 
-SHAPE = -1
-"""In place of a fiducial's number: all of them are somewhere else."""
-
-
-@dataclass(frozen=True)
-class ObjectChange:
-    """What happened to the object."""
-
-    fiducial: int | None  # the one that is somewhere else, `SHAPE` = all; None = another scale: it is another object
-    since: int  # number of the first snapshot, counted from 0, that saw it so
-    size: float  # mm that the fiducial went (RMS of all), or the relative change of scale
-    sigma: float  # one standard deviation of it
-    odds: float  # log odds against that cameras have moved
+# When it is asked: snapshots that fit worse than is usual, or first ones that never fitted.
+SNAPSHOTS_PER_FALSE_ALARM = 1e9
+MOST_STEP = 4.0
+"""Standard deviations by which one snapshot counts at most: a single bad one is no misfit."""
+LEAST_USUAL = 30
+"""Snapshots from which it is known how well they usually fit."""
+FIRST_ASKED, FIRST_SIGMAS = (8, 16, 32, 64), 2.0
+"""Numbers of first snapshots, and the standard deviations by which their chi-squared must exceed what is expected."""
 
 
-def free_object(belief: RigBelief, fiducial: int | None, by: float = BENT) -> RigBelief:
-    """Let a fiducial be off by so many mm (`SHAPE`: all of them), or, where that is None, the scale."""
+def free_object(belief: RigBelief, fiducial: int | None, by: float = ONE_MM) -> RigBelief:
+    """Let a fiducial be off by so many mm (`SHAPE`: all of them), or, where that is None, the scale.
+
+    Raises:
+        RefusedError: nothing is known of the rig.
+    """
     obj, known, wide = belief.obj, len(belief.object_offset), belief.unit.numel()
     if not known:
         tolerance = torch.zeros(obj.num_fiducials, dtype=torch.float64)
         if fiducial is not None:
             tolerance[slice(None) if fiducial == SHAPE else fiducial] = by
-        obj = replace(obj, tolerance=tolerance, scale_tolerance=SCALED if fiducial is None else 0.0)
+        obj = replace(obj, tolerance=tolerance, scale_tolerance=SCALE if fiducial is None else 0.0)
         size = 3 * obj.num_fiducials + 1
         factor = torch.eye(wide + size, dtype=torch.float64)
         factor[:wide, :wide] = belief.factor
@@ -58,9 +66,9 @@ def free_object(belief: RigBelief, fiducial: int | None, by: float = BENT) -> Ri
     std = object_prior_std(obj)
     rows = _rows(known, fiducial)
     spread = torch.zeros(wide + known, dtype=torch.float64)
-    spread[wide + rows] = (SCALED if fiducial is None else by) / std[rows].clamp_min(1e-6)
+    spread[wide + rows] = (SCALE if fiducial is None else by) / std[rows].clamp_min(1e-6)
     covariance = torch.cholesky_inverse(belief.factor) + spread.square().diag()
-    return replace(belief, factor=torch.linalg.cholesky(torch.cholesky_inverse(torch.linalg.cholesky(covariance))))
+    return replace(belief, factor=cholesky_factor(torch.cholesky_inverse(cholesky_factor(covariance))))
 
 
 def _rows(known: int, fiducial: int | None) -> Tensor:
@@ -71,59 +79,52 @@ def _rows(known: int, fiducial: int | None) -> Tensor:
     return rows[:-1] if fiducial == SHAPE else rows[3 * fiducial : 3 * fiducial + 3]
 
 
-def changed_object(
-    before: RigBelief,
-    snapshots: Sequence[tuple[Observations, RigidTransform]],
-    options: EstimationOptions,
-    otherwise: MeasurementUpdate,
-    least: float = 0.0,
-) -> tuple[ObjectChange, RigBelief] | None:
-    """Ask whether a change of the object explains some snapshots better than what is supposed else.
+class ObjectChanged(Explanation):
+    """A fiducial is elsewhere, all of them are, or the object has another scale; the cameras stand still."""
 
-    Args:
-        before: what was believed before them.
-        snapshots: observations (1, C, N) and the object's pose (1,) of each.
-        options: how to minimize.
-        otherwise: the same snapshots absorbed where the object has not changed, cameras that moved being let free.
-        least: log odds against that from which the object has changed.
+    name = "object changed"
 
-    Returns:
-        The most probable change, its `since` being zero, and what was believed before with that let free; None =
-        the object has not changed.
+    def variants(self, case: Case) -> Sequence[Callable[[], Variant]]:
+        """Let a part of the object free: each question takes as long as all that is known of the object."""
+        known: tuple[int | None, float] = (None, ONE_MM)
+        if case.before.obj.num_fiducials > PRINT_FIDUCIALS:
+            return [partial(_free_part, case, *known)]
+        parts = [known, (SHAPE, ALL_MM), (SHAPE, ONE_MM), *((n, ONE_MM) for n in _suspected_fiducials(case))]
+        return [partial(_free_part, case, *part) for part in parts]
+
+
+def _free_part(case: Case, fiducial: int | None, by: float) -> Variant:
+    """Let a part of the object free: see `free_object`."""
+
+    def find(result: MeasurementUpdate) -> Finding:
+        size, sigma = _measure_change(case.before, result.belief, fiducial)
+        if not abs(size) > LEAST_SIGMAS * sigma:
+            raise RefusedError("no change of the object is significant")
+        return Finding(object_change=ObjectChange(fiducial, 0, size, sigma, math.nan))
+
+    return Variant(free_object(case.before, fiducial, by), case.latest, find=find)
+
+
+def _suspected_fiducials(case: Case) -> list[int]:
+    """Fiducials that may be elsewhere: those that are seen, of many those with the largest residuals.
+
+    Raises:
+        RefusedError: see `absorb`.
     """
-    given = stack_snapshots(list(snapshots))
-    cameras = otherwise.evidence + least
-    best: tuple[float, int | None, MeasurementUpdate] | None = None
-    for fiducial, by in _doubtful(given[0], otherwise.residual):
-        try:
-            result = absorb(free_object(before, fiducial, by), *given, options)
-        except RefusedError:
-            continue
-        if best is None or result.evidence > best[0]:
-            best = result.evidence, fiducial, result
-    if best is None or best[0] <= cameras:
-        return None
-    evidence, fiducial, result = best
-    size, sigma = _size(before, result.belief, fiducial)
-    if not abs(size) > LEAST_SIGMAS * sigma:
-        return None
-    return ObjectChange(fiducial, 0, size, sigma, evidence - cameras), result.before
-
-
-def _doubtful(observations: Observations, residual: Tensor) -> list[tuple[int | None, float]]:
-    """What may be off, and by how much: each question takes as long as all that is known of the object."""
-    scale: tuple[int | None, float] = (None, BENT)
-    if observations.seen.shape[-1] > MANY:
-        return [scale]
-    squared = torch.where(observations.seen, (residual.square().sum(-1) / observations.sigma.square()), 0.0)
+    observations, poses = stack_snapshots(case.latest)
     count = observations.seen.sum((0, 1))
-    mean = squared.sum((0, 1)) / count.clamp_min(1)
-    found = [int(n) for n in mean.argsort(descending=True) if int(count[n])]
-    return [scale, (SHAPE, ROUGH), (SHAPE, BENT), *((n, BENT) for n in sorted(found[:MOST_ASKED]))]
+    found = count.nonzero()[:, 0].tolist()
+    if len(found) > ASKED_FIDUCIALS:
+        free = free_cameras(case.before, dict.fromkeys(case.cameras))
+        residual = absorb(free, observations, poses, case.options).residual
+        squared = torch.where(observations.seen, residual.square().sum(-1) / observations.sigma.square(), 0.0)
+        mean = squared.sum((0, 1)) / count.clamp_min(1)
+        found = mean.argsort(descending=True)[:ASKED_FIDUCIALS].tolist()
+    return sorted(found)
 
 
-def _size(before: RigBelief, after: RigBelief, fiducial: int | None) -> tuple[float, float]:
-    """How far it went, and the standard deviation of that: of all fiducials what is no motion and no scale."""
+def _measure_change(before: RigBelief, after: RigBelief, fiducial: int | None) -> tuple[float, float]:
+    """Measure how far it went, and the standard deviation: of all fiducials without what is motion or scale."""
     std = object_prior_std(after.obj)
     rows = _rows(len(std), fiducial)
     was = before.object_offset if len(before.object_offset) else torch.zeros_like(std)
@@ -148,3 +149,30 @@ def _similarities(points: Tensor) -> Tensor:
         torch.linalg.cross(torch.eye(3).to(points)[None], arms[:, None], dim=-1),
     )
     return torch.cat((shifts, turns, arms[:, None]), 1).movedim(1, -1).flatten(0, 1)
+
+
+@dataclass
+class Misfit:
+    """Notices that snapshots fit worse than is usual.
+
+    Examples:
+        >>> watch = Misfit()
+        >>> watch.update(chi2=50.0, dof=48)
+        0
+    """
+
+    risen: Cusum = field(default_factory=lambda: Cusum(1, 1.0, SNAPSHOTS_PER_FALSE_ALARM))
+    usual: RunningMedian = field(default_factory=lambda: RunningMedian(256))
+
+    def update(self, chi2: float, dof: int) -> int:
+        """Count the snapshots that fit worse than is usual, this one included; 0 = they fit."""
+        ratio = chi2 / max(dof, 1)
+        self.usual.append(ratio)
+        step = (ratio / self.usual.value - 1) * math.sqrt(max(dof, 1) / 2)
+        risen = self.risen.update([min(step, MOST_STEP)])
+        return int(self.risen.found[0]) if risen[0] and len(self.usual) >= LEAST_USUAL else 0
+
+
+def never_fitted(result: MeasurementUpdate, count: int) -> bool:
+    """Tell whether the first snapshots, absorbed together, fit so badly that the object may never have been as said."""
+    return count in FIRST_ASKED and result.chi2 - result.dof >= FIRST_SIGMAS * math.sqrt(2 * result.dof)

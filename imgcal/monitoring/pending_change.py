@@ -1,4 +1,4 @@
-"""Cameras that have changed, nobody knows how yet: what was seen since then decides which kind of change it was."""
+"""Cameras that have changed in a way that is not known yet: what they see since then decides its kind."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, age_belie
 from imgcal.monitoring.rig_filter import YOUNG_SECONDS
 from imgcal.types import CameraRig
 
-DECIDED = 5.0
-"""Log odds of a kind of change against every other, from which it is told ..."""
-ALONE, MIXED = 3.0, 15.0
+# Log odds from which the kind of a change is believed.
+KIND_LEAD = 5.0
+"""Of one kind against every other; ..."""
+SINGLE_KIND_LEAD, ALL_KINDS_LEAD = 3.0, 15.0
 """... against a change of all kinds at once, and of that against each: what is believed wrongly does no harm then."""
-JUDGED = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
-"""Numbers of snapshots since a change at which its kind is asked for."""
+DECIDE_AFTER = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
+"""Numbers of snapshots since a change at which its kind is decided, if it can be."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class Change:
     size: float  # rad, mm or pixels; nan where the kind is not known
     sigma: float  # one standard deviation of it
     decided: bool = False  # the last that will be said of it
-    evidence: float = math.nan  # chi-squared of its having stood still; nan = it was told that it moved
+    evidence: float = math.nan  # chi-squared of its having stood still; nan = not tested
 
 
 @dataclass
@@ -49,9 +50,9 @@ class PendingChange:
     kinds: dict[int, str | None]  # of the cameras that changed; None = not decided
 
     @property
-    def late(self) -> bool:
+    def overdue(self) -> bool:
         """Tell whether more snapshots are not worth waiting for."""
-        return self.count >= JUDGED[-1] or self.seconds > YOUNG_SECONDS
+        return self.count >= DECIDE_AFTER[-1] or self.seconds > YOUNG_SECONDS
 
     def distance(self, belief: RigBelief) -> Tensor:
         """Error (D,) in the chart of what was believed at some time.
@@ -76,10 +77,10 @@ class PendingChange:
 
     @property
     def due(self) -> bool:
-        """Tell whether the kind is to be asked for now."""
-        return self.late or self.count in JUDGED
+        """Tell whether to decide the kind now, if that can be."""
+        return self.overdue or self.count in DECIDE_AFTER
 
-    def take(self, result: MeasurementUpdate, seconds: float) -> None:
+    def add(self, result: MeasurementUpdate, seconds: float) -> None:
         """Add what a snapshot has brought."""
         brought = result.brought
         information = brought.information()
@@ -103,7 +104,7 @@ class PendingChange:
         change = change_of_errors(before.rig, before.unit)
         return ChangeTest.of(known, self.brought, pull, change, pixel_changes(before.rig))
 
-    def decided(self, test: ChangeTest, camera: int, last: bool) -> tuple[str | None, str | None] | None:
+    def decide(self, test: ChangeTest, camera: int, last: bool) -> tuple[str | None, str | None] | None:
         """Decide how a camera has changed.
 
         Args:
@@ -112,37 +113,37 @@ class PendingChange:
             last: it is to be decided now.
 
         Returns:
-            What is believed, None = any kind, and what is told, None = nothing; None = it cannot be told yet.
+            What is believed, None = any kind, and what is reported, None = no kind; None = it cannot be decided yet.
         """
         odds = {kind: test.odds({**self.others(camera), camera: kind}) for kind in (*CHANGES, None)}
         best, second = sorted(odds, key=lambda kind: -odds[kind])[:2]
-        least = MIXED if best is None else ALONE if second is None else DECIDED
+        least = ALL_KINDS_LEAD if best is None else SINGLE_KIND_LEAD if second is None else KIND_LEAD
         if odds[best] - odds[second] >= least:
             return best, best
         if not last:
             return None
         # Told as what it most probably is, and believed to be anything.
-        return None, max(CHANGES, key=lambda kind: odds[kind]) if self.late else None
+        return None, max(CHANGES, key=lambda kind: odds[kind]) if self.overdue else None
 
-    def judged(
+    def decide_kinds(
         self, test: ChangeTest, changes: Mapping[int, Change], last: bool
     ) -> tuple[tuple[Change, ...], dict[int, str | None]]:
-        """Decide of which kind open changes are, by camera, where that can be told, or it is time.
+        """Decide of which kind open changes are, by camera, where that can be decided, or it is time.
 
         Returns:
-            What is told of them, and what is believed of the cameras that are decided.
+            What is reported of them, and what is believed of the cameras that are decided.
         """
-        told, kinds = [], dict[int, str | None]()
+        decided, kinds = [], dict[int, str | None]()
         for camera, change in changes.items():
-            decided = self.decided(test, camera, last)
-            if decided is None:
+            found = self.decide(test, camera, last)
+            if found is None:
                 continue
-            kinds[camera], kind = decided
+            kinds[camera], kind = found
             size = (math.nan, math.nan) if kind is None else self.size(test, camera, kind)
             scores = test.given(self.others(camera)).scores()
             evidence = max(float(scores[name][camera]) for name in ([kind] if kind else CHANGES))
-            told.append(Change(camera, change.since, kind or "unknown", *size, decided=True, evidence=evidence))
-        return tuple(told), kinds
+            decided.append(Change(camera, change.since, kind or "unknown", *size, decided=True, evidence=evidence))
+        return tuple(decided), kinds
 
     def size(self, test: ChangeTest, camera: int, kind: str) -> tuple[float, float]:
         """How far a camera went, were it of this kind alone, and the standard deviation of that."""
@@ -151,7 +152,7 @@ class PendingChange:
         along = change / max(size, 1e-30)
         return size, float((along @ covariance @ along).clamp_min(0).sqrt())
 
-    def supposed(self, test: ChangeTest) -> tuple[RigBelief, RigBelief, Tensor]:
+    def adopt_kinds(self, test: ChangeTest) -> tuple[RigBelief, RigBelief, Tensor]:
         """Believe that cameras have changed in the `kinds` only.
 
         What was believed is moved along with them first: a large turn is no small one times a number.

@@ -1,4 +1,4 @@
-"""Cameras that see the object elsewhere than the others do, and nobody knows yet why: nothing is learnt of them."""
+"""Cameras that see the object elsewhere than the others do: nothing is learnt of them until it is known why."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ from collections import deque
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
-from imgcal.geometry import RigidTransform
-from imgcal.monitoring.explanations import Suspicion
+from torch import Tensor
+
+from imgcal.estimation import EstimationOptions
+from imgcal.monitoring.case import Case, Snapshot
+from imgcal.monitoring.object_change import ObjectChanged
 from imgcal.monitoring.recent_snapshots import RecentSnapshots
-from imgcal.monitoring.unsynchronized import without
+from imgcal.monitoring.shaking import Shaking
 from imgcal.types import Observations
 
-MOST = 16
-"""Latest snapshots that are asked why ..."""
-MOST_WIDE = 64
-"""... of cameras that are known; and of others, of which it takes more to tell anything."""
-ASKED = (1, 2, 3, 4, 6, 8, 12, 16, 20, 24, 28, 32, 48, 64)
-EVERY = 32
-"""Numbers of snapshots since cameras are held after which it is asked, and how often later."""
-SHAKEN_SECONDS, SHAKEN = 2.0, 20
-"""For how long, and how many snapshots at least, a camera that sees the object at moments of its own may as well be one
-that is being shaken."""
+CASE_SNAPSHOTS, CASE_SNAPSHOTS_UNCERTAIN = 16, 64
+"""Latest snapshots of a case; the second where it is hardly known where the cameras are, which takes more of them."""
+CASE_AFTER = (1, 2, 3, 4, 6, 8, 12, 16, 20, 24, 28, 32, 48, 64)
+CASE_EVERY = 32
+"""Numbers of snapshots since the quarantine began after which there is a case, and how often later."""
+SETTLE_SECONDS, SETTLE_SNAPSHOTS = 2.0, 20
+"""For how long, and how many snapshots at least, an unsynchronized camera may as well be one that is being shaken."""
 
 
 @dataclass
@@ -29,99 +29,102 @@ class Quarantine:
     """Cameras of which nothing is learnt, and what they have seen meanwhile."""
 
     cameras: set[int] = field(default_factory=set)
-    seen: deque[Observations] = field(default_factory=lambda: deque(maxlen=MOST_WIDE))  # (1, C, N), of all cameras
-    elapsed: int = 0  # snapshots since they are held
+    seen: deque[Observations] = field(default_factory=lambda: deque(maxlen=CASE_SNAPSHOTS_UNCERTAIN))  # (1, C, N)
+    snapshots: int = 0  # since it began
+    sightings: int = 0  # of those that count, the ones in which these cameras see the object
     passing: bool = True  # what is wrong with them may still be an error that passes
-    taken: int = 0  # of those that count, the ones in which they see the object
     seconds: float = 0.0  # since then
-    wide: bool = False  # it is hardly known where they are
-    apart: bool = False  # they see the object at moments of their own, or are shaken ...
-    told: bool = False  # ... and it is told that it is the former
+    uncertain: bool = False  # it is hardly known where they are
+    unsynchronized: bool = False  # they see the object at moments of their own, or are being shaken ...
+    reported: bool = False  # ... and it was reported that it is the former
 
-    def hold(self, cameras: Collection[int], wide: bool) -> None:
-        """Hold cameras, and begin anew where one of them is new."""
+    def add(self, cameras: Collection[int], uncertain: bool) -> None:
+        """Add cameras, and begin anew where one of them is new."""
         if not set(cameras) <= self.cameras:
-            self._begin(self.cameras | set(cameras), wide)
+            self._begin(self.cameras | set(cameras), uncertain)
 
-    def tell(self) -> tuple[int, ...]:
-        """Cameras that surely have moments of their own, once: they would stand still by now if they were shaken."""
-        if not self.apart or self.told or self.seconds < SHAKEN_SECONDS or len(self.seen) < SHAKEN:
+    def report_unsynchronized(self) -> tuple[int, ...]:
+        """Report, once, cameras that surely have moments of their own: they would be at rest by now if shaken."""
+        soon = self.seconds < SETTLE_SECONDS or len(self.seen) < SETTLE_SNAPSHOTS
+        if not self.unsynchronized or self.reported or soon:
             return ()
-        self.told = True
+        self.reported = True
         return tuple(sorted(self.cameras))
 
-    def take(self, observations: Observations, seconds: float, episode: int = 1) -> bool:
-        """Keep a snapshot, and tell whether to ask what has happened to the cameras.
+    def observe(self, observations: Observations, seconds: float, episode: int = 1) -> bool:
+        """Keep a snapshot, and tell whether there is a case now.
 
         Args:
             observations: (1, C, N).
             seconds: since the one before.
-            episode: successive snapshots that one passing error of these cameras may last. The first so many are no
-                evidence: what is wrong with them may pass.
+            episode: successive snapshots that one passing error of these cameras may last. There is no case before it
+                is over: what is wrong with them may pass.
         """
         self.seconds += seconds if self.seen else 0.0
-        self.elapsed += 1
+        self.snapshots += 1
         self.seen.append(observations)
-        if not self._shows(observations):
+        if not self._is_sighting(observations):
             return False
-        self.taken += 1
-        if self.passing and self.elapsed > episode > 1:
+        self.sightings += 1
+        if self.passing and self.snapshots > episode > 1:
             self._forget_episode()
-        self.passing = self.elapsed <= episode and episode > 1
-        return not self.passing and (self.taken in ASKED or self.taken % EVERY == 0)
+        self.passing = self.snapshots <= episode and episode > 1
+        return not self.passing and (self.sightings in CASE_AFTER or self.sightings % CASE_EVERY == 0)
 
-    def _shows(self, observations: Observations) -> bool:
+    def _is_sighting(self, observations: Observations) -> bool:
         return bool(observations.seen[:, list(self.cameras)].any())
 
     def _forget_episode(self) -> None:
         """Keep of the first episode the last snapshot that shows the object: later ones must agree with it."""
-        shown = [number for number, observations in enumerate(self.seen) if self._shows(observations)]
+        shown = [number for number, observations in enumerate(self.seen) if self._is_sighting(observations)]
         for _ in range(shown[-2] if len(shown) > 1 else 0):
             self.seen.popleft()
-        self.taken = min(len(shown), 2)
+        self.sightings = min(len(shown), 2)
 
-    def hold_since(
-        self,
-        snapshots: Sequence[tuple[Observations, RigidTransform]],
-        pauses: Sequence[float],
-        cameras: Collection[int],
-        wide: bool,
-    ) -> list[tuple[Observations, RigidTransform]]:
-        """Hold cameras that seem to have moments of their own; returns what may be learnt of snapshots with them.
+    def add_unsynchronized(
+        self, snapshots: Sequence[Snapshot], pauses: Sequence[float], cameras: Collection[int], uncertain: bool
+    ) -> None:
+        """Add cameras that seem to have moments of their own.
 
         Args:
-            snapshots: observations (1, C, N) and the object's pose (1,) of each.
+            snapshots: observations (1, C, N) and the object's pose (1,) of each since then.
             pauses: s before each of them.
             cameras: those.
-            wide: it is hardly known where they are.
+            uncertain: it is hardly known where they are.
         """
-        self.hold(cameras, wide)
+        self.add(cameras, uncertain)
         for (observations, _), seconds in zip(snapshots, pauses, strict=True):
-            self.take(observations, seconds)
-        self.apart = True
-        return [(without(observations, self.cameras), pose) for observations, pose in snapshots]
+            self.observe(observations, seconds)
+        self.unsynchronized = True
 
-    def suspicion(self, recent: RecentSnapshots) -> Suspicion:
-        """What is to be asked: these cameras, and the latest snapshots with what they have seen.
+    def case(self, recent: RecentSnapshots, options: EstimationOptions, lasting: Tensor | None = None) -> Case:
+        """Put together a case of these cameras: the latest snapshots, with what they have seen.
 
         Raises:
             RefusedError: nothing is known of the rig.
         """
         total = recent.snapshots(len(recent))
-        window = list(self.seen)[-min(MOST_WIDE if self.wide else MOST, len(total)) :]
+        most = CASE_SNAPSHOTS_UNCERTAIN if self.uncertain else CASE_SNAPSHOTS
+        window = list(self.seen)[-min(most, len(total)) :]
         count = len(window)
         snapshots = [*total[:-count], *zip(window, [pose for _, pose in total[-count:]], strict=True)]
         before, pauses = recent.belief_before(count), recent.pauses(len(recent))
-        cameras = dict.fromkeys(sorted(self.cameras))
-        return Suspicion(before, snapshots, pauses, count, cameras, wide=self.wide, held=True)
+        excluded = {
+            Shaking.name: "what shakes is not so far off",
+            ObjectChanged.name: "the other cameras see the object as it was",
+        }
+        cameras = tuple(sorted(self.cameras))
+        return Case(
+            before, snapshots, pauses, count, options, cameras, self.uncertain, True, lasting, excluded=excluded
+        )
 
     def release(self) -> None:
-        """Hold none."""
-        self._begin(set(), wide=False)
+        """Release all cameras."""
+        self._begin(set(), uncertain=False)
 
-    def _begin(self, cameras: set[int], wide: bool) -> None:
-        """Hold cameras of which nothing has been seen yet."""
-        self.cameras, self.wide = cameras, wide
-        self.elapsed, self.passing = 0, True
-        self.taken, self.seconds, self.apart, self.told = 0, 0.0, False, False
+    def _begin(self, cameras: set[int], uncertain: bool) -> None:
+        """Begin with cameras of which nothing has been seen yet."""
+        self.cameras, self.uncertain = cameras, uncertain
+        self.snapshots, self.sightings, self.passing = 0, 0, True
+        self.seconds, self.unsynchronized, self.reported = 0.0, False, False
         self.seen.clear()

@@ -26,11 +26,11 @@ from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, error_cov
 from imgcal.monitoring.snapshot_information import SnapshotInformation, add_blocks
 from imgcal.types import CameraRig, Observations
 
-OLDEST = 64
+KEPT_SNAPSHOTS = 64
 """Snapshots within which a change must show: one second at 60 a second."""
 MOST_BASES = 8
 """How often the belief may have aged within them."""
-SCREENED = np.array((2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64))
+SCREENED_AGES = np.array((2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64))
 """Numbers of snapshots that are screened."""
 PARTS = np.array([(part.start, part.stop) for part in CHANGES.values()])
 
@@ -42,7 +42,7 @@ class _Base:
     number: int  # of the snapshot
     information: Tensor  # (D, D)
     weighted: Tensor  # (D,) information times the error of what was most probable
-    own: bool = False  # nobody else has these numbers
+    own: bool = False  # no belief shares these numbers
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class _Seen:
 
 
 class RecentSnapshots:
-    """A ring of the latest `OLDEST` snapshots."""
+    """A ring of the latest `KEPT_SNAPSHOTS` snapshots."""
 
     def __init__(self, belief: RigBelief, walk: Tensor, lasting: Tensor | float = MODEL_ERROR) -> None:
         """Begin with none.
@@ -67,11 +67,11 @@ class RecentSnapshots:
         self.walk, self._belief = walk, belief
         self.lasting = lasting
         self._unit = belief.unit.numpy()
-        self._carried = np.zeros((OLDEST, 6, wide))
-        self._border = np.zeros((OLDEST, wide - cameras * free, wide))
-        self._weighted = np.zeros((OLDEST, wide))  # pull, as it would be at the chart's origin
+        self._carried = np.zeros((KEPT_SNAPSHOTS, 6, wide))
+        self._border = np.zeros((KEPT_SNAPSHOTS, wide - cameras * free, wide))
+        self._weighted = np.zeros((KEPT_SNAPSHOTS, wide))  # pull, as it would be at the chart's origin
         self._ring = (self._carried, self._border, self._weighted)
-        blocks = (OLDEST + 1, cameras, free, free)
+        blocks = (KEPT_SNAPSHOTS + 1, cameras, free, free)
         self._totals = (np.zeros(blocks), np.zeros(blocks))  # rounded by 10^-7 of a snapshot after a year
         self._pixels = pixel_changes(belief.rig)
         self._begin(belief.rig, belief.object_offset)
@@ -100,7 +100,7 @@ class RecentSnapshots:
             observations: (1, C, N).
             seconds: since the snapshot before.
         """
-        while len(self._seen) >= OLDEST or len(self._bases) >= MOST_BASES:
+        while len(self._seen) >= KEPT_SNAPSHOTS or len(self._bases) >= MOST_BASES:
             self._drop()
         if self._aged or self._belief is not result.before:
             before = self._error(result.before.arrays, result.before.object_offset)
@@ -112,7 +112,7 @@ class RecentSnapshots:
         self._follow(result.belief)
         self._aged = False
 
-    def relinearized(self, result: MeasurementUpdate) -> None:
+    def relinearize(self, result: MeasurementUpdate) -> None:
         """Take the same snapshots, and any number before them, as they are where they lead together."""
         brought, before, seen = result.brought, result.before, self._seen
         self._begin(brought.rig, brought.object_offset)
@@ -130,17 +130,7 @@ class RecentSnapshots:
             self._seen.append(entry)
         self._follow(result.belief)
 
-    def restarted(self, result: MeasurementUpdate, last: int) -> None:
-        """Forget all but the last snapshots, which were absorbed together."""
-        while len(self._seen) > last:
-            self._seen.popleft()
-        self.relinearized(result)
-
-    def began(self, result: MeasurementUpdate, observations: Observations, seconds: float) -> None:
-        """Forget all snapshots, and take one that another belief than the last one has absorbed."""
-        self.took([(observations, result.rig_from_object)], [seconds], result)
-
-    def took(
+    def replace(
         self,
         snapshots: Sequence[tuple[Observations, RigidTransform]],
         pauses: Sequence[float],
@@ -154,9 +144,9 @@ class RecentSnapshots:
             result: what they taught.
         """
         self._seen = deque(_Seen(*snapshot, pause) for snapshot, pause in zip(snapshots, pauses, strict=True))
-        self.relinearized(result)
+        self.relinearize(result)
 
-    def rebased(self, belief: RigBelief, information: Tensor) -> None:
+    def rebase(self, belief: RigBelief, information: Tensor) -> None:
         """Believe something else, of which these snapshots brought a part.
 
         Args:
@@ -181,10 +171,10 @@ class RecentSnapshots:
         return [entry.seconds for entry in list(self._seen)[-age:]]
 
     def screened(self) -> NDArray[np.float64]:
-        """Score each camera since each of `SCREENED`: (ages, C); see `screen`."""
-        scores = np.empty((len(SCREENED), len(self._change)))
+        """Score each camera since each of `SCREENED_AGES`: (ages, C); see `screen`."""
+        scores = np.empty((len(SCREENED_AGES), len(self._change)))
         known = (self._at, self._change.numpy(), PARTS)
-        screen(self._ring, self._totals, self._next, len(self), *known, SCREENED, scores)
+        screen(self._ring, self._totals, self._next, len(self), *known, SCREENED_AGES, scores)
         return scores
 
     def test(self, age: int, aged: bool = True) -> ChangeTest:
@@ -208,7 +198,7 @@ class RecentSnapshots:
             information = torch.cholesky_inverse(_cholesky(covariance))
         return ChangeTest.of(information, brought, pull, self._change, self._pixels, self.lasting)
 
-    def repeated(self, age: int, camera: int, kind: str, episode: int) -> float:
+    def score_without_episode(self, age: int, camera: int, kind: str, episode: int) -> float:
         """Score of a change of a camera, all else taken to be known, without the episode that speaks most for it.
 
         Args:
@@ -244,7 +234,7 @@ class RecentSnapshots:
         rig = displaced(self._belief.rig, error * self._belief.unit)
         return replace(self._belief, rig=rig, object_offset=at[wide:], factor=_cholesky(information))
 
-    def brought(self, count: int) -> tuple[Tensor, Tensor]:
+    def information(self, count: int) -> tuple[Tensor, Tensor]:
         """Information (D, D) of the latest snapshots, and their pull (D,) at what is believed now."""
         information, weighted = self._sums(self._next - count, self._next)
         return information, weighted - information @ torch.from_numpy(self._at)
@@ -260,7 +250,7 @@ class RecentSnapshots:
     def _sums(self, first: int, last: int) -> tuple[Tensor, Tensor]:
         """Information (D, D) and weighted errors (D,) of some snapshots."""
         first = max(first, self._next - len(self))
-        rows = np.arange(first, last) % OLDEST
+        rows = np.arange(first, last) % KEPT_SNAPSHOTS
         carried = torch.from_numpy(self._carried[rows].reshape(-1, self._at.size))
         information = -(carried.mT @ carried)
         total = self._totals[0]

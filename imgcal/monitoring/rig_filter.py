@@ -136,12 +136,15 @@ class RigFilter:
         self.belief, self._waited = age_belief(result.belief, self._span, self.walk), 0.0
         return replace(result.of_last(), belief=self.belief)
 
-    def restart(self, first: RigBelief, snapshots: Sequence[tuple[Observations, RigidTransform]]) -> MeasurementUpdate:
+    def restart(
+        self, first: RigBelief, snapshots: Sequence[tuple[Observations, RigidTransform]], new: int = 0
+    ) -> MeasurementUpdate:
         """Begin anew: with what was believed before some snapshots, and these.
 
         Args:
             first: what was believed before them.
             snapshots: observations (1, C, N) and the object's pose (1,) of each.
+            new: how many of them have not been absorbed before.
 
         Raises:
             RefusedError: see `absorb`; the filter stays as it was.
@@ -149,6 +152,7 @@ class RigFilter:
         result = absorb(first, *stack_snapshots(snapshots), self.options)
         self.belief, self._first, self._early = result.belief, first, list(snapshots)
         self._young, self._span, self._waited = True, 0.0, 0.0
+        self.count += new
         return result
 
     def suppose(self, first: RigBelief, belief: RigBelief) -> None:

@@ -1,47 +1,60 @@
-"""A filter that notices when a camera changes, says how, and learns that camera anew while it keeps the others."""
+"""A filter that notices when something changes, says what, and learns a camera anew while it keeps the others."""
 
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType
+
+from torch import Tensor
 
 from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
+from imgcal.monitoring.case import Case, ClockSlip, ObjectChange, Snapshot
 from imgcal.monitoring.change_search import (
-    NEARBY,
-    changed_before,
+    NEARBY_SNAPSHOTS,
     changed_cameras,
-    contradicting,
+    contradicting_camera,
+    find_alarm,
     likeliest_age,
-    surest,
+    likeliest_camera,
 )
-from imgcal.monitoring.change_test import JUMPS
-from imgcal.monitoring.clock_slip import ClockSlip, image_of
-from imgcal.monitoring.drift_learning import DriftLearning
-from imgcal.monitoring.drift_pace import DriftPaces
-from imgcal.monitoring.explanations import ExplanationSearch, Suspicion, doubtful_cameras
-from imgcal.monitoring.measurement_update import absorb, stack_snapshots
+from imgcal.monitoring.change_test import JUMPS, LARGE
+from imgcal.monitoring.clock_slip import image_of
+from imgcal.monitoring.drift_pace import DriftLearning, DriftPaces
+from imgcal.monitoring.explanations import Diagnosis, Moved, Steady, Verdict, doubtful_cameras, weigh
 from imgcal.monitoring.noise_correlation import NoiseCorrelation
-from imgcal.monitoring.object_change import ObjectChange, changed_object
-from imgcal.monitoring.object_question import Misfit, never_fitted, object_explains
+from imgcal.monitoring.object_change import MISFIT_LEAD, Misfit, ObjectChanged, never_fitted
 from imgcal.monitoring.pending_change import Change, PendingChange, free_cameras
 from imgcal.monitoring.quarantine import Quarantine
 from imgcal.monitoring.recent_snapshots import RecentSnapshots
 from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, age_belief
 from imgcal.monitoring.rig_filter import RigFilter
 from imgcal.monitoring.shaking import ShakeLevel
-from imgcal.monitoring.unsynchronized import without
+from imgcal.monitoring.unsynchronized import drop_cameras
 from imgcal.types import Observations
 
-FEW = 16
+FEW_SNAPSHOTS = 16
 """Snapshots up to which what was known before a change is too little to go by: it bends, within what it leaves open, by
 more than it says, and others would be blamed. What came before is then forgotten ..."""
-UNSURE = 8
-"""... and of the object nothing is asked before so many have been learnt."""
-DOUBT = 16
-"""Snapshots for which a camera is in doubt that seemed to have moved, and of which nothing could be told."""
+OBJECT_SNAPSHOTS = 8
+"""... and no change of the object is looked for before so many have been learnt."""
+UNDECIDED_SNAPSHOTS = 16
+"""Snapshots for which a camera is in doubt that seemed to have moved, and of which nothing could be decided."""
+
+
+@dataclass(frozen=True)
+class MonitorUpdate:
+    """What a snapshot taught, and what became known with it."""
+
+    update: MeasurementUpdate  # with the pose (1,) and the residual (1, C, N, 2) of the latest snapshot
+    changes: tuple[Change, ...] = ()  # of cameras: first that there is one, then of which kind it is
+    slips: tuple[ClockSlip, ...] = ()
+    unsynchronized: tuple[int, ...] = ()  # cameras that see the object at moments of their own
+    object_change: ObjectChange | None = None
+    restarted: bool = False  # nothing that was known before a change counts any more
 
 
 class RigMonitor:
@@ -58,20 +71,17 @@ class RigMonitor:
         """Watch over a filter, which is to be updated by this monitor alone from now on."""
         self.filter = rig_filter
         self.open: dict[int, Change] = {}  # changes whose kind is not decided yet, by camera
-        self.object_change: ObjectChange | None = None  # that became known with the latest snapshot
-        self.slips: tuple[ClockSlip, ...] = ()  # that became known with the latest snapshot
-        self.apart: tuple[int, ...] = ()  # cameras of which it became known that they have moments of their own
         self.undecided: dict[int, int] = {}  # cameras that seem to have moved, and for how many snapshots yet
-        self._clocks = ExplanationSearch()
-        self.held = Quarantine()  # of which nothing is learnt until it is known why they see the object elsewhere
+        self.quarantine = Quarantine()  # cameras that see the object elsewhere, until it is known why
         self.shaking = ShakeLevel(rig_filter.belief.rig.num_cameras)
+        self.known_since = 0  # number of the first snapshot that what is known rests on
+        self._diagnosis = Diagnosis()
         self._misfit = Misfit()
         self.noise = NoiseCorrelation(rig_filter.belief.rig.num_cameras)
         self._recent = RecentSnapshots(rig_filter.belief, rig_filter.walk)
         self._drifting = DriftLearning(DriftPaces(rig_filter.belief.rig.num_cameras))
-        self._since: PendingChange | None = None
+        self._pending: PendingChange | None = None
         self._prior = rig_filter.belief
-        self.first = 0  # number of the first snapshot of which something is known
         self._moved_early: set[int] = set()  # cameras of which the factory knows nothing more
         self._suspect: int | None = None  # the camera without which the last snapshot would not have been refused
 
@@ -81,7 +91,7 @@ class RigMonitor:
         rig_from_object: RigidTransform,
         seconds: float = 0.0,
         moved: Collection[int] = (),
-    ) -> tuple[MeasurementUpdate, tuple[Change, ...]]:
+    ) -> MonitorUpdate:
         """Learn from a snapshot.
 
         Args:
@@ -91,94 +101,101 @@ class RigMonitor:
             moved: cameras that are known to have moved before this snapshot, how far they may.
 
         Returns:
-            What was learnt, with the pose and the residual of this snapshot, and the changes that became known with it:
-            first that there is one, then, once that is decided, of which kind it is.
+            What was learnt, and what became known.
 
         Raises:
             RefusedError: see `absorb`. What no minimum is found for, but for one camera, is refused once; if the next
                 snapshot says the same, that camera has moved.
         """
-        self.object_change, self.slips, self.apart = None, (), ()
         self.undecided = {camera: left - 1 for camera, left in self.undecided.items() if left > 1}
         given = observations
         if self.filter.calibrated:
             self.noise.expect(seconds)
         observations = self.noise.weigh(self.shaking.of(observations))
-        new = [camera for camera in moved if camera not in self.held.cameras]
+        new = [camera for camera in moved if camera not in self.quarantine.cameras]
         if new:
-            self.held.hold(new, self.filter.count - self.first < FEW)
-        learn = self._beside_held if self.held.cameras else self._followed
-        result, changes = learn(observations, rig_from_object, seconds)
-        last = result.of_last()
-        if not (changes or self.open or self.slips or self.object_change):
-            self._follow_noise(without(given, self.held.cameras), last)
-        return last, changes
+            self.quarantine.add(new, self._is_new())
+        known_since = self.known_since
+        follow = self._follow_beside_quarantine if self.quarantine.cameras else self._follow
+        found = follow(observations, rig_from_object, seconds)
+        found = replace(found, update=found.update.of_last(), restarted=self.known_since != known_since)
+        if not (found.changes or self.open or found.slips or found.object_change):
+            self._follow_noise(drop_cameras(given, self.quarantine.cameras), found.update.residual)
+        return found
 
-    def _follow_noise(self, observations: Observations, result: MeasurementUpdate) -> None:
-        """Measure by a snapshot that nobody doubts how much cameras shake, and how long their errors last."""
-        self.shaking.take(observations, result.residual)
+    def _follow_noise(self, observations: Observations, residual: Tensor) -> None:
+        """Measure by a snapshot that nothing is wrong with how much cameras shake, and how long their errors last."""
+        self.shaking.take(observations, residual)
         before = self.noise.time
-        self.noise.add(observations, result.residual)
+        self.noise.add(observations, residual)
         if self.noise.time is not before:
             self._recent.lasting = self.noise.model_error
             self.filter.rescale((self.noise.time / before).sqrt())
 
-    def _followed(
-        self, observations: Observations, rig_from_object: RigidTransform, seconds: float
-    ) -> tuple[MeasurementUpdate, tuple[Change, ...]]:
-        """Learn from a snapshot of which nobody knows that something has moved before it."""
+    def _is_new(self, age: int = 0) -> bool:
+        """Tell whether hardly anything was known of the rig before the latest `age` snapshots."""
+        return self.filter.count - age - self.known_since < FEW_SNAPSHOTS
+
+    def _follow(self, observations: Observations, rig_from_object: RigidTransform, seconds: float) -> MonitorUpdate:
+        """Learn from a snapshot, and test whether something has changed before it.
+
+        Raises:
+            RefusedError: see `update`.
+        """
         try:
             result = self.filter.follow(observations, rig_from_object, seconds)
         except RefusedError:
             last, belief = self._suspect, self.filter.belief
-            self._suspect = contradicting(belief, observations, rig_from_object, self.filter.options)
+            self._suspect = contradicting_camera(belief, observations, rig_from_object, self.filter.options)
             if last is None or last != self._suspect:
                 raise
-            self.held.hold((last,), self.filter.count - self.first < FEW)
+            self.quarantine.add((last,), self._is_new())
             self._suspect = None
-            return self._beside_held(observations, rig_from_object, seconds)
+            return self._follow_beside_quarantine(observations, rig_from_object, seconds)
         self._suspect = None
         self._recent.append(result, observations, seconds)
-        if self._since is not None:
-            self._since.take(result, seconds)
-        found = changed_before(self._recent, self.filter.count, self.noise.episodes)
-        misfit = self._misfit.take(result.chi2, result.dof)
-        if found is None and misfit and self._since is None:
-            anew = self._learnt_object(misfit)
-            if anew is not None:
-                return anew, ()
-        if found is not None:
-            with contextlib.suppress(RefusedError):  # what cannot be told or learnt is tested with the next snapshot
-                told = self._alarmed(found)
+        if self._pending is not None:
+            self._pending.add(result, seconds)
+        alarm = find_alarm(self._recent, self.filter.count, self.noise.episodes)
+        misfit = self._misfit.update(result.chi2, result.dof)
+        if alarm is None and misfit and self._pending is None and (anew := self._diagnose_misfit(misfit)) is not None:
+            return anew
+        changes: list[Change] = []
+        if alarm is not None:
+            with contextlib.suppress(RefusedError):  # what cannot be decided or learnt is tested with the next snapshot
+                anew = self._diagnose_alarm(alarm, changes)
                 self.undecided = {}
-                return told
+                return replace(anew, changes=(*changes, *anew.changes))
         if self.filter.due:
             result = self.filter.relinearize()
-            self._recent.relinearized(result)
-            if (anew := self._learnt_first_object(result)) is not None:
-                return anew, ()
-            if self._since is not None:
-                self._since = PendingChange.of(result, self._since.before, self._since.seconds, self._since.kinds)
-        self._drifting.take(self.filter, self._recent, seconds, quiet=self._since is None and found is None)
-        if self._since is not None and self._since.due:
-            return result, self._judged(self._since.late)
-        return result, ()
+            self._recent.relinearize(result)
+            if (anew := self._diagnose_first_misfit(result)) is not None:
+                return replace(anew, changes=tuple(changes))
+            if self._pending is not None:
+                self._pending = PendingChange.of(
+                    result, self._pending.before, self._pending.seconds, self._pending.kinds
+                )
+        self._drifting.take(self.filter, self._recent, seconds, quiet=self._pending is None and alarm is None)
+        if self._pending is not None and self._pending.due:
+            changes += self._decide_kinds(self._pending.overdue)
+        return MonitorUpdate(result, tuple(changes))
 
-    def _beside_held(
+    def _follow_beside_quarantine(
         self, observations: Observations, rig_from_object: RigidTransform, seconds: float
-    ) -> tuple[MeasurementUpdate, tuple[Change, ...]]:
-        """Learn from a snapshot without the cameras that are held, and ask what has happened to these."""
-        held, cameras = self.held, set(self.held.cameras)
-        result, changes = self._followed(without(observations, cameras), rig_from_object, seconds)
-        if not held.cameras or held.cameras != cameras:  # those that are new have taken it already
-            return result, changes
-        if held.take(observations, seconds, self._episode(cameras, observations, result)):
-            with contextlib.suppress(RefusedError):  # not yet
-                anew = self._asked_held()
-                if anew is not None:
-                    return anew[0], (*changes, *anew[1])
-        self.apart = held.tell()
-        return result, changes
+    ) -> MonitorUpdate:
+        """Learn from a snapshot without the cameras in quarantine, and diagnose these.
+
+        Raises:
+            RefusedError: see `update`.
+        """
+        quarantine, cameras = self.quarantine, set(self.quarantine.cameras)
+        found = self._follow(drop_cameras(observations, cameras), rig_from_object, seconds)
+        if not quarantine.cameras or quarantine.cameras != cameras:  # those that are new have seen it already
+            return found
+        if quarantine.observe(observations, seconds, self._episode(cameras, observations, found.update)):
+            with contextlib.suppress(RefusedError):  # it cannot be decided yet, or they do not see enough
+                found = self._diagnose_quarantine(found)
+        return replace(found, unsynchronized=quarantine.report_unsynchronized())
 
     def _episode(self, cameras: Collection[int], observations: Observations, result: MeasurementUpdate) -> int:
         """Successive snapshots that what is wrong with cameras may last, if it is an error that passes."""
@@ -190,170 +207,185 @@ class RigMonitor:
             longest = max(longest, self.noise.episode(camera, shift))
         return longest
 
-    def _asked_held(self) -> tuple[MeasurementUpdate, tuple[Change, ...]] | None:
-        """Ask what has happened to the cameras that are held; what was learnt anew where they have moved.
+    def _diagnose_quarantine(self, found: MonitorUpdate) -> MonitorUpdate:
+        """Find out what has happened to the cameras in quarantine, and learn them anew where they have moved.
 
         Raises:
-            RefusedError: it cannot be told yet, or they do not see enough.
+            RefusedError: it cannot be decided yet, or they do not see enough.
         """
-        held, suspicion = self.held, self.held.suspicion(self._recent)
-        since, patient = self.filter.count - suspicion.count, self._since is None
-        held.apart = False
-        answer = self._clocks.ask(suspicion, since, self.filter.options, patient)
-        held.apart = answer.kind == "apart"
-        if held.apart:
-            return None
-        held.release()
-        if answer.kind == "moved":
-            return self._restarted(suspicion, self._judged(last=True))
-        self.slips = () if answer.slipped is None else answer.slipped.slips
-        return None
+        quarantine, case = (
+            self.quarantine,
+            self.quarantine.case(self._recent, self.filter.options, self.noise.correlated),
+        )
+        quarantine.unsynchronized = False
+        verdict = self._diagnosis.decide(case, patient=self._pending is None)
+        quarantine.unsynchronized = bool(verdict.best.finding.unsynchronized)
+        if quarantine.unsynchronized:
+            return found
+        quarantine.release()
+        if verdict.best.name == Moved.name:
+            decided = self._decide_kinds(last=True)
+            anew = self._learn_moved(case, dict.fromkeys(case.cameras), JUMPS[-1], sum(case.pauses[-case.count :]))
+            return replace(anew, changes=(*found.changes, *decided, *anew.changes))
+        return replace(found, slips=self._slips_of(verdict))
 
-    def _restarted(self, moved: Suspicion, told: Sequence[Change]) -> tuple[MeasurementUpdate, tuple[Change, ...]]:
-        """Learn the latest snapshots, which the filter has absorbed otherwise, with cameras that have moved before.
+    def _diagnose_alarm(self, age: int, changes: list[Change]) -> MonitorUpdate:
+        """Find out what has happened before the latest snapshots, since which cameras seem to have changed.
+
+        Args:
+            age: number of these snapshots.
+            changes: those that are decided meanwhile are added.
+
+        Raises:
+            RefusedError: it cannot be decided yet, or learnt.
+        """
+        free: dict[int, str | None] = {}
+        pending, test = self._pending, self._recent.test(age)
+        age = likeliest_age(self._recent, likeliest_camera(test), age)
+        if pending is not None and age >= pending.count - NEARBY_SNAPSHOTS:  # it was then that the open ones changed
+            again = likeliest_camera(self._recent.test(age)) in pending.kinds
+            # Again: the first snapshots were from the old place.
+            age = age if again else min(pending.count, len(self._recent))
+            before, seconds, free = pending.before, pending.seconds, dict(pending.kinds)
+        else:
+            changes += self._decide_kinds(last=True)
+            before, seconds = self._recent.belief_before(age), self._recent.seconds(age)
+        excluded = {Steady.name: "a test of every camera has excluded it"}
+        if pending is not None and free:
+            excluded[ObjectChanged.name] = "a change of a camera is open"
+        free, evidence = changed_cameras(self._recent.test(age), free)
+        self.undecided |= dict.fromkeys(free, UNDECIDED_SNAPSHOTS)
+        if self._is_new(age):
+            excluded[ObjectChanged.name] = "too little was known before"
+        case = self._case(before, age, tuple(free), excluded)
+        verdict = self._diagnosis.decide(case, patient=self._pending is None)
+        if verdict.best.name != Moved.name:
+            return self._adopt(case, verdict)
+        return self._learn_moved(case, free, LARGE, seconds, evidence)
+
+    def _case(self, before: RigBelief, age: int, cameras: tuple[int, ...], excluded: Mapping[str, str]) -> Case:
+        """Put together a case of cameras that seem to have moved before the latest `age` snapshots."""
+        kept = len(self._recent)
+        everything = self.filter.count - self.known_since == kept
+        moved = dict.fromkeys(sorted(self._moved_early))
+        beginning = free_cameras(self._prior, moved, JUMPS[-1]) if everything else None
+        snapshots, pauses = self._recent.snapshots(kept), self._recent.pauses(kept)
+        options = self.filter.options
+        return Case(before, snapshots, pauses, age, options, cameras, beginning=beginning, excluded=excluded)
+
+    def _adopt(self, case: Case, verdict: Verdict, new: bool = False) -> MonitorUpdate:
+        """Learn snapshots anew as the best explanation has them.
+
+        Args:
+            case: what was explained.
+            verdict: how.
+            new: the filter has not absorbed these snapshots before.
 
         Raises:
             RefusedError: see `absorb`.
         """
-        count, free = moved.count, dict(moved.cameras)
-        snapshots, pauses = moved.snapshots[-count:], moved.pauses[-count:]
-        if self.filter.count - count - self.first < FEW:
-            return self._begin_again(free, snapshots, pauses, {}, told)
-        result = self.filter.restart(free_cameras(moved.before, free, JUMPS[-1]), snapshots)
-        self._recent.took(snapshots, pauses, result)
-        return result, (*told, *self._begin(free, result, moved.before, sum(pauses)))
+        best, count = verdict.best, len(verdict.best.snapshots)
+        pauses, finding = case.pauses[-count:], best.finding
+        result = self._restart(best.before, best.snapshots, pauses, new)
+        self.open, self._pending = {}, None
+        if finding.shake is not None:
+            self.shaking.believe(finding.shake)
+        if finding.unsynchronized:
+            snapshots, uncertain = case.snapshots[-count:], self._is_new(count)
+            self.quarantine.add_unsynchronized(snapshots, pauses, finding.unsynchronized, uncertain)
+        change = finding.object_change
+        if change is not None:
+            change = replace(change, since=self.filter.count - count, odds=verdict.lead)
+        return MonitorUpdate(result, slips=self._slips_of(verdict), object_change=change)
 
-    def _begin_again(
+    def _slips_of(self, verdict: Verdict) -> tuple[ClockSlip, ...]:
+        """The slips of clocks that a verdict has found among the latest snapshots."""
+        since = self.filter.count - len(verdict.best.snapshots)
+        return tuple(replace(slip, since=since, odds=verdict.lead) for slip in verdict.best.finding.slips)
+
+    def _learn_moved(
         self,
+        case: Case,
         free: Mapping[int, str | None],
-        snapshots: Sequence[tuple[Observations, RigidTransform]],
-        pauses: Sequence[float],
-        evidence: Mapping[int, float],
-        told: Sequence[Change],
-    ) -> tuple[MeasurementUpdate, tuple[Change, ...]]:
-        """Learn from the snapshots since a change alone: before it, hardly anything had been learnt.
+        jump: float,
+        seconds: float,
+        evidence: Mapping[int, float] = MappingProxyType({}),
+    ) -> MonitorUpdate:
+        """Learn the latest snapshots of a case anew, with cameras that have moved before them.
+
+        Where hardly anything had been learnt before, only what the factory says is kept of that time.
+
+        Args:
+            case: those snapshots, and what was believed before them.
+            free: the cameras, and how they moved, None = in any way.
+            jump: pixels by which they may have.
+            seconds: since the snapshot before.
+            evidence: chi-squared of each camera that has not moved.
 
         Raises:
             RefusedError: see `absorb`; the monitor stays as it was.
         """
-        self._moved_early |= free.keys()
-        prior = free_cameras(self._prior, dict.fromkeys(sorted(self._moved_early)), JUMPS[-1])
-        result = self.filter.restart(prior, snapshots)
-        self._recent = RecentSnapshots(result.belief, self.filter.walk, self.noise.model_error)
-        self._recent.took(snapshots, pauses, result)
-        self.first = self.filter.count - len(snapshots)
-        nan, number = float("nan"), self.first
-        since = {camera: self.open[camera].since if camera in self.open else number for camera in free}
-        new = [Change(c, since[c], "unknown", nan, nan, True, evidence.get(c, nan)) for c in free]
-        self.open, self._since, self._suspect = {}, None, None
-        return result, (*told, *new)
-
-    def _begin(
-        self,
-        free: dict[int, str | None],
-        result: MeasurementUpdate,
-        before: RigBelief,
-        seconds: float,
-        evidence: Mapping[int, float] = MappingProxyType({}),
-    ) -> list[Change]:
-        """Open changes of cameras, and return those that are new."""
-        told, nan = [], float("nan")
-        for camera, kind in free.items():
-            if kind is None and camera not in self.open:
-                number = self.filter.count - len(result.brought)
-                self.open[camera] = Change(camera, number, "unknown", nan, nan, evidence=evidence.get(camera, nan))
-                told.append(self.open[camera])
-        self._since = PendingChange.of(result, before, seconds, free)
-        return told
-
-    def _alarmed(self, age: int) -> tuple[MeasurementUpdate, tuple[Change, ...]]:
-        """Let cameras free that have changed, the surest first, until what has been seen since then is explained."""
-        told: list[Change] = []
-        free: dict[int, str | None] = {}
-        since, test = self._since, self._recent.test(age)
-        age = likeliest_age(self._recent, surest(test), age)
-        if since is not None and age >= since.count - NEARBY:  # it was then that the open ones changed
-            again = surest(self._recent.test(age)) in since.kinds
-            # Again: the first snapshots were from the old place.
-            age = age if again else min(since.count, len(self._recent))
-            before, seconds, free = since.before, since.seconds, dict(since.kinds)
+        forget, nan = self._is_new(case.count), math.nan
+        early = self._moved_early | free.keys()
+        if forget:
+            before = free_cameras(self._prior, dict.fromkeys(sorted(early)), JUMPS[-1])
         else:
-            told = list(self._judged(last=True))
-            before, seconds = self._recent.belief_before(age), self._recent.seconds(age)
-        known = since is not None and bool(free)
-        free, evidence = changed_cameras(self._recent.test(age), free)
-        self.undecided |= dict.fromkeys(free, DOUBT)
-        snapshots = self._recent.snapshots(age)
-        if (in_time := self._in_time_since(before, age, free)) is not None:
-            return in_time, tuple(told)
-        if self.filter.count - age - self.first < FEW:
-            return self._begin_again(free, snapshots, self._recent.pauses(age), evidence, told)
-        moved = absorb(free_cameras(before, free), *stack_snapshots(snapshots), self.filter.options)
-        if not known and (found := changed_object(before, snapshots, self.filter.options, moved)) is not None:
-            return self._learn_object(*found, snapshots, self._recent.pauses(age)), tuple(told)
-        result = self.filter.restart(free_cameras(before, free), snapshots)
-        self._recent.restarted(result, age)
-        return result, (*told, *self._begin(free, result, before, seconds, evidence))
+            before = free_cameras(case.before, free, jump)
+        result = self._restart(before, case.latest, case.pauses[-case.count :])
+        number, new = self.filter.count - case.count, dict[int, Change]()
+        for camera, kind in free.items():
+            if forget or (kind is None and camera not in self.open):
+                since = self.open[camera].since if camera in self.open else number
+                new[camera] = Change(camera, since, "unknown", nan, nan, forget, evidence.get(camera, nan))
+        if forget:
+            self._moved_early, self.known_since = early, number
+            self.open, self._pending, self._suspect = {}, None, None
+        else:
+            self.open |= new
+            self._pending = PendingChange.of(result, case.before, seconds, dict(free))
+        return MonitorUpdate(result, tuple(new.values()))
 
-    def _in_time_since(
-        self, before: RigBelief, age: int, cameras: Mapping[int, str | None]
-    ) -> MeasurementUpdate | None:
-        """Learn the latest snapshots anew as cameras had seen them in time, or at rest, or without them.
+    def _restart(
+        self, before: RigBelief, snapshots: Sequence[Snapshot], pauses: Sequence[float], new: bool = False
+    ) -> MeasurementUpdate:
+        """Restart the filter with the latest snapshots.
 
-        Returns:
-            What was learnt; None = they have moved.
+        Args:
+            before: what was believed before them.
+            snapshots: observations (1, C, N) and the object's pose (1,) of each.
+            pauses: s before each of them.
+            new: the filter has not absorbed them before.
 
         Raises:
-            RefusedError: it cannot be told yet.
+            RefusedError: see `absorb`; the monitor stays as it was.
         """
-        count = len(self._recent)
-        snapshots, pauses = self._recent.snapshots(count), self._recent.pauses(count)
-        everything = self.filter.count - self.first == count
-        first = free_cameras(self._prior, dict.fromkeys(sorted(self._moved_early)), JUMPS[-1]) if everything else None
-        suspicion = Suspicion(before, snapshots, pauses, age, cameras, first)
-        answer = self._clocks.ask(suspicion, self.filter.count - age, self.filter.options, self._since is None)
-        if answer.kind == "moved":
-            return None
-        if answer.slipped is not None:
-            self.slips = answer.slipped.slips
-            before, snapshots = answer.slipped.before, answer.slipped.snapshots
-        elif answer.shaken is not None:
-            self.shaking.believe(answer.shaken.shake)
-            before, snapshots = answer.shaken.before, answer.shaken.snapshots
-        else:
-            before, snapshots = (before, snapshots[-age:]) if first is None else (first, snapshots)
-            few = self.filter.count - age - self.first < FEW
-            snapshots = self.held.hold_since(snapshots, pauses[-len(snapshots) :], cameras, few)
-        result = self.filter.restart(before, snapshots)
+        result = self.filter.restart(before, snapshots, new=len(snapshots) if new else 0)
         self._recent = RecentSnapshots(result.belief, self.filter.walk, self.noise.model_error)
-        self._recent.took(snapshots, pauses[-len(snapshots) :], result)
-        self.open, self._since = {}, None
+        self._recent.replace(snapshots, pauses, result)
         return result
 
-    def _learnt_object(self, age: int) -> MeasurementUpdate | None:
-        """Learn the object anew where snapshots fit worse because it has changed."""
+    def _diagnose_misfit(self, age: int) -> MonitorUpdate | None:
+        """Learn the object anew where the latest snapshots fit worse because it has changed."""
         age = min(age, len(self._recent))
-        if self.filter.count - age - self.first < UNSURE:
+        if self.filter.count - age - self.known_since < OBJECT_SNAPSHOTS:
             return None
-        with contextlib.suppress(RefusedError):
+        with contextlib.suppress(RefusedError):  # nothing was known of the rig
             before = self._recent.belief_before(age)
-            return self._asked_object(before, self._recent.snapshots(age), self._recent.pauses(age))
+            return self._adopt_object(before, self._recent.snapshots(age), self._recent.pauses(age))
         return None
 
-    def _learnt_first_object(self, result: MeasurementUpdate) -> MeasurementUpdate | None:
+    def _diagnose_first_misfit(self, result: MeasurementUpdate) -> MonitorUpdate | None:
         """Learn the object anew where it never was as its file says, and so the first snapshots do not fit."""
         count = self.filter.count
-        asked = not self.first and self._since is None and len(self._recent) == count
-        if not asked or not never_fitted(result, count):
+        first = not self.known_since and self._pending is None and len(self._recent) == count
+        if not first or not never_fitted(result, count):
             return None
-        with contextlib.suppress(RefusedError):
-            return self._asked_object(self._prior, self._recent.snapshots(count), self._recent.pauses(count))
-        return None
+        return self._adopt_object(self._prior, self._recent.snapshots(count), self._recent.pauses(count))
 
-    def ask_object(
-        self, snapshots: Sequence[tuple[Observations, RigidTransform]], pauses: Sequence[float], learnt: bool
-    ) -> MeasurementUpdate | None:
-        """Ask whether it is the object that has changed where labels do not fit; `object_change` says how.
+    def diagnose_object(
+        self, snapshots: Sequence[Snapshot], pauses: Sequence[float], learnt: bool
+    ) -> MonitorUpdate | None:
+        """Find out whether labels do not fit because the object has changed, and learn it anew then.
 
         Args:
             snapshots: observations (1, C, N), with those labels, and poses (1,): the latest ones.
@@ -361,86 +393,71 @@ class RigMonitor:
             learnt: they have been learnt without those labels; else not at all.
 
         Returns:
-            What they taught, with pose and residual of the last one; None = the object is as it was.
+            What they taught, and how it has changed; None = the object is as it was.
         """
-        self.object_change = None
-        if self._since is not None or (learnt and len(self._recent) < len(snapshots)):
+        if self._pending is not None or (learnt and len(self._recent) < len(snapshots)):
             return None
-        unlearnt, found = 0 if learnt else len(snapshots), None
-        self.filter.count += unlearnt
-        with contextlib.suppress(RefusedError):
+        found = None
+        with contextlib.suppress(RefusedError):  # nothing was known of the rig
             if learnt:
                 before = self._recent.belief_before(len(snapshots))
             else:
                 before = age_belief(self.filter.belief, self.filter.waited + pauses[0], self.filter.walk)
-            found = self._asked_object(before, snapshots, pauses)
-        if found is None:
-            self.filter.count -= unlearnt
-        return None if found is None else found.of_last()
+            found = self._adopt_object(before, snapshots, pauses, new=not learnt)
+        return None if found is None else replace(found, update=found.update.of_last())
 
-    def ask_clocks(
-        self, snapshots: Sequence[tuple[Observations, RigidTransform]], pauses: Sequence[float]
-    ) -> tuple[int, ...]:
-        """Ask which cameras are to be doubted where labels fit in most cameras no more; they are held then.
+    def quarantine_doubtful(self, snapshots: Sequence[Snapshot], pauses: Sequence[float]) -> tuple[int, ...]:
+        """Put cameras into quarantine because of which labels fit in most cameras no more.
 
         Args:
             snapshots: observations (1, C, N), with those labels, and poses (1,): of the latest ones, not learnt.
             pauses: s before each of them.
 
         Returns:
-            Those that have not been held before.
+            Those that are new there.
         """
-        if self._since is not None:
+        if self._pending is not None:
             return ()
         before = age_belief(self.filter.belief, self.filter.waited + pauses[0], self.filter.walk)
-        found, sure = doubtful_cameras(before, snapshots, self.filter.options)
-        new = tuple(sorted(set(found) - self.held.cameras))
+        try:
+            found, sure = doubtful_cameras(before, snapshots, pauses, self.filter.options)
+        except RefusedError:  # nothing explains these snapshots
+            return ()
+        new = tuple(sorted(set(found) - self.quarantine.cameras))
         if new:
-            self.held.hold(new, self.filter.count - self.first < FEW)
-            self.held.apart, self.held.seconds = sure, sum(pauses[1:])
+            self.quarantine.add(new, self._is_new())
+            self.quarantine.unsynchronized, self.quarantine.seconds = sure, sum(pauses[1:])
         return new
 
-    def _asked_object(
-        self,
-        before: RigBelief,
-        snapshots: Sequence[tuple[Observations, RigidTransform]],
-        pauses: Sequence[float],
-    ) -> MeasurementUpdate | None:
-        """Learn the object anew where that explains some snapshots.
+    def _adopt_object(
+        self, before: RigBelief, snapshots: Sequence[Snapshot], pauses: Sequence[float], new: bool = False
+    ) -> MonitorUpdate | None:
+        """Learn the object anew where a change of it explains some snapshots, which the filter has absorbed or are new.
 
-        Raises:
-            RefusedError: see `absorb`.
+        Returns:
+            What was learnt; None = it does not, or cannot be learnt.
         """
-        found = object_explains(before, snapshots, self.filter.options)
-        return None if found is None else self._learn_object(*found, snapshots, pauses)
+        case = Case(before, snapshots, pauses, len(snapshots), self.filter.options)
+        with contextlib.suppress(RefusedError):  # nothing explains these snapshots
+            verdict = weigh(case)
+            sure = Steady.name in verdict.explained and verdict.lead >= MISFIT_LEAD
+            if sure and verdict.best.name == ObjectChanged.name:
+                return self._adopt(case, verdict, new)
+        return None
 
-    def _learn_object(
-        self,
-        change: ObjectChange,
-        before: RigBelief,
-        snapshots: Sequence[tuple[Observations, RigidTransform]],
-        pauses: Sequence[float],
-    ) -> MeasurementUpdate:
-        """Go on with an object that is not as it was; its shape is learnt from now on."""
-        result = self.filter.restart(before, snapshots)
-        self.object_change = replace(change, since=self.filter.count - len(snapshots))
-        self._recent = RecentSnapshots(result.belief, self.filter.walk, self.noise.model_error)
-        self._recent.took(snapshots, pauses, result)
-        return result
-
-    def _judged(self, last: bool) -> tuple[Change, ...]:
+    def _decide_kinds(self, last: bool) -> tuple[Change, ...]:
         """Decide what kind of change each open one is, where the snapshots since can tell, or it is time."""
-        since = self._since
-        if since is None:
+        pending = self._pending
+        if pending is None:
             return ()
-        test = since.test(self.filter.walk)
-        told, kinds = since.judged(test, self.open, last)
-        since.kinds.update(kinds)
+        test = pending.test(self.filter.walk)
+        decided, kinds = pending.decide_kinds(test, self.open, last)
+        pending.kinds.update(kinds)
         if any(kind is not None for kind in kinds.values()):
-            first, belief, information = since.supposed(test)
-            self.filter.suppose(first, age_belief(belief, since.seconds, self.filter.walk))
-            self._recent.rebased(belief, information)
+            first, belief, information = pending.adopt_kinds(test)
+            self.filter.suppose(first, age_belief(belief, pending.seconds, self.filter.walk))
+            self._recent.rebase(belief, information)
         self.open = {camera: change for camera, change in self.open.items() if camera not in kinds}
         if not self.open:
-            self._since = None
-        return told
+            self._pending = None
+        return decided

@@ -6,11 +6,11 @@ cameras that move, over and over, and like a rig that is known better than it is
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -18,16 +18,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.errors import RefusedError
-from imgcal.estimation import EstimationOptions
-from imgcal.geometry import RigidTransform
-from imgcal.monitoring.measurement_update import absorb, stack_snapshots
-from imgcal.monitoring.rig_belief import RigBelief
+from imgcal.monitoring.case import Case, Explained, Explanation, Finding, Start, Variant
+from imgcal.monitoring.measurement_update import stack_snapshots
+from imgcal.monitoring.rig_belief import MeasurementUpdate
 from imgcal.types import Observations
 
 SHAKES = (0.15, 0.5, 1.5)
-"""Pixels, one standard deviation: by how much cameras are supposed to shake. What shakes by more is told as moved."""
+"""Pixels, one standard deviation: by how much cameras may shake. What shakes by more counts as moved."""
 EVERY = 64
-"""Snapshots of which it is asked how much cameras shake."""
+"""Snapshots after which the level is estimated anew."""
 OTHER = 2.0
 """Factor between two variances that are told apart; 1.3 comes by chance."""
 LEAST_POINTS = 3
@@ -37,53 +36,41 @@ LEAST_SHIFTS, SMOOTH = 4, 0.7
 Neumann's ratio (2 where each is drawn by itself) below which they do."""
 
 
-@dataclass(frozen=True)
-class Shaken:
-    """Some snapshots, if cameras shake."""
+class Shaking(Explanation):
+    """All cameras shake, or the suspected ones: by each of `SHAKES`."""
 
-    before: RigBelief  # what was believed before them
-    snapshots: list[tuple[Observations, RigidTransform]]
-    shake: Tensor  # (C,) px
-    evidence: float  # log probability, to compare with that of `MeasurementUpdate`
+    name = "shaking"
+
+    def variants(self, case: Case) -> Sequence[Callable[[], Variant]]:
+        """Let all that a camera sees in a snapshot be shifted alike."""
+        every = tuple(range(case.before.rig.num_cameras))
+        sets = dict.fromkeys((every, tuple(sorted(case.cameras)) or every))
+        return [
+            partial(shake_cameras, start, cameras, size) for start in case.starts for cameras in sets for size in SHAKES
+        ]
+
+    def premature(self, case: Case, found: Explained) -> str | None:
+        """Wait for several shifts: one shift twice is no random one, and a late clock shifts smoothly."""
+        if case.count < LEAST_SHIFTS:
+            return "too few snapshots to call their shifts random"
+        return "too little was seen before to exclude a late clock" if case.too_early else None
 
 
-def shaken(
-    before: RigBelief,
-    snapshots: Sequence[tuple[Observations, RigidTransform]],
-    cameras: Collection[int],
-    options: EstimationOptions,
-) -> Shaken | None:
-    """Suppose that cameras have shaken in some snapshots: all of them, or some, and nothing has moved.
+def shake_cameras(start: Start, cameras: Sequence[int], size: float) -> Variant:
+    """Let cameras shake by so many pixels, or by more where that is known."""
+    snapshots = []
+    for one, pose in start.snapshots:
+        shake = torch.zeros(1, one.seen.shape[1], dtype=torch.float64) if one.shake is None else one.shake.clone()
+        shake[:, list(cameras)] = shake[:, list(cameras)].clamp_min(size)
+        snapshots.append((replace(one, shake=shake), pose))
+    observations, _ = stack_snapshots(snapshots)
 
-    Args:
-        before: what was believed before them.
-        snapshots: observations (1, C, N) and the object's pose (1,) of each.
-        cameras: some that may shake while others do not.
-        options: how to minimize.
+    def find(result: MeasurementUpdate) -> Finding:
+        if _smooth(shared_shifts(observations, result.residual)[0][:, shake[0].numpy() > 0]):
+            raise RefusedError("the shifts follow each other smoothly, as those of a late clock do")
+        return Finding(shake=shake[0])
 
-    Returns:
-        The most probable of these; None = none explains the snapshots.
-    """
-    observations, poses = stack_snapshots(list(snapshots))
-    count, total = observations.seen.shape[:2]
-    known = torch.zeros(count, total, dtype=torch.float64) if observations.shake is None else observations.shake
-    best: tuple[float, Tensor, Tensor] | None = None
-    sets = dict.fromkeys((tuple(range(total)), tuple(sorted(cameras)) or tuple(range(total))))
-    for some in sets:
-        for size in SHAKES:
-            shake = known.clone()
-            shake[:, list(some)] = shake[:, list(some)].clamp_min(size)
-            with contextlib.suppress(RefusedError):
-                result = absorb(before, replace(observations, shake=shake), poses, options)
-                if best is None or result.evidence > best[0]:
-                    best = result.evidence, shake, result.residual
-    if best is None:
-        return None
-    evidence, shake, residual = best
-    if _smooth(shared_shifts(observations, residual)[0][:, shake[-1].numpy() > 0]):
-        return None
-    again = [(replace(one, shake=shake[s : s + 1]), pose) for s, (one, pose) in enumerate(snapshots)]
-    return Shaken(before, again, shake[-1], evidence - math.log(len(sets) * len(SHAKES)))
+    return Variant(start.before, snapshots, start.log_prior, find=find)
 
 
 def shared_shifts(observations: Observations, residual: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -137,7 +124,7 @@ class ShakeLevel:
         self.latest.clear()
 
     def take(self, observations: Observations, residual: Tensor) -> None:
-        """Take what a snapshot that nobody doubts has left: (1, C, N) and pixels (1, C, N, 2)."""
+        """Take what a snapshot without any suspicion has left: (1, C, N) and pixels (1, C, N, 2)."""
         (shift,), (variance,) = shared_shifts(observations, residual)
         both = np.concatenate((shift.T, variance[None]))
         both[:, observations.seen[0].sum(1).numpy() < LEAST_POINTS] = np.nan

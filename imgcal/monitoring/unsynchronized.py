@@ -7,22 +7,46 @@ camera explains one such pose as well, and not several: two or three snapshots t
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
+from imgcal.errors import RefusedError
 from imgcal.estimation import EstimationOptions
 from imgcal.geometry import RigidTransform, rotation_from_vector, vector_from_rotation
-from imgcal.monitoring.measurement_update import absorb
-from imgcal.monitoring.rig_belief import RigBelief
+from imgcal.monitoring.case import Case, Explanation, Finding, Start, Variant
+from imgcal.monitoring.measurement_update import absorb, stack_snapshots
+from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief
 from imgcal.types import Observations
 
 ELSEWHERE = (0.2,) * 3 + (50.0,) * 3
 """Standard deviations of the pose (rad, mm) in which such a camera sees the object, about that of the others."""
 NUDGE = (1e-5,) * 3 + (1e-3,) * 3
 """By which a pose is changed for derivatives (rad, mm)."""
+LEAST_SNAPSHOTS = 2
+"""Snapshots that tell a camera that has moved from one with moments of its own: one explains any pose of the object."""
+
+
+class Unsynchronized(Explanation):
+    """The suspected cameras, or the surest alone, see the object at moments of their own."""
+
+    name = "unsynchronized"
+
+    def variants(self, case: Case) -> Sequence[Callable[[], Variant]]:
+        """Let the cameras see the object in poses of their own."""
+        if case.count < LEAST_SNAPSHOTS:
+            raise RefusedError("a single snapshot is explained by a move as well")
+        return [partial(_unsynchronize, case, start, cameras) for start in case.starts for cameras in case.camera_sets]
+
+
+def _unsynchronize(case: Case, start: Start, cameras: tuple[int, ...]) -> Variant:
+    """Suppose that some cameras see the object at moments of their own."""
+    snapshots = [(drop_cameras(one, cameras), pose) for one, pose in start.snapshots]
+    own = partial(_evidence_of_own_poses, stack_snapshots(start.snapshots)[0], cameras, case.options)
+    return Variant(start.before, snapshots, start.log_prior, own, lambda _: Finding(unsynchronized=cameras))
 
 
 def unsynchronized_evidence(
@@ -47,15 +71,32 @@ def unsynchronized_evidence(
     Raises:
         RefusedError: the other cameras, or one of these, do not determine poses.
     """
-    result = absorb(before, without(observations, cameras), rig_from_object, options)
-    poses, evidence = result.rig_from_object, result.evidence
+    result = absorb(before, drop_cameras(observations, cameras), rig_from_object, options)
+    return result.evidence + _evidence_of_own_poses(observations, cameras, options, result)
+
+
+def _evidence_of_own_poses(
+    observations: Observations, cameras: Collection[int], options: EstimationOptions, result: MeasurementUpdate
+) -> float:
+    """Log probability of what cameras with moments of their own see, given what the others taught.
+
+    Args:
+        observations: (S, C, N).
+        cameras: those with moments of their own, each.
+        options: how to minimize.
+        result: the same snapshots without these cameras, absorbed.
+
+    Raises:
+        RefusedError: the other cameras, or one of these, do not determine poses.
+    """
+    poses, evidence = result.rig_from_object, 0.0
     spread = torch.tensor(ELSEWHERE, dtype=torch.float64)
-    others = _pose_information(result.belief, without(observations, cameras), poses)
+    others = _pose_information(result.belief, drop_cameras(observations, cameras), poses)
     every = _pose_information(result.belief, observations, poses)
     evidence += 0.5 * float((torch.logdet(every) - torch.logdet(others)).sum())  # `absorb` leaves out what all share
     for camera in cameras:
         rest = [other for other in range(observations.seen.shape[1]) if other != camera]
-        alone = without(observations, rest)
+        alone = drop_cameras(observations, rest)
         rows = alone.seen[:, camera].any(-1).nonzero()[:, 0]
         if not len(rows):
             continue
@@ -71,8 +112,8 @@ def unsynchronized_evidence(
     return evidence
 
 
-def without(observations: Observations, cameras: Collection[int]) -> Observations:
-    """The same, some cameras having seen nothing."""
+def drop_cameras(observations: Observations, cameras: Collection[int]) -> Observations:
+    """Drop what some cameras have seen."""
     seen = observations.seen.clone()
     seen[:, list(cameras)] = False
     return replace(observations, seen=seen)

@@ -24,7 +24,7 @@ SAID: Mapping[CameraHealth, str] = {
 def health_of(memory: KeeperMemory) -> dict[str, CameraHealth]:
     """How each camera is, by name."""
     found: dict[str, CameraHealth] = {}
-    doubted = {*memory.sightings.doubted, *memory.monitor.held.cameras, *memory.monitor.undecided}
+    doubted = {*memory.sightings.doubted, *memory.monitor.quarantine.cameras, *memory.monitor.undecided}
     if memory.in_vain >= VAIN:
         doubted |= set(range(memory.prior.num_cameras))  # nobody knows yet which of them are not where they were
     for camera, name in enumerate(memory.prior.camera_names):

@@ -16,7 +16,7 @@ from imgcal.association import PipelineOptions, Proposer
 from imgcal.detection import DetectionOptions, Frame
 from imgcal.errors import InputError, RefusedError
 from imgcal.geometry import RigidTransform
-from imgcal.monitoring import Change, MeasurementUpdate, RigBelief
+from imgcal.monitoring import MeasurementUpdate, MonitorUpdate, RigBelief
 from imgcal.online.camera_health import health_of, sentence_of, take_health
 from imgcal.online.clock import ClockOffsets, apart_event
 from imgcal.online.default_tests import default_tests
@@ -143,21 +143,20 @@ class RigKeeper:
         detections = self._labelling.blobs(source, snapshot_name(memory.count))
         frames = None if isinstance(source, Detections) else source
         memory.count, memory.time = memory.count + 1, time
-        labelled, result, refused = None, None, None
-        changes: tuple[Change, ...] = ()
+        labelled, found, refused = None, None, None
         shown, lag = replace(detections, fiducial=np.full(len(detections), -1, dtype=np.int64)), self._lag(detections)
         try:
             labelled, shown, lag = self._labelled(detections, lag, frames)
-            result, changes = learnt_from(memory, labelled.checked)
+            found = learnt_from(memory, labelled.checked)
             self._labelling.follow(memory.poses[-1][1][0])
         except RefusedError as reason:
             self._labelling.follows, refused = False, str(reason)
         events, memory.pending = memory.pending, []
-        if result is not None:
-            events += self._told(changes)
-        state = self._state(shown, lag, result, refused)
+        if found is not None:
+            events += self._told(found)
+        state = self._state(shown, lag, None if found is None else found.update, refused)
         out = silent if frames is None else [name for name in memory.prior.camera_names if frames.get(name) is None]
-        return self._concluded(state, frames, frozenset(out), labelled, result, events)
+        return self._concluded(state, frames, frozenset(out), labelled, found, events)
 
     def _labelled(
         self, detections: Detections, lag: NDArray[np.float64], frames: Mapping[str, Frame | None] | None
@@ -197,16 +196,16 @@ class RigKeeper:
         memory = self._memory
         return in_time(blobs, self._clock.late, memory.belief, [*memory.poses, *now], memory.time)
 
-    def _told(self, changes: tuple[Change, ...]) -> list[Event]:
+    def _told(self, found: MonitorUpdate) -> list[Event]:
         """Say what the monitor found with a snapshot that was learnt."""
         memory, events = self._memory, []
-        for change in changes:
+        for change in found.changes:
             since = memory.since(change.since, change.camera)
             told = memory.relearning.events.get(change.camera)
             if told is not None and told.change == "unknown" and told.since is not None:  # the same, told again
                 since = told.since
             events.append(memory.relearning.told(change, since, memory.time, memory.count - 1, memory.before))
-        if (of_object := memory.monitor.object_change) is not None:
+        if (of_object := found.object_change) is not None:
             events.append(object_event(of_object, memory.since(of_object.since), memory.time, memory.count - 1))
         return events
 
@@ -250,28 +249,28 @@ class RigKeeper:
         frames: Mapping[str, Frame | None] | None,
         out: frozenset[str],
         labelled: Labelled | None,
-        result: MeasurementUpdate | None,
+        found: MonitorUpdate | None,
         events: list[Event],
     ) -> RigState:
         """Add what became known of cameras, and what is said of them."""
         memory, time, number = self._memory, state.time, state.snapshot
         names = memory.prior.camera_names
-        for slip in memory.monitor.slips if result is not None else ():
+        for slip in () if found is None else found.slips:
             events += self._clock.slipped(state, slip, memory.since(slip.since, slip.camera))
             state = replace(state, lag=self._lag(state.detections))
-        for camera in memory.monitor.apart if result is not None else ():
+        for camera in () if found is None else found.unsynchronized:
             events.append(apart_event(names[camera], memory.off.get(camera, time), time, number))
         silent = (camera for camera, name in enumerate(names) if name in out)
         # A camera with moments of its own has not moved far.
-        astray = frozenset() if labelled is None else labelled.astray - memory.monitor.held.cameras
+        astray = frozenset() if labelled is None else labelled.astray - memory.monitor.quarantine.cameras
         look = Look(time, number, state.detections, state.predicted, astray, frozenset(silent))
         events += memory.sightings.take(state.rig, look)
         events += memory.relearning.learnt(memory.belief, frozenset(memory.monitor.open), time, number)
-        if result is not None:
+        if found is not None:
             unsettled = frozenset(memory.relearning.events) | frozenset(memory.sightings.lost) | frozenset(memory.off)
             events += memory.drift_watch.take(memory.belief, unsettled, time, number)
         for test in self.tests:
-            for event in test(state, frames, result):
+            for event in test(state, frames, None if found is None else found.update):
                 events.append(event)
                 take_health(memory, event)
         health = health_of(memory)

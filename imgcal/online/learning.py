@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from imgcal.monitoring import Change, MeasurementUpdate, RigFilter, RigMonitor
+from imgcal.monitoring import MonitorUpdate, RigFilter, RigMonitor
 from imgcal.online.drift_watch import DriftWatch
 from imgcal.online.keeper_memory import LEAST_LOOKS, KeeperMemory
 from imgcal.online.label_checks import Checked
 from imgcal.online.object_doubts import ObjectDoubts
 
 
-def learnt_from(memory: KeeperMemory, checked: Checked) -> tuple[MeasurementUpdate, tuple[Change, ...]]:
+def learnt_from(memory: KeeperMemory, checked: Checked) -> MonitorUpdate:
     """Absorb a snapshot; what a camera sees that does not fit for the first time waits for the next one.
 
     Args:
@@ -21,7 +21,7 @@ def learnt_from(memory: KeeperMemory, checked: Checked) -> tuple[MeasurementUpda
         checked: the snapshot of `memory.time`, with its labels.
 
     Returns:
-        What it taught, and the changes of cameras that became known.
+        What it taught, and what became known.
 
     Raises:
         RefusedError: see `RigMonitor.update`.
@@ -39,34 +39,35 @@ def learnt_from(memory: KeeperMemory, checked: Checked) -> tuple[MeasurementUpda
     observations = memory.observed(blobs)
     if not off and not still_open:
         memory.before = memory.belief
-    first = monitor.first
-    result, changes = monitor.update(observations, checked.rig_from_object, seconds, moved)
-    if monitor.first != first:  # nothing that was known before counts any more
+    found = monitor.update(observations, checked.rig_from_object, seconds, moved)
+    if found.restarted:
         memory.drift_watch = DriftWatch(memory.prior.camera_names)
         memory.looks[:] = 0
     memory.times.append((monitor.filter.count - 1, time))
-    if changes or monitor.open or monitor.object_change is not None:
+    if found.changes or monitor.open or found.object_change is not None:
         memory.doubts = ObjectDoubts(memory.obj.num_fiducials)
     elif memory.doubts.take(checked, blobs, seconds, time):
-        result = ask_object(memory, learnt=True) or result
+        of_object = ask_object(memory, learnt=True)
+        if of_object is not None:
+            found = replace(found, update=of_object.update, object_change=of_object.object_change)
     memory.looks += observations.seen[0].any(-1).numpy()
-    memory.looks[[change.camera for change in changes]] = 0
+    memory.looks[[change.camera for change in found.changes]] = 0
     seen = np.unique(checked.given.camera[checked.given.fiducial >= 0])
     waits = {camera: since for camera, since in memory.off.items() if camera not in seen}  # for the next that it shows
     memory.off, memory.learnt, memory.in_vain = waits | off, time, 0
-    if monitor.slips:  # poses were off that have been found with blobs of another time
+    if found.slips:  # poses were off that have been found with blobs of another time
         memory.poses.clear()
-    memory.poses.append((time, result.rig_from_object))
+    memory.poses.append((time, found.update.rig_from_object))
     memory.labels = checked.labels
     memory.search.learnt(checked.blobs, memory.count - 1)
     memory.usual.append(checked.usual)
-    steady = not (off or changes or monitor.open or monitor.slips)
-    if memory.noise.take(blobs, observations, result, steady, monitor.filter.count):
-        result = _again(memory, result)
-    return result, changes
+    steady = not (off or found.changes or monitor.open or found.slips)
+    if memory.noise.take(blobs, observations, found.update, steady, monitor.filter.count):
+        found = replace(_relearn(memory, found), changes=found.changes)
+    return found
 
 
-def ask_object(memory: KeeperMemory, learnt: bool) -> MeasurementUpdate | None:
+def ask_object(memory: KeeperMemory, learnt: bool) -> MonitorUpdate | None:
     """Ask whether labels do not fit because the object is not as its file says; what was learnt then.
 
     Args:
@@ -76,30 +77,30 @@ def ask_object(memory: KeeperMemory, learnt: bool) -> MeasurementUpdate | None:
     doubted = memory.doubts.learnt if learnt else memory.doubts.refused
     snapshots = [(memory.observed(one.blobs), one.rig_from_object) for one in doubted]
     first = memory.monitor.filter.count
-    result = memory.monitor.ask_object(snapshots, [one.seconds for one in doubted], learnt)
-    if result is not None and not learnt:
+    found = memory.monitor.diagnose_object(snapshots, [one.seconds for one in doubted], learnt)
+    if found is not None and not learnt:
         memory.times.extend((first + n, one.time) for n, one in enumerate(doubted))
         memory.learnt = doubted[-1].time
-    memory.doubts.asked(result is not None)
-    return result
+    memory.doubts.asked(found is not None)
+    return found
 
 
 def ask_clocks(memory: KeeperMemory) -> bool:
     """Ask whether labels fit in no camera because of some that are to be held then."""
     doubted = memory.doubts.refused
     snapshots = [(memory.observed(one.blobs), one.rig_from_object) for one in doubted]
-    held = memory.monitor.ask_clocks(snapshots, [one.seconds for one in doubted])
+    held = memory.monitor.quarantine_doubtful(snapshots, [one.seconds for one in doubted])
     if held:
         memory.off |= dict.fromkeys(held, doubted[0].time)
         memory.doubts = ObjectDoubts(memory.obj.num_fiducials)
     return bool(held)
 
 
-def _again(memory: KeeperMemory, result: MeasurementUpdate) -> MeasurementUpdate:
+def _relearn(memory: KeeperMemory, found: MonitorUpdate) -> MonitorUpdate:
     """Learn the first snapshots again, with the noise that they have shown."""
     monitor = RigMonitor(RigFilter(memory.prior, memory.obj, memory.drift, memory.options.estimation))
     for blobs, pose in memory.noise.first:
-        result, _ = monitor.update(memory.observed(blobs), pose)
+        found = monitor.update(memory.observed(blobs), pose)
     memory.monitor = monitor
     memory.doubts = ObjectDoubts(memory.obj.num_fiducials)
-    return result
+    return found

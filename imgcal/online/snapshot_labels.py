@@ -65,9 +65,8 @@ def labelled_snapshot(
     checked = _checked(memory, blobs, pose.reshape(1))
     if checked.usual > memory.most_usual and memory.doubts.due and ask_clocks(memory):
         checked = _checked(memory, blobs, pose.reshape(1))
-    if checked.usual > memory.most_usual and memory.doubts.due and ask_object(memory, learnt=False) is not None:
-        change = memory.monitor.object_change
-        assert change is not None
+    changed = checked.usual > memory.most_usual and memory.doubts.due and ask_object(memory, learnt=False)
+    if changed and (change := changed.object_change) is not None:
         memory.pending.append(object_event(change, memory.since(change.since), memory.time, memory.count - 1))
         checked = _checked(memory, blobs, pose.reshape(1))
     if checked.usual > memory.most_usual:
@@ -113,13 +112,13 @@ def _checked(memory: KeeperMemory, named: Detections, pose: RigidTransform) -> C
     """See which labels fit; cameras with moments of their own have no say in where the object is."""
     given = memory.belief.rig, memory.obj_now, pose, memory.options
     every = check_labels(named, *given)
-    if not memory.monitor.held.cameras:
+    if not memory.monitor.quarantine.cameras:
         return every
-    held = np.isin(named.camera, list(memory.monitor.held.cameras))
+    held = np.isin(named.camera, list(memory.monitor.quarantine.cameras))
     others = check_labels(replace(named, fiducial=np.where(held, -1, named.fiducial)), *given)
     fiducial = np.where(held, every.blobs.fiducial, others.blobs.fiducial)
     blobs, labels = replace(others.blobs, fiducial=fiducial), int((fiducial >= 0).sum())
-    off = others.off | every.off & np.isin(np.arange(len(every.off)), list(memory.monitor.held.cameras))
+    off = others.off | every.off & np.isin(np.arange(len(every.off)), list(memory.monitor.quarantine.cameras))
     return replace(others, blobs=blobs, given=every.given, off=off, labels=labels)
 
 

@@ -51,12 +51,12 @@ class Followed:
             pose = initial_pose(observations, self.monitor.filter.belief.rig, self.stream.obj)
         seconds = (number - self.last) / self.stream.conditions.rate
         try:
-            result, changes = self.monitor.update(observations, pose, seconds)
+            found = self.monitor.update(observations, pose, seconds)
         except RefusedError:
             return None
-        self.pose, self.last = result.rig_from_object, number
+        self.pose, self.last = found.update.rig_from_object, number
         self.numbers.append(number)
-        self.told += [(number, change) for change in changes]
+        self.told += [(number, change) for change in found.changes]
         return observations
 
     @property

@@ -35,7 +35,7 @@ def followed(count: int, seed: int = 5, rate: float = 60.0, **happened) -> Follo
         result = follows.follow(observations, poses[number : number + 1], 1 / rate)
         recent.append(result, observations, 1 / rate)
         if follows.due:
-            recent.relinearized(follows.relinearize())
+            recent.relinearize(follows.relinearize())
         beliefs.append(follows.belief)
         snapshots.append((observations, result.rig_from_object))
     return Followed(stream, follows, recent, beliefs, snapshots)

@@ -2,7 +2,7 @@
 
 import math
 
-from imgcal.monitoring.change_search import SIGNIFICANT, changed_before, changed_cameras, likeliest_age, surest
+from imgcal.monitoring.change_search import ALARM_CHI2, changed_cameras, find_alarm, likeliest_age, likeliest_camera
 from scripts.benchmarks.rig_streams import Bump
 from tests.imgcal.monitoring.followed import followed
 
@@ -11,18 +11,18 @@ TURN = math.radians(0.1)
 
 def test_a_steady_rig_has_not_changed() -> None:
     steady = followed(40)
-    assert changed_before(steady.recent, steady.filter.count) is None
+    assert find_alarm(steady.recent, steady.filter.count) is None
 
 
 def test_a_camera_that_was_turned_is_found_with_its_moment() -> None:
     turned = followed(46, bumps=[Bump(40, 2, "rotation", TURN)])
-    age = changed_before(turned.recent, turned.filter.count)
+    age = find_alarm(turned.recent, turned.filter.count)
     assert age is not None
     test = turned.recent.test(age)
-    assert surest(test) == 2
+    assert likeliest_camera(test) == 2
     assert likeliest_age(turned.recent, 2, age) == 6
     free, evidence = changed_cameras(turned.recent.test(6), {})
-    assert free == {2: None} and evidence[2] >= SIGNIFICANT
+    assert free == {2: None} and evidence[2] >= ALARM_CHI2
 
 
 def test_two_cameras_are_found_and_what_is_known_is_not_found_again() -> None:
@@ -32,4 +32,4 @@ def test_two_cameras_are_found_and_what_is_known_is_not_found_again() -> None:
     assert free.keys() == evidence.keys() == {1, 3}
     free, evidence = changed_cameras(test, {1: "rotation"})
     assert free == {1: "rotation", 3: None} and evidence.keys() == {3}
-    assert surest(test, known={1}) == 3
+    assert likeliest_camera(test, known={1}) == 3

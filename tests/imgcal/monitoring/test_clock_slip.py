@@ -20,10 +20,10 @@ def told(**happened) -> tuple[list, list]:
     for number in range(BEFORE + 30):
         observations = seen.of_snapshots([number])
         pose = initial_pose(observations, monitor.filter.belief.rig, stream.obj) if pose is None else pose
-        result, changes = monitor.update(observations, pose, 1 / 60)
-        pose = result.rig_from_object
-        if changes or monitor.slips:
-            return list(changes), list(monitor.slips)
+        found = monitor.update(observations, pose, 1 / 60)
+        pose = found.update.rig_from_object
+        if found.changes or found.slips:
+            return list(found.changes), list(found.slips)
     return [], []
 
 

@@ -7,9 +7,10 @@ import torch
 
 import imgcal
 from imgcal.monitoring import CHANGES, ChangeTest, RigBelief, RigFilter, RigMonitor, change_of_errors, pixel_changes
-from imgcal.monitoring.drift_pace import SECONDS, DriftPaces, Stretch
+from imgcal.monitoring.drift_pace import ADDED_TOGETHER, STRETCH_SECONDS, DriftLearning, DriftPaces, Stretch
 from imgcal.types import CameraRig, DriftRate
 from scripts.benchmarks.rig_streams import Conditions, Stream
+from tests.imgcal.monitoring.followed import Followed, followed
 
 STEADY = DriftRate(0.0, 0.0, 0.0, 0.0, 0.0)
 RATE = 10.0  # snapshots/s
@@ -24,7 +25,7 @@ def known(sigma: float = 0.01) -> RigBelief:
 def drifted(belief: RigBelief, step: torch.Tensor, generator: torch.Generator) -> Stretch:
     """A stretch that measured every value, twice as well as it was known, of a rig that went by a step (C, K)."""
     stretch = Stretch.after(belief)
-    stretch.seconds = SECONDS
+    stretch.seconds = STRETCH_SECONDS
     brought = 4 * belief.information
     error = torch.einsum("cij,cj->ci", change_of_errors(belief.rig, belief.unit), step).flatten()
     noise = torch.linalg.cholesky(brought) @ torch.randn(len(brought), generator=generator, dtype=torch.float64)
@@ -37,7 +38,7 @@ def test_a_pace_is_learnt_of_its_camera_and_kind_and_forgotten() -> None:
     walk = DriftRate().std(belief.rig)
     noise = belief.std()  # and no more: what is known leaves room for nothing but drift
     step = torch.zeros(4, 15, dtype=torch.float64)
-    step[2, 6:8] = 10 * walk[2, 6:8] * math.sqrt(SECONDS / 3600) + 3 * noise[2, 6:8]
+    step[2, 6:8] = 10 * walk[2, 6:8] * math.sqrt(STRETCH_SECONDS / 3600) + 3 * noise[2, 6:8]
     lacking = sum(paces.take(drifted(belief, step, generator), walk) for _ in range(8))
     pace = paces.squared.sqrt()
     assert pace[2, 2] > 10
@@ -56,7 +57,7 @@ def test_what_is_added_up_is_what_the_snapshots_say() -> None:
     there = RigBelief.of_prior(belief.rig.retract(0.5 * step), belief.obj, belief.unit)
     error = torch.einsum("cij,cj->ci", change_of_errors(belief.rig, belief.unit), 0.5 * step).flatten()
     other.add(there, whole.brought, whole.pull - whole.brought @ error)  # the same from another place
-    other.seconds = SECONDS
+    other.seconds = STRETCH_SECONDS
     torch.testing.assert_close(other.pull, whole.pull, rtol=1e-4, atol=1e-6 * float(whole.pull.abs().max()))
     test = other.test(STEADY)
     assert torch.allclose(test.learnt, whole.test(STEADY).learnt)
@@ -90,7 +91,7 @@ def crept(turn: float, seconds: int, seed: int) -> tuple[RigMonitor, CameraRig, 
         observations, _ = made.labelled(first, last)
         for row in range(last - first):
             one = observations.of_snapshots([row])
-            told += len(monitor.update(one, poses[row : row + 1], 1 / RATE)[1])
+            told += len(monitor.update(one, poses[row : row + 1], 1 / RATE).changes)
         made.creep = creep
     return monitor, made.rig, told
 
@@ -106,3 +107,36 @@ def test_a_camera_that_turns_slowly_is_followed_without_alarm_and_known_to_be(tu
     assert 0.4 < squared < 1.8
     assert float(pace[[0, 1, 3]].max()) < 1.5
     assert (float(pace[2, :3].max()) > 1.7) == (turn > 0)
+
+
+def grown_up() -> Followed:
+    """A filter whose first snapshots are no longer kept."""
+    made = followed(40)
+    made.filter._young = False
+    return made
+
+
+def test_it_begins_once_the_filter_has_grown_up_and_nothing_has_changed() -> None:
+    made, learning = followed(20), DriftLearning(DriftPaces(4))
+    learning.take(made.filter, made.recent, 1 / 60, quiet=True)
+    assert learning.stretch is None  # young
+    made = grown_up()
+    learning.take(made.filter, made.recent, 1 / 60, quiet=True)
+    assert learning.stretch is not None
+    learning.take(made.filter, made.recent, 1 / 60, quiet=False)
+    assert learning.stretch is None
+
+
+def test_snapshots_are_added_to_the_stretch_and_a_stretch_to_the_paces() -> None:
+    made, learning = grown_up(), DriftLearning(DriftPaces(4))
+    for _ in range(ADDED_TOGETHER):
+        learning.take(made.filter, made.recent, 0.1, quiet=True)
+    assert learning.stretch is not None and learning.waiting == ADDED_TOGETHER - 1
+    assert not learning.stretch.brought.any()
+    learning.take(made.filter, made.recent, 0.1, quiet=True)
+    assert learning.waiting == 0 and bool(learning.stretch.brought.any())
+    known = learning.stretch
+    learning.paces.squared[1] = 9.0
+    learning.take(made.filter, made.recent, 20.0, quiet=True)
+    assert learning.stretch is not known and learning.stretch.seconds < 20.0
+    assert torch.equal(made.filter.pace, learning.paces.of_parameters(15))

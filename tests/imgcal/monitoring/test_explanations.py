@@ -1,132 +1,160 @@
-"""A clock that slips and a camera that moves are told apart, where the object moves; what cannot be told waits."""
+"""All explanations of a case are compared in the same measure; what cannot be decided waits."""
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import pytest
 import torch
 
 from imgcal.errors import RefusedError
-from imgcal.estimation import EstimationOptions
-from imgcal.monitoring import ClockSlip
-from imgcal.monitoring.clock_slip import Slipped
-from imgcal.monitoring.explanations import SLIP_ODDS, SLIP_PATIENCE, ExplanationSearch, Suspicion
+from imgcal.monitoring import ClockSlip, absorb
+from imgcal.monitoring.case import Case, Explained, Explanation, Finding, Variant
+from imgcal.monitoring.change_test import JUMPS
+from imgcal.monitoring.clock_slip import ClockSlipped
+from imgcal.monitoring.explanations import EXPLANATIONS, LEAD, PATIENCE, Diagnosis, Moved, doubtful_cameras, weigh
+from imgcal.monitoring.measurement_update import stack_snapshots
+from imgcal.monitoring.pending_change import free_cameras
+from imgcal.monitoring.shaking import Shaking
 from scripts.benchmarks.rig_streams import Bump, Slip
-from tests.imgcal.monitoring.followed import followed
+from tests.imgcal.monitoring.followed import Followed, followed
 
-BEFORE, COUNT, OPTIONS = 40, 3, EstimationOptions()
+BEFORE, COUNT = 40, 3
 
 
-def suspected(cameras: list[int], **happened) -> Suspicion:
-    """Cameras that seem to have moved before the last snapshots."""
-    made = followed(BEFORE + COUNT, **happened)
-    return Suspicion(
-        made.beliefs[BEFORE], made.snapshots, [1 / 60] * len(made.snapshots), COUNT, dict.fromkeys(cameras)
-    )
+def case_of(made: Followed, rate: float = 60.0, **more) -> Case:
+    """Camera 2 seems to have moved before the last snapshots."""
+    count = len(made.snapshots) - BEFORE
+    case = Case(made.beliefs[BEFORE], made.snapshots, [1 / rate] * len(made.snapshots), count, cameras=(2,))
+    return replace(case, **more)
+
+
+@dataclass(frozen=True)
+class Known(Explanation):
+    """An explanation whose evidence is known, and whose variants give it or fail."""
+
+    name: str
+    evidences: tuple[float | str, ...]
+    log_prior: float = 0.0
+    why_premature: str | None = None
+
+    def variants(self, case: Case) -> Sequence[Callable[[], Variant]]:
+        return [lambda given=given: self._variant(case, given) for given in self.evidences]
+
+    def _variant(self, case: Case, given: float | str) -> Variant:
+        if isinstance(given, str):
+            raise RefusedError(given)
+        slip = ClockSlip(1, 0, given, 1e-4, math.nan)
+        known = absorb(case.before, *stack_snapshots(case.latest)).evidence
+        return Variant(case.before, case.latest, given - known, find=lambda _: Finding((slip,)))
+
+    def premature(self, case: Case, found: Explained) -> str | None:
+        return self.why_premature
+
+
+@pytest.fixture(scope="module")
+def case() -> Case:
+    made = followed(COUNT)
+    return Case(made.beliefs[0], made.snapshots, [1 / 60] * COUNT, COUNT)
+
+
+def test_the_evidence_is_the_mean_over_all_variants_times_the_prior(case: Case) -> None:
+    one, many = Known("one", (2.0,)), Known("many", (2.0, -90.0, "no minimum", -90.0), log_prior=0.5)
+    verdict = weigh(case, (many, one))
+    assert list(verdict.explained) == ["one", "many"] and not verdict.reasons
+    assert verdict.evidence("one") == pytest.approx(2.0, abs=1e-6)
+    assert verdict.evidence("many") == pytest.approx(2.5 - math.log(4), abs=1e-6)
+    assert verdict.lead == pytest.approx(math.log(4) - 0.5, abs=1e-6)
+    assert verdict.explained["many"].finding.slips[0].seconds == 2.0  # of its best variant
+
+
+def test_what_cannot_be_weighed_says_why_and_wins_nothing(case: Case) -> None:
+    failed, excluded = Known("failed", ("no minimum", "no pose")), Known("excluded", (90.0,))
+    verdict = weigh(replace(case, excluded={"excluded": "tested before"}), (failed, excluded, Known("left", (-9.0,))))
+    assert verdict.best.name == "left" and verdict.lead == math.inf
+    assert verdict.reasons == {"failed": "no minimum; no pose", "excluded": "tested before"}
+    assert verdict.evidence("failed", "excluded") == -math.inf
+    with pytest.raises(RefusedError, match="failed: no minimum; no pose"):
+        weigh(case, (failed,))
+
+
+def test_what_cannot_be_decided_waits_and_is_then_what_is_more_probable(case: Case) -> None:
+    table: tuple[Explanation, ...] = (Known("a", (1.0,)), Known("b", (0.0,)))
+    diagnosis = Diagnosis()
+    for _ in range(PATIENCE):
+        with pytest.raises(RefusedError, match="a cannot be told from the rest yet: no explanation leads by 5"):
+            diagnosis.decide(case, True, table)
+    assert diagnosis.decide(case, True, table).best.name == "a"
+    assert Diagnosis().decide(case, False, table).best.name == "a"
+    assert Diagnosis().decide(case, True, (Known("a", (2 * LEAD,)), table[1])).best.name == "a"
+    premature = Known("a", (2 * LEAD,), why_premature="one snapshot")
+    with pytest.raises(RefusedError, match="yet: one snapshot"):
+        Diagnosis().decide(case, False, (premature, table[1]))
+
+
+def test_the_table_names_each_explanation_once() -> None:
+    names = [explanation.name for explanation in EXPLANATIONS]
+    assert len(set(names)) == len(names)
 
 
 @pytest.mark.parametrize("late", [0.002, -0.01, 0.0167])
 def test_a_slip_is_more_probable_than_a_move(late: float) -> None:
-    odds, slipped = suspected([2], slips=[Slip(BEFORE, 2, late)]).clocks(OPTIONS)
-    assert odds > 0 and slipped is not None
-    (slip,) = slipped.slips
+    verdict = weigh(case_of(followed(BEFORE + COUNT, slips=[Slip(BEFORE, 2, late)])), (Moved(), ClockSlipped()))
+    assert verdict.best.name == "clock slip"
+    (slip,) = verdict.best.finding.slips
     assert slip.camera == 2
     assert slip.seconds == pytest.approx(late, abs=max(5 * slip.sigma, 2e-4))
 
 
 @pytest.mark.parametrize(("kind", "size"), [("rotation", math.radians(0.3)), ("position", 3.0)])
-def test_a_move_is_more_probable_than_a_slip(kind: str, size: float) -> None:
-    odds, _ = suspected([2], bumps=[Bump(BEFORE, 2, kind, size)]).clocks(OPTIONS)
-    assert odds < -SLIP_ODDS
+def test_a_move_is_more_probable_than_anything_else(kind: str, size: float) -> None:
+    verdict = weigh(case_of(followed(BEFORE + COUNT, bumps=[Bump(BEFORE, 2, kind, size)])))
+    assert verdict.best.name == "moved" and verdict.lead > LEAD
+    assert verdict.evidence("clock slip") < verdict.evidence("moved") - LEAD
+    assert set(verdict.explained) | set(verdict.reasons) == {one.name for one in EXPLANATIONS}
 
 
-@dataclass
-class Told:
-    """A suspicion whose answer is known."""
-
-    odds: float
-    apart_odds: float = -math.inf
-    steady_odds: float = -math.inf
-    shaken_odds: float = -math.inf
-    count: int = COUNT
-    held: bool = False
-    wide: bool = False
-    too_early: bool = False
-
-    def clocks(self, options: EstimationOptions) -> tuple[float, Slipped]:
-        made = followed(1)
-        slip = ClockSlip(1, 0, 0.01, 1e-4, math.nan)
-        return self.odds, Slipped(made.beliefs[0], (slip,), [made.snapshots[0]] * 5, 0.0)
-
-    def apart(self, options: EstimationOptions) -> float:
-        return self.apart_odds
-
-    def steady(self, options: EstimationOptions) -> float:
-        return self.steady_odds
-
-    def shaken(self, options: EstimationOptions) -> tuple[float, None]:
-        return self.shaken_odds, None
+def test_a_move_is_averaged_over_how_far_it_went() -> None:
+    made = followed(BEFORE + COUNT, bumps=[Bump(BEFORE, 2, "rotation", math.radians(0.3))])
+    given = stack_snapshots(made.snapshots[BEFORE:])
+    jumps = [absorb(free_cameras(made.beliefs[BEFORE], {2: None}, jump), *given).evidence for jump in JUMPS]
+    mean = float(torch.tensor(jumps).double().logsumexp(0)) - math.log(len(jumps))
+    assert weigh(case_of(made), (Moved(),)).evidence("moved") == pytest.approx(mean, abs=1e-6)
 
 
-def test_what_cannot_be_told_waits_and_is_then_what_is_more_probable() -> None:
-    question = ExplanationSearch()
-    for _ in range(SLIP_PATIENCE):
-        with pytest.raises(RefusedError, match="cannot be told yet"):
-            question.ask(Told(1.0), 40, OPTIONS, patient=True)
-    answer = question.ask(Told(1.0), 40, OPTIONS, patient=True)
-    assert answer.slipped is not None
-    (slip,) = answer.slipped.slips
-    assert (slip.since, slip.odds) == (40 - (5 - COUNT), 1.0)  # it was found in earlier snapshots, too
-    assert ExplanationSearch().ask(Told(-1.0), 40, OPTIONS, patient=False).kind == "moved"
-    assert ExplanationSearch().ask(Told(-2 * SLIP_ODDS), 40, OPTIONS, patient=True).kind == "moved"
-
-
-@pytest.mark.parametrize(
-    ("told", "kind"),
-    [
-        (Told(-9.0, apart_odds=20.0), "apart"),
-        (Told(40.0, apart_odds=20.0), "slipped"),
-        (Told(-9.0, apart_odds=20.0, steady_odds=90.0), "moved"),  # only what is held can be as if nothing was
-        (Told(-9.0, apart_odds=-9.0, steady_odds=90.0, held=True), "steady"),
-        (Told(-9.0, apart_odds=20.0, shaken_odds=30.0, count=4), "shaken"),
-        (Told(-9.0, apart_odds=20.0, shaken_odds=30.0, held=True), "apart"),  # what is held shakes by more than that
-        (Told(-9.0, apart_odds=20.0, count=1), "moved"),  # one snapshot is explained by either
-    ],
-)
-def test_what_is_most_probable_is_answered(told: Told, kind: str) -> None:
-    if kind == "moved" and told.count > 1:
-        told.apart_odds = -20.0
-    assert ExplanationSearch().ask(told, 40, OPTIONS, patient=True).kind == kind
-
-
-@pytest.mark.parametrize("told", [Told(-9.0, held=True, count=1), Told(-9.0, too_early=True)])
-def test_a_move_is_not_told_of_too_little(told: Told) -> None:
-    with pytest.raises(RefusedError, match="cannot be told yet"):
-        ExplanationSearch().ask(told, 40, OPTIONS, patient=False)
+def test_a_move_is_not_believed_of_too_little() -> None:
+    made = followed(BEFORE + 1, bumps=[Bump(BEFORE, 2, "rotation", math.radians(0.5))])
+    case = case_of(made)
+    verdict = weigh(case)
+    assert verdict.best.name == "moved" and Diagnosis().decide(case, patient=False).best.name == "moved"
+    assert "a move" in verdict.reasons["unsynchronized"]  # one snapshot is explained by either
+    with pytest.raises(RefusedError, match="moved cannot be told from the rest yet"):
+        Diagnosis().decide(replace(case, quarantined=True), patient=False)
+    early = replace(case, pauses=[0.0] * (BEFORE + 1), count=BEFORE, beginning=case.before)
+    assert early.too_early and Moved().premature(early, verdict.best) is not None
 
 
 def test_a_slip_that_is_hardly_known_of_a_camera_that_is_hardly_known_waits() -> None:
-    told = Told(40.0, wide=True)
-    assert ExplanationSearch().ask(told, 40, OPTIONS, patient=True).kind == "slipped"  # to 0.1 ms
-    vague = replace(told.clocks(OPTIONS)[1], slips=(ClockSlip(1, 0, 0.01, 2e-3, math.nan),))
-    told.clocks = lambda options: (40.0, vague)
-    with pytest.raises(RefusedError, match="cannot be told yet"):
-        ExplanationSearch().ask(told, 40, OPTIONS, patient=False)
+    case = case_of(followed(BEFORE + COUNT), uncertain=True)
+    slipped = ClockSlipped()
+    for sigma, why in ((1e-4, None), (2e-3, "the slip is hardly known")):
+        found = Finding((ClockSlip(2, 0, 0.01, sigma, math.nan),))
+        explained = Explained(slipped, 0.0, case.before, list(case.latest), found)
+        assert slipped.premature(case, explained) == why
+        assert slipped.premature(replace(case, uncertain=False), explained) is None
 
 
 @pytest.mark.parametrize("rate", [4.0, 60.0])
 def test_a_camera_with_moments_of_its_own_is_told_from_one_that_moved_at_any_rate(rate: float) -> None:
-    for happened, apart in (
-        ({"slips": [Slip(BEFORE, 2, 0.25)]}, True),
-        ({"bumps": [Bump(BEFORE, 2, "position", 5.0)]}, False),
+    for happened, name in (
+        ({"slips": [Slip(BEFORE, 2, 0.25)]}, "unsynchronized"),
+        ({"bumps": [Bump(BEFORE, 2, "position", 5.0)]}, "moved"),
     ):
-        made = followed(BEFORE + COUNT, rate=rate, **happened)
-        pauses = [1 / rate] * len(made.snapshots)
-        suspicion = Suspicion(made.beliefs[BEFORE], made.snapshots, pauses, COUNT, {2: None}, held=True)
-        assert (suspicion.apart(OPTIONS) > 10 * SLIP_ODDS) == apart
-        assert suspicion.apart(OPTIONS) > 10 * SLIP_ODDS or suspicion.apart(OPTIONS) < -10 * SLIP_ODDS
-        assert suspicion.steady(OPTIONS) < -10 * SLIP_ODDS
-        assert ExplanationSearch().ask(suspicion, 0, OPTIONS, patient=True).kind == ("apart" if apart else "moved")
+        case = case_of(followed(BEFORE + COUNT, rate=rate, **happened), rate, quarantined=True)
+        verdict = Diagnosis().decide(case, patient=True)
+        assert verdict.best.name == name
+        assert abs(verdict.evidence("unsynchronized") - verdict.evidence("moved")) > 10 * LEAD
+        assert verdict.evidence("steady") < verdict.evidence("moved") - 10 * LEAD
 
 
 @pytest.mark.parametrize("shakes", [True, False])
@@ -134,16 +162,26 @@ def test_a_camera_that_shakes_a_little_is_told_from_one_that_moved(shakes: bool)
     made, generator = followed(BEFORE + 6), torch.Generator().manual_seed(2)
     shift = 0.6 * torch.randn(6, 2, generator=generator, dtype=torch.float64)
     shift = shift if shakes else torch.tensor([[0.9, -0.7]], dtype=torch.float64).expand(6, -1)
-    snapshots = list(made.snapshots)
     for s in range(6):
-        one, pose = snapshots[BEFORE + s]
+        one, pose = made.snapshots[BEFORE + s]
         uv = one.uv.clone()
         uv[:, 2] += shift[s]
-        snapshots[BEFORE + s] = (replace(one, uv=uv), pose)
-    suspicion = Suspicion(made.beliefs[BEFORE], snapshots, [1 / 60] * len(snapshots), 6, {2: None})
-    odds, found = suspicion.shaken(OPTIONS)
-    assert (odds > 2 * SLIP_ODDS) if shakes else (odds < -2 * SLIP_ODDS)
-    answer = ExplanationSearch().ask(suspicion, BEFORE, OPTIONS, patient=True)
-    assert answer.kind == ("shaken" if shakes else "moved")
-    assert (answer.shaken is None) != shakes
-    assert not shakes or (found is not None and float(found.shake[2]) > 0)
+        made.snapshots[BEFORE + s] = (replace(one, uv=uv), pose)
+    case = case_of(made)
+    both = weigh(case, (Moved(), Shaking()))
+    assert both.best.name == ("shaking" if shakes else "moved") and both.lead > 2 * LEAD
+    found = Diagnosis().decide(replace(case, excluded={"steady": "a test has excluded it"}), patient=True).best
+    assert found.name == both.best.name
+    assert (found.finding.shake is not None) == shakes
+    assert not shakes or float(found.finding.shake[2]) > 0
+
+
+def refused(made: Followed) -> tuple[tuple[int, ...], bool]:
+    before, snapshots = made.beliefs[BEFORE], made.snapshots[BEFORE:]
+    return doubtful_cameras(before, snapshots, [1 / 60] * len(snapshots), Case(before, snapshots, [], 1).options)
+
+
+def test_cameras_are_doubted_that_explain_what_fits_nowhere_and_else_none() -> None:
+    assert refused(followed(BEFORE + 6, slips=[Slip(BEFORE, 2, 0.25)])) == ((2,), True)
+    assert refused(followed(BEFORE + 6, bumps=[Bump(BEFORE, 1, "position", 20.0)])) == ((1,), False)
+    assert refused(followed(BEFORE + 6)) == ((), False)

@@ -2,12 +2,15 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 import imgcal
-from imgcal.estimation import EstimationOptions
 from imgcal.monitoring import SHAPE, RigBelief, RigFilter, RigMonitor, absorb, object_change
+from imgcal.monitoring.case import Case
+from imgcal.monitoring.explanations import weigh
+from imgcal.monitoring.object_change import LEAST_USUAL, MISFIT_LEAD, Misfit, ObjectChanged, never_fitted
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import Observations
 from renderers import palette
@@ -31,9 +34,9 @@ def test_a_change_of_the_object_is_told_and_learnt(fiducial: int | None, toleran
         image = truth.rig.expand(1).project(truth.rig_from_object[s : s + 1].apply(points))
         uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
         there = Observations(uv, torch.full(uv.shape[:-1], NOISE, dtype=torch.float64), image.visible)
-        _, changes = monitor.update(there, truth.rig_from_object[s : s + 1], 1 / 60)
-        told += changes
-        found = monitor.object_change or found
+        update = monitor.update(there, truth.rig_from_object[s : s + 1], 1 / 60)
+        told += update.changes
+        found = update.object_change or found
     assert told == []
     assert found is not None
     assert (found.fiducial, found.since) == (fiducial, 45)
@@ -53,8 +56,9 @@ def test_another_object_of_the_same_design_is_told_as_that_and_no_camera_is_blam
         image = truth.rig.expand(1).project(truth.rig_from_object[s : s + 1].apply(other if s >= 30 else obj.points))
         uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
         there = Observations(uv, torch.full(uv.shape[:-1], NOISE, dtype=torch.float64), image.visible)
-        told += monitor.update(there, truth.rig_from_object[s : s + 1], 1 / 60)[1]
-        found += [] if monitor.object_change is None else [monitor.object_change]
+        update = monitor.update(there, truth.rig_from_object[s : s + 1], 1 / 60)
+        told += update.changes
+        found += [] if update.object_change is None else [update.object_change]
     assert told == []
     assert found[0].fiducial == SHAPE
     assert 28 <= found[0].since <= 33
@@ -79,8 +83,9 @@ def test_a_fiducial_that_never_was_where_the_file_says_is_told() -> None:
         image = truth.rig.expand(1).project(truth.rig_from_object[s : s + 1].apply(points))
         uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
         there = Observations(uv, torch.full(uv.shape[:-1], NOISE, dtype=torch.float64), image.visible)
-        told += monitor.update(there, truth.rig_from_object[s : s + 1], 1 / 60)[1]
-        found += [] if monitor.object_change is None else [monitor.object_change]
+        update = monitor.update(there, truth.rig_from_object[s : s + 1], 1 / 60)
+        told += update.changes
+        found += [] if update.object_change is None else [update.object_change]
     assert told == []
     assert [(change.fiducial, change.since) for change in found] == [(5, 0)]
     assert abs(found[0].size - 0.985) < 5 * found[0].sigma
@@ -97,8 +102,8 @@ def test_an_object_that_never_was_as_its_file_says_is_told_however_it_is_turned(
         image = truth.rig.expand(1).project(truth.rig_from_object[s : s + 1].apply(other))
         uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
         there = Observations(uv, torch.full(uv.shape[:-1], NOISE, dtype=torch.float64), image.visible)
-        monitor.update(there, truth.rig_from_object[s : s + 1], 1 / 60)
-        found += [] if monitor.object_change is None else [monitor.object_change]
+        update = monitor.update(there, truth.rig_from_object[s : s + 1], 1 / 60)
+        found += [] if update.object_change is None else [update.object_change]
     assert [(change.fiducial, change.since) for change in found] == [(SHAPE, 0)]
     assert found[0].size == pytest.approx(_apart(obj.points, other), abs=5 * found[0].sigma)
 
@@ -115,10 +120,47 @@ def test_few_questions_are_asked_of_a_print(monkeypatch: pytest.MonkeyPatch) -> 
         return belief  # with more than 400 values of the object, an answer takes seconds
 
     monkeypatch.setattr(object_change, "free_object", noted)
-    before = RigFilter(rig, obj).belief
     seen = torch.ones(1, *truth.uv.shape[1:-1], dtype=torch.bool)
     there = Observations(truth.uv[:1], torch.full(seen.shape, NOISE, dtype=torch.float64), seen)
-    pose = truth.rig_from_object[:1]
-    known = absorb(before, there, pose)
-    object_change.changed_object(before, [(there, pose)], EstimationOptions(), known, 1.0)
+    case = Case(RigFilter(rig, obj).belief, [(there, truth.rig_from_object[:1])], [0.0], 1)
+    assert [make().before for make in ObjectChanged().variants(case)] == [case.before]
     assert asked == [None]
+
+
+def test_a_misfit_is_noticed_after_some_snapshots_and_counted() -> None:
+    random, watch = np.random.default_rng(1), Misfit()
+    assert [watch.update(random.chisquare(60), 60) for _ in range(500)] == [0] * 500
+    taken = [watch.update(2 * random.chisquare(60), 60) for _ in range(10)]
+    first = next(number for number, age in enumerate(taken) if age)
+    assert first < 8 and first <= taken[first] <= first + 3
+
+
+def test_one_wrong_snapshot_and_a_beginning_are_no_misfit() -> None:
+    random, watch = np.random.default_rng(2), Misfit()
+    assert [watch.update(9 * random.chisquare(60), 60) for _ in range(LEAST_USUAL - 1)] == [0] * (LEAST_USUAL - 1)
+    watch = Misfit()
+    for _ in range(100):
+        watch.update(random.chisquare(60), 60)
+    assert watch.update(1e4, 60) == 0
+
+
+@pytest.mark.parametrize("bent", [False, True])
+def test_an_object_that_never_was_as_its_file_says_explains_the_first_snapshots(bent: bool) -> None:
+    factory, obj, generator = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), torch.Generator().manual_seed(8)
+    points = obj.points.clone()
+    points[5] += bent * torch.tensor([0.6, -0.5, 0.6])
+    truth = simulate_truth(factory, replace(obj, points=points), 16, generator, PhysicalDrift())
+    uv = truth.uv + NOISE * torch.randn(truth.uv.shape, generator=generator, dtype=torch.float64)
+    seen = Observations(uv, torch.full(uv.shape[:-1], NOISE, dtype=torch.float64), torch.ones(uv.shape[:-1]) > 0)
+    before = RigFilter(factory, obj).belief
+    result = absorb(before, seen, truth.rig_from_object)
+    assert never_fitted(result, 16) == bent
+    assert not never_fitted(result, 15)  # not asked then
+    parts = [(seen.of_snapshots([s]), truth.rig_from_object[s : s + 1]) for s in range(16)]
+    verdict = weigh(Case(before, parts, [0.1] * 16, 16))
+    changed = verdict.best.finding.object_change
+    assert (changed is not None and verdict.lead >= MISFIT_LEAD) == bent
+    if bent:
+        assert changed.fiducial == 5
+    else:
+        assert verdict.best.name == "steady" and verdict.lead > 0

@@ -35,13 +35,13 @@ def test_the_kind_the_size_and_what_is_believed_then() -> None:
     before, result, rig = zoomed()
     still = torch.zeros_like(before.unit)
     since = PendingChange.of(result, before, 0.0, {1: None})
-    assert (since.count, since.due, since.late) == (8, True, False)
+    assert (since.count, since.due, since.overdue) == (8, True, False)
     test = since.test(still)
-    assert since.decided(test, 1, last=False) == ("focal_length", "focal_length")
+    assert since.decide(test, 1, last=False) == ("focal_length", "focal_length")
     size, sigma = since.size(test, 1, "focal_length")
     assert abs(size - ZOOM) < 4 * sigma < ZOOM
     since.kinds[1] = "focal_length"
-    first, belief, information = since.supposed(test)
+    first, belief, information = since.adopt_kinds(test)
     assert torch.allclose(information, belief.factor @ belief.factor.mT)
     error = belief.rig.local(rig).flatten()
     assert 0.4 < float(error @ torch.linalg.solve(belief.covariance(), error)) / len(error) < 1.8

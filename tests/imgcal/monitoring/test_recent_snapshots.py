@@ -8,7 +8,7 @@ import torch
 import imgcal
 from imgcal.geometry import RigidTransform
 from imgcal.monitoring import RecentSnapshots, RigFilter, absorb
-from imgcal.monitoring.recent_snapshots import OLDEST
+from imgcal.monitoring.recent_snapshots import KEPT_SNAPSHOTS
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import DriftRate, Observations
 
@@ -29,7 +29,7 @@ def test_what_was_believed_before_is_found_again(tolerance: float | None) -> Non
     )
     follows.belief = absorb(follows.belief, first, truth.rig_from_object).belief
     recent, believed = RecentSnapshots(follows.belief, follows.walk), [follows.belief]
-    for s in range(OLDEST + 10):
+    for s in range(KEPT_SNAPSHOTS + 10):
         pick = s % 12
         there = Observations(first.uv[[pick]], first.sigma[[pick]], first.seen[[pick]])
         pose = RigidTransform(
@@ -38,8 +38,8 @@ def test_what_was_believed_before_is_found_again(tolerance: float | None) -> Non
         result = follows.follow(there, pose, seconds=0.1)
         recent.append(result, there, 0.1)
         believed.append(result.belief)
-    assert len(recent) == OLDEST
-    for age in (1, 2, 7, 30, OLDEST):
+    assert len(recent) == KEPT_SNAPSHOTS
+    for age in (1, 2, 7, 30, KEPT_SNAPSHOTS):
         was, found = believed[-1 - age], recent.belief_before(age)
         std = was.std()
         apart = (found.rig.local(was.rig) / std).abs().max()

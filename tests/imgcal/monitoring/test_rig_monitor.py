@@ -10,7 +10,9 @@ import imgcal
 from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
 from imgcal.monitoring import CHANGES, Change, RigFilter, RigMonitor
-from imgcal.monitoring.change_search import SIGNIFICANT
+from imgcal.monitoring.change_search import ALARM_CHI2
+from imgcal.monitoring.explanations import Diagnosis
+from imgcal.monitoring.pending_change import PendingChange
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import CameraRig, Observations
 from scripts.benchmarks.rig_streams import Bump, Conditions, Stream
@@ -41,9 +43,10 @@ def followed(bumps: dict[int, dict[int, str]], count: int, seed: int) -> tuple[R
         uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
         seen = image.visible & (torch.rand(image.visible.shape, generator=generator) > 0.1)
         observations = Observations(uv, torch.full(seen.shape, NOISE, dtype=torch.float64), seen)
-        result, changes = monitor.update(observations, pose, seconds=1 / 60)
-        assert len(result.rig_from_object.translation) == len(result.residual) == 1  # also where it was learnt anew
-        told += changes
+        found = monitor.update(observations, pose, seconds=1 / 60)
+        one = found.update
+        assert len(one.rig_from_object.translation) == len(one.residual) == 1  # also where it was learnt anew
+        told += found.changes
     return monitor, rig, told
 
 
@@ -70,7 +73,7 @@ def test_a_bump_is_told_with_camera_kind_and_size(camera: int, kind: str) -> Non
     assert abs(alarm.since - 30) <= 3
     assert (change.camera, change.kind, change.decided) == (camera, kind, True)
     assert abs(change.size - SIZES[kind]) < 4 * change.sigma < 0.5 * SIZES[kind]
-    assert alarm.evidence >= SIGNIFICANT and change.evidence >= SIGNIFICANT
+    assert alarm.evidence >= ALARM_CHI2 and change.evidence >= ALARM_CHI2
     assert 0.5 < normalized_error(monitor, rig) < 1.8
     assert monitor.open == {}
 
@@ -79,12 +82,28 @@ def test_a_camera_that_changes_while_a_change_of_another_is_open_for_longer_than
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monitor, _, _ = followed({30: {1: "focal_length"}}, 33, seed=12)
-    assert monitor._since is not None
-    monkeypatch.setattr(type(monitor._since), "due", False)
+    assert monitor._pending is not None
+    monkeypatch.setattr(type(monitor._pending), "due", False)
     everything = "imgcal.monitoring.rig_monitor.likeliest_age"
     monkeypatch.setattr(everything, lambda recent, camera, age: 64 if len(recent) == 64 else age)
     monitor, _, told = followed({30: {1: "focal_length"}, 94: {2: "focal_length"}}, 100, seed=12)
     assert monitor.filter.count == 100 and told[0].camera == 1
+
+
+def test_a_change_that_is_decided_is_reported_though_the_next_one_cannot_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, own = [], Diagnosis.decide
+
+    def decide_first(self, case, *rest):
+        asked.append(case.cameras)
+        if asked[0] != case.cameras:
+            raise RefusedError("not yet")
+        return own(self, case, *rest)
+
+    monkeypatch.setattr(Diagnosis, "decide", lambda self, case, patient: decide_first(self, case, patient))
+    monkeypatch.setattr(PendingChange, "due", False)
+    monitor, _, told = followed({30: {1: "focal_length"}, 50: {2: "rotation"}}, 60, seed=12)
+    assert (2,) in asked and 2 in monitor.undecided
+    assert [(change.camera, change.decided) for change in told] == [(1, False), (1, True)]
 
 
 def test_two_cameras_at_once() -> None:
@@ -118,11 +137,11 @@ def test_a_large_turn_is_learnt_whether_it_was_announced_or_not(told_before: boo
         observations = Observations(uv, torch.full(uv.shape[:-1], NOISE, dtype=torch.float64), image.depth > 0)
         moved = (2,) if told_before and s == 20 else ()
         try:
-            _, changes = monitor.update(observations, truth.rig_from_object[s : s + 1], 1 / 60, moved)
+            found = monitor.update(observations, truth.rig_from_object[s : s + 1], 1 / 60, moved)
         except RefusedError:
             refused += 1
             continue
-        told += changes
+        told += found.changes
     assert refused <= (0 if told_before else 2)
     assert {change.camera for change in told} == {2}
     assert told[0].since == 20
@@ -146,14 +165,15 @@ def test_of_a_camera_that_moves_within_the_first_snapshots_no_other_and_no_objec
     times = torch.arange(50, dtype=torch.float64) / seen.rate
     made.frequency = made.frequency * seen.rate / 60
     poses, (observations, rigs) = made.poses_at(times), made.labelled(0, 50)
-    monitor, told = RigMonitor(RigFilter(made.factory, made.obj)), []
+    monitor, told, restarts = RigMonitor(RigFilter(made.factory, made.obj)), [], 0
     for s in range(50):
         one = observations.of_snapshots([s])
-        _, changes = monitor.update(one, poses[s : s + 1], 1 / seen.rate)
-        told += changes
-        assert monitor.object_change is None
+        found = monitor.update(one, poses[s : s + 1], 1 / seen.rate)
+        told += found.changes
+        restarts += found.restarted
+        assert found.object_change is None
     assert {change.camera for change in told} == {camera}
-    assert monitor.first == at
+    assert monitor.known_since == at and restarts == 1
     assert 0.5 < normalized_error(monitor, rigs[-1]) < 1.8
 
 
@@ -166,8 +186,7 @@ def test_a_camera_of_which_it_cannot_be_told_yet_is_undecided_until_it_is() -> N
     monitor, told, undecided = RigMonitor(RigFilter(made.factory, made.obj)), [], []
     for s in range(90):
         one = observations.of_snapshots([s])
-        _, changes = monitor.update(one, poses[s : s + 1], 1 / 60)
-        told += [(s, change.camera) for change in changes]
+        told += [(s, change.camera) for change in monitor.update(one, poses[s : s + 1], 1 / 60).changes]
         undecided.append(set(monitor.undecided))
     assert told and {camera for _, camera in told} == {2}
     first = told[0][0]
@@ -183,8 +202,8 @@ def watched(stream: Stream, count: int) -> list[tuple[int, int]]:
     monitor, told = RigMonitor(RigFilter(stream.factory, stream.obj)), []
     for number in range(count):
         with contextlib.suppress(RefusedError):
-            _, changes = monitor.update(seen.of_snapshots([number]), poses[number : number + 1], 1 / rate)
-            told += [(number, change.camera) for change in changes]
+            found = monitor.update(seen.of_snapshots([number]), poses[number : number + 1], 1 / rate)
+            told += [(number, change.camera) for change in found.changes]
     return told
 
 

@@ -6,14 +6,16 @@ from dataclasses import replace
 import pytest
 import torch
 
-from imgcal.estimation import EstimationOptions
-from imgcal.monitoring import absorb
+from imgcal.errors import RefusedError
+from imgcal.monitoring import RigBelief, absorb
+from imgcal.monitoring.case import Case, Snapshot
+from imgcal.monitoring.explanations import Steady, weigh
 from imgcal.monitoring.measurement_update import stack_snapshots
-from imgcal.monitoring.shaking import EVERY, ShakeLevel, shaken
+from imgcal.monitoring.shaking import EVERY, ShakeLevel, Shaking
 from imgcal.types import Observations
 from tests.imgcal.monitoring.followed import followed
 
-BEFORE, COUNT, OPTIONS = 40, 6, EstimationOptions()
+BEFORE, COUNT = 40, 6
 
 
 def shifted(observations: Observations, cameras: list[int], size: float, seed: int) -> Observations:
@@ -23,20 +25,24 @@ def shifted(observations: Observations, cameras: list[int], size: float, seed: i
     return replace(observations, uv=observations.uv + shift)
 
 
+def case_of(before: RigBelief, snapshots: list[Snapshot]) -> Case:
+    """Camera 2 is suspected."""
+    return Case(before, snapshots, [1 / 60] * len(snapshots), len(snapshots), cameras=(2,))
+
+
 @pytest.mark.parametrize("cameras", [[0, 1, 2, 3], [2]])
 def test_it_is_found_which_cameras_shake_and_that_it_is_more_probable_than_that_nothing_does(cameras) -> None:
     made = followed(BEFORE + COUNT)
     snapshots = [(shifted(one, cameras, 0.5, s), pose) for s, (one, pose) in enumerate(made.snapshots[BEFORE:])]
-    found = shaken(made.beliefs[BEFORE], snapshots, [2], OPTIONS)
-    assert found is not None
-    assert (found.shake > 0).nonzero()[:, 0].tolist() == cameras
-    still = absorb(made.beliefs[BEFORE], *stack_snapshots(snapshots), OPTIONS)
+    verdict = weigh(case_of(made.beliefs[BEFORE], snapshots), (Steady(), Shaking()))
+    found, shake = verdict.best, verdict.best.finding.shake
+    assert found.name == "shaking" and verdict.lead > 50
+    assert (shake > 0).nonzero()[:, 0].tolist() == cameras
+    still = absorb(made.beliefs[BEFORE], *stack_snapshots(snapshots))
     assert found.evidence > still.evidence + 50
-    assert all(torch.equal(one.shake[0], found.shake) for one, _ in found.snapshots)
-    quiet = made.snapshots[BEFORE:]
-    nothing = shaken(made.beliefs[BEFORE], quiet, [2], OPTIONS)
-    assert nothing is not None
-    assert nothing.evidence < absorb(made.beliefs[BEFORE], *stack_snapshots(quiet), OPTIONS).evidence
+    assert all(torch.equal(one.shake[0], shake) for one, _ in found.snapshots)
+    quiet = weigh(case_of(made.beliefs[BEFORE], made.snapshots[BEFORE:]), (Steady(), Shaking()))
+    assert list(quiet.explained) == ["steady", "shaking"] and not quiet.reasons
 
 
 def test_shifts_that_follow_each_other_smoothly_are_no_shaking() -> None:
@@ -46,7 +52,8 @@ def test_shifts_that_follow_each_other_smoothly_are_no_shaking() -> None:
         uv = one.uv.clone()
         uv[:, 2, :, 0] += 0.5 * (s - 2.5)
         snapshots.append((replace(one, uv=uv), pose))
-    assert shaken(made.beliefs[BEFORE], snapshots, [2], OPTIONS) is None
+    with pytest.raises(RefusedError, match="shaking: the shifts follow each other smoothly"):
+        weigh(case_of(made.beliefs[BEFORE], snapshots), (Shaking(),))
 
 
 def test_how_much_each_camera_shakes_is_followed() -> None:

@@ -9,7 +9,7 @@ from imgcal.estimation import EstimationOptions
 from imgcal.monitoring import absorb
 from imgcal.monitoring.measurement_update import stack_snapshots
 from imgcal.monitoring.pending_change import free_cameras
-from imgcal.monitoring.unsynchronized import unsynchronized_evidence, without
+from imgcal.monitoring.unsynchronized import drop_cameras, unsynchronized_evidence
 from scripts.benchmarks.rig_streams import Bump, Slip
 from tests.imgcal.monitoring.followed import followed
 
@@ -31,6 +31,6 @@ def test_it_is_compared_with_a_move(rate: float, late: float) -> None:
 
 def test_what_cameras_saw_is_left_out() -> None:
     observations, _ = followed(1).snapshots[0]
-    less = without(observations, [0, 2])
+    less = drop_cameras(observations, [0, 2])
     assert not less.seen[:, [0, 2]].any() and torch.equal(less.seen[:, [1, 3]], observations.seen[:, [1, 3]])
     assert observations.seen[:, 0].any()

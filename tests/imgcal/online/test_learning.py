@@ -22,12 +22,12 @@ def test_a_camera_that_sees_the_object_elsewhere_waits_for_the_next_snapshot_and
     assert memory.looks[2] >= LEAST_LOOKS
     labelled = made.labelled(made.blobs())
     assert labelled.checked.off[2]
-    result, changes = learnt_from(memory, labelled.checked)
-    assert not changes and list(memory.off) == [2]
-    assert not result.residual[0, 2].any()  # nothing was learnt of it
+    found = learnt_from(memory, labelled.checked)
+    assert not found.changes and list(memory.off) == [2]
+    assert not found.update.residual[0, 2].any()  # nothing was learnt of it
     known = memory.before
-    _, changes = learnt_from(memory, made.labelled(made.blobs()).checked)
-    assert not changes and memory.monitor.held.cameras == {2}  # one snapshot more, and it is sure that it is no clock
-    _, changes = learnt_from(memory, made.labelled(made.blobs()).checked)
-    assert [change.camera for change in changes] == [2]
+    found = learnt_from(memory, made.labelled(made.blobs()).checked)
+    assert not found.changes and memory.monitor.held.cameras == {2}  # one snapshot more rules out the clock
+    found = learnt_from(memory, made.labelled(made.blobs()).checked)
+    assert [change.camera for change in found.changes] == [2]
     assert memory.looks[2] == 0 and memory.before is known
