@@ -38,7 +38,7 @@ class Notes:
         numbers = ("time", "since", "size", "sigma")
         plain = {k: _known(v) if k in numbers else v for k, v in content.items()}
         waits = plain["kind"] in ALARMS
-        ended = ENDS.get(plain["kind"], set())
+        ended = ENDS.get(content["kind"], set())
         for event in self.events:
             if not event["open"] or event["camera"] != plain["camera"]:
                 continue

@@ -1,4 +1,4 @@
-"""Is a camera getting dirty, or out of focus? Compare its blobs with what it used to see of the object at that place."""
+"""Is a camera getting dirty, or out of focus? Compare its blobs with what it used to see at that place."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ LEAST_FIDUCIALS = np.array((10.0, 10.0, 20.0))
 LONGEST = 60.0
 """Seconds after which an unfinished block is discarded: the object was away."""
 CORRELATION_SECONDS = 4.0
-"""Time constant of what place and distance do not explain: arms and bodies in front, motion blur, the object's attitude.
-On the ten-camera stream the autocorrelation at one second is below 0.3 for nine cameras and 0.6 for the tenth."""
+"""Time constant of what place and distance do not explain: arms in front, motion blur, the object's attitude. On the
+ten-camera stream the autocorrelation at one second is below 0.3 for nine cameras and 0.6 for the tenth."""
 CENTRES = (-2 / 3, 0.0, 2 / 3)
 """Centres of the local terms across and down the image, in halves of its size from its middle ..."""
 WIDTH = 0.5
 """... and the standard deviation of each."""
-FEATURES = 1 + len(CENTRES) ** 2 + 2 + 3  # constant, local terms, log distance and its square, direction of view
+FEATURES = 1 + len(CENTRES) ** 2 + 2 + 3  # constant, local terms, log distance and its square, direction
 SPREAD = np.array((0.03, 0.15, 0.1))
-"""Standard deviations of a block at least: size (3 %), sigma (15 %), share that is missing (0.1, on the real stream)."""
+"""Standard deviations of a block at least: size (3 %), sigma (15 %), share missing (0.1, on the real stream)."""
 PRIOR = np.array(((10.0, 0.1, 0.3, 0.1), (10.0, 0.5, 2.0, 0.5), (0.3, 0.2, 0.2, 0.2)))
 """Prior standard deviations of the coefficients of each measure: constant, local terms, distance, direction."""
 PRIOR_BLOCKS = 20
@@ -48,8 +48,8 @@ RUN_LENGTH = 1e7
 REFERENCE = 0.5
 """Standard deviations of a block that are subtracted from each."""
 MOST_SPREADS = np.array((4.0, 4.0, 1.0))
-"""Standard deviations for which one block counts at most. An arm in front of a camera hides fiducials for seconds, dirt for
-as long as nobody cleans: evidence that they are missing grows with time alone, and suffices after half a minute."""
+"""Standard deviations for which one block counts at most. An arm in front of a camera hides fiducials for seconds, dirt
+until somebody cleans: evidence that they are missing grows with time alone, and suffices after half a minute."""
 COMMON = 4
 """Cameras from which what most see alike (a fast object, a hand, a weak lamp) is the fault of none of them."""
 CLEAN, CLEAN_BLOCKS = 1.5, 5
@@ -144,12 +144,12 @@ class ImageQuality:
         total = np.maximum(self._count, 1)
         value, place = self._sum / total, self._place / total[..., None]
         self._discard(done)
-        correlation = np.exp(-np.maximum(state.time - self._last_time, 0.0) / CORRELATION_SECONDS)
+        correlation = np.exp(-np.maximum(state.time - self._last_time, BLOCK) / CORRELATION_SECONDS)
         own = self._variance * (1 - correlation**2)  # of the innovation; after a long pause all of it
         step_place = place - correlation[..., None] * self._last_place
         step = value - correlation * self._last_value - (step_place * self._coefficients).sum(-1)
         spread = np.einsum("qcij,qcj->qci", self._covariance, step_place)
-        variance = (step_place * spread).sum(-1) + own
+        variance = np.maximum((step_place * spread).sum(-1), 0.0) + own
         z = np.where(done, step / np.sqrt(variance), np.nan)
         level = value - (place * self._coefficients).sum(-1)
         unknown = np.einsum("qci,qcij,qcj->qc", place, self._covariance, place)

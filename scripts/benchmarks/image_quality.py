@@ -1,10 +1,10 @@
 """Are alarms about image quality right? Hours in which nothing happens, a real stream, and cameras that get worse.
 
-`python -m scripts.benchmarks.image_quality` runs all parts, or `--only` some; the others stay as they were. `hour` and the
-faults use blobs of the demo's world with labels, and a model of their size, sigma and visibility that depends on distance,
-place, direction, motion and on arms in front of cameras, from 15 snapshots a second. `demo` and `covered` run the demo
-itself through `RigKeeper`, `frames` its rendered frames through the detector; `stream` is the real stream of ten cameras
-in the captures' folder, from frame 2400 on, which begins with a calibration of the frames before.
+`python -m scripts.benchmarks.image_quality` runs all parts, or `--only` some; the others stay as they were. `hour` and
+most faults use labelled blobs of the demo's world, 15 snapshots a second, whose size, sigma and visibility depend on
+distance, place, direction, motion and on arms in front of cameras. `demo` and `covered` run the demo itself through
+`RigKeeper`, `frames` its rendered frames through the detector; `stream` is the real stream of ten cameras in the folder
+of the captures, from frame 2400 on, which begins with a calibration of the frames before.
 """
 
 from __future__ import annotations
@@ -144,8 +144,8 @@ def made_state(
     """Make a state of labelled blobs, of a rig that is known."""
     rig, nothing = belief.rig, np.full(belief.rig.num_cameras, np.nan)
     return RigState(
-        time=time, snapshot=number, belief=belief, factory=rig, cameras=dict.fromkeys(rig.camera_names, "ok"), sentence="",
-        refused=None, detections=blobs, lag=np.zeros((len(blobs), 2)), predicted=uv, residual=nothing,
+        time=time, snapshot=number, belief=belief, factory=rig, cameras=dict.fromkeys(rig.camera_names, "ok"),
+        sentence="", refused=None, detections=blobs, lag=np.zeros((len(blobs), 2)), predicted=uv, residual=nothing,
         rig_from_object=pose, events=(), clock_offset=nothing, clock_offset_sigma=nothing, noise=nothing, shake=nothing,
     )  # fmt: skip
 
@@ -164,7 +164,7 @@ def labelled(seed: int, fault: str, seconds: float, still: float = np.inf) -> li
 
 
 def demo(seed: int, seconds: float, covered_at: float = np.inf, share: float = 1.0) -> list[Event]:
-    """Run the demo's rig at full rate through the keeper, its blobs without labels; cover a share of a camera's image."""
+    """Run the demo's rig at full rate through the keeper, without labels; cover a share of a camera's image."""
     factory, obj = imgcal.load_rig("O10").to(torch.float64), imgcal.load_object("asymmetric8")
     volume, events = viewing_volume(factory), list[Event]()
     true = AGED.apply(factory, torch.Generator().manual_seed(seed))
@@ -281,8 +281,8 @@ PARTS: dict[str, Callable[[Options], dict[str, Any]]] = {
 QUIET = ("hour", "object put down", "demo", "frames", "stream, every frame", "stream, every third frame")
 """Parts in which nothing happens."""
 IN_TIME = {
-    "covered": 5.0, "half covered": 60.0, "fiducials missing": 120.0, "blobs half as bright": 30.0, "slowly dirty": SLOW,
-    "defocused": 30.0,
+    "covered": 5.0, "half covered": 60.0, "fiducials missing": 120.0, "blobs half as bright": 30.0,
+    "slowly dirty": SLOW, "defocused": 30.0,
 }  # fmt: skip
 """Seconds after which the others must have been reported."""
 

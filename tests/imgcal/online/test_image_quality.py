@@ -1,4 +1,4 @@
-"""Blobs that grow, fade or fail to come are reported, and so is when they are as before; where the object is explains some."""
+"""Blobs that grow, fade or fail to come are reported, and that they are as before; the object's place explains some."""
 
 from dataclasses import replace
 
@@ -114,4 +114,12 @@ def test_a_snapshot_a_second_of_which_a_tenth_is_hidden_is_clean() -> None:
     for number in range(3000):
         shown = state.detections.select(luck.random(32) > 0.1)
         events += test(replace(state, detections=shown, time=1.7e9 + number), None, None)
+    assert events == []
+
+
+def test_clocks_that_are_set_back_are_no_evidence() -> None:
+    test, events = ImageQuality(4), []
+    for number in range(120):
+        state = state_at(number, number / 3)
+        events += test(replace(state, time=1.7e9 + number / 3 - (1000.0 if number >= 60 else 0.0)), None, None)
     assert events == []
