@@ -126,6 +126,7 @@ class Board:
             "rate": self._rate(time.monotonic(), content["snapshot"]),
             "sentence": content["sentence"],
             "refused": content["refused"],
+            "inView": content["in_view"],
             "health": content["health"],
             "value": rounded(self._value),
             "sigma": rounded(self._sigma),

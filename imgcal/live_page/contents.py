@@ -26,6 +26,7 @@ PICTURE_WIDTH = 480  # pixels
 QUALITY = 80  # of JPEG
 BRIGHT = 0.9997  # quantile of a picture that is shown white; its median is shown black
 LEAST_RANGE = 0.2  # of the depth, between black and white: what differs less is noise
+LEAST_BLOBS = 4  # in some camera: with fewer, no object is in view
 DEPTHS = (255, 1023, 4095, 16383, 65535)  # largest values of cameras that write 16 bit
 
 
@@ -67,6 +68,7 @@ def state_message(state: RigState, obj: CalibrationObject) -> dict[str, Any]:
         "snapshot": int(state.snapshot),
         "sentence": state.sentence,
         "refused": state.refused,
+        "in_view": state.refused is None or bool(np.bincount(blobs.camera[blobs.usable]).max(initial=0) >= LEAST_BLOBS),
         "health": [str(state.cameras[name]) for name in state.rig.camera_names],
         "residual": np.asarray(state.residual, dtype=np.float64),
         "sees": np.bincount(labelled, minlength=state.rig.num_cameras),

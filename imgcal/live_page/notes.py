@@ -13,6 +13,8 @@ from imgcal.live_page.commands import Action, Command
 MOST_EVENTS = 200
 ALARMS = frozenset({"moved", "camera_lost", "dirty", "defocused", "object_bent", "object_exchanged", "clock_slip"})
 """Events that wait for somebody to acknowledge them."""
+ENDS = {"camera_back": {"camera_lost"}, "clean": {"dirty", "defocused"}}
+"""Good news, which nobody needs to acknowledge, and the alarms of the same camera that are over then."""
 
 
 @dataclass
@@ -36,8 +38,13 @@ class Notes:
         numbers = ("time", "since", "size", "sigma")
         plain = {k: _known(v) if k in numbers else v for k, v in content.items()}
         waits = plain["kind"] in ALARMS
-        for event in self.events:  # what is known better now, or is over, takes the place of what was told first
-            if event["open"] and event["camera"] == plain["camera"] and event["since"] == plain["since"] is not None:
+        ended = ENDS.get(content["kind"], set())
+        for event in self.events:
+            if not event["open"] or event["camera"] != plain["camera"]:
+                continue
+            if event["kind"] in ended:
+                event["open"] = False
+            elif not ended and event["since"] == plain["since"] is not None:  # the same, known better now
                 event["open"], waits = False, True
         self.events.append(plain | {"number": self.count, "open": waits})
         self.count += 1

@@ -10,15 +10,16 @@ from imgcal.online.rig_state import CameraHealth
 
 VAIN = 2
 """Snapshots in a row that fit in most cameras no more: the labels of a single one may be wrong."""
-SAID: Mapping[CameraHealth, str] = {
-    "lost": "lost",
-    "blind": "blind",
-    "relearning": "moved, being learnt again",
-    "doubtful": "in doubt",
-    "dirty": "dirty",
-    "defocused": "out of focus",
-    "unseen": "not looked at yet",
+SAID: Mapping[CameraHealth, tuple[str, str]] = {
+    "lost": ("is lost", "are lost"),
+    "blind": ("is blind", "are blind"),
+    "relearning": ("moved and is being recalibrated", "moved and are being recalibrated"),
+    "doubtful": ("is in doubt", "are in doubt"),
+    "dirty": ("is dirty", "are dirty"),
+    "defocused": ("is out of focus", "are out of focus"),
+    "unseen": ("has not seen the object yet", "have not seen the object yet"),
 }
+"""What is said of one camera, and of several."""
 
 
 def health_of(memory: KeeperMemory) -> dict[str, CameraHealth]:
@@ -59,7 +60,7 @@ def sentence_of(health: Mapping[str, CameraHealth], learnt: int) -> str:
 
     Examples:
         >>> sentence_of({"cam01": "ok", "cam02": "lost", "cam03": "lost"}, 9)
-        'cam02, cam03 lost'
+        'cam02, cam03 are lost'
     """
     if not learnt:
         return "the object has not been seen yet"
@@ -67,5 +68,5 @@ def sentence_of(health: Mapping[str, CameraHealth], learnt: int) -> str:
     for state, words in SAID.items():
         names = [name for name, found in health.items() if found == state]
         if names:
-            parts.append(f"{', '.join(names)} {words}")
+            parts.append(f"{', '.join(names)} {words[len(names) > 1]}")
     return "; ".join(parts) if parts else f"all {len(health)} cameras are calibrated"

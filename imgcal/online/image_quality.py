@@ -1,4 +1,4 @@
-"""Is a camera getting dirty, or out of focus? Its blobs, second after second, against what they used to be."""
+"""Is a camera getting dirty, or out of focus? Compare its blobs with what it used to see at that place."""
 
 from __future__ import annotations
 
@@ -14,131 +14,168 @@ from imgcal.online.events import Event, EventKind
 from imgcal.online.rig_state import RigState
 from imgcal.online.sightings import well_inside
 
+Array = NDArray[np.float64]
+
 BLOCK = 1.0
-"""Seconds that are put together: neighbouring snapshots say the same."""
-MISSING = 2
-"""Number of the share of fiducials that are missing, after size and uncertainty of blobs."""
-LEAST_VALUES = np.array((10, 10, 20))
-"""Blobs in such a block from which its median counts, and fiducials from which the share of those that are missing is
-nearly normal; where there are fewer, the next block is put to it."""
-LEAST_SNAPSHOTS = 10
-"""Snapshots of it: a few cameras a second make a block of many seconds."""
+"""Seconds of snapshots that are averaged into one block."""
+LEAST_FIDUCIALS = np.array((10.0, 10.0, 20.0))
+"""Fiducials in a block, for each measure; a block with fewer goes on."""
 LONGEST = 60.0
-"""Seconds after which what has been put together is forgotten: the object was away."""
-LEARNT = 30
-"""Blocks that say what is usual."""
-RUN_LENGTH = 1e6
-"""Blocks for one false alarm of a camera and value: eleven days in which it sees the object."""
-LEAST_SPREAD = np.array((0.03, 0.15, 0.05))
-"""Standard deviations of a block at least: size (3 %), uncertainty (15 %), share that is missing (5 %)."""
-MOST_SPREADS = 4.0
-"""Standard deviations by which one block counts at most: shares are not normal."""
+"""Seconds after which an unfinished block is discarded: the object was away."""
+CORRELATION_SECONDS = 4.0
+"""Time constant of what place and distance do not explain: arms in front, motion blur, the object's attitude. On the
+ten-camera stream the autocorrelation at one second is below 0.3 for nine cameras and 0.6 for the tenth."""
+CENTRES = (-2 / 3, 0.0, 2 / 3)
+"""Centres of the local terms across and down the image, in halves of its size from its middle ..."""
+WIDTH = 0.5
+"""... and the standard deviation of each."""
+FEATURES = 1 + len(CENTRES) ** 2 + 2 + 3  # constant, local terms, log distance and its square, direction
+SPREAD = np.array((0.03, 0.15, 0.1))
+"""Standard deviations of a block at least: size (3 %), sigma (15 %), share missing (0.1, on the real stream)."""
+PRIOR = np.array(((10.0, 0.1, 0.3, 0.1), (10.0, 0.5, 2.0, 0.5), (0.3, 0.2, 0.2, 0.2)))
+"""Prior standard deviations of the coefficients of each measure: constant, local terms, distance, direction."""
+PRIOR_BLOCKS = 20
+"""Blocks that the prior `SPREAD` counts for."""
+MEMORY = 600
+"""Blocks over which the spread is averaged."""
+LEARNT = 0.1
+"""Variance of the expected value, in variances of a block, below which a place is known: it is only tested there, so
+that slow changes are not learnt."""
+SUSPICION = 0.3
+"""Of the threshold of an alarm, from which nothing is learnt: it may be the fault that is looked for."""
+RUN_LENGTH = 1e7
+"""Blocks between two false alarms of a camera and measure if blocks were normal: four months in view."""
+REFERENCE = 0.5
+"""Standard deviations of a block that are subtracted from each."""
+MOST_SPREADS = np.array((4.0, 4.0, 1.0))
+"""Standard deviations for which one block counts at most. An arm in front of a camera hides fiducials for seconds, dirt
+until somebody cleans: evidence that they are missing grows with time alone, and suffices after half a minute."""
+COMMON = 4
+"""Cameras from which what most see alike (a fast object, a hand, a weak lamp) is the fault of none of them."""
 CLEAN, CLEAN_BLOCKS = 1.5, 5
-"""Standard deviations within which a value is as usual again, and for how many blocks it must be."""
-SAID: tuple[tuple[EventKind, str], ...] = (
-    ("defocused", "shows blobs that are larger than they used to be: out of focus"),
-    ("dirty", "shows blobs that are fainter than they used to be: dirty, or badly lit"),
+"""Standard deviations below which a block is as usual, and how many of them in a row end an alarm."""
+MESSAGES: tuple[tuple[EventKind, str], ...] = (
+    ("defocused", "shows larger blobs than it used to: out of focus"),
+    ("dirty", "shows fainter blobs than it used to: dirty, or badly lit"),
     ("dirty", "misses fiducials that other cameras see: dirty, or half covered"),
 )
 
 
 class ImageQuality:
-    """Follows size and uncertainty of blobs, and the share that is missing, camera by camera.
+    """Follows three measures of each camera: size and sigma of its blobs, and the share of fiducials that it misses.
 
-    A blob is as large as its fiducial is near; its uncertainty says how bright it is against the noise.
-    Page's cumulative sum of medians over a second is compared with the first half minute.
+    Each is averaged over a second and compared with a regression on where the object is in the image, how far away and
+    seen from which side, learnt from the camera's own history. Places that it does not know yet are learnt; known
+    ones are tested. What remains is correlated in time: its innovations feed Page's cumulative sum.
     """
 
     name = "image quality"
 
     def __init__(self, cameras: int) -> None:
         """Begin with cameras whose images are good."""
-        self._cameras = cameras
-        self._values = _nothing()  # of each thing that is watched: camera (M,), value (M,) of every snapshot
-        self._began: float | None = None  # s, of the block ...
-        self._snapshots = 0  # ... and how many there are in it
-        self._count = np.zeros((3, cameras), dtype=np.int64)  # blocks that have been learnt
-        self._sum, self._squares = np.zeros((3, cameras)), np.zeros((3, cameras))
-        self._usual = np.zeros((3, cameras), dtype=np.int64)  # blocks in a row that are as usual
-        self._bad = np.zeros((3, cameras), dtype=bool)
-        self._good = np.zeros((3, cameras))  # s, until when nothing spoke for worse
-        self._test = Cusum(3 * cameras, 1.0, RUN_LENGTH)
+        shape = (3, cameras)
+        self._distance = np.zeros(cameras)  # log mm, the first one; 0 = the object has not been seen
+        self._began: float | None = None  # s, of the block
+        self._count = np.zeros(shape)  # fiducials in the block ...
+        self._sum, self._place = np.zeros(shape), np.zeros((*shape, FEATURES))  # ... sums of values and of features
+        self._last_time = np.full(shape, -1e9)  # s, of the last block ...
+        self._last_value, self._last_place = np.zeros(shape), np.zeros((*shape, FEATURES))  # ... and what it was
+        self._coefficients = np.zeros((*shape, FEATURES))
+        self._covariance = np.broadcast_to(_prior()[:, None], (*shape, FEATURES, FEATURES)).copy()
+        self._variance = np.repeat(SPREAD[:, None] ** 2, cameras, 1)  # of a block
+        self._blocks = np.zeros(shape)
+        self._usual = np.zeros(shape)  # blocks in a row that are as usual
+        self._bad = np.zeros(shape, dtype=bool)
+        self._good = np.zeros(shape)  # s, until when nothing spoke for worse
+        self._test = Cusum(3 * cameras, REFERENCE, RUN_LENGTH)
 
     def __call__(
         self, state: RigState, frames: Mapping[str, Frame | None] | None, absorbed: MeasurementUpdate | None
     ) -> Iterable[Event]:
         """See `SequentialTest`."""
-        if self._began is None:  # also after a start that goes on: what was before is not known to the second
+        if self._began is None:  # also after a restart: what was before is not known to the second
             self._good[:] = state.time
         self._good = np.minimum(self._good, state.time)  # clocks may be set back
         if self._began is None or not 0 <= state.time - self._began < LONGEST:
-            self._began, self._values = state.time, _nothing()
-        events = self._judged(state) if state.time - self._began >= BLOCK else []
+            self._began = state.time
+            self._discard(np.ones_like(self._bad))
+        events = []
+        if state.time - self._began >= BLOCK:
+            events = self._judge(state)
+            self._began = state.time
         if state.rig_from_object is not None:
             self._collect(state)
         return events
 
     def _collect(self, state: RigState) -> None:
-        """Add the blobs of a snapshot."""
+        """Add a snapshot to the block."""
         assert state.rig_from_object is not None
-        blobs, rig = state.detections, state.rig
+        blobs, rig, shape = state.detections, state.rig, state.predicted.shape[:2]
+        points = rig.cam_from_rig.apply(state.rig_from_object.apply(state.belief.points_object)).numpy()
         rows = np.flatnonzero((blobs.fiducial >= 0) & blobs.usable)
-        camera, fiducial = blobs.camera[rows], blobs.fiducial[rows]
-        points = state.rig_from_object.apply(state.belief.points_object)
-        depth = rig.cam_from_rig.apply(points)[..., 2].numpy()[camera, fiducial]
+        at = blobs.camera[rows], blobs.fiducial[rows]
+        measured = np.full((2, *shape), np.nan)
         with np.errstate(invalid="ignore", divide="ignore"):
-            size = np.log(blobs.radius[rows] * depth / rig.focal_length.mean(-1).numpy()[camera])
-            sigma = np.log(blobs.sigma[rows] / depth)  # a lamp is as bright as it is near
-        seen = np.zeros(state.predicted.shape[:2], dtype=bool)
-        seen[camera, fiducial] = True
-        inside = well_inside(state.predicted, rig)
+            size = blobs.radius[rows] * points[..., 2][at] / rig.focal_length.mean(-1).numpy()[at[0]]
+            measured[0][at], measured[1][at] = np.log(size), np.log(blobs.sigma[rows])
+        value, count = np.zeros((3, shape[0])), np.zeros((3, shape[0]))
+        count[:2], value[:2] = _medians(measured)
+        seen = np.zeros(shape, dtype=bool)
+        seen[at] = True
         others_tell = (seen.sum(0) - seen >= 2) & seen.any(axis=1, keepdims=True)  # of a camera that is not out
-        at = np.nonzero(inside & others_tell)
-        missing = (~seen[at]).astype(np.float64)
-        for kept, cameras, values in zip(self._values, (camera, camera, at[0]), (size, sigma, missing), strict=True):
-            finite = np.isfinite(values)
-            kept.append((cameras[finite], values[finite]))
+        inside = well_inside(state.predicted, rig)
+        asked = inside & others_tell
+        unlabelled = np.bincount(blobs.camera[blobs.fiducial < 0], minlength=shape[0])  # each may be one of these
+        count[2] = asked.sum(1)
+        value[2] = np.maximum((asked & ~seen).sum(1) - unlabelled, 0) / np.maximum(count[2], 1)
+        place = _place(state, points, inside, self._distance)
+        count[:, ~np.isfinite(place).all(1)] = 0.0
+        self._count += count
+        self._sum += np.where(count > 0, count * value, 0.0)
+        self._place += np.where(count[..., None] > 0, count[..., None] * place, 0.0)
 
-    def _block(self) -> NDArray[np.float64]:
-        """Put together what was collected, where it is enough, and keep the rest: (3, C), nan where it is not."""
-        block = np.full((3, self._cameras), np.nan)
-        for number, least in enumerate(LEAST_VALUES):
-            if not self._values[number]:
-                continue
-            cameras, values = (np.concatenate(parts) for parts in zip(*self._values[number], strict=True))
-            enough = np.bincount(cameras, minlength=self._cameras) >= least
-            for camera in np.flatnonzero(enough):
-                own = values[cameras == camera]
-                block[number, camera] = own.mean() if number == MISSING else np.median(own)
-            rest = ~enough[cameras]
-            self._values[number] = [(cameras[rest], values[rest])]
-        return block
+    def _discard(self, which: NDArray[np.bool_]) -> None:
+        """Begin the blocks of some measures and cameras anew."""
+        self._count[which], self._sum[which], self._place[which] = 0.0, 0.0, 0.0
 
-    def _judged(self, state: RigState) -> list[Event]:
-        """Compare a block with those before, and begin the next one."""
-        block = self._block()
-        self._began = state.time
-        learning = np.isfinite(block) & (self._count < LEARNT)
-        self._count += learning
-        self._sum += np.where(learning, block, 0.0)
-        self._squares += np.where(learning, np.square(np.nan_to_num(block)), 0.0)
-        mean = self._sum / np.maximum(self._count, 1)
-        spread = np.sqrt(np.maximum(self._squares / np.maximum(self._count, 1) - mean**2, 0.0))
-        z = (block - mean) / np.maximum(spread, LEAST_SPREAD[:, None])
-        z[(self._count < LEARNT) | learning] = np.nan
-        risen = self._test.update(np.minimum(z, MOST_SPREADS).ravel()).reshape(z.shape)
-        self._usual = np.where(np.isnan(z), self._usual, np.where(z < CLEAN, self._usual + 1, 0))
-        events = self._told(state, risen & ~self._bad, self._bad & (self._usual >= CLEAN_BLOCKS), z)
+    def _judge(self, state: RigState) -> list[Event]:
+        """Compare the blocks that are complete with what is expected, and learn from them."""
+        done = self._count >= LEAST_FIDUCIALS[:, None]
+        total = np.maximum(self._count, 1)
+        value, place = self._sum / total, self._place / total[..., None]
+        self._discard(done)
+        correlation = np.exp(-np.maximum(state.time - self._last_time, BLOCK) / CORRELATION_SECONDS)
+        own = self._variance * (1 - correlation**2)  # of the innovation; after a long pause all of it
+        step_place = place - correlation[..., None] * self._last_place
+        step = value - correlation * self._last_value - (step_place * self._coefficients).sum(-1)
+        spread = np.einsum("qcij,qcj->qci", self._covariance, step_place)
+        variance = np.maximum((step_place * spread).sum(-1), 0.0) + own
+        z = np.where(done, step / np.sqrt(variance), np.nan)
+        level = value - (place * self._coefficients).sum(-1)
+        unknown = np.einsum("qci,qcij,qcj->qc", place, self._covariance, place)
+        usual = level < CLEAN * np.sqrt(self._variance + unknown)
+        calm = self._test.value.reshape(done.shape) < SUSPICION * self._test.threshold
+        learning = done & ~self._bad & calm & (unknown > LEARNT * self._variance)
+        gain = np.where(learning[..., None], spread / variance[..., None], 0.0)
+        self._coefficients += gain * step[..., None]
+        self._covariance -= gain[..., None] * spread[..., None, :]
+        self._blocks += done
+        excess = np.where(done, np.minimum(z**2, 9.0) - 1.0, 0.0) / np.minimum(PRIOR_BLOCKS + self._blocks, MEMORY)
+        self._variance = np.maximum(self._variance * (1 + excess), SPREAD[:, None] ** 2)
+        self._last_time[done] = state.time
+        self._last_value[done], self._last_place[done] = value[done], place[done]
+        risen = self._test.update(np.minimum(_own_part(z), MOST_SPREADS[:, None]).ravel()).reshape(z.shape)
+        self._usual = np.where(done, np.where(usual, self._usual + 1, 0), self._usual)
+        events = self._report(state, risen & ~self._bad, self._bad & (self._usual >= CLEAN_BLOCKS), z)
         self._good = np.where(self._test.age.reshape(z.shape) == 0, state.time, self._good)
         return events
 
-    def _told(
-        self, state: RigState, worse: NDArray[np.bool_], better: NDArray[np.bool_], z: NDArray[Any]
-    ) -> list[Event]:
+    def _report(self, state: RigState, worse: NDArray[np.bool_], better: NDArray[np.bool_], z: Array) -> list[Event]:
+        """Make the events of measures that became worse, and of cameras that are as before."""
         events, names = [], state.factory.camera_names
         was = self._bad.any(0)
         for number, camera in zip(*np.nonzero(worse), strict=True):
-            kind, message = SAID[number]
+            kind, message = MESSAGES[number]
             since = float(self._good[number, camera])
             events.append(
                 Event(
@@ -155,20 +192,65 @@ class ImageQuality:
 
     def saved(self) -> dict[str, Any]:
         """See `SequentialTest`."""
-        return {
-            "count": self._count.tolist(), "sum": self._sum.tolist(), "squares": self._squares.tolist(),
-            "bad": self._bad.tolist(), "usual": self._usual.tolist(),
-        }  # fmt: skip
+        return {name: getattr(self, f"_{name}").tolist() for name in _KEPT}
 
     def restored(self, values: dict[str, Any]) -> None:
         """See `SequentialTest`."""
-        shape = (3, self._cameras)
-        kept = {name: np.array(values[name], dtype=np.float64) for name in ("count", "sum", "squares", "bad", "usual")}
-        if any(array.shape != shape or not np.isfinite(array).all() for array in kept.values()):
-            raise ValueError(f"{self.name}: expected numbers of {shape[1]} cameras")
-        self._count, self._usual = kept["count"].astype(np.int64), kept["usual"].astype(np.int64)
-        self._sum, self._squares, self._bad = kept["sum"], kept["squares"], kept["bad"] > 0
+        for name in _KEPT:
+            known = getattr(self, f"_{name}")
+            found = np.array(values[name], dtype=np.float64)
+            if found.shape != known.shape or not np.isfinite(found).all():
+                raise ValueError(f"{self.name}: {name}: expected finite numbers of {self._bad.shape[1]} cameras")
+            setattr(self, f"_{name}", found.astype(known.dtype))
 
 
-def _nothing() -> list[list[tuple[NDArray[np.int64], NDArray[np.float64]]]]:
-    return [[] for _ in SAID]
+_KEPT = ("distance", "coefficients", "covariance", "variance", "blocks", "usual", "bad")
+
+
+def _prior() -> Array:
+    """Prior covariance of the coefficients of each measure: (3, F, F)."""
+    std = np.repeat(PRIOR, (1, len(CENTRES) ** 2, 2, 3), axis=1)
+    return std[..., None] ** 2 * np.eye(FEATURES)
+
+
+def _medians(values: Array) -> tuple[NDArray[np.int64], Array]:
+    """Count finite values along the last axis, and take their median; 0 where there are none."""
+    finite = np.isfinite(values)
+    count = finite.sum(-1)
+    ordered = np.sort(np.where(finite, values, np.inf), axis=-1)
+    middle = np.stack(((count - 1).clip(0) // 2, count // 2), axis=-1).clip(max=values.shape[-1] - 1)
+    median = np.take_along_axis(ordered, middle, axis=-1).mean(-1)
+    return count, np.where(count > 0, median, 0.0)
+
+
+def _place(state: RigState, points: Array, inside: NDArray[np.bool_], reference: Array) -> Array:
+    """Describe where each camera sees the object: (C, F); nan where it should not see it.
+
+    Args:
+        state: with a pose and predictions of the fiducials.
+        points: (C, N, 3) mm, the fiducials in the frame of each camera.
+        inside: (C, N), those that are well inside of the image.
+        reference: (C,) logarithms of the first distances (mm); 0 = not known yet, which is filled in.
+    """
+    rig, pose = state.rig, state.rig_from_object
+    assert pose is not None
+    count = inside.sum(1, keepdims=True)
+    weight = (inside / np.where(count > 0, count, np.nan))[..., None]
+    half = rig.image_size.numpy() / 2
+    centre = (np.where(inside[..., None], state.predicted, 0.0) * weight).sum(1) / half - 1
+    distance = np.log((points[..., 2:] * weight).sum((1, 2)))
+    reference[:] = np.where(reference == 0, np.nan_to_num(distance), reference)
+    far = (distance - reference)[:, None]
+    local = [np.exp(-0.5 * np.square((axis[:, None] - CENTRES) / WIDTH)) for axis in centre.T]
+    nearby = (local[0][:, :, None] * local[1][:, None, :]).reshape(len(points), -1)
+    ray = (rig.positions - pose.apply(state.belief.points_object).mean(0)) @ pose.rotation
+    direction = (ray / ray.norm(dim=-1, keepdim=True)).numpy()
+    return np.concatenate((np.ones_like(far), nearby, far, far**2, direction), axis=1)
+
+
+def _own_part(z: Array) -> Array:
+    """Subtract what most cameras see alike (3, C), where there are enough of them."""
+    enough = np.isfinite(z).sum(1) >= COMMON
+    common = np.zeros(len(z))
+    common[enough] = np.maximum(np.nanmedian(z[enough], axis=1), 0.0)
+    return z - common[:, None]

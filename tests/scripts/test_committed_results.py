@@ -1,6 +1,6 @@
 """Results of benchmarks as they are committed: whole, within what they promise, and on their pages."""
 
-from scripts.benchmarks import honesty_moves, honesty_prediction
+from scripts.benchmarks import honesty_moves, honesty_prediction, image_quality
 from scripts.output import read_json
 from scripts.results import formats
 
@@ -47,3 +47,13 @@ def test_formats_are_read_and_written_as_their_tools_have_them():
     verified = {name for name, row in result["formats"].items() if row["write"] and row["write"]["reader"]}
     assert verified == set(formats.READERS)
     assert formats.table(result) in formats.PAGE.read_text("utf-8")
+
+
+def test_image_quality_has_no_false_alarm_and_finds_every_fault():
+    found = read_json(image_quality.RESULT)["found"]
+    assert set(found) == set(image_quality.PARTS)
+    runs = {name: part.get("runs", [part]) for name, part in found.items()}
+    for name in image_quality.QUIET:
+        assert all(run["events"] == [] for run in runs.pop(name)), name
+    for name, every in runs.items():
+        assert all(run["seconds"] <= image_quality.IN_TIME[name] and run["false"] == 0 for run in every), name

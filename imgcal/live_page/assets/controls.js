@@ -1,11 +1,11 @@
 // What people can ask for. Each command carries the token of this page.
 
 async function command(name, more = {}) {
-  const camera = more.camera, told = { pause: "Paused.", resume: "Goes on.", acknowledge: "Acknowledged.", factory: "Asked for: an event tells when it is so." };
+  const camera = more.camera, told = { pause: "Paused.", resume: "Resumed.", acknowledge: "Acknowledged.", factory: "Requested; an event confirms it." };
   try {
     const answer = await fetch("/command", { method: "POST", headers: { "Content-Type": "application/json", "X-Imgcal-Token": data.token }, body: JSON.stringify({ name, ...more }) });
     say($("said"), answer.ok ? told[name] || "Done." : `Not done: ${(await answer.text()).trim()}`);
-    if (!answer.ok) notice(`not done: ${answer.status === 403 ? "reload the page" : answer.status > 500 ? "the program that runs the rig does not listen" : "try again"}`);
+    if (!answer.ok) notice(`not done: ${answer.status === 403 ? "reload the page" : answer.status > 500 ? "the program that runs the rig does not answer" : "try again"}`);
     return answer.ok;
   } catch {
     notice("not done: no connection");
@@ -20,7 +20,7 @@ function startControls() {
   const dialog = $("confirm");
   $("factory").addEventListener("click", () => {
     const changed = page.state ? page.hello.cameras.filter((_, i) => page.state.health[i] !== "ok").length : 0;
-    say($("confirm-text"), `From now on, the rig as it is known at this moment is what ${page.hello.rig} is compared with.` + (changed ? ` ${plural(changed, "camera")} of ${page.hello.cameras.length} ${changed === 1 ? "is" : "are"} not well now.` : ""));
+    say($("confirm-text"), `From now on, changes of ${page.hello.rig} are measured against the rig as it is calibrated now.` + (changed ? ` ${changed} of ${plural(page.hello.cameras.length, "camera")} ${changed === 1 ? "needs" : "need"} attention first.` : ""));
     dialog.showModal();
     $("confirm-no").focus();
   });
@@ -47,7 +47,7 @@ function buildActions() {
 
 function drawControls() {
   const { paused, on } = page.controls;
-  say($("pause"), paused ? "Go on" : "Pause");
+  say($("pause"), paused ? "Resume" : "Pause");
   if (!page.hello) return;
   for (const action of page.hello.actions) {
     const button = document.querySelector(`[data-action="${CSS.escape(action.name)}"]`);

@@ -2,7 +2,8 @@
 
 const data = JSON.parse($("data").textContent), fixed = "contents" in data;
 const STALE = 3000; // ms without a new state
-const line = { source: null, wait: 500, timer: null, last: 0, offset: null, until: 0 };
+const line = { source: null, wait: 500, timer: null, last: 0, until: 0, gone: null };
+const GONE = 1; // s without the object from which the page says so: single snapshots may miss it
 const CALM = 450; // ms between changes of numbers, which can be read then
 let drawn = -Infinity, numbers = null;
 
@@ -32,8 +33,12 @@ const TAKE = {
   volume(content) { page.volume = content; drawVolumeMaps(); refreshScene(); },
   picture(content) { page.pictures.set(content.camera, content); drawPicture(content.camera); },
   state(content) {
+    const before = page.state && page.state.health.join();
     page.state = content;
+    if (content.inView) line.gone = null;
+    else line.gone ??= content.time;
     line.last = performance.now();
+    if (before !== content.health.join()) drawEvents(); // what was so may be over
     appendHistory(content); drawState(); refreshScene();
     if (!numbers) numbers = setTimeout(drawNumbers, Math.max(0, CALM - (line.last - drawn)));
   },
@@ -44,25 +49,35 @@ function worstTone() {
   if (page.controls && page.controls.paused) return "none";
   const tones = page.hello.cameras.map((_, i) => ORDER.indexOf(toneOf(i)));
   const worst = ORDER[Math.max(...tones)];
+  if (worst === "good" && isGone()) return "none";
   return worst === "good" && page.events.some((event) => event.open) ? "caution" : worst;
 }
+
+const isGone = () => line.gone !== null && (fixed || page.state.time - line.gone >= GONE);
+const sentenceCase = (text) => { // names of cameras stay as they are
+  const named = page.hello.cameras.some((name) => text.startsWith(name));
+  return (named ? text : text.charAt(0).toUpperCase() + text.slice(1)) + (/[.!?]$/.test(text) ? "" : ".");
+};
 
 function drawState() {
   if (!page.hello) return;
   const { state, controls } = page, tone = worstTone();
   if ($("sign").dataset.tone !== tone) { $("sign").dataset.tone = tone; $("sign").replaceChildren(sign(tone)); }
   if (!state) { return; }
-  const named = page.hello.cameras.some((name) => state.sentence.startsWith(name)); // names stay as they are
-  const text = named ? state.sentence : state.sentence.charAt(0).toUpperCase() + state.sentence.slice(1);
-  say($("sentence"), controls && controls.paused ? "Paused: the rig is not followed." : /[.!?]$/.test(text) ? text : text + ".");
+  const paused = controls && controls.paused, gone = isGone();
+  say($("sentence"), paused ? "Paused: snapshots are not evaluated." : gone ? "No object in view." : sentenceCase(state.sentence));
   const seeing = state.sees.filter((n) => n > 0).length, parts = [];
-  if (state.refused) parts.push(`this snapshot taught nothing: ${state.refused}`);
-  else parts.push(`the object is seen by ${seeing} of ${plural(page.hello.cameras.length, "camera")}`);
+  if (paused) parts.push(`last snapshot at ${clock(state.time)}`);
+  else if (gone) parts.push(state.sentence);
+  else if (!state.inView) parts.push("no object in view");
+  else if (state.refused) parts.push(`this snapshot was not used: ${state.refused.replace(/^identity: /, "")}`);
+  else parts.push(`${seeing} of ${plural(page.hello.cameras.length, "camera")} ${seeing === 1 ? "sees" : "see"} the object`);
   const residuals = state.value.map((v) => v[3]).filter((v) => v !== null);
-  if (residuals.length && !state.refused) parts.push(`residual ${digits(Math.sqrt(residuals.reduce((sum, v) => sum + v * v, 0) / residuals.length))} px`);
-  if (state.rate !== null) parts.push(`${state.rate.toFixed(state.rate < 10 ? 1 : 0)} snapshots a second`);
+  if (residuals.length && !state.refused && !paused) parts.push(`residual ${digits(Math.sqrt(residuals.reduce((sum, v) => sum + v * v, 0) / residuals.length))} px`);
+  if (state.rate !== null && !paused) parts.push(`${state.rate.toFixed(state.rate < 10 ? 1 : 0)} snapshots a second`);
   const detail = parts.join(" · ");
-  say($("detail"), detail.charAt(0).toUpperCase() + detail.slice(1));
+  say($("detail"), sentenceCase(detail).replace(/\.$/, ""));
+  drawAlarm();
 }
 
 function notice(text) {
@@ -76,7 +91,7 @@ function drawLink() {
   if (fixed) { say($("link").lastChild, page.state ? `as of ${new Date(page.state.time * 1000).toLocaleString([], { hour12: false })}` : "no snapshot"); return; }
   const connected = line.source && line.source.readyState === EventSource.OPEN, quiet = performance.now() - line.last;
   const paused = page.controls && page.controls.paused, stale = connected && page.state && quiet > STALE && !paused;
-  const text = !connected ? "connection lost, trying again" : stale ? `no snapshot for ${Math.round(quiet / 1000)} s` : page.state ? `live ${clock(page.state.time)}` : "connected";
+  const text = !connected ? "connection lost, trying again" : stale ? `no snapshot for ${Math.round(quiet / 1000)} s` : page.state ? `${paused ? "paused at" : "live"} ${clock(page.state.time)}` : "connected";
   say($("link").lastChild, text);
   $("link").className = `link ${!connected ? "lost" : stale ? "stale" : page.state ? "live" : ""}`;
   document.body.classList.toggle("away", !connected);

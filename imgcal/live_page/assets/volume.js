@@ -18,14 +18,14 @@ function ratioOf(advice, here) {
 
 function guidance() {
   const advice = page.volume && page.volume.advice;
-  if (!advice) return "Nothing is known yet: show the object to the cameras.";
-  const known = advice.median === null ? "No two cameras see the same part of the volume." : `Points are known to ${digits(advice.median)} mm, 95 % of the volume to ${digits(advice.p95)} mm.`;
+  if (!advice) return page.state && page.state.object ? "Computing how accurate the rig is …" : "Show the object to the cameras.";
+  const known = advice.median === null ? "No two cameras see the same part of the volume." : `Typical error of a triangulated point: ${digits(advice.median)} mm; in 95 % of the volume below ${digits(advice.p95)} mm.`;
   const next = target();
-  if (!next) return `${known} Where the object is, a snapshot teaches about as much as anywhere.`;
+  if (!next) return `${known} The object is in a good place: snapshots elsewhere would not improve the rig much more.`;
   const here = page.state && page.state.object ? mean(page.state.object) : null;
-  if (!here) return `${known} Bring the object near x ${next[0].toFixed(0)}, y ${next[1].toFixed(0)}, z ${next[2].toFixed(0)} mm.`;
+  if (!here) return `${known} Bring the object near ${["x", "y", "z"].map((axis, k) => `${axis} ${next[k].toFixed(0).replace("-", "−")}`).join(", ")} mm.`;
   const ratio = ratioOf(advice, here);
-  const worth = ratio === Infinity ? "no snapshot here teaches anything" : `a snapshot there teaches ${ratio.toFixed(1)} times as much`;
+  const worth = ratio === Infinity ? "snapshots where it is now teach nothing" : `a snapshot there teaches ${ratio.toFixed(1)} times as much`;
   return `${known} Move the object here next: ${directions(add(next, here, -1), next)}; ${worth}.`;
 }
 

@@ -3,8 +3,8 @@
 const page = { hello: null, layout: null, state: null, history: null, events: [], volume: null, controls: null, pictures: new Map(), selected: 0, span: "fine" };
 
 const HEALTH = {
-  ok: ["good", "as calibrated"], doubtful: ["caution", "in doubt"], relearning: ["caution", "re-learning"], dirty: ["caution", "dirty"], defocused: ["caution", "out of focus"],
-  blind: ["bad", "sees nothing"], lost: ["bad", "lost"], unseen: ["none", "not looked at yet"],
+  ok: ["good", "calibrated"], doubtful: ["caution", "in doubt"], relearning: ["caution", "recalibrating"], dirty: ["caution", "dirty"], defocused: ["caution", "out of focus"],
+  blind: ["bad", "sees nothing"], lost: ["bad", "lost"], unseen: ["none", "not seen the object yet"],
 };
 const ORDER = ["none", "good", "caution", "bad"];
 
@@ -63,10 +63,19 @@ function withSigma(value, sigma) { // as many places as the deviation has
 }
 
 const clock = (seconds) => new Date(seconds * 1000).toLocaleTimeString([], { hour12: false });
-const readable = (event) => { // numbers as they are printed, and when it was
-  const text = event.message.replaceAll(" +- ", " ± ");
-  return event.since === null || !["moved", "relearnt"].includes(event.kind) ? text : text.replace(/(, re-learnt|$)/, ` at ${clock(event.since)}$1`);
-};
+const RESULT = { camera_lost: ["lost", "blind"], dirty: ["dirty"], defocused: ["defocused"] }; // the health of a camera while an alarm holds
+const PAST = { camera_lost: "lost the object", camera_back: "saw the object again", dirty: "was dirty, half covered or badly lit", defocused: "was out of focus", clean: "was clear and sharp again" };
+function holds(event) { // whether what an event reports is still so
+  const camera = page.hello ? page.hello.cameras.indexOf(event.camera) : -1;
+  return Boolean(RESULT[event.kind] && page.state && RESULT[event.kind].includes(page.state.health[camera])) && !page.events.some((later) => later.number > event.number && later.camera === event.camera && later.kind === event.kind);
+}
+function readable(event) { // in the past tense once it is over
+  if (PAST[event.kind] && !holds(event)) return `${event.camera} ${PAST[event.kind]}`;
+  const text = event.message.replaceAll(" +- ", " ± ").replace(/, re-learnt.*$/, ""), when = event.since === null ? "" : ` at ${clock(event.since)}`;
+  if (event.kind === "moved") return text + when;
+  if (event.kind !== "relearnt") return text;
+  return `${text}${when}; known again${event.sigma === null ? "" : ` to ±${digits(event.sigma)} ${event.unit}`}`;
+}
 const shortClock = (seconds) => clock(seconds).slice(0, 5);
 const plural = (count, noun) => `${count} ${noun}${count === 1 ? "" : "s"}`;
 

@@ -64,6 +64,17 @@ def test_a_snapshot_that_taught_nothing_has_no_object(o10, asymmetric8):
     assert belief.rig.num_cameras == factory.num_cameras == 10 and turn.shape == (3, 3)
 
 
+def test_an_object_is_in_view_while_a_camera_sees_enough_blobs(o10, asymmetric8):
+    state = made_state(o10, asymmetric8)
+    assert state_message(state, asymmetric8)["in_view"]
+    refused = replace(state, refused="identity: two poses fit")
+    assert state_message(refused, asymmetric8)["in_view"]
+    rows = state.detections.fiducial < 3
+    assert not state_message(replace(refused, detections=state.detections.select(rows)), asymmetric8)["in_view"]
+    nothing = state.detections.select(np.zeros_like(rows))
+    assert not state_message(replace(refused, detections=nothing), asymmetric8)["in_view"]
+
+
 def test_rigs_and_events_go_through(o10, asymmetric8):
     rig, factory = pickle.loads(rig_message(made_state(o10, asymmetric8))["pickled"])
     assert rig.camera_names == factory.camera_names

@@ -1,4 +1,5 @@
 import pickle
+from dataclasses import replace
 
 import pytest
 
@@ -40,3 +41,14 @@ def test_commands_without_a_state_switch_nothing(name):
     notes = Notes()
     notes.obey(Command(name), NAMED)
     assert notes == Notes()
+
+
+@pytest.mark.parametrize(
+    ("kind", "ended"), [("camera_lost", "camera_back"), ("dirty", "clean"), ("defocused", "clean")]
+)
+def test_an_alarm_that_is_over_needs_no_acknowledgement_and_nor_does_its_end(kind, ended):
+    notes = Notes()
+    for camera in ("cam01", "cam02"):
+        notes.take(event_message(replace(alarm(camera, since=5.0), kind=kind)))
+    notes.take(event_message(replace(alarm("cam01", since=5.0), kind=ended)))
+    assert [event["open"] for event in notes.events] == [False, True, False]

@@ -120,7 +120,7 @@ def test_a_camera_that_moved_is_on_the_page_soon(browser, calm, o10, asymmetric8
     with opened(browser, calm.url) as tab:
         says(tab, "as calibrated")
         tab.wait_for_function("() => document.querySelectorAll('#cameras .pick').length === 10")
-        words = "() => document.querySelectorAll('#cameras tbody tr')[6].textContent.includes('re-learning')"
+        words = "() => document.querySelectorAll('#cameras tbody tr')[6].textContent.includes('recalibrating')"
         moved = {"health": {"cam07": "relearning"}, "sentence": "cam07 turned 0.3 degrees", "events": (alarm("cam07"),)}
         begun = time.monotonic()
         calm.publish(made_state(o10, asymmetric8, 2, **moved))
@@ -134,6 +134,48 @@ def test_a_camera_that_moved_is_on_the_page_soon(browser, calm, o10, asymmetric8
         assert commands_of(calm)[0].name == "acknowledge"
         calm.publish(made_state(o10, asymmetric8, 3))
         says(tab, "All 10 cameras as calibrated")
+        assert tab.wrong == []
+
+
+def test_without_the_object_the_page_says_so(browser, calm, o10, asymmetric8):
+    """And not what the identification could not do; a single snapshot without it is no news."""
+    seen = made_state(o10, asymmetric8, 2, now=1.7e9)
+    blobs = seen.detections.select(seen.detections.fiducial < 1)
+    refused = "identity: too few blobs: at most 1 in a camera, expected at least 4 in one"
+    without = replace(seen, detections=blobs, rig_from_object=None, refused=refused)
+    with opened(browser, calm.url) as tab:
+        calm.publish(replace(without, snapshot=3, time=1.7e9 + 0.1))
+        says(tab, "No object in view", "#detail")
+        says(tab, "All 10 cameras as calibrated")
+        calm.publish(replace(without, snapshot=4, time=1.7e9 + 2.0))
+        says(tab, "No object in view.")
+        assert "identity" not in tab.inner_text("#state") and "All 10 cameras" in tab.inner_text("#detail")
+        calm.publish(replace(seen, snapshot=5, time=1.7e9 + 3.0))
+        says(tab, "All 10 cameras as calibrated")
+        says(tab, "10 of 10 cameras see the object", "#detail")
+        assert tab.wrong == []
+
+
+def test_an_alarm_that_is_over_is_in_the_past_tense(browser, o10, asymmetric8):
+    lost = replace(alarm("cam02", message="cam02 does not see the object", since=5.0), kind="camera_lost")
+    back = replace(alarm("cam02", message="cam02 sees the object again", since=5.0), kind="camera_back")
+    with LivePage(o10, asymmetric8, Address(port=0)) as page, opened(browser, page.url) as tab:
+        page.publish(made_state(o10, asymmetric8, 1, health={"cam02": "lost"}, events=(lost,)))
+        says(tab, "cam02 does not see the object", "#alarm-text")
+        page.publish(made_state(o10, asymmetric8, 2, events=(back,)))
+        says(tab, "cam02 saw the object again", "#events")
+        says(tab, "cam02 lost the object", "#events")
+        tab.wait_for_selector("#alarm", state="hidden")
+        assert "does not" not in tab.inner_text("#events")
+        assert tab.wrong == []
+
+
+def test_how_well_a_camera_is_known_again_is_no_value(browser, o10, asymmetric8):
+    event = alarm("cam03", message="cam03 turned 0.3 +- 0.01 deg, re-learnt to 0.013 deg", since=5.0)
+    with LivePage(o10, asymmetric8, Address(port=0)) as page, opened(browser, page.url) as tab:
+        page.publish(made_state(o10, asymmetric8, 1, events=(replace(event, kind="relearnt", sigma=0.013),)))
+        says(tab, "known again to ±0.013 deg", "#events")
+        assert "re-learnt" not in tab.inner_text("body")
         assert tab.wrong == []
 
 
@@ -186,7 +228,7 @@ def test_keys_do_what_a_mouse_does_and_the_wheel_scrolls(browser, calm):
             "!(e.getAttribute('aria-label') || e.textContent.trim() || e.labels?.length)).map(e => e.outerHTML)"
         )
         assert names == []  # everything that can be used has a name that can be read out
-        assert "10 as calibrated" in tab.get_attribute("#scene", "aria-label")
+        assert "10 calibrated" in tab.get_attribute("#scene", "aria-label")
         assert tab.get_attribute("#sentence", "aria-live") == "polite"
         assert tab.wrong == []
 

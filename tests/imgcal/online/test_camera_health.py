@@ -30,4 +30,4 @@ def test_the_worst_is_said_of_a_camera() -> None:
 def test_the_rig_is_said_in_a_sentence() -> None:
     assert sentence_of({"a": "ok"}, 0) == "the object has not been seen yet"
     assert sentence_of({"a": "ok", "b": "ok"}, 5) == "all 2 cameras are calibrated"
-    assert sentence_of({"a": "dirty", "b": "relearning"}, 5) == "b moved, being learnt again; a dirty"
+    assert sentence_of({"a": "dirty", "b": "relearning"}, 5) == "b moved and is being recalibrated; a is dirty"

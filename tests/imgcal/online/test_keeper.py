@@ -128,7 +128,7 @@ def test_tests_see_every_snapshot_and_tell_of_cameras() -> None:
         states = [keeper.update(blobs, time) for time, blobs in made.snapshots(4)]
     assert [state.cameras["cam03"] for state in states] == ["ok", "dirty", "dirty", "ok"]
     assert [event.kind for state in states for event in state.events] == ["dirty", "clean"]
-    assert states[1].sentence == "cam03 dirty"
+    assert states[1].sentence == "cam03 is dirty"
 
 
 def test_present_values_may_become_those_of_the_factory() -> None:
