@@ -19,7 +19,7 @@ from imgcal.types import Observations
 ALARM_CHI2 = 60.0
 """That a camera which stands still exceeds once in 10^12 tests."""
 SCREEN_CHI2 = 20.0
-"""Of the quick test (`screen`), from which on the exact one is made: a third of it where half of the knowledge is new."""
+"""Of the quick test (`screen`), from which on the exact one is made: a third of it where half of the data are new."""
 REMAINING_CHI2 = 20.0
 """What is left without the episode that speaks most for a change: a wrong label, or an error that passes, is none."""
 
@@ -33,13 +33,16 @@ FIT_CHI2_PER_DOF = 4.0
 """Chi-squared per degree of freedom up to which a snapshot fits that is else refused."""
 
 
-def find_alarm(recent: RecentSnapshots, count: int, episodes: Sequence[int]) -> int | None:
+def find_alarm(
+    recent: RecentSnapshots, count: int, episodes: Sequence[int], least_shifts: Sequence[float]
+) -> int | None:
     """Find the number of latest snapshots before which some camera has surely changed; None = none has.
 
     Args:
         recent: the latest snapshots.
         count: of all snapshots so far.
         episodes: for each camera the successive snapshots that one passing error may last.
+        least_shifts: for each camera the pixels by which a change must shift its image.
     """
     ages = {age for age, every in SLOW_TESTS.items() if age <= len(recent) and count % every == 0}
     screened = recent.screened()
@@ -49,8 +52,10 @@ def find_alarm(recent: RecentSnapshots, count: int, episodes: Sequence[int]) -> 
         scores = recent.test(age).scores()
         kind = max(scores, key=lambda name: float(scores[name].max()))
         camera = int(scores[kind].argmax())
-        significant = float(scores[kind][camera]) >= ALARM_CHI2
-        if significant and recent.score_without_episode(age, camera, kind, episodes[camera]) >= REMAINING_CHI2:
+        if float(scores[kind][camera]) < ALARM_CHI2:
+            continue
+        left, shift = recent.score_without_episode(age, camera, kind, episodes[camera])
+        if left >= REMAINING_CHI2 and shift >= least_shifts[camera]:
             return age
     return None
 

@@ -36,6 +36,10 @@ EPISODE = 2.0
 """Correlation times that a passing error may last."""
 LARGEST, SHORT = 20.0, 3
 """Times the usual size of lasting errors that one may have; the snapshots that a larger one (wrong labels) lasts."""
+LEAST_SHIFT = 6.0
+"""Times the usual size of lasting errors by which a change must shift an image."""
+TAIL, TAIL_SIGMAS = 0.99, 3.03
+"""Part of the shifts that the tail leaves out, and how far it begins where they are normal, in standard deviations."""
 LEAST_POINTS = 2
 """Labels of a camera from which the shift of its image counts."""
 
@@ -87,6 +91,11 @@ class NoiseCorrelation:
         """Successive snapshots of each camera that one passing error may last."""
         return [1 if time <= 1 else math.ceil(EPISODE * time) for time in self.time.tolist()]
 
+    @property
+    def least_shifts(self) -> list[float]:
+        """Pixels by which a change must shift the image of each camera: less may be an error that lasts."""
+        return torch.where(self.time > 1, LEAST_SHIFT * self.model_error, 0.0).tolist()
+
     def weigh(self, observations: Observations) -> Observations:
         """Give observations (S, C, N) the variance with which their number is an effective sample size."""
         if not bool((self.time > 1).any()):
@@ -119,7 +128,12 @@ class NoiseCorrelation:
         together = float(correlation_time(whitened[:, None])[0])
         time = np.maximum(correlation_time(series), together)
         self.time = torch.from_numpy(time)
-        self.lasting = torch.from_numpy(np.sqrt(variance * (1 - 1 / time)))
+        # A passing error is seldom, and large: the tail says more of it than the variance.
+        length = np.where(seen, np.linalg.norm(series, axis=-1), np.nan)
+        tail = np.array(
+            [np.nanquantile(column, TAIL) if some.any() else 0.0 for column, some in zip(length.T, seen.T, strict=True)]
+        )
+        self.lasting = torch.from_numpy(np.where(time > 1, tail / TAIL_SIGMAS, 0.0))
 
 
 def usual_time(seconds: float) -> float:

@@ -7,6 +7,7 @@ such base begins.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -32,6 +33,7 @@ MOST_BASES = 8
 """How often the belief may have aged within them."""
 SCREENED_AGES = np.array((2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64))
 """Numbers of snapshots that are screened."""
+PRINCIPAL_POINT = CHANGES["principal_point"].start
 PARTS = np.array([(part.start, part.stop) for part in CHANGES.values()])
 
 
@@ -198,18 +200,21 @@ class RecentSnapshots:
             information = torch.cholesky_inverse(_cholesky(covariance))
         return ChangeTest.of(information, brought, pull, self._change, self._pixels, self.lasting)
 
-    def score_without_episode(self, age: int, camera: int, kind: str, episode: int) -> float:
-        """Score of a change of a camera, all else taken to be known, without the episode that speaks most for it.
+    def score_without_episode(self, age: int, camera: int, kind: str, episode: int) -> tuple[float, float]:
+        """Score a change of a camera, all else taken to be known, without the episode that speaks most for it.
 
         Args:
             age: snapshots since the change.
             camera: its number.
             kind: of `CHANGES`.
             episode: successive snapshots that one passing error may last.
+
+        Returns:
+            Chi-squared, and the shift (px, RMS) of the image that it amounts to; zeros where all may be one episode.
         """
         number, part = self._next - age, CHANGES[kind]
         if age <= episode:
-            return 0.0
+            return 0.0, 0.0
         _, at = self._known(number)
         own, pull = [], []
         row = slice(camera * self._unit.shape[1], (camera + 1) * self._unit.shape[1])
@@ -220,7 +225,13 @@ class RecentSnapshots:
             own.append(change.mT @ brought[row, row] @ change)
         pulls, blocks = _all_but(torch.stack(pull), episode), _all_but(torch.stack(own), episode)
         least = 1e-9 * torch.stack(own).sum(0).diagonal().clamp_min(1e-30).diag()
-        return float((pulls * torch.linalg.solve(blocks + least, pulls[..., None])[..., 0]).sum(-1).min())
+        score = float((pulls * torch.linalg.solve(blocks + least, pulls[..., None])[..., 0]).sum(-1).min())
+        total = self._totals[0]
+        gained = total[self._next % len(total)][camera] - total[number % len(total)][camera]
+        weight = (
+            gained[PRINCIPAL_POINT, PRINCIPAL_POINT] / self._unit[camera, PRINCIPAL_POINT] ** 2
+        )  # of all its labels
+        return score, math.sqrt(max(score, 0.0) / max(weight, 1e-12))
 
     def belief_before(self, age: int) -> RigBelief:
         """What was believed before the latest `age` snapshots.

@@ -156,7 +156,7 @@ class RigMonitor:
         self._recent.append(result, observations, seconds)
         if self._pending is not None:
             self._pending.add(result, seconds)
-        alarm = find_alarm(self._recent, self.filter.count, self.noise.episodes)
+        alarm = find_alarm(self._recent, self.filter.count, self.noise.episodes, self.noise.least_shifts)
         misfit = self._misfit.update(result.chi2, result.dof)
         if alarm is None and misfit and self._pending is None and (anew := self._diagnose_misfit(misfit)) is not None:
             return anew
@@ -270,8 +270,10 @@ class RigMonitor:
         moved = dict.fromkeys(sorted(self._moved_early))
         beginning = free_cameras(self._prior, moved, JUMPS[-1]) if everything else None
         snapshots, pauses = self._recent.snapshots(kept), self._recent.pauses(kept)
-        options = self.filter.options
-        return Case(before, snapshots, pauses, age, options, cameras, beginning=beginning, excluded=excluded)
+        return Case(
+            before, snapshots, pauses, age, self.filter.options, cameras,
+            lasting=self.noise.correlated, beginning=beginning, excluded=excluded,
+        )  # fmt: skip
 
     def _adopt(self, case: Case, verdict: Verdict, new: bool = False) -> MonitorUpdate:
         """Learn snapshots anew as the best explanation has them.

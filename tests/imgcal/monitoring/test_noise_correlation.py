@@ -22,7 +22,7 @@ def observations(cameras: int = 2, fiducials: int = 5) -> Observations:
 
 
 def follow(remain: list[float], count: int = 1200, seed: int = 1) -> NoiseCorrelation:
-    """Follow cameras with noise of each point, and a shift of the image of which a part remains in the next snapshot."""
+    """Follow cameras with noise of each point, and a shift of the image of which a part remains each time."""
     rng, noise = np.random.default_rng(seed), NoiseCorrelation(len(remain))
     shift, keep = np.zeros((len(remain), 2)), np.array(remain)[:, None]
     for _ in range(count):
