@@ -19,7 +19,7 @@ from imgcal.types import Observations
 ALARM_CHI2 = 60.0
 """That a camera which stands still exceeds once in 10^12 tests."""
 SCREEN_CHI2 = 20.0
-"""Of the quick test (`screen`), from which on the exact one is made: a third of it where half of what is known is new."""
+"""Of the quick test (`screen`), from which on the exact one is made: it finds a third where half of the rest is new."""
 REMAINING_CHI2 = 20.0
 """What is left without the snapshot that speaks most for a change: one wrong label is none."""
 

@@ -157,7 +157,7 @@ class RigMonitor:
                 )
         if self._pending is None:
             self.shaking.take(observations, result.residual[-1:])
-        self._drifting.take(self.filter, self._recent, seconds, quiet=self._pending is None and alarm is None)
+        self._drifting.update(self.filter, self._recent, seconds, quiet=self._pending is None and alarm is None)
         if self._pending is not None and self._pending.due:
             changes += self._decide_kinds(self._pending.overdue)
         return MonitorUpdate(result, tuple(changes))
