@@ -91,7 +91,7 @@ class DriftInformation:
         return cls(camera_names, 0.5 * (information + information.mT), asked)
 
     @classmethod
-    def stack_snapshots(cls, parts: Sequence[DriftInformation]) -> DriftInformation:
+    def joined(cls, parts: Sequence[DriftInformation]) -> DriftInformation:
         """Put devices behind one another.
 
         Raises:

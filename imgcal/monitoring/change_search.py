@@ -19,7 +19,7 @@ from imgcal.types import Observations
 ALARM_CHI2 = 60.0
 """That a camera which stands still exceeds once in 10^12 tests."""
 SCREEN_CHI2 = 20.0
-"""Of the quick test (`screen`), from which on the exact one is made: a third of it where half of the data are new."""
+"""Of the quick test (`screen`), from which on the exact one is made: it finds a third where half of the rest is new."""
 REMAINING_CHI2 = 20.0
 """What is left without the episode that speaks most for a change: a wrong label, or an error that passes, is none."""
 

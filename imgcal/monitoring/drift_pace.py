@@ -100,7 +100,7 @@ class DriftPaces:
             pace[:, part] = self.squared[:, number, None].sqrt()
         return pace
 
-    def take(self, stretch: Stretch, walk: Tensor) -> Tensor:
+    def add_stretch(self, stretch: Stretch, walk: Tensor) -> Tensor:
         """Learn from a stretch.
 
         Args:
@@ -175,7 +175,7 @@ class DriftLearning:
     stretch: Stretch | None = None  # of snapshots ...
     waiting: int = 0  # ... and the latest of them, which are not added yet
 
-    def take(self, follows: RigFilter, recent: RecentSnapshots, seconds: float, quiet: bool) -> None:
+    def update(self, follows: RigFilter, recent: RecentSnapshots, seconds: float, quiet: bool) -> None:
         """Take the latest snapshot, and change what the filter believes.
 
         Args:
@@ -197,7 +197,7 @@ class DriftLearning:
             stretch.add(follows.belief, *recent.information(self.waiting))
             self.waiting = 0
         if done:
-            lacking = self.paces.take(stretch, follows.rate.std(follows.belief.rig))
+            lacking = self.paces.add_stretch(stretch, follows.rate.std(follows.belief.rig))
             follows.pace = self.paces.of_parameters(follows.pace.shape[1])
             recent.walk = follows.walk
             if bool(lacking.any()):

@@ -175,7 +175,7 @@ class RigMonitor:
                 self._pending = PendingChange.of(
                     result, self._pending.before, self._pending.seconds, self._pending.kinds
                 )
-        self._drifting.take(self.filter, self._recent, seconds, quiet=self._pending is None and alarm is None)
+        self._drifting.update(self.filter, self._recent, seconds, quiet=self._pending is None and alarm is None)
         if self._pending is not None and self._pending.due:
             changes += self._decide_kinds(self._pending.overdue)
         return MonitorUpdate(result, tuple(changes))
@@ -199,13 +199,18 @@ class RigMonitor:
 
     def _episode(self, cameras: Collection[int], observations: Observations, result: MeasurementUpdate) -> int:
         """Successive snapshots that what is wrong with cameras may last, if it is an error that passes."""
-        longest = 1
-        for camera in cameras:
-            seen, uv = observations.seen[0, camera], observations.uv[0, camera]
-            off = (uv - image_of(result.belief, result.rig_from_object[-1:], camera)[0])[seen]
-            shift = float(off.median(0).values.norm()) if len(off) else 0.0
-            longest = max(longest, self.noise.episode(camera, shift))
-        return longest
+        snapshot = observations, result.rig_from_object[-1:]
+        return max(self.noise.episode(camera, _shift(result.belief, snapshot, camera)) for camera in cameras)
+
+    def _shows_move(self, case: Case) -> bool:
+        """Tell whether the image of some suspected camera is shifted by clearly more than errors that last."""
+        least = self.noise.least_shifts
+        for camera in case.cameras:
+            seen = [one for one in case.latest if bool(one[0].seen[0, camera].any())]
+            shifts = [_shift(case.before, snapshot, camera) for snapshot in seen]
+            if shifts and sorted(shifts)[len(shifts) // 2] >= least[camera]:
+                return True
+        return False
 
     def _diagnose_quarantine(self, found: MonitorUpdate) -> MonitorUpdate:
         """Find out what has happened to the cameras in quarantine, and learn them anew where they have moved.
@@ -213,17 +218,15 @@ class RigMonitor:
         Raises:
             RefusedError: it cannot be decided yet, or they do not see enough.
         """
-        quarantine, case = (
-            self.quarantine,
-            self.quarantine.case(self._recent, self.filter.options, self.noise.correlated),
-        )
+        quarantine = self.quarantine
+        case = quarantine.case(self._recent, self.filter.options, self.noise.correlated)
         quarantine.unsynchronized = False
         verdict = self._diagnosis.decide(case, patient=self._pending is None)
         quarantine.unsynchronized = bool(verdict.best.finding.unsynchronized)
         if quarantine.unsynchronized:
             return found
         quarantine.release()
-        if verdict.best.name == Moved.name:
+        if verdict.best.name == Moved.name and self._shows_move(case):
             decided = self._decide_kinds(last=True)
             anew = self._learn_moved(case, dict.fromkeys(case.cameras), JUMPS[-1], sum(case.pauses[-case.count :]))
             return replace(anew, changes=(*found.changes, *decided, *anew.changes))
@@ -463,3 +466,11 @@ class RigMonitor:
         if not self.open:
             self._pending = None
         return decided
+
+
+def _shift(belief: RigBelief, snapshot: Snapshot, camera: int) -> float:
+    """Median distance (px) along both axes of what a camera sees in a snapshot from where it should be."""
+    observations, pose = snapshot
+    seen = observations.seen[0, camera]
+    off = (observations.uv[0, camera] - image_of(belief, pose, camera)[0])[seen]
+    return float(off.median(0).values.norm()) if len(off) else 0.0

@@ -39,14 +39,14 @@ def test_a_pace_is_learnt_of_its_camera_and_kind_and_forgotten() -> None:
     noise = belief.std()  # and no more: what is known leaves room for nothing but drift
     step = torch.zeros(4, 15, dtype=torch.float64)
     step[2, 6:8] = 10 * walk[2, 6:8] * math.sqrt(STRETCH_SECONDS / 3600) + 3 * noise[2, 6:8]
-    lacking = sum(paces.take(drifted(belief, step, generator), walk) for _ in range(8))
+    lacking = sum(paces.add_stretch(drifted(belief, step, generator), walk) for _ in range(8))
     pace = paces.squared.sqrt()
     assert pace[2, 2] > 10
     assert (pace > 2).sum() == 1
     assert lacking[2, 6] > 0 and bool((lacking[:2] <= 1e-2 * lacking[2, 6]).all())
     assert torch.equal(paces.of_parameters(15)[2, 6:8], pace[2, 2].expand(2))
     for _ in range(20):
-        paces.take(drifted(belief, torch.zeros_like(step), generator), walk)
+        paces.add_stretch(drifted(belief, torch.zeros_like(step), generator), walk)
     assert bool((paces.squared < 4).all())
 
 
@@ -118,25 +118,25 @@ def grown_up() -> Followed:
 
 def test_it_begins_once_the_filter_has_grown_up_and_nothing_has_changed() -> None:
     made, learning = followed(20), DriftLearning(DriftPaces(4))
-    learning.take(made.filter, made.recent, 1 / 60, quiet=True)
+    learning.update(made.filter, made.recent, 1 / 60, quiet=True)
     assert learning.stretch is None  # young
     made = grown_up()
-    learning.take(made.filter, made.recent, 1 / 60, quiet=True)
+    learning.update(made.filter, made.recent, 1 / 60, quiet=True)
     assert learning.stretch is not None
-    learning.take(made.filter, made.recent, 1 / 60, quiet=False)
+    learning.update(made.filter, made.recent, 1 / 60, quiet=False)
     assert learning.stretch is None
 
 
 def test_snapshots_are_added_to_the_stretch_and_a_stretch_to_the_paces() -> None:
     made, learning = grown_up(), DriftLearning(DriftPaces(4))
     for _ in range(ADDED_TOGETHER):
-        learning.take(made.filter, made.recent, 0.1, quiet=True)
+        learning.update(made.filter, made.recent, 0.1, quiet=True)
     assert learning.stretch is not None and learning.waiting == ADDED_TOGETHER - 1
     assert not learning.stretch.brought.any()
-    learning.take(made.filter, made.recent, 0.1, quiet=True)
+    learning.update(made.filter, made.recent, 0.1, quiet=True)
     assert learning.waiting == 0 and bool(learning.stretch.brought.any())
     known = learning.stretch
     learning.paces.squared[1] = 9.0
-    learning.take(made.filter, made.recent, 20.0, quiet=True)
+    learning.update(made.filter, made.recent, 20.0, quiet=True)
     assert learning.stretch is not known and learning.stretch.seconds < 20.0
     assert torch.equal(made.filter.pace, learning.paces.of_parameters(15))

@@ -27,7 +27,7 @@ def test_a_camera_that_sees_the_object_elsewhere_waits_for_the_next_snapshot_and
     assert not found.update.residual[0, 2].any()  # nothing was learnt of it
     known = memory.before
     found = learnt_from(memory, made.labelled(made.blobs()).checked)
-    assert not found.changes and memory.monitor.held.cameras == {2}  # one snapshot more rules out the clock
+    assert not found.changes and memory.monitor.quarantine.cameras == {2}  # one snapshot more rules out the clock
     found = learnt_from(memory, made.labelled(made.blobs()).checked)
     assert [change.camera for change in found.changes] == [2]
     assert memory.looks[2] == 0 and memory.before is known
