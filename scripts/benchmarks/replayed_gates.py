@@ -145,12 +145,14 @@ def summarize(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "snapshots": sum(row["snapshots"] for row in quiet),
         "false": sum(row["false"] for row in quiet),
         "false_by_kind": dict(kinds),
-        "false_in_8_hours": EIGHT_HOURS * sum(r["false"] for r in quiet) / max(sum(r["snapshots"] for r in quiet), 1),
+        "false_in_8_hours": (
+            EIGHT_HOURS * sum(r["false"] for r in quiet) / sum(r["snapshots"] for r in quiet) if quiet else None
+        ),
         "lost": sum(row["lost"] for row in quiet),
         "looks": looks,
-        "nees": sum(r["nees"] * r["looks"] for r in quiet if r["looks"]) / max(looks, 1),
+        "nees": sum(r["nees"] * r["looks"] for r in quiet if r["looks"]) / looks if looks else None,
         "nees_median": float(np.median([row["nees_median"] for row in quiet if row["looks"]])) if looks else None,
-        "beyond_3_sigma": sum(row["beyond_3_sigma"] for row in quiet) / max(looks, 1),
+        "beyond_3_sigma": sum(row["beyond_3_sigma"] for row in quiet) / looks if looks else None,
         "bumps": len(bumps),
         "in_time": len(delays),
         "right": sum(row["in_time"] and row["right_kind"] and not row["others_blamed"] for row in bumps),
@@ -178,8 +180,9 @@ def tables(result: dict[str, Any]) -> dict[str, str]:
             "and right", "others blamed"]  # fmt: skip
     rows = [
         [
-            place, f"{part['snapshots']:,}", str(part["false"]), f"{part['false_in_8_hours']:.0f}",
-            f"{part['nees']:.2f} ({part['nees_median'] or math.nan:.2f})", f"{100 * part['beyond_3_sigma']:.1f} %",
+            place, f"{part['snapshots']:,}", str(part["false"]), _figure(part["false_in_8_hours"], ".0f"),
+            f"{_figure(part['nees'], '.2f')} ({_figure(part['nees_median'], '.2f')})",
+            _figure(part["beyond_3_sigma"], ".1%"),
             f"{part['in_time']} of {part['bumps']}", f"{part['right']} of {part['bumps']}", str(part["others_blamed"]),
         ]
         for place, part in result["found"].items()
@@ -207,6 +210,10 @@ def tables(result: dict[str, Any]) -> dict[str, str]:
             ["recorded / replayed", "spread px", "shared shift px", "if independent", *lags], noise
         ),
     }
+
+
+def _figure(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
 
 
 @dataclass(frozen=True)

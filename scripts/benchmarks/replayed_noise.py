@@ -23,8 +23,8 @@ BLOCK = (60, 240)
 """Frames of a block: beyond 60 no correlation is left in the recording."""
 BRIDGED = 10
 """Frames without a camera's residuals that are filled; a longer gap ends a run."""
-LEAST_RUN = 60
-"""Frames of the shortest run that blocks are taken from."""
+LEAST_RUN = 20
+"""Frames of the shortest run that is replayed; blocks go on from run to run."""
 SHARING = 3
 """Markers of a frame, at least, from which the shift that they share is taken."""
 LAGS = (1, 5, 20, 60)
@@ -36,18 +36,18 @@ CACHE = WORK / "wand_residuals.npz"
 
 @dataclass(frozen=True)
 class Series:
-    """Residuals of one camera in consecutive frames, without gaps."""
+    """Residuals of one camera: runs of consecutive frames without gaps, in the order of time, one after another."""
 
-    runs: Sequence[Floats]  # (F, N, 2) pixels each, N markers
+    residual: Floats  # (F, N, 2) pixels, N markers
 
     def __post_init__(self) -> None:
-        """Refuse a camera that has nothing to be replayed.
+        """Refuse a camera that has too little to be replayed.
 
         Raises:
-            InputError: there is no run.
+            InputError: there are fewer frames than in the shortest block.
         """
-        if not self.runs:
-            raise InputError(f"residuals: found no run of {LEAST_RUN} frames, expected one")
+        if len(self.residual) < BLOCK[0]:
+            raise InputError(f"residuals: found {len(self.residual)} frames in runs, expected at least {BLOCK[0]}")
 
 
 def series_of(residual: Floats, generator: np.random.Generator) -> Series:
@@ -73,7 +73,7 @@ def series_of(residual: Floats, generator: np.random.Generator) -> Series:
         there = np.stack([np.interp(every, run, shift[run, axis]) for axis in range(2)], -1)
         drawn = deviations[generator.integers(len(deviations), size=(len(every), residual.shape[1]))]
         runs.append(np.where(known[every][..., None], residual[every], there[:, None] + drawn))
-    return Series(runs)
+    return Series(np.concatenate(runs) if runs else residual[:0])
 
 
 @dataclass
@@ -103,7 +103,7 @@ class Replay:
         return np.concatenate(parts)
 
     def _block(self, camera: int) -> Floats:
-        """Draw a block (F, N, 2) of one camera: a run is as probable as it is long."""
+        """Draw a block (F, N, 2) of one camera: every frame is as probable."""
         block = self._piece(camera, int(self.generator.integers(*BLOCK)))
         count = self.markers - block.shape[1]
         if count <= 0:
@@ -114,11 +114,9 @@ class Replay:
         return np.concatenate((block, more), 1)
 
     def _piece(self, camera: int, length: int) -> Floats:
-        runs = self.sources[camera].runs
-        lengths = np.array([len(run) for run in runs])
-        run = int(self.generator.choice(len(runs), p=lengths / lengths.sum()))
-        begin = int(self.generator.integers(lengths[run] - LEAST_RUN + 1))
-        return runs[run][begin : begin + length]
+        residual = self.sources[camera].residual
+        begin = int(self.generator.integers(len(residual)))
+        return np.take(residual, np.arange(begin, begin + length), axis=0, mode="wrap")
 
 
 def statistics(residual: Floats) -> dict[str, Any]:
