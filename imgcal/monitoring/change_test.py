@@ -46,9 +46,8 @@ LEAST_LEARNT = 1e-6
 """Directions of which less was learnt than this share of the most of their kind do not take part."""
 LEAST_VARIANCE = 1e-3
 """Share of a variance that is left where one is taken away: rounding."""
-MODEL_ERROR = 0.05
-"""Pixels, one standard deviation of each axis: by how much a camera's image may be off in a way that changes
-slowly: what ten real infrared cameras, well calibrated, have on average over a quarter of a second."""
+MODEL_ERROR = 0.02
+"""Pixels, one standard deviation of each axis: by how much a camera's image may be off in a way that changes slowly."""
 SLOPE = 0.25
 """Tangent of the angle to the optical axis at which a change of the focal length counts as what it moves there."""
 USUAL_DISTANCE = 1000.0  # mm, of a rig that has no working distance

@@ -36,6 +36,8 @@ EPISODE = 2.0
 """Correlation times that a passing error may last."""
 LARGEST, SHORT = 20.0, 3
 """Times the usual size of lasting errors that one may have; the snapshots that a larger one (wrong labels) lasts."""
+LEAST_LASTING = 0.05
+"""Pixels: errors that last are at least so large, by what ten well calibrated infrared cameras show."""
 LEAST_SHIFT = 6.0
 """Times the usual size of lasting errors by which a change must shift an image."""
 TAIL, TAIL_SIGMAS = 0.99, 3.03
@@ -74,7 +76,7 @@ class NoiseCorrelation:
     @property
     def model_error(self) -> Tensor:
         """By how much each camera's image may be off for a while where nothing has moved: (C,) px."""
-        return self.lasting.clamp_min(MODEL_ERROR)
+        return torch.where(self.time > 1, self.lasting.clamp_min(LEAST_LASTING), MODEL_ERROR)
 
     def episode(self, camera: int, shift: float) -> int:
         """Successive snapshots that an error of a camera may last which shifts its image by so many pixels."""

@@ -30,7 +30,7 @@ def update_in_tensors(
     damping, light = 0.0, DAMPED
     for iteration in range(options.max_iterations):
         tolerance = options.tolerance * measurement_update_cpu.LOOSER ** max(
-            0, iteration - measurement_update_cpu.PATIENCE
+            0, iteration - measurement_update_cpu.LOOSEN_AFTER
         )
         step, gain, factor, brought = at.step(damping)
         trial = at.moved(step)

@@ -7,16 +7,17 @@ from scripts.benchmarks.rig_streams import Bump
 from tests.imgcal.monitoring.followed import followed
 
 TURN = math.radians(0.1)
+INDEPENDENT = ([1] * 4, [0.0] * 4)  # errors of single snapshots, which feign no shift
 
 
 def test_a_steady_rig_has_not_changed() -> None:
     steady = followed(40)
-    assert find_alarm(steady.recent, steady.filter.count) is None
+    assert find_alarm(steady.recent, steady.filter.count, *INDEPENDENT) is None
 
 
 def test_a_camera_that_was_turned_is_found_with_its_moment() -> None:
     turned = followed(46, bumps=[Bump(40, 2, "rotation", TURN)])
-    age = find_alarm(turned.recent, turned.filter.count)
+    age = find_alarm(turned.recent, turned.filter.count, *INDEPENDENT)
     assert age is not None
     test = turned.recent.test(age)
     assert likeliest_camera(test) == 2
@@ -33,3 +34,13 @@ def test_two_cameras_are_found_and_what_is_known_is_not_found_again() -> None:
     free, evidence = changed_cameras(test, {1: "rotation"})
     assert free == {1: "rotation", 3: None} and evidence.keys() == {3}
     assert likeliest_camera(test, known={1}) == 3
+
+
+def test_what_may_be_one_passing_error_is_no_alarm() -> None:
+    turned = followed(46, bumps=[Bump(40, 2, "rotation", TURN)])
+    count, cameras = turned.filter.count, 4
+    assert find_alarm(turned.recent, count, [6] * cameras, [0.0] * cameras) is None  # six snapshots are one episode
+    assert find_alarm(turned.recent, count, [3] * cameras, [0.0] * cameras) is not None
+    _, shift = turned.recent.score_without_episode(6, 2, "rotation", 3)
+    assert 0.5 < shift < 3.5  # 0.1 degrees are some 2.8 px, less what the poses take
+    assert find_alarm(turned.recent, count, [1] * cameras, [4.0] * cameras) is None
