@@ -185,7 +185,7 @@ def _decide(scene: Scene, fits: Fits, options: IdentityOptions, known_pose: bool
                 f"{options.least_margin:.0f}; show more of the object, to more cameras"
             )
     if share < options.least_share:
-        refusal = _too_little(_share(scene, best), share, options.least_share)
+        refusal = _too_little(scene.obj.name, _share(scene, best), share, options.least_share)
     rig, pose = rig_and_pose(scene, chosen, 0)
     if refusal is not None:
         undecided = share >= options.least_share
@@ -196,17 +196,18 @@ def _decide(scene: Scene, fits: Fits, options: IdentityOptions, known_pose: bool
     return Identity(scene.blobs.to_rows(chosen.labels[0]), pose, rig, status, order, margin, reason, share)
 
 
-def _too_little(fitted: float, certain_share: float, least: float) -> str:
+def _too_little(name: str, fitted: float, certain_share: float, least: float) -> str:
     """Say why too few labels are certain: nothing fits, or what fits could be something else."""
     if fitted >= least:
         return (
-            f"the best pose explains {100 * fitted:.0f} % of what could be seen, but labels are certain of only "
+            f"the best fit explains {100 * fitted:.0f} % of the visible markers, but labels are certain of only "
             f"{100 * certain_share:.0f} %, expected {100 * least:.0f} %: too few blobs, or too many that are no "
             "fiducials; show more of the object, to more cameras"
         )
     return (
-        f"the best pose explains {100 * fitted:.0f} % of what could be seen, expected {100 * least:.0f} %; check that "
-        "object and rig are those in the images, and that the blobs are its fiducials (polarity, threshold, radius)"
+        f"this does not look like {name}: the best fit explains {100 * fitted:.0f} % of the visible markers "
+        f"({100 * least:.0f} % needed); check that object and rig are those in the images, and that the blobs are its "
+        "fiducials (polarity, threshold, radius)"
     )
 
 

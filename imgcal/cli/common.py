@@ -143,7 +143,7 @@ def check_folder(path: Path) -> None:
     if not existing.is_dir():
         raise InputError(f"{path}: found a file at {existing}, expected a folder to write to")
     if not os.access(existing, os.W_OK):
-        raise InputError(f"{path}: found {existing} without the right to write, expected a folder to write to")
+        raise InputError(f"{path}: no permission to write to {existing}")
 
 
 def make_folder(path: Path) -> Path:

@@ -7,6 +7,7 @@ from typing import Any
 
 from imgcal.estimation import Gauge
 from imgcal.io import RigCovariance
+from imgcal.messages import listed
 from imgcal.pipeline import Calibration, Knowledge, Motion, knowledge_of, motion_since_factory
 
 
@@ -17,6 +18,7 @@ class Findings:
     motion: Motion
     knowledge: Knowledge
     from_scratch: bool = False  # there was no factory calibration since which a camera could have moved
+    untimed: tuple[str, ...] = ()  # cameras of which nothing tells whether their frames are of the same moments
 
     @property
     def values(self) -> dict[str, Any]:
@@ -34,6 +36,7 @@ class Findings:
                     for c, name in enumerate(motion.camera_names)
                 },
             },
+            "timing_untested": list(self.untimed),
             "knowledge": {
                 "coverage": dict(zip(known.camera_names, known.coverage, strict=True)),
                 "undetermined": {name: list(cameras) for name, cameras in known.undetermined.items()},
@@ -47,16 +50,22 @@ class Findings:
         lines = [self.motion.sentence] if self.motion.sentence and not self.from_scratch else []
         if self.knowledge.sentences:
             lines.append("not known: " + " ".join(self.knowledge.sentences))
+        if self.untimed:
+            which = "all cameras" if len(self.untimed) == len(self.knowledge.camera_names) else listed(self.untimed)
+            lines.append(
+                f"timing of {which} not tested: the object moved too little, or too evenly, between snapshots to show "
+                "a camera that is late"
+            )
         if self.knowledge.advice:
             lines.append(self.knowledge.advice)
         return lines
 
 
-UNKNOWN: dict[str, Any] = {"motion": None, "knowledge": None}
+UNKNOWN: dict[str, Any] = {"motion": None, "timing_untested": None, "knowledge": None}
 """`Findings.values` of a refused run."""
 
 
 def findings(calibration: Calibration, gauge: Gauge, covariance: RigCovariance) -> Findings:
     """Look at what was found."""
     motion, knowledge = motion_since_factory(calibration, gauge), knowledge_of(calibration, covariance.std)
-    return Findings(motion, knowledge, calibration.from_scratch)
+    return Findings(motion, knowledge, calibration.from_scratch, calibration.untimed)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import difflib
 import io
 import re
 import sys
@@ -20,7 +21,7 @@ from imgcal.cli.compiling import tells_of_compiling
 from imgcal.cli.interruption import ends_at_once
 from imgcal.errors import InputError, RefusedError
 from imgcal.extras import advice
-from imgcal.messages import one_line, quoted
+from imgcal.messages import one_line, quoted, shortened
 
 DONE, UNUSABLE, REFUSED, INTERRUPTED = 0, 2, 3, 130
 
@@ -150,6 +151,10 @@ def _understood(arguments: list[str]) -> Runnable:
         return command(**vars(given))
     # The shell's completion knows the options of every command; all else ends here, and names and summaries will do.
     load = _arguments if first.startswith("--tyro-") else _summary
+    if first and not first.startswith("-"):
+        near = difflib.get_close_matches(first, COMMANDS, 1)
+        hint = f"did you mean `{near[0]}`?" if near else "see imgcal --help"
+        raise InputError(f"unknown command `{shortened(first)}`; {hint}")
     commands: Any = Union[tuple(Annotated[load(name), tyro.conf.subcommand(name)] for name in COMMANDS)]  # noqa: UP007
     return tyro.cli(commands, prog="imgcal", description=DESCRIPTION, args=arguments)
 
@@ -169,7 +174,28 @@ def _undrawn(box: str) -> str:
     problem, _, hint = text.partition("For full helptext, ")
     problem = problem.partition("Argument helptext:")[0].replace("__tyro-dummy-inner__.", "")
     command = re.search(r"imgcal[a-z ]* --help", hint)
-    return f"{problem.strip()}; see {command[0] if command else 'imgcal --help'}"
+    return f"{_in_brief(problem.strip())}; see {command[0] if command else 'imgcal --help'}"
+
+
+def _in_brief(problem: str) -> str:
+    """Say what is wrong with a command line: the first thing, in a few words."""
+    if unknown := re.search(r"Unrecognized options: (.*?)(?: Perhaps you meant:? (.*))?$", problem):
+        words, near = unknown[1].split(", "), re.search(r"--[\w.-]+", unknown[2] or "")
+        options = [word for word in words if word.startswith("-")]
+        if not options:
+            return f"found {quoted(' '.join(words))!r}, expected no more than was given before it"
+        option = options[0].split()[0]
+        return f"unknown option `{shortened(option)}`" + (f"; did you mean `{near[0]}`?" if near else "")
+    if problem.startswith("Missing from"):
+        entries = problem.partition(": ")[2].split("(required)")[:-1]
+        parts = [entry.split() for entry in entries]
+        named = [p[0] if p[0].startswith("--") else f"{p[0]} ({' '.join(p[1:])})" for p in parts if p]
+        return f"missing {', '.join(named)}"
+    if count := re.search(
+        r"Error parsing (\S+): .*input length (\d+) did not match expected argument count (\d+)", problem
+    ):
+        return f"{count[1]}: found {count[2]} values, expected {count[3]}"
+    return re.sub(r"\[/?[a-z ]+\]", "", problem)
 
 
 def _verdict(error: BaseException, given: list[str]) -> tuple[int, str]:

@@ -10,6 +10,7 @@ import posixpath
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -141,9 +142,9 @@ class Manifest:
         ]
         text = {name: str(values[name]) if values.get(name) else None for name in KNOWN[:-1]}
         named = {
-            "capture": text["capture"] and self._beside(text["capture"]),
-            "rig": self._beside(text["rig"]) if text["rig"] else self.rig,
-            "object": self._beside(text["object"]) if text["object"] else self.object,
+            "capture": text["capture"] and _beside(self.url, text["capture"]),
+            "rig": _beside(self.url, text["rig"]) if text["rig"] else self.rig,
+            "object": _beside(self.url, text["object"]) if text["object"] else self.object,
         }
         faults += [
             f"found no {name}, expected one in its column, or for all by an option"
@@ -159,18 +160,20 @@ class Manifest:
         fault = f"row {row}: {faults[0]}" if faults else None
         return Item(row, paths["capture"], paths["rig"], paths["object"], text["device"] or "", moment, given, fault)
 
-    def _beside(self, path: str) -> str:
-        """Take relative paths from the manifest's folder; names of shipped files stay."""
-        if "://" in path or posixpath.isabs(path):
-            return path
-        if "://" in self.url:
-            return posixpath.join(posixpath.dirname(self.url), path)
-        found = Path(self.url).parent / path
-        try:
-            is_file = "/" in path or "." in path or found.exists()
-        except (OSError, ValueError):  # too long for a name, or no text: whoever opens it says so
-            is_file = True
-        return str(found) if is_file else path
+
+@lru_cache(maxsize=4096)
+def _beside(url: str, path: str) -> str:
+    """Take relative paths from the folder of the manifest at an address; names of shipped files stay."""
+    if "://" in path or posixpath.isabs(path):
+        return path
+    if "://" in url:
+        return posixpath.join(posixpath.dirname(url), path)
+    found = Path(url).parent / path
+    try:
+        is_file = "/" in path or "." in path or found.exists()
+    except (OSError, ValueError):  # too long for a name, or no text: whoever opens it says so
+        is_file = True
+    return str(found) if is_file else path
 
 
 def opened(url: str) -> Any:

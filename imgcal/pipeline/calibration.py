@@ -22,7 +22,7 @@ from imgcal.estimation import (
 from imgcal.geometry import RigidTransform
 from imgcal.monitoring import posterior_of
 from imgcal.pipeline.initialization import Initialization
-from imgcal.pipeline.lateness import LateCamera
+from imgcal.pipeline.lateness import LEAST_BETTER, LateCamera, timing_motion
 from imgcal.pipeline.object_checks import displaced, lost_fiducials
 from imgcal.pipeline.tally import Tally, tally
 from imgcal.types import (
@@ -145,6 +145,15 @@ class Calibration:
         points = self.rig_from_object.apply(self.points_object)
         visible = self.rig.expand(len(points)).project(points, self.obj.radius).visible
         return lost_fiducials(self.observations.seen.numpy(), visible.numpy())
+
+    @property
+    def untimed(self) -> tuple[str, ...]:
+        """Cameras whose frames may be of other moments than the others' without a trace: too little motion."""
+        seen = self.observations.seen
+        moved = timing_motion(self.observations.uv, seen, self.labelled.used)
+        shown = seen.any(0).any(-1)
+        names = zip(self.rig.camera_names, moved.tolist(), shown.tolist(), strict=True)
+        return tuple(name for name, motion, is_shown in names if is_shown and motion < LEAST_BETTER)
 
     @cached_property
     def tally(self) -> Tally:

@@ -61,6 +61,26 @@ class LateCamera:
         )
 
 
+def timing_motion(uv: Tensor, seen: Tensor, used: Sequence[int]) -> Tensor:
+    """How far images would be off if a camera were late by one snapshot, and turned to make up for it: (C,) pixels.
+
+    A steady motion shifts all images of a late camera alike, as a turn of the camera does; only changes of the motion
+    tell them apart.
+
+    Args:
+        uv: (S, C, N, 2) pixels.
+        seen: (S, C, N) bool.
+        used: numbers of the S snapshots.
+    """
+    both = seen[1:] & seen[:-1]
+    both[torch.tensor(used).diff() != 1] = False
+    shift = torch.where(both[..., None], uv[1:] - uv[:-1], 0.0).sum(2) / both.sum(2).clamp_min(1)[..., None]
+    known = both.any(2)  # (S - 1, C)
+    count = known.sum(0).clamp_min(1)
+    mean = (shift * known[..., None]).sum(0) / count[:, None]
+    return ((shift - mean).square().sum(-1) * known).sum(0).div(count).sqrt()
+
+
 def suspects(counts: Tally, names: tuple[str, ...], moved: Sequence[tuple[str, int]] = ()) -> dict[int, int]:
     """Choose cameras that see the object, and often not where the others have it; those that are said to have moved.
 

@@ -31,14 +31,14 @@ def sentences(content: ReportContent) -> tuple[str, ...]:
         return ()
     usual = float(np.nanmedian(predicted.camera_px))
     names = [content.cameras[i] for i in predicted.exceptions]
-    words = "You know the images of this volume"
+    words = ""
     if math.isfinite(predicted.median_mm):
-        words = f"You know this volume to {length(predicted.median_mm)} (95 % of it to {length(predicted.p95_mm)}), "
+        most = length(predicted.p95_mm)
+        words = f"Median predicted error {length(predicted.median_mm)}; 95 % of the volume below {most}; "
         without = float(predicted.mm_without_exceptions.nanmedian())
         if without < WORTH_SAYING * predicted.median_mm:
-            words += f"to {length(without)} without {_listed(names)}, "
-        words += "and its images"
-    words += f" to {svg.pixels(usual)} px"
+            words += f"{length(without)} without {_listed(names)}; "
+    words += f"{'' if words else 'Median predicted error '}in the images {svg.pixels(usual)} px"
     if names:
         worst = [f"{content.cameras[i]} ({svg.pixels(predicted.camera_px[i])} px)" for i in predicted.exceptions]
         words += f", except through {_listed(worst)}"

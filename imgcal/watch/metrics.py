@@ -74,14 +74,14 @@ class Metrics:
         Raises:
             InputError: the address is taken, or none of this machine's.
         """
-        from prometheus_client import CollectorRegistry, start_http_server  # not in the core
+        from prometheus_client import CollectorRegistry, make_wsgi_app, start_http_server  # not in the core
 
         registry = CollectorRegistry()
         registry.register(self)
         host, port = self._address
         try:
             self._server, self._thread = start_http_server(port, host, registry)
-            self._server.set_app(_guarded(self._server.get_app(), Gate(Address(host, port), "")))
+            self._server.set_app(_guarded(make_wsgi_app(registry), Gate(Address(host, port), "")))
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
             raise InputError(f"--metrics: {host}:{port} cannot be listened on: {reason}") from error

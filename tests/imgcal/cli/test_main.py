@@ -116,3 +116,20 @@ def test_an_interruption_during_start_up_is_one_line(slow, arguments, tmp_path):
     process.send_signal(signal.SIGINT)
     _, error = process.communicate(timeout=60)
     assert (process.returncode, error) == (130, "imgcal: interrupted\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["kalibrate", "x"], "unknown command `kalibrate`; did you mean `calibrate`?"),
+        (["calibrate", "x", "--rig", "T4", "--object", "cube8", "--out", "o", "--snapshot", "1:2"],
+         "unknown option `--snapshot`; did you mean `--snapshots`?; see imgcal calibrate --help"),
+        (["calibrate", "x", "--object", "cube8", "--out", "o", "--start-pose", "1", "2", "3"],
+         "--start-pose: found 3 values, expected 6; see imgcal calibrate --help"),
+        (["calibrate"],
+         "missing PATH (capture folder or detections file), --object, --out; see imgcal calibrate --help"),
+    ],
+)  # fmt: skip
+def test_a_mistyped_command_line_is_answered_briefly(arguments, expected, capsys):
+    assert main(arguments) == 2
+    assert one_line(capsys) == f"imgcal: {expected}"

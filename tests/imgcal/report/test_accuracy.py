@@ -21,7 +21,7 @@ def with_bad(content: ReportContent, cameras: tuple[int, ...], factor: float) ->
 def test_one_plain_sentence(content):
     (words,) = sentences(content)
     assert re.fullmatch(
-        r"You know this volume to [\d.]+ mm \(95 % of it to [\d.]+ mm\), and its images to [\d.]+ px\.", words
+        r"Median predicted error [\d.]+ mm; 95 % of the volume below [\d.]+ mm; in the images [\d.]+ px\.", words
     )
     assert advice(content) == ()
 
@@ -34,7 +34,7 @@ def test_exceptions_are_named_with_what_helps(content):
     assert advice(bad) == ("Take 50 more snapshots in the view of cam07.",)
     assert "without" not in words
     spoilt = replace(bad, predicted=replace(bad.predicted, mm=3 * bad.predicted.mm))
-    assert re.search(r"mm\), to [\d.]+ mm without cam07, and its images", sentences(spoilt)[0])
+    assert re.search(r"mm; [\d.]+ mm without cam07; in the images", sentences(spoilt)[0])
     verdict = judge(bad)
     assert words in verdict.found and advice(bad)[0] in verdict.next_steps
 
@@ -61,7 +61,7 @@ def test_a_volume_that_is_hardly_seen_says_so(content):
 
 def test_one_camera_knows_no_mm(single_content):
     (words,) = sentences(single_content)
-    assert re.fullmatch(r"You know the images of this volume to [\d.]+ px\.", words)
+    assert re.fullmatch(r"Median predicted error in the images [\d.]+ px\.", words)
     assert "how far a pixel is off" in render(single_content)
 
 
