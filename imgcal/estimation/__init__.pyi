@@ -48,7 +48,7 @@ from .map_operator import encoded, map_state, with_lenses, without_lenses
 from .moves import find_moves
 from .object_change import SHAPE, ObjectChange, changed_object
 from .object_motion import ObjectMotion
-from .object_shape import SNAPSHOTS_TO_BEND, FiducialOffset, ShapeEvidence, offsets
+from .object_shape import SNAPSHOTS_TO_BEND, FiducialOffset, ScaleEvidence, ShapeEvidence, offsets
 from .open_change import Change
 from .pose_initialization import initial_pose
 from .pose_support import ON_A_LINE, UndeterminedPosesError, require_poses
@@ -101,6 +101,7 @@ __all__ = [
     "RigFilter",
     "RigMonitor",
     "RigUncertainty",
+    "ScaleEvidence",
     "ShapeEvidence",
     "Solution",
     "Start",
