@@ -7,7 +7,6 @@ import datetime
 import gzip
 import hashlib
 import json
-import resource
 import signal
 import tempfile
 import threading
@@ -33,6 +32,11 @@ from imgcal.messages import one_line
 from imgcal.pipeline import Calibration, Detector, DetectorName, calibrate, detect_capture, sight_of_capture
 from imgcal.types import CalibrationObject, CameraRig
 
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
+
 Status = Literal["ok", "refused", "unusable", "unreachable", "timed_out", "out_of_memory", "crashed", "fault"]
 STATUSES: tuple[Status, ...] = (
     "ok", "refused", "unusable", "unreachable", "timed_out", "out_of_memory", "crashed", "fault",
@@ -41,6 +45,7 @@ STATUSES: tuple[Status, ...] = (
 TRANSIENT = frozenset({"unreachable", "timed_out", "out_of_memory", "crashed"})
 """What another try may mend."""
 BLOCK = 1 << 20
+STATM = Path("/proc/self/statm")  # Linux tells there how much memory a process has
 
 
 @dataclass(frozen=True)
@@ -258,25 +263,26 @@ def _fault(error: Exception, settings: Settings) -> tuple[Status, str]:
 
 @contextlib.contextmanager
 def _limited(settings: Settings) -> Iterator[None]:
-    """Hold what runs in the block to its time and memory, where the system can."""
+    """Hold what runs in the block to its time (not on Windows) and its memory (on Linux)."""
 
     def over(number: int, frame: FrameType | None) -> None:
         raise TooLongError
 
-    timed = threading.current_thread() is threading.main_thread()
-    before = resource.getrlimit(resource.RLIMIT_AS)
-    pages = int(Path("/proc/self/statm").read_text().split()[0]) if Path("/proc/self/statm").exists() else 0
-    limit = pages * resource.getpagesize() + int(settings.memory_mb * 2**20)
+    timed = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
+    pages = int(STATM.read_text().split()[0]) if resource is not None and STATM.exists() else 0
+    before = resource.getrlimit(resource.RLIMIT_AS) if pages else None
     old = None
     try:
         if timed:
             old = signal.signal(signal.SIGALRM, over)
             signal.setitimer(signal.ITIMER_REAL, settings.seconds)
-        if pages:
+        if before is not None:
+            limit = pages * resource.getpagesize() + int(settings.memory_mb * 2**20)
             resource.setrlimit(resource.RLIMIT_AS, (limit, before[1]))
         yield
     finally:
-        resource.setrlimit(resource.RLIMIT_AS, before)
+        if before is not None:
+            resource.setrlimit(resource.RLIMIT_AS, before)
         if timed:
             signal.setitimer(signal.ITIMER_REAL, 0)
             signal.signal(signal.SIGALRM, old)

@@ -1,3 +1,4 @@
+import signal
 import time
 from pathlib import Path
 from typing import Any
@@ -77,3 +78,12 @@ def test_captures_that_hang_or_grow(
     row = processed(item(capture), Settings(seconds=0.5, memory_mb=500))
     assert row is not None and row["status"] == status
     assert row["seconds"] < 10 and row["key"]
+
+
+def test_a_system_that_can_limit_nothing_still_calibrates(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows has neither module nor timer."""
+    monkeypatch.setattr(jobs, "resource", None)
+    monkeypatch.delattr(signal, "setitimer")
+    monkeypatch.delattr(signal, "SIGALRM")
+    row = processed(item(capture), Settings(seconds=0.0))
+    assert row is not None and row["status"] == "ok"
