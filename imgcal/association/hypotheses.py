@@ -18,7 +18,8 @@ from imgcal.association.p3p import FAST, three_point_pose, towards
 from imgcal.types import CalibrationObject, CameraRig
 from renderers.compiling import njit
 
-MOST_FIDUCIAL_TRIPLES = 300_000
+MOST_TRIPLES = 40_000  # of an object's fiducials, up to which all are tried
+MOST_FIDUCIAL_TRIPLES = 300_000  # of its outer ones, beyond which some are drawn
 DRAWS = 3  # blob triples of which the widest is taken
 PROBES = 8  # fiducials that every hypothesis is tested on; only promising ones are tested on all
 CELLS = 4  # raster cells to a tolerance
@@ -85,7 +86,7 @@ def many(obj: CalibrationObject) -> bool:
 
     Then only outer blobs are compared with outer fiducials: what is outermost in an image is so in space.
     """
-    return _orders(obj.num_fiducials) > MOST_FIDUCIAL_TRIPLES
+    return _orders(obj.num_fiducials) > MOST_TRIPLES
 
 
 def _orders(count: int) -> int:

@@ -394,7 +394,7 @@ class Compare:
     def __post_init__(self) -> None:
         """Ask for models at once: their number is free, so that the parser does not."""
         if not self.models:
-            raise InputError("compare: found no models, expected two or more, or with --captures one detector or more")
+            raise InputError("found no models, expected two or more, or with --captures one detector or more")
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import imgcal
+from imgcal.machine import usable_cores
 
 HINT = "compiling for this machine, once for each kind of lens; `imgcal warmup --all-lenses` does it ahead of time"
 HELP = "from imgcal.online import warm_up_fits; warm_up_fits()"
@@ -62,10 +63,8 @@ def is_of_use() -> bool:
     """Tell whether a second process can compile beside this one, and leave it where this one finds it."""
     from renderers.compiling import cache_folder, is_shared
 
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return bool(
-        cores - _load() > 1 and sys.executable and is_shared() and not any(Path(cache_folder()).rglob(NEEDED_LAST))
-    )
+    idle = usable_cores() - _load() > 1
+    return bool(idle and sys.executable and is_shared() and not any(Path(cache_folder()).rglob(NEEDED_LAST)))
 
 
 def _load() -> float:

@@ -45,7 +45,7 @@ from .map_estimate import (
 )
 from .map_operator import encoded, map_state, with_lenses, without_lenses
 from .moves import find_moves
-from .object_shape import SNAPSHOTS_TO_BEND, FiducialOffset, ShapeEvidence, offsets
+from .object_shape import SNAPSHOTS_TO_BEND, FiducialOffset, ScaleEvidence, ShapeEvidence, offsets
 from .pose_initialization import initial_pose
 from .pose_support import ON_A_LINE, UndeterminedPosesError, require_poses
 from .rig_error import displaced, error_between, step_by_error
@@ -77,6 +77,7 @@ __all__ = [
     "PredictedError",
     "Problem",
     "RigUncertainty",
+    "ScaleEvidence",
     "ShapeEvidence",
     "Solution",
     "Start",

@@ -214,14 +214,15 @@ def predicted_error(
     uncertainty = uncertainty_over(rig, covariance.detach().to(points), anchors)
     projection = rig.project(points)
     seen, noise = projection.visible, _noise(found)
+    px, mm, mm_with_noise = uncertainty.errors(points, seen, noise)
     maps, depths, inside = _maps(uncertainty, volume, torch.where(seen, projection.depth, torch.nan))
     return PredictedError(
         volume=volume,
         camera_names=rig.camera_names,
         uncertainty=uncertainty,
-        px=torch.where(seen, uncertainty.pixel_error(points), torch.nan).unflatten(1, shape),
-        mm=uncertainty.point_error(points, seen).view(shape),
-        mm_with_noise=uncertainty.point_error(points, seen, noise).view(shape),
+        px=torch.where(seen, px, torch.nan).unflatten(1, shape),
+        mm=mm.view(shape),
+        mm_with_noise=mm_with_noise.view(shape),
         noise=noise,
         maps=maps,
         map_depths=depths,

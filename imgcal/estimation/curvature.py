@@ -40,8 +40,8 @@ from imgcal.types import CameraRig
 
 MOST_PAIRS, LEAST_PAIRS = 256, 64
 """Drawn for one snapshot; for many, where the posterior is narrow and hardly curved."""
-AT_ONCE = 16
-"""Pairs that are projected together."""
+AT_ONCE, POINTS_AT_ONCE = 16, 2**16
+"""Pairs that are projected together: more where they show so few points in all."""
 
 
 def curvature_covariance(estimate: Estimate, quantity: Callable[[CameraRig, Tensor], Tensor]) -> Tensor:
@@ -104,8 +104,9 @@ def _follow(problem: Problem, state: State, factorization: Factorization, x: Ste
     by_rig = at.by_rig[..., :-1, :, :] * squared
     by_object = None if at.by_fiducial is None else with_scale(problem, at.by_fiducial) * squared
     steps = []
-    for first in range(0, x.camera.shape[1], AT_ONCE):
-        some = Step(*(part if part is None else part[:, first : first + AT_ONCE] for part in x))  # type: ignore[arg-type]
+    together = max(AT_ONCE, POINTS_AT_ONCE // at.residual[..., 0, :].numel())
+    for first in range(0, x.camera.shape[1], together):
+        some = Step(*(part if part is None else part[:, first : first + together] for part in x))  # type: ignore[arg-type]
         there, back = (_residual(problem, state, some, sign) for sign in (1, -1))
         bend = 0.5 * (there + back) - at.residual.unsqueeze(1)  # (B, K, S, C, 2, N)
         right = -torch.einsum("bscirn,bkscrn->bksci", by_rig, bend)
@@ -113,11 +114,10 @@ def _follow(problem: Problem, state: State, factorization: Factorization, x: Ste
         if by_object is not None and problem.object_prior_std is not None:
             sums = torch.einsum("bscirn,bkscrn->bkin", by_object, bend)
             own = -object_columns(sums) * problem.object_prior_std.unsqueeze(1)
-        for k in range(camera.shape[1]):
-            steps.append(factorization.solve(Step(camera[:, k], pose[:, k], None if own is None else own[:, k])))
-    cameras, poses = (torch.stack([step[i] for step in steps], dim=1) for i in (0, 1))  # type: ignore[misc]
+        steps.append(factorization.solve_many(Step(camera, pose, own)))
+    cameras, poses = (torch.cat([step[i] for step in steps], dim=1) for i in (0, 1))  # type: ignore[misc]
     objects = [step.object for step in steps if step.object is not None]
-    return Step(cameras, poses, torch.stack(objects, dim=1) if objects else None)
+    return Step(cameras, poses, torch.cat(objects, dim=1) if objects else None)
 
 
 def _residual(problem: Problem, state: State, step: Step, sign: int) -> Tensor:

@@ -136,6 +136,16 @@ class Factorization:
             pose, camera, border = schur.solve(self.reduced, right.pose, right.camera, right.object)
         return Step(camera, pose, border)
 
+    def solve_many(self, right: Step) -> Step:
+        """Solve for K right-hand sides at once: (B, K, ...) in, the same out."""
+        camera, pose = right.camera.movedim(1, -1), right.pose.movedim(1, -1)
+        border = None if right.object is None else right.object.movedim(1, -1)
+        if self.cameras_first:
+            camera, pose, border = schur.solve_columns(self.reduced, camera, pose, border)
+        else:
+            pose, camera, border = schur.solve_columns(self.reduced, pose, camera, border)
+        return Step(camera.movedim(-1, 1), pose.movedim(-1, 1), None if border is None else border.movedim(-1, 1))
+
 
 def factorize(
     equations: NormalEquations, damping: Tensor | None = None, cameras_first: bool | None = None

@@ -22,6 +22,7 @@ from imgcal.estimation.linearization import (
     POSE_PARAMETERS,
     Problem,
     State,
+    Step,
     jacobian_at,
     points_at,
     robust_weight,
@@ -44,6 +45,8 @@ COMPLEXITY = 3.0
 """Log evidence that each further tolerance must gain."""
 SNAPSHOTS_TO_BEND = 8
 """From which the pulls of single snapshots are compared with each other."""
+POINTS_AT_ONCE = 2**16
+"""Pixels whose derivatives are held in memory together."""
 ROUNDS = 60
 """Of `learnt_tolerances` and of `offsets`, at most."""
 
@@ -133,8 +136,66 @@ class ShapeEvidence:
         return explained / (mine * left), mine, rest
 
 
-def shape_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> ShapeEvidence | None:
+@dataclass(frozen=True)
+class ScaleEvidence:
+    """What a fit says about an exact object of so many fiducials that its shape is not asked about."""
+
+    scale_error: tuple[float, float]  # as of `ShapeEvidence`
+
+    def bent_sigma(self) -> float:
+        """Zero: it is not asked; see `ShapeEvidence.bent_sigma`."""
+        return 0.0
+
+
+def object_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> ShapeEvidence | ScaleEvidence | None:
     """Ask a fit of one rig (B = 1) about the object that it took; None where rig and poses are undetermined."""
+    if problem.object_prior_std is None and len(problem.points) > MOST_FIDUCIALS:
+        return scale_evidence(problem, solution, loss)
+    return shape_evidence(problem, solution, loss)
+
+
+def scale_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> ScaleEvidence | None:
+    """Find the `scale_error` of an exact object in a time that grows with its fiducials, not with their cube.
+
+    Args:
+        problem: of one rig, with an exact object.
+        solution: the minimum.
+        loss: of the fit.
+
+    Returns:
+        None where rig and poses are undetermined.
+    """
+    factorization, state = solution.factorization, solution.state
+    if bool(factorization.reduced.failed.any()):
+        return None
+    unit = problem.uv.new_ones(1, 3 * len(problem.points) + 1)
+    own = pull = problem.uv.new_zeros(())
+    each, camera, poses = problem.uv.new_zeros(len(problem.points), 3), [], []
+    together = max(1, POINTS_AT_ONCE // problem.uv[0, 0, :, 0].numel())
+    for first in range(0, problem.uv.shape[1], together):
+        rows = slice(first, first + together)
+        some = replace(problem, uv=problem.uv[:, rows], root_weight=problem.root_weight[:, rows], object_prior_std=unit)
+        at = jacobian_at(some, replace(state, rotation=state.rotation[:, rows], centre=state.centre[:, rows]))
+        assert at.by_fiducial is not None
+        weight = robust_weight(some, at, loss).unsqueeze(-2)  # (1, S, C, 1, N)
+        by_scale = (at.by_fiducial * problem.points.mT[:, None]).sum(-3)  # (1, S, C, 2, N)
+        own = own + (by_scale.square() * weight).sum()
+        pull = pull - (by_scale * weight * at.residual).sum()
+        each += (at.by_fiducial.square() * weight.unsqueeze(-3)).sum((0, 1, 2, 4)).mT
+        across = (at.by_rig[..., :-1, :, :] * (by_scale * weight).unsqueeze(-3)).sum((-2, -1))  # (1, S, C, K + 6)
+        camera.append(across[..., :-POSE_PARAMETERS].sum(1))
+        poses.append(across[..., -POSE_PARAMETERS:].sum(2))
+    coupling = Step(torch.stack(camera).sum(0), torch.cat(poses, dim=1))
+    taken = factorization.solve(coupling)
+    left = own - (coupling.camera * taken.camera).sum() - (coupling.pose * taken.pose).sum()
+    # As of `ShapeEvidence`, but against what a fiducial says before rig and poses have adapted.
+    if left <= UNSURE * each.max() * problem.points.square().sum():
+        return ScaleEvidence((0.0, np.inf))
+    return ScaleEvidence((float(pull / left), float(left) ** -0.5))
+
+
+def shape_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> ShapeEvidence | None:
+    """Ask a fit of one rig (B = 1) about all of the object's shape; None where rig and poses are undetermined."""
     state = solution.state
     points = points_at(problem, state)[0]
     size = 3 * len(points) + 1

@@ -52,12 +52,7 @@ class RigUncertainty:
             points: (P, 3) mm in the rig frame, or (C, P, 3), own points for each camera. What a camera does not see has
                 an error, too, which means nothing.
         """
-        rows = pixel_jacobian(self.rig, points).flatten(1, 2)  # (C, 2 P, K)
-        cameras = self.rig.num_cameras
-        blocks = self.px_covariance.unflatten(0, (cameras, -1)).unflatten(-1, (cameras, -1))
-        own = blocks.diagonal(dim1=0, dim2=2).permute(2, 0, 1)  # (C, K, K)
-        variance = ((rows @ own) * rows).sum(-1).unflatten(1, (-1, 2)).sum(-1)
-        return variance.clamp_min(0).sqrt()
+        return _pixel_error(pixel_jacobian(self.rig, points), self.px_covariance)
 
     def point_error(self, points: Tensor, seen: Tensor, noise: float = 0.0) -> Tensor:
         """Predicted error of triangulated points: (P,) mm, expected (RMS) distance.
@@ -70,12 +65,46 @@ class RigUncertainty:
         Returns:
             nan where fewer than two cameras take part.
         """
-        triangulation, information = _triangulation(self.rig, points, seen)
-        rows = triangulation.flatten(0, 1)
-        variance = ((rows @ self.mm_covariance) * rows).sum(-1).unflatten(0, (-1, 3)).sum(-1)
-        if noise:
-            variance = variance + noise**2 * inverse_or_zero(information).diagonal(dim1=-2, dim2=-1).sum(-1)
-        return torch.where(seen.sum(0) >= 2, variance.clamp_min(0).sqrt(), torch.nan)
+        triangulation, by_noise = _triangulation(pixel_jacobian(self.rig, points), seen)
+        variance = _point_variance(triangulation, self.mm_covariance)
+        return _length(variance + noise**2 * by_noise if noise else variance, seen)
+
+    def errors(self, points: Tensor, seen: Tensor, noise: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Predict what `pixel_error` and `point_error`, without noise and with, say of the same points, in one pass.
+
+        Args:
+            points: (P, 3) mm in the rig frame.
+            seen: (C, P) bool, the cameras that take part in triangulation.
+            noise: px, standard deviation of each axis of one measured pixel.
+
+        Returns:
+            (C, P) px, (P,) mm, (P,) mm with noise.
+        """
+        pixels = pixel_jacobian(self.rig, points)
+        triangulation, by_noise = _triangulation(pixels, seen)
+        variance = _point_variance(triangulation, self.mm_covariance)
+        noisy = _length(variance + noise**2 * by_noise, seen)
+        return _pixel_error(pixels, self.px_covariance), _length(variance, seen), noisy
+
+
+def _pixel_error(pixels: Tensor, covariance: Tensor) -> Tensor:
+    """Expected length (C, P) px of the errors of pixels whose Jacobian is (C, P, 2, K)."""
+    rows, cameras = pixels.flatten(1, 2), len(pixels)
+    blocks = covariance.unflatten(0, (cameras, -1)).unflatten(-1, (cameras, -1))
+    own = blocks.diagonal(dim1=0, dim2=2).permute(2, 0, 1)  # (C, K, K)
+    variance = (rows @ own).mul_(rows).sum(-1).unflatten(1, (-1, 2)).sum(-1)
+    return variance.clamp_min(0).sqrt()
+
+
+def _point_variance(triangulation: Tensor, covariance: Tensor) -> Tensor:
+    """Expected squared error (P,) mm^2 of points whose Jacobian is (P, 3, K C)."""
+    rows = triangulation.flatten(0, 1)
+    return (rows @ covariance).mul_(rows).sum(-1).unflatten(0, (-1, 3)).sum(-1)
+
+
+def _length(variance: Tensor, seen: Tensor) -> Tensor:
+    """Expected length (P,) of an error; nan where fewer than two cameras take part."""
+    return torch.where(seen.sum(0) >= 2, variance.clamp_min(0).sqrt(), torch.nan)
 
 
 def uncertainty_over(rig: CameraRig, covariance: Tensor, points: Tensor) -> RigUncertainty:
@@ -89,17 +118,20 @@ def uncertainty_over(rig: CameraRig, covariance: Tensor, points: Tensor) -> RigU
     seen = rig.project(points).visible
     motion = rigid_motion(rig, points.mean(0))
     pixels = pixel_jacobian(rig, points)
-    triangulation, _ = _triangulation(rig, points, seen)
-    px_weight, mm_weight = seen.to(points), (seen.sum(0) >= 2).to(points)
+    triangulation, _ = _triangulation(pixels, seen)
+    shared = seen.sum(0) >= 2
+    px_weight, mm_weight = seen.to(points), shared.to(points)
+    px_rows, mm_rows = pixels.flatten(1, 2), triangulation.flatten(0, 1)
     px_covariance = mm_covariance = covariance
     for _ in range(ROUNDS):
-        metric = torch.block_diag(*torch.einsum("cp,cpai,cpaj->cij", px_weight, pixels, pixels))
+        weighted = px_weight.repeat_interleave(2, dim=1)[..., None] * px_rows
+        metric = torch.block_diag(*(px_rows.mT @ weighted))
         px_covariance = _aligned_if_possible(covariance, motion, metric)
-        rows = (mm_weight.sqrt()[:, None, None] * triangulation).flatten(0, 1)
+        rows = mm_weight.sqrt().repeat_interleave(3)[:, None] * mm_rows
         mm_covariance = _aligned_if_possible(covariance, motion, rows.mT @ rows)
         found = RigUncertainty(rig, covariance, points, px_weight, mm_weight, px_covariance, mm_covariance)
-        px_weight = _weight(found.pixel_error(points), seen)
-        mm_weight = _weight(found.point_error(points, seen), seen.sum(0) >= 2)
+        px_weight = _weight(_pixel_error(pixels, px_covariance), seen)
+        mm_weight = _weight(_length(_point_variance(triangulation, mm_covariance), seen), shared)
     return found
 
 
@@ -186,20 +218,25 @@ def pixel_jacobian(rig: CameraRig, points: Tensor) -> Tensor:
     return jacobian
 
 
-def _triangulation(rig: CameraRig, points: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
+def _triangulation(pixels: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
     """How triangulated points follow the rig, and how well pixels determine them.
 
     With exact pixels, the point that fits them best moves by -(sum K^T K)^-1 sum K^T J dp, where J is the derivative of
     the pixels by the parameters, and K by the point.
 
+    Args:
+        pixels: (C, P, 2, K) the J of every camera.
+        seen: (C, P) bool, the cameras that take part.
+
     Returns:
-        (P, 3, K C) mm by parameter, without the sign; (P, 3, 3) sum of K^T K, 1 / mm^2 for pixels of unit variance.
+        (P, 3, K C) mm by parameter, without the sign; (P,) variance of the point, mm^2, for pixels of unit variance.
     """
-    by_camera = pixel_jacobian(rig, points)
-    by_point = -by_camera[..., 3:6] * seen[..., None, None]
-    information = torch.einsum("cpai,cpaj->pij", by_point, by_point)
-    response = torch.einsum("cpai,cpaj->picj", by_point, by_camera).flatten(-2)
-    return inverse_or_zero(information) @ response, information
+    by_point = pixels[..., 3:6] * -seen.to(pixels)[..., None, None]  # (C, P, 2, 3)
+    stacked = by_point.transpose(0, 1).flatten(1, 2)  # (P, 2 C, 3)
+    inverse = inverse_or_zero(stacked.mT @ stacked)
+    response = inverse @ by_point.mT @ pixels  # (C, P, 3, K)
+    variance = inverse.diagonal(dim1=-2, dim2=-1).sum(-1)
+    return response.permute(1, 2, 0, 3).flatten(-2), variance
 
 
 def inverse_or_zero(information: Tensor) -> Tensor:

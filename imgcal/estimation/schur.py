@@ -81,15 +81,33 @@ def solve(
     Returns:
         The solution in the same shapes.
     """
-    first = torch.linalg.solve_triangular(reduced.eliminated, right_eliminated[..., None], upper=False)
-    right = right_kept.flatten(1)
+    border = None if right_border is None else right_border[..., None]
+    eliminated, kept, border = solve_columns(reduced, right_eliminated[..., None], right_kept[..., None], border)
+    return eliminated.squeeze(-1), kept.squeeze(-1), None if border is None else border.squeeze(-1)
+
+
+def solve_columns(
+    reduced: Reduced, right_eliminated: Tensor, right_kept: Tensor, right_border: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Solve the arrow for R right-hand sides at once.
+
+    Args:
+        reduced: from `reduce`.
+        right_eliminated: (B, P, p, R).
+        right_kept: (B, Q, q, R).
+        right_border: (B, M, R), None without a border.
+
+    Returns:
+        The solutions in the same shapes.
+    """
+    first = torch.linalg.solve_triangular(reduced.eliminated, right_eliminated, upper=False)
+    right = right_kept.flatten(1, 2)
     wide = right.shape[1]
     if right_border is not None:
         right = torch.cat((right, right_border), dim=1)
-    right = right[..., None] - (reduced.whitened.mT @ first).sum(1)
+    right = right - (reduced.whitened.mT @ first).sum(1)
     kept = torch.cholesky_solve(right, reduced.kept)
     second = first - reduced.whitened @ kept.unsqueeze(1)
     eliminated = torch.linalg.solve_triangular(reduced.eliminated.mT, second, upper=True)
-    kept = kept.squeeze(-1)
     border = None if right_border is None else kept[:, wide:]
-    return eliminated.squeeze(-1), kept[:, :wide].reshape(right_kept.shape), border
+    return eliminated, kept[:, :wide].reshape(right_kept.shape), border

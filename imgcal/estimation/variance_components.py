@@ -17,7 +17,13 @@ from imgcal.estimation.covariance import remaining_variance
 from imgcal.estimation.levenberg_marquardt import Solution
 from imgcal.estimation.linearization import Problem, State, points_at
 from imgcal.estimation.map_estimate import EstimationOptions, make_loss, minimize
-from imgcal.estimation.object_shape import ShapeEvidence, learnt_tolerances, pull_scatter, shape_evidence
+from imgcal.estimation.object_shape import (
+    ScaleEvidence,
+    ShapeEvidence,
+    learnt_tolerances,
+    object_evidence,
+    pull_scatter,
+)
 from imgcal.estimation.pose_support import require_poses
 
 KINDS = {
@@ -66,7 +72,7 @@ class VarianceComponents:
     seen: NDArray[np.bool_]  # (S, C, N) labels that fit
     additive_noise: float  # px
     prior_scale: Mapping[str, float]
-    shape: ShapeEvidence | None = None  # what the residuals say about the object; None = not asked
+    shape: ShapeEvidence | ScaleEvidence | None = None  # what the residuals say about the object; None = not asked
 
 
 class ObjectQuestion(Enum):
@@ -201,7 +207,7 @@ def estimate_variance_components(
 
 def _examine(
     fit: _Fit, options: FitOptions, least_scale: float, question: ObjectQuestion
-) -> tuple[ShapeEvidence | None, tuple[Problem, State] | None]:
+) -> tuple[ShapeEvidence | ScaleEvidence | None, tuple[Problem, State] | None]:
     """Ask a fit about the object; errors of its scale count from `least_scale`, relative.
 
     Returns:
@@ -211,7 +217,7 @@ def _examine(
     Raises:
         RefusedError: the object has another scale; or it is bent, and symmetric.
     """
-    shape = shape_evidence(fit.problem, fit.solution, make_loss(options.estimation))
+    shape = object_evidence(fit.problem, fit.solution, make_loss(options.estimation))
     if shape is None:
         return None, None
     bent = shape.bent_sigma() >= BENT
@@ -222,7 +228,9 @@ def _examine(
             python="measure it anew, give labels (Detections.fiducial), or use an object without symmetry",
             command="measure it anew, give labels (a column `fiducial`), or use an object without symmetry",
         )
-    free = _free_object(shape, fit.problem, fit.solution, options) if bent else None
+    free = None
+    if bent and isinstance(shape, ShapeEvidence):
+        free = _free_object(shape, fit.problem, fit.solution, options)
     if free is None:
         _require_scale(shape, fit, least_scale)
     return shape, free
@@ -250,7 +258,7 @@ def _free_object(
     return problem, found.state
 
 
-def _require_scale(shape: ShapeEvidence, fit: _Fit, least: float) -> None:
+def _require_scale(shape: ShapeEvidence | ScaleEvidence, fit: _Fit, least: float) -> None:
     """Refuse where the cameras have moved together as a wrong scale of the object would make them.
 
     How far they have moved otherwise says how far the prior can be trusted to know them.

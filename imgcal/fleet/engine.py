@@ -18,6 +18,7 @@ from typing import Any, Generic, TypeVar
 
 from imgcal.errors import InputError, RefusedError
 from imgcal.fleet.manifest import reason_of
+from imgcal.machine import usable_cores
 from imgcal.messages import quoted
 
 Item = TypeVar("Item")
@@ -75,7 +76,7 @@ class Engine:
             cores: of this machine; None = all that this process may use.
         """
         self.address = address
-        self.cores = cores or len(os.sched_getaffinity(0))
+        self.cores = cores or usable_cores()
         self._ours = False
 
     def __enter__(self) -> Engine:

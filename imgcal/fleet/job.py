@@ -8,7 +8,6 @@ import gzip
 import hashlib
 import json
 import os
-import resource
 import signal
 import stat
 import tempfile
@@ -35,6 +34,11 @@ from imgcal.messages import one_line
 from imgcal.pipeline import Calibration, Detector, DetectorName, calibrate, detect_capture, sight_of_capture
 from imgcal.types import CalibrationObject, CameraRig
 
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
+
 Status = Literal["ok", "refused", "unusable", "unreachable", "timed_out", "out_of_memory", "crashed", "fault"]
 STATUSES: tuple[Status, ...] = (
     "ok", "refused", "unusable", "unreachable", "timed_out", "out_of_memory", "crashed", "fault",
@@ -45,6 +49,7 @@ TRANSIENT = frozenset({"unreachable", "timed_out", "out_of_memory", "crashed"})
 BLOCK = 1 << 20
 REMINDER = 5.0
 """Seconds until somebody whose code could not be interrupted, a callback for example, is told once more."""
+STATM = Path("/proc/self/statm")  # Linux tells there how much memory a process has
 
 
 @dataclass(frozen=True)
@@ -274,25 +279,26 @@ def _fault(error: Exception, settings: Settings) -> tuple[Status, str]:
 
 @contextlib.contextmanager
 def _limited(settings: Settings) -> Iterator[None]:
-    """Hold what runs in the block to its time and memory, where the system can."""
+    """Hold what runs in the block to its time (not on Windows) and its memory (on Linux)."""
 
     def over(number: int, frame: FrameType | None) -> None:
         raise TooLongError
 
-    timed = threading.current_thread() is threading.main_thread()
-    before = resource.getrlimit(resource.RLIMIT_AS)
-    pages = int(Path("/proc/self/statm").read_text().split()[0]) if Path("/proc/self/statm").exists() else 0
-    limit = pages * resource.getpagesize() + int(settings.memory_mb * 2**20)
+    timed = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
+    pages = int(STATM.read_text().split()[0]) if resource is not None and STATM.exists() else 0
+    before = resource.getrlimit(resource.RLIMIT_AS) if pages else None
     old = None
     try:
         if timed:
             old = signal.signal(signal.SIGALRM, over)
             signal.setitimer(signal.ITIMER_REAL, settings.seconds, REMINDER)
-        if pages:
+        if before is not None:
+            limit = pages * resource.getpagesize() + int(settings.memory_mb * 2**20)
             resource.setrlimit(resource.RLIMIT_AS, (limit, before[1]))
         yield
     finally:
-        resource.setrlimit(resource.RLIMIT_AS, before)
+        if before is not None:
+            resource.setrlimit(resource.RLIMIT_AS, before)
         if timed:
             signal.setitimer(signal.ITIMER_REAL, 0)
             signal.signal(signal.SIGALRM, old)

@@ -33,7 +33,7 @@ def main(listening: int, pipe: int) -> None:
         listening: number of the open file of the socket on which viewers come.
         pipe: the same of the socket to the loop's process.
     """
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(AttributeError, OSError):  # Windows has no such thing
         os.nice(POLITE)
     with contextlib.suppress(KeyboardInterrupt):
         asyncio.run(_serve(socket.socket(fileno=listening), socket.socket(fileno=pipe)))

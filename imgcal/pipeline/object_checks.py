@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.errors import RefusedError
-from imgcal.estimation import BENT, SNAPSHOTS_TO_BEND, Estimate, FiducialOffset, ShapeEvidence, offsets
+from imgcal.estimation import BENT, SNAPSHOTS_TO_BEND, Estimate, FiducialOffset, ScaleEvidence, ShapeEvidence, offsets
 from imgcal.types import CalibrationObject
 
 CERTAIN = 4.0
@@ -25,7 +25,9 @@ IN_PLACE = 1e-4
 """Of the object's size: a fiducial that is nearer to its place is in it."""
 
 
-def object_offsets(fit: Estimate, shape: ShapeEvidence | None, obj: CalibrationObject) -> tuple[FiducialOffset, ...]:
+def object_offsets(
+    fit: Estimate, shape: ShapeEvidence | ScaleEvidence | None, obj: CalibrationObject
+) -> tuple[FiducialOffset, ...]:
     """Say how far each fiducial is from its place, and refuse where the data do not carry that.
 
     Args:

@@ -86,7 +86,8 @@ class EventLog:
             os.close(descriptor)
 
     def _opened(self) -> int:
-        return os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        # Windows would write line ends of its own.
+        return os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o644)
 
     def _cut(self) -> None:
         """Cut off an unfinished line."""

@@ -103,7 +103,10 @@ class Hook:
             process.communicate(line, timeout)
         except subprocess.TimeoutExpired:
             with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
+                if hasattr(os, "killpg"):
+                    os.killpg(process.pid, signal.SIGKILL)
+                else:  # Windows: what it has started goes on
+                    process.kill()
             process.communicate()
             self._fail(f"was killed after {timeout:.3g} s")
             return

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
+import queue
 import select
 import stat
+import sys
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -31,12 +34,12 @@ class JsonLines:
         """Read lines; one that is too long is left out, and read over in bounded memory."""
         parts: list[bytes] = []
         length = 0
+        chunks = (_chunks_by_thread if sys.platform == "win32" else _chunks)(self.descriptor)
         while True:
-            ready, _, _ = select.select([self.descriptor], [], [], TICK)
-            if not ready:
+            chunk = next(chunks)
+            if chunk is None:
                 yield None
                 continue
-            chunk = os.read(self.descriptor, AT_ONCE)
             *lines, rest = chunk.split(b"\n")
             for line in lines:
                 yield from _item(parts, line, length)
@@ -47,6 +50,31 @@ class JsonLines:
             if not chunk:
                 yield from _item(parts, b"", length)
                 return
+
+
+def _chunks(descriptor: int) -> Iterator[bytes | None]:
+    """Read what comes, None while nothing does; the last chunk is empty."""
+    while True:
+        ready, _, _ = select.select([descriptor], [], [], TICK)
+        yield os.read(descriptor, AT_ONCE) if ready else None
+
+
+def _chunks_by_thread(descriptor: int) -> Iterator[bytes | None]:
+    """Do the same where only sockets can be asked whether they have something: on Windows."""
+    read: queue.Queue[bytes] = queue.Queue(1)
+
+    def read_all() -> None:
+        chunk = b"x"
+        while chunk:
+            chunk = os.read(descriptor, AT_ONCE)
+            read.put(chunk)
+
+    threading.Thread(target=read_all, daemon=True).start()
+    while True:
+        try:
+            yield read.get(timeout=TICK)
+        except queue.Empty:
+            yield None
 
 
 def _item(parts: list[bytes], last: bytes, length: int) -> Iterator[Item]:

@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.estimation import EstimationOptions, estimate
-from imgcal.estimation.object_shape import learnt_tolerances, offsets, pull_scatter, shape_evidence
+from imgcal.estimation import EstimationOptions, estimate, object_shape
+from imgcal.estimation.object_shape import (
+    ScaleEvidence,
+    learnt_tolerances,
+    object_evidence,
+    offsets,
+    pull_scatter,
+    scale_evidence,
+    shape_evidence,
+)
 from imgcal.estimation.robust_losses import NamedLoss
 
 LOSS = NamedLoss("huber", 3.0)
@@ -93,3 +101,34 @@ def test_one_camera_does_not_know_the_scale(simulate) -> None:
     found = estimate(case.observations, case.factory, case.obj, prior_std=case.prior_std)
     error, deviation = shape_evidence(found.problem, found.solution, LOSS).scale_error
     assert abs(error) < 4 * deviation and deviation > 0.01
+
+
+@pytest.mark.parametrize(("snapshots", "cameras", "together"), [(1, 5, 2**16), (7, 3, 1), (4, 4, 60)])
+def test_the_scale_by_itself_is_that_of_the_whole_shape(monkeypatch, simulate, snapshots, cameras, together) -> None:
+    monkeypatch.setattr(object_shape, "POINTS_AT_ONCE", together)
+    case = simulate(2, snapshots=snapshots, cameras=cameras, missing=0.1)
+    uv = case.observations.uv.clone()
+    uv[:, 0, 0, 0] += 9.0  # for the loss to weigh
+    for row in range(2):
+        one = replace(case.observations, uv=uv).of_snapshots(row)
+        found = estimate(one, case.factory, case.obj, prior_std=case.prior_std)
+        expected = shape_evidence(found.problem, found.solution, LOSS)
+        quick = scale_evidence(found.problem, found.solution, LOSS)
+        np.testing.assert_allclose(quick.scale_error, expected.scale_error, rtol=1e-6, atol=1e-12)
+
+
+def test_an_exact_object_of_many_fiducials_is_asked_about_its_scale_alone(monkeypatch, simulate) -> None:
+    case = simulate(snapshots=2, cameras=3)
+    found = estimate(case.observations, case.factory, case.obj, prior_std=case.prior_std)
+    assert isinstance(object_evidence(found.problem, found.solution, LOSS), object_shape.ShapeEvidence)
+    monkeypatch.setattr(object_shape, "MOST_FIDUCIALS", 7)
+    quick = object_evidence(found.problem, found.solution, LOSS)
+    assert isinstance(quick, ScaleEvidence) and quick.bent_sigma() == 0 and 0 < quick.scale_error[1] < np.inf
+
+
+def test_the_scale_of_a_single_camera_is_not_known_in_either_way(simulate) -> None:
+    case = simulate(snapshots=1, cameras=1, missing=0.0)
+    wide = 1e5 * case.prior_std
+    found = estimate(case.observations, case.factory, case.obj, case.poses, prior_std=wide)
+    expected = shape_evidence(found.problem, found.solution, LOSS).scale_error
+    assert scale_evidence(found.problem, found.solution, LOSS).scale_error == pytest.approx(expected, rel=1e-2)

@@ -122,3 +122,12 @@ def test_nothing_in_view_says_nothing(rig, points):
     motion = rigid_motion(rig, points.mean(0))
     with pytest.raises(RefusedError, match="too little of the working volume"):
         aligned_covariance(covariance, motion, torch.zeros_like(covariance))
+
+
+def test_all_errors_in_one_pass_are_those_of_each(rig, points):
+    found = uncertainty_over(rig, covariance_of(rig)[0], points)
+    seen = torch.ones(3, len(points), dtype=torch.bool)
+    seen[0, :7] = seen[1, 3] = seen[2, 5:20] = False
+    expected = (found.pixel_error(points), found.point_error(points, seen), found.point_error(points, seen, 0.3))
+    for one, other in zip(found.errors(points, seen, 0.3), expected, strict=True):
+        torch.testing.assert_close(one, other, equal_nan=True)

@@ -69,3 +69,23 @@ def test_a_border_is_solved_with_the_rest(batch: int, first: int, second: int, p
     reduced = schur.reduce(kept, coupling.permute(0, 2, 1, 4, 3), blocks, schur.Border(*parts[::-1], own))
     b, a, c = schur.solve(reduced, *rights[::-1], right[:, size:])
     torch.testing.assert_close(torch.cat((a.flatten(1), b.flatten(1), c), 1), expected)
+
+
+@pytest.mark.parametrize("bordered", [False, True])
+def test_columns_are_solved_as_they_are_one_by_one(bordered: bool) -> None:
+    blocks, coupling, kept, _ = system(3, 2, 4, 5, 3)
+    generator = torch.Generator().manual_seed(3)
+
+    def drawn(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    border = schur.Border(drawn(3, 2, 5, 2), drawn(3, 4, 3, 2), 500 * torch.eye(2).double().expand(3, 2, 2))
+    reduced = schur.reduce(blocks, coupling, kept, border if bordered else None)
+    right = (drawn(3, 2, 5, 7), drawn(3, 4, 3, 7), drawn(3, 2, 7) if bordered else None)
+    found = schur.solve_columns(reduced, *right)
+    for k in range(7):
+        alone = schur.solve(reduced, *(None if part is None else part[..., k] for part in right))  # type: ignore[arg-type]
+        for one, part in zip(alone, found, strict=True):
+            assert (one is None) == (part is None) == (not bordered and part is found[2])
+            if one is not None and part is not None:
+                torch.testing.assert_close(part[..., k], one)

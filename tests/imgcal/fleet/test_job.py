@@ -1,4 +1,5 @@
 import os
+import signal
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -103,3 +104,12 @@ def test_the_limit_holds_where_every_exception_is_caught(capture: Path, monkeypa
     monkeypatch.setattr(jobs, "calibrate", stubborn)
     row = processed(item(capture), Settings(seconds=0.5))
     assert row is not None and row["status"] == "timed_out" and row["seconds"] < 30
+
+
+def test_a_system_that_can_limit_nothing_still_calibrates(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows has neither module nor timer."""
+    monkeypatch.setattr(jobs, "resource", None)
+    monkeypatch.delattr(signal, "setitimer")
+    monkeypatch.delattr(signal, "SIGALRM")
+    row = processed(item(capture), Settings(seconds=0.0))
+    assert row is not None and row["status"] == "ok"

@@ -1,4 +1,5 @@
 import json
+import os
 import sys
 import time
 from dataclasses import replace
@@ -107,3 +108,12 @@ def test_an_event_that_cannot_be_written_is_counted_and_the_next_one_is_told(tmp
     hook.tell(replace(event(2), size=float("inf")))
     hook.close()
     assert hook.failed == 1 and json.loads((tmp_path / "out").read_text())["snapshot"] == "00002"
+
+
+def test_one_that_hangs_is_killed_where_there_are_no_process_groups(tmp_path, monkeypatch):
+    monkeypatch.delattr(os, "killpg")
+    hook = Hook(script(tmp_path, "import time; time.sleep(600)"), timeout=0.2)
+    hook.tell(event(7))
+    until(lambda: hook.failed == 1)
+    assert "was killed after" in hook.problem
+    hook.close()

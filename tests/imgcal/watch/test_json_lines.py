@@ -1,12 +1,20 @@
 import os
+import sys
 import tempfile
 import threading
+
+import pytest
 
 from imgcal.watch.exposures import Exposure, Unreadable
 from imgcal.watch.json_lines import AT_ONCE, JsonLines
 from imgcal.watch.wire import LONGEST_LINE
 
 LINE = b'{"camera": "a", "time": %d, "uv": [[1, 2]]}\n'
+
+
+@pytest.fixture(params=["linux", "win32"], autouse=True)
+def _system(request, monkeypatch):
+    monkeypatch.setattr(sys, "platform", request.param)
 
 
 def read(content):

@@ -1,0 +1,15 @@
+"""What the machine offers this process."""
+
+import os
+
+
+def usable_cores() -> int:
+    """Count the cores that this process may use; all of the machine's where the system does not say (macOS, Windows).
+
+    Examples:
+        >>> usable_cores() >= 1
+        True
+    """
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
