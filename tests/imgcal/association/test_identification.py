@@ -134,7 +134,7 @@ def test_other_objects_and_rigs(o10: CameraRig, asymmetric: CalibrationObject, k
         assert right >= 0.9 * visible * rig.num_cameras
 
 
-def test_four_fiducials_in_one_camera_are_hardly_ever_told_and_never_wrong(o10: CameraRig) -> None:
+def test_four_fiducials_in_one_camera_are_mostly_told_and_never_wrong(o10: CameraRig) -> None:
     rig = o10.select([0])
     four = make_object(np.array([[0.0, 0, 0], [90, 10, 0], [20, 80, 10], [-30, 40, 70]]))
     refused = 0
@@ -143,7 +143,7 @@ def test_four_fiducials_in_one_camera_are_hardly_ever_told_and_never_wrong(o10: 
         assert (found.labels == (truth if found.accepted else -1)).all()
         assert found.reason
         refused += not found.accepted
-    assert refused >= 6
+    assert refused <= 4
 
 
 def test_clutter_alone_is_refused(o10: CameraRig, asymmetric: CalibrationObject) -> None:
