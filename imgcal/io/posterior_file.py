@@ -44,9 +44,16 @@ def read_posterior(path: str | Path, rig: CameraRig) -> RigPosterior:
     tensors, texts = read_tensors(path, FORMAT)
     try:
         cam_from_rig = replace(rig.cam_from_rig, rotation=tensors["rotation"], translation=tensors["translation"])
-        values = {name: tensors[name] for name in RIG}
+        focal, principal, distortion = (tensors[name] for name in RIG)
         posterior = RigPosterior(
-            replace(rig, cam_from_rig=cam_from_rig, posterior=None, **values),
+            replace(
+                rig,
+                cam_from_rig=cam_from_rig,
+                posterior=None,
+                focal_length=focal,
+                principal_point=principal,
+                distortion=distortion,
+            ),  # fmt: skip
             snapshots=int(texts["snapshots"]),
             scale_tolerance=float(texts["scale_tolerance"]),
             time=float(texts["time"]) if "time" in texts else None,

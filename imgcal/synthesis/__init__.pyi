@@ -30,7 +30,7 @@ from .rigs import (
     synthesize_at_once,
 )
 from .simulated_rig import SimulatedRig
-from .volumes import sample_volume, seen_volume, simulate_volume
+from .volumes import sample_path, sample_volume, seen_volume, simulate_volume
 
 __all__ = [
     "DIFFICULTIES",
@@ -66,6 +66,7 @@ __all__ = [
     "render_crops",
     "render_patches",
     "render_views",
+    "sample_path",
     "sample_scenes",
     "sample_volume",
     "second_look",

@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 import imgcal
 from imgcal.detection import detect
 from imgcal.errors import InputError
-from imgcal.estimation import RigBelief
 from imgcal.geometry import RigidTransform
 from imgcal.live_page.demonstration import AGED
 from imgcal.live_page.viewing_volume import viewing_volume
+from imgcal.monitoring import RigBelief
 from imgcal.online import Event, ImageQuality, RigKeeper, RigState
 from imgcal.synthesis import SimulatedRig
 from imgcal.types import CalibrationObject, CameraRig, Detections

@@ -13,7 +13,7 @@ from torch import Tensor
 
 import imgcal
 from imgcal.geometry import RigidTransform
-from imgcal.synthesis import HandHeld, PhysicalDrift, arranged_rig
+from imgcal.synthesis import HandHeld, PhysicalDrift, arranged_rig, sample_path
 from imgcal.types import CalibrationObject, CameraRig, Detections, Volume
 from scripts.benchmarks.replayed_noise import Replay, Series, recorded_series
 from scripts.benchmarks.rig_streams import Blobs, Bump, Conditions, Stream
@@ -101,8 +101,8 @@ class ReplayedStream(Stream):
         near, far = self.given.off
         reach = near + (far - near) * torch.rand(count, 1, generator=self.generator, dtype=torch.float64)
         self.points = self.obj.points + reach * way
-        hand = HandHeld(self.given.speed, self.given.turning, self.conditions.rate)
-        centres, _ = hand.path(self.place.volume, self.length, self.generator)
+        hand = HandHeld(speed=self.given.speed, turning=self.given.turning, rate=self.conditions.rate)
+        centres, _ = sample_path(hand, self.place.volume, self.length, self.generator)
         middle = self.points.mean(0)
         self.path = RigidTransform(centres.rotation, centres.translation - centres.rotation @ middle)
         every = self.sources or recorded_series()
