@@ -160,7 +160,8 @@ def _understood(arguments: list[str]) -> Runnable:
 
 
 def _arguments(name: str) -> Any:
-    return getattr(import_module("imgcal.cli.arguments"), name.capitalize())
+    with ends_at_once():
+        return getattr(import_module("imgcal.cli.arguments"), name.capitalize())
 
 
 def _summary(name: str) -> Any:

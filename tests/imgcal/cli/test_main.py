@@ -92,7 +92,14 @@ def test_help_is_no_failure(capsys):
     assert "--debug" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("slow", "arguments"), [("tyro", ["--help"]), ("torch", ["score", "--help"])])
+SLOW = [
+    ("tyro", ["--help"]),
+    ("pydantic", ["score", "--help"]),
+    ("torch", ["score", "blobs.csv", "--rig", "T4", "--object", "cube8"]),
+]
+
+
+@pytest.mark.parametrize(("slow", "arguments"), SLOW)
 def test_an_interruption_during_start_up_is_one_line(slow, arguments, tmp_path):
     # The module sleeps on import: however long it really takes, the signal meets it.
     (tmp_path / "sitecustomize.py").write_text(
