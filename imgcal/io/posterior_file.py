@@ -45,15 +45,9 @@ def read_posterior(path: str | Path, rig: CameraRig) -> RigPosterior:
     try:
         cam_from_rig = replace(rig.cam_from_rig, rotation=tensors["rotation"], translation=tensors["translation"])
         focal, principal, distortion = (tensors[name] for name in RIG)
+        lens = replace(rig, focal_length=focal, principal_point=principal, distortion=distortion)
         posterior = RigPosterior(
-            replace(
-                rig,
-                cam_from_rig=cam_from_rig,
-                posterior=None,
-                focal_length=focal,
-                principal_point=principal,
-                distortion=distortion,
-            ),  # fmt: skip
+            replace(lens, cam_from_rig=cam_from_rig, posterior=None),
             snapshots=int(texts["snapshots"]),
             scale_tolerance=float(texts["scale_tolerance"]),
             time=float(texts["time"]) if "time" in texts else None,
