@@ -73,7 +73,7 @@ class Relearning:
                 event = self.events.pop(camera)
                 del self.before[camera]
                 sigma = sigma_of(std[camera], event.change)
-                known = "" if sigma is None else f" to {sigma:.2g} {event.unit}"
+                known = "" if sigma is None else f" to +- {sigma:.2g} {event.unit}"
                 told.append(
                     replace(
                         event,
@@ -81,7 +81,7 @@ class Relearning:
                         snapshot=number,
                         kind="relearnt",
                         sigma=sigma,
-                        message=f"{event.message}, re-learnt{known}",
+                        message=f"{event.message}; known again{known}",
                     )
                 )
         return told

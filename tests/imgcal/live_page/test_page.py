@@ -171,11 +171,11 @@ def test_an_alarm_that_is_over_is_in_the_past_tense(browser, o10, asymmetric8):
 
 
 def test_how_well_a_camera_is_known_again_is_no_value(browser, o10, asymmetric8):
-    event = alarm("cam03", message="cam03 turned 0.3 +- 0.01 deg, re-learnt to 0.013 deg", since=5.0)
+    event = alarm("cam03", message="cam03 turned 0.3 +- 0.01 deg; known again to +- 0.013 deg", since=5.0)
     with LivePage(o10, asymmetric8, Address(port=0)) as page, opened(browser, page.url) as tab:
         page.publish(made_state(o10, asymmetric8, 1, events=(replace(event, kind="relearnt", sigma=0.013),)))
         says(tab, "known again to ±0.013 deg", "#events")
-        assert "re-learnt" not in tab.inner_text("body")
+        assert "known again to +- 0.013" not in tab.inner_text("body")
         assert tab.wrong == []
 
 
