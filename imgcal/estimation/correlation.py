@@ -1,0 +1,139 @@
+"""How long errors remember: the integrated autocorrelation time of series of residuals, from the series themselves.
+
+Errors of real captures go on from frame to frame: a marker that is half hidden, a lens that is off at one place in the
+image. N such samples say as much as N / tau independent ones, where tau = 1 + 2 (rho_1 + rho_2 + ...) and rho_k is the
+autocorrelation at lag k. The sum ends where the autocorrelation can no longer be told from that of white noise, so
+that tau of white noise is one but for chance.
+
+Source: Politis and White, "Automatic block-length selection for the dependent bootstrap" (Econometric Reviews 2004),
+with the correction by Patton, Politis and White (2009): the rule for the last lag, and the flat-top window.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+SURE = 2.0
+"""An autocorrelation counts from `SURE` (log10 n / n)^1/2 on, n pairs: three standard deviations of white noise."""
+QUIET = 5
+"""Lags in a row that must not count before the sum ends."""
+MOST_LAGS = 0.25
+"""Of the length of a series, the lags that are looked at: of longer ones there are too few independent pairs."""
+FIRST_LAGS = 32
+"""Lags that are looked at first; more where the autocorrelation has not died away by then."""
+LEAST_PAIRS = 16
+"""Pairs of samples from which an autocorrelation is looked at."""
+OUTLYING = 5.0
+"""Standard deviations (from the median absolute deviation) to which samples are clipped: outliers whiten a series."""
+
+
+def autocorrelation(series: NDArray[np.floating], lags: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Autocorrelation of series with gaps at lags 0 to `lags`, and how many pairs of samples it rests on.
+
+    Args:
+        series: (S, C, ...) samples in the order of time, NaN where there is none. What follows the axis C are parallel
+            series of the same source, pooled with weights by their variance.
+        lags: at most S - 1.
+
+    Returns:
+        (lags + 1, C) autocorrelation, NaN without pairs, and (lags + 1, C) pairs.
+
+    Examples:
+        >>> rho, pairs = autocorrelation(np.array([[1.0], [-1.0], [1.0], [-1.0]]), 1)
+        >>> rho[:, 0].tolist(), pairs[:, 0].tolist()
+        ([1.0, -1.0], [4.0, 3.0])
+    """
+    count, sources = series.shape[:2]
+    x = _centred(np.asarray(series, dtype=np.float64).reshape(count, sources, -1))
+    known = np.isfinite(x)
+    x = np.where(known, x, 0.0)
+    products, pairs = np.empty((lags + 1, sources)), np.empty((lags + 1, sources))
+    for lag in range(lags + 1):
+        ahead, behind = slice(lag, count), slice(0, count - lag)
+        products[lag] = np.einsum("scd,scd->c", x[ahead], x[behind])
+        pairs[lag] = np.einsum("scd,scd->c", known[ahead], known[behind], dtype=np.float64)
+    mean = np.divide(products, pairs, out=np.full_like(products, np.nan), where=pairs > 0)
+    variance = mean[0]
+    rho = np.divide(mean, variance, out=np.full_like(mean, np.nan), where=variance > 0)
+    return rho, pairs
+
+
+def correlation_time(series: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Integrated autocorrelation time of each source, in samples; at least one.
+
+    Args:
+        series: (S, C, ...) samples in the order of time, NaN where there is none; see `autocorrelation`. Samples are
+            comparable with each other (divided by their own standard deviation, where those differ).
+
+    Returns:
+        (C,) number of successive samples that say as much as one independent sample; one for white noise, and where the
+        samples are too few to tell.
+
+    Examples:
+        >>> rng = np.random.default_rng(1)
+        >>> white = rng.normal(size=(2000, 1))
+        >>> held = np.repeat(white, 10, axis=0)  # each value ten times
+        >>> float(correlation_time(white)[0]), 8 < float(correlation_time(held)[0]) < 12
+        (1.0, True)
+    """
+    count, sources = series.shape[:2]
+    most = int(MOST_LAGS * count)
+    lags, tau = min(FIRST_LAGS, most), np.ones(sources)
+    while lags > 0:
+        rho, pairs = autocorrelation(series, lags)
+        last = [_last_lag(rho[:, source], pairs[:, source]) for source in range(sources)]
+        if lags == most or 2 * max(last, default=0) + QUIET <= lags:
+            return np.array([_integrated(rho[:, c], pairs[:, c], last[c]) for c in range(sources)]).reshape(sources)
+        lags = min(4 * lags, most)
+    return tau
+
+
+def effective_size(series: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Number of independent samples that say as much as the samples of each source do: (C,).
+
+    Args:
+        series: (S, C, ...), as for `correlation_time`. A moment counts once, however many parallel series know it.
+    """
+    known = np.isfinite(series).reshape(*series.shape[:2], -1).any(-1)
+    return known.sum(0) / correlation_time(series)
+
+
+def _centred(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Series (S, C, D) without their medians, which are no correlation, and without the tails of outliers."""
+    known = np.isfinite(x)
+    if not known.any():
+        return x
+    filled = np.where(known, x, np.nan)
+    empty = ~known.any(0)
+    filled[:, empty] = 0.0
+    centre = np.nanmedian(filled, axis=0)
+    spread = 1.4826 * np.nanmedian(np.abs(filled - centre), axis=0)
+    limit = np.where(spread > 0, OUTLYING * spread, np.inf)
+    clipped = np.clip(filled - centre, -limit, limit)
+    clipped -= np.nanmean(clipped, axis=0)
+    return np.where(known, clipped, np.nan)
+
+
+def _last_lag(rho: NDArray[np.float64], pairs: NDArray[np.float64]) -> int:
+    """Last lag that counts before `QUIET` in a row do not; 0 = none. See `autocorrelation` for the arrays (L + 1,)."""
+    noise = SURE * np.sqrt(np.log10(np.maximum(pairs, 10)) / np.maximum(pairs, 1))
+    counts = (pairs >= LEAST_PAIRS) & (np.abs(np.nan_to_num(rho)) > noise)
+    last = 0
+    for lag in range(1, len(rho)):
+        if counts[lag]:
+            last = lag
+        elif lag - last >= QUIET:
+            break
+    return last
+
+
+def _integrated(rho: NDArray[np.float64], pairs: NDArray[np.float64], last: int) -> float:
+    """Sum of an autocorrelation (L + 1,) over both signs of the lag by the flat-top window; at least one.
+
+    The window is one up to the last lag that counts, and falls to zero at twice that lag.
+    """
+    lag = np.arange(1, min(2 * last, len(rho)))
+    window = np.clip(2 * (1 - lag / (2 * max(last, 1))), 0.0, 1.0)
+    known = np.where(pairs[lag] >= LEAST_PAIRS, np.nan_to_num(rho[lag]), 0.0)
+    return max(1.0, 1 + 2 * float((window * known).sum()))
