@@ -23,6 +23,7 @@ from imgcal.geometry import RigidTransform
 from imgcal.pipeline.initialization import Initialization
 from imgcal.pipeline.lateness import LateCamera
 from imgcal.pipeline.object_checks import displaced, lost_fiducials
+from imgcal.pipeline.repeats import Repeats
 from imgcal.pipeline.tally import Tally, tally
 from imgcal.types import (
     BlobFlag,
@@ -68,6 +69,7 @@ class Calibration:
     moved: tuple[MovedCamera, ...] = ()  # during the capture; snapshots used are those since then
     from_scratch: bool = False  # there was no factory calibration: `factory` is a first rig made from the same data
     late: tuple[LateCamera, ...] = ()  # whose frames, from some snapshot on, are of other moments: these took no part
+    repeats: Repeats = Repeats()  # exact copies of earlier images: these took no part
 
     def __repr__(self) -> str:
         """Say what was found: the rig, its error before and after, how the fiducials were identified."""
