@@ -5,6 +5,7 @@ from .blocks import BlockScatter, block_scatter
 from .brought import Brought
 from .change_points import CLIP, LEAST_SNAPSHOTS
 from .clock_slip import ClockSlip, image_of
+from .correlation import correlation_time, effective_size
 from .covariance import (
     camera_covariance,
     camera_std,
@@ -14,6 +15,7 @@ from .covariance import (
     relative_covariance,
     relative_difference,
     relative_jacobian,
+    scale_response,
     whitened_covariance,
 )
 from .cusum import Cusum, cusum_threshold
@@ -117,8 +119,10 @@ __all__ = [
     "change_of_errors",
     "changed_object",
     "cold_start",
+    "correlation_time",
     "cusum_threshold",
     "displaced",
+    "effective_size",
     "encoded",
     "equations_at",
     "error_between",
@@ -156,6 +160,7 @@ __all__ = [
     "retract",
     "rig_at",
     "rigid_motion",
+    "scale_response",
     "shared_shifts",
     "spread_of",
     "squared",

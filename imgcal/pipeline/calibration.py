@@ -24,6 +24,7 @@ from imgcal.pipeline.initialization import Initialization
 from imgcal.pipeline.lateness import LateCamera
 from imgcal.pipeline.object_checks import displaced, lost_fiducials
 from imgcal.pipeline.repeats import Repeats
+from imgcal.pipeline.scale import Scale, scale_of
 from imgcal.pipeline.tally import Tally, tally
 from imgcal.types import (
     BlobFlag,
@@ -159,6 +160,11 @@ class Calibration:
     def predicted_error(self) -> PredictedError:
         """How good the rig is over the working volume."""
         return predicted_error(self.estimate)
+
+    @cached_property
+    def scale(self) -> Scale:
+        """What the size of the rig rests on, and what an error of the object's file would add to the predicted one."""
+        return scale_of(self.estimate, self.obj, self.scale_sigma, self.predicted_error.volume)
 
     @property
     def detectors(self) -> Mapping[str, int]:

@@ -7,6 +7,7 @@ result look surer than it is.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +25,11 @@ class Repeats:
     rows: int = 0  # blobs that stand twice in one image
     images: int = 0  # images of one camera, with the same blobs as an earlier one
     snapshots: tuple[tuple[str, str], ...] = ()  # all images of which are copies: their names, and those of the first
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """The form that scripts read."""
+        return {"rows": self.rows, "images": self.images, "snapshots": dict(self.snapshots), "note": str(self)}
 
     def __str__(self) -> str:
         """One line for people; empty where there are none."""

@@ -17,7 +17,7 @@ import torch
 import tyro
 from torch import Tensor
 
-from imgcal import InputError, PipelineOptions, calibrate, load_object, load_rig
+from imgcal import InputError, PipelineOptions, RefusedError, calibrate, load_object, load_rig
 from imgcal.association import associate
 from imgcal.estimation import camera_covariance, rigid_motion
 from imgcal.io import load_detections
@@ -143,14 +143,21 @@ def main() -> None:
     capture = Path(folder) / CAPTURE
     rig, obj = load_rig(capture / "factory.yaml"), load_object(capture / "object.csv")
     detections = load_detections(capture / "detections.csv.gz", rig)
-    blocks = []
+    blocks: list[Block] = []
+    refused: dict[int, str] = {}  # first frame: why
     for first in range(options.first, options.first + options.blocks * options.length, options.length):
-        blocks.append(calibrated(frames(detections, first, first + options.length), rig, obj))
+        try:
+            blocks.append(calibrated(frames(detections, first, first + options.length), rig, obj))
+        except RefusedError as error:
+            refused[first] = str(error)
+            print(f"frames {first}-{first + options.length - 1}: refused: {error}")
+            continue
         found = blocks[-1].calibration
         print(f"frames {first}-{first + options.length - 1}: {found}, sigmas times {found.estimate.inflation:.2f}")
     result = measure(blocks)
-    stretch = {"first_frame": options.first, "frames_per_block": options.length}
-    write_json(options.out, before | {"seconds": round(time.monotonic() - began), "capture": CAPTURE} | stretch | result)
+    stretch = {"capture": CAPTURE, "first_frame": options.first, "frames_per_block": options.length}
+    before |= {"seconds": round(time.monotonic() - began)}
+    write_json(options.out, before | stretch | {"refused": refused} | result)
     for name, kinds in result["chi2_per_dof"].items():
         print(f"chi2/dof between blocks, {name}: " + ", ".join(f"{kind} {value:.2f}" for kind, value in kinds.items()))
     print(f"gate {GATE}: {'passed' if result['passed'] else 'failed'}")
