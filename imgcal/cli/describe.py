@@ -90,6 +90,7 @@ def describe(
         prior_std=gauge.prior_std(rig.to(torch.float64), calibration.estimate.problem.prior_std[0]).numpy(),
         gauge=gauge,
         predicted=calibration.predicted_error,
+        scale=str(calibration.scale),
         moves=tuple(map(str, calibration.moved)),
         late=tuple(map(str, calibration.late)),
         unknown=found.knowledge.sentences,

@@ -65,6 +65,8 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
             "inflation": calibration.estimate.inflation,
         },
         "predicted_error": calibration.predicted_error.summary(),
+        "scale": calibration.scale.values,
+        "repeats": calibration.repeats.values,
         "seconds": seconds,
     }
 
@@ -112,6 +114,8 @@ def refused_summary(
         "object_bent_sigma": None,
         "covariance": None,
         "predicted_error": None,
+        "scale": None,
+        "repeats": None,
         **UNKNOWN,
         "seconds": seconds,
     }
@@ -139,13 +143,15 @@ def print_outcome(result: dict[str, Any], found: Findings, out: Path, report: bo
     print(f"reprojection error {earlier}{after:.4f} px (RMS)")
     if guess is not None and not guess["used"]:
         print("note: the network's guess was no better than the factory calibration: not used", file=sys.stderr)
-    print(predicted_line(result["predicted_error"]))
+    print("; ".join(filter(None, (predicted_line(result["predicted_error"]), result["scale"]["note"]))))
     print(
         f"identity {result['identity']}, {result['snapshots_used']} snapshots used, "
         f"{result['snapshots_rejected']} rejected"
     )
     for line in found.lines:
         print(line)
+    if result["repeats"]["note"]:
+        print(f"note: {result['repeats']['note']}", file=sys.stderr)
     for kind, factor in result["prior_too_narrow"].items():
         kind = kind.replace("_", " ")
         print(f"note: {kind} drifted {factor:.1f} times as far as the rig's prior allows: widened", file=sys.stderr)

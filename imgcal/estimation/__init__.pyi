@@ -13,6 +13,7 @@ from .covariance import (
     relative_covariance,
     relative_difference,
     relative_jacobian,
+    scale_response,
     whitened_covariance,
 )
 from .gauge import aligned
@@ -133,6 +134,7 @@ __all__ = [
     "retract",
     "rig_at",
     "rigid_motion",
+    "scale_response",
     "squared",
     "step_by_error",
     "uncertainty_over",

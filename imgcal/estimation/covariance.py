@@ -21,7 +21,8 @@ from imgcal.errors import RefusedError
 from imgcal.estimation.curvature import curvature_covariance
 from imgcal.estimation.levenberg_marquardt import Solution, factorize
 from imgcal.estimation.linearization import POSE_PARAMETERS, NormalEquations, points_at
-from imgcal.estimation.map_estimate import Estimate
+from imgcal.estimation.map_estimate import Estimate, equations_at
+from imgcal.estimation.robust_losses import NamedLoss
 from imgcal.geometry import RigidTransform, cross_matrix, kernels, left_jacobian
 from imgcal.types import CameraRig
 from renderers.compiling import njit
@@ -29,6 +30,8 @@ from renderers.compiling import njit
 UNDETERMINED = "covariance: the observations do not determine the object's pose in every snapshot"
 LEAST_STD = 1e-9
 """Prior standard deviation (rad, mm, pixels, 1) of what is fixed, where it is divided by."""
+HUBER = 3.0
+"""Standard deviations, as those of an estimate: residuals beyond tell less of how parameters follow each other."""
 FEW_SNAPSHOTS = 10
 """Up to which `remaining_variance` eliminates the cameras of an exact object, not the poses."""
 
@@ -368,6 +371,36 @@ def _unwhitening(estimate: Estimate) -> Tensor:
     left = left_jacobian(state.offset[..., :3] * prior_std[..., :3])
     scale[..., :3, :3] = left * prior_std[..., None, :3]
     return scale
+
+
+def scale_response(estimate: Estimate) -> Tensor:
+    """How the parameters follow the scale of the object's file: (K C,) change of each by a relative change of one.
+
+    The poses follow, too, and fiducials as far as they have tolerances; the prior of the cameras holds against it.
+
+    Args:
+        estimate: without batch axes.
+
+    Raises:
+        RefusedError: the information is singular.
+    """
+    problem, state = estimate.problem, estimate.solution.state
+    points = points_at(problem, state)[0]
+    unit = points.new_zeros(1, 3 * len(points) + 1)
+    if problem.object_prior_std is not None:
+        unit = problem.object_prior_std.clone()
+    unit[:, -1] = 1.0
+    free = replace(problem, points=points, object_prior_std=unit)
+    equations = equations_at(free, replace(state, object_offset=torch.zeros_like(unit)), NamedLoss("huber", HUBER))
+    factorization = factorize(equations, cameras_first=False)
+    if bool(factorization.reduced.failed.any()):
+        raise RefusedError(UNDETERMINED)
+    lower = factorization.reduced.kept[0]
+    # A step of the last unknown by one is followed by -A^-1 a of the others; with the Cholesky factor, -L^-T l.
+    follow = -torch.linalg.solve_triangular(lower[:-1, :-1].mT, lower[-1, :-1, None], upper=True)[:, 0]
+    cameras = estimate.rig.num_cameras
+    whitened = follow[: problem.prior_std[0].numel()].unflatten(0, (cameras, -1))
+    return torch.einsum("cij,cj->ci", _unwhitening(estimate)[0], whitened).flatten()
 
 
 def pose_covariance(estimate: Estimate) -> Tensor:

@@ -24,6 +24,8 @@ from imgcal.monitoring import posterior_of
 from imgcal.pipeline.initialization import Initialization
 from imgcal.pipeline.lateness import LEAST_BETTER, LateCamera, timing_motion
 from imgcal.pipeline.object_checks import displaced, lost_fiducials
+from imgcal.pipeline.repeats import Repeats
+from imgcal.pipeline.scale import Scale, scale_of
 from imgcal.pipeline.tally import Tally, tally
 from imgcal.types import (
     BlobFlag,
@@ -70,6 +72,7 @@ class Calibration:
     moved: tuple[MovedCamera, ...] = ()  # during the capture; snapshots used are those since then
     from_scratch: bool = False  # there was no factory calibration: `factory` is a first rig made from the same data
     late: tuple[LateCamera, ...] = ()  # whose frames, from some snapshot on, are of other moments: these took no part
+    repeats: Repeats = Repeats()  # exact copies of earlier images: these took no part
 
     def __repr__(self) -> str:
         """Say what was found: the rig, its error before and after, how the fiducials were identified."""
@@ -176,6 +179,11 @@ class Calibration:
     def predicted_error(self) -> PredictedError:
         """How good the rig is over the working volume."""
         return predicted_error(self.estimate)
+
+    @cached_property
+    def scale(self) -> Scale:
+        """What the size of the rig rests on, and what an error of the object's file would add to the predicted one."""
+        return scale_of(self.estimate, self.obj, self.scale_sigma, self.predicted_error.volume)
 
     @property
     def detectors(self) -> Mapping[str, int]:

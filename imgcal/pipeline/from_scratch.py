@@ -31,6 +31,7 @@ from imgcal.messages import listed
 from imgcal.pipeline.calibration import Calibration
 from imgcal.pipeline.fitting import fit_steady
 from imgcal.pipeline.recalibration import late_cameras, require_same_moments
+from imgcal.pipeline.repeats import name_repeats, without_repeats
 from imgcal.pipeline.sources import Frames, blobs_of
 from imgcal.pipeline.units import require_solvable, require_units
 from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior, Volume
@@ -92,7 +93,7 @@ def calibrate_from_scratch(
         True
     """
     started, cameras = time.perf_counter(), _with_prior(cameras)
-    detections = blobs_of(source, cameras, obj, detection)
+    detections, repeats = without_repeats(blobs_of(source, cameras, obj, detection))
     found = time.perf_counter()
     is_labelled = (detections.fiducial >= 0).any()
     alone = detections if is_labelled else labels_of_images(detections, cameras, obj, options, progress)
@@ -119,6 +120,7 @@ def calibrate_from_scratch(
     box = Volume.box(_corner(volume.low), _corner(volume.high))
     # What was known before is no prior for what comes after; the defaults are.
     rig = replace(fit.rig, name=cameras.name, prior=None, volume=box)
+    fit = replace(fit, labelled=name_repeats(fit.labelled, repeats), repeats=repeats)
     return replace(fit, estimate=replace(fit.estimate, rig=rig), seconds=seconds, from_scratch=True, late=late)
 
 

@@ -22,6 +22,7 @@ from imgcal.pipeline.fitting import fit_labelled, fit_steady
 from imgcal.pipeline.initialization import Initializer
 from imgcal.pipeline.lateness import LateCamera, late_camera, suspects
 from imgcal.pipeline.measuring import LearnedMeasurer
+from imgcal.pipeline.repeats import name_repeats, without_repeats
 from imgcal.pipeline.sources import Detector, Frames, blobs_of, checked_frames, sight_of
 from imgcal.pipeline.tally import Tally, tally
 from imgcal.pipeline.units import require_solvable, require_units
@@ -77,7 +78,7 @@ def calibrate(
     """
     started, rig = time.perf_counter(), rig.to(torch.float64)
     source = source if isinstance(source, Detections) else checked_frames(source, rig)
-    detections = blobs_of(source, rig, obj, detection, measurer)
+    detections, repeats = without_repeats(blobs_of(source, rig, obj, detection, measurer))
     found = time.perf_counter()
     sight = sight_of(detector, source, detection, measurer)
     labelled: Associations | None = None
@@ -105,7 +106,7 @@ def calibrate(
         "estimation": time.perf_counter() - identified,
     }
     late = late_cameras(detections, fit.tally, rig, obj, options)
-    return replace(fit, seconds=seconds, late=late)
+    return replace(fit, labelled=name_repeats(fit.labelled, repeats), seconds=seconds, late=late, repeats=repeats)
 
 
 def _by_blobs(labelled: Associations) -> bool:

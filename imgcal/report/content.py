@@ -54,6 +54,7 @@ class ReportContent:
     from_scratch: bool = False  # there was no factory calibration: `factory` is a first rig made from the same data
     gauge: Gauge | None = None  # which cameras are taken to have stood still; None = nothing is compared
     predicted: PredictedError | None = None  # over the working volume
+    scale: str = ""  # what the prediction leaves out, since no image shows it, in words
     moves: tuple[str, ...] = ()  # cameras that moved during the capture, in words; earlier snapshots are rejected
     late: tuple[str, ...] = ()  # cameras whose frames are of other moments, in words; these took no part
     unknown: tuple[str, ...] = ()  # what the data do not say, in words
