@@ -109,8 +109,9 @@ class RigMonitor:
         """
         self.undecided = {camera: left - 1 for camera, left in self.undecided.items() if left > 1}
         given = observations
+        self.noise.pass_time(seconds)
         if self.filter.calibrated:
-            self.noise.expect(seconds)
+            self.noise.expect_usual()
         observations = self.noise.weigh(self.shaking.of(observations))
         new = [camera for camera in moved if camera not in self.quarantine.cameras]
         if new:
@@ -119,6 +120,7 @@ class RigMonitor:
         follow = self._follow_beside_quarantine if self.quarantine.cameras else self._follow
         found = follow(observations, rig_from_object, seconds)
         found = replace(found, update=found.update.of_last(), restarted=self.known_since != known_since)
+        self.noise.settle({*(change.camera for change in found.changes), *(slip.camera for slip in found.slips)})
         if not (found.changes or self.open or found.slips or found.object_change):
             self._follow_noise(drop_cameras(given, self.quarantine.cameras), found.update.residual)
         return found
@@ -192,15 +194,11 @@ class RigMonitor:
         found = self._follow(drop_cameras(observations, cameras), rig_from_object, seconds)
         if not quarantine.cameras or quarantine.cameras != cameras:  # those that are new have seen it already
             return found
-        if quarantine.observe(observations, seconds, self._episode(cameras, observations, found.update)):
+        episode = max(self.noise.episodes[camera] for camera in cameras)
+        if quarantine.observe(observations, seconds, episode):
             with contextlib.suppress(RefusedError):  # it cannot be decided yet, or they do not see enough
                 found = self._diagnose_quarantine(found)
         return replace(found, unsynchronized=quarantine.report_unsynchronized())
-
-    def _episode(self, cameras: Collection[int], observations: Observations, result: MeasurementUpdate) -> int:
-        """Successive snapshots that what is wrong with cameras may last, if it is an error that passes."""
-        snapshot = observations, result.rig_from_object[-1:]
-        return max(self.noise.episode(camera, _shift(result.belief, snapshot, camera)) for camera in cameras)
 
     def _shows_move(self, case: Case) -> bool:
         """Tell whether the image of some suspected camera is shifted by clearly more than errors that last."""
