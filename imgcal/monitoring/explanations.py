@@ -24,6 +24,7 @@ from imgcal.monitoring.pending_change import free_cameras
 from imgcal.monitoring.rig_belief import RigBelief
 from imgcal.monitoring.shaking import Shaking, shake_cameras
 from imgcal.monitoring.unsynchronized import LEAST_SNAPSHOTS, Unsynchronized, unsynchronized_evidence
+from imgcal.monitoring.warming import Warmed
 
 PASSING = (2.0, 5.0)
 """Times their usual size that errors may have which pass."""
@@ -93,6 +94,7 @@ EXPLANATIONS: tuple[Explanation, ...] = (
     Shaking(),
     ObjectChanged(),
     PassingError(),
+    Warmed(),
 )
 """All that is weighed. A new one: a class as above, in a module of its own where it is long, and its line here."""
 

@@ -34,6 +34,7 @@ from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, age_belie
 from imgcal.monitoring.rig_filter import RigFilter
 from imgcal.monitoring.shaking import ShakeLevel
 from imgcal.monitoring.unsynchronized import drop_cameras
+from imgcal.monitoring.warming import Warmed
 from imgcal.types import Observations
 
 FEW_SNAPSHOTS = 16
@@ -254,7 +255,7 @@ class RigMonitor:
         excluded = {Steady.name: "a test of every camera has excluded it"}
         if pending is not None and free:
             excluded[ObjectChanged.name] = "a change of a camera is open"
-        free, evidence = changed_cameras(self._recent.test(age), free)
+        free, evidence = changed_cameras(self._recent.test(age), free, self.noise.least_shifts)
         self.undecided |= dict.fromkeys(free, UNDECIDED_SNAPSHOTS)
         if self._is_new(age):
             excluded[ObjectChanged.name] = "too little was known before"
@@ -444,7 +445,7 @@ class RigMonitor:
         with contextlib.suppress(RefusedError):  # nothing explains these snapshots
             verdict = weigh(case)
             sure = Steady.name in verdict.explained and verdict.lead >= MISFIT_LEAD
-            if sure and verdict.best.name == ObjectChanged.name:
+            if sure and verdict.best.name in (ObjectChanged.name, Warmed.name):
                 return self._adopt(case, verdict, new)
         return None
 
