@@ -158,7 +158,8 @@ class Calibration:
     @cached_property
     def tally(self) -> Tally:
         """What each camera saw in each snapshot, and how much of it is explained."""
-        return tally(self.labelled, self.observations.seen.numpy(), self.rig_from_object, self.factory, self.obj)
+        seen = self.observations.seen.numpy()
+        return tally(self.labelled, seen, self.rig_from_object, self.factory, self.object, self.estimate.rig)
 
     @property
     def labelled_detections(self) -> Detections:
