@@ -93,6 +93,7 @@ def describe(
         scale=str(calibration.scale),
         moves=tuple(map(str, calibration.moved)),
         late=tuple(map(str, calibration.late)),
+        doubtful=tuple(map(str, calibration.doubtful)),
         unknown=found.knowledge.sentences,
         advice=found.knowledge.advice,
         unexplained=calibration.tally.unexplained.sum(0),

@@ -49,6 +49,7 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         "rejected": {s.name: s.reason for s in snapshots if s.status == "refused"},
         "moved": [move.as_values() for move in calibration.moved],
         "late": [vars(late) for late in calibration.late],
+        "doubtful": [camera.as_values() for camera in calibration.doubtful],
         "per_camera": per_camera,
         "per_snapshot": counts_by_snapshot(calibration),
         "object": [
@@ -105,6 +106,7 @@ def refused_summary(
         "rejected": {},
         "moved": [move.as_values() for move in moved],
         "late": [],
+        "doubtful": [],
         "per_camera": blobs_by_camera(detections, rig),
         "per_snapshot": {},
         "object": [],

@@ -48,7 +48,7 @@ from .map_operator import encoded, map_state, with_lenses, without_lenses
 from .moves import find_moves
 from .object_shape import SNAPSHOTS_TO_BEND, FiducialOffset, ScaleEvidence, ShapeEvidence, offsets
 from .pose_initialization import initial_pose
-from .pose_support import ON_A_LINE, UndeterminedPosesError, require_poses
+from .pose_support import ON_A_LINE, UndeterminedPosesError, has_poses, require_poses
 from .rig_error import displaced, error_between, step_by_error
 from .rig_initialization import K3, ColdStart, cold_start, ordinary_lens, poses_alone
 from .rig_uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian, rigid_motion, uncertainty_over
@@ -104,6 +104,7 @@ __all__ = [
     "find_moves",
     "fit_pose",
     "flat_std",
+    "has_poses",
     "initial_pose",
     "initial_state",
     "inverse_or_zero",

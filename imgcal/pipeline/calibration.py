@@ -21,6 +21,7 @@ from imgcal.estimation import (
 )
 from imgcal.geometry import RigidTransform
 from imgcal.monitoring import posterior_of
+from imgcal.pipeline.doubtful import DoubtfulCamera, doubtful_at_end
 from imgcal.pipeline.initialization import Initialization
 from imgcal.pipeline.lateness import LEAST_BETTER, LateCamera, timing_motion
 from imgcal.pipeline.object_checks import displaced, lost_fiducials
@@ -161,7 +162,14 @@ class Calibration:
     @cached_property
     def tally(self) -> Tally:
         """What each camera saw in each snapshot, and how much of it is explained."""
-        return tally(self.labelled, self.observations.seen.numpy(), self.rig_from_object, self.factory, self.obj)
+        seen = self.observations.seen.numpy()
+        return tally(self.labelled, seen, self.rig_from_object, self.factory, self.object, self.estimate.rig)
+
+    @cached_property
+    def doubtful(self) -> tuple[DoubtfulCamera, ...]:
+        """Cameras that stop fitting at the end: where they were bumped there, the rig is not as it is now."""
+        names = tuple(snapshot.name for snapshot in self.labelled.snapshots)
+        return doubtful_at_end(self.tally, self.rig.camera_names, names)
 
     @property
     def labelled_detections(self) -> Detections:
