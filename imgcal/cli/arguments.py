@@ -210,6 +210,9 @@ class Watch:
     remove: bool = False  #: delete the frames of a folder once what they taught is saved
     metrics: str | None = None  #: [HOST:]PORT for Prometheus; the host is 127.0.0.1 if not given
     serve: str | None = None  #: [HOST:]PORT of the live page; the host is 127.0.0.1 if not given
+    poses: tuple[str, ...] = ()
+    """where the object's pose of each snapshot goes: FILE.csv, FILE.jsonl, tcp://HOST:PORT (ZeroMQ) or
+    igtl://[HOST:]PORT (OpenIGTLink: 3D Slicer, PLUS); several are possible"""
     hook: str | None = None
     """command to run for each event, without a shell; the event is its standard input, a line of JSON"""
     detector: str = "classical"  #: who finds the fiducials in frames, as for imgcal calibrate
