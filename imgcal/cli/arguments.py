@@ -186,6 +186,7 @@ class Watch:
     INPUT is what the cameras write or send:
     a folder that is being filled with frames/<camera>/<snapshot>.png, or that holds a video a camera;
     tcp://host:port or ipc://path, frames or blobs from another process through ZeroMQ;
+    qtm://host, markers from Qualisys' QTM as it measures or plays;
     - for blobs on standard input, a line of JSON each: {"camera": "cam01", "time": 12.5, "uv": [[u, v], ...]};
     a rosbag2 folder or .mcap file; a table of blobs (.csv, .csv.gz).
 

@@ -43,6 +43,7 @@ from imgcal.watch import (
     Poses,
     PoseSink,
     Progress,
+    Qualisys,
     Source,
     Tally,
     Timing,
@@ -164,6 +165,8 @@ class Watch(arguments.Watch):
             return JsonLines(sys.stdin.fileno())
         if "://" in self.input:
             self._check_options("an address")
+            if self.input.startswith("qtm://"):
+                return Qualisys(self.input, rig)
             self._require("zmq", "an address")
             return ZeroMQ((self.input,))
         path = Path(self.input)

@@ -11,6 +11,7 @@ from .open_igt_link import OpenIGTLink, listening_address
 from .pose_files import PoseFile
 from .pose_publisher import PosePublisher
 from .poses import PoseRecord, Poses, PoseSink
+from .qualisys import Qualisys
 from .recordings import BlobTable, Videos, holds_videos
 from .rig_files import CURRENT, RigFiles, put_aside
 from .synchronization import COUNTS, Synchronizer, TimedSnapshot
@@ -43,6 +44,7 @@ __all__ = [
     "PoseSink",
     "Poses",
     "Progress",
+    "Qualisys",
     "RigFiles",
     "Source",
     "Synchronizer",

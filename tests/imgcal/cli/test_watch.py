@@ -347,6 +347,11 @@ def test_addresses():
             metrics_address(text)
 
 
+def test_an_address_of_qtm_is_no_address_of_zeromq(tmp_path, capsys):
+    assert watch("qtm://host:0", tmp_path / "out") == 2
+    assert "expected an address qtm://HOST[:PORT]" in capsys.readouterr().err
+
+
 def test_poses_of_a_recording_go_into_files(blobs, tmp_path, capsys):
     save_detections(blobs.of_snapshots(0, 5), tmp_path / "blobs.csv")
     table, lines_ = tmp_path / "poses.csv", tmp_path / "poses.jsonl"
