@@ -186,6 +186,7 @@ class Watch:
     INPUT is what the cameras write or send:
     a folder that is being filled with frames/<camera>/<snapshot>.png, or that holds a video a camera;
     tcp://host:port or ipc://path, frames or blobs from another process through ZeroMQ;
+    qtm://host, markers from Qualisys' QTM as it measures or plays;
     - for blobs on standard input, a line of JSON each: {"camera": "cam01", "time": 12.5, "uv": [[u, v], ...]};
     a rosbag2 folder or .mcap file; a table of blobs (.csv, .csv.gz).
 
@@ -210,6 +211,9 @@ class Watch:
     remove: bool = False  #: delete the frames of a folder once what they taught is saved
     metrics: str | None = None  #: [HOST:]PORT for Prometheus; the host is 127.0.0.1 if not given
     serve: str | None = None  #: [HOST:]PORT of the live page; the host is 127.0.0.1 if not given
+    poses: tuple[str, ...] = ()
+    """where the object's pose of each snapshot goes: FILE.csv, FILE.jsonl, tcp://HOST:PORT (ZeroMQ) or
+    igtl://[HOST:]PORT (OpenIGTLink: 3D Slicer, PLUS); several are possible"""
     hook: str | None = None
     """command to run for each event, without a shell; the event is its standard input, a line of JSON"""
     detector: str = "classical"  #: who finds the fiducials in frames, as for imgcal calibrate

@@ -37,7 +37,13 @@ from imgcal.watch import (
     JsonLines,
     Known,
     Metrics,
+    OpenIGTLink,
+    PoseFile,
+    PosePublisher,
+    Poses,
+    PoseSink,
     Progress,
+    Qualisys,
     Source,
     Tally,
     Timing,
@@ -45,6 +51,7 @@ from imgcal.watch import (
     ZeroMQ,
     forget_after,
     holds_videos,
+    listening_address,
     put_aside,
 )
 from imgcal.watch import Watch as Loop
@@ -86,6 +93,7 @@ class Watch(arguments.Watch):
             keeper, restored = self._keeper(folder, rig, obj)
             stack.enter_context(keeper)
             stack.enter_context(intake).opened()  # before anything is written
+            poses = [stack.enter_context(Poses(name, _pose_sink(name))) for name in self.poses]
             page = None
             if self.serve is not None:
                 from imgcal.live_page import LivePage, parse_address  # brings a server along, which is not in the core
@@ -93,8 +101,9 @@ class Watch(arguments.Watch):
                 page = stack.enter_context(LivePage(rig, obj, parse_address(self.serve), problem=display.warn))
                 print(page.notice)
             loop = Loop(
-                keeper, folder, hook, page, display.tell, display.warn, _removing(source), source=origin, rate=rate
-            )
+                keeper, folder, hook, page, display.tell, display.warn, _removing(source), source=origin, rate=rate,
+                poses=poses,
+            )  # fmt: skip
             if self.metrics is not None:
                 stack.enter_context(Metrics(loop.tally, intake, hook, metrics_address(self.metrics)))
             told = 0 if not restored else None if progress is None else progress.logged
@@ -112,6 +121,8 @@ class Watch(arguments.Watch):
             loop.run(intake, stopped, display.draw)
         tally = loop.tally
         said = display.result(self.out / CURRENT)
+        if lost := [f"{output.name}: {output.lost:,} poses" for output in poses if output.lost]:
+            said = f"{said} | not written: {'; '.join(lost)}"
         if loop.unwritten:
             said = f"{said} | not written: {'; '.join(loop.unwritten.values())}"
         if stopped.interrupted:
@@ -154,6 +165,8 @@ class Watch(arguments.Watch):
             return JsonLines(sys.stdin.fileno())
         if "://" in self.input:
             self._check_options("an address")
+            if self.input.startswith("qtm://"):
+                return Qualisys(self.input, rig)
             self._require("zmq", "an address")
             return ZeroMQ((self.input,))
         path = Path(self.input)
@@ -285,6 +298,25 @@ def metrics_address(text: str) -> tuple[str, int]:
     if not re.fullmatch(r"\d{1,5}", port) or int(port) >= 2**16:
         raise InputError(f"found {shortened(text)!r}, expected [HOST:]PORT")
     return host.strip("[]") or "127.0.0.1", int(port)
+
+
+def _pose_sink(name: str) -> PoseSink:
+    """Open what poses are to go to, by its name.
+
+    Raises:
+        InputError: it cannot be opened, or is no name of any.
+    """
+    scheme, separator, _ = name.partition("://")
+    if not separator:
+        return PoseFile(Path(name))
+    if scheme == "igtl":
+        return OpenIGTLink(*listening_address(name))
+    if scheme not in ("tcp", "ipc"):
+        expected = "FILE.csv, FILE.jsonl, tcp://HOST:PORT or igtl://[HOST:]PORT"
+        raise InputError(f"--poses: found {shortened(name)!r}, expected {expected}")
+    if missing("zmq"):
+        raise InputError(f"--poses: {shortened(name)} {advice('zmq')}")
+    return PosePublisher(name)
 
 
 def _topics(given: tuple[str, ...]) -> dict[str, str]:

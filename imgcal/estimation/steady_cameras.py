@@ -68,7 +68,7 @@ class Gauge:
 
     def _nearer(self, rig: CameraRig, factory: CameraRig) -> CameraRig:
         """Move a whole rig once."""
-        motion = self._averaging(factory) @ error_between(rig, factory)[..., :EXTRINSICS].flatten(-2)[..., None]
+        motion = self.averaging(factory) @ error_between(rig, factory)[..., :EXTRINSICS].flatten(-2)[..., None]
         turn = rotation_from_vector(motion[..., :3, 0])
         transform = RigidTransform(turn.unsqueeze(-3), motion[..., 3:, 0].unsqueeze(-2))
         return replace(rig, cam_from_rig=rig.cam_from_rig @ transform)
@@ -81,7 +81,7 @@ class Gauge:
         """Derivative of the difference by the parameters: (K C, K C)."""
         cameras = factory.num_cameras
         step = step_by_error(factory)[:, :EXTRINSICS, :EXTRINSICS]
-        averaging = self._averaging(factory).unflatten(-1, (cameras, EXTRINSICS))  # (6, C, 6)
+        averaging = self.averaging(factory).unflatten(-1, (cameras, EXTRINSICS))  # (6, C, 6)
         common = torch.einsum("cij,jdk,dkl->cidl", step, averaging, torch.linalg.inv(step))
         jacobian = torch.eye(cameras * factory.num_parameters, dtype=torch.float64)
         blocks = jacobian.unflatten(0, (cameras, -1)).unflatten(-1, (cameras, -1))
@@ -114,7 +114,7 @@ class Gauge:
             std[self.reference, :EXTRINSICS] = 0
         return std
 
-    def _averaging(self, factory: CameraRig) -> Tensor:
+    def averaging(self, factory: CameraRig) -> Tensor:
         """Common motion (6,) by the errors of all cameras (6 C,): (*B, 6, 6 C)."""
         scaled = _scaled(step_by_error(factory)[..., :EXTRINSICS, :EXTRINSICS].mT).mT
         weighted = scaled.mT @ scaled * self.weights.to(scaled)[:, None, None]

@@ -1,4 +1,5 @@
 from .conversion import Held, describe_lens, from_camera_rig, held_by, to_camera_rig, with_image_sizes
+from .documents import Element, parse_xml
 from .fitting import Fit, Holds
 from .foreign_rig import ForeignCamera, ForeignRig
 from .format import Format
@@ -14,6 +15,7 @@ __all__ = [
     "FORMATS",
     "LIMIT",
     "OURS",
+    "Element",
     "Fit",
     "ForeignCamera",
     "ForeignRig",
@@ -33,6 +35,7 @@ __all__ = [
     "load_cameras",
     "load_rig",
     "millimetres",
+    "parse_xml",
     "read_foreign_rig",
     "selected",
     "to_camera_rig",

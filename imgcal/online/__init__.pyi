@@ -4,6 +4,7 @@ from .foreign_object import ForeignObject
 from .image_quality import ImageQuality
 from .keeper import RigKeeper
 from .keeper_file import KeeperFile
+from .object_pose import ObjectPose
 from .recalibrator import Recalibrator
 from .rig_state import CameraHealth, RigState
 from .sequential_test import SequentialTest
@@ -19,6 +20,7 @@ __all__ = [
     "ForeignObject",
     "ImageQuality",
     "KeeperFile",
+    "ObjectPose",
     "Recalibrator",
     "RigKeeper",
     "RigState",

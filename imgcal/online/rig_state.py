@@ -15,9 +15,12 @@ from imgcal.estimation import Gauge
 from imgcal.geometry import RigidTransform
 from imgcal.monitoring import RigBelief
 from imgcal.online.events import Event
+from imgcal.online.object_pose import ObjectPose, object_pose
 from imgcal.types import CameraRig, Detections
 
 CameraHealth = Literal["ok", "doubtful", "relearning", "blind", "dirty", "defocused", "lost", "unseen"]
+UNTRUSTED: frozenset[CameraHealth] = frozenset({"doubtful", "lost"})
+"""Cameras whose labels say nothing of where the object is."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,14 @@ class RigState:
     def rig(self) -> CameraRig:
         """The rig as it is now."""
         return self.belief.rig
+
+    @cached_property
+    def object_pose(self) -> ObjectPose | None:
+        """The object's pose in this snapshot with its covariance; None = it was not seen, or not well enough."""
+        if self.rig_from_object is None:
+            return None
+        trusted = np.array([health not in UNTRUSTED for health in self.cameras.values()])
+        return object_pose(self.belief, self.rig_from_object, self.detections, self.noise, self.shake, trusted)
 
     @cached_property
     def gauge(self) -> Gauge:

@@ -7,6 +7,11 @@ from .intake import Intake, Known
 from .json_lines import JsonLines
 from .loop import EVENTS, STATE, Keeper, Page, Progress, Watch
 from .metrics import Metrics, Tally
+from .open_igt_link import OpenIGTLink, listening_address
+from .pose_files import PoseFile
+from .pose_publisher import PosePublisher
+from .poses import PoseRecord, Poses, PoseSink
+from .qualisys import Qualisys
 from .recordings import BlobTable, Videos, holds_videos
 from .rig_files import CURRENT, RigFiles, put_aside
 from .synchronization import COUNTS, Synchronizer, TimedSnapshot
@@ -31,8 +36,15 @@ __all__ = [
     "Keeper",
     "Known",
     "Metrics",
+    "OpenIGTLink",
     "Page",
+    "PoseFile",
+    "PosePublisher",
+    "PoseRecord",
+    "PoseSink",
+    "Poses",
     "Progress",
+    "Qualisys",
     "RigFiles",
     "Source",
     "Synchronizer",
@@ -46,5 +58,6 @@ __all__ = [
     "checked",
     "forget_after",
     "holds_videos",
+    "listening_address",
     "put_aside",
 ]

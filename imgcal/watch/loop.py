@@ -18,6 +18,7 @@ from imgcal.watch.event_log import EventLog
 from imgcal.watch.hook import Hook
 from imgcal.watch.intake import Intake
 from imgcal.watch.metrics import Tally
+from imgcal.watch.poses import Poses
 from imgcal.watch.rig_files import FRAMES, STATE, RigFiles
 from imgcal.watch.synchronization import TimedSnapshot
 
@@ -124,6 +125,7 @@ class Watch:
         saved: Callable[[Progress], None] = lambda progress: None,
         source: str | None = None,
         rate: float | None = None,
+        poses: Collection[Poses] = (),
     ) -> None:
         """Prepare; nothing is written before it is entered.
 
@@ -137,10 +139,12 @@ class Watch:
             saved: gets how far the source has been worked on, once what it taught until then has been written.
             source: which source it is.
             rate: snapshots a second, of a source that has no times.
+            poses: get what is known after each snapshot; not closed here.
         """
         self.keeper, self.folder, self.tally = keeper, folder, Tally()
         self.paused = False
         self._hook, self._page, self._told, self._problem = hook, page, told, problem
+        self._poses = poses
         self._when_saved, self._source, self._rate = saved, source, rate
         self._saved = time.monotonic()
         self._progress: Progress | None = None
@@ -163,6 +167,7 @@ class Watch:
         self.save()
         self._files.close()
         self._told_problems()
+        self._told_of_poses()
         self._log.close()
         if self._hook is not None:
             self._hook.close()
@@ -190,6 +195,7 @@ class Watch:
                 return
             self._obey()
             self._told_of_hook()
+            self._told_of_poses()
             if snapshot is not None:
                 self.take(snapshot)
             if time.monotonic() - self._saved >= SAVED_EVERY:
@@ -220,6 +226,8 @@ class Watch:
         self._unsaved = True
         for event in state.events:
             self.tell(event)
+        for output in self._poses:
+            output.publish(state)
         if self._page is not None:
             self._page.publish(state, snapshot.frames(names))
         return state
@@ -270,6 +278,12 @@ class Watch:
         if problem is not None:
             self._hook_told = True
             self._problem(problem)
+
+    def _told_of_poses(self) -> None:
+        """Say once of each output of poses that it fails."""
+        for output in self._poses:
+            if output.problem is not None and not self.tally.problems[output.name]:
+                self._failed(output.name, output.problem)
 
     def _failed(self, output: str, message: str) -> None:
         self.tally.problems[output] += 1

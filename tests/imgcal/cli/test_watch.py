@@ -345,3 +345,24 @@ def test_addresses():
     for text in ("", "a:b", "1:70000", "-5", ":"):
         with pytest.raises(InputError, match=r"expected \[HOST:\]PORT"):
             metrics_address(text)
+
+
+def test_an_address_of_qtm_is_no_address_of_zeromq(tmp_path, capsys):
+    assert watch("qtm://host:0", tmp_path / "out") == 2
+    assert "expected an address qtm://HOST[:PORT]" in capsys.readouterr().err
+
+
+def test_poses_of_a_recording_go_into_files(blobs, tmp_path, capsys):
+    save_detections(blobs.of_snapshots(0, 5), tmp_path / "blobs.csv")
+    table, lines_ = tmp_path / "poses.csv", tmp_path / "poses.jsonl"
+    more = ("--rate", "60", "--poses", str(table), str(lines_), "igtl://0")
+    assert watch(tmp_path / "blobs.csv", tmp_path / "out", *more) == 0
+    rows = [row.split(",")[:5] for row in table.read_text().splitlines()]
+    assert rows[0] == ["time", "snapshot", "status", "markers", "cameras"] and len(rows) == 6
+    found = [json.loads(line) for line in lines_.read_text().splitlines()]
+    assert [entry["time"] for entry in found] == [number / 60 for number in range(5)] == [float(r[0]) for r in rows[1:]]
+    assert {entry["status"] for entry in found} == {"ok"} and "not written" not in capsys.readouterr().out
+    more = ("--rate", "60", "--fresh", "--poses")
+    for name, said in (("x.txt", "expected a name that ends in"), ("ftp://x", "--poses: found 'ftp://x'")):
+        assert watch(tmp_path / "blobs.csv", tmp_path / "out", *more, name) == 2
+        assert said in capsys.readouterr().err

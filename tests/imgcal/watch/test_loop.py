@@ -13,6 +13,7 @@ from imgcal.watch.exposures import CameraBlobs, Exposure
 from imgcal.watch.hook import Hook
 from imgcal.watch.intake import Intake
 from imgcal.watch.loop import Progress, Watch
+from imgcal.watch.poses import Poses
 from imgcal.watch.synchronization import TimedSnapshot
 from tests.imgcal.watch.states import OBJECT, RIG, KeeperOfStates, event
 
@@ -187,3 +188,30 @@ def test_progress_that_is_none_of_ours(text, tmp_path):
     (tmp_path / "state.json").write_text(text)
     with pytest.raises(InputError, match=r"state\.json: found"):
         Progress.load(tmp_path)
+
+
+def test_poses_go_out_and_an_output_that_fails_is_told_once(tmp_path):
+    class Broken:
+        def send(self, record):
+            raise OSError(f"no space for {record.snapshot}")
+
+        def close(self):
+            pass
+
+    class Listed(Broken):
+        def __init__(self):
+            self.records = []
+
+        def send(self, record):
+            self.records.append((record.snapshot, record.status))
+
+    told, good = [], Listed()
+    with Poses("broken", Broken()) as broken, Poses("good", good) as fine:
+        outputs = broken, fine
+        with Watch(KeeperOfStates(), tmp_path, problem=told.append, poses=outputs) as loop:
+            for number in range(3):
+                loop.take(snapshot(number / 10))
+            while broken.problem is None:
+                time.sleep(0.01)
+    assert good.records == [(number, "ok") for number in range(3)]
+    assert told == ["broken: cannot be written: no space for 0"] and broken.lost == 3

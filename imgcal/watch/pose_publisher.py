@@ -1,0 +1,40 @@
+"""Poses for other processes through ZeroMQ: who listens too slowly misses some, and nobody waits."""
+
+from __future__ import annotations
+
+from imgcal.errors import InputError
+from imgcal.messages import shortened
+from imgcal.watch.poses import PoseRecord
+
+QUEUED = 1000  # messages kept for a subscriber that is slow
+
+
+class PosePublisher:
+    """Publishes a line of JSON a snapshot, as `PoseRecord.to_json` writes it."""
+
+    def __init__(self, address: str) -> None:
+        """Bind to tcp://host:port or ipc://path.
+
+        Raises:
+            InputError: the address is taken, or is none.
+        """
+        import zmq  # not in the core
+
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.PUB)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.SNDHWM, QUEUED)
+        try:
+            self._socket.bind(address)
+        except zmq.ZMQError as error:
+            self.close()
+            raise InputError(f"{shortened(address)}: cannot be published at: {error}") from error
+
+    def send(self, record: PoseRecord) -> None:
+        """See `PoseSink`."""
+        self._socket.send(record.to_json().encode(errors="replace"))  # a publisher drops, and never blocks
+
+    def close(self) -> None:
+        """See `PoseSink`."""
+        self._socket.close()
+        self._context.term()

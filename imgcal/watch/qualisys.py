@@ -1,0 +1,324 @@
+"""Markers of Qualisys cameras from QTM as it measures: the 2D component of its real-time protocol, over TCP.
+
+Source: QTM Real-time Server Protocol Documentation, version 1.20: https://docs.qualisys.com/qtm-rt-protocol/
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import re
+import select
+import socket
+import struct
+import time
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imgcal.errors import InputError
+from imgcal.formats import Element, parse_xml
+from imgcal.messages import listed, one_line, shortened
+from imgcal.types import CameraRig
+from imgcal.watch.exposures import MOST_BLOBS, CameraBlobs, Exposure, Item, Unreadable
+
+PORT = 22223
+"""QTM's base port plus one: numbers come with their low byte first."""
+TICK = 0.05  # s
+LARGEST = 2**24  # bytes of a packet
+AT_ONCE = 2**16  # bytes
+VERSION = "1.20"
+COMMANDS = (f"Version {VERSION}", "GetParameters General", "StreamFrames AllFrames 2D")
+ERROR, COMMAND, XML, DATA = 0, 1, 2, 3
+TWO_DIMENSIONAL = 7
+HEADER, DATA_HEADER, COMPONENT, CAMERAS, CAMERA = map(struct.Struct, ("<II", "<qII", "<II", "<Ihh", "<iB"))
+MARKER = np.dtype([("x", "<i4"), ("y", "<i4"), ("width", "<u2"), ("height", "<u2")])
+UNITS = 64  # of a pixel, where the image is a part of the sensor
+LEAST_UNITS = 8.0  # and where it is all of it
+BEFORE_NOW = 5.0
+"""Seconds that time stamps may be from what the clock says after a new connection; more, and they began anew."""
+
+
+class _Lost(Exception):
+    """The connection is of no use any more."""
+
+
+@dataclass(frozen=True)
+class _Camera:
+    """How a camera's markers become pixels of the rig."""
+
+    name: str  # in the rig
+    unit: float  # of its coordinates, in a pixel
+    corner: tuple[float, float]  # pixels, of the image in the sensor
+
+
+@dataclass
+class _Clock:
+    """Seconds since 1970 of time stamps that begin anywhere."""
+
+    now: Callable[[], float]
+    began: float | None = None  # s, of a time stamp of zero
+    fresh: bool = True  # the connection is new
+
+    def seconds(self, stamp: int) -> float:
+        """Of a time stamp in microseconds; the first one is now."""
+        passed = stamp * 1e-6
+        if self.fresh and (self.began is None or abs(self.began + passed - self.now()) > BEFORE_NOW):
+            self.began = self.now() - passed
+        self.fresh = False
+        assert self.began is not None
+        return self.began + passed
+
+
+@dataclass(frozen=True)
+class Qualisys:
+    """Receives the markers of all cameras, frame by frame, from QTM or from what it plays back.
+
+    Cameras are those of the rig by their serial numbers; else, where the rig has as many, in the order of QTM. QTM need
+    not be there yet, and may go and come back. A packet that cannot be read is left out; a stream whose packets do not
+    begin where they should is connected to again.
+    """
+
+    address: str  # qtm://host[:port]
+    rig: CameraRig
+    silence: float = 5.0  # s without anything after which the connection is made anew
+    pause: float = 1.0  # s between two attempts
+    clock: Callable[[], float] = time.time
+    live: bool = True
+
+    def items(self) -> Iterator[Item]:
+        """Receive until the reader stops asking.
+
+        Raises:
+            InputError: the address is none.
+        """
+        host, port = _host_and_port(self.address)
+        clock, said = _Clock(self.clock), ""
+        while True:
+            clock.fresh = True
+            try:
+                with (yield from _connected(host, port, self.silence)) as connection:
+                    for item in self._session(connection, clock):
+                        said = "" if isinstance(item, Exposure) else said
+                        yield item
+            except (_Lost, OSError) as error:
+                reason = one_line(f"{self.address}: {error}")
+                if reason != said:  # once, however often it is tried again
+                    said = reason
+                    yield Unreadable(reason)
+            ends = time.monotonic() + self.pause
+            while time.monotonic() < ends:
+                time.sleep(min(TICK, self.pause))
+                yield None
+
+    def _session(self, connection: socket.socket, clock: _Clock) -> Iterator[Item]:
+        """Ask for the stream and read it.
+
+        Raises:
+            _Lost, OSError: the connection is of no use any more.
+        """
+        for command in COMMANDS:
+            text = command.encode() + b"\0"
+            connection.sendall(HEADER.pack(HEADER.size + len(text), COMMAND) + text)
+        cameras: tuple[_Camera | None, ...] | None = None
+        for packet in _packets(connection, self.silence):
+            if packet is None:
+                yield None
+                continue
+            kind, body = packet
+            if kind == ERROR:
+                raise _Lost(f"QTM says: {shortened(_text(body))}")
+            try:
+                if kind == XML:
+                    cameras = cameras_of(parse_xml(_text(body), "GetParameters General"), self.rig)
+                elif kind == DATA and cameras is None:
+                    raise InputError("found data before the parameters of the cameras")
+                elif kind == DATA and cameras is not None:
+                    yield from _exposures(body, cameras, clock)
+            except InputError as error:
+                yield Unreadable(str(error))
+                if cameras is None:
+                    raise _Lost(str(error)) from error
+
+
+def cameras_of(root: Element, rig: CameraRig) -> tuple[_Camera | None, ...]:
+    """Find the cameras of a rig among those of QTM's general settings.
+
+    Args:
+        root: its answer to `GetParameters General`.
+        rig: whose cameras they are to be.
+
+    Returns:
+        QTM's cameras in its order; None = the rig does not have it.
+
+    Raises:
+        InputError: they are not those of the rig, or have images of another size.
+    """
+    general = root.find("General")
+    elements = [] if general is None else general.all("Camera")
+    if not elements:
+        raise InputError(f"found no cameras in QTM's parameters, expected those of rig {rig.name}")
+    serials = [_value(element, "Serial") or f"camera {number}" for number, element in enumerate(elements, 1)]
+    known = {name: name for name in rig.camera_names}
+    names = [known.get(serial, serial) for serial in serials]
+    if not any(serial in known for serial in serials):
+        if len(serials) != rig.num_cameras:
+            found = f"{len(serials)} cameras ({listed(serials)})"
+            raise InputError(f"found {found}, expected {rig.num_cameras}, or cameras with serials as in rig {rig.name}")
+        names = list(rig.camera_names)
+    sizes = dict(zip(rig.camera_names, rig.image_size.tolist(), strict=True))
+    return tuple(
+        _camera(name, element, sizes[name]) if name in sizes else None
+        for name, element in zip(names, elements, strict=True)
+    )
+
+
+def _camera(name: str, element: Element, size: list[int]) -> _Camera:
+    """Compare a camera's settings with the size of its image."""
+    width, height = (_number(name, element, "Marker_Res", side) for side in ("Width", "Height"))
+    unit = width / size[0]
+    if unit >= LEAST_UNITS and abs(height / size[1] - unit) <= 1e-3 * unit:
+        return _Camera(name, unit, (0.0, 0.0))
+    left, top, right, bottom = (_number(name, element, "Marker_FOV", s) for s in ("Left", "Top", "Right", "Bottom"))
+    if [right - left + 1, bottom - top + 1] == size:
+        return _Camera(name, UNITS, (left, top))
+    found = f"{width / UNITS:g}x{height / UNITS:g} pixels (Marker_Res in 1/{UNITS}), {right - left + 1:g}x"
+    raise InputError(f"{name}: found {found}{bottom - top + 1:g} of them used, expected {size[0]}x{size[1]}")
+
+
+def _exposures(body: bytes, cameras: tuple[_Camera | None, ...], clock: _Clock) -> Iterator[Exposure]:
+    """What all cameras saw in a frame; all of it is read before any is given.
+
+    Raises:
+        InputError: it is no frame of these cameras.
+    """
+    try:
+        stamp, frame, components = DATA_HEADER.unpack_from(body)
+        at = DATA_HEADER.size
+        for _ in range(components):
+            size, kind = COMPONENT.unpack_from(body, at)
+            if kind == TWO_DIMENSIONAL:
+                break
+            if size < COMPONENT.size:
+                raise InputError(f"frame {frame}: found a component of {size} bytes")
+            at += size
+        else:
+            raise InputError(f"frame {frame}: found no 2D component")
+        inside = body[at + COMPONENT.size : at + size]
+        if len(inside) != size - COMPONENT.size:
+            raise InputError(f"frame {frame}: found {len(inside)} bytes of markers, expected {size - COMPONENT.size}")
+        markers = _markers(inside, len(cameras), frame)
+    except struct.error as error:
+        raise InputError(f"found {len(body)} bytes of data, expected a frame: {error}") from error
+    seconds = clock.seconds(stamp)
+    found = []
+    for camera, rows in zip(cameras, markers, strict=True):
+        if camera is None:
+            continue
+        uv = np.stack((rows["x"], rows["y"]), axis=-1) / camera.unit - camera.corner
+        found.append(Exposure(camera.name, seconds, CameraBlobs.of(uv)))
+    yield from found
+
+
+def _markers(inside: bytes, count: int, frame: int) -> list[NDArray[np.void]]:
+    """Markers of each camera."""
+    found, _, _ = CAMERAS.unpack_from(inside)
+    if found != count:
+        raise InputError(f"frame {frame}: found {found} cameras, expected {count}")
+    at, markers = CAMERAS.size, []
+    for _ in range(count):
+        number, _ = CAMERA.unpack_from(inside, at)
+        at += CAMERA.size
+        if not 0 <= number <= MOST_BLOBS or at + number * MARKER.itemsize > len(inside):
+            raise InputError(f"frame {frame}: found {number} markers of a camera in {len(inside)} bytes")
+        markers.append(np.frombuffer(inside, MARKER, number, at))
+        at += number * MARKER.itemsize
+    return markers
+
+
+def _packets(connection: socket.socket, silence: float) -> Iterator[tuple[int, bytes] | None]:
+    """Give packets, as kind and content, and None while nothing comes.
+
+    Raises:
+        _Lost: the stream has ended, is silent, or is none of packets.
+    """
+    waiting, heard = bytearray(), time.monotonic()
+    while True:
+        ready, _, _ = select.select([connection], [], [], TICK)
+        if not ready:
+            if time.monotonic() - heard >= silence:
+                raise _Lost(f"nothing has come for {silence:g} s")
+            yield None
+            continue
+        chunk = connection.recv(AT_ONCE)
+        if not chunk:
+            raise _Lost("the connection was closed")
+        heard = time.monotonic()
+        waiting += chunk
+        at = 0
+        while len(waiting) - at >= HEADER.size:
+            size, kind = HEADER.unpack_from(waiting, at)
+            if not HEADER.size <= size <= LARGEST:
+                raise _Lost(f"found a packet of {size:,} bytes, expected {HEADER.size} to {LARGEST:,}")
+            if len(waiting) - at < size:
+                break
+            yield kind, bytes(waiting[at + HEADER.size : at + size])
+            at += size
+        del waiting[:at]
+
+
+def _connected(host: str, port: int, timeout: float) -> Generator[None, None, socket.socket]:
+    """Connect, giving None meanwhile.
+
+    Raises:
+        _Lost, OSError: the host is not known, nobody listens there, or nobody answers.
+    """
+    family, kind, protocol, _, where = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+    connection, ends = socket.socket(family, kind, protocol), time.monotonic() + timeout
+    try:
+        connection.setblocking(False)
+        failed = connection.connect_ex(where)
+        while failed in (errno.EINPROGRESS, errno.EWOULDBLOCK):
+            yield None
+            if select.select([], [connection], [], TICK)[1]:
+                failed = connection.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+            elif time.monotonic() > ends:
+                raise _Lost("nobody answers")
+        if failed:
+            raise _Lost(f"cannot be connected to: {errno.errorcode.get(failed, failed)}")
+        connection.setblocking(True)
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def _host_and_port(address: str) -> tuple[str, int]:
+    found = re.fullmatch(r"qtm://([^\s:/]+)(?::(\d{1,5}))?/?", address)
+    if found is None or not 0 < int(found[2] or PORT) < 2**16:
+        raise InputError(f"{shortened(address)}: expected an address qtm://HOST[:PORT], such as qtm://127.0.0.1:{PORT}")
+    return found[1], int(found[2] or PORT)
+
+
+def _text(body: bytes) -> str:
+    return body.rstrip(b"\0").decode(errors="replace")
+
+
+def _value(element: Element, *path: str) -> str:
+    """Text of a node by the names that lead there; empty where there is none."""
+    for tag in path:
+        child = element.find(tag)
+        if child is None:
+            return ""
+        element = child
+    return element.text.strip()
+
+
+def _number(name: str, element: Element, *path: str) -> float:
+    with contextlib.suppress(ValueError):
+        value = float(_value(element, *path))
+        if 0 <= value < 2**32:
+            return value
+    raise InputError(f"{name}: found no {'/'.join(path)} in QTM's parameters")
