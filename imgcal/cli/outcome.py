@@ -59,6 +59,7 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         "object_lost": list(calibration.lost),
         "object_scale_sigma": calibration.scale_sigma,
         "object_bent_sigma": calibration.bent_sigma,
+        "board_bend": None if calibration.bend is None else vars(calibration.bend) | {"note": str(calibration.bend)},
         "covariance": {
             "from": "scatter between blocks of snapshots" if calibration.block_length else "noise of the blobs",
             "block_length": calibration.block_length,
@@ -112,6 +113,7 @@ def refused_summary(
         "object_lost": [],
         "object_scale_sigma": None,
         "object_bent_sigma": None,
+        "board_bend": None,
         "covariance": None,
         "predicted_error": None,
         "scale": None,
@@ -168,9 +170,13 @@ def print_outcome(result: dict[str, Any], found: Findings, out: Path, report: bo
             "where the object file has it",
             file=sys.stderr,
         )
+    if result["board_bend"]:
+        print(result["board_bend"]["note"])
     print(f"rig     {out / 'rig.yaml'}")
     if result["object"]:
         print(f"object  {out / 'object.csv'}")
+    elif result["board_bend"]:
+        print(f"board   {out / 'board.yaml'}")
     print(f"result  {out / 'result.json'}")
     if report:
         print(f"report  {out / 'report.html'}")
