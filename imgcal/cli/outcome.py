@@ -49,6 +49,7 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         "rejected": {s.name: s.reason for s in snapshots if s.status == "refused"},
         "moved": [move.as_values() for move in calibration.moved],
         "late": [vars(late) for late in calibration.late],
+        "unsynchronized": None if calibration.unsynchronized is None else calibration.unsynchronized.values,
         "per_camera": per_camera,
         "per_snapshot": counts_by_snapshot(calibration),
         "object": [
@@ -106,6 +107,7 @@ def refused_summary(
         "rejected": {},
         "moved": [move.as_values() for move in moved],
         "late": [],
+        "unsynchronized": None,
         "per_camera": blobs_by_camera(detections, rig),
         "per_snapshot": {},
         "object": [],
@@ -152,6 +154,8 @@ def print_outcome(result: dict[str, Any], found: Findings, out: Path, report: bo
     )
     for line in found.lines:
         print(line)
+    if result["unsynchronized"]:
+        print(f"note: {result['unsynchronized']['note']}", file=sys.stderr)
     if result["repeats"]["note"]:
         print(f"note: {result['repeats']['note']}", file=sys.stderr)
     for kind, factor in result["prior_too_narrow"].items():

@@ -26,6 +26,7 @@ from imgcal.pipeline.lateness import LEAST_BETTER, LateCamera, timing_motion
 from imgcal.pipeline.object_checks import CERTAIN, displaced, lost_fiducials
 from imgcal.pipeline.repeats import Repeats
 from imgcal.pipeline.scale import Scale, scale_of
+from imgcal.pipeline.synchronization import Unsynchronized
 from imgcal.pipeline.tally import Tally, tally
 from imgcal.types import (
     BlobFlag,
@@ -94,6 +95,7 @@ class Calibration:
     moved: tuple[MovedCamera, ...] = ()  # during the capture; snapshots used are those since then
     from_scratch: bool = False  # there was no factory calibration: `factory` is a first rig made from the same data
     late: tuple[LateCamera, ...] = ()  # whose frames, from some snapshot on, are of other moments: these took no part
+    unsynchronized: Unsynchronized | None = None  # cameras expose at moments of their own; None = no sign of it
     repeats: Repeats = Repeats()  # exact copies of earlier images: these took no part
 
     def __repr__(self) -> str:
