@@ -58,6 +58,7 @@ def camera_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
         # The prior's unit information contributes the covariance's square; only the rest comes from the observations.
         by_prior = covariance @ covariance
         covariance = by_prior + estimate.inflation**2 * (covariance - by_prior)
+    covariance = covariance + _by_modes(estimate)
     scale = _unwhitening(estimate).flatten(1, 2)  # (B, K C, K): one block a camera
     blocks = covariance.unflatten(1, (cameras, -1)).unflatten(-1, (cameras, -1))
     per_camera = scale.unflatten(1, (cameras, -1))
@@ -68,6 +69,15 @@ def camera_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
         return result
     centre = estimate.rig.reshape(len(covariance)).map_tensors(lambda tensor, _: tensor.unsqueeze(1))
     return result + curvature_covariance(estimate, lambda rigs, _: rigs.local(centre).flatten(-2))
+
+
+def _by_modes(estimate: Estimate) -> Tensor:
+    """What the object's modes, known only so well, add to the covariance of the cameras' whitened offsets."""
+    if estimate.modes is None:
+        return estimate.problem.prior_std.new_zeros(())
+    follow = estimate.modes.follow.flatten(1)
+    spread = torch.from_numpy(estimate.modes.covariance).to(follow) * estimate.inflation**2
+    return (follow.mT @ spread @ follow)[None]
 
 
 def whitened_covariance(solution: Solution) -> Tensor:
@@ -110,6 +120,14 @@ def joint_information(estimate: Estimate) -> Tensor:
     information = (reduced.kept @ reduced.kept.mT)[0]
     prior = torch.eye(len(information), dtype=information.dtype)
     information = prior + (information - prior) / estimate.inflation**2
+    if estimate.modes is not None:
+        # Woodbury: modes, known only so well, take from what is known of the cameras that follow them.
+        follow = information.new_zeros(len(estimate.modes.offset), len(information))
+        cameras = estimate.modes.follow.flatten(1)
+        follow[:, : cameras.shape[1]] = cameras
+        precise = torch.linalg.inv(torch.from_numpy(estimate.modes.covariance) * estimate.inflation**2)
+        across = follow @ information
+        information = information - across.mT @ torch.linalg.solve(precise + across @ follow.mT, across)
     by_step = torch.linalg.inv(_unwhitening(_with_least_std(estimate, LEAST_STD))[0])  # whitened offsets by parameters
     cameras, wide = len(by_step), problem.prior_std[0].numel()
     whole = prior.clone()

@@ -24,7 +24,7 @@ from imgcal.monitoring.change_search import (
 from imgcal.monitoring.change_test import JUMPS, LARGE
 from imgcal.monitoring.clock_slip import image_of
 from imgcal.monitoring.drift_pace import DriftLearning, DriftPaces
-from imgcal.monitoring.explanations import Diagnosis, Moved, Steady, Verdict, doubtful_cameras, weigh
+from imgcal.monitoring.explanations import LEAD, Diagnosis, Moved, Steady, Verdict, doubtful_cameras, weigh
 from imgcal.monitoring.noise_correlation import NoiseCorrelation
 from imgcal.monitoring.object_change import MISFIT_LEAD, Misfit, ObjectChanged, never_fitted
 from imgcal.monitoring.pending_change import Change, PendingChange, free_cameras
@@ -225,6 +225,10 @@ class RigMonitor:
         if quarantine.unsynchronized:
             return found
         quarantine.release()
+        if verdict.lead < LEAD and verdict.harmless and self._pending is None:
+            # What was known leaves room for it, so it is learnt as any snapshot is.
+            quiet = verdict.explained[Steady.name]
+            return MonitorUpdate(self._restart(quiet.before, quiet.snapshots, case.pauses[-case.count :]))
         if verdict.best.name == Moved.name and self._shows_move(case):
             decided = self._decide_kinds(last=True)
             anew = self._learn_moved(case, dict.fromkeys(case.cameras), JUMPS[-1], sum(case.pauses[-case.count :]))

@@ -24,9 +24,10 @@ from imgcal.monitoring import posterior_of
 from imgcal.pipeline.doubtful import DoubtfulCamera, doubtful_at_end
 from imgcal.pipeline.initialization import Initialization
 from imgcal.pipeline.lateness import LEAST_BETTER, LateCamera, timing_motion
-from imgcal.pipeline.object_checks import displaced, lost_fiducials
+from imgcal.pipeline.object_checks import CERTAIN, displaced, lost_fiducials
 from imgcal.pipeline.repeats import Repeats
 from imgcal.pipeline.scale import Scale, scale_of
+from imgcal.pipeline.synchronization import Unsynchronized
 from imgcal.pipeline.tally import Tally, tally
 from imgcal.types import (
     BlobFlag,
@@ -37,6 +38,28 @@ from imgcal.types import (
     Observations,
     RigPosterior,
 )
+
+
+@dataclass(frozen=True)
+class Bend:
+    """Deflection of the middle of a printed board along x and y: mm, positive = away from the viewer."""
+
+    x: float
+    y: float
+    x_sigma: float
+    y_sigma: float
+
+    @property
+    def is_certain(self) -> bool:
+        """Tell whether the board is bent beyond doubt."""
+        return max(abs(self.x) / self.x_sigma, abs(self.y) / self.y_sigma) > CERTAIN
+
+    def __str__(self) -> str:
+        """Say it in words."""
+        return (
+            f"the board is {'bent' if self.is_certain else 'flat, as far as can be told'}: its middle is off by {self.x:+.2g} +- {self.x_sigma:.1g} mm along x and "
+            f"{self.y:+.2g} +- {self.y_sigma:.1g} mm along y"
+        )
 
 
 @dataclass(frozen=True)
@@ -73,6 +96,7 @@ class Calibration:
     moved: tuple[MovedCamera, ...] = ()  # during the capture; snapshots used are those since then
     from_scratch: bool = False  # there was no factory calibration: `factory` is a first rig made from the same data
     late: tuple[LateCamera, ...] = ()  # whose frames, from some snapshot on, are of other moments: these took no part
+    unsynchronized: Unsynchronized | None = None  # cameras expose at moments of their own; None = no sign of it
     repeats: Repeats = Repeats()  # exact copies of earlier images: these took no part
 
     def __repr__(self) -> str:
@@ -134,9 +158,23 @@ class Calibration:
         )
 
     @property
+    def bend(self) -> Bend | None:
+        """How much a printed board is bent; None = it was taken as its file says."""
+        board, modes = self.obj.board, self.estimate.modes
+        if board is None or modes is None:
+            return None
+        std, known = board.warp_std, np.sqrt(modes.covariance.diagonal())
+        (x, y), (dx, dy), (sx, sy) = board.bend, (std * modes.offset).tolist(), (std * known).tolist()
+        factor = self.estimate.inflation
+        return Bend(x + dx, y + dy, min(factor * sx, std), min(factor * sy, std))
+
+    @property
     def object(self) -> CalibrationObject:
         """The object as it was estimated: its fiducials in their estimated places, taken as exact."""
-        return replace(self.obj.taken_as_exact(), points=self.points_object.detach())
+        board, bend = self.obj.board, self.bend
+        if board is not None and bend is not None:
+            board = replace(board, bend=(bend.x, bend.y), warp=max(bend.x_sigma, bend.y_sigma))
+        return replace(self.obj.taken_as_exact(), points=self.points_object.detach(), board=board)
 
     @property
     def displaced(self) -> tuple[FiducialOffset, ...]:

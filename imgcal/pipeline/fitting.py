@@ -173,7 +173,7 @@ def _fitted_once(
     if latest is None:
         question = ObjectQuestion.SHAPE_OF_TURNS if alike else ObjectQuestion.SHAPE
     found = estimate_variance_components(problem, starts, variance, labels, options, question)
-    fit = make_estimate(found.problem, found.solution, found.solution.state)
+    fit = replace(make_estimate(found.problem, found.solution, found.solution.state), modes=found.modes)
     if latest is None:
         require_one_size(fit, tuple(labelled.snapshots[s].name for s in labelled.used))
     require_same_residuals(fit, observations, found.seen, obj)

@@ -29,8 +29,7 @@ from imgcal.errors import RefusedError
 from imgcal.estimation import K3, ColdStart, cold_start, ordinary_lens
 from imgcal.messages import listed
 from imgcal.pipeline.calibration import Calibration
-from imgcal.pipeline.fitting import fit_steady
-from imgcal.pipeline.recalibration import late_cameras, require_same_moments
+from imgcal.pipeline.recalibration import fit_as_timed, late_cameras, require_same_moments
 from imgcal.pipeline.repeats import name_repeats, without_repeats
 from imgcal.pipeline.sources import Frames, blobs_of
 from imgcal.pipeline.units import require_solvable, require_units
@@ -92,7 +91,7 @@ def calibrate_from_scratch(
         >>> abs(float(apart[0] - apart[1])) < 1  # mm
         True
     """
-    started, cameras = time.perf_counter(), _with_prior(cameras)
+    started, cameras, options = time.perf_counter(), _with_prior(cameras), options.of_object(obj)
     detections, repeats = without_repeats(blobs_of(source, cameras, obj, detection))
     found = time.perf_counter()
     is_labelled = (detections.fiducial >= 0).any()
@@ -132,7 +131,7 @@ def _fit(
     start.distortion[:, K3 - 10] = cameras.distortion[:, K3 - 10]  # about which it has a prior that tells
     std = ordinary_lens(_wide(first, cameras).std(start))
     std[0, :6] = 0.0  # whose frame is the rig's
-    fit = fit_steady(labelled, labelled.detections, start, obj, options, prior_std=std)
+    fit = fit_as_timed(labelled, labelled.detections, start, obj, options, prior_std=std)
     require_determined(fit)
     return fit
 

@@ -122,6 +122,8 @@ def _differences(fit: Estimate) -> Tensor:
 
     def image(step: Tensor) -> Tensor:
         turned = rotation @ rotation_from_vector(step[:3])
-        return rigs.project_values(RigidTransform(turned, poses.translation + step[3:6]).apply((1 + step[6]) * points)).uv
+        return rigs.project_values(
+            RigidTransform(turned, poses.translation + step[3:6]).apply((1 + step[6]) * points)
+        ).uv
 
     return torch.stack([(image(step) - image(-step)) / (2 * float(step.sum())) for step in steps], -1)

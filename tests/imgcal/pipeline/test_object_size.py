@@ -27,7 +27,9 @@ def capture(growth: float, seed: int = 1, count: int = 20) -> Detections:
 
 @pytest.mark.parametrize("growth", [0.003, -0.003, 0.01])
 def test_an_exchanged_object_is_refused_with_its_moment_and_size(growth: float) -> None:
-    with pytest.raises(RefusedError, match=r"object: from snapshot 12 on it is (0\.29|0\.3|0\.96|0\.97|0\.98) ") as refusal:
+    with pytest.raises(
+        RefusedError, match=r"object: from snapshot 12 on it is (0\.29|0\.3|0\.96|0\.97|0\.98) "
+    ) as refusal:
         imgcal.calibrate(capture(growth), imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"))
     assert ("larger" if growth > 0 else "smaller") in str(refusal.value)
 
