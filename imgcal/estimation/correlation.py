@@ -131,9 +131,9 @@ def _last_lag(rho: NDArray[np.float64], pairs: NDArray[np.float64]) -> int:
 def _integrated(rho: NDArray[np.float64], pairs: NDArray[np.float64], last: int) -> float:
     """Sum of an autocorrelation (L + 1,) over both signs of the lag by the flat-top window; at least one.
 
-    The window is one up to the last lag that counts, and falls to zero at twice that lag. It ends before where the
-    autocorrelation falls to zero: errors that last do not oscillate, but the mean that has been taken off a short series
-    makes its far lags negative (Geyer, "Practical Markov chain Monte Carlo", Statistical Science 1992).
+    The window is one up to the last lag that counts, and falls to zero at twice that lag. It ends earlier where the
+    autocorrelation falls to zero: errors that last do not oscillate, but the mean that has been taken off a short
+    series makes its far lags negative (Geyer, "Practical Markov chain Monte Carlo", Statistical Science 1992).
     """
     lag = np.arange(1, min(2 * last, len(rho)))
     window = np.clip(2 * (1 - lag / (2 * max(last, 1))), 0.0, 1.0)

@@ -1,7 +1,7 @@
 """Was it the same object all the time? Each snapshot measures its size by itself, the rig being known.
 
-A calibration from two objects of slightly different size fits neither of them: the rig is a compromise, and the residuals
-look like bent fiducials or a narrow prior. The size that snapshots measure tells: it steps from one moment on.
+A calibration from two objects of slightly different size fits neither of them: the rig is a compromise, and the
+residuals look like bent fiducials or a narrow prior. The size that snapshots measure tells: it steps at one moment.
 """
 
 from __future__ import annotations
