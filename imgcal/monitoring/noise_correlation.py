@@ -38,6 +38,8 @@ SMOOTHING = 0.1
 EPISODE, EPISODE_SECONDS = 2.0, 0.4
 """Correlation times that a passing error may last, and the seconds that it may last at least: a target at the edge of
 an image, behind somebody's arm, or under wrong labels stays there for so long, and may seem to be shifted by pixels."""
+LARGEST = 20.0
+"""Times the usual size of lasting errors from which one lasts no longer than that."""
 LEAST_LASTING = 0.05
 """Pixels: errors that last are at least so large, by what ten well calibrated infrared cameras show."""
 LEAST_SHIFT = 6.0
@@ -89,6 +91,12 @@ class NoiseCorrelation:
         """By how much each camera's image may be off for a while where nothing has moved: (C,) px."""
         return torch.where(self.time > 1, self.lasting.clamp_min(LEAST_LASTING), MODEL_ERROR)
 
+    def episode(self, camera: int, shift: float) -> int:
+        """Successive snapshots that an error of a camera may last which shifts its image by so many pixels."""
+        usual = self.episodes[camera]
+        large = shift > LARGEST * float(self.model_error[camera])
+        return min(usual, math.ceil(self._least_episode)) if large else usual
+
     @property
     def correlated(self) -> Tensor | None:
         """The same of cameras whose errors last: (C,) px; None = the errors of all are independent."""
@@ -97,8 +105,12 @@ class NoiseCorrelation:
     @property
     def episodes(self) -> list[int]:
         """Successive snapshots of each camera that one passing error may last."""
-        least = EPISODE_SECONDS / (self.interval or FASTEST)
+        least = self._least_episode
         return [1 if time <= 1 else math.ceil(max(EPISODE * time, least)) for time in self.time.tolist()]
+
+    @property
+    def _least_episode(self) -> float:
+        return EPISODE_SECONDS / (self.interval or FASTEST)
 
     @property
     def least_shifts(self) -> list[float]:

@@ -195,7 +195,8 @@ class RigMonitor:
         found = self._follow(drop_cameras(observations, cameras), rig_from_object, seconds)
         if not quarantine.cameras or quarantine.cameras != cameras:  # those that are new have seen it already
             return found
-        episode = max(self.noise.episodes[camera] for camera in cameras)
+        snapshot = observations, found.update.rig_from_object[-1:]
+        episode = max(self.noise.episode(camera, _shift(found.update.belief, snapshot, camera)) for camera in cameras)
         if quarantine.observe(observations, seconds, episode):
             with contextlib.suppress(RefusedError):  # it cannot be decided yet, or they do not see enough
                 found = self._diagnose_quarantine(found)

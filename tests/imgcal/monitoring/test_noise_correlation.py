@@ -63,6 +63,13 @@ def test_passing_errors_last_for_seconds_whatever_the_rate() -> None:
         assert noise.episodes == [episode] * 2
 
 
+def test_a_large_error_passes_in_less_time_than_the_correlation_of_small_ones() -> None:
+    noise = follow([0.98, 0.98], count=MEMORY)
+    usual = float(noise.model_error[0])
+    assert noise.episode(0, 3 * usual) == noise.episodes[0] > 24
+    assert noise.episode(0, 30 * usual) == 24
+
+
 def test_a_calibrated_rig_expects_what_is_usual_until_it_knows_better() -> None:
     noise = NoiseCorrelation(2)
     noise.expect_usual()
