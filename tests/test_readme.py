@@ -19,17 +19,19 @@ COMMANDS = [
     for command in re.sub(r"\\\n\s*", "", block).splitlines()
     if re.match(r"(imgcal|scripts/\w+|pip) ", command) and not command.startswith("imgcal: ")
 ]
+COMMANDS += re.findall(r"\| `(imgcal [^`]+)` \|", README)  # the table of jobs
 DEMO = next(command for command in COMMANDS if "data/samples/O10" in command)
 LONG = {
     "pip install": "a network",
+    "uv pip install": "a network",
     "scripts/demo": "the same command as the demo's",
     "scripts/test": "this suite",
     "imgcal train": "cli/test_train",
     "imgcal compare": "cli/test_evaluate",
     "imgcal evaluate": "cli/test_evaluate",
     "imgcal simulate": "cli/test_simulate: twenty snapshots at full size take half a minute",
-    "imgcal calibrate my_capture": "cli/test_calibrate, from smaller captures",
-    "imgcal rig": "cli/test_rig",
+    "imgcal calibrate CAPTURE": "cli/test_calibrate",
+    "imgcal score": "cli/test_score",
     "imgcal fleet": "cli/test_fleet",
     "imgcal watch": "cli/test_watch",
     "imgcal convert": "cli/test_convert",
@@ -70,4 +72,4 @@ def test_python_runs_to_its_end(clone: Path, capsys: pytest.CaptureFixture[str])
     exec(compile(code, "README.md", "exec"), names)
     assert (clone / "recalibrated.yaml").is_file()
     assert "CameraRig('O10 half resolution'" in capsys.readouterr().out
-    assert names["name"] == "00003"  # the live loop has seen the last snapshot
+    assert names["name"] == "00003"  # the running rig has seen the last snapshot
