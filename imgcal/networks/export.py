@@ -220,7 +220,8 @@ def save_onnx(program: Program, path: Path) -> float:
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore")  # of the exporter, about itself
         torch.onnx.export(
-            _Held(_rewritten(_exported(program, fixed=True).module())), program.example, buffer,
+            _Held(_rewritten(_exported(program, fixed=True).module())), program.example,
+            buffer,  # type: ignore[arg-type]  # its stubs know paths alone
             input_names=list(program.inputs), output_names=list(program.outputs), opset_version=OPSET, dynamo=False,
         )  # fmt: skip
     model = onnx.load_model_from_string(buffer.getvalue())

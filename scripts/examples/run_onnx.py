@@ -4,6 +4,7 @@ Usage: imgcal export measurer-cnn --to onnx --out measurer.onnx && python script
 """
 
 import sys
+from typing import Any
 
 import numpy as np
 import onnxruntime
@@ -11,7 +12,7 @@ import onnxruntime
 SIZE = 24  # pixels of a patch, each way
 
 
-def normalized(patches):
+def normalized(patches: Any) -> Any:
     """Grey patches (M, S, S) as networks take them: less their median, over their noise, compressed; NaN becomes 0."""
     level = median(patches)
     noise = 1.05 * median(np.abs(patches[:, :, 2:] - patches[:, :, :-2]))
@@ -20,14 +21,14 @@ def normalized(patches):
     return (np.arcsinh(np.nan_to_num((patches - level) / (2 * noise))) / 2).astype(np.float32)
 
 
-def median(values):
+def median(values: Any) -> Any:
     """Of what is no NaN in each patch: (M, 1, 1); of two in the middle the lower one; 0 where nothing is."""
     flat = np.sort(values.reshape(len(values), -1), axis=1)  # NaN last
     middle = np.maximum(np.isfinite(flat).sum(1) - 1, 0) // 2
     return np.nan_to_num(flat[np.arange(len(flat)), middle])[:, None, None]
 
 
-def measure(session, frame, place, radius):
+def measure(session: Any, frame: Any, place: Any, radius: float) -> tuple[Any, float, float]:
     """Centre (u, v) of the marker of a radius (pixels, 3.5 at most) near a place, its sigma, and whether it is one."""
     corner = np.round(np.asarray(place) - (SIZE - 1) / 2).astype(int)
     patch = frame[corner[1] : corner[1] + SIZE, corner[0] : corner[0] + SIZE].astype(np.float64)
