@@ -60,7 +60,8 @@ def test_the_demo_prints_what_stands_there(clone: Path, capsys: pytest.CaptureFi
     shown = shown[next(i for i, line in enumerate(shown) if line.startswith("reprojection error")) :]
     for line in shown:
         assert any(found.startswith(line.split("; #")[0]) for found in printed), line
-    assert {path.name for path in (clone / "out" / "demo").iterdir()} == {"rig.yaml", "result.json", "report.html"}
+    files = {path.name for path in (clone / "out" / "demo").iterdir()}
+    assert files == {"rig.yaml", "rig.posterior.safetensors", "result.json", "report.html"}
 
 
 def test_python_runs_to_its_end(clone: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,6 +3,7 @@ from .ambiguities import lattice_shifts, near_turns
 from .assignment import distances_to_nearest, mutual_nearest
 from .blobs import pattern_prior
 from .identification import identify, relocalize, track
+from .merging import drop_merged, merging_distance
 from .options import PipelineOptions
 from .orientation import oriented
 from .proposals import Proposal, Proposer, Sight, Snapshot, judge, rows_of
@@ -32,12 +33,14 @@ __all__ = [
     "Tracker",
     "associate",
     "distances_to_nearest",
+    "drop_merged",
     "identify",
     "is_few_and_flat",
     "judge",
     "labels_by_shape",
     "lattice_shifts",
     "matched_to_rig",
+    "merging_distance",
     "mutual_nearest",
     "near_turns",
     "observations_of",

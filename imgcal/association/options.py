@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from imgcal.association.result import IdentityOptions
 from imgcal.estimation import EstimationOptions
 from imgcal.geometry import RigidTransform
+from imgcal.types import CalibrationObject
+
+BOARD_OUTLIER, BOARD_THRESHOLD = 50.0, 20.0
+"""Standard deviations, of a printed board: labels are left out beyond the first, and count less beyond the second."""
 
 
 @dataclass(frozen=True)
@@ -35,3 +39,14 @@ class PipelineOptions:
     start_pose: RigidTransform | None = (
         None  # rig_from_object of the first snapshot, roughly: decides which way round a symmetric object is
     )
+
+    def of_object(self, obj: CalibrationObject) -> PipelineOptions:
+        """What holds for an object: corners of a printed board are labelled by the whole of it.
+
+        What is far off is a lens that its model does not fit, where an image has few of them, and rarely a wrong label:
+        without it, the model is free to be far off there.
+        """
+        if obj.board is None:
+            return self
+        estimation = replace(self.estimation, threshold=max(self.estimation.threshold, BOARD_THRESHOLD))
+        return replace(self, outlier=max(self.outlier, BOARD_OUTLIER), estimation=estimation)

@@ -14,7 +14,7 @@ from imgcal.association.orientation import oriented
 from imgcal.association.proposals import Sight, Snapshot, judge
 from imgcal.association.result import Identity, Status
 from imgcal.errors import InputError
-from imgcal.estimation import estimate, flat_std
+from imgcal.estimation import estimate, flat_std, has_poses
 from imgcal.geometry import RigidTransform, geodesic_angle
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations, RigPrior, check_object, check_rig
 
@@ -183,6 +183,10 @@ class Tracker:
         sigma = (torch.cat([p.sigma for p in parts]).square() + self.options.identity_error**2).sqrt()
         observations = Observations(torch.cat([p.uv for p in parts]), sigma, torch.cat([p.seen for p in parts]))
         poses = RigidTransform.stack([p for _, _, p in accepted])
+        posed = torch.from_numpy(has_poses(observations.seen.numpy(), self.obj.points))
+        if not bool(posed.any()):
+            return
+        observations, poses = observations.of_snapshots(posed), poses[posed]
         fit = estimate(observations, self.factory, self.obj, poses, options=self.options.estimation)
         if bool(fit.converged):
             prior = (self.factory.prior or RigPrior()).std(self.factory)

@@ -59,7 +59,7 @@ from imgcal.pipeline import (
 from imgcal.types import CalibrationObject, CameraRig, Detections, limits
 
 RIG = "rig.yaml"
-WRITTEN = ("report.html", RIG, "rig.posterior.safetensors", "object.csv", "result.json")
+WRITTEN = ("report.html", RIG, "rig.posterior.safetensors", "object.csv", "board.yaml", "result.json")
 
 
 WORST_STD = 1e6  # in any unit: what is known so badly is not known
@@ -82,7 +82,7 @@ class Calibrate(arguments.Calibrate):
             after_last_move=self.after_last_move,
             start_pose=start_pose(self.start_pose),
         )
-        source = open_input(self.input, complete, obj.num_fiducials, self.videos_differ)
+        source = open_input(self.input, complete, obj.rows, self.videos_differ)
         self._require_frames(source, rig)
         measurer = None if self.measurer is None else LearnedMeasurer.load(self.measurer)
         detector = self._detector(source, measurer)
@@ -124,7 +124,9 @@ class Calibrate(arguments.Calibrate):
                 posterior = replace(outcome.posterior(), time=time.time())
                 save_rig(outcome.rig, out / RIG, covariance, self.full_covariance, posterior)
                 if outcome.shape:
-                    save_object(outcome.object, out / "object.csv")
+                    save_object(replace(outcome.object, board=None), out / "object.csv")
+                elif outcome.bend is not None:
+                    save_object(outcome.object, out / "board.yaml")
                 found = findings(outcome, self._gauge(outcome), covariance)
                 result = summary(outcome, seconds) | found.values
                 content = describe(outcome, found, rig, frames, seconds)

@@ -32,7 +32,8 @@ def doubtful_cameras(calibration: Calibration) -> list[str]:
     """Say of which cameras a part of what they see of the object is not where it should be."""
     kept, unexplained = calibration.tally.kept.sum(0), calibration.tally.unexplained.sum(0)
     doubtful = np.flatnonzero(unexplained > DOUBTFUL * np.maximum(kept + unexplained, 1))
-    return [f"{late}; these took no part" for late in calibration.late] or [
+    stopped = [str(camera) for camera in calibration.doubtful]
+    return [f"{late}; these took no part" for late in calibration.late] or stopped + [
         f"camera {calibration.rig.camera_names[c]}: {unexplained[c]} blobs may be fiducials and are not where these "
         f"should be, {kept[c]} are"
         for c in doubtful

@@ -49,6 +49,8 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         "rejected": {s.name: s.reason for s in snapshots if s.status == "refused"},
         "moved": [move.as_values() for move in calibration.moved],
         "late": [vars(late) for late in calibration.late],
+        "doubtful": [camera.as_values() for camera in calibration.doubtful],
+        "unsynchronized": None if calibration.unsynchronized is None else calibration.unsynchronized.values,
         "per_camera": per_camera,
         "per_snapshot": counts_by_snapshot(calibration),
         "object": [
@@ -59,12 +61,15 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         "object_lost": list(calibration.lost),
         "object_scale_sigma": calibration.scale_sigma,
         "object_bent_sigma": calibration.bent_sigma,
+        "board_bend": None if calibration.bend is None else vars(calibration.bend) | {"note": str(calibration.bend)},
         "covariance": {
             "from": "scatter between blocks of snapshots" if calibration.block_length else "noise of the blobs",
             "block_length": calibration.block_length,
             "inflation": calibration.estimate.inflation,
         },
         "predicted_error": calibration.predicted_error.summary(),
+        "scale": calibration.scale.values,
+        "repeats": calibration.repeats.values,
         "seconds": seconds,
     }
 
@@ -103,6 +108,8 @@ def refused_summary(
         "rejected": {},
         "moved": [move.as_values() for move in moved],
         "late": [],
+        "doubtful": [],
+        "unsynchronized": None,
         "per_camera": blobs_by_camera(detections, rig),
         "per_snapshot": {},
         "object": [],
@@ -110,8 +117,11 @@ def refused_summary(
         "object_lost": [],
         "object_scale_sigma": None,
         "object_bent_sigma": None,
+        "board_bend": None,
         "covariance": None,
         "predicted_error": None,
+        "scale": None,
+        "repeats": None,
         **UNKNOWN,
         "seconds": seconds,
     }
@@ -139,13 +149,17 @@ def print_outcome(result: dict[str, Any], found: Findings, out: Path, report: bo
     print(f"reprojection error {earlier}{after:.4f} px (RMS)")
     if guess is not None and not guess["used"]:
         print("note: the network's guess was no better than the factory calibration: not used", file=sys.stderr)
-    print(predicted_line(result["predicted_error"]))
+    print("; ".join(filter(None, (predicted_line(result["predicted_error"]), result["scale"]["note"]))))
     print(
         f"identity {result['identity']}, {result['snapshots_used']} snapshots used, "
         f"{result['snapshots_rejected']} rejected"
     )
     for line in found.lines:
         print(line)
+    if result["unsynchronized"]:
+        print(f"note: {result['unsynchronized']['note']}", file=sys.stderr)
+    if result["repeats"]["note"]:
+        print(f"note: {result['repeats']['note']}", file=sys.stderr)
     for kind, factor in result["prior_too_narrow"].items():
         kind = kind.replace("_", " ")
         print(f"note: {kind} drifted {factor:.1f} times as far as the rig's prior allows: widened", file=sys.stderr)
@@ -162,9 +176,13 @@ def print_outcome(result: dict[str, Any], found: Findings, out: Path, report: bo
             "where the object file has it",
             file=sys.stderr,
         )
+    if result["board_bend"]:
+        print(result["board_bend"]["note"])
     print(f"rig     {out / 'rig.yaml'}")
     if result["object"]:
         print(f"object  {out / 'object.csv'}")
+    elif result["board_bend"]:
+        print(f"board   {out / 'board.yaml'}")
     print(f"result  {out / 'result.json'}")
     if report:
         print(f"report  {out / 'report.html'}")

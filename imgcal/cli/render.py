@@ -26,7 +26,7 @@ class Render(arguments.Render):
         rig, obj = open_rig(self.rig), load_object(self.object)
         if any((self.out / camera).exists() for camera in rig.camera_names):
             raise InputError(f"{self.out}: found images of these cameras there already, expected a new folder")
-        source = open_input(self.input, rig, obj.num_fiducials, self.videos_differ)
+        source = open_input(self.input, rig, obj.rows, self.videos_differ)
         detections, _ = read_detections(source, self.snapshots, self.detection)
 
         def bar(snapshots: Iterable[int], total: int) -> Iterable[int]:

@@ -21,7 +21,7 @@ class Score(arguments.Score):
     def run(self) -> None:
         """Score and print."""
         rig, obj = open_rig(self.rig), load_object(self.object)
-        source = open_input(self.input, rig, obj.num_fiducials, self.videos_differ)
+        source = open_input(self.input, rig, obj.rows, self.videos_differ)
         detections, _ = read_detections(source, self.snapshots, self.detection)
 
         def bar(snapshots: Iterable[int], total: int) -> Iterable[int]:

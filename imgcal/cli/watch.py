@@ -185,7 +185,7 @@ class Watch(arguments.Watch):
         rate = USUAL_RATE if self.rate is None else self.rate
         if not 0 < rate < 1e6:
             raise InputError(f"--rate: found {rate:g}, expected snapshots a second")
-        source = open_input(path, rig, obj.num_fiducials)
+        source = open_input(path, rig, obj.rows)
         assert isinstance(source, Detections)  # folders are seen to above
         return BlobTable(source, rate)
 

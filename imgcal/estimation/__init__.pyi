@@ -13,6 +13,7 @@ from .covariance import (
     relative_covariance,
     relative_difference,
     relative_jacobian,
+    scale_response,
     whitened_covariance,
 )
 from .gauge import aligned
@@ -47,7 +48,7 @@ from .map_operator import encoded, map_state, with_lenses, without_lenses
 from .moves import find_moves
 from .object_shape import SNAPSHOTS_TO_BEND, FiducialOffset, ScaleEvidence, ShapeEvidence, offsets
 from .pose_initialization import initial_pose
-from .pose_support import ON_A_LINE, UndeterminedPosesError, require_poses
+from .pose_support import ON_A_LINE, UndeterminedPosesError, has_poses, require_poses
 from .rig_error import displaced, error_between, step_by_error
 from .rig_initialization import K3, ColdStart, cold_start, ordinary_lens, poses_alone
 from .rig_uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian, rigid_motion, uncertainty_over
@@ -103,6 +104,7 @@ __all__ = [
     "find_moves",
     "fit_pose",
     "flat_std",
+    "has_poses",
     "initial_pose",
     "initial_state",
     "inverse_or_zero",
@@ -133,6 +135,7 @@ __all__ = [
     "retract",
     "rig_at",
     "rigid_motion",
+    "scale_response",
     "squared",
     "step_by_error",
     "uncertainty_over",

@@ -118,7 +118,7 @@ def _centred(x: NDArray[np.float64]) -> NDArray[np.float64]:
 def _last_lag(rho: NDArray[np.float64], pairs: NDArray[np.float64]) -> int:
     """Last lag that counts before `QUIET` in a row do not; 0 = none. See `autocorrelation` for the arrays (L + 1,)."""
     noise = SURE * np.sqrt(np.log10(np.maximum(pairs, 10)) / np.maximum(pairs, 1))
-    counts = (pairs >= LEAST_PAIRS) & (np.abs(np.nan_to_num(rho)) > noise)
+    counts = (pairs >= LEAST_PAIRS) & (np.nan_to_num(rho) > noise)
     last = 0
     for lag in range(1, len(rho)):
         if counts[lag]:
@@ -131,9 +131,12 @@ def _last_lag(rho: NDArray[np.float64], pairs: NDArray[np.float64]) -> int:
 def _integrated(rho: NDArray[np.float64], pairs: NDArray[np.float64], last: int) -> float:
     """Sum of an autocorrelation (L + 1,) over both signs of the lag by the flat-top window; at least one.
 
-    The window is one up to the last lag that counts, and falls to zero at twice that lag.
+    The window is one up to the last lag that counts, and falls to zero at twice that lag. It ends earlier where the
+    autocorrelation falls to zero: errors that last do not oscillate, but the mean that has been taken off a short
+    series makes its far lags negative (Geyer, "Practical Markov chain Monte Carlo", Statistical Science 1992).
     """
     lag = np.arange(1, min(2 * last, len(rho)))
     window = np.clip(2 * (1 - lag / (2 * max(last, 1))), 0.0, 1.0)
     known = np.where(pairs[lag] >= LEAST_PAIRS, np.nan_to_num(rho[lag]), 0.0)
-    return max(1.0, 1 + 2 * float((window * known).sum()))
+    positive = np.logical_and.accumulate((known > 0) | (lag <= 1))
+    return max(1.0, 1 + 2 * float((window * known * positive).sum()))

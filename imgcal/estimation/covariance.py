@@ -21,7 +21,8 @@ from imgcal.errors import RefusedError
 from imgcal.estimation.curvature import curvature_covariance
 from imgcal.estimation.levenberg_marquardt import Solution, factorize
 from imgcal.estimation.linearization import POSE_PARAMETERS, NormalEquations, points_at
-from imgcal.estimation.map_estimate import Estimate
+from imgcal.estimation.map_estimate import Estimate, equations_at
+from imgcal.estimation.robust_losses import NamedLoss
 from imgcal.geometry import RigidTransform, cross_matrix, kernels, left_jacobian
 from imgcal.types import CameraRig
 from renderers.compiling import njit
@@ -29,6 +30,8 @@ from renderers.compiling import njit
 UNDETERMINED = "covariance: the observations do not determine the object's pose in every snapshot"
 LEAST_STD = 1e-9
 """Prior standard deviation (rad, mm, pixels, 1) of what is fixed, where it is divided by."""
+HUBER = 3.0
+"""Standard deviations, as those of an estimate: residuals beyond tell less of how parameters follow each other."""
 FEW_SNAPSHOTS = 10
 """Up to which `remaining_variance` eliminates the cameras of an exact object, not the poses."""
 
@@ -55,6 +58,7 @@ def camera_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
         # The prior's unit information contributes the covariance's square; only the rest comes from the observations.
         by_prior = covariance @ covariance
         covariance = by_prior + estimate.inflation**2 * (covariance - by_prior)
+    covariance = covariance + _by_modes(estimate)
     scale = _unwhitening(estimate).flatten(1, 2)  # (B, K C, K): one block a camera
     blocks = covariance.unflatten(1, (cameras, -1)).unflatten(-1, (cameras, -1))
     per_camera = scale.unflatten(1, (cameras, -1))
@@ -65,6 +69,15 @@ def camera_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
         return result
     centre = estimate.rig.reshape(len(covariance)).map_tensors(lambda tensor, _: tensor.unsqueeze(1))
     return result + curvature_covariance(estimate, lambda rigs, _: rigs.local(centre).flatten(-2))
+
+
+def _by_modes(estimate: Estimate) -> Tensor:
+    """What the object's modes, known only so well, add to the covariance of the cameras' whitened offsets."""
+    if estimate.modes is None:
+        return estimate.problem.prior_std.new_zeros(())
+    follow = estimate.modes.follow.flatten(1)
+    spread = torch.from_numpy(estimate.modes.covariance).to(follow) * estimate.inflation**2
+    return (follow.mT @ spread @ follow)[None]
 
 
 def whitened_covariance(solution: Solution) -> Tensor:
@@ -107,6 +120,14 @@ def joint_information(estimate: Estimate) -> Tensor:
     information = (reduced.kept @ reduced.kept.mT)[0]
     prior = torch.eye(len(information), dtype=information.dtype)
     information = prior + (information - prior) / estimate.inflation**2
+    if estimate.modes is not None:
+        # Woodbury: modes, known only so well, take from what is known of the cameras that follow them.
+        follow = information.new_zeros(len(estimate.modes.offset), len(information))
+        cameras = estimate.modes.follow.flatten(1)
+        follow[:, : cameras.shape[1]] = cameras
+        precise = torch.linalg.inv(torch.from_numpy(estimate.modes.covariance) * estimate.inflation**2)
+        across = follow @ information
+        information = information - across.mT @ torch.linalg.solve(precise + across @ follow.mT, across)
     by_step = torch.linalg.inv(_unwhitening(_with_least_std(estimate, LEAST_STD))[0])  # whitened offsets by parameters
     cameras, wide = len(by_step), problem.prior_std[0].numel()
     whole = prior.clone()
@@ -368,6 +389,36 @@ def _unwhitening(estimate: Estimate) -> Tensor:
     left = left_jacobian(state.offset[..., :3] * prior_std[..., :3])
     scale[..., :3, :3] = left * prior_std[..., None, :3]
     return scale
+
+
+def scale_response(estimate: Estimate) -> Tensor:
+    """How the parameters follow the scale of the object's file: (K C,) change of each by a relative change of one.
+
+    The poses follow, too, and fiducials as far as they have tolerances; the prior of the cameras holds against it.
+
+    Args:
+        estimate: without batch axes.
+
+    Raises:
+        RefusedError: the information is singular.
+    """
+    problem, state = estimate.problem, estimate.solution.state
+    points = points_at(problem, state)[0]
+    unit = points.new_zeros(1, 3 * len(points) + 1)
+    if problem.object_prior_std is not None:
+        unit = problem.object_prior_std.clone()
+    unit[:, -1] = 1.0
+    free = replace(problem, points=points, object_prior_std=unit)
+    equations = equations_at(free, replace(state, object_offset=torch.zeros_like(unit)), NamedLoss("huber", HUBER))
+    factorization = factorize(equations, cameras_first=False)
+    if bool(factorization.reduced.failed.any()):
+        raise RefusedError(UNDETERMINED)
+    lower = factorization.reduced.kept[0]
+    # A step of the last unknown by one is followed by -A^-1 a of the others; with the Cholesky factor, -L^-T l.
+    follow = -torch.linalg.solve_triangular(lower[:-1, :-1].mT, lower[-1, :-1, None], upper=True)[:, 0]
+    cameras = estimate.rig.num_cameras
+    whitened = follow[: problem.prior_std[0].numel()].unflatten(0, (cameras, -1))
+    return torch.einsum("cij,cj->ci", _unwhitening(estimate)[0], whitened).flatten()
 
 
 def pose_covariance(estimate: Estimate) -> Tensor:

@@ -20,6 +20,7 @@ from imgcal.estimation.linearization import (
     rig_at,
 )
 from imgcal.estimation.pose_initialization import initial_pose
+from imgcal.estimation.modes import ModeEvidence
 from imgcal.estimation.robust_losses import NamedLoss
 from imgcal.geometry import RigidTransform
 from imgcal.messages import brief
@@ -78,6 +79,8 @@ class Estimate:
     solution: levenberg_marquardt.Solution  # (B,) flattened: state and normal equations at the minimum
     inflation: float = field(default=1.0, kw_only=True)
     """Factor on what noise adds to standard deviations, where blocks of snapshots scatter more: `block_scatter`."""
+    modes: ModeEvidence | None = field(default=None, kw_only=True)
+    """How well the object's modes are known, and what follows them; None = it has none."""
 
     def covariance(self, reference: int = 0) -> Tensor:
         """Covariance of the cameras relative to one of them: (*B, K C, K C); see `relative_covariance`."""
@@ -121,7 +124,7 @@ def estimate(
         observations: (*B, S, C, N).
         rig: the factory rig, (*B) or without batch axes.
         obj: N fiducials; a radius makes their images ellipses, whose centres are what is observed. Where it has
-            tolerances, its shape is estimated too, one shape for all snapshots.
+            tolerances, its shape is estimated too, one shape for all snapshots. Its modes are left at zero.
         rig_from_object: (*B, S) first guess of the poses; None = `initial_pose`.
         prior_std: (*B, C, K) standard deviation of each factory value, as `CameraRig.parameter_names`; zero keeps a
             value fixed; None = the rig's own prior, or `RigPrior()`.
@@ -277,7 +280,9 @@ def make_problem(
     sigma = sigma.expand(observations.seen.shape).reshape(seen.shape)
     points = obj.points.to(uv)
     centroid = points.mean(0)
+    modes = None if obj.modes is None else obj.modes.to(uv) - obj.modes.to(uv).mean(1, keepdim=True)
     return Problem(
+        modes=modes,
         object_prior_std=None if obj.exact else object_prior_std(obj).to(uv).expand(count, -1),
         uv=torch.where(seen[..., None], uv, 0.0).mT.contiguous(),
         root_weight=torch.where(seen, 1 / torch.where(seen, sigma, 1.0), 0.0),

@@ -22,12 +22,12 @@ from imgcal.estimation.linearization import (
     POSE_PARAMETERS,
     Problem,
     State,
-    Step,
     jacobian_at,
     points_at,
     robust_weight,
 )
 from imgcal.estimation.map_estimate import Estimate, equations_at
+from imgcal.estimation.modes import direction_evidence
 from imgcal.estimation.robust_losses import NamedLoss, RobustKernel
 
 Array = NDArray[np.float64]
@@ -45,8 +45,6 @@ COMPLEXITY = 3.0
 """Log evidence that each further tolerance must gain."""
 SNAPSHOTS_TO_BEND = 8
 """From which the pulls of single snapshots are compared with each other."""
-POINTS_AT_ONCE = 2**16
-"""Pixels whose derivatives are held in memory together."""
 ROUNDS = 60
 """Of `learnt_tolerances` and of `offsets`, at most."""
 
@@ -165,33 +163,14 @@ def scale_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> Sca
     Returns:
         None where rig and poses are undetermined.
     """
-    factorization, state = solution.factorization, solution.state
-    if bool(factorization.reduced.failed.any()):
+    found = direction_evidence(problem, solution, loss, problem.points[None])
+    if found is None:
         return None
-    unit = problem.uv.new_ones(1, 3 * len(problem.points) + 1)
-    own = pull = problem.uv.new_zeros(())
-    each, camera, poses = problem.uv.new_zeros(len(problem.points), 3), [], []
-    together = max(1, POINTS_AT_ONCE // problem.uv[0, 0, :, 0].numel())
-    for first in range(0, problem.uv.shape[1], together):
-        rows = slice(first, first + together)
-        some = replace(problem, uv=problem.uv[:, rows], root_weight=problem.root_weight[:, rows], object_prior_std=unit)
-        at = jacobian_at(some, replace(state, rotation=state.rotation[:, rows], centre=state.centre[:, rows]))
-        assert at.by_fiducial is not None
-        weight = robust_weight(some, at, loss).unsqueeze(-2)  # (1, S, C, 1, N)
-        by_scale = (at.by_fiducial * problem.points.mT[:, None]).sum(-3)  # (1, S, C, 2, N)
-        own = own + (by_scale.square() * weight).sum()
-        pull = pull - (by_scale * weight * at.residual).sum()
-        each += (at.by_fiducial.square() * weight.unsqueeze(-3)).sum((0, 1, 2, 4)).mT
-        across = (at.by_rig[..., :-1, :, :] * (by_scale * weight).unsqueeze(-3)).sum((-2, -1))  # (1, S, C, K + 6)
-        camera.append(across[..., :-POSE_PARAMETERS].sum(1))
-        poses.append(across[..., -POSE_PARAMETERS:].sum(2))
-    coupling = Step(torch.stack(camera).sum(0), torch.cat(poses, dim=1))
-    taken = factorization.solve(coupling)
-    left = own - (coupling.camera * taken.camera).sum() - (coupling.pose * taken.pose).sum()
+    left = found.information[0, 0]
     # As of `ShapeEvidence`, but against what a fiducial says before rig and poses have adapted.
-    if left <= UNSURE * each.max() * problem.points.square().sum():
+    if left <= UNSURE * found.alone * problem.points.square().sum():
         return ScaleEvidence((0.0, np.inf))
-    return ScaleEvidence((float(pull / left), float(left) ** -0.5))
+    return ScaleEvidence((float(found.pull[0] / left), float(left) ** -0.5))
 
 
 def shape_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> ShapeEvidence | None:

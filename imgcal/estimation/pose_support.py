@@ -31,15 +31,21 @@ def require_poses(seen: NDArray[np.bool_], points: Tensor) -> None:
     Raises:
         UndeterminedPosesError: it is not; says in which.
     """
+    posed = has_poses(seen, points)
+    if not posed.all():
+        raise UndeterminedPosesError(np.flatnonzero(~posed).tolist())
+
+
+def has_poses(seen: NDArray[np.bool_], points: Tensor) -> NDArray[np.bool_]:
+    """Tell in which snapshots what is `seen` (S, C, N) of an object's points (N, 3) is more than a line: (S,)."""
     shown, where = seen.any(1), points.detach().cpu().double().numpy()
     whole = _breadth(where)
     if whole > 0 and shown.all():
-        return
+        return np.ones(len(seen), dtype=bool)
     # What is seen repeats itself: thousands of snapshots show few different parts of an object.
     parts, which = np.unique(shown, axis=0, return_inverse=True)
-    narrow = np.array([_breadth(where[part]) <= LEAST_BREADTH * whole for part in parts])[which.reshape(-1)]
-    if narrow.any():
-        raise UndeterminedPosesError(np.flatnonzero(narrow).tolist())
+    broad = np.array([_breadth(where[part]) > LEAST_BREADTH * whole for part in parts], dtype=bool)
+    return broad[which.reshape(-1)]
 
 
 def _breadth(points: NDArray[np.float64]) -> float:

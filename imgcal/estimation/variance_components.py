@@ -17,6 +17,7 @@ from imgcal.estimation.covariance import remaining_variance
 from imgcal.estimation.levenberg_marquardt import Solution
 from imgcal.estimation.linearization import Problem, State, points_at
 from imgcal.estimation.map_estimate import EstimationOptions, make_loss, minimize
+from imgcal.estimation.modes import ModeEvidence, bent, mode_evidence
 from imgcal.estimation.object_shape import (
     ScaleEvidence,
     ShapeEvidence,
@@ -73,6 +74,7 @@ class VarianceComponents:
     additive_noise: float  # px
     prior_scale: Mapping[str, float]
     shape: ShapeEvidence | ScaleEvidence | None = None  # what the residuals say about the object; None = not asked
+    modes: ModeEvidence | None = None  # the same about its modes
 
 
 class ObjectQuestion(Enum):
@@ -163,6 +165,9 @@ def estimate_variance_components(
         if unexamined and not later and fit.converged and not fit.is_clean(options.outlier):
             # Before outliers are left out: all labels of a fiducial that is off its place may be among them.
             unexamined = False
+            if (softer := _bend(fit, options)) is not None:
+                problem, state, kept, unexamined = softer, solution.state, labels, True
+                continue
             shape, free = _examine(fit, options, GROSS_SCALE, question)
             if free is not None:
                 (problem, state), kept = free, labels
@@ -187,6 +192,9 @@ def estimate_variance_components(
             continue
         if question is not ObjectQuestion.NONE:
             unexamined = False
+            if (softer := _bend(fit, options)) is not None:
+                problem, state = softer, solution.state
+                continue
             shape, free = _examine(fit, options, 0.0, question)
             if free is not None:
                 (problem, state), kept = free, labels
@@ -194,7 +202,9 @@ def estimate_variance_components(
         state = solution.state
         too_narrow = _too_narrow(state.offset[0].numpy(), fit.remaining)
         if not too_narrow or max(prior_scale.values(), default=1.0) > options.widest_prior:
-            return VarianceComponents(problem, solution, np.sqrt(fit.noise), seen, additive_noise, prior_scale, shape)
+            modes = mode_evidence(problem, solution, make_loss(options.estimation))
+            sigma = np.sqrt(fit.noise)
+            return VarianceComponents(problem, solution, sigma, seen, additive_noise, prior_scale, shape, modes)
         prior_scale |= {kind: prior_scale.get(kind, 1.0) * factor for kind, factor in too_narrow.items()}
         problem, state = _widen(problem, state, too_narrow)
     raise RefusedError(
@@ -203,6 +213,12 @@ def estimate_variance_components(
         python="give the rig a wider prior where it may have changed so much: replace(rig, prior=RigPrior(...))",
         command="write larger values under `prior` in the rig file where the rig may have changed so much",
     )
+
+
+def _bend(fit: _Fit, options: FitOptions) -> Problem | None:
+    """The problem with the object's modes as the fit asks for them; None = they are."""
+    asked = mode_evidence(fit.problem, fit.solution, make_loss(options.estimation))
+    return None if asked is None or asked.at_rest else bent(fit.problem, asked)
 
 
 def _examine(

@@ -228,7 +228,7 @@ def _loaded(url: str, content: bytes, kind: Literal["rig", "object"]) -> Any:
 
 def _recalibrated(path: Path, rig: CameraRig, obj: CalibrationObject, settings: Settings) -> dict[str, Any]:
     """The columns of a capture that was recalibrated."""
-    source = open_input(path, rig, obj.num_fiducials)
+    source = open_input(path, rig, obj.rows)
     detector: Detector = "classical"
     if isinstance(source, Capture):
         if settings.detector != "classical":

@@ -182,7 +182,10 @@ def open_capture(folder: str | Path, rig: CameraRig | None = None, videos_differ
 
 
 def open_input(
-    path: str | Path, rig: CameraRig | None = None, fiducials: int | None = None, videos_differ: bool = False
+    path: str | Path,
+    rig: CameraRig | None = None,
+    fiducials: int | Sequence[int] | None = None,
+    videos_differ: bool = False,
 ) -> Capture | Detections:
     """Open what a user gives to a command: a capture folder or a detections file; arguments as for their functions."""
     path = Path(path)

@@ -1,7 +1,7 @@
 """Detections: CSV or CSV.gz with the header `snapshot,camera,u,v`.
 
-Optional columns: `sigma` (pixels; without it `DEFAULT_SIGMA` holds for every blob), `fiducial` (row of the object file,
-empty = unlabelled), `radius` (pixels, empty = unknown) and `flags` (sum of `BlobFlag` bits).
+Optional columns: `sigma` (pixels; without it `DEFAULT_SIGMA` holds for every blob), `fiducial` (row of the object file, or
+what its own column `fiducial` calls it; empty = unlabelled), `radius` (pixels, empty = unknown) and `flags` (sum of `BlobFlag` bits).
 
 Convention: a snapshot or camera without any blob has no row, so a file does not know of it; cameras come back when the
 file is read with its rig.
@@ -12,6 +12,7 @@ from __future__ import annotations
 import csv
 import gzip
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,13 +35,16 @@ DEFAULT_SIGMA = 0.1
 MARGIN = 5.0  # pixels outside the image that are still taken: centres of cut discs, rounding
 
 
-def load_detections(path: str | Path, rig: CameraRig | None = None, fiducials: int | None = None) -> Detections:
+def load_detections(
+    path: str | Path, rig: CameraRig | None = None, fiducials: int | Sequence[int] | None = None
+) -> Detections:
     r"""Read detections; a million rows take a few seconds.
 
     Args:
         path: CSV file, with or without gzip compression.
         rig: gives the cameras and their order, and the image sizes that are checked; None = cameras in file order.
-        fiducials: number of points of the object, the limit of the column `fiducial`; None = not checked.
+        fiducials: number of points of the object, the limit of the column `fiducial`; or what that calls them, in the
+            order of the object; None = not checked.
 
     Returns:
         Detections; snapshots in file order, which is the order in which their names first appear.
@@ -156,7 +160,7 @@ def _indices(chunk: Chunk, column: str, known: dict[str, int], allowed: tuple[st
     return np.fromiter(map(known.__getitem__, names), dtype=np.int64, count=len(names))
 
 
-def _numbers(chunk: Chunk, fiducials: int | None) -> dict[str, NDArray[np.float64]]:
+def _numbers(chunk: Chunk, fiducials: int | Sequence[int] | None) -> dict[str, NDArray[np.float64]]:
     """Convert the numeric columns; absent ones get their defaults."""
     count = len(chunk)
     result = {axis: chunk.numbers(axis, limits.PIXEL, f"a finite pixel coordinate, {limits.PIXEL}") for axis in "uv"}
@@ -165,11 +169,14 @@ def _numbers(chunk: Chunk, fiducials: int | None) -> dict[str, NDArray[np.float6
         result["sigma"] = chunk.numbers("sigma", limits.SIGMA, f"a standard deviation > 0, {limits.SIGMA}")
     result["fiducial"] = np.full(count, -1.0)
     if "fiducial" in chunk.columns:
-        last = limits.MOST_FIDUCIALS if fiducials is None else fiducials - 1
         filled = _filled(chunk, "fiducial", "-1")
-        result["fiducial"] = filled.numbers(
-            "fiducial", limits.Range(-1, last, ""), f"a row of the object, 0 to {last}", whole=True
-        )
+        if isinstance(fiducials, Sequence):
+            result["fiducial"] = _rows_of(filled, fiducials)
+        else:
+            last = limits.MOST_FIDUCIALS if fiducials is None else fiducials - 1
+            result["fiducial"] = filled.numbers(
+                "fiducial", limits.Range(-1, last, ""), f"a row of the object, 0 to {last}", whole=True
+            )
     result["radius"] = np.full(count, np.nan)
     if "radius" in chunk.columns:
         radius = _filled(chunk, "radius", "0").numbers("radius", limits.BLOB_RADIUS, f"a radius, {limits.BLOB_RADIUS}")
@@ -179,6 +186,21 @@ def _numbers(chunk: Chunk, fiducials: int | None) -> dict[str, NDArray[np.float6
         bits = limits.Range(0, 2 * max(BlobFlag) - 1, "")
         result["flags"] = chunk.numbers("flags", bits, f"a sum of flag bits, {bits}", whole=True)
     return result
+
+
+def _rows_of(chunk: Chunk, labels: Sequence[int]) -> NDArray[np.float64]:
+    """Replace what a table calls the fiducials by their rows in the object."""
+    plausible = limits.Range(-1, 2**31 - 1, "")
+    named = chunk.numbers("fiducial", plausible, "a number of the object's column `fiducial`", whole=True)
+    row = {-1: -1, **{label: number for number, label in enumerate(labels)}}
+    unknown = [k for k, label in enumerate(named.astype(int).tolist()) if label not in row]
+    if unknown:
+        chunk.fail(
+            unknown[0],
+            f"fiducial: found {int(named[unknown[0]])}, expected a number of the object's column `fiducial`: "
+            f"{listed([str(label) for label in labels])}",
+        )
+    return np.array([row[label] for label in named.astype(int).tolist()], dtype=np.float64)
 
 
 def _filled(chunk: Chunk, column: str, default: str) -> Chunk:

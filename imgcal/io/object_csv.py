@@ -1,4 +1,8 @@
-"""Calibration objects: CSV with the header `x,y,z` (mm), optional columns `name`, `radius` and `tolerance` (mm)."""
+"""Calibration objects: CSV with the header `x,y,z` (mm), optional columns `name`, `radius` and `tolerance` (mm).
+
+A column `fiducial` says by which whole numbers detections know the points; without it, by their rows. Printed boards are
+YAML files: `board_yaml`.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +18,9 @@ import torch
 from imgcal.errors import InputError
 from imgcal.io.atomic import write_text
 from imgcal.io.csv_file import Chunk, read_chunks
-from imgcal.io.names import LONGEST_NAME, find_file, title_of
+from imgcal.io.board_yaml import board_from_yaml, board_text
+from imgcal.io.names import LONGEST_NAME, check_regular, find_file, title_of
+from imgcal.io.resources import data_path, shipped_names
 from imgcal.messages import shortened
 from imgcal.types import CalibrationObject, limits
 from renderers.palette import palette
@@ -22,6 +28,8 @@ from renderers.palette import palette
 # Nearer than this to one line, in units of the object's size, no pose can be found.
 COLLINEAR = 1e-6
 SMALLEST = 1e-3  # mm, extent of an object
+LARGEST_LABEL = 2**31 - 1
+BOARD_SUFFIXES = (".yaml", ".yml")
 NAME = "a different name for every point"
 
 
@@ -29,7 +37,8 @@ def load_object(path: str | Path) -> CalibrationObject:
     """Read a calibration object.
 
     Args:
-        path: a CSV file, or the bare name of a shipped object such as "cube8" when there is no such file.
+        path: a CSV file, the YAML file of a printed board, or the bare name of a shipped object such as "cube8" when
+            there is no such file.
 
     Returns:
         The object in float64; colours from `renderers.palette`.
@@ -43,6 +52,14 @@ def load_object(path: str | Path) -> CalibrationObject:
         >>> obj.points.shape, obj.radius
         (torch.Size([8, 3]), None)
     """
+    path = Path(path)
+    if not path.exists() and str(path) in shipped_names("objects", ".yaml"):
+        path = data_path("objects", f"{path}.yaml")
+    if path.suffix.lower() in BOARD_SUFFIXES:
+        check_regular(path)
+        if not path.is_file():
+            raise InputError(f"{path}: no such file, expected that of a printed board")
+        return board_from_yaml(path.read_bytes(), path)
     return _read(find_file(path, "objects", ".csv"))
 
 
@@ -57,11 +74,14 @@ def object_from_text(text: str, where: str, name: str = "object") -> Calibration
     Raises:
         InputError: as `load_object`.
     """
-    return replace(_read(Path(where), text.encode(errors="replace")), name=name)
+    content = text.encode(errors="replace")
+    if text.startswith("format:"):
+        return replace(board_from_yaml(content, Path(where)), name=name)
+    return replace(_read(Path(where), content), name=name)
 
 
 def _read(path: Path, content: bytes | None = None) -> CalibrationObject:
-    chunks = list(islice(read_chunks(path, ("x", "y", "z"), ("name", "radius", "tolerance"), content), 2))
+    chunks = list(islice(read_chunks(path, ("x", "y", "z"), ("name", "radius", "tolerance", "fiducial"), content), 2))
     count = sum(map(len, chunks))
     if not 4 <= count <= limits.MOST_FIDUCIALS:
         found = count if count < 4 else f"more than {limits.MOST_FIDUCIALS}"
@@ -83,8 +103,27 @@ def _read(path: Path, content: bytes | None = None) -> CalibrationObject:
         if not _is_name(name) or name in names[:row]:
             chunk.fail(row, f"name: found {shortened(name)!r}, expected {NAME}")
     return CalibrationObject(
-        torch.from_numpy(points), palette(count).double(), radius, title_of(path), names, tolerance
+        torch.from_numpy(points),
+        palette(count).double(),
+        radius,
+        title_of(path),
+        names,
+        tolerance,
+        labels=_labels(chunk),
     )
+
+
+def _labels(chunk: Chunk) -> tuple[int, ...]:
+    """What detections call the points; empty where it is their rows."""
+    if "fiducial" not in chunk.columns:
+        return ()
+    plausible = limits.Range(0, LARGEST_LABEL, "")
+    numbers = chunk.numbers("fiducial", plausible, f"a whole number, {plausible}", whole=True)
+    labels = tuple(numbers.astype(int).tolist())
+    for row, label in enumerate(labels):
+        if label in labels[:row]:
+            chunk.fail(row, f"fiducial: found {label} again, expected a different number for every point")
+    return () if labels == tuple(range(len(labels))) else labels
 
 
 def save_object(obj: CalibrationObject, path: str | Path) -> None:
@@ -104,12 +143,17 @@ def save_object(obj: CalibrationObject, path: str | Path) -> None:
 
 def object_text(obj: CalibrationObject, where: str | Path = "object") -> str:
     """Make what `save_object` writes; errors begin with `where`."""
+    if obj.board is not None:
+        return board_text(obj)
     names = obj.fiducial_names
     for row, name in enumerate(names):
         if not _is_name(name) or name in names[:row]:
             raise InputError(f"{where}: not written: found the name {shortened(name)!r}, expected {NAME}")
     columns: list[list[str]] = [[f"{value!r}" for value in axis] for axis in obj.points.double().T.tolist()]
     header = ["x", "y", "z"]
+    if obj.labels:
+        header.append("fiducial")
+        columns.append([str(label) for label in obj.labels])
     if names:
         header.append("name")
         columns.append(list(names))

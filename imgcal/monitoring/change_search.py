@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 from imgcal.errors import RefusedError
 from imgcal.estimation import EstimationOptions
 from imgcal.geometry import RigidTransform
-from imgcal.monitoring.change_test import JUMPS, ChangeTest
+from imgcal.monitoring.change_test import CHANGES, JUMPS, ChangeTest
 from imgcal.monitoring.measurement_update import absorb
 from imgcal.monitoring.pending_change import free_cameras
 from imgcal.monitoring.recent_snapshots import SCREENED_AGES, RecentSnapshots
@@ -85,22 +85,41 @@ def likeliest_camera(test: ChangeTest, known: Collection[int] = ()) -> int:
     return max(odds, key=lambda camera: odds[camera])
 
 
-def changed_cameras(test: ChangeTest, known: dict[int, str | None]) -> tuple[dict[int, str | None], dict[int, float]]:
+def changed_cameras(
+    test: ChangeTest, known: dict[int, str | None], least_shifts: Sequence[float] | None = None
+) -> tuple[dict[int, str | None], dict[int, float]]:
     """Let cameras free that have changed, the likeliest first, until what has been seen since then is explained.
 
     Args:
         test: what has been seen since then.
         known: cameras that are known to have changed already, and how.
+        least_shifts: for each camera the pixels by which a change must shift its image, of all but the first.
 
     Returns:
         Cameras that have changed, at least one, and how (None = in any way); and the chi-squared of each new one.
     """
+    least = least_shifts or [0.0] * len(test.pixels)
     free, evidence = dict(known), dict[int, float]()
-    while not free or _worst(test.given(free), free) >= ALARM_CHI2:
-        given = test.given(free)
-        camera = likeliest_camera(given, free)
-        free[camera], evidence[camera] = None, max(float(score[camera]) for score in given.scores().values())
+    while len(free) < len(test.pixels):
+        given = test.given(free) if free else test
+        scores = given.scores()
+        others = {
+            camera: max(float(score[camera]) for score in scores.values())
+            for camera in range(len(test.pixels))
+            if camera not in free and (not free or _largest_shift(given, camera) >= least[camera])
+        }
+        if free and max(others.values(), default=0.0) < ALARM_CHI2:
+            break
+        odds = {camera: given.odds({camera: None}) for camera in others}
+        camera = max(odds, key=lambda camera: odds[camera])
+        free[camera], evidence[camera] = None, others[camera]
     return free, evidence
+
+
+def _largest_shift(test: ChangeTest, camera: int) -> float:
+    """Pixels by which a change of some kind would shift the image of a camera, were there no other."""
+    kinds = (test.jump(camera, kind)[0] / test.pixels[camera, part] for kind, part in CHANGES.items())
+    return max(float(shift.norm()) for shift in kinds)
 
 
 def contradicting_camera(
@@ -121,9 +140,3 @@ def contradicting_camera(
             if result.chi2 <= FIT_CHI2_PER_DOF * max(result.dof, 1):
                 found[camera] = result.evidence
     return max(found, key=lambda camera: found[camera], default=None)
-
-
-def _worst(test: ChangeTest, known: Collection[int]) -> float:
-    """Largest score of any kind of a camera that is not known to have changed."""
-    others = [camera for camera in range(len(test.pixels)) if camera not in known]
-    return max((float(scores[camera]) for scores in test.scores().values() for camera in others), default=0.0)

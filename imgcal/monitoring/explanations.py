@@ -24,13 +24,16 @@ from imgcal.monitoring.pending_change import free_cameras
 from imgcal.monitoring.rig_belief import RigBelief
 from imgcal.monitoring.shaking import Shaking, shake_cameras
 from imgcal.monitoring.unsynchronized import LEAST_SNAPSHOTS, Unsynchronized, unsynchronized_evidence
+from imgcal.monitoring.warming import Warmed
 
 PASSING = (2.0, 5.0)
 """Times their usual size that errors may have which pass."""
 LEAD = 5.0
 """Log odds against the next best explanation from which one is believed ..."""
 PATIENCE = 16
-"""... and the snapshots for which that is waited for, before the most probable one is believed anyway."""
+"""... and the cases for which that is waited for, before the most probable one is believed anyway ..."""
+HARMLESS_PATIENCE = 4
+"""... or, where it may well be that nothing has happened: after a pause, what was known leaves room for small moves."""
 
 
 class Steady(Explanation):
@@ -93,6 +96,7 @@ EXPLANATIONS: tuple[Explanation, ...] = (
     Shaking(),
     ObjectChanged(),
     PassingError(),
+    Warmed(),
 )
 """All that is weighed. A new one: a class as above, in a module of its own where it is long, and its line here."""
 
@@ -114,6 +118,12 @@ class Verdict:
         """Log odds of the best explanation against the next one; infinite where there is no other."""
         first, *others = self.explained.values()
         return first.evidence - max((other.evidence for other in others), default=-math.inf)
+
+    @property
+    def harmless(self) -> bool:
+        """Tell whether nothing may have happened, and all that is about as probable follows from it or passes."""
+        near = {name for name, one in self.explained.items() if one.evidence > self.best.evidence - LEAD}
+        return Steady.name in near and near <= {Steady.name, Moved.name, Warmed.name, PassingError.name}
 
     def evidence(self, *names: str) -> float:
         """The largest evidence of some explanations; minus infinity where none could be weighed."""
@@ -185,8 +195,9 @@ class Diagnosis:
         verdict = weigh(case, explanations)
         best = verdict.best
         self.waited = self.waited + 1 if verdict.lead < LEAD else 0
+        patience = HARMLESS_PATIENCE if verdict.harmless else PATIENCE
         why = best.explanation.premature(case, best)
-        if why is None and 0 < self.waited <= PATIENCE and patient:
+        if why is None and 0 < self.waited <= patience and patient:
             why = f"no explanation leads by {LEAD:g}"
         if why is not None:
             raise RefusedError(f"diagnosis: {best.name} cannot be told from the rest yet: {why}")

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -27,21 +28,26 @@ MEMORY = 1024
 """Latest snapshots from which correlation times are measured ..."""
 FIRST, EVERY = (48, 64, 96), 128
 """... after the first of them, and again after as many more."""
-USUAL, USUAL_SECONDS = 0.4, 0.1
-"""Autocorrelation of the errors of infrared cameras at short intervals, and the time (s) after which it has fallen by a
-factor e: what is assumed of a rig that has been calibrated, until its own snapshots say otherwise."""
-FASTEST = 1 / 60
-"""Seconds between snapshots, before anything is known of their rate."""
-EPISODE = 2.0
-"""Correlation times that a passing error may last."""
-LARGEST, SHORT = 20.0, 3
-"""Times the usual size of lasting errors that one may have; the snapshots that a larger one (wrong labels) lasts."""
+USUAL, USUAL_SECONDS, USUAL_SNAPSHOTS = 0.4, 0.1, 256
+"""Autocorrelation of the errors of infrared cameras at short intervals, the time (s) after which it has fallen by a
+factor e, and the snapshots up to which no less is assumed of a rig that has been calibrated: few cannot tell."""
+FASTEST, SLOWEST = 1 / 60, 1.0
+"""Seconds between snapshots, before anything is known of their rate; longer ones are pauses."""
+SMOOTHING = 0.1
+"""Weight of the latest interval between snapshots in their average."""
+EPISODE, EPISODE_SECONDS = 2.0, 0.4
+"""Correlation times that a passing error may last, and the seconds that it may last at least: a target at the edge of
+an image, behind somebody's arm, or under wrong labels stays there for so long, and may seem to be shifted by pixels."""
+LARGEST = 20.0
+"""Times the usual size of lasting errors from which one lasts no longer than that."""
 LEAST_LASTING = 0.05
 """Pixels: errors that last are at least so large, by what ten well calibrated infrared cameras show."""
 LEAST_SHIFT = 6.0
 """Times the usual size of lasting errors by which a change must shift an image."""
 TAIL, TAIL_SIGMAS = 0.99, 3.03
 """Part of the shifts that the tail leaves out, and how far it begins where they are normal, in standard deviations."""
+SETTLING_SNAPSHOTS = 64
+"""After a change of a camera, while it is learnt anew: what it leaves then follows from how little is known of it."""
 LEAST_POINTS = 2
 """Labels of a camera from which the shift of its image counts."""
 
@@ -60,18 +66,25 @@ class NoiseCorrelation:
     lasting: Tensor = field(init=False)  # (C,) px, one standard deviation of a shift of the image that lasts
     shifts: deque[NDArray[np.float64]] = field(default_factory=lambda: deque(maxlen=MEMORY))  # (C, 2) px
     taken: int = 0  # snapshots
-
-    measured: bool = False
+    usual: float = 1.0  # least correlation time as long as too few have been taken
+    interval: float = 0.0  # s between snapshots; 0 = not known
+    settled_at: dict[int, int] = field(default_factory=dict)  # number of snapshots from which changed cameras count
 
     def __post_init__(self) -> None:
         """Begin with errors that are independent from snapshot to snapshot."""
         self.time = torch.ones(self.cameras, dtype=torch.float64)
         self.lasting = torch.zeros(self.cameras, dtype=torch.float64)
 
-    def expect(self, seconds: float) -> None:
-        """Assume the usual correlation of snapshots that are so many seconds apart, until it has been measured."""
-        if not self.measured:
-            self.time = torch.full_like(self.time, usual_time(seconds))
+    def pass_time(self, seconds: float) -> None:
+        """Note how long ago the last snapshot was."""
+        if 0 < seconds <= SLOWEST:
+            self.interval += (SMOOTHING if self.interval else 1.0) * (seconds - self.interval)
+
+    def expect_usual(self) -> None:
+        """Assume the usual correlation of snapshots at this rate, until enough have been taken."""
+        self.usual = usual_time(self.interval) if self.taken < USUAL_SNAPSHOTS else 1.0
+        if self.taken < FIRST[0]:
+            self.time = torch.full_like(self.time, self.usual)
 
     @property
     def model_error(self) -> Tensor:
@@ -80,8 +93,9 @@ class NoiseCorrelation:
 
     def episode(self, camera: int, shift: float) -> int:
         """Successive snapshots that an error of a camera may last which shifts its image by so many pixels."""
-        usual = float(self.model_error[camera])
-        return min(self.episodes[camera], SHORT if shift > LARGEST * usual else math.inf)  # type: ignore[return-value]
+        usual = self.episodes[camera]
+        large = shift > LARGEST * float(self.model_error[camera])
+        return min(usual, math.ceil(self._least_episode)) if large else usual
 
     @property
     def correlated(self) -> Tensor | None:
@@ -91,7 +105,12 @@ class NoiseCorrelation:
     @property
     def episodes(self) -> list[int]:
         """Successive snapshots of each camera that one passing error may last."""
-        return [1 if time <= 1 else math.ceil(EPISODE * time) for time in self.time.tolist()]
+        least = self._least_episode
+        return [1 if time <= 1 else math.ceil(max(EPISODE * time, least)) for time in self.time.tolist()]
+
+    @property
+    def _least_episode(self) -> float:
+        return EPISODE_SECONDS / (self.interval or FASTEST)
 
     @property
     def least_shifts(self) -> list[float]:
@@ -106,8 +125,12 @@ class NoiseCorrelation:
         shake = None if observations.shake is None else observations.shake * root
         return replace(observations, sigma=observations.sigma * root[:, None], shake=shake)
 
+    def settle(self, cameras: Collection[int]) -> None:
+        """Leave out the next snapshots of cameras that have changed."""
+        self.settled_at |= dict.fromkeys(cameras, self.taken + SETTLING_SNAPSHOTS)
+
     def add(self, observations: Observations, residual: Tensor) -> None:
-        """Add what a snapshot leaves that nobody doubts.
+        """Add what is left of a snapshot in which nothing is wrong.
 
         Args:
             observations: (1, C, N).
@@ -115,6 +138,7 @@ class NoiseCorrelation:
         """
         shift = shared_shifts(observations, residual)[0][0]
         shift[observations.seen[0].sum(1).numpy() < LEAST_POINTS] = np.nan
+        shift[[camera for camera, settled in self.settled_at.items() if self.taken < settled]] = np.nan
         self.shifts.append(shift)
         self.taken += 1
         if self.taken in FIRST or self.taken % EVERY == 0:
@@ -122,13 +146,12 @@ class NoiseCorrelation:
 
     def _measure(self) -> None:
         """Measure each camera by itself, and all together: those of which little was seen are taken to be alike."""
-        self.measured = True
         series = np.stack(self.shifts)
         seen = np.isfinite(series[..., 0])
         variance = np.nansum(np.square(series), axis=(0, 2)) / (2 * np.maximum(seen.sum(0), 1))
         whitened = series / np.sqrt(np.maximum(variance, 1e-12))[:, None]
         together = float(correlation_time(whitened[:, None])[0])
-        time = np.maximum(correlation_time(series), together)
+        time = np.maximum(correlation_time(series), max(together, self.usual))
         self.time = torch.from_numpy(time)
         # A passing error is seldom, and large: the tail says more of it than the variance.
         length = np.where(seen, np.linalg.norm(series, axis=-1), np.nan)

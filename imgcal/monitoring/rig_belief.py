@@ -153,10 +153,23 @@ def widened(belief: RigBelief, variance: Tensor) -> RigBelief:
     return replace(belief, factor=cholesky_factor(torch.cholesky_inverse(cholesky_factor(covariance))))
 
 
+def widened_along(belief: RigBelief, steps: Tensor) -> RigBelief:
+    """Know less along some changes of all cameras together, each by one standard deviation: steps (M, C, K)."""
+    covariance = torch.cholesky_inverse(belief.factor)
+    error = (_error_by_step(belief) @ steps[..., None]).flatten(1)
+    wide = error.shape[1]
+    covariance[:wide, :wide] += error.mT @ error
+    return replace(belief, factor=cholesky_factor(torch.cholesky_inverse(cholesky_factor(covariance))))
+
+
 def error_covariance(belief: RigBelief, variance: Tensor) -> Tensor:
     """Covariance (C, K, K) of errors in units, of variances (C, K) of a camera's own parameters."""
-    error_by_step = torch.linalg.inv(step_by_error(belief.rig)) / belief.unit[:, :, None]
+    error_by_step = _error_by_step(belief)
     return error_by_step @ torch.diag_embed(variance) @ error_by_step.mT
+
+
+def _error_by_step(belief: RigBelief) -> Tensor:
+    return torch.linalg.inv(step_by_error(belief.rig)) / belief.unit[:, :, None]
 
 
 def cholesky_factor(matrix: Tensor) -> Tensor:

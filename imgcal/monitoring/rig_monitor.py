@@ -24,7 +24,7 @@ from imgcal.monitoring.change_search import (
 from imgcal.monitoring.change_test import JUMPS, LARGE
 from imgcal.monitoring.clock_slip import image_of
 from imgcal.monitoring.drift_pace import DriftLearning, DriftPaces
-from imgcal.monitoring.explanations import Diagnosis, Moved, Steady, Verdict, doubtful_cameras, weigh
+from imgcal.monitoring.explanations import LEAD, Diagnosis, Moved, Steady, Verdict, doubtful_cameras, weigh
 from imgcal.monitoring.noise_correlation import NoiseCorrelation
 from imgcal.monitoring.object_change import MISFIT_LEAD, Misfit, ObjectChanged, never_fitted
 from imgcal.monitoring.pending_change import Change, PendingChange, free_cameras
@@ -34,6 +34,7 @@ from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, age_belie
 from imgcal.monitoring.rig_filter import RigFilter
 from imgcal.monitoring.shaking import ShakeLevel
 from imgcal.monitoring.unsynchronized import drop_cameras
+from imgcal.monitoring.warming import Warmed
 from imgcal.types import Observations
 
 FEW_SNAPSHOTS = 16
@@ -109,8 +110,9 @@ class RigMonitor:
         """
         self.undecided = {camera: left - 1 for camera, left in self.undecided.items() if left > 1}
         given = observations
+        self.noise.pass_time(seconds)
         if self.filter.calibrated:
-            self.noise.expect(seconds)
+            self.noise.expect_usual()
         observations = self.noise.weigh(self.shaking.of(observations))
         new = [camera for camera in moved if camera not in self.quarantine.cameras]
         if new:
@@ -119,6 +121,7 @@ class RigMonitor:
         follow = self._follow_beside_quarantine if self.quarantine.cameras else self._follow
         found = follow(observations, rig_from_object, seconds)
         found = replace(found, update=found.update.of_last(), restarted=self.known_since != known_since)
+        self.noise.settle({*(change.camera for change in found.changes), *(slip.camera for slip in found.slips)})
         if not (found.changes or self.open or found.slips or found.object_change):
             self._follow_noise(drop_cameras(given, self.quarantine.cameras), found.update.residual)
         return found
@@ -192,15 +195,12 @@ class RigMonitor:
         found = self._follow(drop_cameras(observations, cameras), rig_from_object, seconds)
         if not quarantine.cameras or quarantine.cameras != cameras:  # those that are new have seen it already
             return found
-        if quarantine.observe(observations, seconds, self._episode(cameras, observations, found.update)):
+        snapshot = observations, found.update.rig_from_object[-1:]
+        episode = max(self.noise.episode(camera, _shift(found.update.belief, snapshot, camera)) for camera in cameras)
+        if quarantine.observe(observations, seconds, episode):
             with contextlib.suppress(RefusedError):  # it cannot be decided yet, or they do not see enough
                 found = self._diagnose_quarantine(found)
         return replace(found, unsynchronized=quarantine.report_unsynchronized())
-
-    def _episode(self, cameras: Collection[int], observations: Observations, result: MeasurementUpdate) -> int:
-        """Successive snapshots that what is wrong with cameras may last, if it is an error that passes."""
-        snapshot = observations, result.rig_from_object[-1:]
-        return max(self.noise.episode(camera, _shift(result.belief, snapshot, camera)) for camera in cameras)
 
     def _shows_move(self, case: Case) -> bool:
         """Tell whether the image of some suspected camera is shifted by clearly more than errors that last."""
@@ -226,6 +226,10 @@ class RigMonitor:
         if quarantine.unsynchronized:
             return found
         quarantine.release()
+        if verdict.lead < LEAD and verdict.harmless and self._pending is None:
+            # What was known leaves room for it, so it is learnt as any snapshot is.
+            quiet = verdict.explained[Steady.name]
+            return MonitorUpdate(self._restart(quiet.before, quiet.snapshots, case.pauses[-case.count :]))
         if verdict.best.name == Moved.name and self._shows_move(case):
             decided = self._decide_kinds(last=True)
             anew = self._learn_moved(case, dict.fromkeys(case.cameras), JUMPS[-1], sum(case.pauses[-case.count :]))
@@ -256,7 +260,7 @@ class RigMonitor:
         excluded = {Steady.name: "a test of every camera has excluded it"}
         if pending is not None and free:
             excluded[ObjectChanged.name] = "a change of a camera is open"
-        free, evidence = changed_cameras(self._recent.test(age), free)
+        free, evidence = changed_cameras(self._recent.test(age), free, self.noise.least_shifts)
         self.undecided |= dict.fromkeys(free, UNDECIDED_SNAPSHOTS)
         if self._is_new(age):
             excluded[ObjectChanged.name] = "too little was known before"
@@ -446,7 +450,7 @@ class RigMonitor:
         with contextlib.suppress(RefusedError):  # nothing explains these snapshots
             verdict = weigh(case)
             sure = Steady.name in verdict.explained and verdict.lead >= MISFIT_LEAD
-            if sure and verdict.best.name == ObjectChanged.name:
+            if sure and verdict.best.name in (ObjectChanged.name, Warmed.name):
                 return self._adopt(case, verdict, new)
         return None
 

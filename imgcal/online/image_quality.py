@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -18,6 +19,8 @@ Array = NDArray[np.float64]
 
 BLOCK = 1.0
 """Seconds of snapshots that are averaged into one block."""
+INTERVAL = 0.06
+"""Seconds between snapshots that are looked at, at least: more of them say the same."""
 LEAST_FIDUCIALS = np.array((10.0, 10.0, 20.0))
 """Fiducials in a block, for each measure; a block with fewer goes on."""
 LONGEST = 60.0
@@ -76,6 +79,7 @@ class ImageQuality:
         shape = (3, cameras)
         self._distance = np.zeros(cameras)  # log mm, the first one; 0 = the object has not been seen
         self._began: float | None = None  # s, of the block
+        self._collected = -math.inf  # s, of the last snapshot in it
         self._count = np.zeros(shape)  # fiducials in the block ...
         self._sum, self._place = np.zeros(shape), np.zeros((*shape, FEATURES))  # ... sums of values and of features
         self._last_time = np.full(shape, -1e9)  # s, of the last block ...
@@ -103,7 +107,8 @@ class ImageQuality:
         if state.time - self._began >= BLOCK:
             events = self._judge(state)
             self._began = state.time
-        if state.rig_from_object is not None:
+        if state.rig_from_object is not None and not 0 <= state.time - self._collected < INTERVAL:
+            self._collected = state.time
             self._collect(state)
         return events
 

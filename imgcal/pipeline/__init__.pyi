@@ -1,5 +1,6 @@
 from .calibration import Calibration
 from .captured import detect_capture, masks_of, sight_of_capture
+from .doubtful import DoubtfulCamera
 from .fitting import fit_labelled
 from .from_scratch import calibrate_from_scratch
 from .initialization import load_initializer
@@ -23,6 +24,7 @@ __all__ = [
     "Calibration",
     "Detector",
     "DetectorName",
+    "DoubtfulCamera",
     "Knowledge",
     "LateCamera",
     "LearnedMeasurer",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from imgcal.association import Associations, observations_of, without_snapshots
+from imgcal.association import Associations, drop_merged, observations_of, without_snapshots
 from imgcal.estimation import UndeterminedPosesError, initial_pose, require_poses
 from imgcal.geometry import RigidTransform
 from imgcal.types import CalibrationObject, CameraRig, Observations
@@ -25,7 +25,7 @@ class Arranged:
 
 
 def arrange(labelled: Associations, rig: CameraRig, obj: CalibrationObject) -> Arranged:
-    """Refuse the snapshots whose labels lie on one line; find the poses of those that came with labels.
+    """Take blobs of several fiducials out, and snapshots whose labels lie on one line; find poses that are missing.
 
     Raises:
         RefusedError: none is left.
@@ -35,9 +35,10 @@ def arrange(labelled: Associations, rig: CameraRig, obj: CalibrationObject) -> A
         require_poses(observations.seen.numpy(), obj.points)
     except UndeterminedPosesError as error:
         return arrange(without_snapshots(labelled, error.rows), rig, obj)
-    if poses is not None:
-        return Arranged(labelled, observations, poses)
-    poses, snapshots = initial_pose(observations, rig, obj), list(labelled.snapshots)
-    for row, snapshot in enumerate(labelled.used):
-        snapshots[snapshot] = replace(snapshots[snapshot], rig_from_object=poses[row])
-    return Arranged(replace(labelled, snapshots=tuple(snapshots)), observations, poses)
+    if poses is None:
+        poses, snapshots = initial_pose(observations, rig, obj), list(labelled.snapshots)
+        for row, snapshot in enumerate(labelled.used):
+            snapshots[snapshot] = replace(snapshots[snapshot], rig_from_object=poses[row])
+        labelled = replace(labelled, snapshots=tuple(snapshots))
+    left = drop_merged(labelled, poses, rig, obj)
+    return Arranged(labelled, observations, poses) if left is labelled else arrange(left, rig, obj)

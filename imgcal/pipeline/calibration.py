@@ -21,9 +21,13 @@ from imgcal.estimation import (
 )
 from imgcal.geometry import RigidTransform
 from imgcal.monitoring import posterior_of
+from imgcal.pipeline.doubtful import DoubtfulCamera, doubtful_at_end
 from imgcal.pipeline.initialization import Initialization
 from imgcal.pipeline.lateness import LEAST_BETTER, LateCamera, timing_motion
-from imgcal.pipeline.object_checks import displaced, lost_fiducials
+from imgcal.pipeline.object_checks import CERTAIN, displaced, lost_fiducials
+from imgcal.pipeline.repeats import Repeats
+from imgcal.pipeline.scale import Scale, scale_of
+from imgcal.pipeline.synchronization import Unsynchronized
 from imgcal.pipeline.tally import Tally, tally
 from imgcal.types import (
     BlobFlag,
@@ -34,6 +38,28 @@ from imgcal.types import (
     Observations,
     RigPosterior,
 )
+
+
+@dataclass(frozen=True)
+class Bend:
+    """Deflection of the middle of a printed board along x and y: mm, positive = away from the viewer."""
+
+    x: float
+    y: float
+    x_sigma: float
+    y_sigma: float
+
+    @property
+    def is_certain(self) -> bool:
+        """Tell whether the board is bent beyond doubt."""
+        return max(abs(self.x) / self.x_sigma, abs(self.y) / self.y_sigma) > CERTAIN
+
+    def __str__(self) -> str:
+        """Say it in words."""
+        return (
+            f"the board is {'bent' if self.is_certain else 'flat, as far as can be told'}: its middle is off by {self.x:+.2g} +- {self.x_sigma:.1g} mm along x and "
+            f"{self.y:+.2g} +- {self.y_sigma:.1g} mm along y"
+        )
 
 
 @dataclass(frozen=True)
@@ -70,6 +96,8 @@ class Calibration:
     moved: tuple[MovedCamera, ...] = ()  # during the capture; snapshots used are those since then
     from_scratch: bool = False  # there was no factory calibration: `factory` is a first rig made from the same data
     late: tuple[LateCamera, ...] = ()  # whose frames, from some snapshot on, are of other moments: these took no part
+    unsynchronized: Unsynchronized | None = None  # cameras expose at moments of their own; None = no sign of it
+    repeats: Repeats = Repeats()  # exact copies of earlier images: these took no part
 
     def __repr__(self) -> str:
         """Say what was found: the rig, its error before and after, how the fiducials were identified."""
@@ -130,9 +158,23 @@ class Calibration:
         )
 
     @property
+    def bend(self) -> Bend | None:
+        """How much a printed board is bent; None = it was taken as its file says."""
+        board, modes = self.obj.board, self.estimate.modes
+        if board is None or modes is None:
+            return None
+        std, known = board.warp_std, np.sqrt(modes.covariance.diagonal())
+        (x, y), (dx, dy), (sx, sy) = board.bend, (std * modes.offset).tolist(), (std * known).tolist()
+        factor = self.estimate.inflation
+        return Bend(x + dx, y + dy, min(factor * sx, std), min(factor * sy, std))
+
+    @property
     def object(self) -> CalibrationObject:
         """The object as it was estimated: its fiducials in their estimated places, taken as exact."""
-        return replace(self.obj.taken_as_exact(), points=self.points_object.detach())
+        board, bend = self.obj.board, self.bend
+        if board is not None and bend is not None:
+            board = replace(board, bend=(bend.x, bend.y), warp=max(bend.x_sigma, bend.y_sigma))
+        return replace(self.obj.taken_as_exact(), points=self.points_object.detach(), board=board)
 
     @property
     def displaced(self) -> tuple[FiducialOffset, ...]:
@@ -158,7 +200,14 @@ class Calibration:
     @cached_property
     def tally(self) -> Tally:
         """What each camera saw in each snapshot, and how much of it is explained."""
-        return tally(self.labelled, self.observations.seen.numpy(), self.rig_from_object, self.factory, self.obj)
+        seen = self.observations.seen.numpy()
+        return tally(self.labelled, seen, self.rig_from_object, self.factory, self.object, self.estimate.rig)
+
+    @cached_property
+    def doubtful(self) -> tuple[DoubtfulCamera, ...]:
+        """Cameras that stop fitting at the end: where they were bumped there, the rig is not as it is now."""
+        names = tuple(snapshot.name for snapshot in self.labelled.snapshots)
+        return doubtful_at_end(self.tally, self.rig.camera_names, names)
 
     @property
     def labelled_detections(self) -> Detections:
@@ -176,6 +225,11 @@ class Calibration:
     def predicted_error(self) -> PredictedError:
         """How good the rig is over the working volume."""
         return predicted_error(self.estimate)
+
+    @cached_property
+    def scale(self) -> Scale:
+        """What the size of the rig rests on, and what an error of the object's file would add to the predicted one."""
+        return scale_of(self.estimate, self.obj, self.scale_sigma, self.predicted_error.volume)
 
     @property
     def detectors(self) -> Mapping[str, int]:

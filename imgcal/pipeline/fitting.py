@@ -35,6 +35,7 @@ from imgcal.pipeline.checks import (
 )
 from imgcal.pipeline.initialization import Initialization, Initializer, residual_of
 from imgcal.pipeline.object_checks import object_offsets
+from imgcal.pipeline.object_size import require_one_size
 from imgcal.pipeline.steadiness import steady_part
 from imgcal.pipeline.tally import tally
 from imgcal.types import (
@@ -172,7 +173,9 @@ def _fitted_once(
     if latest is None:
         question = ObjectQuestion.SHAPE_OF_TURNS if alike else ObjectQuestion.SHAPE
     found = estimate_variance_components(problem, starts, variance, labels, options, question)
-    fit = make_estimate(found.problem, found.solution, found.solution.state)
+    fit = replace(make_estimate(found.problem, found.solution, found.solution.state), modes=found.modes)
+    if latest is None:
+        require_one_size(fit, tuple(labelled.snapshots[s].name for s in labelled.used))
     require_same_residuals(fit, observations, found.seen, obj)
     shape = object_offsets(fit, found.shape, obj)
     scatter = BlockScatter()

@@ -29,8 +29,8 @@ from imgcal.errors import RefusedError
 from imgcal.estimation import K3, ColdStart, cold_start, ordinary_lens
 from imgcal.messages import listed
 from imgcal.pipeline.calibration import Calibration
-from imgcal.pipeline.fitting import fit_steady
-from imgcal.pipeline.recalibration import late_cameras, require_same_moments
+from imgcal.pipeline.recalibration import fit_as_timed, late_cameras, require_same_moments
+from imgcal.pipeline.repeats import name_repeats, without_repeats
 from imgcal.pipeline.sources import Frames, blobs_of
 from imgcal.pipeline.units import require_solvable, require_units
 from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior, Volume
@@ -91,8 +91,8 @@ def calibrate_from_scratch(
         >>> abs(float(apart[0] - apart[1])) < 1  # mm
         True
     """
-    started, cameras = time.perf_counter(), _with_prior(cameras)
-    detections = blobs_of(source, cameras, obj, detection)
+    started, cameras, options = time.perf_counter(), _with_prior(cameras), options.of_object(obj)
+    detections, repeats = without_repeats(blobs_of(source, cameras, obj, detection))
     found = time.perf_counter()
     is_labelled = (detections.fiducial >= 0).any()
     alone = detections if is_labelled else labels_of_images(detections, cameras, obj, options, progress)
@@ -119,6 +119,7 @@ def calibrate_from_scratch(
     box = Volume.box(_corner(volume.low), _corner(volume.high))
     # What was known before is no prior for what comes after; the defaults are.
     rig = replace(fit.rig, name=cameras.name, prior=None, volume=box)
+    fit = replace(fit, labelled=name_repeats(fit.labelled, repeats), repeats=repeats)
     return replace(fit, estimate=replace(fit.estimate, rig=rig), seconds=seconds, from_scratch=True, late=late)
 
 
@@ -130,7 +131,7 @@ def _fit(
     start.distortion[:, K3 - 10] = cameras.distortion[:, K3 - 10]  # about which it has a prior that tells
     std = ordinary_lens(_wide(first, cameras).std(start))
     std[0, :6] = 0.0  # whose frame is the rig's
-    fit = fit_steady(labelled, labelled.detections, start, obj, options, prior_std=std)
+    fit = fit_as_timed(labelled, labelled.detections, start, obj, options, prior_std=std)
     require_determined(fit)
     return fit
 

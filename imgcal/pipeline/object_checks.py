@@ -57,7 +57,8 @@ def object_offsets(
         )
     if fit.problem.object_prior_std is None:
         return ()
-    found = offsets(fit, obj.points.double().numpy())
+    places = (fit.problem.points + fit.problem.centroid).double().numpy()  # bent as its modes are
+    found = offsets(fit, places)
     learnt = fit.problem.object_prior_std[0, :-1:3].numpy()
     granted = obj.granted.double().numpy()
     for offset in found:

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from imgcal.association import Associations, PipelineOptions, Progress, associate
 from imgcal.detection import DetectionOptions
@@ -22,7 +23,9 @@ from imgcal.pipeline.fitting import fit_labelled, fit_steady
 from imgcal.pipeline.initialization import Initializer
 from imgcal.pipeline.lateness import LateCamera, late_camera, suspects
 from imgcal.pipeline.measuring import LearnedMeasurer
+from imgcal.pipeline.repeats import name_repeats, without_repeats
 from imgcal.pipeline.sources import Detector, Frames, blobs_of, checked_frames, sight_of
+from imgcal.pipeline.synchronization import NOTICEABLE, find_unsynchronized
 from imgcal.pipeline.tally import Tally, tally
 from imgcal.pipeline.units import require_solvable, require_units
 from imgcal.types import (
@@ -75,9 +78,9 @@ def calibrate(
         >>> result.identity, result.rig.camera_names == factory.camera_names
         ('coded', True)
     """
-    started, rig = time.perf_counter(), rig.to(torch.float64)
+    started, rig, options = time.perf_counter(), rig.to(torch.float64), options.of_object(obj)
     source = source if isinstance(source, Detections) else checked_frames(source, rig)
-    detections = blobs_of(source, rig, obj, detection, measurer)
+    detections, repeats = without_repeats(blobs_of(source, rig, obj, detection, measurer))
     found = time.perf_counter()
     sight = sight_of(detector, source, detection, measurer)
     labelled: Associations | None = None
@@ -86,7 +89,7 @@ def calibrate(
             labelled = associate(detections, rig, obj, options, progress, sight)
             identified = time.perf_counter()
             given = detections if sight is None else _as_given(labelled)
-            fit = fit_steady(labelled, given, rig, obj, options, initializer)
+            fit = fit_as_timed(labelled, given, rig, obj, options, initializer)
     except RefusedError as error:
         if sight is not None and labelled is not None and sight.where_blobs_fail and _by_blobs(labelled):
             # They told the pose, and failed all the same.
@@ -105,7 +108,41 @@ def calibrate(
         "estimation": time.perf_counter() - identified,
     }
     late = late_cameras(detections, fit.tally, rig, obj, options)
-    return replace(fit, seconds=seconds, late=late)
+    return replace(fit, labelled=name_repeats(fit.labelled, repeats), seconds=seconds, late=late, repeats=repeats)
+
+
+def fit_as_timed(
+    labelled: Associations,
+    given: Detections,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    options: PipelineOptions,
+    initializer: Initializer | None = None,
+    prior_std: Tensor | None = None,
+) -> Calibration:
+    """Do what `fit_steady` does; where the cameras are not synchronized, with the noise that this makes.
+
+    Raises:
+        RefusedError: the data cannot decide.
+    """
+    refusal: RefusedError | None = None
+    try:
+        fit = fit_steady(labelled, given, rig, obj, options, initializer, prior_std)
+        if fit.additive_noise < NOTICEABLE:
+            return fit
+    except RefusedError as error:
+        refusal = error
+    found = find_unsynchronized(labelled, rig, obj)
+    if found is not None:
+        unsynchronized, noisy = found
+        given = replace(given, sigma=noisy.sigma) if len(given) == len(noisy) else noisy
+        labelled = replace(labelled, detections=noisy)
+        with contextlib.suppress(RefusedError):
+            fit = fit_steady(labelled, given, rig, obj, options, initializer, prior_std)
+            return replace(fit, unsynchronized=unsynchronized)
+    if refusal is not None:
+        raise refusal
+    return fit
 
 
 def _by_blobs(labelled: Associations) -> bool:

@@ -101,7 +101,7 @@ def score(
         >>> float(imgcal.score(blobs, factory, obj).distances.mean()) > 5
         True
     """
-    rig = rig.to(torch.float64)
+    rig, options = rig.to(torch.float64), options.of_object(obj)
     detections = blobs_of(source, rig, obj, detection)
     try:
         with require_solvable():

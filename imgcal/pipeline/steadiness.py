@@ -22,6 +22,7 @@ from imgcal.estimation import (
     make_problem,
     minimize,
     pose_at,
+    rig_at,
 )
 from imgcal.pipeline.arrangement import Arranged, arrange
 from imgcal.pipeline.tally import Tally, tally
@@ -152,8 +153,9 @@ def _fit(arranged: Arranged, rig: CameraRig, obj: CalibrationObject, options: Pi
         free = max(1 - (rig.num_parameters * rig.num_cameras + 6 * len(seen)) / (2 * int(seen.sum())), 0.2)
         noise = own + (squared[seen].median() / (MEDIAN * free) - own[seen].median()).clamp_min(0)
     fitting = (squared <= CLIP**2 * used) & seen
-    poses = pose_at(problem, state)[0]
-    return _Fit(problem, state, tally(arranged.labelled, fitting.numpy(), poses, rig, obj), tuple(solutions))
+    poses, fitted = pose_at(problem, state)[0], rig_at(problem, state.offset)[0]
+    counts = tally(arranged.labelled, fitting.numpy(), poses, rig, obj, fitted)
+    return _Fit(problem, state, counts, tuple(solutions))
 
 
 def _lost(counts: Tally) -> Bools:

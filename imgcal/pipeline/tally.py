@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from imgcal.association import Associations
+from imgcal.association import Associations, merging_distance
 from imgcal.geometry import RigidTransform
 from imgcal.types import CalibrationObject, CameraRig
 
@@ -25,6 +25,10 @@ many do not fit a rig and each other by chance, whatever else the frame shows.""
 WHOLE = 0.7
 """Share of the fiducials in view with a label that fits, from which on what else a frame shows is not the object."""
 
+PLACED = 3.0
+"""Pixels from where the rig sees a fiducial, up to which a blob without a label is taken for it: it may have none
+because too few others are in view, or because they have merged."""
+
 Counts = NDArray[np.int64]
 
 
@@ -36,6 +40,7 @@ class Tally:
     usable: Counts  # (S, C) of these, not merged, at the border or masked
     labelled: Counts  # (S, C) blobs with a fiducial
     kept: Counts  # (S, C) labels that fit
+    placed: Counts  # (S, C) blobs without a label that are where fiducials without one should be, merged ones included
     expected: Counts  # (S, C) fiducials in view of the factory camera, given where the rest of the rig sees the object
     found: NDArray[np.bool_]  # (S, C) the pattern was looked for in the frame itself, and is there
     crowd: Counts  # (S, C) false blobs as usual: as many are no witness
@@ -57,12 +62,14 @@ class Tally:
         where the object is hidden.
         """
         spare = np.maximum(self.usable - self.crowd, 0)
-        return np.where(self.found, 0, np.maximum(np.minimum(self.expected, spare) - self.kept, 0))
+        explained = self.kept + self.placed
+        return np.where(self.found, 0, np.maximum(np.minimum(self.expected, spare) - explained, 0))
 
 
 def tally(
-    labelled: Associations, kept: NDArray[np.bool_], poses: RigidTransform, factory: CameraRig, obj: CalibrationObject
-) -> Tally:
+    labelled: Associations, kept: NDArray[np.bool_], poses: RigidTransform, factory: CameraRig, obj: CalibrationObject,
+    rig: CameraRig | None = None,
+) -> Tally:  # fmt: skip
     """Count.
 
     Args:
@@ -71,6 +78,7 @@ def tally(
         poses: (U,) rig_from_object of the used snapshots.
         factory: the rig that says what is in view: it has not been spoilt by wrong labels.
         obj: N fiducials.
+        rig: as estimated; None = not yet, and what has no label counts as being elsewhere.
     """
     detections, used = labelled.detections, labelled.used
     shape = (len(labelled.snapshots), factory.num_cameras)
@@ -95,10 +103,35 @@ def tally(
         usable=usable,
         labelled=count(detections.fiducial >= 0),
         kept=fitting,
+        placed=np.zeros_like(fitting) if rig is None else _placed(labelled, poses, rig, obj),
         expected=expected,
         found=looked[:, None] & (fitting >= np.maximum(LEAST_FOUND, LEAST_SHARE * expected)),
         crowd=np.where(looked[:, None], _crowd(spare), _besides(spare, whole)),
     )
+
+
+def _placed(labelled: Associations, poses: RigidTransform, rig: CameraRig, obj: CalibrationObject) -> Counts:
+    """Count blobs without a label that are where fiducials without one are seen, alone or several in one: (S, C)."""
+    detections, used = labelled.detections, labelled.used
+    points = poses.apply(obj.points.to(rig.focal_length))
+    image = rig.expand(len(points)).project_values(points, obj.radius)
+    places, open_ = image.uv.numpy(), image.visible.numpy().copy()
+    row = np.full(len(labelled.snapshots), -1)
+    row[used] = np.arange(len(used))
+    snapshot, reach = row[detections.snapshot], merging_distance(labelled)
+    labels = np.flatnonzero((detections.fiducial >= 0) & (snapshot >= 0))
+    open_[snapshot[labels], detections.camera[labels], detections.fiducial[labels]] = False
+    counts = np.zeros((len(labelled.snapshots), rig.num_cameras), dtype=np.int64)
+    blobs = np.flatnonzero((detections.fiducial < 0) & (snapshot >= 0) & detections.usable)
+    blobs = blobs[open_[snapshot[blobs], detections.camera[blobs]].any(-1)]
+    for blob in blobs:
+        s, c = snapshot[blob], detections.camera[blob]
+        away = np.where(open_[s, c], np.hypot(*(places[s, c] - detections.uv[blob]).T), np.inf)
+        merged = np.flatnonzero(away < reach[blob])
+        mine = merged if len(merged) > 1 else np.flatnonzero(away < PLACED)
+        open_[s, c, mine] = False
+        counts[used[s], c] += len(mine) > 0
+    return counts
 
 
 def _crowd(false: Counts) -> Counts:

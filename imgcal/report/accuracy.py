@@ -43,6 +43,8 @@ def sentences(content: ReportContent) -> tuple[str, ...]:
         worst = [f"{content.cameras[i]} ({svg.pixels(predicted.camera_px[i])} px)" for i in predicted.exceptions]
         words += f", except through {_listed(worst)}"
     found = [words + "."]
+    if content.scale:
+        found.append(f"{content.scale[0].upper()}{content.scale[1:]}.")
     if 0 < predicted.seen_share < 0.95:
         found.append(f"{100 * (1 - predicted.seen_share):.0f} % of the volume are seen by fewer than two cameras.")
     return tuple(found)

@@ -54,8 +54,10 @@ class ReportContent:
     from_scratch: bool = False  # there was no factory calibration: `factory` is a first rig made from the same data
     gauge: Gauge | None = None  # which cameras are taken to have stood still; None = nothing is compared
     predicted: PredictedError | None = None  # over the working volume
+    scale: str = ""  # what the prediction leaves out, since no image shows it, in words
     moves: tuple[str, ...] = ()  # cameras that moved during the capture, in words; earlier snapshots are rejected
     late: tuple[str, ...] = ()  # cameras whose frames are of other moments, in words; these took no part
+    doubtful: tuple[str, ...] = ()  # cameras that stop fitting at the end of the capture, in words
     unknown: tuple[str, ...] = ()  # what the data do not say, in words
     advice: str = ""  # where to move the object, in words
     unexplained: NDArray[np.int64] | None = None  # (C,) blobs that may be fiducials in view, not where these should be

@@ -24,6 +24,13 @@ def sightings(content: ReportContent) -> list[tuple[str, str]]:
         (f"{words[:1].upper()}{words[1:]}; these took no part.", "Export the frames of that camera anew, all of them.")
         for words in content.late
     ]
+    notes += [
+        (
+            f"{words[:1].upper()}{words[1:]}.",
+            "Capture some more snapshots and calibrate again: a camera that was bumped will be off in all of them.",
+        )
+        for words in content.doubtful
+    ]
     used = np.bincount(content.detections.camera[content.used], minlength=len(content.cameras))
     blobs = np.bincount(content.detections.camera, minlength=len(content.cameras))
     if content.unexplained is not None:

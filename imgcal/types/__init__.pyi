@@ -1,4 +1,5 @@
 from . import limits
+from .board import Board, BoardKind
 from .calibration_object import CalibrationObject, Symmetry
 from .limits import BLOB_RADIUS, FIDUCIAL_RADIUS, MOST_PIXELS, SIGMA, Range, check_object, check_observations, check_rig
 from .moved_camera import Kind, MovedCamera, MovedError
@@ -32,6 +33,8 @@ __all__ = [
     "UNUSABLE",
     "BlobFlag",
     "BlobKind",
+    "Board",
+    "BoardKind",
     "CalibrationObject",
     "CameraRig",
     "CropPlacement",

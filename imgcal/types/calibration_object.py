@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.errors import InputError
+from imgcal.types.board import Board
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,9 @@ class CalibrationObject:
     fiducial_names: tuple[str, ...] = field(default=())
     tolerance: Tensor | None = None  # (N,) mm, one standard deviation of each coordinate; None = exact
     scale_tolerance: float = 0.0  # relative, one standard deviation of all distances together
+    board: Board | None = None  # the printed pattern whose points these are; None = markers
+    modes: Tensor | None = None  # (K, N, 3) mm: shapes of which it has as much as a standard normal says; None = rigid
+    labels: tuple[int, ...] = ()  # what tables call the fiducials; empty = by their rows
 
     def __repr__(self) -> str:
         """Say what it is: `CalibrationObject('cube8': 8 fiducials)`; points, radii and tolerances are attributes."""
@@ -64,10 +68,22 @@ class CalibrationObject:
             raise InputError(
                 f"object {self.name}: expected a tolerance >= 0 (mm) for each of {len(self.points)} fiducials"
             )
+        if self.modes is not None and self.modes.shape[1:] != self.points.shape:
+            found = tuple(self.modes.shape)
+            raise InputError(f"object {self.name}: found modes of shape {found}, expected (K, {len(self.points)}, 3)")
         if not 0 <= self.scale_tolerance < 1:
             raise InputError(
                 f"object {self.name}: found a scale tolerance of {self.scale_tolerance}, expected a share from 0 to 1"
             )
+
+    @classmethod
+    def of_board(cls, board: Board, name: str = "board") -> CalibrationObject:
+        """Make the object that a printed board is."""
+        from renderers import palette
+
+        points, modes = torch.from_numpy(board.points), torch.from_numpy(board.modes)
+        colours = palette(len(points)).double()
+        return cls(points, colours, name=name, board=board, modes=modes if len(modes) else None)
 
     @property
     def exact(self) -> bool:
@@ -80,13 +96,19 @@ class CalibrationObject:
         return torch.zeros_like(self.points[:, 0]) if self.tolerance is None else self.tolerance
 
     def taken_as_exact(self) -> CalibrationObject:
-        """Return the object without its tolerances."""
-        return self if self.exact else replace(self, tolerance=None, scale_tolerance=0.0)
+        """Return the object without its tolerances and modes."""
+        soft = self.modes is not None or not self.exact
+        return replace(self, tolerance=None, scale_tolerance=0.0, modes=None) if soft else self
 
     @property
     def num_fiducials(self) -> int:
         """Number of fiducials, N."""
         return len(self.points)
+
+    @property
+    def rows(self) -> int | tuple[int, ...]:
+        """What tables call the fiducials: so many rows, or numbers of their own."""
+        return self.labels or self.num_fiducials
 
     @cached_property
     def size(self) -> float:

@@ -49,7 +49,11 @@ def test_the_core_calibrates_all_but_the_report(tmp_path: Path) -> None:
     done = without_extras(*CALIBRATE, str(tmp_path / "out"))
     assert done.returncode == 0, done.stderr
     assert said(done) == ['note: no report.html, which needs jinja2: pip install "imgcal[report]"']
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"rig.yaml", "result.json"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "rig.yaml",
+        "rig.posterior.safetensors",
+        "result.json",
+    }
     assert json.loads((tmp_path / "out" / "result.json").read_text())["status"] == "ok"
     assert "report.html" not in done.stdout
 

@@ -346,10 +346,10 @@ def test_a_refusal_moves_an_earlier_calibration_to_previous(workplace, blind, tm
     assert result["status"] == "refused" and result["version"] == imgcal.__version__
     assert "cam02" in (out / "report.html").read_text()
     assert calibrate(workplace, workplace.capture, out, "--no-report") == 0
-    assert set(contents(out)) == {"rig.yaml", "result.json"}
+    assert set(contents(out)) == {"rig.yaml", "rig.posterior.safetensors", "result.json"}
     assert contents(out / "previous") == earlier
     assert calibrate(workplace, blind, out, "--no-report") == 3
-    assert set(contents(out / "previous")) == {"rig.yaml", "result.json"}
+    assert set(contents(out / "previous")) == {"rig.yaml", "rig.posterior.safetensors", "result.json"}
 
 
 def test_a_folder_of_somebody_elses_named_previous_is_left_alone(workplace, tmp_path, capsys):

@@ -53,7 +53,7 @@ def test_hurried_input(tmp_path: Path, capsys: pytest.CaptureFixture[str], monke
     out = ["--out", str(tmp_path / "o")]
     for arguments, expected in (
         ([str(tmp_path / "m.csv"), *out], "found columns frames; expected capture among them"),
-        ([str(tmp_path / "zero.csv"), *out], "no CSV table"),
+        ([str(tmp_path / "zero.csv"), *out], "zero.csv: found an empty file, expected a CSV table"),
         ([str(tmp_path / "header.csv"), *out], "header.csv: found no rows, expected captures"),
         ([str(tmp_path / "good.csv"), "--out", str(tmp_path / "file" / "o")], "expected a folder to write to"),
         ([str(tmp_path / "good.csv"), *out, "--cores", "0"], "--cores: found 0, expected at least 1"),

@@ -14,6 +14,8 @@ RESULT = {
     "rms_px_before": None,
     "rms_px_after": 0.0512,
     "predicted_error": {**PREDICTED, "worst_camera": "cam03", "worst_camera_px": 0.2},
+    "scale": {"note": "scale rests on the object file alone"},
+    "repeats": {"note": "3 blobs are listed twice"},
     "identity": "unique",
     "snapshots_used": 5,
     "snapshots_rejected": 1,
@@ -40,7 +42,7 @@ def test_results_go_to_standard_output_and_notes_to_standard_error(capsys: pytes
     said = capsys.readouterr()
     assert said.out.splitlines() == [
         "reprojection error without a factory calibration 0.0512 px (RMS)",
-        predicted_line(RESULT["predicted_error"]),
+        predicted_line(RESULT["predicted_error"]) + "; scale rests on the object file alone",
         "identity unique, 5 snapshots used, 1 rejected",
         "rig     out/rig.yaml",
         "object  out/object.csv",
@@ -48,6 +50,7 @@ def test_results_go_to_standard_output_and_notes_to_standard_error(capsys: pytes
         "report  out/report.html",
     ]
     notes = said.err.splitlines()
-    assert all(note.startswith("note: ") for note in notes) and len(notes) == 4
-    assert "guess was no better" in notes[0] and "focal length drifted 2.3 times" in notes[1]
+    assert all(note.startswith("note: ") for note in notes) and len(notes) == 5
+    assert "guess was no better" in notes[0] and notes.pop(1) == "note: 3 blobs are listed twice"
+    assert "focal length drifted 2.3 times" in notes[1]
     assert "fiducial 3 of the object is 1.23 +- 0.1 mm off" in notes[2] and "fiducial 6" in notes[3]

@@ -44,3 +44,10 @@ def test_what_may_be_one_passing_error_is_no_alarm() -> None:
     _, shift = turned.recent.score_without_episode(6, 2, "rotation", 3)
     assert 0.5 < shift < 3.5  # 0.1 degrees are some 2.8 px, less what the poses take
     assert find_alarm(turned.recent, count, [1] * cameras, [4.0] * cameras) is None
+
+
+def test_a_small_change_of_another_camera_may_be_an_error_that_lasts() -> None:
+    turned = followed(46, bumps=[Bump(40, 1, "rotation", TURN), Bump(40, 3, "position", 1.0)])
+    test = turned.recent.test(6)
+    assert changed_cameras(test, {}, [0.5] * 4)[0].keys() == {1, 3}
+    assert changed_cameras(test, {}, [50.0] * 4)[0].keys() == {1}  # the first one has been tested before

@@ -34,7 +34,6 @@ def follow(remain: list[float], count: int = 1200, seed: int = 1) -> NoiseCorrel
 
 def test_white_noise_counts_as_it_is() -> None:
     noise = follow([0.0, 0.0, 0.0])
-    assert noise.measured
     assert noise.time.tolist() == [1.0, 1.0, 1.0]
     seen = observations(3)
     assert noise.weigh(seen) is seen
@@ -50,26 +49,40 @@ def test_errors_that_last_count_by_their_effective_number() -> None:
     weighed = noise.weigh(observations())
     assert torch.allclose(weighed.sigma[0, 0], SIGMA * noise.time[0].sqrt())
     assert 0.7 * SIGMA < float(noise.lasting[0]) < 1.3 * SIGMA
-    assert noise.episodes[0] == math.ceil(2 * float(noise.time[0]))
+    assert noise.episodes[0] == max(math.ceil(2 * float(noise.time[0])), 24)  # 0.4 s at 60 Hz
 
 
-def test_a_large_error_is_no_passing_one() -> None:
+def test_passing_errors_last_for_seconds_whatever_the_rate() -> None:
     noise = follow([0.9, 0.9])
+    noise.time[:] = 1.5
+    for seconds, episode in ((1 / 60, 24), (1 / 30, 12), (0.1, 4), (0.5, 3)):
+        noise.interval = 0.0
+        noise.pass_time(seconds)
+        assert noise.episodes == [episode] * 2
+        noise.pass_time(60.0)  # a pause
+        assert noise.episodes == [episode] * 2
+
+
+def test_a_large_error_passes_in_less_time_than_the_correlation_of_small_ones() -> None:
+    noise = follow([0.98, 0.98], count=MEMORY)
     usual = float(noise.model_error[0])
-    assert noise.episode(0, 3 * usual) == noise.episodes[0] > 3
-    assert noise.episode(0, 30 * usual) == 3
+    assert noise.episode(0, 3 * usual) == noise.episodes[0] > 24
+    assert noise.episode(0, 30 * usual) == 24
 
 
-def test_until_it_is_measured_a_calibrated_rig_expects_what_is_usual() -> None:
+def test_a_calibrated_rig_expects_what_is_usual_until_it_knows_better() -> None:
     noise = NoiseCorrelation(2)
-    noise.expect(0.0)
+    noise.expect_usual()
     assert noise.time.tolist() == [usual_time(FASTEST)] * 2
-    noise.expect(1.0)
+    noise.pass_time(1.0)
+    noise.expect_usual()
     assert noise.time.tolist() == pytest.approx([1.0, 1.0], abs=1e-3)
-    for _ in range(FIRST[0]):
+    noise.interval = FASTEST
+    for number in range(512):
+        noise.expect_usual()
         noise.add(observations(), torch.randn(1, 2, 5, 2, dtype=torch.float64))
-    assert noise.measured
-    noise.expect(0.001)
+        if FIRST[0] <= number < 200:
+            assert float(noise.time.min()) >= usual_time(FASTEST)  # too few to tell
     assert float(noise.time.max()) < 3
 
 

@@ -11,6 +11,7 @@ import torch
 
 import imgcal
 from imgcal.errors import InputError
+from imgcal.monitoring import CHANGES
 from imgcal.online import Event, RigKeeper, RigState
 from imgcal.types import CameraRig, Detections, RigPrior
 from scripts.benchmarks.rig_streams import Bump, Conditions, Slip, Stream
@@ -360,3 +361,29 @@ def test_another_object_is_told_while_a_camera_is_held() -> None:
             made.obj = replace(made.obj, points=points * (1.2 if number >= 60 else 1.0))
             events += keeper.update(made.snapshot(number), number / 60).events
     assert "object_exchanged" in {event.kind for event in events}
+
+
+def test_lenses_that_warm_up_are_no_other_object() -> None:
+    made = stream(1)
+    warming = torch.zeros_like(made.conditions.drift.std(made.rig))
+    warming[:, CHANGES["focal_length"]] = 0.003 / 420 * made.rig.focal_length
+    with RigKeeper(made.factory, made.obj) as keeper:
+        for number in range(480):
+            if number >= 150:
+                made.rig = made.rig.retract(warming)
+            state = keeper.update(made.snapshot(number), number / 60)
+            assert state.events == ()
+    growth = (state.rig.focal_length / made.rig.focal_length - 1).mean()
+    assert abs(float(growth)) < 0.7 * 330 * 0.003 / 420  # some of it has been followed
+
+
+@pytest.mark.parametrize("degrees", [0.2, 0.3])
+def test_a_small_turn_during_a_long_pause_is_decided_within_a_second(degrees: float) -> None:
+    made = stream(3, bumps=[Bump(150, 1, "rotation", math.radians(degrees))])
+    with RigKeeper(made.factory, made.obj) as keeper:
+        for number in range(230):
+            state = keeper.update(made.snapshot(number), number / 60 + 4 * 3600 * (number >= 150))
+            if number == 210:
+                assert state.cameras["cam02"] in ("ok", "relearning")
+    error = state.gauge.difference(state.rig, made.rig)[1, :3].norm()
+    assert math.degrees(float(error)) < 0.5 * degrees

@@ -13,6 +13,7 @@ from imgcal.synthesis.captures import Truth
 from imgcal.types.moved_camera import MovedError
 from imgcal.types.rig import RigPrior
 from scripts.benchmarks import camera_faults as damage
+from scripts.benchmarks import merging_wands
 
 CAMERA = 3
 MAKE = {"room": damage.wand_in_a_room, "ring": damage.object_before_a_ring}
@@ -159,3 +160,10 @@ def test_a_camera_that_is_off_now_and_then_has_not_moved():
     table = damage.blobs(truth, labelled=True)
     table.uv[(table.camera == CAMERA) & (table.fiducial >= 0) & (table.snapshot % 5 == 0)] += (9.0, -7.0)
     assert moves_of(associate(table, rig, obj), rig, obj, PipelineOptions()) == ()
+
+
+@pytest.mark.parametrize("seed", [94, 100, 145])  # named with a size, twice, and without one
+def test_markers_that_merge_are_no_motion(seed):
+    made, _ = merging_wands.capture(seed)
+    assert made.merged > 1
+    assert calibrate(made.detections, made.factory, made.obj).moved == ()

@@ -1,11 +1,15 @@
 """A camera whose blobs nobody can label is refused by name; one that sees much else besides is not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from imgcal.association.options import PipelineOptions
+from imgcal.association.series import associate
 from imgcal.errors import RefusedError
 from imgcal.pipeline import Tally, calibrate
+from imgcal.pipeline.fitting import fit_labelled
 from scripts.benchmarks import camera_faults as damage
 
 CAMERA = 3
@@ -97,10 +101,23 @@ def test_a_covered_camera_with_one_reflection_counts_as_blind():
 
 def test_where_a_frame_was_looked_at_false_blobs_as_usual_are_no_witness():
     def seen(usable, kept, found, crowd):
-        row = {"blobs": usable, "usable": usable, "labelled": kept, "kept": kept, "expected": 8, "crowd": crowd}
+        row = {"blobs": usable, "usable": usable, "labelled": kept, "kept": kept, "placed": 0, "expected": 8}
+        row["crowd"] = crowd
         return Tally(found=np.array([[found]]), **{name: np.full((1, 1), number) for name, number in row.items()})
 
     assert seen(30, 4, True, 0).unexplained == 0  # the pattern was found: what is missing is hidden
     assert seen(30, 4, False, 0).unexplained == 4
     assert seen(24, 0, False, 25).unexplained == 0  # as many false blobs as other frames have
     assert seen(10, 0, False, 3).unexplained == 7  # more than that: the object may be elsewhere
+
+
+def test_blobs_without_a_label_that_are_where_fiducials_should_be_are_no_witness():
+    rig, obj, truth = damage.wand_in_a_room(8)
+    table = damage.blobs(truth, clutter=0.0)
+    labelled = associate(table, rig, obj)
+    taken = (labelled.detections.camera == CAMERA) & (labelled.detections.snapshot < 3)
+    fiducial = np.where(taken, -1, labelled.detections.fiducial)
+    bare = replace(labelled, detections=replace(labelled.detections, fiducial=fiducial))
+    found = fit_labelled(bare, rig, obj).tally
+    assert found.labelled[:3, CAMERA].sum() == 0 and found.placed[:3, CAMERA].sum() > 6
+    assert found.unexplained[:3, CAMERA].sum() == 0

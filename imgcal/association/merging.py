@@ -1,0 +1,83 @@
+"""Blobs that may be several markers in one: a wand seen end-on, two fiducials behind each other.
+
+Such a blob is round and bright like any other, and claims the sigma of one marker. But the labels show it: one
+fiducial has a blob, and another one, whose image should touch it, has none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from imgcal.association.series import Associations, without_snapshots
+from imgcal.geometry import RigidTransform
+from imgcal.types import BlobFlag, CalibrationObject, CameraRig
+
+BLUR = 2.0
+"""Pixels between the edges of two discs, up to which their images may merge: blur, and errors of the prediction."""
+MOST_REACH = 8.0
+"""Pixels between the centres of markers that may merge, where blobs have no radius and no two blobs were closer."""
+
+
+def drop_merged(labelled: Associations, poses: RigidTransform, rig: CameraRig, obj: CalibrationObject) -> Associations:
+    """Take the labels off blobs that may be several fiducials in one, and flag these.
+
+    Args:
+        labelled: S used snapshots.
+        poses: (S,) rig_from_object, roughly.
+        rig: roughly, without batch axes.
+        obj: N fiducials.
+
+    Returns:
+        The same with fewer labels; snapshots that have none left are refused.
+
+    Raises:
+        RefusedError: no snapshot is left.
+    """
+    detections, used = labelled.detections, np.array(labelled.used)
+    points = poses.apply(obj.points.to(rig.focal_length))
+    image = rig.expand(len(points)).project(points, obj.radius)
+    rows = np.flatnonzero((detections.fiducial >= 0) & np.isin(detections.snapshot, used))
+    snapshot, camera = np.searchsorted(used, detections.snapshot[rows]), detections.camera[rows]
+    hidden = image.visible.numpy().copy()
+    hidden[snapshot, camera, detections.fiducial[rows]] = False
+    doubtful = np.flatnonzero(hidden[snapshot, camera].any(-1))
+    where = snapshot[doubtful], camera[doubtful]
+    places, labels = image.uv.numpy()[where], detections.fiducial[rows[doubtful]]  # (M, N, 2), (M,)
+    apart = np.linalg.norm(places - places[np.arange(len(labels)), labels, None], axis=-1)
+    near = hidden[where] & (apart < merging_distance(labelled)[rows[doubtful], None])
+    merged = rows[doubtful[near.any(-1)]]
+    if not len(merged):
+        return labelled
+    fiducial, flags = detections.fiducial.copy(), detections.flags.copy()
+    fiducial[merged], flags[merged] = -1, flags[merged] | np.uint8(BlobFlag.MERGED)
+    left = replace(labelled, detections=replace(detections, fiducial=fiducial, flags=flags))
+    bare = np.flatnonzero(~np.isin(used, detections.snapshot[np.setdiff1d(rows, merged)]))
+    return without_snapshots(left, bare.tolist()) if len(bare) else left
+
+
+def merging_distance(labelled: Associations) -> NDArray[np.float64]:
+    """Distance (px) between two markers below which each blob may be both of them: (M,).
+
+    Markers merge where their discs touch. Where a blob's radius is not known, the capture says how close two labelled
+    blobs of its camera can be.
+    """
+    detections = labelled.detections
+    reach = 2 * detections.radius + BLUR
+    unknown = np.isnan(reach)
+    for camera in np.unique(detections.camera[unknown]):
+        rows = np.flatnonzero((detections.camera == camera) & (detections.fiducial >= 0))
+        reach[unknown & (detections.camera == camera)] = _closest(detections.uv[rows], detections.snapshot[rows])
+    return reach
+
+
+def _closest(uv: NDArray[np.float64], snapshot: NDArray[np.int64]) -> float:
+    """Distance (px) of the two of some blobs (M, 2) that are closest in one snapshot (M,), at most `MOST_REACH`."""
+    if len(uv) < 2:
+        return MOST_REACH
+    apart = 2 * MOST_REACH * (snapshot - snapshot.min())  # snapshots side by side
+    distance, _ = cKDTree(np.column_stack((uv, apart))).query(np.column_stack((uv, apart)), k=2)
+    return min(float(distance[:, 1].min()), MOST_REACH)

@@ -1,0 +1,129 @@
+"""Was it the same object all the time? Each snapshot measures its size by itself, the rig being known.
+
+A calibration from two objects of slightly different size fits neither of them: the rig is a compromise, and the
+residuals look like bent fiducials or a narrow prior. The size that snapshots measure tells: it steps at one moment.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.errors import RefusedError
+from imgcal.estimation import Estimate, correlation_time
+from imgcal.geometry import RigidTransform, rotation_from_vector
+
+Floats = NDArray[np.float64]
+
+SURE = 8.0
+"""Standard deviations by which the size must step, among all moments when it may."""
+LEAST_STEP = 1e-3
+"""Of the size: lenses that are not known exactly make it seem to change by less."""
+LEAST_SNAPSHOTS = 3
+"""Before and after the step."""
+LARGEST_SHARE = 0.5
+"""Of the variance of the sizes, what may be left once they are explained by the step: the rest has other causes."""
+UNKNOWN_SIZE = 0.1
+"""Relative standard deviation from which on a snapshot says nothing about the size: one camera alone."""
+TURN, WAY, GROWTH = 1e-6, 1e-3, 1e-6
+"""Steps of the differences: rad, mm, relative."""
+
+
+@dataclass(frozen=True)
+class SizeStep:
+    """From one moment on, the object is larger or smaller."""
+
+    first: int  # snapshot, of those with a pose
+    change: float  # relative
+    sigma: float  # one standard deviation of it
+
+
+def measure_sizes(fit: Estimate) -> tuple[Floats, Floats]:
+    """Measure the object's size in each snapshot, all cameras being where the estimate has them.
+
+    Args:
+        fit: the estimate of one rig from S snapshots.
+
+    Returns:
+        (S,) relative to that of the estimate's object, and (S,) the standard deviation that noise gives it.
+    """
+    seen = fit.problem.root_weight[0] > 0
+    weight = torch.where(seen, fit.problem.root_weight[0].square(), 0.0)
+    slope = _differences(fit)
+    slope = torch.where(seen[..., None, None], slope, 0.0)  # (S, C, N, 2, 7)
+    information = torch.einsum("scnai,scn,scnaj->sij", slope, weight, slope)
+    pull = -torch.einsum("scnai,scn,scna->si", slope, weight, fit.residual)
+    scale = information.diagonal(dim1=1, dim2=2).clamp_min(1e-30).rsqrt()
+    whitened = information * scale[:, :, None] * scale[:, None]
+    inverse = torch.linalg.pinv(whitened, hermitian=True, rtol=1e-12)
+    size = scale[:, -1] * (inverse @ (scale * pull)[..., None])[:, -1, 0]
+    sigma = scale[:, -1] * inverse[:, -1, -1].clamp_min(0).sqrt()
+    return size.numpy(), sigma.numpy()
+
+
+def find_step(size: Floats, sigma: Floats) -> SizeStep | None:
+    """Find the moment from which on sizes (S,) of standard deviations (S,) differ; None = it is one size."""
+    known = np.flatnonzero((sigma > 0) & (sigma < UNKNOWN_SIZE))
+    if len(known) < 2 * LEAST_SNAPSHOTS:
+        return None
+    x, weight = size[known], sigma[known] ** -2.0
+    before, moment = np.cumsum(weight)[:-1], np.cumsum(weight * x)[:-1]
+    after, later = weight.sum() - before, (weight * x).sum() - moment
+    change = later / after - moment / before
+    gain = change**2 * before * after / weight.sum()
+    inner = slice(LEAST_SNAPSHOTS - 1, len(gain) - LEAST_SNAPSHOTS + 1)
+    at = inner.start + int(gain[inner].argmax())
+    level = np.where(np.arange(len(x)) <= at, moment[at] / before[at], later[at] / after[at])
+    left = (x - level) * np.sqrt(weight)
+    spread = max(1.0, 1.4826 * float(np.median(np.abs(left))))
+    lasting = float(correlation_time(left[:, None])[0])
+    noise = spread * math.sqrt(lasting * (1 / before[at] + 1 / after[at]))
+    step = float(change[at])
+    about = (x - (weight * x).sum() / weight.sum()) * np.sqrt(weight)
+    explained = np.median(np.abs(left)) <= math.sqrt(LARGEST_SHARE) * np.median(np.abs(about))
+    if abs(step) < max(LEAST_STEP, SURE * noise) or not explained:
+        return None
+    return SizeStep(int(known[at + 1]), step, noise)
+
+
+def require_one_size(fit: Estimate, names: tuple[str, ...]) -> None:
+    """Refuse an object that was exchanged for a larger or smaller one.
+
+    Args:
+        fit: the estimate.
+        names: of its snapshots.
+
+    Raises:
+        RefusedError: there is a moment from which on the object has another size.
+    """
+    step = find_step(*measure_sizes(fit))
+    if step is not None:
+        how = "larger" if step.change > 0 else "smaller"
+        raise RefusedError(
+            f"object: from snapshot {names[step.first]} on it is {100 * abs(step.change):.2g} +- "
+            f"{100 * step.sigma:.1g} % {how} than before: another object, or other lenses",
+            python="calibrate the snapshots before and after by themselves",
+            command="calibrate the snapshots before and after by themselves",
+        )
+
+
+def _differences(fit: Estimate) -> Tensor:
+    """Derivatives (S, C, N, 2, 7) of the images by turn (rad), way (mm) and relative growth of the object."""
+    points = fit.points_object - fit.points_object.mean(0)
+    rotation = fit.rig_from_object.rotation
+    poses = RigidTransform(rotation, fit.rig_from_object.apply(fit.points_object.mean(0, keepdim=True))[:, 0])
+    rigs = fit.rig.expand(len(rotation))
+    steps = torch.diag(torch.tensor([TURN] * 3 + [WAY] * 3 + [GROWTH], dtype=points.dtype))
+
+    def image(step: Tensor) -> Tensor:
+        turned = rotation @ rotation_from_vector(step[:3])
+        return rigs.project_values(
+            RigidTransform(turned, poses.translation + step[3:6]).apply((1 + step[6]) * points)
+        ).uv
+
+    return torch.stack([(image(step) - image(-step)) / (2 * float(step.sum())) for step in steps], -1)

@@ -1,0 +1,91 @@
+"""Images and blobs that are exact copies of earlier ones: a stalled grabber, rows written twice. They count once.
+
+Noise differs from image to image, so that a copy brings no evidence of its own; counted as independent, it makes the
+result look surer than it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from imgcal.association import Associations
+from imgcal.types import Detections
+
+LEAST_BLOBS = 2
+"""Of an image that can be a copy: a single blob may well be at the same place again, a reflection for example."""
+
+
+@dataclass(frozen=True)
+class Repeats:
+    """Copies that were left out."""
+
+    rows: int = 0  # blobs that stand twice in one image
+    images: int = 0  # images of one camera, with the same blobs as an earlier one
+    snapshots: tuple[tuple[str, str], ...] = ()  # all images of which are copies: their names, and those of the first
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """The form that scripts read."""
+        return {"rows": self.rows, "images": self.images, "snapshots": dict(self.snapshots), "note": str(self)}
+
+    def __str__(self) -> str:
+        """One line for people; empty where there are none."""
+        parts = []
+        if self.images:
+            whole = f", {len(self.snapshots)} whole snapshots among them" if self.snapshots else ""
+            parts.append(f"{self.images} images have exactly the blobs of an earlier image of their camera{whole}")
+        if self.rows:
+            parts.append(f"{self.rows} blobs are listed twice")
+        return f"{' and '.join(parts)}: these copies are left out" if parts else ""
+
+
+def without_repeats(detections: Detections) -> tuple[Detections, Repeats]:
+    """Leave out blobs that are bit-identical copies of others.
+
+    Args:
+        detections: all blobs, snapshots in the order of time.
+
+    Returns:
+        The others, with the names of all snapshots, and what was left out.
+    """
+    u, v = detections.uv.T
+    order = np.lexsort((detections.fiducial, v, u, detections.camera, detections.snapshot))
+    columns = np.stack([detections.snapshot, detections.camera, u, v, detections.fiducial])[:, order]
+    kept = np.ones(len(detections), dtype=np.bool_)
+    kept[order[1:]] = (np.diff(columns, axis=1) != 0).any(0)
+    rows = int((~kept).sum())
+    order = order[kept[order]]
+    image = np.stack([detections.snapshot[order], detections.camera[order]])
+    begins = np.flatnonzero(np.r_[True, (np.diff(image, axis=1) != 0).any(0)]) if len(order) else np.empty(0, int)
+    first: dict[tuple[int, bytes], int] = {}
+    images, originals, own = 0, dict[int, set[int]](), set[int]()
+    for part in np.split(order, begins[1:]) if len(order) else ():
+        snapshot, camera = int(detections.snapshot[part[0]]), int(detections.camera[part[0]])
+        earlier = snapshot
+        if len(part) >= LEAST_BLOBS:
+            earlier = first.setdefault((camera, detections.uv[part].tobytes()), snapshot)
+        if earlier == snapshot:
+            own.add(snapshot)
+            continue
+        kept[part] = False
+        images += 1
+        originals.setdefault(snapshot, set()).add(earlier)
+    names = detections.snapshot_names
+    whole = tuple((names[s], names[min(of)]) for s, of in sorted(originals.items()) if s not in own)
+    repeats = Repeats(rows, images, whole)
+    return (detections if kept.all() else detections.select(kept)), repeats
+
+
+def name_repeats(labelled: Associations, repeats: Repeats) -> Associations:
+    """Give copies of whole snapshots as the reason why these were refused."""
+    first = dict(repeats.snapshots)
+    snapshots = tuple(
+        replace(snapshot, reason=f"a copy of snapshot {first[snapshot.name]}")
+        if snapshot.name in first and snapshot.status == "refused"
+        else snapshot
+        for snapshot in labelled.snapshots
+    )
+    return replace(labelled, snapshots=snapshots)

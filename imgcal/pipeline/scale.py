@@ -1,0 +1,81 @@
+"""What the size of a recalibrated rig rests on, and what an error of the object's file would do to it.
+
+Images alone know no lengths: the scale is that of the object's file, unless the file grants it a tolerance and the
+cameras' factory positions know it better. Residuals cannot show an error of it, so that no predicted error has it in.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from imgcal.estimation import Estimate, WorkingVolume, predicted_error, scale_response
+from imgcal.types import CalibrationObject
+
+NOTICED = 4.0
+"""Standard deviations of the cameras' factory positions from which an error of the object's scale is refused."""
+MOST_NOTICED = 0.5
+"""Relative error of the scale above which nothing is said about when it would be noticed."""
+PERCENT = 0.01
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Where the scale comes from, and how far it can be trusted."""
+
+    source: Literal["object", "cameras"]
+    sigma: float  # relative, one standard deviation, given what is granted to the object's file
+    noticed_from: float | None  # relative error of the object's scale that would be noticed; None = none would
+    px_per_percent: float | None  # median error that 1 % of the object adds over the working volume; None = unknown
+    mm_per_percent: float | None
+
+    def __str__(self) -> str:
+        """One sentence for people; empty where the scale comes from the cameras, whose error is in the prediction."""
+        if self.source == "cameras" or not self.px_per_percent:
+            return ""
+        added = [f"{self.px_per_percent:.2g} px"]
+        if self.mm_per_percent:
+            added.insert(0, f"{self.mm_per_percent:.2g} mm")
+        words = f"scale rests on the object file alone: 1 % object error adds {', '.join(added)} to this"
+        if self.noticed_from is None:
+            return f"{words}, and no such error can be noticed"
+        return f"{words}, and is noticed from {100 * self.noticed_from:.2g} % on"
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """The form that scripts read."""
+        return {
+            "from": self.source,
+            "sigma_percent": 100 * self.sigma,
+            "noticed_from_percent": None if self.noticed_from is None else 100 * self.noticed_from,
+            "px_per_percent": self.px_per_percent,
+            "mm_per_percent": self.mm_per_percent,
+            "note": str(self),
+        }
+
+
+def scale_of(estimate: Estimate, obj: CalibrationObject, scale_sigma: float | None, volume: WorkingVolume) -> Scale:
+    """Say where the scale of an estimate comes from.
+
+    Args:
+        estimate: without batch axes.
+        obj: the object as its file has it.
+        scale_sigma: relative, how well the cameras' factory positions know the object's scale; None = not at all.
+        volume: where the rig is used.
+    """
+    granted, known = obj.scale_tolerance, scale_sigma or math.inf
+    response = scale_response(estimate) * PERCENT
+    effect = predicted_error(estimate, volume=volume, covariance=response[:, None] * response)
+    noticed = NOTICED * math.hypot(known, granted)
+    return Scale(
+        source="cameras" if known < granted else "object",
+        sigma=granted if math.isinf(known) else granted * known / (math.hypot(granted, known) or 1.0),
+        noticed_from=noticed if noticed < MOST_NOTICED else None,
+        px_per_percent=_finite(effect.median_px),
+        mm_per_percent=_finite(effect.median_mm),
+    )
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,167 @@
+"""Are the sigmas of a calibration honest on real noise? Disjoint blocks of one real stream, calibrated independently.
+
+Run as `python -m scripts.benchmarks.real_blocks`; needs IMGCAL_CAPTURES. Nothing moved in the recording, so that all
+blocks have one true rig: their differences should be as large as their covariances say.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from torch import Tensor
+
+from imgcal import InputError, PipelineOptions, RefusedError, calibrate, load_object, load_rig
+from imgcal.association import associate
+from imgcal.estimation import camera_covariance, rigid_motion
+from imgcal.io import load_detections
+from imgcal.pipeline import Calibration, fit_labelled
+from imgcal.types import CalibrationObject, CameraRig, Detections, MovedError
+from scripts.output import ROOT, command, surroundings, write_json
+
+CAPTURE = "wand-ten-cameras-stream"
+KINDS = {
+    "rotation": slice(0, 3),
+    "position": slice(3, 6),
+    "focal_length": slice(6, 8),
+    "principal_point": slice(8, 10),
+    "distortion": slice(10, None),
+}
+GATE = 1.6
+"""Most chi2 per degree of freedom of focal lengths and positions."""
+ROUNDS = 20
+"""Of weighing cameras by how well they fit, when the motion of the whole rig is taken out."""
+RESULT = ROOT / "docs" / "benchmarks" / "real_blocks.json"
+
+
+@dataclass(frozen=True)
+class Block:
+    """One calibration."""
+
+    calibration: Calibration
+    said_to_move: str | None  # refused at first, because this camera is said to have moved
+
+    def covariance(self, inflated: bool) -> Tensor:
+        """Covariance of all parameters (K C, K C), with or without what the scatter of the snapshots adds."""
+        found = self.calibration.estimate
+        return camera_covariance(found if inflated else replace(found, inflation=1.0), curved=False)
+
+
+def calibrated(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> Block:
+    """Calibrate unlabelled blobs; where a move is claimed, which is wrong here, without asking for moves."""
+    try:
+        return Block(calibrate(detections, rig, obj), None)
+    except MovedError as error:
+        labelled = associate(detections, rig.to(torch.float64), obj, PipelineOptions())
+        return Block(fit_labelled(labelled, rig, obj), error.moved[0].camera)
+
+
+def frames(detections: Detections, first: int, last: int) -> Detections:
+    """Keep the frames of these numbers, `last` excluded; snapshots are named after their frames."""
+    rows = [row for row, name in enumerate(detections.snapshot_names) if first <= int(name) < last]
+    return detections.of_snapshots(rows[0], rows[-1] + 1)
+
+
+def chi2_by_kind(rigs: Sequence[CameraRig], covariances: Sequence[Tensor]) -> dict[str, float]:
+    """Scatter of rigs about their weighted mean over their variances, per degree of freedom, by kind of parameter.
+
+    The motion of the whole rig between them is taken out first, by a fit in which cameras that differ count less; the
+    same projection is applied to the covariances.
+    """
+    cameras, width = rigs[0].num_cameras, rigs[0].num_parameters
+    values = torch.stack([rig.local(rigs[0]).flatten() for rig in rigs])  # (B, K C)
+    values = values - values.mean(0)
+    motion = rigid_motion(rigs[0], rigs[0].positions.mean(0))
+    column = torch.arange(cameras * width) % width
+    variance = torch.stack([covariance.diagonal() for covariance in covariances]).mean(0)
+    unit = torch.zeros_like(variance)
+    for part in (column < 3, (column >= 3) & (column < 6)):
+        unit[part] = 1 / variance[part].median()
+    weight = unit
+    for _ in range(ROUNDS):
+        fit = torch.linalg.solve(motion.mT @ (weight[:, None] * motion), motion.mT * weight)
+        left = values - values @ fit.mT @ motion.mT
+        square = (left.square() * unit).unflatten(1, (cameras, width)).sum(2).mean(0)
+        weight = unit * (1 / (1 + square / square.median())).repeat_interleave(width)
+    project = torch.eye(len(unit), dtype=unit.dtype) - motion @ fit
+    own = torch.stack([(project @ covariance @ project.mT).diagonal() for covariance in covariances])
+    mean = (left / own).sum(0) / (1 / own).sum(0)
+    chi2 = ((left - mean).square() / own).sum(0).unflatten(0, (cameras, width)) / (len(rigs) - 1)
+    return {kind: float(chi2[:, part].mean()) for kind, part in KINDS.items()}
+
+
+def measure(blocks: Sequence[Block]) -> dict[str, Any]:
+    """Compare calibrations of one rig with each other."""
+    rigs = [block.calibration.rig for block in blocks]
+    published = chi2_by_kind(rigs, [block.covariance(True) for block in blocks])
+    return {
+        "chi2_per_dof": {
+            "covariance as published": published,
+            "residuals taken for independent": chi2_by_kind(rigs, [block.covariance(False) for block in blocks]),
+        },
+        "gate": GATE,
+        "passed": max(published["focal_length"], published["position"]) <= GATE,
+        "blocks": [
+            {
+                "snapshots": len(block.calibration.labelled.used),
+                "rms_px": 2**0.5 * float(block.calibration.rms),
+                "inflation": block.calibration.estimate.inflation,
+                "block_length": block.calibration.block_length,
+                "said_to_move": block.said_to_move,
+            }
+            for block in blocks
+        ],
+    }
+
+
+@dataclass(frozen=True)
+class Options:
+    """Calibrate blocks of a real stream independently, and compare them."""
+
+    first: int = 0  #: frame
+    blocks: int = 6
+    length: int = 400  #: frames of a block
+    out: Path = RESULT
+
+
+def main() -> None:
+    """Measure, write, print.
+
+    Raises:
+        InputError: no captures.
+    """
+    options, began, before = tyro.cli(Options, description=__doc__), time.monotonic(), surroundings()
+    folder = os.environ.get("IMGCAL_CAPTURES")
+    if not folder:
+        raise InputError("IMGCAL_CAPTURES: found nothing, expected the folder of the captures")
+    capture = Path(folder) / CAPTURE
+    rig, obj = load_rig(capture / "factory.yaml"), load_object(capture / "object.csv")
+    detections = load_detections(capture / "detections.csv.gz", rig)
+    blocks: list[Block] = []
+    refused: dict[int, str] = {}  # first frame: why
+    for first in range(options.first, options.first + options.blocks * options.length, options.length):
+        try:
+            blocks.append(calibrated(frames(detections, first, first + options.length), rig, obj))
+        except RefusedError as error:
+            refused[first] = str(error)
+            print(f"frames {first}-{first + options.length - 1}: refused: {error}")
+            continue
+        found = blocks[-1].calibration
+        print(f"frames {first}-{first + options.length - 1}: {found}, sigmas times {found.estimate.inflation:.2f}")
+    result = measure(blocks)
+    stretch = {"capture": CAPTURE, "first_frame": options.first, "frames_per_block": options.length}
+    before |= {"seconds": round(time.monotonic() - began)}
+    write_json(options.out, before | stretch | {"refused": refused} | result)
+    for name, kinds in result["chi2_per_dof"].items():
+        print(f"chi2/dof between blocks, {name}: " + ", ".join(f"{kind} {value:.2f}" for kind, value in kinds.items()))
+    print(f"gate {GATE}: {'passed' if result['passed'] else 'failed'}")
+
+
+if __name__ == "__main__":
+    command(main)
