@@ -10,6 +10,7 @@ EXTRAS = {
     "watch": ("prometheus_client", "zmq", "rosbags"),
     "report": ("jinja2", "matplotlib"),
     "live": ("uvicorn",),
+    "onnx": ("onnx", "onnxruntime"),
 }
 """Libraries of each extra, by the names that they are imported by; `pyproject.toml` has the versions."""
 

@@ -9,7 +9,7 @@ _is_transformed: Callable[[], bool] = getattr(torch._C, "_are_functorch_transfor
 
 
 def is_traced() -> bool:
-    """Tell whether `torch.compile`, `torch.export` or a transform of `torch.func` follows: tensors hold no values then,
-    or not the whole of them, and compiled loops cannot read them.
+    """Tell whether `torch.compile`, `torch.export`, `torch.jit.trace` or a transform of `torch.func` follows: tensors
+    hold no values then, or not the whole of them, and compiled loops cannot read them.
     """
-    return torch.compiler.is_compiling() or _is_transformed()
+    return torch.compiler.is_compiling() or torch.jit.is_tracing() or _is_transformed()

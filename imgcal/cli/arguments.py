@@ -290,6 +290,22 @@ class Convert:
 
 
 @dataclass(frozen=True)
+class Export:
+    """Write a trained network for another runtime: ONNX, or a program of torch.export.
+
+    MODEL is a point network, a query network for infrared frames, or a measurer. What is written is run, ONNX by
+    onnxruntime, and compared with PyTorch. docs/runtimes.md has inputs and outputs.
+    Example: imgcal export measurer-cnn --to onnx --out measurer.onnx
+    """
+
+    model: Annotated[str, tyro.conf.Positional]  #: file, folder of a training run, or the name of a shipped network
+    out: Path  #: file to write
+    to: Literal["onnx", "pt2"] = "onnx"  #: ONNX, or a program of torch.export
+    count: int = 1  #: patches, crops or snapshots at a time; fixed in ONNX, a program of torch.export takes any number
+    fiducials: int = 8  #: of the object, for a query network: it serves objects with as many or fewer
+
+
+@dataclass(frozen=True)
 class Describe:
     """List every key of an experiment file: type, default and meaning.
 

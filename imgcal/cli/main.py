@@ -59,6 +59,10 @@ COMMANDS = {
         "imgcal.cli.convert",
         "Convert the calibration of a rig: another tool's to ours, ours to another tool's, or one tool's to another's.",
     ),
+    "export": (
+        "imgcal.cli.export",
+        "Write a trained network for another runtime: ONNX, or a program of torch.export.",
+    ),
     "describe": ("imgcal.cli.experiment_keys", "List every key of an experiment file: type, default and meaning."),
     "train": ("imgcal.cli.train", "Train a network as an experiment file says."),
     "evaluate": (

@@ -19,6 +19,7 @@ from .config import (
     without_pretrained,
 )
 from .expectation import Expectation, cut_crops, cut_patches
+from .export import OPSET, TOLERANCE, Program, load_program, save_exported, save_onnx
 from .factory import build, build_network
 from .images import HueCentroidNetwork, ImageNetwork, Sightings
 from .infrared import Evidence, InfraredConfig, InfraredNetwork, Queries, normalized
@@ -35,7 +36,9 @@ from .subject import check_object, check_rig, check_says_rigs
 from .tiles import Tiles
 
 __all__ = [
+    "OPSET",
     "PRESETS",
+    "TOLERANCE",
     "Checkpoint",
     "Claims",
     "Evidence",
@@ -64,6 +67,7 @@ __all__ = [
     "PooledImageNetwork",
     "PooledImages",
     "PositionNetwork",
+    "Program",
     "Queries",
     "Sightings",
     "Tiles",
@@ -81,9 +85,12 @@ __all__ = [
     "load_infrared",
     "load_measurer",
     "load_network",
+    "load_program",
     "normalized",
     "read_subject",
     "save_checkpoint",
+    "save_exported",
+    "save_onnx",
     "warm_start",
     "without_pretrained",
 ]

@@ -105,7 +105,7 @@ class InfraredNetwork(nn.Module):
         geometry = queries.geometry(self.config.crop).to(windows.dtype)
         for block in self.blocks:
             windows = block(windows, geometry, queries.asked)
-        said = self.head(windows.flatten(0, 1)).float().unflatten(0, windows.shape[:2])
+        said = self.head(windows.flatten(0, 1)).float().unflatten(0, (-1, windows.shape[1]))
         logits = said[:, :, 0]
         weights = logits.flatten(2).softmax(-1).to(windows.dtype)
         attended = torch.einsum("pnk,pndk->pnd", weights, windows.flatten(3))
@@ -149,7 +149,7 @@ class SetBlock(nn.Module):
         seen = functional.gelu(seen + self.geometry(geometry)[..., None, None])
         weight = asked.to(seen.dtype) / asked.sum(1, keepdim=True).clamp(min=1)
         rows = seen.flatten(2)
-        mean = (weight[:, None] @ rows).view(len(rows), *seen.shape[2:])
+        mean = (weight[:, None] @ rows).view(-1, *seen.shape[2:])
         # Turned or stretched constellations: what fiducials see in proportion to where they lie, and back.
         keys, queries = self.key(geometry) * weight[..., None], self.query(geometry)
         related = ((queries @ keys.mT) @ rows).view_as(seen)

@@ -51,7 +51,7 @@ class UpdateBlock(nn.Module):
         tokens = self.embed(inputs) + self.camera_identity
         if self.embed_features is not None and features is not None:
             tokens = tokens + self.embed_features(features)
-        tokens = torch.cat((tokens, self.rig_token.expand(len(tokens), 1, -1)), dim=1)
+        tokens = torch.cat((tokens, self.rig_token.expand(tokens.shape[0], 1, -1)), dim=1)
         encoded = self.encoder(tokens)
         with torch.autocast(inputs.device.type, enabled=False):
             encoded = encoded.to(inputs.dtype)

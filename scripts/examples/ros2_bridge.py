@@ -12,6 +12,7 @@ metres, covariance in ROS's order (position, then rotation), in the frame `rig`.
 
 import json
 import sys
+from typing import Any
 
 import numpy as np
 import zmq
@@ -19,7 +20,7 @@ import zmq
 KINDS = {"mono8": "uint8", "8UC1": "uint8", "mono16": "uint16", "16UC1": "uint16"}
 
 
-def frame_parts(camera, message):
+def frame_parts(camera: str, message: Any) -> list[bytes]:
     """The two parts of a message to imgcal: a header, and pixels without gaps, low byte first."""
     kind = np.dtype(KINDS[message.encoding])
     rows = np.frombuffer(message.data, np.uint8).reshape(message.height, message.step)[
@@ -31,7 +32,7 @@ def frame_parts(camera, message):
     return [json.dumps(header).encode(), pixels.astype(kind.newbyteorder("<")).tobytes()]
 
 
-def pose_values(line):
+def pose_values(line: str | bytes) -> tuple[Any, Any, Any, float] | None:
     """Position (m), quaternion (x, y, z, w) and covariance (36,) of a line that imgcal publishes; None = no pose."""
     from scipy.spatial.transform import Rotation
 
@@ -44,7 +45,7 @@ def pose_values(line):
     return 1e-3 * matrix[:3, 3], Rotation.from_matrix(matrix[:3, :3]).as_quat(), covariance.flatten(), entry["time"]
 
 
-def main():
+def main() -> None:
     import rclpy
     from geometry_msgs.msg import PoseWithCovarianceStamped
     from rclpy.qos import qos_profile_sensor_data
@@ -58,7 +59,7 @@ def main():
     frames.bind(sys.argv[1])
     for camera, topic in topics.items():
 
-        def send(message, camera=camera):
+        def send(message: Any, camera: str = camera) -> None:
             frames.send_multipart(frame_parts(camera, message))
 
         node.create_subscription(Image, topic, send, qos_profile_sensor_data)
@@ -67,7 +68,7 @@ def main():
         found.setsockopt(zmq.SUBSCRIBE, b"")
         found.connect(poses)
 
-        def publish():
+        def publish() -> None:
             while found.poll(0):
                 values = pose_values(found.recv())
                 if values is None:
