@@ -274,7 +274,9 @@ class Convert:
     source_format: Annotated[str | None, tyro.conf.arg(name="from")] = None
     """format of SOURCE by name, where its content is not to decide"""
     to: str | None = None
-    """format to write by name (default: imgcal, where --out ends in .yaml)"""
+    """format to write by name (default: imgcal, where --out ends in .yaml); with --into, the format of that"""
+    into: tuple[Path, ...] = ()
+    """another tool's file, folder or files with the same cameras: OUT is a copy with their numbers replaced"""
     unit: str | None = None
     """unit of SOURCE, where its format does not say: mm, cm, m, inch, or the length of one unit, such as 417.2mm"""
     distance: tuple[str, str, float] | None = None
@@ -284,7 +286,7 @@ class Convert:
     cameras: tuple[str, ...] = ()
     """names of the cameras to keep, in the order to write them (default: all)"""
     out_unit: str | None = None
-    """unit to write, where the format leaves that to its user"""
+    """unit to write, where the format leaves that to its user; with --into, of the lengths in that"""
     fit_limit: float = LIMIT
     """px that a lens may be off, anywhere in its image, where another model takes its place by a fit"""
 

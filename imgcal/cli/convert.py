@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from datetime import datetime
 from pathlib import Path
 
 from imgcal.cli import arguments
@@ -10,8 +12,8 @@ from imgcal.errors import InputError
 from imgcal.formats import (
     FORMATS,
     OURS,
+    Files,
     ForeignRig,
-    Written,
     converted,
     format_named,
     from_camera_rig,
@@ -20,6 +22,7 @@ from imgcal.formats import (
     read_foreign_rig,
     selected,
     with_image_sizes,
+    written_back,
 )
 from imgcal.io import load_rig, load_rig_covariance, publishing, write_bytes
 from imgcal.messages import listed, shortened
@@ -30,6 +33,9 @@ class Convert(arguments.Convert):
 
     def run(self) -> None:
         """Read, convert, verify, write."""
+        if self.into:
+            self._write_back()
+            return
         to = self._target()
         rig, title = self._read()
         print(f"{title}: {len(rig.cameras)} camera{'s' if len(rig.cameras) > 1 else ''}; frame: {rig.frame}")
@@ -38,12 +44,39 @@ class Convert(arguments.Convert):
         made = converted(rig, to, self.out.stem, self.fit_limit, self.out_unit)
         for note in made.notes:
             print(f"note: {note}")
-        self._write(made)
+        written = self._write(made.files)
         models = f"{made.between_models:.2g} px" if made.between_models > 1e-6 else "the same"
         print(
             f"verified on {made.points} known points: read back worst {made.round_trip:.1e} px, lens models {models}\n"
-            f"{to}: {listed(map(str, self._written(made)))}"
+            f"{to}: {listed(map(str, written))}"
         )
+
+    def _write_back(self) -> None:
+        """Replace the numbers in a copy of the user's own file."""
+        self._check_limit()
+        if self.to == OURS:
+            raise InputError("--to: found imgcal, expected the format of what --into names")
+        rig, _ = self._read()
+        made = written_back(rig, self.into, datetime.now(), name=self.to, unit=self.out_unit, limit=self.fit_limit)
+        for note in made.notes:
+            print(f"note: {note}")
+        alone = len(made.files) == 1 and not (len(self.into) == 1 and self.into[0].is_dir())
+        files = {"": next(iter(made.files.values()))} if alone else made.files
+        written = self._write(files)
+        print(
+            f"{made.title}: {_counted(made.changed)} replaced" + (f", {_counted(made.kept)} kept" if made.kept else "")
+        )
+        if made.loss is not None:
+            print(
+                f"lens models: worst {made.loss.worst:.2g} px, RMS {made.loss.rms:.2g} px (limit {self.fit_limit:g} px)"
+            )
+        print(
+            f"wrote {written[0] if len(written) == 1 else listed(map(str, written))}; re-read: worst difference {made.reread:.1e} px on {made.points} points"
+        )
+
+    def _check_limit(self) -> None:
+        if not 0 < self.fit_limit < float("inf"):
+            raise InputError(f"--fit-limit: found {self.fit_limit}, expected pixels > 0")
 
     def _target(self) -> str:
         to = self.to if self.to is not None else OURS if self.out.suffix in (".yaml", ".yml") else None
@@ -52,8 +85,7 @@ class Convert(arguments.Convert):
             raise InputError(f"--to: not given, and {self.out.name} does not say it; expected one of imgcal, {able}")
         if to != OURS:
             format_named(to)
-        if not 0 < self.fit_limit < float("inf"):
-            raise InputError(f"--fit-limit: found {self.fit_limit}, expected pixels > 0")
+        self._check_limit()
         return to
 
     def _read(self) -> tuple[ForeignRig, str]:
@@ -78,24 +110,30 @@ class Convert(arguments.Convert):
             rig, sizes = selected(rig, self.cameras), {name: sizes[name] for name in sizes if name not in left_out}
         return with_image_sizes(rig, where, sizes), title
 
-    def _written(self, made: Written) -> list[Path]:
-        return [self.out / name if name else self.out for name in made.files]
+    def _written(self, files: Files) -> list[Path]:
+        return [self.out / name if name else self.out for name in files]
 
-    def _write(self, made: Written) -> None:
-        """In one step; the source must survive."""
-        for path in self._written(made):
-            for source in self.source:
+    def _write(self, files: Files) -> list[Path]:
+        """In one step; the sources must survive."""
+        written = self._written(files)
+        for path in written:
+            for what, source in [*(("SOURCE", one) for one in self.source), *(("--into", one) for one in self.into)]:
                 if path.exists() and source.exists() and (path.samefile(source) or path.parent.samefile(source)):
-                    raise InputError(f"--out: {path} is what SOURCE holds, expected another place")
-        if "" in made.files:
-            write_bytes(self.out, made.files[""])
-            return
+                    raise InputError(f"--out: {path} is what {what} holds, expected another place")
+        if "" in files:
+            write_bytes(self.out, files[""])
+            return written
         if self.out.exists() and not self.out.is_dir():
             raise InputError(f"--out: found the file {self.out}, expected a folder: this format has several files")
-        names = list(made.files)
+        names = list(files)
         with publishing(self.out, names, mark=names[0]) as folder:
-            for name, content in made.files.items():
+            for name, content in files.items():
                 write_bytes(folder / name, content)
+        return written
+
+
+def _counted(names: Sequence[str]) -> str:
+    return f"{len(names)} camera{'s' if len(names) != 1 else ''}"
 
 
 def _size(text: str) -> tuple[str, tuple[int, int]]:

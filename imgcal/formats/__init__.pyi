@@ -2,13 +2,14 @@ from .conversion import Held, describe_lens, from_camera_rig, held_by, to_camera
 from .documents import Element, parse_xml
 from .fitting import Fit, Holds
 from .foreign_rig import ForeignCamera, ForeignRig
-from .format import Format
+from .format import Files, Format
 from .lens import Lens
 from .limits import LIMIT
 from .loading import load_cameras, load_rig
 from .registry import FORMATS, format_named, is_foreign, read_foreign_rig
 from .units import in_millimetres, millimetres
 from .verification import known_points, worst_difference
+from .write_back import Updated, written_back
 from .writing import OURS, Written, converted, selected
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "LIMIT",
     "OURS",
     "Element",
+    "Files",
     "Fit",
     "ForeignCamera",
     "ForeignRig",
@@ -23,6 +25,7 @@ __all__ = [
     "Held",
     "Holds",
     "Lens",
+    "Updated",
     "Written",
     "converted",
     "describe_lens",
@@ -41,4 +44,5 @@ __all__ = [
     "to_camera_rig",
     "with_image_sizes",
     "worst_difference",
+    "written_back",
 ]

@@ -36,6 +36,7 @@ class Element:
     attributes: dict[str, str]
     children: list[Element] = field(default_factory=list)
     text: str = ""
+    number: int = 0  # in the order of the document, from 1
 
     def find(self, tag: str) -> Element | None:
         """The first child of a name."""
@@ -144,7 +145,7 @@ class _Builder:
         self.count += 1
         if self.count > MOST_ELEMENTS or len(self.open) >= MOST_DEPTH:
             raise InputError(f"{self.where}: found more XML elements, or deeper ones, than any calibration has")
-        element = Element(tag, attributes)
+        element = Element(tag, attributes, number=self.count)
         if self.open:
             self.open[-1][0].children.append(element)
         else:
@@ -164,20 +165,32 @@ class _Builder:
 
 
 def _decoded(content: bytes, path: Path) -> str:
+    return decode(content, path)[0]
+
+
+def decode(content: bytes, path: Path) -> tuple[str, str, bytes]:
+    """Decode the text of a file, line ends as they are.
+
+    Returns:
+        The text, its encoding, and the byte order mark before it: mark + text.encode(encoding) is the content.
+
+    Raises:
+        InputError: it is no text, or not in the encoding that its first bytes say.
+    """
     if content.startswith((b"\xff\xfe", b"\xfe\xff")):
-        encoding = "utf-16"
+        encoding, mark = "utf-16-le" if content[0] == 0xFF else "utf-16-be", content[:2]
     elif content[:4] == b"<\0?\0" or content[:4] == b"\0<\0?":
-        encoding = "utf-16-le" if content[0] else "utf-16-be"
+        encoding, mark = "utf-16-le" if content[0] else "utf-16-be", b""
     else:
-        encoding = "utf-8-sig"
+        encoding, mark = "utf-8", content[:3] if content.startswith(b"\xef\xbb\xbf") else b""
         if b"\0" in content[:4096]:
             raise InputError(f"{path}: found binary data, expected the text of a calibration")
     try:
-        return content.decode(encoding)
+        return content[len(mark) :].decode(encoding), encoding, mark
     except UnicodeDecodeError:
-        if encoding != "utf-8-sig":
-            raise InputError(f"{path}: found text that is not {encoding}, as its first bytes say") from None
-        return content.decode("latin-1")  # comments of old tools; numbers and names are ASCII
+        if encoding != "utf-8":
+            raise InputError(f"{path}: found text that is not {encoding[:6]}, as its first bytes say") from None
+        return content.decode("latin-1"), "latin-1", b""  # comments of old tools; numbers and names are ASCII
 
 
 def _toml(text: str, where: str) -> Any:

@@ -75,7 +75,67 @@ def _judged(lens: Lens, candidate: Lens, image_size: tuple[int, int]) -> Fit:
     return Fit(candidate, float(away.max()), float(np.sqrt((away**2).mean())), False)
 
 
-def _opencv(lens: Lens, uv: Array, rays: Array, count: int) -> Lens:
+def fitted_like(
+    lens: Lens, image_size: tuple[int, int], like: Lens, one_focal_length: bool = False, limit: float = np.inf
+) -> Fit:
+    """Say a lens in the model, and with as many coefficients, that another one has.
+
+    Args:
+        lens: what is to be said.
+        image_size: pixels: width, height, over which the two are to agree.
+        like: a lens of the model.
+        one_focal_length: fx and fy are one number there.
+        limit: pixels; a distortion `to_ideal` keeps its centre at the principal point if that is enough.
+
+    Returns:
+        The lens itself where the model can say it, else the nearest one.
+    """
+    count = len(like.coefficients)
+    sayable = not one_focal_length or lens.focal_length[0] == lens.focal_length[1]
+    if like.model == lens.model and lens.length <= count and sayable and not lens.skew:
+        return Fit(replace(lens, coefficients=tuple(lens.padded(count))), 0.0, 0.0, True)
+    uv = pixels_of(image_size, GRID)
+    rays = lens.rays(uv)
+    if not np.isfinite(rays).all():
+        return Fit(lens, np.inf, np.inf, False)
+    if like.model == "to_ideal":
+        radial = min(count, 3)
+        tied = _judged(lens, _to_ideal(lens, uv, rays, radial, like, False), image_size)
+        if tied.worst <= limit or count < 5:
+            return tied
+        free = _judged(lens, _to_ideal(lens, uv, rays, radial, like, True), image_size)
+        return min((tied, free), key=lambda fit: fit.worst)
+    fit = _fisheye if like.model == "fisheye" else _opencv
+    return _judged(lens, fit(lens, uv, rays, count, one_focal_length), image_size)
+
+
+def _to_ideal(lens: Lens, uv: Array, rays: Array, count: int, like: Lens, free: bool) -> Lens:
+    """Fit where a pinhole would have put each pixel: focal lengths, principal point, coefficients, and their centre."""
+    x, y = rays[:, 0], rays[:, 1]
+    unit = float(np.abs(uv).max())  # so that all values are of the order of one
+
+    def predicted(values: Array) -> Array:
+        fx, fy, cx, cy = values[:4]
+        centre = values[4 + count :] if free else np.zeros(2)
+        du, dv = uv[:, 0] - cx - centre[0], uv[:, 1] - cy - centre[1]
+        square = (du**2 + (dv * fx / fy) ** 2) / unit**2
+        factor = sum(values[4 + n] * square ** (n + 1) for n in range(count))
+        return np.stack((2 * uv[:, 0] + du * factor - fx * x - cx, 2 * uv[:, 1] + dv * factor - fy * y - cy), axis=-1)
+
+    start = [*lens.focal_length, *lens.principal_point]
+    start += [value * unit ** (2 * n + 2) for n, value in enumerate(like.padded(count))]
+    start += [0.0, 0.0] if free else []
+    values = _least_squares(predicted, uv, start)
+    ks = [value / unit ** (2 * n + 2) for n, value in enumerate(values[4 : 4 + count])]
+    return Lens((values[0], values[1]), (values[2], values[3]), (*ks, *values[4 + count :]), "to_ideal")
+
+
+def _with_focal_lengths(values: Array, one: bool) -> Array:
+    """Fx, fy, cx, cy and so on, of values in which fy may be left out."""
+    return np.concatenate((values[:1], values)) if one else values
+
+
+def _opencv(lens: Lens, uv: Array, rays: Array, count: int, one_focal_length: bool = False) -> Lens:
     """Fit focal lengths, principal point and `count` coefficients."""
     count = min(count, 8)  # thin prisms and tilts are small, and hard to tell from the rest
     start = lens.padded(8) if lens.model == "opencv" else [0.0] * 8
@@ -83,27 +143,32 @@ def _opencv(lens: Lens, uv: Array, rays: Array, count: int) -> Lens:
     x, y = rays[:, 0], rays[:, 1]
 
     def predicted(values: Array) -> Array:
-        fx, fy, cx, cy, *coefficients = values
+        fx, fy, cx, cy, *coefficients = _with_focal_lengths(values, one_focal_length)
         u, v = distorted(x, y, [*coefficients, *[0.0] * (14 - count)])
         return np.stack((fx * u + cx, fy * v + cy), axis=-1)
 
-    values = _least_squares(predicted, uv, [*lens.focal_length, *lens.principal_point, *start])
+    focal = lens.focal_length[: 1 if one_focal_length else 2]
+    found = _least_squares(predicted, uv, [*focal, *lens.principal_point, *start])
+    values = _with_focal_lengths(np.array(found), one_focal_length).tolist()
     return Lens((values[0], values[1]), (values[2], values[3]), tuple(values[4:]))
 
 
-def _fisheye(lens: Lens, uv: Array, rays: Array) -> Lens:
+def _fisheye(lens: Lens, uv: Array, rays: Array, count: int = 4, one_focal_length: bool = False) -> Lens:
     x, y = rays[:, 0], rays[:, 1]
     radius = np.maximum(np.hypot(x, y), 1e-30)
     angle = np.arctan(radius)
 
     def predicted(values: Array) -> Array:
-        fx, fy, cx, cy, *ks = values
+        fx, fy, cx, cy, *ks = _with_focal_lengths(values, one_focal_length)
+        ks = [*ks, *[0.0] * (4 - count)]
         square = angle * angle
         bent = angle * (1 + square * (ks[0] + square * (ks[1] + square * (ks[2] + square * ks[3])))) / radius
         return np.stack((fx * x * bent + cx, fy * y * bent + cy), axis=-1)
 
-    start = lens.padded(4) if lens.model == "fisheye" else [0.3, 0.1, 0.0, 0.0]
-    values = _least_squares(predicted, uv, [*lens.focal_length, *lens.principal_point, *start])
+    start = (lens.padded(4) if lens.model == "fisheye" else [0.3, 0.1, 0.0, 0.0])[:count]
+    focal = lens.focal_length[: 1 if one_focal_length else 2]
+    found = _least_squares(predicted, uv, [*focal, *lens.principal_point, *start])
+    values = _with_focal_lengths(np.array(found), one_focal_length).tolist()
     return Lens((values[0], values[1]), (values[2], values[3]), tuple(values[4:]), "fisheye")
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -17,6 +19,17 @@ class FormatError(InputError):
 
 
 @dataclass(frozen=True)
+class Place:
+    """Where numbers of a camera stand in a document, and which numbers of the camera they are."""
+
+    path: Path  # of the document
+    keys: tuple[str | int, ...]  # to the value: of XML the element's number and "@attribute"; of bytes the offset
+    numbers: Callable[[ForeignCamera], Sequence[float]]  # of a camera in the file's frame and unit, in their order
+    first: int = 0  # how many other numbers of the value come before
+    relative_to: int | None = None  # the pose is that of camera_from_camera[n], not of camera_from_rig
+
+
+@dataclass(frozen=True)
 class ForeignCamera:
     """One camera of a file that knows where it stands."""
 
@@ -25,6 +38,8 @@ class ForeignCamera:
     image_size: tuple[int, int] | None  # pixels: width, height; None = the file does not say
     rotation: Array  # (3, 3) of cam_from_rig; camera x right, y down, z forward
     translation: Array  # (3,) of cam_from_rig, in units of the rig
+    places: tuple[Place, ...] = field(default=(), compare=False, repr=False)  # of its numbers in the files
+    one_focal_length: bool = False  # the file has one number for fx and fy
 
     def in_camera(self, points_rig: Array) -> Array:
         """Take points from the rig's frame to the camera's: (N, 3) -> (N, 3)."""
@@ -33,6 +48,11 @@ class ForeignCamera:
     def project(self, points_rig: Array) -> Array:
         """Project points of the rig's frame by the lens of the file: (N, 3) -> (N, 2) pixels."""
         return self.lens.project(self.in_camera(points_rig))
+
+    def seen_from(self, other: ForeignCamera) -> ForeignCamera:
+        """The same camera in the frame of another one."""
+        rotation = self.rotation @ other.rotation.T
+        return replace(self, rotation=rotation, translation=self.translation - rotation @ other.translation)
 
     @property
     def centre(self) -> Array:
@@ -55,6 +75,7 @@ class ForeignRig:
     frame: str  # which frame the rig's is, in words
     notes: tuple[str, ...] = ()  # what was assumed, and what was left out
     covariance: RigCovariance | None = None
+    root: int | None = None  # the camera whose frame is the rig's by definition; None = the frame is a world
     own: CameraRig | None = None  # that it was made of: what other tools have no words for (prior, volume, ...)
 
     @property
@@ -67,14 +88,9 @@ class ForeignRig:
         cameras = tuple(replace(camera, translation=camera.translation * factor) for camera in self.cameras)
         return replace(self, cameras=cameras, unit=unit)
 
-    def seen_from_first(self) -> ForeignRig:
-        """The same rig in the frame of its first camera."""
-        first = self.cameras[0]
-        cameras = []
-        for camera in self.cameras:
-            rotation = camera.rotation @ first.rotation.T
-            cameras.append(
-                replace(camera, rotation=rotation, translation=camera.translation - rotation @ first.translation)
-            )
-        cameras[0] = replace(cameras[0], rotation=np.eye(3), translation=np.zeros(3))
+    def seen_from_first(self, root: int = 0) -> ForeignRig:
+        """The same rig in the frame of its first camera, or of another one."""
+        first = self.cameras[root]
+        cameras = [camera.seen_from(first) for camera in self.cameras]
+        cameras[root] = replace(first, rotation=np.eye(3), translation=np.zeros(3))
         return replace(self, cameras=tuple(cameras), frame=f"camera {first.name}")

@@ -6,16 +6,20 @@ and so does this one; the signs of real files hint at the other. The two differ 
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
+from imgcal.formats import places
 from imgcal.formats.documents import Element
-from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place
 from imgcal.formats.format import Format
 from imgcal.formats.lens import Lens
 from imgcal.formats.source import Source
 from imgcal.formats.values import focal_length, image_size, named, nearest_rotation, number
 
 TITLE = "OptiTrack Motive calibration (.mcal)"
+COEFFICIENTS = ("k1", "k2", "TangentialX", "TangentialY", "k3")  # in OpenCV's order
 UPWARD = np.diag([1.0, -1.0, -1.0])
 
 
@@ -24,7 +28,9 @@ def _recognizes(source: Source) -> bool:
 
 
 def _read(source: Source) -> ForeignRig:
-    root = next(root for root in source.roots() if root.all("Extrinsic") or root.all("Camera"))
+    found = [one for one in source.documents if isinstance(one.value, Element)]
+    document = next(one for one in found if one.value.all("Extrinsic") or one.value.all("Camera"))
+    root = document.value
     cameras: list[ForeignCamera] = []
     lost: list[str] = []
     for element in root.all("Camera"):
@@ -33,7 +39,7 @@ def _read(source: Source) -> ForeignRig:
         if pose is None or lens is None:
             lost.append(name)
             continue
-        cameras.append(_camera(name, element, pose, lens))
+        cameras.append(_camera(name, element, pose, lens, document.path))
     if not cameras:
         raise FormatError("no camera has Extrinsic and IntrinsicStandardCameraModel")
     notes = [
@@ -47,14 +53,14 @@ def _read(source: Source) -> ForeignRig:
     return ForeignRig(FORMAT.name, tuple(cameras), "m", "Motive's world (y up)", tuple(notes))
 
 
-def _camera(name: str, element: Element, pose: Element, model: Element) -> ForeignCamera:
+def _camera(name: str, element: Element, pose: Element, model: Element, path: Path) -> ForeignCamera:
     def get(of: Element, key: str) -> float:
         if key not in of.attributes:
             raise FormatError(f"{name}: no {key}")
         return number(of.attributes[key], f"{name}: {key}")
 
     focal = focal_length(get(model, "HorizontalFocalLength"), get(model, "VerticalFocalLength"), name)
-    ks = [get(model, key) for key in ("k1", "k2", "TangentialX", "TangentialY", "k3")]
+    ks = [get(model, key) for key in COEFFICIENTS]
     lens = Lens(focal, (get(model, "LensCenterX"), get(model, "LensCenterY")), tuple(ks))
     axes = np.array([get(pose, f"OrientMatrix{n}") for n in range(9)]).reshape(3, 3)
     world_from_camera = nearest_rotation(axes, f"{name}: OrientMatrix")
@@ -64,7 +70,22 @@ def _camera(name: str, element: Element, pose: Element, model: Element) -> Forei
     size = None
     if attributes is not None:
         size = image_size([get(attributes, "ImagerPixelWidth"), get(attributes, "ImagerPixelHeight")], name)
-    return ForeignCamera(name, lens, size, rotation, -rotation @ centre)
+    return ForeignCamera(name, lens, size, rotation, -rotation @ centre, _places(path, pose, model))
+
+
+def _places(path: Path, pose: Element, model: Element) -> tuple[Place, ...]:
+    def entry(values: places.Numbers, place: int) -> places.Numbers:
+        return lambda camera: [values(camera)[place]]
+
+    def orientation(camera: ForeignCamera) -> list[float]:
+        return [float(value) for value in (UPWARD @ camera.rotation).T.ravel()]
+
+    keys = ("HorizontalFocalLength", "VerticalFocalLength", "LensCenterX", "LensCenterY")
+    inside = {key: entry(places.focal_and_centre, place) for place, key in enumerate(keys)}
+    inside |= {key: entry(places.coefficients(5), place) for place, key in enumerate(COEFFICIENTS)}
+    outside = {axis: entry(places.centre, place) for place, axis in enumerate("XYZ")}
+    outside |= {f"OrientMatrix{place}": entry(orientation, place) for place in range(9)}
+    return (*places.attributes(path, pose, outside), *places.attributes(path, model, inside))
 
 
 FORMAT = Format("motive", TITLE, _recognizes, _read, states_unit=True)

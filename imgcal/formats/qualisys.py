@@ -6,8 +6,11 @@ is not documented: up to half a pixel is open. Theia3D writes the same elements 
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
+from imgcal.formats import places
 from imgcal.formats.documents import Element
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
 from imgcal.formats.format import Format
@@ -26,7 +29,8 @@ def _recognizes(source: Source) -> bool:
 
 
 def _read(source: Source) -> ForeignRig:
-    root = source.roots("calibration")[0]
+    document = next(one for one in source.documents if one.kind == "xml" and one.value.tag == "calibration")
+    root = document.value
     cameras: list[ForeignCamera] = []
     lost: list[str] = []
     turned: list[str] = []
@@ -39,7 +43,7 @@ def _read(source: Source) -> ForeignRig:
             continue
         if element.attributes.get("viewrotation", "0") not in ("0", ""):
             turned.append(name)
-        camera, plain = _camera(name, element, transform, intrinsic)
+        camera, plain = _camera(name, element, transform, intrinsic, document.path)
         theia |= plain
         cameras.append(camera)
     if not cameras:
@@ -59,7 +63,9 @@ def _read(source: Source) -> ForeignRig:
     return ForeignRig(FORMAT.name, tuple(cameras), "mm", "QTM's world (z up)", tuple(notes))
 
 
-def _camera(name: str, element: Element, transform: Element, intrinsic: Element) -> tuple[ForeignCamera, bool]:
+def _camera(
+    name: str, element: Element, transform: Element, intrinsic: Element, path: Path
+) -> tuple[ForeignCamera, bool]:
     def get(key: str, of: Element = intrinsic) -> float:
         if key not in of.attributes:
             raise FormatError(f"{name}: no {key}")
@@ -78,18 +84,35 @@ def _camera(name: str, element: Element, transform: Element, intrinsic: Element)
         raise FormatError(f"{name}: found an image of {width:g} x {height:g} pixels")
     focal = focal_length(get("focalLengthU") / fraction, get("focalLengthV") / fraction, name)
     centre = get("centerPointU") / fraction - left, get("centerPointV") / fraction - top
-    tangential = [
-        get(next((key for key in (f"{word}Distortion{n}" for word in ("tangental", "tangential"))
-                  if key in intrinsic.attributes), f"tangentalDistortion{n}"))
-        for n in (1, 2)
-    ]  # fmt: skip
-    radial = [get(f"radialDistortion{n}") for n in (1, 2, 3)]
-    lens = Lens(focal, centre, (*radial[:2], *tangential, radial[2]), "opencv", get("skew") / fraction)
+    word = "tangential" if "tangentialDistortion1" in intrinsic.attributes else "tangental"
+    keys = ("radialDistortion1", "radialDistortion2", f"{word}Distortion1", f"{word}Distortion2", "radialDistortion3")
+    lens = Lens(focal, centre, tuple(get(key) for key in keys), "opencv", get("skew") / fraction)
     place = np.array([get(axis, transform) for axis in "xyz"])
     axes: Array = np.array([[get(f"r{row}{column}", transform) for column in (1, 2, 3)] for row in (1, 2, 3)])
     axes = nearest_rotation(axes, f"{name}: transform")
     rotation, translation = (axes, place) if plain else (UPWARD @ axes, -UPWARD @ axes @ place)
-    return ForeignCamera(name, lens, (round(width), round(height)), rotation, translation), plain
+
+    def number_of(values: places.Numbers, place: int, factor: float = 1.0, shift: float = 0.0) -> places.Numbers:
+        return lambda camera: [(values(camera)[place] + shift) * factor]
+
+    def axes_of(camera: ForeignCamera) -> list[float]:
+        return [float(value) for value in (camera.rotation if plain else UPWARD @ camera.rotation).ravel()]
+
+    inside = {key: number_of(places.coefficients(5), place) for place, key in enumerate(keys)}
+    for place, (key, shift) in enumerate(
+        (("focalLengthU", 0.0), ("focalLengthV", 0.0), ("centerPointU", left), ("centerPointV", top))
+    ):
+        inside[key] = number_of(places.focal_and_centre, place, fraction, shift)
+    inside["skew"] = lambda camera: [camera.lens.skew * fraction]
+    if "focallength" in intrinsic.attributes:
+        millimetres = get("focallength") / focal[0]
+        inside["focallength"] = number_of(places.focal_and_centre, 0, millimetres)
+    outside = {
+        axis: number_of(places.translation if plain else places.centre, place) for place, axis in enumerate("xyz")
+    }
+    outside |= {f"r{place // 3 + 1}{place % 3 + 1}": number_of(axes_of, place) for place in range(9)}
+    found = (*places.attributes(path, transform, outside), *places.attributes(path, intrinsic, inside))
+    return ForeignCamera(name, lens, (round(width), round(height)), rotation, translation, found), plain
 
 
 FORMAT = Format("qualisys", TITLE, _recognizes, _read, states_unit=True)

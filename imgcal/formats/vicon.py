@@ -1,13 +1,18 @@
-"""Vicon `.xcp`: XML, millimetres. ORIENTATION is the quaternion x, y, z, w of cam_from_world, POSITION the place.
+"""Vicon `.xcp`: XML, millimetres. ORIENTATION is the quaternion x, y, z, w of cam_from_world, POSITION the centre.
 
-The distortion takes a point of the image to where a pinhole would have put it, with k in powers of pixels: whoever
-takes its numbers for OpenCV's has none. Another lens model takes its place by a fit.
+Checked on a real calibration: the quaternion is that of OpenCV's axes (x right, y down, z forward), and a shift of the
+principal point of 0 fits best. Which axis is up differs from file to file. The distortion takes a point of the image
+to where a pinhole would have put it, with k in powers of pixels: whoever takes its numbers for OpenCV's has none.
+Another lens model takes its place by a fit.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
+
+from imgcal.formats import places
 from imgcal.formats.documents import Element
-from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place
 from imgcal.formats.format import Format
 from imgcal.formats.lens import Lens
 from imgcal.formats.source import Source
@@ -21,7 +26,8 @@ def _recognizes(source: Source) -> bool:
 
 
 def _read(source: Source) -> ForeignRig:
-    root = source.roots("Cameras")[0]
+    document = next(one for one in source.documents if one.kind == "xml" and one.value.tag == "Cameras")
+    root = document.value
     cameras: list[ForeignCamera] = []
     lost: list[str] = []
     several: list[str] = []
@@ -33,22 +39,22 @@ def _read(source: Source) -> ForeignRig:
             continue
         if len(frames) > 1:
             several.append(name)
-        cameras.append(_camera(name, element, frames[0]))
+        cameras.append(_camera(name, element, frames[0], document.path))
     if not cameras:
         raise FormatError("no camera has a KeyFrame with a pose: it was never calibrated")
     notes = [
-        "millimetres, z up",
+        "millimetres; which axis is up is not in the file",
         "distortion: from the image to the ideal, in pixels (VICON_RADIAL2, else VICON_RADIAL); others get it by a fit",
-        "whether pixel centres lie at 0 or 0.5 is not documented: up to half a pixel is open",
+        "pixel centres are taken to lie at whole numbers: not documented, but best by a real calibration",
     ]
     if lost:
         notes.append(f"{named(lost)}: left out, without a KeyFrame")
     if several:
         notes.append(f"{named(several)}: moves (several KeyFrames); the first is taken")
-    return ForeignRig(FORMAT.name, tuple(cameras), "mm", "Vicon's world (z up)", tuple(notes))
+    return ForeignRig(FORMAT.name, tuple(cameras), "mm", "Vicon's world", tuple(notes))
 
 
-def _camera(name: str, element: Element, frame: Element) -> ForeignCamera:
+def _camera(name: str, element: Element, frame: Element, path: Path) -> ForeignCamera:
     def get(key: str) -> str:
         if key not in frame.attributes:
             raise FormatError(f"{name}: no {key}")
@@ -68,7 +74,34 @@ def _camera(name: str, element: Element, frame: Element) -> ForeignCamera:
     rotation = rotation_of_quaternion([*quaternion[3:], *quaternion[:3]], f"{name}: ORIENTATION")
     centre = array(get("POSITION"), (3,), f"{name}: POSITION")
     lens = Lens(focal, (x, y), ks, "to_ideal", skew)
-    return ForeignCamera(name, lens, size, rotation, -rotation @ centre)
+    found = _places(path, element, frame, quaternion)
+    return ForeignCamera(name, lens, size, rotation, -rotation @ centre, tuple(found))
+
+
+def _places(path: Path, element: Element, frame: Element, quaternion: list[float]) -> list[Place]:
+    """Where the camera's numbers stand; both distortions are the same lens, one of them with a centre of its own."""
+
+    def orientation(camera: ForeignCamera) -> list[float]:
+        w, *xyz = places.near_quaternion(camera.rotation, [quaternion[3], *quaternion[:3]])
+        return [*xyz, w]
+
+    def with_centre(camera: ForeignCamera) -> list[float]:
+        k1, k2, k3, x, y = camera.lens.padded(5)
+        return [camera.lens.principal_point[0] + x, camera.lens.principal_point[1] + y, k1, k2, k3]
+
+    fixed = {
+        "PIXEL_ASPECT_RATIO": lambda camera: [camera.lens.focal_length[0] / camera.lens.focal_length[1]],
+        "SKEW": lambda camera: [camera.lens.skew],
+    }
+    moving = {
+        "FOCAL_LENGTH": lambda camera: [camera.lens.focal_length[0]],
+        "PRINCIPAL_POINT": lambda camera: camera.lens.principal_point,
+        "ORIENTATION": orientation,
+        "POSITION": places.centre,
+        "VICON_RADIAL2": with_centre,
+        "VICON_RADIAL": places.coefficients(len(frame.attributes.get("VICON_RADIAL", "").split())),
+    }
+    return [*places.attributes(path, element, fixed), *places.attributes(path, frame, moving)]
 
 
 def _distortion(name: str, frame: Element, centre: tuple[float, float]) -> tuple[float, ...]:
@@ -79,7 +112,7 @@ def _distortion(name: str, frame: Element, centre: tuple[float, float]) -> tuple
         if len(found) < 4:
             raise FormatError(f"{name}: VICON_RADIAL2: found {len(found)} numbers, expected a centre and coefficients")
         ks = (*found[2:5], 0.0, 0.0)[:3]
-        return (*ks, found[0] - centre[0], found[1] - centre[1]) if any(ks) else ()
+        return (*ks, found[0] - centre[0], found[1] - centre[1]) if any(ks) else (0.0, 0.0, 0.0)
     found = numbers(first, f"{name}: VICON_RADIAL") if first else []
     return tuple(found[:3])
 

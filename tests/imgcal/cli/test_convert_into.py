@@ -1,0 +1,66 @@
+from pathlib import Path
+
+import pytest
+import torch
+
+from imgcal.cli.main import main
+from imgcal.io import load_rig, save_rig
+from tests.imgcal.formats import originals
+from tests.imgcal.formats.rigs import brown, rig_of
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    code = main(["convert", *map(str, arguments)])
+    said = capsys.readouterr()
+    return code, said.out, said.err
+
+
+@pytest.fixture
+def recalibrated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> tuple[Path, Path]:
+    """A Qualisys calibration, and the rig that it became."""
+    original, rig = tmp_path / "original.qca.txt", tmp_path / "rig.yaml"
+    lens = brown(-0.05, 0.02, 1e-4, -2e-4, 0.003)
+    original.write_bytes(originals.qualisys(rig_of(lens, lens, lens)))
+    assert run(capsys, original, "--out", rig)[0] == 0
+    factory = load_rig(rig)
+    save_rig(factory.retract(torch.full((3, 15), 1e-3, dtype=torch.float64)), rig)
+    return rig, original
+
+
+def test_the_success_line(recalibrated: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig, original = recalibrated
+    before = original.read_bytes()
+    code, out, err = run(capsys, rig, "--into", original, "--out", tmp_path / "new.qca.txt")
+    assert (code, err) == (0, "")
+    assert "Qualisys calibration: 3 cameras replaced" in out
+    assert f"wrote {tmp_path / 'new.qca.txt'}; re-read: worst difference " in out
+    assert original.read_bytes() == before
+    assert (tmp_path / "new.qca.txt").read_bytes() != before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--into", "original.qca.txt", "--out", "original.qca.txt"], "is what --into holds, expected another place"),
+        (["--into", "rig.yaml", "--out", "new.xml"], "expected"),
+        (["--into", "missing.xcp", "--out", "new.xcp"], "missing.xcp: no such file"),
+        (["--into", "original.qca.txt", "--to", "imgcal", "--out", "new.xcp"], "--to: found imgcal"),
+        (["--into", "original.qca.txt", "--to", "vicon", "--out", "new.xcp"], "this is no Vicon calibration"),
+        (["--into", "original.qca.txt", "--fit-limit", "0", "--out", "new.xcp"], "--fit-limit"),
+        (["--into", "original.qca.txt", "--out-unit", "parsec", "--out", "new.xcp"], "--out-unit: found 'parsec'"),
+    ],
+)
+def test_what_is_refused(
+    recalibrated: tuple[Path, Path],
+    arguments: list[str],
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    code, _, error = run(capsys, "rig.yaml", *arguments)
+    assert (code, error.count("\n")) == (2, 1), error
+    assert said in error
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
