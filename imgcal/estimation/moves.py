@@ -41,6 +41,8 @@ LEAST_GAIN = 50.0
 """Chi-squared of the kind of values that explains a step best."""
 LEAST_MOTION = 0.9
 """Of the chi-squared of a step of all values, the part that a motion alone explains, noise in the others apart."""
+LEAST_SIGMAS = 5.0
+"""Standard deviations, given the dispersion, of the kind of values that explains a step best."""
 MOST_UNEXPLAINED = 0.5
 """Of what does not fit in a camera that stands still, the part that may be left where it has several places."""
 LEAST_LEAD = 0.8
@@ -163,6 +165,12 @@ class Change:
         others = int((self.prior_std > 0).sum()) - MOTION.stop  # each of them takes one from noise alone
         return kinds >= LEAST_GAIN and motion >= LEAST_MOTION * (self.gain(slice(None)) - others)
 
+    @property
+    def is_certain(self) -> bool:
+        """Tell whether its size is known to be more than errors of lenses make of many small steps."""
+        _, size, sigma = self.size()
+        return size >= LEAST_SIGMAS * sigma
+
     def size(self) -> tuple[Kind, float, float]:
         """Kind, size and standard deviation, by the one kind of values that explains the difference best."""
         kind = max(KINDS, key=lambda name: self.gain(KINDS[name][0]))
@@ -208,7 +216,8 @@ def find_moves(
             if (
                 is_significant(step.statistic / left, candidates, ERROR)
                 and divided.shift(step.camera, new) >= LEAST_MOVE * left**0.5
-                and divided.change(step.camera, new, left).is_physical
+                and (change := divided.change(step.camera, new, left)).is_physical
+                and change.is_certain
             ):
                 doubts[new] = _doubts(places, step)
                 places, noise = divided, left
