@@ -36,6 +36,7 @@ LONG = {
     "imgcal watch": "cli/test_watch",
     "imgcal convert": "cli/test_convert",
     "imgcal demo": "cli/test_demo",
+    "imgcal export": "cli/test_export",
 }
 """Beginnings of commands that are not run here."""
 

@@ -58,6 +58,8 @@ def test_commands_are_understood():
     for command in [*commands, json.loads(of("CMD")[0]), services["watch"]["command"]]:
         assert type(parse(command)).__name__.lower() == command[0]
     watch, rig = services["watch"]["command"], services["rig"]
+    built = {"context": "../..", "dockerfile": "scripts/container/Dockerfile"}
+    assert services["watch"]["build"] == rig["build"] == built and (ROOT / built["dockerfile"]).is_file()
     assert rig["command"] == ["tcp://0.0.0.0:5555"] and watch[1] == "tcp://rig:5555"
     program = [part for part in of("COPY") if part.endswith(rig["entrypoint"][1])]
     assert program == [f"scripts/examples/send_blobs.py {rig['entrypoint'][1]}"]
