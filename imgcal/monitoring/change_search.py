@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Sequence
+import math
+from collections.abc import Callable, Collection, Sequence
 
 from imgcal.errors import RefusedError
 from imgcal.estimation import EstimationOptions
@@ -34,14 +35,14 @@ FIT_CHI2_PER_DOF = 4.0
 
 
 def find_alarm(
-    recent: RecentSnapshots, count: int, episodes: Sequence[int], least_shifts: Sequence[float]
+    recent: RecentSnapshots, count: int, episode: Callable[[int, float], int], least_shifts: Sequence[float]
 ) -> int | None:
     """Find the number of latest snapshots before which some camera has surely changed; None = none has.
 
     Args:
         recent: the latest snapshots.
         count: of all snapshots so far.
-        episodes: for each camera the successive snapshots that one passing error may last.
+        episode: successive snapshots that a passing error may last, by the camera and the pixels that it is off.
         least_shifts: for each camera the pixels by which a change must shift its image.
     """
     ages = {age for age, every in SLOW_TESTS.items() if age <= len(recent) and count % every == 0}
@@ -54,7 +55,8 @@ def find_alarm(
         camera = int(scores[kind].argmax())
         if float(scores[kind][camera]) < ALARM_CHI2:
             continue
-        left, shift = recent.score_without_episode(age, camera, kind, episodes[camera])
+        _, shift = recent.score_without_episode(age, camera, kind, episode(camera, math.inf))
+        left, shift = recent.score_without_episode(age, camera, kind, episode(camera, shift))
         if left >= REMAINING_CHI2 and shift >= least_shifts[camera]:
             return age
     return None

@@ -159,7 +159,7 @@ class RigMonitor:
         self._recent.append(result, observations, seconds)
         if self._pending is not None:
             self._pending.add(result, seconds)
-        alarm = find_alarm(self._recent, self.filter.count, self.noise.episodes, self.noise.least_shifts)
+        alarm = find_alarm(self._recent, self.filter.count, self.noise.episode, self.noise.least_shifts)
         misfit = self._misfit.update(result.chi2, result.dof)
         if alarm is None and misfit and self._pending is None and (anew := self._diagnose_misfit(misfit)) is not None:
             return anew

@@ -7,7 +7,7 @@ from scripts.benchmarks.rig_streams import Bump
 from tests.imgcal.monitoring.followed import followed
 
 TURN = math.radians(0.1)
-INDEPENDENT = ([1] * 4, [0.0] * 4)  # errors of single snapshots, which feign no shift
+INDEPENDENT = (lambda camera, shift: 1, [0.0] * 4)  # errors of single snapshots, which feign no shift
 
 
 def test_a_steady_rig_has_not_changed() -> None:
@@ -39,11 +39,13 @@ def test_two_cameras_are_found_and_what_is_known_is_not_found_again() -> None:
 def test_what_may_be_one_passing_error_is_no_alarm() -> None:
     turned = followed(46, bumps=[Bump(40, 2, "rotation", TURN)])
     count, cameras = turned.filter.count, 4
-    assert find_alarm(turned.recent, count, [6] * cameras, [0.0] * cameras) is None  # six snapshots are one episode
-    assert find_alarm(turned.recent, count, [3] * cameras, [0.0] * cameras) is not None
+    assert (
+        find_alarm(turned.recent, count, lambda camera, shift: 6, [0.0] * cameras) is None
+    )  # six snapshots are one episode
+    assert find_alarm(turned.recent, count, lambda camera, shift: 3, [0.0] * cameras) is not None
     _, shift = turned.recent.score_without_episode(6, 2, "rotation", 3)
     assert 0.5 < shift < 3.5  # 0.1 degrees are some 2.8 px, less what the poses take
-    assert find_alarm(turned.recent, count, [1] * cameras, [4.0] * cameras) is None
+    assert find_alarm(turned.recent, count, lambda camera, shift: 1, [4.0] * cameras) is None
 
 
 def test_a_small_change_of_another_camera_may_be_an_error_that_lasts() -> None:
@@ -51,3 +53,15 @@ def test_a_small_change_of_another_camera_may_be_an_error_that_lasts() -> None:
     test = turned.recent.test(6)
     assert changed_cameras(test, {}, [0.5] * 4)[0].keys() == {1, 3}
     assert changed_cameras(test, {}, [50.0] * 4)[0].keys() == {1}  # the first one has been tested before
+
+
+def test_a_large_error_may_pass_sooner_than_a_small_one() -> None:
+    turned = followed(46, bumps=[Bump(40, 2, "rotation", TURN)])
+
+    def episode(camera: int, shift: float) -> int:
+        return 3 if shift > least else 6
+
+    least = 0.5
+    assert find_alarm(turned.recent, turned.filter.count, episode, [0.0] * 4) is not None
+    least = 5.0
+    assert find_alarm(turned.recent, turned.filter.count, episode, [0.0] * 4) is None
