@@ -63,6 +63,7 @@ class Convert(arguments.Convert):
         alone = len(made.files) == 1 and not (len(self.into) == 1 and self.into[0].is_dir())
         files = {"": next(iter(made.files.values()))} if alone else made.files
         written = self._write(files)
+        where = written[0] if len(written) == 1 else listed(map(str, written))
         print(
             f"{made.title}: {_counted(made.changed)} replaced" + (f", {_counted(made.kept)} kept" if made.kept else "")
         )
@@ -70,9 +71,7 @@ class Convert(arguments.Convert):
             print(
                 f"lens models: worst {made.loss.worst:.2g} px, RMS {made.loss.rms:.2g} px (limit {self.fit_limit:g} px)"
             )
-        print(
-            f"wrote {written[0] if len(written) == 1 else listed(map(str, written))}; re-read: worst difference {made.reread:.1e} px on {made.points} points"
-        )
+        print(f"wrote {where}; re-read: worst difference {made.reread:.1e} px on {made.points} points")
 
     def _check_limit(self) -> None:
         if not 0 < self.fit_limit < float("inf"):

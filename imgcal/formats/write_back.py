@@ -118,9 +118,7 @@ def _written(
     else:
         raise FormatError(f"what was written is read back {reread:.3g} px off: nothing is written")
     if digits:
-        notes.append(
-            f"numbers have {digits} digits where they had less, which would have cost up to {ROUNDING:g} px or more"
-        )
+        notes.append(f"numbers have at least {digits} digits: those of the file would cost more than {ROUNDING:g} px")
     notes += stamps
     kept = tuple(camera.name for camera in old.cameras if camera.name not in fits)
     inexact = [fit for fit in fits.values() if not fit.exact]
