@@ -47,8 +47,8 @@ class Convert(arguments.Convert):
         written = self._write(made.files)
         models = f"{made.between_models:.2g} px" if made.between_models > 1e-6 else "the same"
         print(
-            f"verified on {made.points} known points: read back worst {made.round_trip:.1e} px, lens models {models}\n"
-            f"{to}: {listed(map(str, written))}"
+            f"wrote {listed(map(str, written))} ({to}); re-read: worst difference {made.round_trip:.1e} px on "
+            f"{made.points} points, lens models {models}"
         )
 
     def _write_back(self) -> None:
@@ -63,7 +63,7 @@ class Convert(arguments.Convert):
         alone = len(made.files) == 1 and not (len(self.into) == 1 and self.into[0].is_dir())
         files = {"": next(iter(made.files.values()))} if alone else made.files
         written = self._write(files)
-        where = written[0] if len(written) == 1 else listed(map(str, written))
+        where = listed(map(str, written))
         print(
             f"{made.title}: {_counted(made.changed)} replaced" + (f", {_counted(made.kept)} kept" if made.kept else "")
         )

@@ -125,7 +125,7 @@ def _literal(text: str) -> Node:
         if isinstance(node, ast.Dict):
             made.children = {
                 key.value: of(value) for key, value in zip(node.keys, node.values, strict=True)
-                if isinstance(key, ast.Constant)
+                if isinstance(key, ast.Constant) and isinstance(key.value, str | int)
             }  # fmt: skip
         elif isinstance(node, ast.List | ast.Tuple):
             made.children = {place: of(value) for place, value in enumerate(node.elts)}
