@@ -57,7 +57,15 @@ class Convert(arguments.Convert):
         if self.to == OURS:
             raise InputError("--to: found imgcal, expected the format of what --into names")
         rig, _ = self._read()
-        made = written_back(rig, self.into, datetime.now(), name=self.to, unit=self.out_unit, limit=self.fit_limit)
+        made = written_back(
+            rig,
+            self.into,
+            datetime.now(),
+            name=self.to,
+            original_rig=self.source_rig,
+            unit=self.out_unit,
+            limit=self.fit_limit,
+        )
         for note in made.notes:
             print(f"note: {note}")
         alone = len(made.files) == 1 and not (len(self.into) == 1 and self.into[0].is_dir())
@@ -101,7 +109,7 @@ class Convert(arguments.Convert):
             rig = from_camera_rig(load_rig(first), load_rig_covariance(first))
             title = "imgcal rig"
         else:
-            found = read_foreign_rig(self.source, self.source_format)
+            found = read_foreign_rig(self.source, self.source_format, self.source_rig)
             title = format_named(found.format).title
             rig = in_millimetres(found, where, self.unit, self.distance)
         if self.cameras:

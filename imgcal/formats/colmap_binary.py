@@ -84,7 +84,7 @@ def _read(source: Source) -> ForeignRig:
     rigs = _rigs(_Reader(rigs_path)) if rigs_path else []
     if images_path is None and not any(len(rig.sensors) > 1 for rig in rigs):
         raise FormatError("intrinsics alone: expected images.bin or rigs.bin beside cameras.bin")
-    return rig_of_model(FORMAT.name, cameras, _images(_Reader(images_path)) if images_path else [], rigs)
+    return rig_of_model(FORMAT.name, cameras, _images(_Reader(images_path)) if images_path else [], rigs, source.rig)
 
 
 def _cameras(reader: _Reader) -> list[ColmapCamera]:

@@ -17,6 +17,7 @@ from imgcal.formats.chains import IDENTITY, Pose, compose, inverse
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place
 from imgcal.formats.lens import Array, Lens
 from imgcal.formats.values import named, quaternion_of_rotation, rotation_of_quaternion
+from imgcal.messages import shortened
 
 HALF = 0.5
 MODELS = (
@@ -120,7 +121,11 @@ def pose_of(row: Sequence[float], what: str) -> Pose:
 
 
 def rig_of_model(
-    name: str, cameras: Sequence[ColmapCamera], images: Sequence[ColmapImage], rigs: Sequence[ColmapRig]
+    name: str,
+    cameras: Sequence[ColmapCamera],
+    images: Sequence[ColmapImage],
+    rigs: Sequence[ColmapRig],
+    wanted: str | None = None,
 ) -> ForeignRig:
     """Make a rig: of a rig that the model has, else of the images that were taken together.
 
@@ -130,11 +135,43 @@ def rig_of_model(
     known = {camera.id: camera for camera in cameras}
     notes = ["COLMAP's pixels begin half a pixel earlier: cx and cy are 0.5 less here"]
     together = [rig for rig in rigs if len(rig.sensors) > 1]
-    if len(together) > 1:
-        raise FormatError(f"found {len(together)} rigs of several cameras, expected one")
     if together:
-        return _of_rig(name, together[0], known, images, notes)
+        chosen = together[chosen_rig(_rig_names(together, images), wanted)]
+        return _of_rig(name, chosen, known, images, notes)
     return _of_images(name, known, images, notes)
+
+
+def chosen_rig(names: Sequence[str], wanted: str | None) -> int:
+    """Find the rig that the user means.
+
+    Raises:
+        FormatError: there are several and none is named, or there is none of that name.
+    """
+    if wanted is None and len(names) > 1:
+        raise FormatError(f"found {len(names)} rigs of several cameras: choose one with --source-rig {names[0]} (of "
+                          f"{', '.join(names[:8])}), to imgcal convert")  # fmt: skip
+    if wanted is not None and wanted not in names:
+        raise FormatError(f"--source-rig: found {shortened(wanted)}, expected one of {', '.join(names[:8])}")
+    return 0 if wanted is None else list(names).index(wanted)
+
+
+def _rig_names(rigs: Sequence[ColmapRig], images: Sequence[ColmapImage]) -> list[str]:
+    """Rigs are called as the folder of their images, where each has one of its own, else by their numbers."""
+    names = []
+    for rig in rigs:
+        folders = [PurePosixPath(image.name).parts[:-1] for image in images if image.camera in rig.sensors]
+        names.append("/".join(prefix_of(folders)))
+    return names if all(names) and len(set(names)) == len(names) else [str(rig.id) for rig in rigs]
+
+
+def prefix_of(folders: Sequence[Sequence[str]]) -> list[str]:
+    """What several folders have in common at their beginning."""
+    common = []
+    for parts in zip(*folders, strict=False):
+        if len(set(parts)) > 1:
+            break
+        common.append(parts[0])
+    return common
 
 
 def _names(rig: ColmapRig, images: Sequence[ColmapImage]) -> dict[int, str]:

@@ -14,8 +14,10 @@ from imgcal.formats.colmap_model import (
     ColmapCamera,
     ColmapImage,
     ColmapRig,
+    chosen_rig,
     model_of_rig,
     pose_of,
+    prefix_of,
     rig_of_model,
     seven,
 )
@@ -43,7 +45,7 @@ def _read(source: Source) -> ForeignRig:
     rigs = [_rig(row, line, rigs_path) for line, row in _rows(rigs_path)] if rigs_path else []
     if images_path is None and not any(len(rig.sensors) > 1 for rig in rigs):
         raise FormatError("intrinsics alone: expected images.txt or rigs.txt beside cameras.txt")
-    return rig_of_model(FORMAT.name, cameras, list(_images(images_path)) if images_path else [], rigs)
+    return rig_of_model(FORMAT.name, cameras, list(_images(images_path)) if images_path else [], rigs, source.rig)
 
 
 def _camera(row: list[str], number_of_line: int, path: Path) -> ColmapCamera:
@@ -163,14 +165,22 @@ def _configs(source: Source) -> tuple[Path, list[dict[str, Any]]]:
     return Path(), []
 
 
+def _config_names(rigs: list[dict[str, Any]]) -> list[str]:
+    """What the prefixes of a rig's images have in common, where each has something of its own, else its number."""
+    names = []
+    for rig in rigs:
+        entries = [entry for entry in rig.get("cameras") or [] if isinstance(entry, dict)]
+        names.append("/".join(prefix_of([str(entry.get("image_prefix", "")).split("/")[:-1] for entry in entries])))
+    return names if all(names) and len(set(names)) == len(names) else [str(n) for n in range(1, len(rigs) + 1)]
+
+
 def _read_config(source: Source) -> ForeignRig:
     path, rigs = _configs(source)
-    if len(rigs) > 1:
-        raise FormatError(f"found {len(rigs)} rigs, expected one")
+    which = chosen_rig(_config_names(rigs), source.rig)
     cameras: list[ForeignCamera] = []
     without: list[str] = []
     root = None
-    for place, value in enumerate(rigs[0]["cameras"], start=1):
+    for place, value in enumerate(rigs[which]["cameras"], start=1):
         entry = mapping(value, f"camera {place}")
         prefix = text(entry.get("image_prefix", str(place)), f"camera {place}")
         name = prefix.rstrip("/").rpartition("/")[2] or str(place)
@@ -179,7 +189,7 @@ def _read_config(source: Source) -> ForeignRig:
                               "COLMAP estimates them): give the folder of the model instead")  # fmt: skip
         parameters = tuple(numbers(entry["camera_params"], f"camera {name}: camera_params"))
         row = ColmapCamera(place, text(entry["camera_model_name"], name), None, parameters)
-        keys = (0, "cameras", place - 1)
+        keys = (which, "cameras", place - 1)
         others = [Place(path, (*keys, "camera_params"), row.numbers)]
         row.lens()
         turn, shift = entry.get("cam_from_rig_rotation"), entry.get("cam_from_rig_translation")

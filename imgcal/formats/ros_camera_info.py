@@ -71,15 +71,18 @@ def _is_info(values: dict[str, Any]) -> bool:
 def _read(source: Source) -> ForeignRig:
     infos = _infos(source)
     if len(infos) > 2:
+        first, second = (info.path.name for info in infos[:2])
         raise FormatError(f"{len(infos)} files: ROS says in them where two cameras are, no more; the poses of more are "
-                          "in /tf and in no file")  # fmt: skip
+                          f"in /tf and in no file: give the two of a pair (imgcal convert {first} {second} --out "
+                          "rig.yaml), or the folder to imgcal calibrate --cameras, which finds the poses")  # fmt: skip
     if len(infos) == 1:
         return _single(infos[0])
     infos.sort(key=lambda info: float(np.abs(info.shift).sum()))  # the left one has no Tx
     left, right = infos
     if not right.shift.any():
         raise FormatError(
-            "two files without Tx in P: these are two single cameras, and where they are to each other is not said"
+            "two files without Tx in P: these are two single cameras, and where they are to each other is not said: "
+            "imgcal calibrate --cameras FOLDER finds the poses"
         )
     notes = ["a stereo pair: X_right = R_r^T (R_l X_left + (Tx / fx', 0, 0)), metres; the rig's frame is the left "
              "camera's, unrectified"]  # fmt: skip
