@@ -66,14 +66,14 @@ def _read(source: Source) -> ForeignRig:
         turn = values.get(f"Rot_{name}", values.get(f"R_{name}"))
         moved = array(values[f"T_{name}"], (3,), f"T_{name}")
         count = len(lens.coefficients)
-        inside: dict[str, places.Numbers] = {
+        parts: dict[str, places.Numbers] = {
             f"K_{name}": places.camera_matrix, f"T_{name}": places.translation,
             f"dist_{name}" if f"dist_{name}" in values else f"D_{name}": places.coefficients(count),
         }  # fmt: skip
         for key in (f"Rot_{name}", f"R_{name}"):
             if key in values:
-                inside[key] = places.rotation_like(numbers(values[key], key))
-        found = tuple(Place(*place_of(source, key), of) for key, of in inside.items() if key in values)
+                parts[key] = places.rotation_like(numbers(values[key], key))
+        found = tuple(Place(*place_of(source, key), of) for key, of in parts.items() if key in values)
         cameras.append(ForeignCamera(name, lens, size, rotation(turn, f"Rot_{name}"), moved, found))
     return ForeignRig(FORMAT.name, tuple(cameras), "m", "the file's world", tuple(notes))
 

@@ -89,7 +89,8 @@ def _places(source: Source, values: dict[str, Any], camera: ForeignCamera, names
                 continue
             path = _path_of(source, outer[0] if outer else key)
             if between[1] == name and between[2] in names:
-                of, base = places.matrix_rows, names.index(between[2])
+                of: places.Numbers = places.matrix_rows
+                base: int | None = names.index(between[2])
             elif between[2] == name and between[1] in names:
                 continue  # it is among the other camera's
             elif between[1] == name:

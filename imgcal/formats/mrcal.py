@@ -64,12 +64,12 @@ def _camera(path: Path, values: dict[str, Any]) -> ForeignCamera:
     size = image_size(values.get("imagersize"), f"{name}: imagersize")
     turned = places.rotation_like(six[:3].tolist())
     count = COUNTS[short]
-    found = [Place(path, ("intrinsics",), lambda one: [*places.focal_and_centre(one), *one.lens.padded(count)])]
-    found += [
+    where = [Place(path, ("intrinsics",), lambda one: [*places.focal_and_centre(one), *one.lens.padded(count)])]
+    where += [
         Place(path, (key,), lambda one: [*turned(one), *places.translation(one)])
         for key in ("rt_cam_ref", "extrinsics") if values.get(key) is not None
     ]  # fmt: skip
-    return ForeignCamera(name, lens, size, rotation_of_vector(six[:3]), six[3:], tuple(found))
+    return ForeignCamera(name, lens, size, rotation_of_vector(six[:3]), six[3:], tuple(where))
 
 
 def _write(rig: ForeignRig) -> Files:

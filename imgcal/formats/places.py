@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from imgcal.formats.values import quaternion_of_rotation, vector_of_rotation
 Numbers = Callable[[ForeignCamera], Sequence[float]]
 
 
-def attributes(path: Path, element: Element | None, numbers: dict[str, Numbers]) -> list[Place]:
+def attributes(path: Path, element: Element | None, numbers: Mapping[str, Numbers]) -> list[Place]:
     """Places of the attributes that an element has, out of some."""
     if element is None:
         return []

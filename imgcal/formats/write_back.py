@@ -131,12 +131,12 @@ def _written(
     kept = tuple(camera.name for camera in old.cameras if camera.name not in fits)
     inexact = [fit for fit in fits.values() if not fit.exact]
     worst = max(inexact, key=lambda fit: fit.worst, default=None)
-    for camera in (camera for camera, fit in fits.items() if not fit.exact):
-        fit = fits[camera]
-        notes.append(
-            f"camera {camera}: {describe_lens(found[camera].lens)} -> {describe_lens(fit.lens)}, fitted over the "
-            f"image: worst {fit.worst:.2g} px, RMS {fit.rms:.2g} px"
-        )
+    for camera_name, fit in fits.items():
+        if not fit.exact:
+            notes.append(
+                f"camera {camera_name}: {describe_lens(found[camera_name].lens)} -> {describe_lens(fit.lens)}, fitted "
+                f"over the image: worst {fit.worst:.2g} px, RMS {fit.rms:.2g} px"
+            )
     return Updated(files, title, tuple(notes), tuple(fits), kept, reread, worst, points)
 
 

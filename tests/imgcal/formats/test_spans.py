@@ -7,7 +7,7 @@ TEXTS = {
     "toml": '# 9\n[a.b]\nx = 1\nk = [ [1.0, 2], # 5\n [-3e-2] ]\ns = "k = 3 # ]"\n[[c]]\nk = 4\n[[c]]\nk = 5.5\n',
     "json": '{"ä": {"t": "k 1"}, "l": [{"k": 1}, {"k": [2.5, -3]}]}',
     "python": "# 4\n{ 'k': [1.0,  # 2\n 3], 'ü': 1, 'm': -7 }\n",
-    "xml": '<?xml version="1.0"?>\n<r n="1"><!-- ä 3 --><a k=\'ViconRadial2 1 -2e-08\'/><b><data>1 2.\n3</data></b></r>',
+    "xml": '<?xml version="1.0"?>\n<r n="1"><!--ä 3--><a k=\'ViconRadial2 1 -2e-08\'/><b><data>1 2.\n3</data></b></r>',
     "rows": "# a 1\n1 OPENCV 640 480 1.5\r\n2 R2D2 3\n",
 }
 
