@@ -277,6 +277,8 @@ class Convert:
     """format to write by name (default: imgcal, where --out ends in .yaml); with --into, the format of that"""
     into: tuple[Path, ...] = ()
     """another tool's file, folder or files with the same cameras: OUT is a copy with their numbers replaced"""
+    source_rig: str | None = None
+    """name of the rig, where SOURCE, or what --into names, holds several (COLMAP)"""
     unit: str | None = None
     """unit of SOURCE, where its format does not say: mm, cm, m, inch, or the length of one unit, such as 417.2mm"""
     distance: tuple[str, str, float] | None = None

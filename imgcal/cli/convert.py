@@ -47,8 +47,8 @@ class Convert(arguments.Convert):
         written = self._write(made.files)
         models = f"{made.between_models:.2g} px" if made.between_models > 1e-6 else "the same"
         print(
-            f"verified on {made.points} known points: read back worst {made.round_trip:.1e} px, lens models {models}\n"
-            f"{to}: {listed(map(str, written))}"
+            f"wrote {listed(map(str, written))} ({to}); re-read: worst difference {made.round_trip:.1e} px on "
+            f"{made.points} points, lens models {models}"
         )
 
     def _write_back(self) -> None:
@@ -57,12 +57,21 @@ class Convert(arguments.Convert):
         if self.to == OURS:
             raise InputError("--to: found imgcal, expected the format of what --into names")
         rig, _ = self._read()
-        made = written_back(rig, self.into, datetime.now(), name=self.to, unit=self.out_unit, limit=self.fit_limit)
+        made = written_back(
+            rig,
+            self.into,
+            datetime.now(),
+            name=self.to,
+            original_rig=self.source_rig,
+            unit=self.out_unit,
+            limit=self.fit_limit,
+        )
         for note in made.notes:
             print(f"note: {note}")
         alone = len(made.files) == 1 and not (len(self.into) == 1 and self.into[0].is_dir())
         files = {"": next(iter(made.files.values()))} if alone else made.files
         written = self._write(files)
+        where = listed(map(str, written))
         print(
             f"{made.title}: {_counted(made.changed)} replaced" + (f", {_counted(made.kept)} kept" if made.kept else "")
         )
@@ -70,9 +79,7 @@ class Convert(arguments.Convert):
             print(
                 f"lens models: worst {made.loss.worst:.2g} px, RMS {made.loss.rms:.2g} px (limit {self.fit_limit:g} px)"
             )
-        print(
-            f"wrote {written[0] if len(written) == 1 else listed(map(str, written))}; re-read: worst difference {made.reread:.1e} px on {made.points} points"
-        )
+        print(f"wrote {where}; re-read: worst difference {made.reread:.1e} px on {made.points} points")
 
     def _check_limit(self) -> None:
         if not 0 < self.fit_limit < float("inf"):
@@ -102,7 +109,7 @@ class Convert(arguments.Convert):
             rig = from_camera_rig(load_rig(first), load_rig_covariance(first))
             title = "imgcal rig"
         else:
-            found = read_foreign_rig(self.source, self.source_format)
+            found = read_foreign_rig(self.source, self.source_format, self.source_rig)
             title = format_named(found.format).title
             rig = in_millimetres(found, where, self.unit, self.distance)
         if self.cameras:

@@ -10,6 +10,7 @@ from imgcal.formats.chains import IDENTITY, Pose
 from imgcal.formats.colmap_model import (
     COUNTS,
     MODELS,
+    At,
     ColmapCamera,
     ColmapImage,
     ColmapRig,
@@ -36,7 +37,7 @@ class _Reader:
     """Values one after another; a file that ends too early is an error of one line."""
 
     def __init__(self, path: Path) -> None:
-        self.name, self.content, self.place = path.name, read_bytes(path, MOST_BYTES), 0
+        self.path, self.name, self.content, self.place = path, path.name, read_bytes(path, MOST_BYTES), 0
 
     def take(self, layout: str) -> tuple[Any, ...]:
         size = struct.calcsize("<" + layout)
@@ -63,6 +64,10 @@ class _Reader:
         self.place = end + 1
         return text
 
+    def at(self) -> At:
+        """Where it is."""
+        return At(self.path, self.place)
+
     def pose(self) -> Pose:
         return pose_of([number(value, self.name) for value in self.take("7d")], self.name)
 
@@ -79,7 +84,7 @@ def _read(source: Source) -> ForeignRig:
     rigs = _rigs(_Reader(rigs_path)) if rigs_path else []
     if images_path is None and not any(len(rig.sensors) > 1 for rig in rigs):
         raise FormatError("intrinsics alone: expected images.bin or rigs.bin beside cameras.bin")
-    return rig_of_model(FORMAT.name, cameras, _images(_Reader(images_path)) if images_path else [], rigs)
+    return rig_of_model(FORMAT.name, cameras, _images(_Reader(images_path)) if images_path else [], rigs, source.rig)
 
 
 def _cameras(reader: _Reader) -> list[ColmapCamera]:
@@ -91,8 +96,9 @@ def _cameras(reader: _Reader) -> list[ColmapCamera]:
                 f"{reader.name}: camera {camera}: found the model number {model}, which is none of COLMAP's"
             )
         name = MODELS[model]
+        at = reader.at()
         parameters = tuple(number(value, reader.name) for value in reader.take(f"{COUNTS[name]}d"))
-        found.append(ColmapCamera(camera, name, (width, height), parameters))
+        found.append(ColmapCamera(camera, name, (width, height), parameters, at))
     return found
 
 
@@ -102,15 +108,17 @@ def _rigs(reader: _Reader) -> list[ColmapRig]:
         rig, sensors = reader.take("II")
         reader.need(9 * max(sensors - 1, 0))
         poses: dict[int, Pose | None] = {}
+        places: dict[int, At] = {}
         for place in range(sensors):
             kind, sensor = reader.take("iI")
             pose: Pose | None = IDENTITY
             if place:
                 (posed,) = reader.take("B")
+                places[sensor] = reader.at()
                 pose = reader.pose() if posed else None
             if kind == CAMERA:
                 poses[sensor] = pose
-        found.append(ColmapRig(rig, poses))
+        found.append(ColmapRig(rig, poses, {sensor: places[sensor] for sensor in poses.keys() & places.keys()}))
     return found
 
 
@@ -118,12 +126,13 @@ def _images(reader: _Reader) -> list[ColmapImage]:
     found = []
     for _ in range(reader.count(73)):
         (image,) = reader.take("I")
+        at = reader.at()
         pose = reader.pose()
         (camera,) = reader.take("I")
         name = reader.name_of_image()
         points = reader.count(POINT)
         reader.place += points * POINT
-        found.append(ColmapImage(image, pose, camera, name))
+        found.append(ColmapImage(image, pose, camera, name, at))
     return found
 
 

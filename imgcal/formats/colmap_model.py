@@ -7,15 +7,17 @@ unless the model has been given a scale.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import PurePosixPath
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from imgcal.formats import places
 from imgcal.formats.chains import IDENTITY, Pose, compose, inverse
-from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place
 from imgcal.formats.lens import Array, Lens
 from imgcal.formats.values import named, quaternion_of_rotation, rotation_of_quaternion
+from imgcal.messages import shortened
 
 HALF = 0.5
 MODELS = (
@@ -30,6 +32,19 @@ ROTATION_STEADY, PLACE_STEADY = 1e-3, 1e-2  # rad; of the cameras' distances to 
 
 
 @dataclass(frozen=True)
+class At:
+    """Where numbers stand in a file: the line, or the offset in bytes, and how many numbers of the line come before."""
+
+    path: Path
+    line: int
+    first: int = 0
+
+    def place(self, numbers: places.Numbers) -> Place:
+        """The place of numbers of a camera."""
+        return Place(self.path, (self.line,), numbers, self.first)
+
+
+@dataclass(frozen=True)
 class ColmapCamera:
     """A row of cameras.txt."""
 
@@ -37,6 +52,23 @@ class ColmapCamera:
     model: str
     image_size: tuple[int, int] | None
     parameters: tuple[float, ...]
+    at: At | None = None
+
+    @property
+    def one_focal_length(self) -> bool:
+        """Tell whether fx and fy are one number."""
+        return self.model.startswith(("SIMPLE", "RADIAL"))
+
+    def numbers(self, camera: ForeignCamera) -> list[float]:
+        """The parameters of a camera of this model."""
+        fx, fy, cx, cy = places.focal_and_centre(camera)
+        focal = [fx] if self.one_focal_length else [fx, fy]
+        return [*focal, cx + HALF, cy + HALF, *camera.lens.padded(len(self.parameters) - len(focal) - 2)]
+
+    def camera(self, name: str, pose: Pose, *others: Place) -> ForeignCamera:
+        """The camera, where it stands."""
+        found = (self.at.place(self.numbers), *others) if self.at is not None else others
+        return ForeignCamera(name, self.lens(), self.image_size, *pose, found, self.one_focal_length)
 
     def lens(self) -> Lens:
         """The lens with OpenCV's pixels."""
@@ -47,7 +79,7 @@ class ColmapCamera:
                 f"camera {self.id}: found {len(self.parameters)} parameters, {self.model} has {COUNTS[self.model]}"
             )
         p = self.parameters
-        if self.model.startswith("SIMPLE") or self.model.startswith("RADIAL"):
+        if self.one_focal_length:
             focal, centre, ks = (p[0], p[0]), (p[1], p[2]), p[3:]
         else:
             focal, centre, ks = (p[0], p[1]), (p[2], p[3]), p[4:]
@@ -67,6 +99,11 @@ class ColmapImage:
     pose: Pose
     camera: int
     name: str
+    at: At | None = None
+
+    def place(self, before: Pose) -> list[Place]:
+        """Where its pose stands, which goes along with its camera."""
+        return [self.at.place(places.carried(before, self.pose, places.seven))] if self.at is not None else []
 
 
 @dataclass(frozen=True)
@@ -75,6 +112,7 @@ class ColmapRig:
 
     id: int
     sensors: dict[int, Pose | None]
+    at: dict[int, At] = field(default_factory=dict)  # of the poses
 
 
 def pose_of(row: Sequence[float], what: str) -> Pose:
@@ -83,7 +121,11 @@ def pose_of(row: Sequence[float], what: str) -> Pose:
 
 
 def rig_of_model(
-    name: str, cameras: Sequence[ColmapCamera], images: Sequence[ColmapImage], rigs: Sequence[ColmapRig]
+    name: str,
+    cameras: Sequence[ColmapCamera],
+    images: Sequence[ColmapImage],
+    rigs: Sequence[ColmapRig],
+    wanted: str | None = None,
 ) -> ForeignRig:
     """Make a rig: of a rig that the model has, else of the images that were taken together.
 
@@ -93,11 +135,43 @@ def rig_of_model(
     known = {camera.id: camera for camera in cameras}
     notes = ["COLMAP's pixels begin half a pixel earlier: cx and cy are 0.5 less here"]
     together = [rig for rig in rigs if len(rig.sensors) > 1]
-    if len(together) > 1:
-        raise FormatError(f"found {len(together)} rigs of several cameras, expected one")
     if together:
-        return _of_rig(name, together[0], known, images, notes)
+        chosen = together[chosen_rig(_rig_names(together, images), wanted)]
+        return _of_rig(name, chosen, known, images, notes)
     return _of_images(name, known, images, notes)
+
+
+def chosen_rig(names: Sequence[str], wanted: str | None) -> int:
+    """Find the rig that the user means.
+
+    Raises:
+        FormatError: there are several and none is named, or there is none of that name.
+    """
+    if wanted is None and len(names) > 1:
+        raise FormatError(f"found {len(names)} rigs of several cameras: choose one with --source-rig {names[0]} (of "
+                          f"{', '.join(names[:8])}), to imgcal convert")  # fmt: skip
+    if wanted is not None and wanted not in names:
+        raise FormatError(f"--source-rig: found {shortened(wanted)}, expected one of {', '.join(names[:8])}")
+    return 0 if wanted is None else list(names).index(wanted)
+
+
+def _rig_names(rigs: Sequence[ColmapRig], images: Sequence[ColmapImage]) -> list[str]:
+    """Rigs are called as the folder of their images, where each has one of its own, else by their numbers."""
+    names = []
+    for rig in rigs:
+        folders = [PurePosixPath(image.name).parts[:-1] for image in images if image.camera in rig.sensors]
+        names.append("/".join(prefix_of(folders)))
+    return names if all(names) and len(set(names)) == len(names) else [str(rig.id) for rig in rigs]
+
+
+def prefix_of(folders: Sequence[Sequence[str]]) -> list[str]:
+    """What several folders have in common at their beginning."""
+    common = []
+    for parts in zip(*folders, strict=False):
+        if len(set(parts)) > 1:
+            break
+        common.append(parts[0])
+    return common
 
 
 def _names(rig: ColmapRig, images: Sequence[ColmapImage]) -> dict[int, str]:
@@ -120,16 +194,22 @@ def _of_rig(
     lost = [names[sensor] for sensor, pose in rig.sensors.items() if pose is None]
     if lost:
         notes.append(f"{named(lost)}: left out, without a pose in the rig")
-    found = []
+    found: list[ForeignCamera] = []
+    root = None
     for sensor, pose in rig.sensors.items():
         if pose is None:
             continue
         if sensor not in known:
             raise FormatError(f"rig {rig.id}: camera {sensor} is not among the cameras")
-        found.append(ForeignCamera(names[sensor], known[sensor].lens(), known[sensor].image_size, *pose))
+        if pose is IDENTITY:
+            root = len(found)
+        others = [place for image in images if image.camera == sensor for place in image.place(pose)]
+        if sensor in rig.at:
+            others.append(rig.at[sensor].place(places.seven))
+        found.append(known[sensor].camera(names[sensor], pose, *others))
     if len(found) < 2:
         raise FormatError(f"rig {rig.id}: {named(lost)} without a pose in it, so that there is no rig")
-    return ForeignRig(name, tuple(found), None, f"rig {rig.id} (its reference camera)", tuple(notes))
+    return ForeignRig(name, tuple(found), None, f"rig {rig.id} (its reference camera)", tuple(notes), root=root)
 
 
 def _of_images(
@@ -162,7 +242,11 @@ def _of_images(
         if image.camera not in known:
             raise FormatError(f"image {image.name}: camera {image.camera} is not among the cameras")
         row = known[image.camera]
-        cameras.append(ForeignCamera(camera, row.lens(), row.image_size, *image.pose))
+        others = [
+            place for images_of in frames.values() if camera in images_of
+            for place in images_of[camera].place(image.pose)
+        ]  # fmt: skip
+        cameras.append(row.camera(camera, image.pose, *others))
     return ForeignRig(name, tuple(cameras), None, "COLMAP's world" + (f" at {frame!r}" if frame else ""), tuple(notes))
 
 

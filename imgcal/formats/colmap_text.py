@@ -7,18 +7,22 @@ from pathlib import Path
 from typing import Any
 
 from imgcal.errors import InputError
+from imgcal.formats import places
 from imgcal.formats.chains import IDENTITY, Pose
 from imgcal.formats.colmap_model import (
+    At,
     ColmapCamera,
     ColmapImage,
     ColmapRig,
+    chosen_rig,
     model_of_rig,
     pose_of,
+    prefix_of,
     rig_of_model,
     seven,
 )
 from imgcal.formats.fitting import Holds
-from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place
 from imgcal.formats.format import Files, Format
 from imgcal.formats.source import Source
 from imgcal.formats.values import array, mapping, number, numbers, rotation_of_quaternion, text
@@ -36,26 +40,31 @@ def _recognizes(source: Source) -> bool:
 def _read(source: Source) -> ForeignRig:
     path = source.named("cameras.txt")
     assert path is not None
-    cameras = [_camera(row, line) for line, row in _rows(path)]
+    cameras = [_camera(row, line, path) for line, row in _rows(path)]
     rigs_path, images_path = source.named("rigs.txt"), source.named("images.txt")
-    rigs = [_rig(row, line) for line, row in _rows(rigs_path)] if rigs_path else []
+    rigs = [_rig(row, line, rigs_path) for line, row in _rows(rigs_path)] if rigs_path else []
     if images_path is None and not any(len(rig.sensors) > 1 for rig in rigs):
         raise FormatError("intrinsics alone: expected images.txt or rigs.txt beside cameras.txt")
-    return rig_of_model(FORMAT.name, cameras, list(_images(images_path)) if images_path else [], rigs)
+    return rig_of_model(FORMAT.name, cameras, list(_images(images_path)) if images_path else [], rigs, source.rig)
 
 
-def _camera(row: list[str], line: str) -> ColmapCamera:
+def _camera(row: list[str], number_of_line: int, path: Path) -> ColmapCamera:
+    line = f"line {number_of_line}"
     if len(row) < 5:
         raise FormatError(f"cameras.txt: {line}: found {len(row)} values, expected ID MODEL WIDTH HEIGHT PARAMETERS")
     place = f"cameras.txt: {line}"
     width, height = int(number(row[2], place)), int(number(row[3], place))
-    return ColmapCamera(int(number(row[0], place)), row[1], (width, height), tuple(number(v, place) for v in row[4:]))
+    parameters = tuple(number(value, place) for value in row[4:])
+    at = At(path, number_of_line, 3)
+    return ColmapCamera(int(number(row[0], place)), row[1], (width, height), parameters, at)
 
 
-def _rig(row: list[str], line: str) -> ColmapRig:
-    place = f"rigs.txt: {line}"
+def _rig(row: list[str], line: int, path: Path) -> ColmapRig:
+    place = f"rigs.txt: line {line}"
     rest = row[2:]
     sensors: dict[int, Pose | None] = {}
+    at: dict[int, At] = {}
+    plain = 2  # numbers of the row so far: its words are no numbers
     while rest:
         if len(rest) < 2:
             raise FormatError(f"{place}: ends in the middle of a sensor")
@@ -70,10 +79,13 @@ def _rig(row: list[str], line: str) -> ColmapRig:
                     pose_of([number(v, place) for v in rest[3:10]], place) if len(rest) >= 10 else _short(place),
                     10,
                 )
+        if kind == "CAMERA" and taken == 10:
+            at[sensor] = At(path, line, plain + 2)
+        plain += taken - 1
         if kind == "CAMERA":
             sensors[sensor] = pose if posed else None
         rest = rest[taken:]
-    return ColmapRig(int(number(row[0], place)), sensors)
+    return ColmapRig(int(number(row[0], place)), sensors, at)
 
 
 def _short(place: str) -> Pose:
@@ -89,15 +101,16 @@ def _images(path: Path) -> Iterator[ColmapImage]:
             continue
         if not row:
             continue
-        place = f"images.txt: {line}"
+        place = f"images.txt: line {line}"
         if len(row) < 10:
             raise FormatError(f"{place}: found {len(row)} values, expected ID QW QX QY QZ TX TY TZ CAMERA NAME")
         pose = pose_of([number(value, place) for value in row[1:8]], place)
-        yield ColmapImage(int(number(row[0], place)), pose, int(number(row[8], place)), " ".join(row[9:]))
+        at = At(path, line, 1)
+        yield ColmapImage(int(number(row[0], place)), pose, int(number(row[8], place)), " ".join(row[9:]), at)
         expects_points = True
 
 
-def _rows(path: Path, keep_empty: bool = False) -> Iterator[tuple[str, list[str]]]:
+def _rows(path: Path, keep_empty: bool = False) -> Iterator[tuple[int, list[str]]]:
     """The rows of a text file without its remarks, split at spaces or commas; a long one (points) is cut."""
     try:
         if path.stat().st_size > MOST_BYTES:
@@ -111,7 +124,7 @@ def _rows(path: Path, keep_empty: bool = False) -> Iterator[tuple[str, list[str]
                     raise InputError(f"{path}: found a row of more than {MOST_ROW:,} characters")
                 if row.lstrip().startswith("#") or (not row.strip() and not keep_empty):
                     continue
-                yield f"line {count}", row[:20_000].replace(",", " ").split()
+                yield count, row[:20_000].replace(",", " ").split()
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
 
@@ -141,23 +154,33 @@ def _write(rig: ForeignRig) -> Files:
     }
 
 
-def _configs(source: Source) -> list[dict[str, Any]]:
+def _configs(source: Source) -> tuple[Path, list[dict[str, Any]]]:
     """The rigs of a rig_config.json."""
     for document in source.documents:
         rigs = document.value
         if document.kind == "json" and isinstance(rigs, list) and rigs and all(isinstance(rig, dict) for rig in rigs):
             found = [rig for rig in rigs if isinstance(rig.get("cameras"), list)]
             if found and any(isinstance(c, dict) and "image_prefix" in c for c in found[0]["cameras"]):
-                return found
-    return []
+                return document.path, rigs
+    return Path(), []
+
+
+def _config_names(rigs: list[dict[str, Any]]) -> list[str]:
+    """What the prefixes of a rig's images have in common, where each has something of its own, else its number."""
+    names = []
+    for rig in rigs:
+        entries = [entry for entry in rig.get("cameras") or [] if isinstance(entry, dict)]
+        names.append("/".join(prefix_of([str(entry.get("image_prefix", "")).split("/")[:-1] for entry in entries])))
+    return names if all(names) and len(set(names)) == len(names) else [str(n) for n in range(1, len(rigs) + 1)]
 
 
 def _read_config(source: Source) -> ForeignRig:
-    rigs = _configs(source)
-    if len(rigs) > 1:
-        raise FormatError(f"found {len(rigs)} rigs, expected one")
-    cameras, without = [], []
-    for place, value in enumerate(rigs[0]["cameras"], start=1):
+    path, rigs = _configs(source)
+    which = chosen_rig(_config_names(rigs), source.rig)
+    cameras: list[ForeignCamera] = []
+    without: list[str] = []
+    root = None
+    for place, value in enumerate(rigs[which]["cameras"], start=1):
         entry = mapping(value, f"camera {place}")
         prefix = text(entry.get("image_prefix", str(place)), f"camera {place}")
         name = prefix.rstrip("/").rpartition("/")[2] or str(place)
@@ -165,23 +188,35 @@ def _read_config(source: Source) -> ForeignRig:
             raise FormatError(f"camera {name}: no intrinsics (camera_model_name, camera_params are optional there, and "
                               "COLMAP estimates them): give the folder of the model instead")  # fmt: skip
         parameters = tuple(numbers(entry["camera_params"], f"camera {name}: camera_params"))
-        lens = ColmapCamera(place, text(entry["camera_model_name"], name), None, parameters).lens()
+        row = ColmapCamera(place, text(entry["camera_model_name"], name), None, parameters)
+        keys = (which, "cameras", place - 1)
+        others = [Place(path, (*keys, "camera_params"), row.numbers)]
+        row.lens()
         turn, shift = entry.get("cam_from_rig_rotation"), entry.get("cam_from_rig_translation")
         if entry.get("ref_sensor") is True:
-            pose = IDENTITY
+            pose, root = IDENTITY, len(cameras)
         elif turn is None or shift is None:
             without.append(name)
             continue
         else:
             pose = rotation_of_quaternion(turn, name), array(shift, (3,), name)
-        cameras.append(ForeignCamera(name, lens, None, *pose))
+            sign = numbers(turn, name)
+            others += [
+                Place(path, (*keys, "cam_from_rig_rotation"), _quaternion_like(sign)),
+                Place(path, (*keys, "cam_from_rig_translation"), places.translation),
+            ]
+        cameras.append(row.camera(name, pose, *others))
     notes = ["COLMAP's pixels begin half a pixel earlier: cx and cy are 0.5 less here"]
     if without:
         notes.append(f"{', '.join(without)}: left out, without a pose in the rig")
     if len(cameras) < 2:
         raise FormatError("fewer than two cameras have a pose: COLMAP estimates them later")
-    return ForeignRig(CONFIG.name, tuple(cameras), None, "the rig's reference camera", tuple(notes))
+    return ForeignRig(CONFIG.name, tuple(cameras), None, "the rig's reference camera", tuple(notes), root=root)
+
+
+def _quaternion_like(found: list[float]) -> places.Numbers:
+    return lambda camera: places.near_quaternion(camera.rotation, found)
 
 
 FORMAT = Format("colmap", TITLE, _recognizes, _read, _write, Holds((4, 8), fisheye=True), unit="m", cameras=(2, 256))
-CONFIG = Format("colmap-rig-config", CONFIG_TITLE, lambda source: bool(_configs(source)), _read_config)
+CONFIG = Format("colmap-rig-config", CONFIG_TITLE, lambda source: bool(_configs(source)[1]), _read_config)

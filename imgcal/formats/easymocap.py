@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from imgcal.formats.file_storage import merged, storage_text
+from imgcal.formats import places
+from imgcal.formats.file_storage import merged, place_of, storage_text
 from imgcal.formats.fitting import Holds
-from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place
 from imgcal.formats.format import Files, Format
 from imgcal.formats.lens import Lens
 from imgcal.formats.source import Source
@@ -17,6 +18,7 @@ from imgcal.formats.values import (
     image_size,
     named,
     number,
+    numbers,
     rotation,
     text,
     vector_of_rotation,
@@ -62,11 +64,17 @@ def _read(source: Source) -> ForeignRig:
             pair = [number(_only(values[f"{side}_{name}"]), f"{side}_{name}") for side in "WH"]
             size = image_size(pair, f"W_{name}, H_{name}")
         turn = values.get(f"Rot_{name}", values.get(f"R_{name}"))
-        cameras.append(
-            ForeignCamera(
-                name, lens, size, rotation(turn, f"Rot_{name}"), array(values[f"T_{name}"], (3,), f"T_{name}")
-            )
-        )
+        moved = array(values[f"T_{name}"], (3,), f"T_{name}")
+        count = len(lens.coefficients)
+        parts: dict[str, places.Numbers] = {
+            f"K_{name}": places.camera_matrix, f"T_{name}": places.translation,
+            f"dist_{name}" if f"dist_{name}" in values else f"D_{name}": places.coefficients(count),
+        }  # fmt: skip
+        for key in (f"Rot_{name}", f"R_{name}"):
+            if key in values:
+                parts[key] = places.rotation_like(numbers(values[key], key))
+        found = tuple(Place(*place_of(source, key), of) for key, of in parts.items() if key in values)
+        cameras.append(ForeignCamera(name, lens, size, rotation(turn, f"Rot_{name}"), moved, found))
     return ForeignRig(FORMAT.name, tuple(cameras), "m", "the file's world", tuple(notes))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,14 @@ def merged(source: Source) -> dict[str, Any]:
         for key, value in values.items():
             together.setdefault(key, value)
     return together
+
+
+def place_of(source: Source, key: str) -> tuple[Path, tuple[str, ...]]:
+    """Where the numbers of a key stand: the document that counts, and the keys to them."""
+    document, values = next((document, values) for document, values in storages(source) if key in values)
+    outer = (ROOT,) if document.kind == "xml" else ()
+    inner = ("data",) if isinstance(values[key], dict) else ()
+    return document.path, (*outer, key, *inner)
 
 
 def is_matrix(value: Any) -> bool:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from imgcal.formats import places
 from imgcal.formats.chains import Link, Pose, from_root, inverse, pose_of_matrix
 from imgcal.formats.fitting import Holds
-from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place
 from imgcal.formats.format import Files, Format
 from imgcal.formats.lens import Lens
 from imgcal.formats.source import Source
@@ -57,7 +60,49 @@ def _read(source: Source) -> ForeignRig:
         ForeignCamera(name, lenses[name], image_size(entries[name].get("resolution"), name), *poses[name])
         for name in names
     )
-    return ForeignRig(FORMAT.name, cameras, "m", f"camera {root}", tuple(notes))
+    cameras = tuple(replace(camera, places=_places(source, values, camera, names)) for camera in cameras)
+    return ForeignRig(FORMAT.name, cameras, "m", f"camera {root}", tuple(notes), root=0)
+
+
+def _places(source: Source, values: dict[str, Any], camera: ForeignCamera, names: list[str]) -> tuple[Place, ...]:
+    """Where a camera's numbers stand; poses to the IMU go along with the camera."""
+    name, entry = camera.name, values[camera.name]
+    before = (camera.rotation, camera.translation)
+    path = _path_of(source, name)
+    found = [
+        Place(path, (name, "intrinsics"), places.focal_and_centre),
+        Place(path, (name, "distortion_coeffs"), places.coefficients(len(camera.lens.coefficients))),
+    ]
+    if "T_cn_cnm1" in entry and names.index(name):
+        found.append(Place(path, (name, "T_cn_cnm1"), places.matrix_rows, relative_to=names.index(name) - 1))
+    if "T_cam_imu" in entry:
+        pose = _pose(entry["T_cam_imu"], "T_cam_imu")
+        found.append(Place(path, (name, "T_cam_imu"), places.carried(before, pose, places.matrix_rows)))
+    elif "T_imu_cam" in entry:
+        pose = inverse(_pose(entry["T_imu_cam"], "T_imu_cam"))
+        found.append(Place(path, (name, "T_imu_cam"), places.carried(before, pose, places.inverse_rows)))
+    groups = [((), values), *(((other,), values[other]) for other in names)]
+    for outer, group in groups:
+        for key, value in group.items():
+            between = BETWEEN.fullmatch(key)
+            if between is None or value is None or name not in between.groups():
+                continue
+            path = _path_of(source, outer[0] if outer else key)
+            if between[1] == name and between[2] in names:
+                of: places.Numbers = places.matrix_rows
+                base: int | None = names.index(between[2])
+            elif between[2] == name and between[1] in names:
+                continue  # it is among the other camera's
+            elif between[1] == name:
+                of, base = places.carried(before, _pose(value, key), places.matrix_rows), None
+            else:
+                of, base = places.carried(before, inverse(_pose(value, key)), places.inverse_rows), None
+            found.append(Place(path, (*outer, key), of, relative_to=base))
+    return tuple(found)
+
+
+def _path_of(source: Source, key: str) -> Path:
+    return next(document.path for document, values in source.mappings if key in values)
 
 
 def _with(source: Source, key: str) -> list[str]:
@@ -81,6 +126,7 @@ def _lens(name: str, entry: dict[str, Any]) -> Lens:
     ks = coefficients(entry.get("distortion_coeffs"), f"{name}: distortion_coeffs", counts)
     if kind in ("none", "") and any(ks):
         raise FormatError(f"{name}: found distortion_coeffs without a distortion_model")
+    ks = () if kind in ("none", "") else ks
     focal = focal_length(fx, fy, f"{name}: intrinsics")
     return Lens(focal, (cx, cy), ks, "fisheye" if family == "fisheye" else "opencv")
 

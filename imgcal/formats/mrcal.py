@@ -5,12 +5,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from imgcal.formats import places
 from imgcal.formats.fitting import Holds
-from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place
 from imgcal.formats.format import Files, Format
 from imgcal.formats.lens import Lens
 from imgcal.formats.source import Source
@@ -33,7 +35,7 @@ def _is_model(values: dict[str, Any]) -> bool:
 
 
 def _read(source: Source) -> ForeignRig:
-    cameras = [_camera(document.path.stem, values) for document, values in source.mappings if _is_model(values)]
+    cameras = [_camera(document.path, values) for document, values in source.mappings if _is_model(values)]
     notes = []
     if len(cameras) > 1 and not any(camera.translation.any() for camera in cameras):
         raise FormatError("all cameras stand at the origin of their reference: extrinsics were never calibrated")
@@ -42,7 +44,8 @@ def _read(source: Source) -> ForeignRig:
     return ForeignRig(FORMAT.name, tuple(cameras), None, "mrcal's reference frame", tuple(notes))
 
 
-def _camera(name: str, values: dict[str, Any]) -> ForeignCamera:
+def _camera(path: Path, values: dict[str, Any]) -> ForeignCamera:
+    name = path.stem
     model = text(values.get("lensmodel", values.get("distortion_model")), f"{name}: lensmodel")
     short = model.removeprefix("LENSMODEL_").removeprefix("DISTORTION_")
     for start, reason in REASONS.items():
@@ -59,7 +62,14 @@ def _camera(name: str, values: dict[str, Any]) -> ForeignCamera:
         raise FormatError(f"{name}: no extrinsics (rt_cam_ref)")
     six = array(pose, (6,), f"{name}: extrinsics")
     size = image_size(values.get("imagersize"), f"{name}: imagersize")
-    return ForeignCamera(name, lens, size, rotation_of_vector(six[:3]), six[3:])
+    turned = places.rotation_like(six[:3].tolist())
+    count = COUNTS[short]
+    where = [Place(path, ("intrinsics",), lambda one: [*places.focal_and_centre(one), *one.lens.padded(count)])]
+    where += [
+        Place(path, (key,), lambda one: [*turned(one), *places.translation(one)])
+        for key in ("rt_cam_ref", "extrinsics") if values.get(key) is not None
+    ]  # fmt: skip
+    return ForeignCamera(name, lens, size, rotation_of_vector(six[:3]), six[3:], tuple(where))
 
 
 def _write(rig: ForeignRig) -> Files:

@@ -3,35 +3,50 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from imgcal.formats.chains import IDENTITY, Link, from_root
+from imgcal.formats import places
+from imgcal.formats.chains import IDENTITY, Link, Pose, from_root
+from imgcal.formats.documents import Document
 from imgcal.formats.fitting import Holds
-from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place
 from imgcal.formats.format import Files, Format
 from imgcal.formats.lens import Lens
 from imgcal.formats.source import Source
-from imgcal.formats.values import array, camera_matrix, coefficients, image_size, mapping, named, rotation, text
+from imgcal.formats.values import (
+    array,
+    camera_matrix,
+    coefficients,
+    image_size,
+    mapping,
+    named,
+    numbers,
+    rotation,
+    text,
+)
 
 TITLE = "multical calibration.json"
 MODELS = {"standard": (0, 4, 5), "rational": (5, 8), "thin_prism": (5, 8, 12), "tilted": (5, 8, 12, 14)}
 
 
-def _values(source: Source) -> dict[str, Any] | None:
+def _values(source: Source) -> tuple[Document, dict[str, Any]] | None:
     for document, values in source.mappings:
         cameras = values.get("cameras")
         if document.kind == "json" and isinstance(cameras, dict) and any(
             isinstance(camera, dict) and "K" in camera for camera in cameras.values()
         ):  # fmt: skip
-            return values
+            return document, values
     return None
 
 
 def _read(source: Source) -> ForeignRig:
-    values = _values(source)
-    assert values is not None
+    found_values = _values(source)
+    assert found_values is not None
+    document, values = found_values
     cameras = mapping(values["cameras"], "cameras")
     if not isinstance(values.get("camera_poses"), dict):
         raise FormatError("intrinsics alone (no camera_poses): give calibration.json, which has both")
@@ -58,7 +73,31 @@ def _read(source: Source) -> ForeignRig:
         raise FormatError("camera_poses holds no pose of one camera to another")
     found = from_root(root, posed, links) if links else {root: IDENTITY}
     made = [ForeignCamera(name, _lens(name, cameras[name]), _size(name, cameras[name]), *found[name]) for name in posed]
-    return ForeignRig(FORMAT.name, tuple(made), "m", f"camera {root}", tuple(notes))
+    made = [replace(camera, places=_places(document.path, camera, poses, posed)) for camera in made]
+    return ForeignRig(FORMAT.name, tuple(made), "m", f"camera {root}", tuple(notes), root=posed.index(root))
+
+
+def _places(path: Path, camera: ForeignCamera, poses: dict[str, Any], names: list[str]) -> tuple[Place, ...]:
+    name = camera.name
+    before = (camera.rotation, camera.translation)
+    found = [
+        Place(path, ("cameras", name, "K"), places.camera_matrix),
+        Place(path, ("cameras", name, "dist"), places.coefficients(len(camera.lens.coefficients))),
+    ]
+    for key, entry in poses.items():
+        turn = numbers(entry["R"], key)
+        parts = {"R": places.rotation_like(turn), "T": places.translation}
+        others = [place for place, other in enumerate(names) if key == f"{name}_to_{other}"]
+        if others:
+            found += [Place(path, ("camera_poses", key, part), of, relative_to=others[0]) for part, of in parts.items()]
+        elif key == name:
+            pose: Pose = rotation(entry["R"], key), array(entry["T"], (3,), key)
+            if np.abs(pose[1]).max() > 1e-6 or np.abs(pose[0] - np.eye(3)).max() > 1e-6:
+                found += [
+                    Place(path, ("camera_poses", key, part), places.carried(before, pose, of))
+                    for part, of in parts.items()
+                ]
+    return tuple(found)
 
 
 def _lens(name: str, entry: Any) -> Lens:

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from imgcal.formats.file_storage import is_matrix, matrix, merged, storage_text
+from imgcal.formats import places
+from imgcal.formats.file_storage import is_matrix, matrix, merged, place_of, storage_text
 from imgcal.formats.fitting import Holds
-from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place
 from imgcal.formats.format import Files, Format
 from imgcal.formats.lens import Lens
 from imgcal.formats.source import Source
@@ -51,8 +52,18 @@ def _read(source: Source) -> ForeignRig:
         lens = Lens(focal, centre, coefficients(ks, f"camera {name}"), "fisheye" if fisheye else "opencv", skew)
         size = image_size(sizes[number], f"camera {name}: image size")
         turned = rotation(turns[number], f"camera {name}: R")
-        cameras.append(ForeignCamera(name, lens, size, turned, np.array(shifts[number])))
-    return ForeignRig(FORMAT.name, tuple(cameras), None, f"camera {names[0]}")
+        parts = {
+            "Ks": (9, places.camera_matrix),
+            "Ts": (3, places.translation),
+            "Rs": (len(turns[number]), places.rotation_like(turns[number])),
+            "distortions": (len(distortions[number]), places.coefficients(len(ks))),
+        }
+        found = tuple(
+            Place(*place_of(source, key), of, first=width * number)
+            for key, (width, of) in parts.items() if key in values
+        )  # fmt: skip
+        cameras.append(ForeignCamera(name, lens, size, turned, np.array(shifts[number]), found))
+    return ForeignRig(FORMAT.name, tuple(cameras), None, f"camera {names[0]}", root=0)
 
 
 def _write(rig: ForeignRig) -> Files:

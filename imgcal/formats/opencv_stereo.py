@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from imgcal.formats.file_storage import is_matrix, merged, storage_text
+from imgcal.formats import places
+from imgcal.formats.file_storage import is_matrix, merged, place_of, storage_text
 from imgcal.formats.fitting import Holds
-from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place
 from imgcal.formats.format import Files, Format
 from imgcal.formats.lens import Lens
 from imgcal.formats.source import Source
-from imgcal.formats.values import array, camera_matrix, coefficients, image_size, number, rotation
+from imgcal.formats.values import array, camera_matrix, coefficients, image_size, number, numbers, rotation
 
 TITLE = "OpenCV stereo pair (FileStorage)"
 
@@ -40,7 +41,8 @@ def _recognizes(source: Source) -> bool:
 
 def _read(source: Source) -> ForeignRig:
     keys = _keys(merged(source))
-    matrices, distortions = _sides(keys, MATRIX), _sides(keys, DISTORTION)
+    matrix_keys, distortion_keys = _sides(keys, MATRIX), _sides(keys, DISTORTION)
+    matrices, distortions = [keys[key] for key in matrix_keys], [keys[key] for key in distortion_keys]
     turn, shift = _first(keys, ROTATION), _first(keys, TRANSLATION)
     if len(matrices) < 2:
         raise FormatError("extrinsics alone (R, T): give the file with M1, D1, M2, D2, too, or the folder of both")
@@ -55,8 +57,8 @@ def _read(source: Source) -> ForeignRig:
     for side, k in enumerate(matrices):
         d = distortions[side] if len(distortions) == 2 else None
         focal, centre, skew = camera_matrix(k, f"camera matrix {side + 1}")
-        numbers = coefficients(d, f"distortion {side + 1}", counts=(4,) if fisheye else (0, 4, 5, 8, 12, 14))
-        lenses.append(Lens(focal, centre, numbers, "fisheye" if fisheye else "opencv", skew))
+        ks = coefficients(d, f"distortion {side + 1}", counts=(4,) if fisheye else (0, 4, 5, 8, 12, 14))
+        lenses.append(Lens(focal, centre, ks, "fisheye" if fisheye else "opencv", skew))
     if len(distortions) != 2:
         notes.append("no distortion in the file: taken as none")
     elif not fisheye and all(len(lens.coefficients) == 4 for lens in lenses):
@@ -65,11 +67,21 @@ def _read(source: Source) -> ForeignRig:
     if translation[0] > 0:
         notes.append("T[0] > 0: camera 2 stands to the left of camera 1; taken as it is")
     poses = ((np.eye(3), np.zeros(3)), (turned, translation))
-    cameras = tuple(
-        ForeignCamera(str(side + 1), lens, size, *pose)
-        for side, (lens, pose) in enumerate(zip(lenses, poses, strict=True))
-    )
-    return ForeignRig(FORMAT.name, cameras, None, "camera 1", tuple(notes))
+    written = {_plain(key): key for key in reversed(list(merged(source)))}
+
+    def place(key: str, of: places.Numbers) -> Place:
+        return Place(*place_of(source, written[key]), of)
+
+    cameras = []
+    for side, (lens, pose) in enumerate(zip(lenses, poses, strict=True)):
+        found = [place(matrix_keys[side], places.camera_matrix)]
+        if len(distortion_keys) == 2:
+            found.append(place(distortion_keys[side], places.coefficients(len(lens.coefficients))))
+        if side:
+            found.append(place(_first_key(keys, ROTATION), places.rotation_like(numbers(turn, "R"))))
+            found.append(place(_first_key(keys, TRANSLATION), places.translation))
+        cameras.append(ForeignCamera(str(side + 1), lens, size, *pose, tuple(found)))
+    return ForeignRig(FORMAT.name, tuple(cameras), None, "camera 1", tuple(notes), root=0)
 
 
 def _write(rig: ForeignRig) -> Files:
@@ -88,21 +100,29 @@ def _write(rig: ForeignRig) -> Files:
 def _keys(values: dict[str, Any]) -> dict[str, Any]:
     plain: dict[str, Any] = {}
     for key, value in values.items():
-        plain.setdefault(re.sub(r"[^a-z0-9]", "", key.lower()), value)
+        plain.setdefault(_plain(key), value)
     return plain
 
 
+def _plain(key: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", key.lower())
+
+
 def _first(keys: dict[str, Any], names: tuple[str, ...]) -> Any:
-    return next((keys[name] for name in names if name in keys), None)
+    return keys.get(_first_key(keys, names))
 
 
-def _sides(keys: dict[str, Any], names: tuple[str, ...]) -> list[Any]:
-    """The values of the first and the second camera; fewer where the file has no such pair."""
+def _first_key(keys: dict[str, Any], names: tuple[str, ...]) -> str:
+    return next((name for name in names if name in keys), "")
+
+
+def _sides(keys: dict[str, Any], names: tuple[str, ...]) -> list[str]:
+    """The keys of the first and the second camera; fewer where the file has no such pair."""
     for ours, theirs in zip(*SIDES, strict=True):
         for name in names:
             for one, other in ((name + ours, name + theirs), (ours + name, theirs + name)):
                 if is_matrix(keys.get(one)) and is_matrix(keys.get(other)):
-                    return [keys[one], keys[other]]
+                    return [one, other]
     return []
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from imgcal.formats.documents import decode, parse_document
 from imgcal.formats.foreign_rig import FormatError
+from imgcal.formats.source import COLMAP_FILES
 from imgcal.formats.spans import Keys, Node, Span, locate, numbers_in
 
 EXACT_DIGITS = 15  # a number with so many is one that was written in full
@@ -19,7 +20,7 @@ LEAST_DIGITS = 12  # of a number in the place of one that shows none, such as 0 
 WIDEST = 17  # decimals; a smaller number is written with an exponent
 NUMBER_PARTS = re.compile(r"([-+]?)(\d*)(\.?)(\d*)(?:([eE])([-+]?)(\d+))?")
 STAMP_KEY = re.compile(
-    r"(?i)@?(created|(calibration|creation)[_ -]?(time|date)|(calibrated|created)[_ -]?(at|on)|"
+    r"(?i)@?(created|calibration[_ -]?(time|date)|(calibrated|created)[_ -]?(at|on)|"
     r"date[_ -]?time[_ -]?(calibrated|created)|timestamp|date|datetime)"
 )
 STAMP_FORMS = (
@@ -54,7 +55,7 @@ class TextFile:
         """
         self.name = path.name
         self.text, self.encoding, self.mark = decode(content, path)
-        self.kind = parse_document(content, path).kind
+        self.kind = "rows" if path.name in COLMAP_FILES else parse_document(content, path).kind
         try:
             self.root = locate(self.text, self.kind)
         except ValueError as error:
@@ -75,6 +76,8 @@ class TextFile:
         wanted: dict[Span, tuple[float, float]] = {}
         groups: list[tuple[str | int, list[Span]]] = []  # by the last key: what is written alike
         for change in changes:
+            if all(map(_is_near, change.before, change.after)):
+                continue
             node = self.root.at(change.keys)
             spans = numbers_in(self.text, node.span, self.kind) if node is not None else []
             spans = spans[change.first : change.first + len(change.after)]
@@ -95,7 +98,7 @@ class TextFile:
             style = style_of([tokens[span] for span in spans])
             for span in spans:
                 before, after = wanted[span]
-                if not math.isclose(before, after, rel_tol=1e-13):
+                if not _is_same(tokens[span], before, after):
                     new[span] = like(tokens[span], after, style, digits)
         return self._replaced(new)
 
@@ -128,6 +131,16 @@ class TextFile:
                 new[(start, start + len(text))] = made
                 replaced.append(key.lstrip("@"))
         return self._replaced(new), list(dict.fromkeys(replaced)), list(dict.fromkeys(left))
+
+
+def _is_near(before: float, after: float) -> bool:
+    return math.isclose(before, after, rel_tol=1e-13)
+
+
+def _is_same(token: str, before: float, after: float) -> bool:
+    """Tell whether a number that stands there need not be touched, though its digits are rounded."""
+    found = float(token.replace("_", ""))
+    return found == after or (_is_near(before, after) and math.isclose(found, before, rel_tol=1e-4, abs_tol=1e-4))
 
 
 def _is_date(node: Node) -> bool:
@@ -194,7 +207,7 @@ def like(token: str, value: float, style: Style | None = None, digits: int = 0) 
         return f"{plus}{mantissa}{e}{shown}{abs(int(power)):0{len(exponent)}d}"
     if digits and value:
         places = max(places, digits - 1 - math.floor(math.log10(abs(value))))
-    if places > WIDEST:
+    if digits and places > max(WIDEST, len(decimals)):
         return _with_point(f"{value:.{digits - 1}e}")
     return f"{plus}{value:.{places}f}"
 
@@ -230,6 +243,6 @@ def patched_bytes(content: bytes, changes: Sequence[Change]) -> bytes:
     for change in changes:
         (offset,) = change.keys
         for place, (before, after) in enumerate(zip(change.before, change.after, strict=True)):
-            if not math.isclose(before, after, rel_tol=1e-13):
+            if not _is_near(before, after):
                 struct.pack_into("<d", made, int(offset) + 8 * (change.first + place), after)
     return bytes(made)

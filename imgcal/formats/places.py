@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from imgcal.formats.values import quaternion_of_rotation, vector_of_rotation
 Numbers = Callable[[ForeignCamera], Sequence[float]]
 
 
-def attributes(path: Path, element: Element | None, numbers: dict[str, Numbers]) -> list[Place]:
+def attributes(path: Path, element: Element | None, numbers: Mapping[str, Numbers]) -> list[Place]:
     """Places of the attributes that an element has, out of some."""
     if element is None:
         return []
@@ -68,15 +68,15 @@ def rotation_like(found: Sequence[float]) -> Numbers:
     return vector
 
 
+def seven(camera: ForeignCamera) -> list[float]:
+    """Quaternion w, x, y, z and translation of cam_from_rig."""
+    return [*quaternion_of_rotation(camera.rotation).tolist(), *translation(camera)]
+
+
 def near_quaternion(rotation: Array, wxyz: Sequence[float]) -> list[float]:
     """A rotation's quaternion w, x, y, z with the sign of the one in the file."""
     made = quaternion_of_rotation(rotation)
     return [float(value) for value in (made if made @ np.array(wxyz) >= 0 else -made)]
-
-
-def seven_like(wxyz: Sequence[float]) -> Numbers:
-    """Quaternion and translation of cam_from_rig."""
-    return lambda camera: [*near_quaternion(camera.rotation, wxyz), *translation(camera)]
 
 
 def matrix_rows(camera: ForeignCamera) -> list[float]:
@@ -99,3 +99,9 @@ def carried(before: Pose, pose: Pose, numbers: Numbers) -> Numbers:
         return numbers(replace(camera, rotation=turned, translation=moved))
 
     return of
+
+
+def inverse_rows(camera: ForeignCamera) -> list[float]:
+    """Of rig_from_cam: rotation and translation, (3, 4) row by row."""
+    turned, moved = inverse((camera.rotation, camera.translation))
+    return [float(value) for value in np.column_stack((turned, moved)).ravel()]

@@ -98,19 +98,19 @@ def _camera(
     def axes_of(camera: ForeignCamera) -> list[float]:
         return [float(value) for value in (camera.rotation if plain else UPWARD @ camera.rotation).ravel()]
 
-    inside = {key: number_of(places.coefficients(5), place) for place, key in enumerate(keys)}
-    for place, (key, shift) in enumerate(
+    inside = {key: number_of(places.coefficients(5), which) for which, key in enumerate(keys)}
+    for which, (key, shift) in enumerate(
         (("focalLengthU", 0.0), ("focalLengthV", 0.0), ("centerPointU", left), ("centerPointV", top))
     ):
-        inside[key] = number_of(places.focal_and_centre, place, fraction, shift)
+        inside[key] = number_of(places.focal_and_centre, which, fraction, shift)
     inside["skew"] = lambda camera: [camera.lens.skew * fraction]
     if "focallength" in intrinsic.attributes:
         millimetres = get("focallength") / focal[0]
         inside["focallength"] = number_of(places.focal_and_centre, 0, millimetres)
     outside = {
-        axis: number_of(places.translation if plain else places.centre, place) for place, axis in enumerate("xyz")
+        axis: number_of(places.translation if plain else places.centre, which) for which, axis in enumerate("xyz")
     }
-    outside |= {f"r{place // 3 + 1}{place % 3 + 1}": number_of(axes_of, place) for place in range(9)}
+    outside |= {f"r{which // 3 + 1}{which % 3 + 1}": number_of(axes_of, which) for which in range(9)}
     found = (*places.attributes(path, transform, outside), *places.attributes(path, intrinsic, inside))
     return ForeignCamera(name, lens, (round(width), round(height)), rotation, translation, found), plain
 

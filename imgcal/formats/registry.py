@@ -59,17 +59,20 @@ BY_NAME = {one.name: one for one in FORMATS}
 NATIVE = re.compile(rb"(?m)^[\"']?format[\"']?[ \t]*:")
 
 
-def read_foreign_rig(paths: str | Path | Sequence[str | Path], name: str | None = None) -> ForeignRig:
+def read_foreign_rig(
+    paths: str | Path | Sequence[str | Path], name: str | None = None, rig: str | None = None
+) -> ForeignRig:
     """Read a calibration of another tool.
 
     Args:
         paths: a file, a folder, or the files that are one calibration together.
         name: of the format, as in `FORMATS`; None = by what stands in the files.
+        rig: name of the rig, where the files hold several (COLMAP).
 
     Raises:
         InputError: one line with the file, what it is and what it lacks.
     """
-    source = Source([Path(one) for one in ([paths] if isinstance(paths, str | Path) else paths)])
+    source = Source([Path(one) for one in ([paths] if isinstance(paths, str | Path) else paths)], rig)
     return _read(source, format_of(source) if name is None else _asked_for(source, format_named(name)))
 
 

@@ -6,15 +6,16 @@ X_right = R_r^T (R_l X_left + (Tx / fx', Ty / fy', 0)).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from imgcal.formats import places
 from imgcal.formats.documents import Document
 from imgcal.formats.fitting import Holds
-from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, unplaced_camera
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place, unplaced_camera
 from imgcal.formats.format import Files, Format
 from imgcal.formats.lens import Array, Lens
 from imgcal.formats.source import Source
@@ -40,6 +41,16 @@ class _Info:
     image_size: tuple[int, int] | None
     rectified: Array  # (3, 3): rectified_from_camera
     projection: Array  # (3, 4)
+    path: Path
+    keys: dict[str, tuple[str, ...]]  # to the numbers of k, d, r and p
+
+    @property
+    def places(self) -> tuple[Place, ...]:
+        """Where the lens stands; a projection that is K goes along with it."""
+        found = {"k": places.camera_matrix, "d": places.coefficients(len(self.lens.coefficients))}
+        if not self.shift.any() and np.allclose(self.projection[:, :3], self.lens.matrix, rtol=1e-9):
+            found["p"] = lambda camera: np.column_stack((camera.lens.matrix, np.zeros(3))).ravel().tolist()
+        return tuple(Place(self.path, self.keys[key], of) for key, of in found.items() if key in self.keys)
 
     @property
     def shift(self) -> Array:
@@ -60,15 +71,18 @@ def _is_info(values: dict[str, Any]) -> bool:
 def _read(source: Source) -> ForeignRig:
     infos = _infos(source)
     if len(infos) > 2:
+        first, second = (info.path.name for info in infos[:2])
         raise FormatError(f"{len(infos)} files: ROS says in them where two cameras are, no more; the poses of more are "
-                          "in /tf and in no file")  # fmt: skip
+                          f"in /tf and in no file: give the two of a pair (imgcal convert {first} {second} --out "
+                          "rig.yaml), or the folder to imgcal calibrate --cameras, which finds the poses")  # fmt: skip
     if len(infos) == 1:
         return _single(infos[0])
     infos.sort(key=lambda info: float(np.abs(info.shift).sum()))  # the left one has no Tx
     left, right = infos
     if not right.shift.any():
         raise FormatError(
-            "two files without Tx in P: these are two single cameras, and where they are to each other is not said"
+            "two files without Tx in P: these are two single cameras, and where they are to each other is not said: "
+            "imgcal calibrate --cameras FOLDER finds the poses"
         )
     notes = ["a stereo pair: X_right = R_r^T (R_l X_left + (Tx / fx', 0, 0)), metres; the rig's frame is the left "
              "camera's, unrectified"]  # fmt: skip
@@ -79,10 +93,27 @@ def _read(source: Source) -> ForeignRig:
     turned = nearest_rotation(right.rectified.T @ left.rectified, "R of the pair")
     translation = right.rectified.T @ (right.shift - left.shift)
     cameras = (
-        unplaced_camera(left.name, left.lens, left.image_size),
-        ForeignCamera(right.name, right.lens, right.image_size, turned, translation),
+        replace(unplaced_camera(left.name, left.lens, left.image_size), places=left.places),
+        ForeignCamera(
+            right.name, right.lens, right.image_size, turned, translation, (*right.places, *_pair_places(left, right))
+        ),
     )
-    return ForeignRig(FORMAT.name, cameras, "m", f"camera {left.name}", tuple(notes))
+    return ForeignRig(FORMAT.name, cameras, "m", f"camera {left.name}", tuple(notes), root=0)
+
+
+def _pair_places(left: _Info, right: _Info) -> list[Place]:
+    """Where the right camera's pose in the left one's frame stands: both rectifications and Tx."""
+    if "r" not in left.keys or "r" not in right.keys or "p" not in right.keys:
+        return []
+
+    def tx(camera: ForeignCamera) -> list[float]:
+        return [float(right.projection[0, 0] * (_rectification(camera, left.name)[2] + left.shift[0]))]
+
+    return [
+        Place(left.path, left.keys["r"], lambda camera: _rectification(camera, left.name)[0].ravel().tolist()),
+        Place(right.path, right.keys["r"], lambda camera: _rectification(camera, left.name)[1].ravel().tolist()),
+        Place(right.path, right.keys["p"], tx, first=3),
+    ]
 
 
 def _read_lenses(source: Source) -> list[ForeignCamera]:
@@ -98,7 +129,7 @@ def _single(info: _Info) -> ForeignRig:
     note = "one camera: its own frame is the rig's" + (
         "; R and P are those of a stereo pair: give both files, or their folder, for the pair" if pair else ""
     )
-    camera = unplaced_camera(info.name, info.lens, info.image_size)
+    camera = replace(unplaced_camera(info.name, info.lens, info.image_size), places=info.places)
     return ForeignRig(FORMAT.name, (camera,), "m", f"camera {info.name}", (note,))
 
 
@@ -128,7 +159,12 @@ def _info(values: dict[str, Any], document: Document) -> _Info:
         raise FormatError(
             f"{name}: projection_matrix: found {projection[0, 0]:g} and {projection[1, 1]:g} on its diagonal"
         )
-    return _Info(name, lens, size, rectified, projection)
+    keys: dict[str, tuple[str, ...]] = {}
+    for key in "kdrp":
+        found = next((one for one in KEYS[key] if values.get(one) is not None), None)
+        if found is not None:
+            keys[key] = (found, "data") if isinstance(values[found], dict) else (found,)
+    return _Info(name, lens, size, rectified, projection, document.path, keys)
 
 
 def _write(rig: ForeignRig) -> Files:
@@ -138,6 +174,22 @@ def _write(rig: ForeignRig) -> Files:
             _file_name(camera): _info_text(camera, np.eye(3), camera.lens.focal_length, camera.lens.principal_point)
         }
     left, right = rig.cameras
+    of_left, of_right, shift = _rectification(right.seen_from(left), left.name)
+    focal = float(min(*left.lens.focal_length, *right.lens.focal_length))
+    width, height = left.image_size or (0, 0)
+    centre = ((width - 1) / 2, (height - 1) / 2)
+    return {
+        _file_name(left): _info_text(left, of_left, (focal, focal), centre),
+        _file_name(right): _info_text(right, of_right, (focal, focal), centre, focal * shift),
+    }
+
+
+def _rectification(right: ForeignCamera, left_name: str) -> tuple[Array, Array, float]:
+    """The rotations of both cameras, (3, 3), and Tx / fx', of a right camera in the frame of the left one.
+
+    Raises:
+        FormatError: they do not stand side by side.
+    """
     across = right.rotation.T @ right.translation  # minus the baseline, in the left camera
     # Rectified: x along the baseline to the right, z as near to both optical axes as that leaves free.
     x = -across / np.linalg.norm(across)
@@ -145,7 +197,7 @@ def _write(rig: ForeignRig) -> Files:
     x = -x if turned_round else x
     if abs(x[0]) < 0.5:
         raise FormatError(
-            f"camera {right.name} stands above, below, before or behind camera {left.name}, expected a stereo pair, "
+            f"camera {right.name} stands above, below, before or behind camera {left_name}, expected a stereo pair, "
             "side by side: choose another with --cameras"
         )
     ahead = np.array([0.0, 0.0, 1.0]) + right.rotation.T @ np.array([0.0, 0.0, 1.0])
@@ -153,15 +205,7 @@ def _write(rig: ForeignRig) -> Files:
     y /= np.linalg.norm(y)
     of_left = np.stack((x, y, np.cross(x, y)))
     of_right = of_left @ right.rotation.T
-    focal = float(min(*left.lens.focal_length, *right.lens.focal_length))
-    width, height = left.image_size or (0, 0)
-    centre = ((width - 1) / 2, (height - 1) / 2)
-    shift = float((of_left @ across)[0])  # Tx / fx'
-    texts = {
-        _file_name(left): _info_text(left, of_left, (focal, focal), centre),
-        _file_name(right): _info_text(right, of_right, (focal, focal), centre, focal * shift),
-    }
-    return texts
+    return of_left, of_right, float((of_left @ across)[0])
 
 
 def _file_name(camera: ForeignCamera) -> str:

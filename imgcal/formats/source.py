@@ -26,12 +26,17 @@ COLMAP_FILES = frozenset(
 class Source:
     """Files whose content is read when a format asks for it."""
 
-    def __init__(self, paths: Sequence[Path]) -> None:
+    def __init__(self, paths: Sequence[Path], rig: str | None = None) -> None:
         """Look at paths; nothing is read yet.
+
+        Args:
+            paths: files and folders.
+            rig: which one is meant where the files hold several.
 
         Raises:
             InputError: a path that does not exist, or a device.
         """
+        self.rig = rig
         self.where = quoted(", ".join(map(str, paths)))
         self.alone = False  # one file, whose faults are the user's to know
         self.files: list[Path] = []

@@ -53,7 +53,7 @@ def locate(text: str, kind: str) -> Node:
 
     Args:
         text: of the file, without a byte order mark.
-        kind: of the document: yaml, toml, json, xml, python.
+        kind: of the document: yaml, toml, json, xml, python, rows.
 
     Raises:
         ValueError: the text is written in a way that is not followed here.
@@ -63,6 +63,8 @@ def locate(text: str, kind: str) -> Node:
             return _xml(text)
         if kind == "toml":
             return _toml(text)
+        if kind == "rows":
+            return _rows(text)
         if kind == "yaml":
             return _yaml(text)
         return _literal(text)
@@ -77,6 +79,15 @@ def numbers_in(text: str, span: Span, kind: str) -> list[Span]:
     if kind != "xml":
         value = COMMENT.sub(lambda match: " " * len(match[0]), value)
     return [(start + match.start(), start + match.end()) for match in NUMBER.finditer(value)]
+
+
+def _rows(text: str) -> Node:
+    """Lines by their number, from 1."""
+    root, at = Node((0, len(text))), 0
+    for number, line in enumerate(re.split(r"(?<=\n)|(?<=\r)(?!\n)", text), start=1):
+        root.children[number] = Node((at, at + len(line)))
+        at += len(line)
+    return root
 
 
 def _yaml(text: str) -> Node:
@@ -114,7 +125,7 @@ def _literal(text: str) -> Node:
         if isinstance(node, ast.Dict):
             made.children = {
                 key.value: of(value) for key, value in zip(node.keys, node.values, strict=True)
-                if isinstance(key, ast.Constant)
+                if isinstance(key, ast.Constant) and isinstance(key.value, str | int)
             }  # fmt: skip
         elif isinstance(node, ast.List | ast.Tuple):
             made.children = {place: of(value) for place, value in enumerate(node.elts)}

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-from imgcal.formats.foreign_rig import ForeignCamera, FormatError, unplaced_camera
+import numpy as np
+
+from imgcal.formats import places
+from imgcal.formats.foreign_rig import ForeignCamera, FormatError, Place, unplaced_camera
 from imgcal.formats.lens import Lens
 from imgcal.formats.source import Source
 from imgcal.formats.values import array, camera_matrix, coefficients, image_size, named, numbers, rotation, text
 from imgcal.messages import listed
 
 Table = dict[str, Any]
+AT = ""  # the key of a table under which it is kept where it stands: path and keys
 
 
 @dataclass(frozen=True)
@@ -35,7 +39,10 @@ def tables_of(source: Source) -> Tables | None:
             continue
         nested = values.get("cameras")
         group = nested if isinstance(nested, dict) else values
-        cameras = {key: value for key, value in group.items() if is_camera(value)}
+        outer = ("cameras",) if group is nested else ()
+        cameras = {
+            key: {**value, AT: (document.path, (*outer, key))} for key, value in group.items() if is_camera(value)
+        }
         if cameras:
             metadata = values.get("metadata")
             found.append((document.path.name, Tables(cameras, metadata if isinstance(metadata, dict) else {})))
@@ -119,7 +126,30 @@ def lenses_of(tables: Mapping[str, Table]) -> list[ForeignCamera]:
 def _camera(name: str, table: Table) -> ForeignCamera:
     lens, size = _lens(name, table)
     translation = array(table["translation"], (3,), f"{name}: translation")
-    return ForeignCamera(name, lens, size, rotation(table["rotation"], f"{name}: rotation"), translation)
+    turned = rotation(table["rotation"], f"{name}: rotation")
+    camera = ForeignCamera(name, lens, size, turned, translation)
+    return replace(camera, places=_places(camera, table))
+
+
+def _places(camera: ForeignCamera, table: Table) -> tuple[Place, ...]:
+    """Where a camera's numbers stand; FreeMoCap's copies of the pose only where they are copies."""
+    path, keys = table[AT]
+    inside: dict[str, places.Numbers] = {
+        "matrix": places.camera_matrix,
+        "distortions": places.coefficients(len(camera.lens.coefficients)),
+        "rotation": places.rotation_like(numbers(table["rotation"], "rotation")),
+        "translation": places.translation,
+    }
+    copies: dict[str, places.Numbers] = {
+        "world_position": places.centre,
+        "world_orientation": lambda one: [float(value) for value in one.rotation.T.ravel()],
+    }
+    for key, of in copies.items():
+        found = numbers(table[key], key) if isinstance(table.get(key), list) else []
+        expected = of(camera)
+        if len(found) == len(expected) and np.allclose(found, expected, rtol=1e-4, atol=1e-4):
+            inside[key] = of
+    return tuple(Place(path, (*keys, key), of) for key, of in inside.items())
 
 
 def _lens(name: str, table: Table) -> tuple[Lens, tuple[int, int] | None]:

@@ -89,11 +89,11 @@ def _places(path: Path, element: Element, frame: Element, quaternion: list[float
         k1, k2, k3, x, y = camera.lens.padded(5)
         return [camera.lens.principal_point[0] + x, camera.lens.principal_point[1] + y, k1, k2, k3]
 
-    fixed = {
+    fixed: dict[str, places.Numbers] = {
         "PIXEL_ASPECT_RATIO": lambda camera: [camera.lens.focal_length[0] / camera.lens.focal_length[1]],
         "SKEW": lambda camera: [camera.lens.skew],
     }
-    moving = {
+    moving: dict[str, places.Numbers] = {
         "FOCAL_LENGTH": lambda camera: [camera.lens.focal_length[0]],
         "PRINCIPAL_POINT": lambda camera: camera.lens.principal_point,
         "ORIENTATION": orientation,

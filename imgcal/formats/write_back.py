@@ -49,6 +49,7 @@ def written_back(
     now: datetime,
     *,
     name: str | None = None,
+    original_rig: str | None = None,
     unit: str | None = None,
     limit: float = LIMIT,
 ) -> Updated:
@@ -59,6 +60,7 @@ def written_back(
         original: the file, the folder, or the files that are one calibration.
         now: what times of calibration in the files become.
         name: of the format; None = by content.
+        original_rig: which one, where the files hold several.
         unit: of the lengths in the files, where they do not say.
         limit: pixels that a lens may be off, anywhere in its image, in the model of the file.
 
@@ -67,16 +69,22 @@ def written_back(
         RefusedError: the file's lens model comes not near enough.
     """
     where = ", ".join(map(str, original))
-    old = read_foreign_rig(original, name)
+    old = read_foreign_rig(original, name, original_rig)
     title = format_named(old.format).title
     try:
-        return _written(rig, old, original, now, unit, limit)
+        return _written(rig, old, original, now, unit, limit, original_rig)
     except FormatError as error:
         raise InputError(f"{where}: this is a {title}: {error}") from error
 
 
 def _written(
-    rig: ForeignRig, old: ForeignRig, original: Sequence[Path], now: datetime, unit: str | None, limit: float
+    rig: ForeignRig,
+    old: ForeignRig,
+    original: Sequence[Path],
+    now: datetime,
+    unit: str | None,
+    limit: float,
+    original_rig: str | None,
 ) -> Updated:
     where, title = ", ".join(map(str, original)), format_named(old.format).title
     absent = [camera for camera in rig.names if camera not in old.names]
@@ -111,26 +119,24 @@ def _written(
     sized = _with_sizes(wanted, rig)
     for digits in DIGITS:
         files, stamps = _patched(contents, changes, digits, now)
-        back = _read_back(files, old)
+        back = _read_back(files, old, original_rig)
         reread, points = worst_difference(sized, _with_sizes(back, rig))
         if reread <= ROUNDING:
             break
     else:
         raise FormatError(f"what was written is read back {reread:.3g} px off: nothing is written")
     if digits:
-        notes.append(
-            f"numbers have {digits} digits where they had less, which would have cost up to {ROUNDING:g} px or more"
-        )
+        notes.append(f"numbers have at least {digits} digits: those of the file would cost more than {ROUNDING:g} px")
     notes += stamps
     kept = tuple(camera.name for camera in old.cameras if camera.name not in fits)
     inexact = [fit for fit in fits.values() if not fit.exact]
     worst = max(inexact, key=lambda fit: fit.worst, default=None)
-    for camera in (camera for camera, fit in fits.items() if not fit.exact):
-        fit = fits[camera]
-        notes.append(
-            f"camera {camera}: {describe_lens(found[camera].lens)} -> {describe_lens(fit.lens)}, fitted over the "
-            f"image: worst {fit.worst:.2g} px, RMS {fit.rms:.2g} px"
-        )
+    for camera_name, fit in fits.items():
+        if not fit.exact:
+            notes.append(
+                f"camera {camera_name}: {describe_lens(found[camera_name].lens)} -> {describe_lens(fit.lens)}, fitted "
+                f"over the image: worst {fit.worst:.2g} px, RMS {fit.rms:.2g} px"
+            )
     return Updated(files, title, tuple(notes), tuple(fits), kept, reread, worst, points)
 
 
@@ -254,13 +260,13 @@ def _patched(
     return files, notes
 
 
-def _read_back(files: Mapping[str, bytes], old: ForeignRig) -> ForeignRig:
+def _read_back(files: Mapping[str, bytes], old: ForeignRig, rig: str | None) -> ForeignRig:
     with tempfile.TemporaryDirectory() as folder:
         paths = [Path(folder) / name for name in files]
         for path in paths:
             path.write_bytes(files[path.name])
         try:
-            back = read_foreign_rig(paths[0] if len(paths) == 1 else Path(folder), old.format)
+            back = read_foreign_rig(paths[0] if len(paths) == 1 else Path(folder), old.format, rig)
         except InputError as error:
             raise FormatError(f"what was written cannot be read back: {str(error).replace(folder, '')}") from error
     if back.names != old.names:

@@ -31,7 +31,9 @@ from imgcal.formats.registry import read_foreign_rig
 from tests.imgcal.formats.test_registry import SAMPLES
 
 TARGETS: dict[str, Format | None] = {OURS: None, **{one.name: one for one in FORMATS if one.write is not None}}
-VERIFIED = re.compile(r"verified on (\d+) known points: read back worst (\S+) px, lens models (\S+)")
+VERIFIED = re.compile(
+    r"re-read: worst difference (?P<worst>\S+) px on (?P<points>\d+) points, lens models (?P<between>\S+)"
+)
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
@@ -93,8 +95,8 @@ def direction(one: ForeignCamera, other: ForeignCamera) -> NDArray[np.float64]:
 def check(said: str) -> tuple[float, float]:
     """What the command says about the points that it has compared."""
     match = VERIFIED.search(said)
-    assert match is not None and int(match[1]) > 20, said
-    return float(match[2]), 0.0 if match[3] == "the" else float(match[3])
+    assert match is not None and int(match["points"]) > 20, said
+    return float(match["worst"]), 0.0 if match["between"] == "the" else float(match["between"])
 
 
 def judge(found: Any, rig: ForeignRig, rows: list[dict[str, Any]], between: float) -> None:

@@ -21,7 +21,8 @@ def vicon(rig: ForeignRig) -> bytes:
         radial = f"{cx:.12f} {cy:.12f} -2.9612345678901e-08 1.1212345678901e-014 0"
         cameras.append(
             f'  <Camera DEVICEID=\'{camera.name}\' NAME="top 1 2 3" PIXEL_ASPECT_RATIO="1" SENSOR_SIZE="1280 960" '
-            f'SKEW="0" TYPE="VantageV5" USERID="7">\n    <!-- 12.5 lux at 3 m -->\n    <ThresholdGrid DATA="0 1 1 0 255"/>'
+            f'SKEW="0" TYPE="VantageV5" USERID="7">\n    <!-- 12.5 lux at 3 m -->\n'
+            '    <ThresholdGrid DATA="0 1 1 0 255"/>'
             f'\n    <KeyFrames>\n      <KeyFrame FOCAL_LENGTH="{fx:.12f}" FRAME="0" IMAGE_ERROR="0.118"\n        '
             f'ORIENTATION="{-x:.15f} {-y:.15f} {-z:.15f} {-w:.15f}" POSITION="{place}" '
             f'PRINCIPAL_POINT="{cx:.12f} {cy:.12f}" VICON_RADIAL="-2.9612345678901e-08 1.1212345678901e-014" '
@@ -41,7 +42,8 @@ def motive(rig: ForeignRig) -> bytes:
         (fx, fy), (cx, cy) = camera.lens.focal_length, camera.lens.principal_point
         k1, k2, p1, p2, k3 = camera.lens.padded(5)
         cameras.append(
-            f'<Camera Serial="{camera.name}"\nExposure="250"\nName="Prime 13"\nLed="1"\n><Attributes ImagerPixelWidth="1280" '
+            f'<Camera Serial="{camera.name}"\nExposure="250"\nName="Prime 13"\nLed="1"\n>'
+            '<Attributes ImagerPixelWidth="1280" '
             f'ImagerPixelHeight="960"/><Extrinsic {turned} X="{x:.15f}" Y="{y:.15f}" Z="{z:.15f}"/>\n'
             f'<IntrinsicStandardCameraModel HorizontalFocalLength="{fx:.15f}" LensCenterX="{cx:.15f}" '
             f'LensCenterY="{cy:.15f}" VerticalFocalLength="{fy:.15f}" TangentialX="{p1:.15f}" TangentialY="{p2:.15f}" '

@@ -18,7 +18,8 @@ from tests.imgcal.formats.rigs import apart, brown, fisheye, read_in_mm, rig_of
 NOW = datetime(2026, 11, 24, 3, 30, 5)
 NUMBER = re.compile(r"(?<![\w.])[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
 RIG = rig_of(
-    brown(-0.05, 0.02, 1e-4, -2e-4, 0.003), brown(-0.06, 0.03, 2e-4, 1e-4, 0.002), brown(-0.055, 0.025, 1e-5, 1e-5, 1e-3),
+    brown(-0.05, 0.02, 1e-4, -2e-4, 0.003), brown(-0.06, 0.03, 2e-4, 1e-4, 0.002), 
+    brown(-0.055, 0.025, 1e-5, 1e-5, 1e-3),
     names=("a1", "b2", "c3"),
 )  # fmt: skip
 WRITERS: dict[str, Callable[[ForeignRig], bytes]] = {
@@ -167,7 +168,7 @@ def test_a_lens_that_the_file_cannot_say_is_refused(original: Path) -> None:
     wide = replace(
         rig, cameras=(*rig.cameras[:2], replace(rig.cameras[2], lens=fisheye(0.2, 0.3, -0.2, 0.1))), own=None
     )
-    with pytest.raises(RefusedError, match="camera c3: .* cannot say its lens .*more than the limit of 0.05 px"):
+    with pytest.raises(RefusedError, match=r"camera c3: .* cannot say its lens .*more than the limit of 0.05 px"):
         written_back(wide, [original], NOW)
     near = replace(rig.cameras[2], lens=Lens((1010.0, 1010.0), (640.0, 480.0), (-0.05, 0.01, 1e-5, 0, 0, 1e-3)))
     made = written_back(replace(rig, cameras=(*rig.cameras[:2], near), own=None), [original], NOW, limit=1.0)
@@ -178,7 +179,7 @@ def test_another_frame_is_refused_where_a_camera_would_stay_behind(original: Pat
     rig = ours(original).seen_from_first()
     made = written_back(rig, [original], NOW)
     assert any("the frame of the rig is not that of the file" in note for note in made.notes)
-    with pytest.raises(InputError, match="another frame than the file .*camera c3, which the rig does not have"):
+    with pytest.raises(InputError, match=r"another frame than the file .*camera c3, which the rig does not have"):
         written_back(replace(rig, cameras=rig.cameras[:2], own=None), [original], NOW)
 
 
