@@ -19,6 +19,7 @@ from imgcal.association.hypotheses import (
     likely_blobs,
     many,
 )
+from imgcal.association.points import identify_points
 from imgcal.association.result import Identity, IdentityOptions, Status
 from imgcal.association.search import VERIFIED, Search
 from imgcal.association.verify import (
@@ -38,7 +39,6 @@ from imgcal.association.voting import match, predict_ideal, vote
 from imgcal.geometry import RigidTransform
 from imgcal.types import CalibrationObject, CameraRig, Detections
 
-NEEDS_LABELS = "blobs do not tell a single light or points on one line from others: give labels (a column `fiducial`)"
 FIRST_HYPOTHESES = 8_000  # in the first round: large objects get fewer triples of blobs; then twice as many each time
 MOST_HYPOTHESES = 400_000  # in a round
 MOST_FALSE = 40  # blobs a fiducial, above which three of them drawn in all rounds are hardly ever fiducials
@@ -101,9 +101,9 @@ def track(
     pose_known: bool = True,
 ) -> Identity:
     """Label the blobs of one snapshot near a pose; arguments as in `identify`, `pose_known` = it is no mere guess."""
-    scene = Scene(gather(detections, rig), obj, rig, std)
     if obj.pose_rank < 6:
-        return _refused(scene, NEEDS_LABELS)
+        return identify_points(detections, rig, obj, std, options)
+    scene = Scene(gather(detections, rig), obj, rig, std)
     if scene.blobs.uv[..., 0].size * obj.num_fiducials > MOST_PAIRS:
         return _refused(scene, _too_many(scene))
     poses = Poses(rig_from_object.rotation.numpy()[None], rig_from_object.translation.numpy()[None])
@@ -129,9 +129,9 @@ def relocalize(
     options: IdentityOptions = IdentityOptions(),
 ) -> Identity:
     """Label the blobs of one snapshot with no pose known; arguments as in `identify`."""
-    scene = Scene(gather(detections, rig), obj, rig, std)
     if obj.pose_rank < 6:
-        return _refused(scene, NEEDS_LABELS)
+        return identify_points(detections, rig, obj, std, options)
+    scene = Scene(gather(detections, rig), obj, rig, std)
     cameras = np.flatnonzero(scene.blobs.count >= 4)
     if len(cameras) == 0:
         return _refused(

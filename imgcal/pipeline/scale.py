@@ -33,7 +33,7 @@ class Scale:
     mm_per_percent: float | None
 
     def __str__(self) -> str:
-        """One sentence for people; empty where an object's scale comes from the cameras: the prediction has its error."""
+        """One sentence for people; empty where the cameras know an object's scale: the prediction has its error."""
         if self.source == "cameras" and self.px_per_percent is None:
             return f"scale rests on the cameras' factory positions alone, which know it to {100 * self.sigma:.2g} %"
         if self.source == "cameras" or not self.px_per_percent:

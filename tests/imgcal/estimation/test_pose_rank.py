@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from imgcal.association.tracker import to_observations
-from imgcal.errors import RefusedError
 from imgcal.estimation import EstimationOptions, camera_covariance, estimate
 from imgcal.estimation.levenberg_marquardt import minimize
 from imgcal.estimation.linearization import linearize
@@ -90,9 +89,3 @@ def test_a_light_calibrates_and_says_that_its_scale_is_that_of_the_cameras():
     assert result.identity == "coded" and result.scale.source == "cameras"
     assert 0.0003 < result.scale.sigma < 0.01
     assert "cameras" in str(result.scale)
-
-
-def test_blobs_of_a_light_without_labels_are_refused_by_name():
-    rig, obj, _, table = capture(LIGHT, 3)
-    with pytest.raises(RefusedError, match="label"):
-        calibrate(replace(table, fiducial=np.full(len(table), -1)), rig, obj)
