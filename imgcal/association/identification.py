@@ -19,6 +19,7 @@ from imgcal.association.hypotheses import (
     likely_blobs,
     many,
 )
+from imgcal.association.points import identify_points
 from imgcal.association.result import Identity, IdentityOptions, Status
 from imgcal.association.search import VERIFIED, Search
 from imgcal.association.verify import (
@@ -100,6 +101,8 @@ def track(
     pose_known: bool = True,
 ) -> Identity:
     """Label the blobs of one snapshot near a pose; arguments as in `identify`, `pose_known` = it is no mere guess."""
+    if obj.pose_rank < 6:
+        return identify_points(detections, rig, obj, std, options)
     scene = Scene(gather(detections, rig), obj, rig, std)
     if scene.blobs.uv[..., 0].size * obj.num_fiducials > MOST_PAIRS:
         return _refused(scene, _too_many(scene))
@@ -126,6 +129,8 @@ def relocalize(
     options: IdentityOptions = IdentityOptions(),
 ) -> Identity:
     """Label the blobs of one snapshot with no pose known; arguments as in `identify`."""
+    if obj.pose_rank < 6:
+        return identify_points(detections, rig, obj, std, options)
     scene = Scene(gather(detections, rig), obj, rig, std)
     cameras = np.flatnonzero(scene.blobs.count >= 4)
     if len(cameras) == 0:

@@ -93,6 +93,8 @@ def associate(
         ('unique', True)
     """
     count = len(detections.snapshot_names)
+    if obj.pose_rank < 6:
+        sight = None  # it looks for patterns, and these objects have none
     series = _Series(detections, Tracker(rig, obj, options), sight)
     order: Iterable[int] = range(count)
     series.first(progress(order, count) if progress else order)

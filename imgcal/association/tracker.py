@@ -112,9 +112,10 @@ class Tracker:
     def _too_few(self, name: str, labels: NDArray[np.int64]) -> SnapshotIdentity | None:
         """Refuse a snapshot that shows too few fiducials; None = it shows enough."""
         shown = len(np.unique(labels[labels >= 0]))
-        if shown >= self.options.least_fiducials:
+        least = min(self.options.least_fiducials, self.obj.num_fiducials)
+        if shown >= least:
             return None
-        reason = f"too few fiducials: found {shown}, expected at least {self.options.least_fiducials}"
+        reason = f"too few fiducials: found {shown}, expected at least {least}"
         return SnapshotIdentity(name, "refused", reason, 1, None)
 
     def follow(self, pose: RigidTransform) -> tuple[Status, int]:

@@ -6,6 +6,9 @@ local offsets of the object: a rotation (left, about its centroid) and a transla
 and, where the object is known within tolerances only, its own M = 3 N + 1 offsets, whitened as well: of each
 fiducial's coordinates (mm, in the object's frame), and one scale of all distances.
 
+Turns that move no fiducial (of a stick about itself, of a single light) have no derivative and couple to nothing. They
+get unit information, which fixes them, adds nothing to any other unknown and leaves every determinant as it is.
+
 Axes: B rigs, S snapshots, C cameras, N fiducials. Components stand before fiducials, so that every step works on long
 contiguous rows.
 """
@@ -25,7 +28,9 @@ from imgcal.geometry import (
     RigidTransform,
     distort_by_coefficients,
     distort_with_jacobian,
+    free_turns,
     left_jacobian,
+    pose_rank,
     rotation_from_vector,
 )
 from imgcal.types import CameraRig
@@ -47,6 +52,11 @@ class Problem:
     object_prior_std: Tensor | None = None  # (B, M) prior standard deviation of the object's parameters; None = exact
     modes: Tensor | None = None  # (K, N, 3) mm, about the centroid, by one prior standard deviation; see `modes.py`
     mode_offset: Tensor | None = None  # (K,) how much of each `points` have, whitened; None = nothing
+
+    @property
+    def pose_rank(self) -> int:
+        """How many of its pose's 6 numbers the object shows; see `imgcal.geometry.pose_rank`."""
+        return pose_rank(self.points)
 
     def select(self, rows: Tensor) -> Problem:
         """Keep the given rigs, (R,) indices."""
@@ -164,6 +174,11 @@ def linearize(problem: Problem, state: State, loss: Callable[[Tensor], tuple[Ten
     over_snapshots = products[..., :k, :].sum(1)
     over_cameras = products[..., k:, k:].sum(2)
     eye = torch.eye(k, dtype=rows.dtype, device=rows.device)
+    pose = over_cameras[..., :POSE_PARAMETERS, :POSE_PARAMETERS]
+    turns = free_turns(problem.points)
+    if bool(turns.any()):
+        pose = pose.clone()
+        pose[..., :3, :3] += state.rotation @ turns @ state.rotation.mT
     own = None
     if at.by_fiducial is not None and state.object_offset is not None:
         cost = cost + 0.5 * state.object_offset.square().sum(1)
@@ -172,7 +187,7 @@ def linearize(problem: Problem, state: State, loss: Callable[[Tensor], tuple[Ten
         cost=cost,
         camera=over_snapshots[..., :k] + eye,
         coupling=products[..., :k, k:last],
-        pose=over_cameras[..., :POSE_PARAMETERS, :POSE_PARAMETERS],
+        pose=pose,
         camera_gradient=over_snapshots[..., last] + state.offset,
         pose_gradient=over_cameras[..., :POSE_PARAMETERS, POSE_PARAMETERS],
         residual=residual,

@@ -79,11 +79,15 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold, shake):
     snapshots, cameras, fiducials = root_weight.shape
     kind, free = uv.dtype, 10 + lens_kernels.width_of(lenses, distortion0)
     wide = free + 6
+    turns = np.empty((3, 3), dtype=kind)
+    lacking = kernels.fill_free_turns(points, turns)
     for s in range(snapshots):
         for i in range(6):
             pose_gradient[s, i] = 0
             for j in range(6):
                 pose[s, i, j] = 0
+        if lacking:
+            _fix_turns(rotation[s], turns, pose[s])
     rows = np.zeros((2, wide), dtype=kind)
     products = np.empty((wide, wide), dtype=kind)
     gradient = np.empty(wide, dtype=kind)
@@ -217,6 +221,16 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold, shake):
                 products, gradient, c, s, free, camera, coupling, pose, camera_gradient, pose_gradient, cameras_first
             )
     return cost
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _fix_turns(rotation, turns, pose):
+    """Add unit information (6, 6) on the turns that move no fiducial, as `linearization.linearize` does."""
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                for m in range(3):
+                    pose[i, j] += rotation[i, k] * turns[k, m] * rotation[j, m]
 
 
 @njit(cache=True, fastmath=kernels.FAST)

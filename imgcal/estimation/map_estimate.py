@@ -71,7 +71,7 @@ class Estimate:
     rig_from_object: RigidTransform  # (*B, S)
     residual: Tensor  # (*B, S, C, N, 2) pixels, predicted minus observed; zero where not seen
     chi2: Tensor  # (*B) sum of squared whitened residuals (robust), data and prior
-    dof: Tensor  # (*B) expected chi2: 2 observations - 6 snapshots (each prior pays for its parameter)
+    dof: Tensor  # (*B) expected chi2: 2 observations - what the object shows of its poses (each prior pays for itself)
     converged: Tensor  # (*B) bool
     iterations: int
     points_object: Tensor  # (*B, N, 3) mm, the fiducials as estimated; as given where the object is exact
@@ -124,7 +124,8 @@ def estimate(
         observations: (*B, S, C, N).
         rig: the factory rig, (*B) or without batch axes.
         obj: N fiducials; a radius makes their images ellipses, whose centres are what is observed. Where it has
-            tolerances, its shape is estimated too, one shape for all snapshots. Its modes are left at zero.
+            tolerances, its shape is estimated too, one shape for all snapshots; that of a stick is taken as it is. Its
+            modes are left at zero.
         rig_from_object: (*B, S) first guess of the poses; None = `initial_pose`.
         prior_std: (*B, C, K) standard deviation of each factory value, as `CameraRig.parameter_names`; zero keeps a
             value fixed; None = the rig's own prior, or `RigPrior()`.
@@ -239,7 +240,7 @@ def make_estimate(
     plain = state is solution.state and state.offset.device.type == "cpu"  # no gradient to carry
     rigs, poses = (lm_cpu.rig_at if plain else rig_at)(problem, state.offset), pose_at(problem, state)
     residual = torch.where(seen.unsqueeze(-2), solution.equations.residual, 0.0).mT
-    dof = 2 * seen.flatten(1).sum(1) - 6 * seen.shape[1]
+    dof = 2 * seen.flatten(1).sum(1) - problem.pose_rank * seen.shape[1]
     return Estimate(
         rig=rigs.reshape(*batch),
         rig_from_object=poses.reshape(*batch, seen.shape[1]),
@@ -283,7 +284,7 @@ def make_problem(
     modes = None if obj.modes is None else obj.modes.to(uv) - obj.modes.to(uv).mean(1, keepdim=True)
     return Problem(
         modes=modes,
-        object_prior_std=None if obj.exact else object_prior_std(obj).to(uv).expand(count, -1),
+        object_prior_std=None if obj.exact or obj.pose_rank < 6 else object_prior_std(obj).to(uv).expand(count, -1),
         uv=torch.where(seen[..., None], uv, 0.0).mT.contiguous(),
         root_weight=torch.where(seen, 1 / torch.where(seen, sigma, 1.0), 0.0),
         points=points - centroid,

@@ -147,7 +147,7 @@ class ScaleEvidence:
 
 def object_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> ShapeEvidence | ScaleEvidence | None:
     """Ask a fit of one rig (B = 1) about the object that it took; None where rig and poses are undetermined."""
-    if problem.object_prior_std is None and len(problem.points) > MOST_FIDUCIALS:
+    if problem.object_prior_std is None and (len(problem.points) > MOST_FIDUCIALS or problem.pose_rank < 6):
         return scale_evidence(problem, solution, loss)
     return shape_evidence(problem, solution, loss)
 
@@ -201,7 +201,7 @@ def shape_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> Sha
         points=points.cpu().double().numpy(),
         tolerance=tolerance,
         chi2=2 * cost,
-        freedom=2 * int((problem.root_weight > 0).sum()) - 6 * problem.uv.shape[1],
+        freedom=2 * int((problem.root_weight > 0).sum()) - problem.pose_rank * problem.uv.shape[1],
     )
 
 

@@ -47,7 +47,7 @@ def initial_pose(
     """Estimate where the object is, with the rig taken as it stands.
 
     Args:
-        observations: (*B, S, C, N); every snapshot needs three fiducials or more, seen by one camera or several.
+        observations: (*B, S, C, N); what is seen of each snapshot must show all of the object's pose that there is.
         rig: (*B) or without batch axes.
         obj: N fiducials, planar or not.
         iterations: Gauss-Newton steps on the rotation.
@@ -80,7 +80,8 @@ def initial_pose(
     starts = torch.as_tensor(Rotation.create_group("I").as_matrix(), dtype=rays.dtype, device=rays.device)
     promising = _cost(form, starts.expand(len(rays), -1, -1, -1)).topk(STARTS, largest=False).indices
     minimized = _minimize_cpu if plain else _minimize_on_rotations
-    rotation = minimized(form, starts[promising], iterations)  # (P, M, 3, 3)
+    # A single light has no rotation to look for.
+    rotation = minimized(form, starts[promising], iterations if bool(centred.any()) else 0)  # (P, M, 3, 3)
 
     entries, cost = rotation.flatten(-2), _cost(form, rotation)
     translation = form.translation_constant[:, None] - entries @ form.translation_slope.mT

@@ -9,35 +9,52 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.errors import RefusedError
+from imgcal.geometry import pose_rank
 
 LEAST_BREADTH = 0.05
 """Breadth of what is left of an object, in parts of the whole object's: below, it turns about a line unseen."""
 
 ON_A_LINE = "the labels that are left lie on one line, about which the object could be turned"
+TOO_FEW = "fewer than {} have labels in two cameras"
 
 
 class UndeterminedPosesError(RefusedError):
     """Raise where labels leave the object's pose open in some snapshots, which can be done without."""
 
-    def __init__(self, rows: Sequence[int]) -> None:
+    def __init__(self, rows: Sequence[int], reason: str = ON_A_LINE) -> None:
         """Keep the numbers of the snapshots, counted among those of the fit."""
-        super().__init__(f"estimation: in {len(rows)} snapshots {ON_A_LINE}")
+        super().__init__(f"estimation: in {len(rows)} snapshots {reason}")
         self.rows = tuple(rows)
 
 
 def require_poses(seen: NDArray[np.bool_], points: Tensor) -> None:
-    """Make sure that what is `seen` (S, C, N) of an object's points (N, 3) is more than a line in every snapshot.
+    """Make sure that what is `seen` (S, C, N) of an object's points (N, 3) shows its pose in every snapshot.
+
+    That is more than a line; of a stick two points, of a light the one, each in two cameras.
 
     Raises:
         UndeterminedPosesError: it is not; says in which.
     """
     posed = has_poses(seen, points)
     if not posed.all():
-        raise UndeterminedPosesError(np.flatnonzero(~posed).tolist())
+        least = _least_fiducials(pose_rank(points))
+        rows = np.flatnonzero(~posed).tolist()
+        if least is None:
+            raise UndeterminedPosesError(rows)
+        raise UndeterminedPosesError(rows, TOO_FEW.format("1 fiducial" if least == 1 else f"{least} fiducials"))
+
+
+def _least_fiducials(rank: int) -> int | None:
+    """Fiducials that two cameras must see of a light or a stick; None = other objects."""
+    return None if rank == 6 else 2 if rank == 5 else 1
 
 
 def has_poses(seen: NDArray[np.bool_], points: Tensor) -> NDArray[np.bool_]:
-    """Tell in which snapshots what is `seen` (S, C, N) of an object's points (N, 3) is more than a line: (S,)."""
+    """Tell in which snapshots what is `seen` (S, C, N) of an object's points (N, 3) determines its pose: (S,)."""
+    least = _least_fiducials(pose_rank(points))
+    if least is not None:
+        enough: NDArray[np.bool_] = (seen.sum(1) >= 2).sum(1) >= least
+        return enough
     shown, where = seen.any(1), points.detach().cpu().double().numpy()
     whole = _breadth(where)
     if whole > 0 and shown.all():

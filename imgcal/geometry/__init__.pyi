@@ -1,4 +1,5 @@
 from . import kernels, lens_kernels
+from .free_turns import free_turns, pose_rank
 from .lens_model import LensModel
 from .lenses import (
     LENS_MODELS,
@@ -38,6 +39,7 @@ __all__ = [
     "distort_by_coefficients",
     "distort_with_jacobian",
     "euler_from_rotation",
+    "free_turns",
     "geodesic_angle",
     "kernels",
     "left_jacobian",
@@ -46,6 +48,7 @@ __all__ = [
     "lens_names",
     "lens_width",
     "named_lenses",
+    "pose_rank",
     "project_components",
     "project_cpu",
     "project_kornia",

@@ -16,6 +16,37 @@ from renderers.compiling import njit
 
 FAST = {"contract", "reassoc", "nsz"}
 """Of floating-point arithmetic; nan and inf keep their meaning: a bad step must show."""
+LINE = 1e-3
+"""Breadth of points on one line, in parts of their greatest distance from the origin: no turn about it can be seen."""
+
+
+@njit(cache=True, fastmath=FAST)
+def fill_free_turns(points, turns):
+    """Fill the projector (3, 3) onto those turns about the origin that leave points (N, 3) where they are.
+
+    Returns:
+        How many there are: 0 of a solid or a plane, 1 of a line through the origin, 3 of the origin alone.
+    """
+    far, greatest = 0, 0.0
+    for n in range(len(points)):
+        squared = points[n, 0] ** 2 + points[n, 1] ** 2 + points[n, 2] ** 2
+        if squared > greatest:
+            far, greatest = n, squared
+    turns[:] = 0
+    if greatest == 0:
+        for i in range(3):
+            turns[i, i] = 1
+        return 3
+    a = points[far]
+    for n in range(len(points)):
+        b = points[n]
+        x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+        if x * x + y * y + z * z > (LINE * greatest) ** 2:
+            return 0
+    for i in range(3):
+        for j in range(3):
+            turns[i, j] = a[i] * a[j] / greatest
+    return 1
 
 
 @njit(fastmath=FAST)

@@ -25,8 +25,6 @@ from imgcal.messages import shortened
 from imgcal.types import CalibrationObject, limits
 from renderers.palette import palette
 
-# Nearer than this to one line, in units of the object's size, no pose can be found.
-COLLINEAR = 1e-6
 SMALLEST = 1e-3  # mm, extent of an object
 LARGEST_LABEL = 2**31 - 1
 BOARD_SUFFIXES = (".yaml", ".yml")
@@ -83,9 +81,9 @@ def object_from_text(text: str, where: str, name: str = "object") -> Calibration
 def _read(path: Path, content: bytes | None = None) -> CalibrationObject:
     chunks = list(islice(read_chunks(path, ("x", "y", "z"), ("name", "radius", "tolerance", "fiducial"), content), 2))
     count = sum(map(len, chunks))
-    if not 4 <= count <= limits.MOST_FIDUCIALS:
-        found = count if count < 4 else f"more than {limits.MOST_FIDUCIALS}"
-        raise InputError(f"{path}: found {found} points, expected 4 to {limits.MOST_FIDUCIALS}")
+    if not 1 <= count <= limits.MOST_FIDUCIALS:
+        found = f"more than {limits.MOST_FIDUCIALS}" if count else 0
+        raise InputError(f"{path}: found {found} points, expected 1 to {limits.MOST_FIDUCIALS}")
     chunk = chunks[0]
     axes = [chunk.numbers(axis, limits.COORDINATE, f"a finite coordinate, {limits.COORDINATE}") for axis in "xyz"]
     points = np.stack(axes, axis=1)
@@ -182,7 +180,5 @@ def _check_points(chunk: Chunk, points: np.ndarray) -> None:
         original = int(first[groups.ravel()][row])
         chunk.fail(row, f"found the same point as in row {original + 1}, expected different points")
     singular = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    if singular[0] < SMALLEST:
+    if len(points) > 1 and singular[0] < SMALLEST:
         raise InputError(f"{chunk.path}: found all {len(points)} points at one place, expected coordinates in mm")
-    if singular[1] < COLLINEAR * singular[0]:
-        raise InputError(f"{chunk.path}: found all {len(points)} points on one line, expected a plane or a solid")

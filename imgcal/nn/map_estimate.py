@@ -128,7 +128,7 @@ class MapEstimate(nn.Module):
     def _solution(self, problem: Problem, state: State, converged: Tensor, seen: Tensor) -> MapSolution:
         batch = seen.shape[:-3]
         cost = map_cost(problem, state, make_loss(self.options))
-        dof = 2 * seen.flatten(-3).sum(-1) - 6 * seen.shape[-3]
+        dof = 2 * seen.flatten(-3).sum(-1) - problem.pose_rank * seen.shape[-3]
         points = points_at(problem, state) + problem.centroid
         return MapSolution(
             rig=rig_at(problem, state.offset).reshape(*batch),

@@ -98,7 +98,8 @@ def calibrate(
                 return calibrate(
                     detections, rig, obj, options, initializer=initializer, progress=progress, detector=sight
                 )
-        require_units(error, detections, rig, obj)
+        if obj.pose_rank == 6:  # the extent of what is seen says nothing of a light, and little of a stick
+            require_units(error, detections, rig, obj)
         if labelled is not None:
             require_same_moments(error, detections, labelled, rig, obj, options)
         raise

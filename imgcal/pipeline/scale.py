@@ -10,7 +10,9 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from imgcal.estimation import Estimate, WorkingVolume, predicted_error, scale_response
+import torch
+
+from imgcal.estimation import Estimate, WorkingVolume, camera_covariance, predicted_error, scale_response
 from imgcal.types import CalibrationObject
 
 NOTICED = 4.0
@@ -31,7 +33,9 @@ class Scale:
     mm_per_percent: float | None
 
     def __str__(self) -> str:
-        """One sentence for people; empty where the scale comes from the cameras, whose error is in the prediction."""
+        """One sentence for people; empty where the cameras know an object's scale: the prediction has its error."""
+        if self.source == "cameras" and self.px_per_percent is None:
+            return f"scale rests on the cameras' factory positions alone, which know it to {100 * self.sigma:.2g} %"
         if self.source == "cameras" or not self.px_per_percent:
             return ""
         added = [f"{self.px_per_percent:.2g} px"]
@@ -64,6 +68,8 @@ def scale_of(estimate: Estimate, obj: CalibrationObject, scale_sigma: float | No
         scale_sigma: relative, how well the cameras' factory positions know the object's scale; None = not at all.
         volume: where the rig is used.
     """
+    if obj.pose_rank == 3:
+        return Scale("cameras", _of_positions(estimate), noticed_from=None, px_per_percent=None, mm_per_percent=None)
     granted, known = obj.scale_tolerance, scale_sigma or math.inf
     response = scale_response(estimate) * PERCENT
     effect = predicted_error(estimate, volume=volume, covariance=response[:, None] * response)
@@ -75,6 +81,15 @@ def scale_of(estimate: Estimate, obj: CalibrationObject, scale_sigma: float | No
         px_per_percent=_finite(effect.median_px),
         mm_per_percent=_finite(effect.median_mm),
     )
+
+
+def _of_positions(estimate: Estimate) -> float:
+    """How well the estimate knows the size of the rig: relative, one standard deviation."""
+    parts = estimate.problem.prior_std.shape[1:]
+    covariance = camera_covariance(estimate, curved=False).unflatten(0, parts).unflatten(-1, parts)
+    away = estimate.rig.positions - estimate.rig.positions.mean(0)
+    variance = torch.einsum("ci,cidj,dj->", away, covariance[:, 3:6, :, 3:6], away)
+    return float(variance.clamp_min(0).sqrt() / away.square().sum())
 
 
 def _finite(value: float) -> float | None:

@@ -150,7 +150,9 @@ def _fit(arranged: Arranged, rig: CameraRig, obj: CalibrationObject, options: Pi
         solutions.append(minimize(problem, state, options.estimation))
         state = solutions[-1].state
         squared, used = solutions[-1].equations.residual[0].square().sum(-2), noise
-        free = max(1 - (rig.num_parameters * rig.num_cameras + 6 * len(seen)) / (2 * int(seen.sum())), 0.2)
+        free = max(
+            1 - (rig.num_parameters * rig.num_cameras + problem.pose_rank * len(seen)) / (2 * int(seen.sum())), 0.2
+        )
         noise = own + (squared[seen].median() / (MEDIAN * free) - own[seen].median()).clamp_min(0)
     fitting = (squared <= CLIP**2 * used) & seen
     poses, fitted = pose_at(problem, state)[0], rig_at(problem, state.offset)[0]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.errors import InputError
+from imgcal.geometry import pose_rank
 from imgcal.types.board import Board
 
 
@@ -56,9 +57,9 @@ class CalibrationObject:
         return f"CalibrationObject({self.name!r}: {len(self.points)} fiducials{exact})"
 
     def __post_init__(self) -> None:
-        if self.points.ndim != 2 or self.points.shape[1] != 3 or len(self.points) < 4:
+        if self.points.ndim != 2 or self.points.shape[1] != 3 or len(self.points) < 1:
             raise InputError(
-                f"object {self.name}: found points of shape {tuple(self.points.shape)}, expected (N >= 4, 3)"
+                f"object {self.name}: found points of shape {tuple(self.points.shape)}, expected (N >= 1, 3)"
             )
 
         if self.tolerance is not None and (
@@ -116,10 +117,15 @@ class CalibrationObject:
         return float((self.points - self.points.mean(0)).square().sum(1).mean().sqrt())
 
     @cached_property
+    def pose_rank(self) -> int:
+        """How many of its pose's 6 numbers it shows: 3 of a light, 5 of fiducials on one line, else 6."""
+        return pose_rank(self.points)
+
+    @cached_property
     def planar(self) -> bool:
         """Tell whether all fiducials lie in one plane (to 1e-3 of the object's size)."""
         singular = torch.linalg.svdvals((self.points - self.points.mean(0)).double())
-        return bool(singular[2] < 1e-3 * singular[0])
+        return len(singular) < 3 or bool(singular[2] < 1e-3 * singular[0])
 
     @cached_property
     def symmetries(self) -> tuple[Symmetry, ...]:
@@ -141,8 +147,7 @@ class CalibrationObject:
         """
         points = (self.points - self.points.mean(0)).double().cpu().numpy()
         radius = np.zeros(len(points)) if self.radius is None else self.radius.double().cpu().numpy()
-        base = _base_pair(points)
-        rotations = _rotations_of_pairs(points, base, tolerance)
+        rotations = _turns_to_try(points, self.pose_rank, tolerance)
         moved = points @ rotations.transpose(0, 2, 1)  # (R, N, 3)
         found: dict[bytes, Symmetry] = {}
         centroid = self.points.mean(0).double().cpu().numpy()
@@ -161,6 +166,18 @@ class CalibrationObject:
         identity = np.arange(len(points)).tobytes()
         rest = sorted((m for key, m in found.items() if key != identity), key=lambda m: m.residual)
         return (Symmetry(np.eye(3), np.zeros(3), np.arange(len(points)), 0.0), *rest)
+
+
+def _turns_to_try(points: NDArray[np.float64], rank: int, tolerance: float) -> NDArray[np.float64]:
+    """Rotations (R, 3, 3) that may map points (N, 3) about their centroid onto each other; half a turn of a stick."""
+    if rank == 6:
+        return _rotations_of_pairs(points, _base_pair(points), tolerance)
+    if rank == 3:
+        return np.eye(3)[None]
+    along = points[int(np.linalg.norm(points, axis=1).argmax())]
+    across = np.cross(along, np.eye(3)[int(np.abs(along).argmin())])
+    across /= np.linalg.norm(across)
+    return np.stack((np.eye(3), 2 * np.outer(across, across) - np.eye(3)))
 
 
 def _base_pair(points: NDArray[np.float64]) -> tuple[int, int]:

@@ -1,6 +1,5 @@
 """`CalibrationObject`: symmetry groups of known bodies, near symmetries, bad input."""
 
-from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -105,9 +104,16 @@ def test_planarity_and_size() -> None:
 
 
 def test_unusable_objects_say_why() -> None:
-    with pytest.raises(InputError, match="expected \\(N >= 4, 3\\)"):
-        body(TETRAHEDRON[:3])
-    line = body(torch.tensor([[float(i), 2.0 * i, 0] for i in range(5)]))
-    with pytest.raises(InputError, match="one line"):
-        _ = line.symmetries
-    assert replace(line, points=TETRAHEDRON.double()).num_fiducials == 4
+    with pytest.raises(InputError, match="expected \\(N >= 1, 3\\)"):
+        body(TETRAHEDRON[:0])
+
+
+def test_a_stick_has_two_ends_and_a_light_has_no_symmetry() -> None:
+    light, pair = body(torch.tensor([[5.0, 6, 7]])), body(torch.tensor([[0.0, 0, 0], [30, 40, 0]]))
+    uneven = body(torch.tensor([[0.0, 0, 0], [30, 0, 0], [100, 0, 0]]))
+    assert (light.pose_rank, pair.pose_rank, uneven.pose_rank, body(TETRAHEDRON).pose_rank) == (3, 5, 5, 6)
+    assert [len(x.symmetries) for x in (light, pair, uneven)] == [1, 2, 1]
+    turned = pair.symmetries[1]
+    assert turned.permutation.tolist() == [1, 0]
+    moved = pair.points.double().numpy() @ turned.rotation.T + turned.translation
+    np.testing.assert_allclose(moved, pair.points.double().numpy()[::-1], atol=1e-9)

@@ -1,0 +1,250 @@
+"""Identity of a single light and of markers on one line: no pattern tells them, but cameras that agree on places do.
+
+Any two blobs of different cameras that may be one point give a place. It counts by the evidence of all cameras: a blob
+near its image against a false one there, no blob against a hidden marker. Places at the object's distances from each
+other make a stick. What is chosen must beat the best different choice by the odds that every identity must have.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.association.blobs import PaddedBlobs, gather
+from imgcal.association.result import Identity, IdentityOptions
+from imgcal.geometry import RigidTransform
+from imgcal.types import CalibrationObject, CameraRig, Detections
+
+Array = NDArray[np.float64]
+
+REACH = 4.0
+"""Standard deviations of a camera's error within which a blob may be a place's image."""
+HIDDEN = 0.3
+"""Chance that a camera in whose view a marker is does not show it."""
+LEAST_CAMERAS = 3
+"""That must agree on a place: two rays that happen to meet are no witness of each other."""
+MOST_PLACES, MOST_PAIRS = 60, 20000
+"""That are looked at: the best of them."""
+SURE_ENDS = 3.0
+"""Times that the other end of an uneven stick must fit its distances worse."""
+ROUNDS = 3
+"""Of choosing blobs near a place and placing it anew."""
+
+
+@dataclass(frozen=True)
+class _Views:
+    """What the cameras saw of one snapshot, in pixels from the principal point without distortion."""
+
+    blobs: PaddedBlobs
+    rotation: Array  # (C, 3, 3) cam_from_rig
+    position: Array  # (C, 3) mm
+    focal: Array  # (C, 2) px
+    error: Array  # (C,) px, one standard deviation of what rig and blobs may be off
+    half: Array  # (C, 2) px, half the image
+    density: Array  # (C,) false blobs a square pixel
+
+    def project(self, places: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Images (P, C, 2) of places (P, 3), and whether they are in view (P, C)."""
+        there = np.einsum("cij,pcj->pci", self.rotation, places[:, None] - self.position)
+        depth = np.maximum(there[..., 2], 1.0)
+        uv = there[..., :2] / depth[..., None] * self.focal
+        return uv, (there[..., 2] > 1.0) & (np.abs(uv) < self.half).all(-1)
+
+    def rays(self) -> Array:
+        """Directions (C, M, 3) in the rig's frame."""
+        xy = self.blobs.ideal.astype(np.float64) / self.focal[:, None]
+        rays = np.concatenate((xy, np.ones((*xy.shape[:2], 1))), -1) @ self.rotation
+        return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Points in space that cameras may agree on."""
+
+    at: Array  # (P, 3) mm
+    chosen: NDArray[np.int64]  # (P, C) blob, -1 = none
+    odds: Array  # (P,) log odds against false blobs
+
+    def best(self, count: int) -> _Places:
+        """Keep the best of each choice of blobs."""
+        _, first = np.unique(self.chosen, axis=0, return_index=True)
+        first = first[(self.chosen[first] >= 0).sum(1) >= LEAST_CAMERAS]
+        rows = first[np.argsort(-self.odds[first], kind="stable")][:count]
+        return _Places(self.at[rows], self.chosen[rows], self.odds[rows])
+
+
+def identify_points(
+    detections: Detections, rig: CameraRig, obj: CalibrationObject, std: Tensor, options: IdentityOptions
+) -> Identity:
+    """Label the blobs of one snapshot of an object that is a point or a line; arguments as in `identify`."""
+    views = _views(detections, rig, std)
+    nothing = np.full(views.blobs.rows, -1, dtype=np.int64)
+
+    def refused(reason: str, undecided: bool = False) -> Identity:
+        return Identity(nothing, None, None, "refused", 0, 0.0, reason, hypotheses=1, undecided=undecided)
+
+    places = _places(views).best(MOST_PLACES)
+    if not len(places.at):
+        return refused(f"no place on which {LEAST_CAMERAS} cameras agree")
+    points = obj.points.double().numpy()
+    found = (
+        _lights(places, options.least_margin)
+        if obj.pose_rank == 3
+        else _sticks(places, points, views, len(obj.symmetries) > 1)
+    )
+    if found is None:
+        return refused("no places at the object's distances from each other")
+    rows, margin, turns = found
+    if margin < options.least_margin:
+        return refused(f"another place explains the blobs nearly as well: log odds {margin:.3g}", undecided=True)
+    labels = np.stack([places.chosen[row] for row in rows], axis=1)  # (C, N)
+    labels = _certain(views, places.at[list(rows)], labels)
+    if int(((labels >= 0).sum(0) >= 2).sum()) < len(rows):
+        return refused(f"no place on which {LEAST_CAMERAS} cameras agree")
+    pose = _pose(points, places.at[list(rows)])
+    status = "unique" if turns == 1 else "ambiguous"
+    reason = f"{int((labels >= 0).any(1).sum())} cameras agree"
+    return Identity(views.blobs.to_rows(labels), pose, rig, status, turns, margin, reason, explained=1.0)
+
+
+def _views(detections: Detections, rig: CameraRig, std: Tensor) -> _Views:
+    blobs = gather(detections, rig)
+    plain = (t.double().numpy() for t in (rig.cam_from_rig.rotation, rig.positions, rig.focal_length))
+    rotation, position, focal = plain
+    spread, size = std.double().numpy(), rig.image_size.double().numpy()
+    half = np.broadcast_to(0.5 * size, focal.shape)
+    distance = np.linalg.norm(position - position.mean(0), axis=1).mean() or 1000.0
+    mean = focal.mean(1)
+    turned, moved = spread[:, :3].mean(1) * mean, spread[:, 3:6].mean(1) * mean / distance
+    zoomed, shifted = spread[:, 6:8].mean(1) / mean * half.mean(1) * 0.6, spread[:, 8:10].mean(1)
+    own = np.where(blobs.row >= 0, blobs.sigma, 0.0).max(1, initial=0.0)
+    error = np.sqrt(turned**2 + moved**2 + zoomed**2 + shifted**2 + own**2 + 0.25)
+    density = np.maximum(blobs.count, 1) / (4 * half.prod(1))
+    return _Views(blobs, rotation, position, focal, error, half, density)
+
+
+def _places(views: _Views) -> _Places:
+    """Find all places where the rays of two cameras nearly meet, and what all cameras say of them."""
+    rays, valid = views.rays(), views.blobs.row >= 0
+    camera, blob = np.nonzero(valid)
+    a, b = np.nonzero(np.triu(np.ones((len(camera), len(camera)), dtype=bool), 1) & (camera[:, None] != camera))
+    if len(a) > MOST_PAIRS:
+        kept = np.linspace(0, len(a) - 1, MOST_PAIRS).astype(int)
+        a, b = a[kept], b[kept]
+    d1, d2 = rays[camera[a], blob[a]], rays[camera[b], blob[b]]
+    p1, p2 = views.position[camera[a]], views.position[camera[b]]
+    base, cosine = p2 - p1, (d1 * d2).sum(1)
+    sine = np.maximum(1 - cosine**2, 1e-12)
+    along1 = ((base * d1).sum(1) - (base * d2).sum(1) * cosine) / sine
+    along2 = ((base * d1).sum(1) * cosine - (base * d2).sum(1)) / sine
+    gap = np.linalg.norm(p1 + along1[:, None] * d1 - p2 - along2[:, None] * d2, axis=1)
+    reach = REACH * np.hypot(
+        along1 * views.error[camera[a]] / views.focal[camera[a], 0],
+        along2 * views.error[camera[b]] / views.focal[camera[b], 0],
+    )
+    good = (along1 > 0) & (along2 > 0) & (sine > 1e-3) & (gap < reach)
+    at = 0.5 * (p1 + along1[:, None] * d1 + p2 + along2[:, None] * d2)[good]
+    chosen, odds = _seen_at(views, at)
+    for _ in range(ROUNDS):
+        at = _placed(views, rays, at, chosen)
+        chosen, odds = _seen_at(views, at)
+    return _Places(at, chosen, odds)
+
+
+def _seen_at(views: _Views, at: Array) -> tuple[NDArray[np.int64], Array]:
+    """Nearest blobs (P, C) to the images of places, -1 = none within reach, and the places' log odds (P,)."""
+    uv, inside = views.project(at)
+    squared = np.square(uv[:, :, None] - views.blobs.ideal).sum(-1)  # (P, C, M)
+    nearest = squared.argmin(-1)
+    least = np.take_along_axis(squared, nearest[..., None], -1)[..., 0] / views.error**2
+    hit = (least < REACH**2) & inside
+    told = np.log((1 - HIDDEN) / (2 * np.pi * views.error**2 * views.density)) - 0.5 * least
+    odds = np.where(hit, told, np.where(inside, np.log(HIDDEN), 0.0)).sum(1)
+    return np.where(hit, nearest, -1), np.asarray(odds)
+
+
+def _placed(views: _Views, rays: Array, at: Array, chosen: NDArray[np.int64]) -> Array:
+    """Places (P, 3) nearest to the rays of their blobs."""
+    cameras = np.arange(len(rays))
+    ray = rays[cameras, np.maximum(chosen, 0)]  # (P, C, 3)
+    away = np.square(at[:, None] - views.position).sum(-1)
+    weight = (chosen >= 0) * np.square(views.focal[:, 0] / views.error) / np.maximum(away, 1.0)
+    across = (np.eye(3) - ray[..., :, None] * ray[..., None, :]) * weight[..., None, None]
+    total = across.sum(1)
+    trace = np.trace(total, axis1=1, axis2=2)[:, None, None]
+    pulled = np.einsum("pcij,cj->pi", across, views.position) + 1e-9 * trace[:, :, 0] * at
+    return np.linalg.solve(total + 1e-9 * np.maximum(trace, 1e-12) * np.eye(3), pulled[..., None])[..., 0]
+
+
+def _lights(places: _Places, least: float) -> tuple[tuple[int, ...], float, int]:
+    """The best place, and by how much it beats the best of other blobs."""
+    shared = ((places.chosen == places.chosen[0]) & (places.chosen[0] >= 0)).sum(1)
+    # The same point with another blob of a camera or two is settled camera by camera: see `_certain`.
+    rivals = places.odds[shared < 2]
+    rival = max(float(rivals.max(initial=0.0)), 0.0)
+    # A second place that is as sure as a light must be is a light, too: which of them is meant cannot be told.
+    return (0,), float(places.odds[0]) - rival if rival < least else 0.0, 1
+
+
+def _sticks(
+    places: _Places, points: Array, views: _Views, symmetric: bool
+) -> tuple[tuple[int, ...], float, int] | None:
+    """The best places at the object's distances, and by how much they beat the best others."""
+    distance = np.linalg.norm(places.at[:, None] - places.at, axis=-1)
+    wanted = np.linalg.norm(points[:, None] - points, axis=-1)
+    away = np.linalg.norm(places.at[:, None] - views.position, axis=-1).mean(1)
+    slack = REACH * away * float(np.median(views.error / views.focal[:, 0]))
+    partial: list[tuple[tuple[int, ...], float]] = [((row,), float(places.odds[row])) for row in range(len(places.at))]
+    for n in range(1, len(points)):
+        longer = []
+        for rows, odds in partial:
+            last = list(rows)
+            fits = (np.abs(distance[last] - wanted[:n, n, None]) < slack[None] + slack[last][:, None]).all(0)
+            taken = ((places.chosen[:, None] == places.chosen[last][None]) & (places.chosen[:, None] >= 0)).any((1, 2))
+            longer += [((*rows, int(k)), odds + float(places.odds[k])) for k in np.flatnonzero(fits & ~taken)]
+        partial = sorted(longer, key=lambda found: -found[1])[: 50 * MOST_PLACES]
+    if not partial:
+        return None
+    first, odds = partial[0]
+    same = [rows for rows, _ in partial if set(rows) == set(first)]
+    rivals = [other for rows, other in partial if len(set(rows) & set(first)) < len(first)]
+    margin = odds - max(rivals, default=0.0)
+    if symmetric or len(same) == 1:
+        return first, margin, 2 if symmetric else 1
+    # Cameras that are off change all of a stick's distances alike: their relations tell its ends.
+    misfit = [_misfit(distance[np.ix_(rows, rows)], wanted) for rows in same]
+    order = np.argsort(misfit)
+    sure = misfit[order[1]] > SURE_ENDS * misfit[order[0]]
+    return same[order[0]], margin if sure else 0.0, 1
+
+
+def _misfit(distance: Array, wanted: Array) -> float:
+    """How far distances are from being in the wanted relations, mm."""
+    scale = (distance * wanted).sum() / np.square(distance).sum()
+    return float(np.abs(scale * distance - wanted).max())
+
+
+def _certain(views: _Views, at: Array, labels: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Leave out blobs (C, N) beside which another one may be the marker as well."""
+    uv, _ = views.project(at)
+    squared = np.square(uv[:, :, None] - views.blobs.ideal).sum(-1) / views.error[:, None] ** 2  # (N, C, M)
+    near = (squared < REACH**2).sum(-1).T
+    return np.where(near == 1, labels, -1)
+
+
+def _pose(points: Array, at: Array) -> RigidTransform:
+    """Lay the object onto its places; a stick by the shortest turn."""
+    rotation = np.eye(3)
+    if len(points) > 1:
+        far = int(np.linalg.norm(points - points[0], axis=1).argmax())
+        a, b = points[far] - points[0], at[far] - at[0]
+        a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
+        middle = a + b if np.linalg.norm(a + b) > 1e-6 else np.cross(a, np.eye(3)[int(np.abs(a).argmin())])
+        middle = middle / np.linalg.norm(middle)
+        rotation = 2 * np.outer(middle, middle) - np.eye(3)  # half a turn that takes a to b
+    shift = at.mean(0) - rotation @ points.mean(0)
+    return RigidTransform(torch.from_numpy(rotation), torch.from_numpy(shift))
