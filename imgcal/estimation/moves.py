@@ -35,8 +35,8 @@ from imgcal.types import Kind, MovedCamera
 ERROR = 1e-5
 """Probability of naming a camera in a capture in which none has moved, as far as noise is what it is said to be."""
 LEAST_MOVE = 0.15
-"""Pixels, in the image of the camera: smaller ones do no harm, and slow drifts of every rig reach them. Errors that last
-reach more, by the root of what they add to the variance of snapshots."""
+"""Pixels, in the image of the camera: smaller ones do no harm, and slow drifts of every rig reach them. Errors that
+last reach more, by the root of what they add to the variance of snapshots."""
 LEAST_GAIN = 50.0
 """Chi-squared of the kind of values that explains a step best."""
 LEAST_MOTION = 0.9

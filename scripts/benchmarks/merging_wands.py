@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -29,7 +29,7 @@ from imgcal.types import CalibrationObject, CameraRig, Detections, MovedError
 from scripts.output import ROOT, command, markdown, surroundings, write_json
 
 RESULT = ROOT / "docs" / "benchmarks" / "merging_wands.json"
-SHAPES = ("ring", "dome", "row")
+SHAPES: tuple[Literal["ring", "dome", "row"], ...] = ("ring", "dome", "row")
 CAMERAS = (4, 6, 8, 10)
 LENGTHS = (20, 20, 30, 30, 50, 50, 80, 120, 200)
 """Snapshots; short captures are the usual ones."""
@@ -171,7 +171,7 @@ def capture(seed: int, moving: bool = False, last: int | None = None) -> tuple[C
 def drawn_bump(truth: Truth, draw: np.random.Generator, last: int | None) -> Bump:
     """Draw a camera that sees the wand, the moment, and how far it is turned."""
     whole = shown(truth).all(-1).numpy()
-    degrees = math.exp(draw.uniform(*(math.log(d) for d in DEGREES)))
+    degrees = math.exp(draw.uniform(math.log(DEGREES[0]), math.log(DEGREES[1])))
     cameras = np.flatnonzero(whole.sum(0) >= 4 * AT_EITHER_END)
     if last is not None:  # such as see it at the end
         cameras = np.intersect1d(cameras, np.flatnonzero(whole[-last:].all(0)))
