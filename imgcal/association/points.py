@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.association.blobs import PaddedBlobs, gather
-from imgcal.association.result import Identity, IdentityOptions
+from imgcal.association.result import Identity, IdentityOptions, Status
 from imgcal.geometry import RigidTransform
 from imgcal.types import CalibrationObject, CameraRig, Detections
 
@@ -106,7 +106,7 @@ def identify_points(
     if int(((labels >= 0).sum(0) >= 2).sum()) < len(rows):
         return refused(f"no place on which {LEAST_CAMERAS} cameras agree")
     pose = _pose(points, places.at[list(rows)])
-    status = "unique" if turns == 1 else "ambiguous"
+    status: Status = "unique" if turns == 1 else "ambiguous"
     reason = f"{int((labels >= 0).any(1).sum())} cameras agree"
     return Identity(views.blobs.to_rows(labels), pose, rig, status, turns, margin, reason, explained=1.0)
 
