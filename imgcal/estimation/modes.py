@@ -118,7 +118,7 @@ def mode_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> Mode
         return None
     offset = np.zeros(len(problem.modes)) if problem.mode_offset is None else problem.mode_offset.numpy()
     information = found.information.numpy() + np.eye(len(offset))
-    covariance: NDArray[np.float64] = np.linalg.inv(information)
+    covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
     return ModeEvidence(offset, covariance, covariance @ (found.pull.numpy() - offset), found.follow)
 
 
