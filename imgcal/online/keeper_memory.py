@@ -79,6 +79,7 @@ class KeeperMemory:
         cls, rig: CameraRig, obj: CalibrationObject, drift: DriftRate | None, options: PipelineOptions
     ) -> KeeperMemory:
         """Begin with a factory calibration."""
+        obj.require_rigid("for a running rig")
         rig = rig.to(torch.float64)
         calibration, rig = calibration_of(rig), replace(rig, posterior=None)
         start = None if calibration is None else (belief_of(calibration, obj), calibration.snapshots)

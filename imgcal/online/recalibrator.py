@@ -105,6 +105,7 @@ class Recalibrator:
                 more slowly. Of a camera that moves, those before the move are left out.
             detector: who finds the fiducials in frames, as for `calibrate`; blobs found elsewhere decide alone.
         """
+        obj.require_rigid("for a running rig")
         if window < 1:
             raise InputError(f"window: found {window}, expected at least 1 snapshot")
         rig = rig.to(torch.float64)

@@ -91,6 +91,7 @@ def calibrate_from_scratch(
         >>> abs(float(apart[0] - apart[1])) < 1  # mm
         True
     """
+    obj.require_rigid("to calibrate without a factory calibration")
     started, cameras, options = time.perf_counter(), _with_prior(cameras), options.of_object(obj)
     detections, repeats = without_repeats(blobs_of(source, cameras, obj, detection))
     found = time.perf_counter()

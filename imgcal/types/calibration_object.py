@@ -91,6 +91,19 @@ class CalibrationObject:
         """Tell whether the fiducials are where the object says, without any tolerance."""
         return self.scale_tolerance == 0 and (self.tolerance is None or not bool(self.tolerance.any()))
 
+    def require_rigid(self, use: str) -> None:
+        """Refuse lights and sticks where they are not supported yet.
+
+        Args:
+            use: what the object is for, in words.
+
+        Raises:
+            InputError: its fiducials lie on one line, or there is only one.
+        """
+        if self.pose_rank < 6:
+            found = "one fiducial" if len(self.points) == 1 else f"{len(self.points)} fiducials on one line"
+            raise InputError(f"object {self.name}: found {found}, expected some that are not on one line {use}")
+
     @property
     def granted(self) -> Tensor:
         """Tolerance of each fiducial, (N,) mm: zero where none is given."""
