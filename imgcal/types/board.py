@@ -124,10 +124,12 @@ class Board:
 
         The first is no turn at all. Boards with markers have no other.
         """
+        if self.is_coded:
+            return ((0.0, np.arange(len(self.points))),)
         across, down = self.shape
         number = np.arange(across * down).reshape(down, across)
         found = [(0.0, number.ravel())]
-        if self.is_coded or (self.kind == "circles" and self.asymmetric and down % 2 == 1):
+        if self.kind == "circles" and self.asymmetric and down % 2 == 1:
             return tuple(found)
         colour = self.kind == "checkerboard"
         if not colour or (self.columns + self.rows) % 2 == 0:

@@ -121,7 +121,9 @@ def test_a_stick_has_two_ends_and_a_light_has_no_symmetry() -> None:
     np.testing.assert_allclose(moved, pair.points.double().numpy()[::-1], atol=1e-9)
 
 
-@pytest.mark.parametrize(("points", "found"), [([[0.0, 0, 0]], "one fiducial"), ([[0.0, 0, 0], [500, 0, 0]], "2 fiduc")])
+@pytest.mark.parametrize(
+    ("points", "found"), [([[0.0, 0, 0]], "one fiducial"), ([[0.0, 0, 0], [500, 0, 0]], "2 fiduc")]
+)
 def test_lights_and_sticks_are_refused_where_they_are_not_supported_yet(points, found):
     obj = CalibrationObject(torch.tensor(points, dtype=torch.float64), torch.ones(len(points), 3).double(), name="it")
     with pytest.raises(InputError, match=f"object it: found {found}.* for a running rig"):
