@@ -38,7 +38,7 @@ SMOOTHING = 0.1
 EPISODE, EPISODE_SECONDS = 2.0, 0.4
 """Correlation times that a passing error may last, and the seconds that it may last at least: a target at the edge of
 an image, behind somebody's arm, or under wrong labels stays there for so long, and may seem to be shifted by pixels."""
-LARGEST = 20.0
+LARGEST = 10.0
 """Times the usual size of lasting errors from which one lasts no longer than that."""
 LEAST_LASTING = 0.05
 """Pixels: errors that last are at least so large, by what ten well calibrated infrared cameras show."""
