@@ -21,6 +21,8 @@ Floats = NDArray[np.float64]
 MOST_TILT = 0.6  # rad between a board and the camera that it faces
 FLATTEST = 0.25
 """Cosine of the angle from its normal, below which a camera sees nothing of a board."""
+NODES = 8
+"""Pixels between rays that the lens is inverted for; those between are interpolated."""
 FINER = 3
 """Rays to a pixel, across and down."""
 MARGIN = 0.6
@@ -158,14 +160,11 @@ def _window(
 ) -> Floats:
     """Grey values (H, W) of the pixels from `first` to `last` (excluded)."""
     columns, rows = last - first
-    fine = [(np.arange(FINER * n) + 0.5) / FINER - 0.5 + start for n, start in zip((columns, rows), first, strict=True)]
-    uv = np.stack(np.meshgrid(*fine), -1).reshape(-1, 2)
-    xy = (torch.from_numpy(uv) - single.principal_point[0].double()) / single.focal_length[0].double()
-    rays, _ = undistort(xy[None], single.distortion.double(), single.lens_model)
-    ray = np.concatenate((rays[0].numpy(), np.ones((len(uv), 1))), 1)
+    ray = _rays(single, first, last).reshape(-1, 2)
+    ray = np.concatenate((ray, np.ones((len(ray), 1))), 1)
     rotation, translation = cam_from_object.rotation.numpy(), cam_from_object.translation.numpy()
     direction, origin = ray @ rotation, -rotation.T @ translation
-    place = np.zeros((len(uv), 2))
+    place = np.zeros((len(ray), 2))
     for _ in range(1 if board.bend == (0.0, 0.0) else 3):  # the surface is nearly a plane: fixed points
         depth = (board.deflection_at(place) - origin[2]) / direction[:, 2]
         place = origin[:2] + direction[:, :2] * depth[:, None]
@@ -174,6 +173,25 @@ def _window(
     white = is_white(board, place) != board.inverted
     value = np.where(sheet, np.where(white, ink.white, ink.black), ink.background)
     return value.reshape(rows, FINER, columns, FINER).mean((1, 3))
+
+
+def _rays(single: CameraRig, first: NDArray[np.int_], last: NDArray[np.int_]) -> Floats:
+    """Where the rays of a window meet the z = 1 plane: (H FINER, W FINER, 2), between those of a coarser grid."""
+    weights, nodes = [], []
+    for start, end in zip(first.tolist(), last.tolist(), strict=True):
+        fine = (np.arange(FINER * (end - start)) + 0.5) / FINER - 0.5
+        count = int(np.ceil((end - start) / NODES)) + 2
+        node, share = np.divmod((fine + 1) / NODES, 1)
+        weight = np.zeros((len(fine), count))
+        weight[np.arange(len(fine)), node.astype(int)] = 1 - share
+        weight[np.arange(len(fine)), node.astype(int) + 1] = share
+        weights.append(weight)
+        nodes.append(start - 1.0 + NODES * np.arange(count))
+    uv = torch.from_numpy(np.stack(np.meshgrid(*nodes), -1))
+    xy = (uv - single.principal_point[0].double()) / single.focal_length[0].double()
+    rays, _ = undistort(xy.reshape(1, -1, 2), single.distortion.double(), single.lens_model)
+    grid = rays[0].numpy().reshape(uv.shape)
+    return np.stack([weights[1] @ grid[..., axis] @ weights[0].T for axis in range(2)], -1)
 
 
 def _sheet(board: Board) -> tuple[Floats, Floats]:
@@ -195,12 +213,12 @@ def is_white(board: Board, xy: Floats) -> NDArray[np.bool_]:
     if board.kind == "checkerboard":
         return ~inside | (square.sum(1) % 2 == 1)
     if board.kind == "circles":
-        points = board.points[:, :2]
+        row = np.clip(np.rint(xy[:, 1] / board.pitch), 0, board.rows - 1)
+        wide, shift = (2.0, row % 2) if board.asymmetric else (1.0, 0.0 * row)
+        column = np.clip(np.rint((xy[:, 0] / board.pitch - shift) / wide), 0, board.columns - 1)
+        nearest = board.pitch * np.stack((wide * column + shift, row), 1)
         apart = board.pitch * (2**0.5 if board.asymmetric else 1.0)
-        white = np.ones(len(xy), dtype=bool)
-        for point in points:
-            white &= np.square(xy - point).sum(1) > (DOT * apart) ** 2
-        return white
+        return np.square(xy - nearest).sum(1) > (DOT * apart) ** 2
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
     if board.kind == "charuco":
         count = (board.columns * board.rows + 1) // 2
