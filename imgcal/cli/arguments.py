@@ -37,7 +37,9 @@ class Simulate:
     """
 
     rig: str  #: factory rig: file, or the name of a shipped one (O10, O6, U7, T4, room10)
-    object: str  #: object: file, or the name of a shipped one (asymmetric8, cube8, cube27, sphere64, wand4)
+    object: str
+    """object: file, or the name of a shipped one (asymmetric8, cube8, cube27, sphere64, wand4; printed boards: charuco,
+    aprilgrid, checkerboard, circles)"""
     out: Path  #: folder to write; must not hold a capture yet
     snapshots: int = 10  #: number of poses of the object
     seed: int = 0  #: the same seed gives the same capture

@@ -91,7 +91,7 @@ class Calibrate(arguments.Calibrate):
         named, trusted = self.first_guess, self.trust
         initializer = None if named == "none" else load_initializer(named, rig, obj, trusted=trusted)
         loaded = time.perf_counter()
-        detections, frames = read_detections(source, self.snapshots, self.detection, measurer)
+        detections, frames = read_detections(source, self.snapshots, self.detection, measurer, obj.board)
         detections = only_cameras(detections, rig)
         seconds = {"loading": loaded - started, "reading and detection": time.perf_counter() - loaded}
 

@@ -26,7 +26,7 @@ from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import Capture, Frame
 from imgcal.messages import listed, shortened
 from imgcal.pipeline import LearnedMeasurer, detect_capture
-from imgcal.types import CameraRig, Detections
+from imgcal.types import Board, CameraRig, Detections
 
 Item = TypeVar("Item")
 
@@ -67,6 +67,7 @@ def read_detections(
     snapshots: str | None,
     options: DetectionOptions,
     measurer: LearnedMeasurer | None = None,
+    board: Board | None = None,
 ) -> tuple[Detections, dict[str, Frame | None]]:
     """Take detections from a file as they are, or find blobs in the frames of a capture.
 
@@ -75,6 +76,7 @@ def read_detections(
         snapshots: A:B, or None for all.
         options: what counts as a blob.
         measurer: measures the blobs of frames again.
+        board: the printed board whose points are found instead of blobs.
 
     Returns:
         The detections of the chosen snapshots, and the frames of the first one, for pictures (empty without frames).
@@ -91,7 +93,7 @@ def read_detections(
             raise InputError(f"--measurer {measurer.name}: found blobs without frames, expected a capture with frames")
         return source.of_snapshots(first, count if last is None else min(last, count)), {}
     bar = partial(progress, label="detecting blobs")
-    return detect_capture(source, first, last, options, measurer, bar)
+    return detect_capture(source, first, last, options, measurer, board, bar)
 
 
 def progress(items: Iterable[Item], total: int, label: str) -> Iterator[Item]:

@@ -27,7 +27,7 @@ class Render(arguments.Render):
         if any((self.out / camera).exists() for camera in rig.camera_names):
             raise InputError(f"{self.out}: found images of these cameras there already, expected a new folder")
         source = open_input(self.input, rig, obj.rows, self.videos_differ)
-        detections, _ = read_detections(source, self.snapshots, self.detection)
+        detections, _ = read_detections(source, self.snapshots, self.detection, board=obj.board)
 
         def bar(snapshots: Iterable[int], total: int) -> Iterable[int]:
             return progress(snapshots, total, "identifying")

@@ -22,7 +22,7 @@ class Score(arguments.Score):
         """Score and print."""
         rig, obj = open_rig(self.rig), load_object(self.object)
         source = open_input(self.input, rig, obj.rows, self.videos_differ)
-        detections, _ = read_detections(source, self.snapshots, self.detection)
+        detections, _ = read_detections(source, self.snapshots, self.detection, board=obj.board)
 
         def bar(snapshots: Iterable[int], total: int) -> Iterable[int]:
             return progress(snapshots, total, "scoring")

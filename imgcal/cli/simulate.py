@@ -30,6 +30,8 @@ from imgcal.synthesis import (
     PoseRange,
     RelativeDrift,
     Truth,
+    render_board,
+    simulate_board,
     simulate_shots,
     simulate_truth,
     simulate_volume,
@@ -37,7 +39,7 @@ from imgcal.synthesis import (
 )
 from imgcal.types import FIDUCIAL_RADIUS, CalibrationObject, CameraRig
 
-WRITTEN = ("capture.yaml", "rig.yaml", "object.csv", "truth", "frames")
+WRITTEN = ("capture.yaml", "rig.yaml", "object.csv", "board.yaml", "truth", "frames")
 
 MOST_SNAPSHOTS = 100_000
 
@@ -75,10 +77,19 @@ class Simulate(arguments.Simulate):
     def _write(
         self, truth: Truth, rig: CameraRig, obj: CalibrationObject, generator: torch.Generator, out: Path
     ) -> None:
-        save_capture_settings(out, self.sensor.bit_depth, note=f"simulated, seed {self.seed}")
+        save_capture_settings(
+            out, self.sensor.bit_depth if obj.board is None else 8, note=f"simulated, seed {self.seed}"
+        )
         save_rig(rig, out / "rig.yaml")
-        save_object(obj, out / "object.csv")
+        save_object(obj, out / ("object.csv" if obj.board is None else "board.yaml"))
         _write_truth(truth, out / "truth")
+        if obj.board is not None:
+            for snapshot in progress(range(self.snapshots), self.snapshots, "rendering frames"):
+                pose = truth.rig_from_object[snapshot]
+                for camera, image in render_board(obj.board, truth.rig, pose, generator).items():
+                    (out / "frames" / camera).mkdir(parents=True, exist_ok=True)
+                    write_frame(out / "frames" / camera / f"{snapshot:05d}.png", image)
+            return
         level = None if self.difficulty is None else DIFFICULTIES[self.difficulty]
         model = FrameModel(self.sensor, self.clutter_model if self.clutter else None, self.marker_radius, level)
         model = replace(model, exposure_ms=self.exposure_ms)
@@ -93,6 +104,10 @@ class Simulate(arguments.Simulate):
 
     def _truth(self, rig: CameraRig, obj: CalibrationObject, generator: torch.Generator) -> Truth:
         """Disturb the rig and place the object."""
+        if obj.board is not None:
+            if self.poses is not None or self.exposure_ms > 0 or self.difficulty is not None:
+                raise InputError("--poses, --exposure-ms, --difficulty: expected an object with markers, found a board")
+            return simulate_board(rig, obj, self.snapshots, generator, self._drift())
         poses = self.poses or ("hemisphere" if rig.volume is None and rig.working_distance is not None else "volume")
         if self.exposure_ms > 0 and poses != "hand-held":
             raise InputError(f"--exposure-ms: found {self.exposure_ms:g}, expected --poses hand-held with it")

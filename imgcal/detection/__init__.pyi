@@ -1,3 +1,4 @@
+from .boards import require_board
 from .centroids import Blobs, to_detections
 from .checks import Frame
 from .detector import detect, detect_frame, detect_snapshot
@@ -11,6 +12,7 @@ __all__ = [
     "detect",
     "detect_frame",
     "detect_snapshot",
+    "require_board",
     "to_detections",
     "without_dim",
 ]

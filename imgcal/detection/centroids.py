@@ -28,6 +28,7 @@ class Blobs:
     flags: NDArray[np.uint8]  # (K,) BlobFlag bits
     camera: NDArray[np.int64]  # (K,) which of the frames
     contrast: NDArray[np.float64]  # (K,) brightest pixel above the background, share of full scale
+    fiducial: NDArray[np.int64]  # (K,) which one it is, -1 = the image does not say
 
     def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Blobs:
         """Keep the given rows."""
@@ -35,22 +36,23 @@ class Blobs:
 
 
 def to_detections(shots: Sequence[Blobs], camera_names: tuple[str, ...], snapshot_names: tuple[str, ...]) -> Detections:
-    """Stack the blobs of one or several snapshots, none of them labelled: rows run over snapshots, then cameras.
+    """Stack the blobs of one or several snapshots: rows run over snapshots, then cameras.
 
     Args:
         shots: blobs of each snapshot, at least one.
         camera_names: which `Blobs.camera` counts.
         snapshot_names: one for each snapshot.
     """
-    uv, sigma, radius, flags, camera = (
-        np.concatenate([getattr(shot, name) for shot in shots]) for name in ("uv", "sigma", "radius", "flags", "camera")
+    names = ("uv", "sigma", "radius", "flags", "camera", "fiducial")
+    uv, sigma, radius, flags, camera, fiducial = (
+        np.concatenate([getattr(shot, name) for shot in shots]) for name in names
     )
     return Detections(
         uv=uv,
         sigma=sigma,
         camera=camera,
         snapshot=np.repeat(np.arange(len(shots)), [len(shot.uv) for shot in shots]),
-        fiducial=np.full(len(camera), -1, np.int64),
+        fiducial=fiducial,
         radius=radius,
         flags=flags,
         camera_names=camera_names,
@@ -71,7 +73,7 @@ def measure(frame: Frame, candidates: Candidates, options: DetectionOptions, sca
     count = len(boxes)
     blobs = Blobs(
         np.zeros((count, 2)), np.zeros(count), np.zeros(count), np.zeros(count, np.uint8), np.zeros(count, np.int64),
-        np.zeros(count),
+        np.zeros(count), np.full(count, -1, np.int64),
     )  # fmt: skip
     kept = np.zeros(count, np.bool_)
     saturation = 0.995 * scale if options.saturation is None else options.saturation

@@ -10,13 +10,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from imgcal.detection.boards import find_board, require_board
 from imgcal.detection.candidates import block_means, outline, screen
 from imgcal.detection.centroids import Blobs, measure, to_detections
 from imgcal.detection.checks import Frame, checked_frame, checked_mask, full_scale
 from imgcal.detection.options import DetectionOptions
 from imgcal.detection.populations import DIMMER, usable, usual_size, without_dim
 from imgcal.errors import InputError
-from imgcal.types import BlobFlag, Detections
+from imgcal.types import BlobFlag, Board, Detections
 
 LARGER = 32.0  # px, radius up to which blobs show when they are looked for with the usual limit
 LARGEST = 48.0  # px, radius that the windows hold
@@ -30,6 +31,7 @@ def detect(
     options: DetectionOptions | None = None,
     *,
     masks: Mapping[str, Mask] | None = None,
+    board: Board | None = None,
 ) -> Detections:
     """Detect the blobs of all cameras in one or several snapshots.
 
@@ -37,9 +39,10 @@ def detect(
         frames: camera name -> frame (H, W) uint8 or uint16, or one frame a snapshot; None = the camera has no frame.
         options: what counts as a blob.
         masks: camera name -> (H, W), non-zero inside known reflections; blobs there are flagged.
+        board: the printed board whose points are found instead of blobs, each with its label.
 
     Raises:
-        InputError: a frame is no grey image, or cameras have different numbers of snapshots.
+        InputError: the board is in no frame; a frame is no grey image, or cameras have different numbers of snapshots.
 
     Examples:
         >>> import imgcal
@@ -60,8 +63,11 @@ def detect(
         raise InputError("frames: found no snapshot, expected at least one frame for each camera")
     with ThreadPoolExecutor(_workers(len(names))) as pool:
         blobs = [
-            detect_snapshot(snapshot, options, masks=masks, pool=pool, whole_capture=True) for snapshot in snapshots
+            detect_snapshot(snapshot, options, masks=masks, pool=pool, whole_capture=True, board=board)
+            for snapshot in snapshots
         ]
+    if board is not None:
+        require_board(blobs, (frame for shot in snapshots for frame in shot.values() if frame is not None), board)
     digits = len(str(max(len(blobs) - 1, 0)))
     numbers = tuple(f"{index:0{digits}d}" for index in range(len(blobs)))
     return to_detections(without_dim(blobs, options), names, numbers)
@@ -74,6 +80,7 @@ def detect_snapshot(
     masks: Mapping[str, Mask] | None = None,
     pool: ThreadPoolExecutor | None = None,
     whole_capture: bool = False,
+    board: Board | None = None,
 ) -> Blobs:
     """Detect the blobs of one snapshot; `Blobs.camera` counts the cameras in the order of `frames`.
 
@@ -83,10 +90,13 @@ def detect_snapshot(
         masks: camera name -> (H, W).
         pool: threads that live on between snapshots; None = a pool for this call.
         whole_capture: the blobs of all snapshots will go through `without_dim` together; nothing is left out here.
+        board: as in `detect`; a snapshot without it is no error.
     """
     if pool is None:
         with ThreadPoolExecutor(_workers(len(frames))) as own_pool:
-            return detect_snapshot(frames, options, masks=masks, pool=own_pool, whole_capture=whole_capture)
+            return detect_snapshot(
+                frames, options, masks=masks, pool=own_pool, whole_capture=whole_capture, board=board
+            )
     present = [(camera, name) for camera, name in enumerate(frames) if frames[name] is not None]
     images = [checked_frame(frames[name], name) for _, name in present]
     covered = [
@@ -95,7 +105,7 @@ def detect_snapshot(
     ]
     names = [name for _, name in present]
     # OpenCV and the compiled functions release the interpreter: frames are worked on in parallel.
-    found = list(pool.map(_detect_one, images, names, covered, [options] * len(images)))
+    found = list(pool.map(_detect_one, images, names, covered, [options] * len(images), [board] * len(images)))
     camera = np.repeat([camera for camera, _ in present], [len(blobs.uv) for blobs in found]).astype(np.int64)
     blobs = Blobs(
         np.concatenate([np.zeros((0, 2)), *(blobs.uv for blobs in found)]),
@@ -104,8 +114,9 @@ def detect_snapshot(
         np.concatenate([np.zeros(0, np.uint8), *(blobs.flags for blobs in found)]),
         camera,
         np.concatenate([np.zeros(0), *(blobs.contrast for blobs in found)]),
+        np.concatenate([np.zeros(0, np.int64), *(blobs.fiducial for blobs in found)]),
     )
-    return blobs if whole_capture else without_dim([blobs], options)[0]
+    return blobs if whole_capture or board is not None else without_dim([blobs], options)[0]
 
 
 def detect_frame(frame: Frame, options: DetectionOptions, mask: Mask | None = None) -> Blobs:
@@ -113,8 +124,13 @@ def detect_frame(frame: Frame, options: DetectionOptions, mask: Mask | None = No
     return detect_snapshot({"frame": frame}, options, masks=None if mask is None else {"frame": mask})
 
 
-def _detect_one(frame: Frame, name: str, mask: NDArray[np.bool_] | None, options: DetectionOptions) -> Blobs:
-    """Detect the blobs of one checked frame; their camera is 0."""
+def _detect_one(
+    frame: Frame, name: str, mask: NDArray[np.bool_] | None, options: DetectionOptions, board: Board | None
+) -> Blobs:
+    """Detect the blobs of one checked frame, or the points of a board; their camera is 0."""
+    if board is not None:
+        points = find_board(frame, board)
+        return points if mask is None else points.select(~_inside(mask, points.uv))
     scale = full_scale(frame, options.bit_depth, name)
     contiguous = frame if frame.flags.c_contiguous else frame.copy()
     if options.max_radius is None:

@@ -45,6 +45,8 @@ COMPLEXITY = 3.0
 """Log evidence that each further tolerance must gain."""
 SNAPSHOTS_TO_BEND = 8
 """From which the pulls of single snapshots are compared with each other."""
+LEAST_NOISE = 0.01
+"""Of the noise that was stated: what residuals of exact data leave is the solver's, and says nothing of the object."""
 ROUNDS = 60
 """Of `learnt_tolerances` and of `offsets`, at most."""
 
@@ -130,7 +132,7 @@ class ShapeEvidence:
         mine, rest = len(displacement) - int(np.isfinite(deviation)), self.freedom - len(displacement)
         if mine <= 0 or rest <= 0:
             return 0.0, mine, rest
-        left = max(self.chi2 - explained, 1e-12 * self.chi2) / rest
+        left = max((self.chi2 - explained) / rest, LEAST_NOISE**2)
         return explained / (mine * left), mine, rest
 
 

@@ -233,7 +233,7 @@ def _recalibrated(path: Path, rig: CameraRig, obj: CalibrationObject, settings: 
     if isinstance(source, Capture):
         if settings.detector != "classical":
             detector = sight_of_capture(source, settings.detector)
-        source, _ = detect_capture(source)
+        source, _ = detect_capture(source, board=obj.board)
     options = PipelineOptions(blind_cameras=settings.blind_cameras)
     result = calibrate(source, rig, obj, options, detector=detector)
     return columns_of(result) | ({"rig_file": rig_text(result.rig)} if settings.keep_rig else {})

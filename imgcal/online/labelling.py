@@ -91,7 +91,7 @@ class Labelling:
             if isinstance(frame, Sequence):
                 raise InputError(f"camera {camera}: found {len(frame)} frames, expected one of this moment, or None")
             frames[camera] = frame
-        blobs = detect_snapshot(frames, self.detection, pool=self._pool)
+        blobs = detect_snapshot(frames, self.detection, pool=self._pool, board=self.obj.board)
         return to_detections([blobs], self.rig.camera_names, (name,))
 
     def decided(

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.association import Sight
-from imgcal.detection import Blobs, DetectionOptions, detect_snapshot, to_detections, without_dim
+from imgcal.detection import Blobs, DetectionOptions, detect_snapshot, require_board, to_detections, without_dim
+from imgcal.errors import InputError
 from imgcal.io import Capture, Frame
 from imgcal.pipeline.measuring import LearnedMeasurer
 from imgcal.pipeline.sources import DetectorName, proposer_of
-from imgcal.types import Detections
+from imgcal.types import Board, Detections
 
 Snapshots = Iterable[tuple[str, dict[str, Frame | None]]]
 Bar = Callable[[Snapshots, int], Snapshots]
@@ -25,6 +26,7 @@ def detect_capture(
     last: int | None = None,
     options: DetectionOptions = DetectionOptions(),
     measurer: LearnedMeasurer | None = None,
+    board: Board | None = None,
     bar: Bar = lambda snapshots, count: snapshots,
 ) -> tuple[Detections, dict[str, Frame | None]]:
     """Find blobs in the frames of a capture.
@@ -35,13 +37,14 @@ def detect_capture(
         last: number of the snapshot to stop before; None = to the end.
         options: what counts as a blob.
         measurer: measures the blobs of frames again.
+        board: the printed board whose points are found instead of blobs.
         bar: wraps the loop over snapshots, for a progress bar.
 
     Returns:
         The blobs, and the frames of the first snapshot, for pictures.
 
     Raises:
-        InputError: a frame cannot be read.
+        InputError: a frame cannot be read, or the board is in none.
     """
     names, masks = capture.snapshot_names[first:last], masks_of(capture)
     found: list[Blobs] = []
@@ -49,8 +52,14 @@ def detect_capture(
     with ThreadPoolExecutor() as pool:
         for _, frames in bar(capture.snapshots(first, last), len(names)):
             shown = shown or dict(frames)
-            blobs = detect_snapshot(frames, options, masks=masks, pool=pool, whole_capture=True)
+            blobs = detect_snapshot(frames, options, masks=masks, pool=pool, whole_capture=True, board=board)
             found.append(blobs if measurer is None else measurer(frames, blobs, options))
+    if board is not None:
+        if measurer is not None:
+            raise InputError(f"measurer {measurer.name}: found a printed board, expected an object with markers")
+        again = capture.snapshots(first, last)
+        require_board(found, (frame for _, shot in again for frame in shot.values() if frame is not None), board)
+        return to_detections(found, capture.camera_names, names), shown
     return to_detections(without_dim(found, options), capture.camera_names, names), shown
 
 

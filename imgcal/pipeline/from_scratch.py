@@ -28,6 +28,7 @@ from imgcal.detection import DetectionOptions
 from imgcal.errors import RefusedError
 from imgcal.estimation import K3, ColdStart, cold_start, ordinary_lens
 from imgcal.messages import listed
+from imgcal.pipeline.board_turns import require_one_turn
 from imgcal.pipeline.calibration import Calibration
 from imgcal.pipeline.recalibration import fit_as_timed, late_cameras, require_same_moments
 from imgcal.pipeline.repeats import name_repeats, without_repeats
@@ -94,6 +95,7 @@ def calibrate_from_scratch(
     obj.require_rigid("to calibrate without a factory calibration")
     started, cameras, options = time.perf_counter(), _with_prior(cameras), options.of_object(obj)
     detections, repeats = without_repeats(blobs_of(source, cameras, obj, detection))
+    require_one_turn(cameras, obj)
     found = time.perf_counter()
     is_labelled = (detections.fiducial >= 0).any()
     alone = detections if is_labelled else labels_of_images(detections, cameras, obj, options, progress)

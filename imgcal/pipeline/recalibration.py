@@ -18,6 +18,7 @@ from imgcal.detection import DetectionOptions
 from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
 from imgcal.pipeline.arrangement import arrange
+from imgcal.pipeline.board_turns import settle_turns
 from imgcal.pipeline.calibration import Calibration
 from imgcal.pipeline.fitting import fit_labelled, fit_steady
 from imgcal.pipeline.initialization import Initializer
@@ -80,7 +81,8 @@ def calibrate(
     """
     started, rig, options = time.perf_counter(), rig.to(torch.float64), options.of_object(obj)
     source = source if isinstance(source, Detections) else checked_frames(source, rig)
-    detections, repeats = without_repeats(blobs_of(source, rig, obj, detection, measurer))
+    blobs = settle_turns(blobs_of(source, rig, obj, detection, measurer), rig, obj)
+    detections, repeats = without_repeats(blobs)
     found = time.perf_counter()
     sight = sight_of(detector, source, detection, measurer)
     labelled: Associations | None = None

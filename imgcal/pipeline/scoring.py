@@ -11,6 +11,7 @@ from imgcal.association import Associations, PipelineOptions, Progress, associat
 from imgcal.detection import DetectionOptions
 from imgcal.errors import RefusedError
 from imgcal.estimation import estimate
+from imgcal.pipeline.board_turns import settle_turns
 from imgcal.pipeline.sources import Frames, blobs_of
 from imgcal.pipeline.units import require_solvable, require_units
 from imgcal.types import CalibrationObject, CameraRig, Detections
@@ -102,7 +103,7 @@ def score(
         True
     """
     rig, options = rig.to(torch.float64), options.of_object(obj)
-    detections = blobs_of(source, rig, obj, detection)
+    detections = settle_turns(blobs_of(source, rig, obj, detection), rig, obj)
     try:
         with require_solvable():
             return _scored(associate(detections, rig, obj, options, progress), rig, obj, options)

@@ -50,7 +50,9 @@ def blobs_of(
     frames = checked_frames(source, rig)
     if not frames:
         raise InputError(f"frames: found no camera, expected frames of the cameras of rig {rig.name}")
-    blobs = detect(frames, options)
+    blobs = detect(frames, options, board=obj.board)
+    if obj.board is not None and measurer is not None:
+        raise InputError(f"measurer {measurer.name}: found a printed board, expected an object with markers")
     if measurer is not None:
         blobs = measurer.of_snapshots(_in_memory(frames), blobs, options)
     return matched_to_rig(blobs, rig)

@@ -104,13 +104,13 @@ def _verdict(
     speed: NDArray[np.float64], shift: NDArray[np.float64], scatter: NDArray[np.float64]
 ) -> Unsynchronized | None:
     """Compare images (K,) by speed (px a snapshot), shift (px) and the scatter of their points (px^2)."""
-    grows, inside = spearmanr(speed, shift), spearmanr(speed, scatter)
-    order = np.argsort(speed)
+    grows, order = spearmanr(speed, shift), np.argsort(speed)
     slow, fast = order[: len(order) // 3], order[-(len(order) // 3) :]
     low, high = (float(np.sqrt(np.square(shift[part]).mean())) for part in (slow, fast))
-    if not (grows.pvalue < CHANCE and grows.statistic > max(2 * inside.statistic, 0.0)):
+    if not (grows.pvalue < CHANCE and grows.statistic > 0) or high < max(FASTER * low, LEAST_SHIFT):
         return None
-    if high < max(FASTER * low, LEAST_SHIFT):
+    # Motion blur makes single points worse, and what they have in common less so.
+    if high**2 - low**2 < 2 * float(scatter[fast].mean() - scatter[slow].mean()):
         return None
     before, after = float(np.square(speed[slow]).mean()), float(np.square(speed[fast]).mean())
     share = ((high**2 - low**2) / (after - before)) ** 0.5

@@ -1,4 +1,5 @@
 from .arrangements import arranged_positions, arranged_rig, look_at
+from .boards import Print, render_board, simulate_board
 from .captures import (
     FrameModel,
     Frames,
@@ -51,6 +52,7 @@ __all__ = [
     "Patches",
     "PhysicalDrift",
     "PoseRange",
+    "Print",
     "RelativeDrift",
     "Scenes",
     "Shape",
@@ -63,6 +65,7 @@ __all__ = [
     "expose_patches",
     "host_generator",
     "look_at",
+    "render_board",
     "render_crops",
     "render_patches",
     "render_views",
@@ -72,6 +75,7 @@ __all__ = [
     "second_look",
     "seen_volume",
     "share_of_good_rigs",
+    "simulate_board",
     "simulate_frames",
     "simulate_shots",
     "simulate_truth",

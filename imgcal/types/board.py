@@ -107,6 +107,12 @@ class Board:
             xy = self.pitch * np.stack((column + 1, row + 1), -1)
         return np.concatenate((xy, np.zeros((len(xy), 1))), axis=1)
 
+    def deflection_at(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+        """How far places (K, 2) mm of the board are from its plane: (K,) mm along z."""
+        low, extent = self._flat[:, :2].min(0), np.maximum(np.ptp(self._flat[:, :2], axis=0), 1e-300)
+        share = (xy - low) / extent
+        return 4 * (share * (1 - share)) @ np.array(self.bend)
+
     @staticmethod
     def _deflections(flat: NDArray[np.float64]) -> NDArray[np.float64]:
         """Displacements (2, N, 3) by a deflection of 1 mm along x and y.

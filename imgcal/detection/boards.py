@@ -1,0 +1,370 @@
+"""Corners and circles of printed boards in one frame: OpenCV finds them, and says which is which.
+
+What is found is kept where it lies as the board's layout says. How exact it is, the image says: corners are compared
+with homographies of their neighbourhoods, which a lens or a bent print hardly changes over so short a way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from imgcal.detection.centroids import Blobs
+from imgcal.detection.checks import Frame
+from imgcal.errors import InputError
+from imgcal.messages import listed
+from imgcal.types import BlobFlag, Board
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+NEIGHBOURS = 9
+"""Points of a neighbourhood, itself included, that a homography is compared with."""
+LEAST_POINTS = 4
+UNKNOWN_SIGMA = 0.2  # px, of corners too few to be compared with each other
+LEAST_SIGMA, MOST_SIGMA = 0.02, 2.0  # px
+OFF_LAYOUT = 0.3
+"""Of the distance between neighbouring points: what is farther from where the layout has it is another corner."""
+LEAST_ON_LAYOUT = 0.7
+"""Share of the markers that must lie as the layout says."""
+CONTRAST = 0.25
+"""Of the contrast inside the board, from which corners beyond its edge say that it goes on."""
+MOST_LOOKED = 8
+"""Frames that are looked at to say why a board was not found."""
+OTHER_SIZES = 2
+"""Columns and rows more or fewer that are tried for that."""
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What was found of a board in one frame."""
+
+    uv: Floats  # (K, 2) pixels
+    fiducial: Ints  # (K,)
+
+
+def find_board(frame: Frame, board: Board) -> Blobs:
+    """Find a board in one frame (H, W) of any depth; each point with its fiducial. Their camera is 0."""
+    grey = _eight_bits(frame, board)
+    seen = _FINDERS[board.kind](grey, board)
+    if seen is None or len(seen.uv) < LEAST_POINTS:
+        seen = _Seen(np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
+    count = len(seen.uv)
+    sigma = np.full(count, corner_sigma(board.points[seen.fiducial, :2], seen.uv)) if count else np.zeros(0)
+    flags = np.full(count, int(BlobFlag.NONE), dtype=np.uint8)
+    camera, radius = np.zeros(count, dtype=np.int64), np.full(count, np.nan)
+    return Blobs(seen.uv, sigma, radius, flags, camera, np.ones(count), seen.fiducial)
+
+
+def require_board(blobs: Sequence[Blobs], frames: Iterable[Frame], board: Board) -> None:
+    """Say why, where a board was found in none of some frames.
+
+    Raises:
+        InputError: it was in none.
+    """
+    if not any(len(shot.uv) for shot in blobs):
+        why = explain_missing(frames, board)
+        raise InputError(f"frames: found no {board}" + (f": {why}" if why else ""))
+
+
+def corner_sigma(xy: Floats, uv: Floats) -> float:
+    """Standard deviation (px, each axis) of corners, by what homographies of their neighbourhoods leave.
+
+    Args:
+        xy: (K, 2) where they are on the board.
+        uv: (K, 2) pixels.
+    """
+    count = min(NEIGHBOURS, len(xy))
+    if count < 6:
+        return UNKNOWN_SIGMA
+    apart = np.linalg.norm(xy[:, None] - xy[None], axis=-1)
+    near = np.argsort(apart, axis=1, kind="stable")[:, :count]
+    left = _homography_residuals(xy[near], uv[near])
+    variance = np.square(left).sum((1, 2)) / (2 * count - 8)
+    # The median of chi-squared over its degrees of freedom is less than one.
+    freedom = 2 * count - 8
+    usual = (1 - 2 / (9 * freedom)) ** 3
+    return float(np.clip(np.sqrt(np.median(variance) / usual), LEAST_SIGMA, MOST_SIGMA))
+
+
+def _homography_residuals(xy: Floats, uv: Floats) -> Floats:
+    """What homographies (least squares, direct linear) leave of points: (K, M, 2) and (K, M, 2) -> (K, M, 2) pixels."""
+    source = xy - xy.mean(1, keepdims=True)
+    source = source / np.sqrt(np.square(source).mean((1, 2), keepdims=True))
+    middle = uv.mean(1, keepdims=True)
+    scale = np.sqrt(np.square(uv - middle).mean((1, 2), keepdims=True)) + 1e-12
+    target = (uv - middle) / scale
+    rows = np.concatenate((source, np.ones_like(source[..., :1])), -1)
+    zero = np.zeros_like(rows)
+    upper = np.concatenate((rows, zero, -target[..., :1] * rows), -1)
+    lower = np.concatenate((zero, rows, -target[..., 1:] * rows), -1)
+    matrix = np.linalg.svd(np.concatenate((upper, lower), 1))[2][:, -1].reshape(-1, 3, 3)
+    mapped = rows @ matrix.transpose(0, 2, 1)
+    return (mapped[..., :2] / mapped[..., 2:] - target) * scale
+
+
+def _eight_bits(frame: Frame, board: Board) -> NDArray[np.uint8]:
+    """Stretch the grey values of a frame to eight bits; a board in negative is turned over."""
+    grey = np.ascontiguousarray(frame)
+    if grey.dtype != np.uint8:
+        values = grey.astype(np.float64)
+        low, high = (float(value) for value in np.percentile(values, (0.5, 99.8)))
+        grey = np.asarray(np.clip((values - low) / max(high - low, 1.0), 0, 1) * 255)
+    plain = grey.astype(np.uint8)
+    return 255 - plain if board.inverted else plain
+
+
+# Markers
+
+
+@lru_cache(maxsize=32)
+def _dictionary(name: str) -> Any:
+    number = getattr(cv2.aruco, name, None)
+    if not name.startswith("DICT_") or number is None:
+        raise InputError(f"board: dictionary: found {name!r}, expected one of OpenCV's: {listed(dictionaries())}")
+    return cv2.aruco.getPredefinedDictionary(number)
+
+
+def dictionaries() -> list[str]:
+    """Names of the dictionaries that OpenCV has."""
+    by_number = {getattr(cv2.aruco, name): name for name in sorted(dir(cv2.aruco)) if name.startswith("DICT_")}
+    return sorted(by_number.values())
+
+
+def _parameters(board: Board) -> Any:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.markerBorderBits = board.border
+    if board.kind == "aprilgrid":
+        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    return parameters
+
+
+@lru_cache(maxsize=8)
+def _charuco_of(board: Board) -> Any:
+    """OpenCV's own description of a ChArUco board."""
+    count = board.columns * board.rows // 2 if not board.legacy else (board.columns * board.rows + 1) // 2
+    count = max(count, board.columns * board.rows // 2)
+    dictionary = _dictionary(board.dictionary)
+    if board.first_id + count > len(dictionary.bytesList):
+        raise InputError(
+            f"board: found {count} markers from id {board.first_id} on, expected at most "
+            f"{len(dictionary.bytesList)} of {board.dictionary}"
+        )
+    ids = np.arange(board.first_id, board.first_id + count, dtype=np.int32)
+    made = cv2.aruco.CharucoBoard((board.columns, board.rows), board.pitch, board.marker, dictionary, ids)
+    made.setLegacyPattern(board.legacy)
+    return made
+
+
+def _charuco(grey: NDArray[np.uint8], board: Board) -> _Seen | None:
+    made = _charuco_of(board)
+    detector = cv2.aruco.CharucoDetector(made, cv2.aruco.CharucoParameters(), _parameters(board))
+    corners, ids, marker_corners, marker_ids = detector.detectBoard(grey)
+    if ids is None or marker_ids is None:
+        return None
+    layout = {int(k): np.asarray(p)[:, :2] for k, p in zip(made.getIds().ravel(), made.getObjPoints(), strict=True)}
+    if not _as_laid_out(marker_corners, marker_ids, layout, board.marker):
+        return None
+    return _Seen(np.asarray(corners, dtype=np.float64).reshape(-1, 2), np.asarray(ids).ravel().astype(np.int64))
+
+
+def _as_laid_out(corners: Any, ids: Any, layout: dict[int, Any], size: float) -> bool:
+    """Tell whether markers lie on a plane as a layout has them: id -> (4, 2) mm."""
+    known = [k for k, marker in enumerate(np.ravel(ids)) if int(marker) in layout]
+    if len(known) < LEAST_ON_LAYOUT * len(np.ravel(ids)):
+        return False
+    if len(known) < 2:
+        return len(known) == 1
+    uv = np.concatenate([np.asarray(corners[k], dtype=np.float64).reshape(4, 2) for k in known])
+    xy = np.concatenate([np.asarray(layout[int(np.ravel(ids)[k])], dtype=np.float64) for k in known])
+    matrix, _ = cv2.findHomography(uv, xy, cv2.RANSAC, OFF_LAYOUT * size)
+    if matrix is None:
+        return False
+    mapped = cv2.perspectiveTransform(uv[:, None], matrix)[:, 0]
+    on = np.linalg.norm(mapped - xy, axis=1) < OFF_LAYOUT * size
+    return bool(on.mean() >= LEAST_ON_LAYOUT)
+
+
+def _april_grid(grey: NDArray[np.uint8], board: Board) -> _Seen | None:
+    corners, ids = _markers(grey, board)
+    if len(ids) == 0:
+        return None
+    number = ids - board.first_id
+    inside = (number >= 0) & (number < board.columns * board.rows)
+    if inside.mean() < LEAST_ON_LAYOUT:
+        return None
+    corners, number = corners[inside], number[inside]
+    points = board.points[:, :2].reshape(-1, 4, 2)[number]
+    layout = {int(n): p for n, p in zip(number, points, strict=True)}
+    # Printed tags may all be turned in their places: OpenCV and AprilTag's own images differ by half a turn.
+    for turn in range(4):
+        turned = np.roll(corners, turn, axis=1)
+        if len(number) > 1 and _as_laid_out(turned, number, layout, board.marker):
+            fiducial = (4 * number[:, None] + np.arange(4)).ravel()
+            return _Seen(turned.reshape(-1, 2), fiducial)
+    return None
+
+
+def _markers(grey: NDArray[np.uint8], board: Board) -> tuple[Floats, Ints]:
+    """All markers of the board's dictionary: corners (K, 4, 2), ids (K,)."""
+    corners, ids, _ = cv2.aruco.ArucoDetector(_dictionary(board.dictionary), _parameters(board)).detectMarkers(grey)
+    if ids is None or not len(corners):
+        return np.zeros((0, 4, 2)), np.zeros(0, dtype=np.int64)
+    number = np.asarray(ids, dtype=np.int64).ravel()
+    _, first = np.unique(number, return_index=True)
+    return np.asarray(corners, dtype=np.float64).reshape(-1, 4, 2)[first], number[first]
+
+
+# Grids
+
+
+def _checkerboard(grey: NDArray[np.uint8], board: Board) -> _Seen | None:
+    across, down = board.shape
+    found, corners = cv2.findChessboardCornersSB(
+        grey, (across, down), flags=cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
+    )
+    if not found:
+        return None
+    grid = np.asarray(corners, dtype=np.float64).reshape(down, across, 2)
+    grid = _seen_from_front(grid)
+    if _goes_on(grey, grid):
+        return None
+    # The first square, at the top left, is black; so is the first between four inner corners.
+    if _colour(grey, grid, 0, 0) > _colour(grey, grid, 0, 1):
+        turned = grid[::-1, ::-1]
+        if _colour(grey, turned, 0, 0) > _colour(grey, turned, 0, 1) and across == down:
+            turned = _seen_from_front(grid.transpose(1, 0, 2))
+        grid = turned
+    return _Seen(grid.reshape(-1, 2), np.arange(across * down))
+
+
+def _circles(grey: NDArray[np.uint8], board: Board) -> _Seen | None:
+    across, down = board.shape
+    flags = cv2.CALIB_CB_ASYMMETRIC_GRID if board.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
+    found, centres = cv2.findCirclesGrid(grey, (across, down), flags=flags, blobDetector=_blob_detector())
+    if not found:
+        return None
+    grid = np.asarray(centres, dtype=np.float64).reshape(down, across, 2)
+    return _Seen((grid if board.asymmetric else _seen_from_front(grid)).reshape(-1, 2), np.arange(across * down))
+
+
+@lru_cache(maxsize=1)
+def _blob_detector() -> Any:
+    library: Any = cv2  # whose types do not know of it
+    parameters = library.SimpleBlobDetector_Params()
+    parameters.minArea, parameters.maxArea = 12, 50_000
+    parameters.minDistBetweenBlobs = 4
+    return library.SimpleBlobDetector_create(parameters)
+
+
+def _seen_from_front(grid: Floats) -> Floats:
+    """Reverse the rows of a grid (R, C, 2) that is numbered as a mirror would show it."""
+    right, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
+    return grid if right[0] * down[1] - right[1] * down[0] > 0 else grid[:, ::-1]
+
+
+def _colour(grey: NDArray[np.uint8], grid: Floats, row: int, column: int) -> float:
+    """Grey value in the middle of four inner corners."""
+    return _grey_at(grey, grid[row : row + 2, column : column + 2].mean((0, 1))[None])[0]
+
+
+def _grey_at(grey: NDArray[np.uint8], uv: Floats) -> Floats:
+    """Grey values at pixels (K, 2), averaged over nine; nan outside."""
+    smooth = cv2.blur(grey, (3, 3))
+    column, row = np.rint(uv).astype(np.int64).T
+    inside = (column >= 0) & (row >= 0) & (column < grey.shape[1]) & (row < grey.shape[0])
+    value = smooth[np.clip(row, 0, grey.shape[0] - 1), np.clip(column, 0, grey.shape[1] - 1)].astype(np.float64)
+    return np.where(inside, value, np.nan)
+
+
+def _goes_on(grey: NDArray[np.uint8], grid: Floats) -> bool:
+    """Tell whether the squares go on beyond some side of the grid: the board is larger than what was looked for."""
+    for side in (grid, grid[::-1], grid.transpose(1, 0, 2), grid[:, ::-1].transpose(1, 0, 2)):
+        # Middles of the squares beyond the side, and of those one farther: white paper, or squares of two colours.
+        first, second = (side[0, 1:] + side[0, :-1]) / 2, (side[1, 1:] + side[1, :-1]) / 2
+        inner = _grey_at(grey, (first + second) / 2)
+        outer = _grey_at(grey, first + 1.5 * (first - second))
+        inside, beyond = np.diff(inner), np.diff(outer)
+        contrast = max(float(np.abs(inside).mean()), 1.0)
+        if len(beyond) == 0 or not np.isfinite(beyond).all() or np.abs(beyond).mean() < CONTRAST * contrast:
+            continue
+        if max((beyond * inside > 0).mean(), (beyond * inside < 0).mean()) > 0.8:
+            return True
+    return False
+
+
+_FINDERS: dict[str, Callable[[NDArray[np.uint8], Board], _Seen | None]] = {
+    "charuco": _charuco,
+    "aprilgrid": _april_grid,
+    "checkerboard": _checkerboard,
+    "circles": _circles,
+}
+
+
+# Why there is none
+
+
+def explain_missing(frames: Iterable[Frame], board: Board) -> str:
+    """Say why a board is in none of some frames, as far as these show it: one line, to follow `found no ...`."""
+    looked = [_eight_bits(frame, board) for _, frame in zip(range(MOST_LOOKED), frames, strict=False)]
+    negative = [255 - grey for grey in looked]
+    if not board.is_coded:
+        return _other_grid(looked, board) or _turned_over(negative, board)
+    found = [_markers(grey, board) for grey in looked]
+    ids = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(number for _, number in found)]))
+    if len(ids) >= 2:
+        count = board.columns * board.rows // (2 if board.kind == "charuco" else 1)
+        last = board.first_id + count - 1
+        if ids.max() > last or ids.min() < board.first_id:
+            return (
+                f"markers {ids.min()} to {ids.max()} of {board.dictionary} are seen, expected {board.first_id} to "
+                f"{last}: the board has other numbers of columns and rows, or another first_id"
+            )
+        seen = f"{len(ids)} markers of {board.dictionary} are seen, but they do not lie as on this board"
+        if board.kind == "charuco":
+            return f"{seen}: are columns and rows exchanged, or is it a legacy pattern?"
+        return f"{seen}: look at columns, rows, tag, gap and numbered_from"
+    if sum(len(_markers(grey, board)[1]) for grey in negative) >= 2:
+        return f"it is printed the other way round: expected inverted: {'false' if board.inverted else 'true'}"
+    return _other_dictionary(looked, board)
+
+
+def _other_dictionary(looked: list[NDArray[np.uint8]], board: Board) -> str:
+    counts = {}
+    for name in dictionaries():
+        detector = cv2.aruco.ArucoDetector(_dictionary(name), _parameters(board))
+        ids = [detector.detectMarkers(grey)[1] for grey in looked]
+        counts[name] = sum(0 if found is None else len(found) for found in ids)
+    best = max(counts.values())
+    if best < 3:
+        return "no marker of any dictionary is seen"
+    # The small dictionaries of a family are the beginnings of the large ones.
+    names = [name for name in counts if counts[name] == best]
+    return f"its markers are of {' or '.join(names[:4])}, expected {board.dictionary} as its file says"
+
+
+def _other_grid(looked: list[NDArray[np.uint8]], board: Board) -> str:
+    part = "squares" if board.kind == "checkerboard" else "circles"
+    least = 3 if board.kind == "checkerboard" else 2
+    steps = range(-OTHER_SIZES, OTHER_SIZES + 1)
+    sizes = [(board.columns + i, board.rows + j) for i in steps for j in steps] + [(board.rows, board.columns)]
+    sizes = [size for size in dict.fromkeys(sizes) if min(size) >= least and size != (board.columns, board.rows)]
+    sizes.sort(key=lambda size: -size[0] * size[1])
+    for grey in looked[: MOST_LOOKED // 2]:
+        for columns, rows in sizes:
+            other = Board(board.kind, columns, rows, board.pitch, asymmetric=board.asymmetric)
+            if _FINDERS[board.kind](grey, other) is not None:
+                return f"a board of {columns}x{rows} {part} is seen, expected {board.columns}x{board.rows}"
+    return ""
+
+
+def _turned_over(negative: list[NDArray[np.uint8]], board: Board) -> str:
+    if any(_FINDERS[board.kind](grey, board) is not None for grey in negative):
+        return f"it is printed the other way round: expected inverted: {'false' if board.inverted else 'true'}"
+    return "the whole board must be in the image, with a white margin" if not board.inverted else ""

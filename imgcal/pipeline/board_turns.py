@@ -1,0 +1,52 @@
+"""Which way round a board is whose images do not say it: the same for all cameras of a snapshot, or no rig is right."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from imgcal.association import to_observations
+from imgcal.errors import RefusedError
+from imgcal.estimation import poses_alone
+from imgcal.types import CalibrationObject, CameraRig, Detections
+
+
+def settle_turns(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> Detections:
+    """Turn the labels of each camera so that all of a snapshot have the board the same way round.
+
+    Which way that is does not matter for the rig. It is the turn of the camera that comes first; the others follow, by
+    the factory rig, which knows the cameras' directions far better than half a turn.
+
+    Args:
+        detections: points of a board, each image with labels of some turn.
+        rig: what is known before.
+        obj: the object; one without a board, or whose images say its turn, is left alone.
+    """
+    if obj.board is None or len(obj.board.turns) == 1 or rig.num_cameras == 1:
+        return detections
+    cam_from_object, known = poses_alone(to_observations(detections, rig, obj), rig, obj)
+    rotation = rig.cam_from_rig.rotation.double().mT @ cam_from_object.rotation.double()  # of the board in the rig
+    fiducial = detections.fiducial.copy()
+    angles = [angle for angle, _ in obj.board.turns]
+    for snapshot in range(len(known)):
+        cameras = np.flatnonzero(known[snapshot])
+        for camera in cameras[1:].tolist():
+            between = rotation[snapshot, cameras[0]].mT @ rotation[snapshot, camera]
+            turn = float(torch.atan2(between[1, 0], between[0, 0]))
+            away = [abs(np.angle(np.exp(1j * (turn - angle)))) for angle in angles]
+            motion = obj.board.turns[int(np.argmin(away))][1]
+            rows = (detections.snapshot == snapshot) & (detections.camera == camera) & (fiducial >= 0)
+            fiducial[rows] = motion[fiducial[rows]]
+    return replace(detections, fiducial=fiducial)
+
+
+def require_one_turn(cameras: CameraRig, obj: CalibrationObject) -> None:
+    """Raise `RefusedError` where nothing says how the turns of several cameras go together."""
+    if obj.board is not None and len(obj.board.turns) > 1 and cameras.num_cameras > 1:
+        raise RefusedError(
+            f"object: a {obj.board} looks the same turned, so that without a factory calibration the images of several "
+            "cameras do not say which of its points are the same: use a ChArUco board, or one of an even and an odd "
+            "number of squares"
+        )

@@ -1,0 +1,69 @@
+"""Boards that OpenCV draws, seen through a lens: all points are found where they are, with their numbers."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import imgcal
+from imgcal.detection import DetectionOptions, detect_snapshot
+from imgcal.detection.boards import corner_sigma
+from imgcal.errors import InputError
+from imgcal.synthesis import render_board, simulate_board
+from imgcal.types import CalibrationObject
+
+KINDS = ("charuco", "aprilgrid", "checkerboard", "circles")
+
+
+def rig_of(cameras=1):
+    rig = imgcal.load_rig("T4").select(range(cameras))
+    return rig.resized(torch.tensor([1024, 544]))
+
+
+def seen(obj, rig, seed=1, printed=None):
+    generator = torch.Generator().manual_seed(seed)
+    truth = simulate_board(rig, obj, 1, generator, None)
+    return truth, render_board(printed or obj.board, rig, truth.rig_from_object[0], generator)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("inverted", [False, True])
+def test_finds_every_point_of_a_board_where_it_is(kind, inverted):
+    obj = imgcal.load_object(kind)
+    obj = CalibrationObject.of_board(replace(obj.board, inverted=inverted))
+    rig = rig_of()
+    truth, frames = seen(obj, rig)
+    found = detect_snapshot(frames, DetectionOptions(), board=obj.board)
+    assert len(found.fiducial) > 0.8 * obj.num_fiducials
+    error = found.uv - truth.uv[0, 0].numpy()[found.fiducial]
+    # Blur rounds the corners of tags, which stand alone; those of a chessboard touch.
+    assert np.median(np.linalg.norm(error, axis=1)) < (0.8 if kind == "aprilgrid" else 0.3)
+    assert np.abs(np.median(error, axis=0)).max() < 0.15  # no shift by half a pixel
+
+
+def test_sigma_is_the_scatter_of_the_corners():
+    random = np.random.default_rng(0)
+    xy = np.stack(np.meshgrid(np.arange(8.0), np.arange(6.0)), -1).reshape(-1, 2)
+    depth = 1 + xy @ [0.02, 0.01]
+    uv = 100 * (xy @ [[0.9, 0.2], [-0.1, 0.8]]) / depth[:, None]
+    found = [corner_sigma(xy, uv + 0.3 * random.standard_normal(uv.shape)) for _ in range(20)]
+    assert np.mean(found) == pytest.approx(0.3, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "words"),
+    [
+        ("charuco", {"dictionary": "DICT_5X5_50"}, "its markers are of DICT_4X4"),
+        ("charuco", {"columns": 7, "rows": 5}, "do not lie as on this board"),
+        ("charuco", {"inverted": True}, "expected inverted: false"),
+        ("aprilgrid", {"columns": 3, "rows": 3}, "expected 0 to 8"),
+        ("checkerboard", {"columns": 7, "rows": 6}, "a board of (8x7|7x8) squares is seen, expected 7x6"),
+    ],
+)
+def test_says_why_a_board_is_not_found(kind, change, words):
+    printed = imgcal.load_object(kind)
+    rig = rig_of()
+    _, frames = seen(printed, rig)
+    with pytest.raises(InputError, match=words):
+        imgcal.detect(frames, board=replace(printed.board, **change))

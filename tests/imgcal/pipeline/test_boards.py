@@ -1,0 +1,108 @@
+"""Boards from images and tables to a rig: the error is as predicted, the bend is found, clocks are recognized."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import imgcal
+from imgcal.errors import RefusedError
+from imgcal.pipeline import calibrate, calibrate_from_scratch
+from imgcal.pipeline.board_turns import settle_turns
+from imgcal.synthesis import PhysicalDrift, render_board, simulate_board, true_detections
+from imgcal.types import Board, CalibrationObject
+
+
+def labelled(truth, noise, seed=0):
+    seen = true_detections(truth)
+    shift = noise * np.random.default_rng(seed).standard_normal(seen.uv.shape)
+    return replace(seen, uv=seen.uv + shift, sigma=np.full(len(seen), noise))
+
+
+@pytest.mark.parametrize("kind", ["charuco", "checkerboard"])
+def test_images_of_a_board_give_the_rig(kind):
+    rig = imgcal.load_rig("T4").select([0, 1]).resized(torch.tensor([1024, 544]))
+    obj, generator = imgcal.load_object(kind), torch.Generator().manual_seed(3)
+    truth = simulate_board(rig, obj, 6, generator, PhysicalDrift())
+    shots = [render_board(obj.board, truth.rig, truth.rig_from_object[k], generator) for k in range(6)]
+    found = calibrate({name: [shot[name] for shot in shots] for name in rig.camera_names}, rig, obj)
+    assert found.identity == "coded"
+    assert float(found.rms) < 0.3 < float(found.before.rms)
+
+
+def test_a_bent_board_is_taken_as_it_is_bent():
+    rig, generator = imgcal.load_rig("T4"), torch.Generator().manual_seed(5)
+    flat = imgcal.load_object("checkerboard")
+    bent = CalibrationObject.of_board(replace(flat.board, bend=(0.4, -0.25)))
+    truth = simulate_board(rig, bent, 15, generator, PhysicalDrift())
+    found = calibrate(labelled(truth, 0.05), rig, flat)
+    assert found.bend is not None and found.bend.is_certain
+    assert abs(found.bend.x - 0.4) < 4 * found.bend.x_sigma < 0.2
+    assert abs(found.bend.y + 0.25) < 4 * found.bend.y_sigma < 0.2
+    stiff = calibrate(labelled(truth, 0.05), rig, CalibrationObject.of_board(replace(flat.board, warp=0.0)))
+    assert found.shape == () and stiff.shape != ()  # not fiducial by fiducial
+
+
+def test_the_bend_is_part_of_the_uncertainty_of_the_rig():
+    rig, generator = imgcal.load_rig("T4"), torch.Generator().manual_seed(6)
+    obj = imgcal.load_object("checkerboard")
+    seen = labelled(simulate_board(rig, obj, 10, generator, None), 0.05)
+    free = calibrate(seen, rig, obj)
+    stiff = calibrate(seen, rig, CalibrationObject.of_board(replace(obj.board, warp=0.0)))
+    wider = free.estimate.covariance().diagonal() / stiff.estimate.covariance().diagonal().clamp_min(1e-300)
+    assert stiff.bend is None
+    assert float(wider[wider > 0].max()) > 1.05
+
+
+def test_a_print_of_another_size_is_named():
+    rig, generator = imgcal.load_rig("room10"), torch.Generator().manual_seed(7)
+    big = CalibrationObject.of_board(Board("charuco", 5, 7, 120.0, 90.0, "DICT_4X4_50"))
+    small = CalibrationObject.of_board(Board("charuco", 5, 7, 110.0, 82.0, "DICT_4X4_50"))
+    truth = simulate_board(rig, big, 30, generator, None)
+    with pytest.raises(RefusedError, match=r"as if it were .* % larger than its file says"):
+        calibrate(labelled(truth, 0.1), rig, small)
+
+
+def test_images_that_do_not_say_the_turn_of_a_board_agree_about_it():
+    rig, generator = imgcal.load_rig("T4"), torch.Generator().manual_seed(8)
+    obj = CalibrationObject.of_board(Board("checkerboard", 7, 7, 30.0))
+    truth = simulate_board(rig, obj, 4, generator, None)
+    seen = true_detections(truth)
+    turned = seen.fiducial.copy()
+    for image, (s, c) in enumerate(np.unique(np.stack((seen.snapshot, seen.camera), 1), axis=0)):
+        rows = (seen.snapshot == s) & (seen.camera == c)
+        turned[rows] = obj.board.turns[image % 4][1][turned[rows]]
+    found = settle_turns(replace(seen, fiducial=turned), rig, obj)
+    assert float(calibrate(found, rig, obj).rms) < 0.01
+    with pytest.raises(RefusedError, match="looks the same turned"):
+        calibrate_from_scratch(found, rig, obj)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.05])
+def test_cameras_with_clocks_of_their_own_are_recognized(late):
+    rig, generator = imgcal.load_rig("T4"), torch.Generator().manual_seed(9)
+    obj = imgcal.load_object("charuco")
+    truth = simulate_board(rig, obj, 1, generator, None)
+    random, count = np.random.default_rng(1), 40
+    time = np.cumsum(np.where(np.arange(count) % 13 < 6, 0.05, 0.4))  # slow, then fast
+    moments = time[:, None] + late * np.gradient(time)[:, None] * random.standard_normal((count, 4))
+    step = torch.from_numpy(
+        np.stack([60 * np.sin(moments), 25 * np.cos(0.8 * moments), 20 * np.sin(0.5 * moments)], -1)
+    )
+    points = truth.rig_from_object[0].apply(obj.points)
+    uv = torch.stack([rig.expand(count).project(points + step[:, c, None]).uv[:, c] for c in range(4)], 1)
+    seen = true_detections(replace(truth, rig_from_object=_repeated(truth, count), uv=uv, visible=None))
+    noisy = seen.uv + 0.1 * random.standard_normal(seen.uv.shape)
+    found = calibrate(replace(seen, uv=noisy), rig, obj)
+    assert (found.unsynchronized is not None) == (late > 0)
+    if found.unsynchronized is not None:
+        assert "not synchronized" in str(found.unsynchronized)
+        assert 0.3 * late < found.unsynchronized.share < 2 * late
+
+
+def _repeated(truth, count):
+    from imgcal.geometry import RigidTransform
+
+    pose = truth.rig_from_object
+    return RigidTransform(pose.rotation.expand(count, 3, 3), pose.translation.expand(count, 3))
