@@ -1,5 +1,5 @@
 from . import kernels, lens_kernels
-from .free_turns import free_turns, pose_rank
+from .object_turns import free_turns, pose_rank
 from .lens_model import LensModel
 from .lenses import (
     LENS_MODELS,
