@@ -112,7 +112,8 @@ class Tracker:
     def _too_few(self, name: str, labels: NDArray[np.int64]) -> SnapshotIdentity | None:
         """Refuse a snapshot that shows too few fiducials; None = it shows enough."""
         shown = len(np.unique(labels[labels >= 0]))
-        least = min(self.options.least_fiducials, self.obj.num_fiducials)
+        least = self.options.least_fiducials
+        least = least if self.obj.pose_rank == 6 else min(least, self.obj.num_fiducials)
         if shown >= least:
             return None
         reason = f"too few fiducials: found {shown}, expected at least {least}"

@@ -21,7 +21,8 @@ KIND_LEAD = 5.0
 SINGLE_KIND_LEAD, ALL_KINDS_LEAD = 3.0, 15.0
 """... against a change of all kinds at once, and of that against each: what is believed wrongly does no harm then."""
 LENS_KINDS, LENS_LOG_PRIOR = ("focal_length", "principal_point"), -3.0
-"""Changes of a lens alone, and the log odds of one against a turn or a shift beforehand: what is bumped is a camera."""
+"""Changes of a lens alone, and the log odds of one against a turn or a shift where the snapshots cannot tell: what is
+bumped is a camera."""
 DECIDE_AFTER = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
 """Numbers of snapshots since a change at which its kind is decided, if it can be."""
 
@@ -117,10 +118,7 @@ class PendingChange:
         Returns:
             What is believed, None = any kind, and what is reported, None = no kind; None = it cannot be decided yet.
         """
-        odds = {
-            kind: test.odds({**self.others(camera), camera: kind}) + LENS_LOG_PRIOR * (kind in LENS_KINDS)
-            for kind in (*CHANGES, None)
-        }
+        odds = {kind: test.odds({**self.others(camera), camera: kind}) for kind in (*CHANGES, None)}
         best, second = sorted(odds, key=lambda kind: -odds[kind])[:2]
         least = ALL_KINDS_LEAD if best is None else SINGLE_KIND_LEAD if second is None else KIND_LEAD
         if odds[best] - odds[second] >= least:
@@ -128,7 +126,8 @@ class PendingChange:
         if not last:
             return None
         # Told as what it most probably is, and believed to be anything.
-        return None, max(CHANGES, key=lambda kind: odds[kind]) if self.overdue else None
+        likely = {kind: odds[kind] + LENS_LOG_PRIOR * (kind in LENS_KINDS) for kind in CHANGES}
+        return None, max(likely, key=lambda kind: likely[kind]) if self.overdue else None
 
     def decide_kinds(
         self, test: ChangeTest, changes: Mapping[int, Change], last: bool
