@@ -1,5 +1,4 @@
 from . import kernels, lens_kernels
-from .object_turns import free_turns, pose_rank
 from .lens_model import LensModel
 from .lenses import (
     LENS_MODELS,
@@ -12,6 +11,7 @@ from .lenses import (
     named_lenses,
     undistort,
 )
+from .object_turns import free_turns, pose_rank
 from .projection import NEAREST_DEPTH, Projection, project_components, project_kornia, resized_pixels
 from .projection_cpu import project_cpu, undistort_cpu
 from .rotations import (
