@@ -21,7 +21,7 @@ from imgcal.estimation import (
     pose_at,
     rig_at,
 )
-from imgcal.geometry import RigidTransform
+from imgcal.geometry import RigidTransform, pose_rank
 from imgcal.nn.held import HeldObject, HeldRig
 from imgcal.nn.pytrees import register
 from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior
@@ -97,6 +97,7 @@ class MapEstimate(nn.Module):
         self.register_buffer("prior_std", prior_std.clone(), persistent=False)
         self.register_buffer("object_prior_std", None if obj.exact else object_prior_std(obj), persistent=False)
         self.options, self._encoded = options, encoded(options)
+        self._pose_rank = pose_rank(obj.points)
 
     def forward(
         self,
@@ -128,7 +129,7 @@ class MapEstimate(nn.Module):
     def _solution(self, problem: Problem, state: State, converged: Tensor, seen: Tensor) -> MapSolution:
         batch = seen.shape[:-3]
         cost = map_cost(problem, state, make_loss(self.options))
-        dof = 2 * seen.flatten(-3).sum(-1) - problem.pose_rank * seen.shape[-3]
+        dof = 2 * seen.flatten(-3).sum(-1) - self._pose_rank * seen.shape[-3]
         points = points_at(problem, state) + problem.centroid
         return MapSolution(
             rig=rig_at(problem, state.offset).reshape(*batch),

@@ -3,9 +3,10 @@ import tomllib
 import pytest
 
 from imgcal.formats.foreign_rig import FormatError
-from imgcal.formats.toml_cameras import cameras_of, toml_key, toml_text
+from imgcal.formats.toml_cameras import AT, cameras_of, toml_key, toml_text
 
 LENS = {"matrix": [[900.0, 0, 640], [0, 901, 400], [0, 0, 1]], "distortions": [0.1, 0, 0, 0, 0], "size": [1280, 800]}
+LENS |= {AT: ("cameras.toml", ())}
 POSED = {**LENS, "rotation": [0.1, 0.2, 0.3], "translation": [1.0, 2.0, 3.0]}
 
 
