@@ -3,6 +3,9 @@
 Machine code is kept in NUMBA_CACHE_DIR where that is set, else in `imgcal/<version>` in the user's cache folder: an
 installation may be read-only, and code of an earlier version is never mistaken for that of this one. A folder that can
 be read but not written, such as that of an image that was warmed up when it was built, is used as it is.
+
+Machine code contains that of the functions it calls, and the constants. Numba compiles a function again when its own
+file has changed; here also when one has that its file imports.
 """
 
 from __future__ import annotations
@@ -22,6 +25,8 @@ from typing import Any, TypeVar, cast
 import numba
 from numba.core import event
 
+from renderers.sources import source_digest
+
 try:
     import fcntl
 except ImportError:  # Windows
@@ -40,7 +45,8 @@ def njit(**options: Any) -> Callable[[Function], Function]:
         # Numba chooses the folder when it decorates. Only then: what others compile is theirs to keep.
         before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, cache_folder()  # type: ignore[attr-defined]
         try:
-            return cast(Function, _saved_alone(numba.njit(**options)(function)))
+            compiled = numba.njit(**options)(function)
+            return cast(Function, _kept(compiled) if options["cache"] else compiled)
         except RuntimeError:  # nowhere to write: compiled anew in every process
             return cast(Function, numba.njit(**(options | {"cache": False}))(function))
         finally:
@@ -49,13 +55,14 @@ def njit(**options: Any) -> Callable[[Function], Function]:
     return decorate
 
 
-def _saved_alone(compiled: Any) -> Any:
-    """Let no other process save at the same time.
+def _kept(compiled: Any) -> Any:
+    """Keep machine code as long as all that went into it stays the same, and let no other process save meanwhile.
 
     Numba numbers the files of a function's signatures without a lock: of two processes that save two of them at once,
     one may find the code of the other under its own name.
     """
     cache = compiled._cache
+    cache._cache_file._source_stamp = source_digest(compiled.py_func.__module__)
     save = cache.save_overload
 
     def save_overload(*arguments: Any) -> None:

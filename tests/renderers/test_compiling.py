@@ -72,6 +72,38 @@ def test_a_folder_that_cannot_be_written_is_read(tmp_path: Path) -> None:
     assert before == {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
 
 
+def test_code_that_calls_what_has_changed_is_compiled_again(tmp_path: Path) -> None:
+    lab = tmp_path / "lab"
+    lab.mkdir()
+    head = "from renderers.compiling import njit\n\n@njit()\ndef {}(x):\n    return {}\n"
+    sources = {
+        "__init__.py": "",
+        "constants.py": "WIDTH = 2.0\n",
+        "low.py": head.format("inner", "3 * x"),
+        "middle.py": "from lab import low\n" + head.format("between", "low.inner(x)"),
+        "high.py": "from lab.constants import WIDTH\nfrom lab.middle import between\n"
+        + head.format("outer", "WIDTH + between(x)")
+        + "\nprint(outer(1.0), sum(outer.stats.cache_hits.values()))\n",
+    }
+    for name, text in sources.items():
+        (lab / name).write_text(text)
+
+    def call() -> str:
+        environment = {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONDONTWRITEBYTECODE": "1"}
+        environment |= {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+        command = [sys.executable, "-c", "import lab.high"]
+        done = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+
+    assert call() == "5.0 0"
+    assert call() == "5.0 1"
+    (lab / "low.py").write_text(head.format("inner", "4 * x"))
+    assert call() == "6.0 0"
+    (lab / "constants.py").write_text("WIDTH = 1.0\n")
+    assert call() == "5.0 0"
+    assert call() == "5.0 1"
+
+
 def test_where_nothing_can_be_written_functions_are_compiled_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     def njit(*functions: object, **options: object) -> object:
         if options.get("cache"):
