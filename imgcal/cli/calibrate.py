@@ -119,7 +119,7 @@ class Calibrate(arguments.Calibrate):
                 if earlier:
                     keep_previous(self.out, out, WRITTEN)
                 result = refused_summary(outcome, detections, rig, seconds)
-                content = describe_refusal(outcome.for_command, detections, rig, obj, frames, seconds)
+                content = describe_refusal(outcome, detections, rig, obj, frames, seconds)
             else:
                 posterior = replace(outcome.posterior(), time=time.time())
                 save_rig(outcome.rig, out / RIG, covariance, self.full_covariance, posterior)

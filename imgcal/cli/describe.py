@@ -14,17 +14,18 @@ from torch import Tensor
 import imgcal
 from imgcal.association import matched_to_rig
 from imgcal.cli.findings import Findings
+from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
 from imgcal.io import Frame
-from imgcal.pipeline import Calibration, rms_length
+from imgcal.pipeline import EARLIER, Calibration, rms_length
 from imgcal.report import ReportContent, SnapshotSummary
-from imgcal.types import CalibrationObject, CameraRig, Detections
+from imgcal.types import CalibrationObject, CameraRig, Detections, MovedError
 
 Pictures = Mapping[str, Frame | None]
 
 
 def describe_refusal(
-    reason: str,
+    refusal: RefusedError,
     detections: Detections,
     rig: CameraRig,
     obj: CalibrationObject,
@@ -32,6 +33,12 @@ def describe_refusal(
     seconds: dict[str, float],
 ) -> ReportContent:
     """Say why there is no calibration, beside what was seen."""
+    moves: tuple[str, ...] = ()
+    reason, sound = refusal.for_command, len(detections.snapshot_names)
+    if isinstance(refusal, MovedError):
+        moves, sound = tuple(map(str, refusal.moved)), len(detections.snapshot_names) - refusal.since
+        if refusal.labelled is not None:
+            detections = refusal.labelled
     detections = matched_to_rig(detections, rig)
     found = np.bincount(detections.snapshot, minlength=len(detections.snapshot_names))
     return ReportContent(
@@ -43,9 +50,10 @@ def describe_refusal(
         detections=detections,
         labels=detections.fiducial,
         snapshots=tuple(
-            SnapshotSummary(name, int(blobs), 0, reason)
-            for name, blobs in zip(detections.snapshot_names, found, strict=True)
+            SnapshotSummary(name, int(blobs), 0, "" if moves and s >= sound else EARLIER if moves else reason)
+            for s, (name, blobs) in enumerate(zip(detections.snapshot_names, found, strict=True))
         ),
+        moves=moves,
         object_points=obj.points.double().numpy(),
         frames=tuple(pictures.get(name) for name in rig.camera_names) if pictures else (),
         seconds=seconds,

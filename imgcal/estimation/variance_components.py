@@ -158,7 +158,7 @@ def estimate_variance_components(
     state, additive_noise, known = start.state, start.additive_noise, start.solution
     prior_scale: dict[str, float] = {}
     kept, unexamined, shape = labels, question is not ObjectQuestion.NONE, None
-    nearer = start.nearer
+    nearer, needed = start.nearer, 0.0
     for _ in range(ROUNDS):
         fit, known = _fit(problem, state, additive_noise, variance, kept, options, known), None
         problem, solution, seen = fit.problem, fit.solution, fit.seen
@@ -188,6 +188,11 @@ def estimate_variance_components(
             raise RefusedError(f"estimation: no minimum after {solution.iterations} iterations (RMS {rms:.3g} px)")
         state, nearer = nearer or solution.state, None
         previous, additive_noise = additive_noise, fit.additive_noise
+        # Noise that is barely significant is needed where none is allowed, and not where it is: it stays.
+        if previous == 0:
+            needed = additive_noise
+        if additive_noise == 0 and (kept == seen).all():
+            additive_noise = min(needed, previous)
         if abs(additive_noise - previous) > 0.02 * previous or (kept != seen).any():
             continue
         if question is not ObjectQuestion.NONE:

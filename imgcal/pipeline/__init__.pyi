@@ -12,12 +12,14 @@ from .motion import MOVED, Motion, motion_since_factory
 from .recalibration import calibrate
 from .scoring import RigScore, rms_length, score
 from .sources import DETECTORS, Detector, DetectorName, checked_detections, checked_frames, proposer_of
+from .steadiness import EARLIER
 from .tally import DOUBTFUL, Tally
 from .units import unit_doubt
 
 __all__ = [
     "DETECTORS",
     "DOUBTFUL",
+    "EARLIER",
     "FIELDS",
     "MOVED",
     "UNDETERMINED",

@@ -36,6 +36,8 @@ MOST_MIXED = 0.2
 """Share of snapshots of the other kind on either side of the time at which a camera was lost."""
 LEAST_CHANCE = 0.05
 """That what a camera does not agree with falls so cleanly on one side of a moment; of those that disagree at all."""
+EARLIER = "taken before a camera moved"
+"""Why snapshots before the last move are refused."""
 MOST_MOVES = 8  # parts of a capture that are looked at, one after the other
 
 Bools = NDArray[np.bool_]
@@ -74,21 +76,50 @@ def steady_part(
     names = [snapshot.name for snapshot in labelled.snapshots]
     for _ in range(MOST_MOVES):
         first = max(names.index(move.snapshot) for move in found)
-        if not options.after_last_move:
-            raise MovedError(moved, total - first, total)
+        explained = _are_explained(found, detections, first, rig, obj, options)
+        if not (options.after_last_move and explained):
+            raise MovedError(moved, total - first, total, explained, labelled.detections)
         part = associate(detections.of_snapshots(first, total), rig, obj, options)
         found = moves_of(part, rig, obj, options)
         if not found:
             return SteadyPart(arrange(_with_earlier(part, labelled, first), rig, obj), tuple(moved))
         moved += found
-    raise MovedError(moved, total - first, total)
+    raise MovedError(moved, total - first, total, labelled=labelled.detections)
+
+
+def _are_explained(
+    moves: tuple[MovedCamera, ...], detections: Detections, first: int, rig: CameraRig, obj: CalibrationObject,
+    options: PipelineOptions,
+) -> bool:  # fmt: skip
+    """Tell whether cameras that were lost at a moment fit the others on either side of it, by themselves.
+
+    A motion whose size is known has been measured on both sides. Of a camera that fits on one side only, nothing says
+    that it moved: its labels or frames may be wrong on the other.
+
+    Args:
+        moves: what was found.
+        detections: as they were given.
+        first: number of the first snapshot after the last move.
+        rig: the factory calibration.
+        obj: the calibration object.
+        options: how sure identity must be.
+    """
+    lost = [rig.camera_names.index(move.camera) for move in moves if move.size is None]
+    for begin, end in ((0, first), (first, len(detections.snapshot_names))) if lost else ():
+        try:
+            part = arrange(associate(detections.of_snapshots(begin, end), rig, obj, options), rig, obj)
+            counts = _fit(part, rig, obj, options).tally
+        except RefusedError:
+            return False
+        if (counts.unexplained > counts.kept)[:, lost].sum() > MOST_MIXED * (counts.usable > 0)[:, lost].sum():
+            return False
+    return True
 
 
 def _with_earlier(part: Associations, labelled: Associations, first: int) -> Associations:
     """Put the snapshots before a part of a capture back, refused."""
-    reason = "taken before a camera moved"
     earlier = tuple(
-        s if s.status == "refused" else replace(s, status="refused", reason=reason, rig_from_object=None)
+        s if s.status == "refused" else replace(s, status="refused", reason=EARLIER, rig_from_object=None)
         for s in labelled.snapshots[:first]
     )
     fiducial = np.full(len(labelled.detections), -1, dtype=np.int64)

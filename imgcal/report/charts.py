@@ -158,8 +158,8 @@ def coverage_panel(content: ReportContent, camera: int, limits: Array) -> Markup
 
 
 def covered_share(content: ReportContent, camera: int) -> float:
-    """Share of an 8 x 8 division of the image in which blobs were used (or found, where none could be used)."""
-    rows = (content.detections.camera == camera) & (content.used if content.used.any() else True)
+    """Share of an 8 x 8 division of the image in which blobs were used (or labelled, where none could be used)."""
+    rows = (content.detections.camera == camera) & (content.used if content.used.any() else content.labels >= 0)
     place = (content.detections.uv[rows] + 0.5) / content.image_size[camera] * COVERAGE_FIELDS
     field = np.clip(place, 0, COVERAGE_FIELDS - 1).astype(int)
     return len(np.unique(field[:, 0] * COVERAGE_FIELDS + field[:, 1])) / COVERAGE_FIELDS**2

@@ -139,14 +139,21 @@ def _residuals(content: ReportContent) -> dict[str, object] | None:
 
 def _coverage(content: ReportContent) -> dict[str, object]:
     limits = charts.coverage_limits(content)
-    counts = content.observations if content.used.any() else np.bincount(
-        content.detections.camera, minlength=len(content.cameras)
-    )  # fmt: skip
+    fitted, labelled = content.used.any(), content.labels >= 0
+    rows = content.used if fitted else labelled if labelled.any() else np.ones_like(labelled)
+    counts = np.bincount(content.detections.camera[rows], minlength=len(content.cameras))
+
+    def words(camera: int) -> str:
+        number = f"{svg.grouped(int(counts[camera]))} blobs"
+        if not labelled.any():  # of reflections nobody knows what they cover
+            return f"{number}, none labelled"
+        return f"{number}, {100 * charts.covered_share(content, camera):.0f} %"
+
     panels = [
         Panel(
             name,
             charts.coverage_panel(content, i, limits),
-            f"{svg.grouped(int(counts[i]))} blobs, {100 * charts.covered_share(content, i):.0f} %",
+            words(i),
         )
         for i, name in enumerate(content.cameras)
     ]

@@ -191,7 +191,7 @@ def _refused(content: ReportContent) -> Verdict:
     total = len(content.snapshots)
     used = sum(not s.reason for s in content.snapshots)
     figures = [
-        KeyFigure(f"{used} / {total}", "snapshots accepted"),
+        KeyFigure(f"{used} / {total}", "snapshots since the last move" if content.moves else "snapshots accepted"),
         KeyFigure(grouped(len(d)), "blobs found"),
         *([KeyFigure(grouped(labelled), "blobs labelled")] if content.reason.startswith(NOT_IDENTIFIED) else []),
         KeyFigure(f"{int((blobs > 0).sum())} / {len(blobs)}", "cameras with blobs"),
@@ -206,6 +206,12 @@ def _refused(content: ReportContent) -> Verdict:
 
 def _helpful(content: ReportContent) -> list[str]:
     """What would help a refused run, as far as the detections show."""
+    if content.moves:
+        return [
+            "Fasten what has moved, and capture again.",
+            "Look at the frames of that camera before and after: a hand or a reflection in front of it, or a frame of "
+            "another moment, can look like a motion.",
+        ]
     blobs = np.bincount(content.detections.camera, minlength=len(content.cameras))
     total, labelled = len(content.detections), int((content.labels >= 0).sum())
     blind = [name for name, n in zip(content.cameras, blobs, strict=True) if n == 0]

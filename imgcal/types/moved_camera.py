@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from imgcal.errors import RefusedError
+from imgcal.types.observations import Detections
 
 Kind = Literal["rotation", "position", "focal_length", "unknown"]
 
@@ -52,18 +53,32 @@ class MovedCamera:
 class MovedError(RefusedError):
     """Raise where cameras moved during a capture: one rig cannot be right for all of it."""
 
-    def __init__(self, moved: Sequence[MovedCamera], since: int, total: int) -> None:
+    def __init__(
+        self, moved: Sequence[MovedCamera], since: int, total: int, explained: bool = True,
+        labelled: Detections | None = None,
+    ) -> None:  # fmt: skip
         """Say which, and what can be had instead.
 
         Args:
             moved: in the order of time.
             since: snapshots after the last move.
             total: snapshots.
+            explained: the snapshots before the last move and those since then each fit a rig that stands still; False =
+                that they do not agree may have another cause.
+            labelled: all blobs, with the labels that they got.
         """
+        self.moved, self.since, self.labelled = tuple(moved), since, labelled
         shown = "; ".join(map(str, moved[:MOST_TOLD])) + ("; ..." if len(moved) > MOST_TOLD else "")
+        if not explained:
+            super().__init__(
+                f"{shown}: no rig is right for all {total} snapshots, and a motion alone does not explain them: that "
+                "camera's labels, frames or view may be wrong on one side of that moment",
+                python="look at its frames before and after; rig.select leaves the camera out",
+                command="look at its frames before and after; --without leaves the camera out",
+            )
+            return
         super().__init__(
             f"{shown}: no rig is right for all {total} snapshots",
             python=f"PipelineOptions(after_last_move=True) calibrates from the {since} since then",
             command=f"--after-last-move calibrates from the {since} since then",
         )
-        self.moved = tuple(moved)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from imgcal.cli.main import main
-from imgcal.io import load_detections, save_detections, save_object, save_rig
+from imgcal.io import load_detections, load_object, save_detections, save_object, save_rig
 from imgcal.types.observations import BlobFlag
 from scripts.benchmarks import camera_faults as damage
 
@@ -143,3 +143,25 @@ def test_a_camera_with_blobs_beside_their_places_is_noted(room, capsys):
     assert run(table)[0] == 0
     assert "note: camera cam04: " in capsys.readouterr().err
     assert re.search(r"cam04: \d+ blobs may be fiducials", (folder / "out" / "report.html").read_text())
+
+
+def test_the_report_of_a_refusal_for_a_move_is_about_that_move(room):
+    folder, run, _, moved = room
+    code, _ = run(damage.blobs(moved, clutter=3.0))
+    page = (folder / "out" / "report.html").read_text()
+    assert code == 3 and "Fasten what has moved" in page
+    assert "no camera was exchanged" not in page and "Capture more snapshots, the whole object" not in page
+    assert f"{moved.uv.shape[0] - 12} / {moved.uv.shape[0]}" in page and "snapshots since the last move" in page
+    labelled = re.findall(r"([0-9]+) blobs, [0-9]+ %", page)
+    assert len(labelled) == 10 and max(map(int, labelled)) <= 4 * moved.uv.shape[0]  # clutter is no coverage
+
+
+def test_a_camera_bumped_before_the_last_snapshot_is_in_the_result_and_on_the_terminal(room, capsys):
+    folder, run, truth, _ = room
+    last = len(truth.uv) - 1
+    wand = load_object("wand4")
+    late = damage.changed_from(truth, wand, CAMERA, last, lambda r: damage.turned(r, CAMERA, 0.5))
+    code, result = run(damage.blobs(late))
+    said = "camera cam04 stopped fitting at snapshot"
+    assert code == 0 and result["doubtful"] == [{"camera": "cam04", "snapshots": [f"{last:05d}"]}]
+    assert said in capsys.readouterr().err and said[1:] in (folder / "out" / "report.html").read_text()

@@ -13,6 +13,7 @@ from imgcal.io import load_object, load_rig
 from imgcal.pipeline import calibrate, fit_labelled, fitting
 from imgcal.synthesis.captures import simulate_truth, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
+from scripts.benchmarks import merging_wands
 
 
 def two_captures(rig, obj, noise=0.05):
@@ -100,10 +101,10 @@ def fits_made(monkeypatch) -> list[int]:
 def test_what_does_not_come_to_rest_is_refused_after_forty_fits(monkeypatch) -> None:
     """Captures whose labels leave and come back without end (of four hundred like these, three need 38 fits or more).
 
-    Which ones they are hangs on the last digits: most of these four, on any machine.
+    Which ones they are hangs on the last digits: most of these three, on any machine.
     """
     counts, endless = fits_made(monkeypatch), 0
-    for seed in (421, 501, 572, 645):
+    for seed in (501, 572, 645):
         rig, obj, table = hard(seed)
         with pytest.raises(RefusedError) as refusal:
             calibrate(table, rig, obj)
@@ -134,3 +135,10 @@ def test_a_solution_of_another_problem_is_not_returned(o10, asymmetric8, monkeyp
     monkeypatch.setattr(fitting, "estimate_variance_components", prior_scale)
     with pytest.raises(RefusedError, match="do not belong together"):
         calibrate(table, o10, asymmetric8)
+
+
+def test_noise_that_is_barely_significant_comes_to_rest() -> None:
+    """None is too little by a hair, and a little too much: the fits went to and fro between the two."""
+    made, _ = merging_wands.capture(122)
+    found = calibrate(made.detections, made.factory, made.obj)
+    assert 0 < found.additive_noise < 0.01

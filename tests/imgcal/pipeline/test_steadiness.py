@@ -167,3 +167,15 @@ def test_markers_that_merge_are_no_motion(seed):
     made, _ = merging_wands.capture(seed)
     assert made.merged > 1
     assert calibrate(made.detections, made.factory, made.obj).moved == ()
+
+
+def test_a_camera_that_fits_on_one_side_only_is_not_said_to_have_moved_for_sure():
+    """Its image is mirrored before some moment: no motion does that, and the later part must not confirm one."""
+    rig, obj, truth = damage.wand_in_a_room(30, 1)
+    table = damage.blobs(truth, 1)
+    wrong = damage.mirrored(table, rig, CAMERA, "u")
+    both = damage.joined(wrong.select(wrong.snapshot < 8), table.select(table.snapshot >= 8))
+    for options in (PipelineOptions(), AFTER):
+        with pytest.raises(MovedError, match="a motion alone does not explain them") as found:
+            calibrate(both, rig, obj, options)
+        assert "after_last_move" not in str(found.value) and "--after-last-move" not in found.value.for_command

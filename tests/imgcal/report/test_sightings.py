@@ -36,3 +36,10 @@ def test_cameras_full_of_reflections_are_named(content: ReportContent) -> None:
     said = [said for said, _ in sightings(replace(content, predicted_after=predicted))]
     assert len(said) == (len(own) - 5 > 10)
     assert all("in cam07" in line for line in said)
+
+
+def test_a_camera_that_stopped_fitting_makes_the_verdict_cautious(content: ReportContent) -> None:
+    said = "camera cam04 stopped fitting at snapshot 00007: bumped, or mislabelled; the calibration holds before it"
+    verdict = judge(replace(content, doubtful=(said,)))
+    assert verdict.level == "caution" and said[1:] in verdict.reservations[0]
+    assert any("Capture some more snapshots" in step for step in verdict.next_steps)
