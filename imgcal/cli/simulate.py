@@ -77,7 +77,9 @@ class Simulate(arguments.Simulate):
     def _write(
         self, truth: Truth, rig: CameraRig, obj: CalibrationObject, generator: torch.Generator, out: Path
     ) -> None:
-        save_capture_settings(out, self.sensor.bit_depth if obj.board is None else 8, note=f"simulated, seed {self.seed}")
+        save_capture_settings(
+            out, self.sensor.bit_depth if obj.board is None else 8, note=f"simulated, seed {self.seed}"
+        )
         save_rig(rig, out / "rig.yaml")
         save_object(obj, out / ("object.csv" if obj.board is None else "board.yaml"))
         _write_truth(truth, out / "truth")

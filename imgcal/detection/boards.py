@@ -113,9 +113,11 @@ def _eight_bits(frame: Frame, board: Board) -> NDArray[np.uint8]:
     """Stretch the grey values of a frame to eight bits; a board in negative is turned over."""
     grey = np.ascontiguousarray(frame)
     if grey.dtype != np.uint8:
-        low, high = (float(value) for value in np.percentile(grey, (0.5, 99.8)))
-        grey = (np.clip((grey - low) / max(high - low, 1.0), 0, 1) * 255).astype(np.uint8)
-    return 255 - grey if board.inverted else grey
+        values = grey.astype(np.float64)
+        low, high = (float(value) for value in np.percentile(values, (0.5, 99.8)))
+        grey = np.asarray(np.clip((values - low) / max(high - low, 1.0), 0, 1) * 255)
+    plain = grey.astype(np.uint8)
+    return 255 - plain if board.inverted else plain
 
 
 # Markers
@@ -214,9 +216,9 @@ def _markers(grey: NDArray[np.uint8], board: Board) -> tuple[Floats, Ints]:
     corners, ids, _ = cv2.aruco.ArucoDetector(_dictionary(board.dictionary), _parameters(board)).detectMarkers(grey)
     if ids is None or not len(corners):
         return np.zeros((0, 4, 2)), np.zeros(0, dtype=np.int64)
-    ids = np.asarray(ids).ravel().astype(np.int64)
-    _, first = np.unique(ids, return_index=True)
-    return np.asarray(corners, dtype=np.float64).reshape(-1, 4, 2)[first], ids[first]
+    number = np.asarray(ids, dtype=np.int64).ravel()
+    _, first = np.unique(number, return_index=True)
+    return np.asarray(corners, dtype=np.float64).reshape(-1, 4, 2)[first], number[first]
 
 
 # Grids
@@ -254,10 +256,11 @@ def _circles(grey: NDArray[np.uint8], board: Board) -> _Seen | None:
 
 @lru_cache(maxsize=1)
 def _blob_detector() -> Any:
-    parameters = cv2.SimpleBlobDetector_Params()
+    library: Any = cv2  # whose types do not know of it
+    parameters = library.SimpleBlobDetector_Params()
     parameters.minArea, parameters.maxArea = 12, 50_000
     parameters.minDistBetweenBlobs = 4
-    return cv2.SimpleBlobDetector_create(parameters)
+    return library.SimpleBlobDetector_create(parameters)
 
 
 def _seen_from_front(grid: Floats) -> Floats:
@@ -287,12 +290,12 @@ def _goes_on(grey: NDArray[np.uint8], grid: Floats) -> bool:
         first, second = (side[0, 1:] + side[0, :-1]) / 2, (side[1, 1:] + side[1, :-1]) / 2
         inner = _grey_at(grey, (first + second) / 2)
         outer = _grey_at(grey, first + 1.5 * (first - second))
-        contrast = np.abs(np.diff(inner)).mean()
-        signs = (np.diff(outer) * np.diff(inner)) / max(contrast, 1.0) ** 2
-        if len(signs) and np.isfinite(signs).all() and np.abs(np.diff(outer)).mean() > CONTRAST * contrast:
-            # Squares two rows apart have the same colours.
-            if (np.sign(np.diff(outer)) == np.sign(np.diff(inner))).mean() > 0.8 or (signs < -CONTRAST).mean() > 0.8:
-                return True
+        inside, beyond = np.diff(inner), np.diff(outer)
+        contrast = max(float(np.abs(inside).mean()), 1.0)
+        if len(beyond) == 0 or not np.isfinite(beyond).all() or np.abs(beyond).mean() < CONTRAST * contrast:
+            continue
+        if max((beyond * inside > 0).mean(), (beyond * inside < 0).mean()) > 0.8:
+            return True
     return False
 
 
@@ -320,15 +323,13 @@ def explain_missing(frames: Iterable[Frame], board: Board) -> str:
         last = board.first_id + count - 1
         if ids.max() > last or ids.min() < board.first_id:
             return (
-                f"markers {ids.min()} to {ids.max()} of {board.dictionary} are seen, expected {board.first_id} to {last}: "
-                "the board has other numbers of columns and rows, or another first_id"
+                f"markers {ids.min()} to {ids.max()} of {board.dictionary} are seen, expected {board.first_id} to "
+                f"{last}: the board has other numbers of columns and rows, or another first_id"
             )
-        return (
-            f"{len(ids)} markers of {board.dictionary} are seen, but they do not lie as on this board: are columns and "
-            "rows exchanged, or is it a legacy pattern?" if board.kind == "charuco"
-            else f"{len(ids)} tags of {board.dictionary} are seen, but they do not lie as on this board: look at columns, "
-            "rows, tag, gap and numbered_from"
-        )
+        seen = f"{len(ids)} markers of {board.dictionary} are seen, but they do not lie as on this board"
+        if board.kind == "charuco":
+            return f"{seen}: are columns and rows exchanged, or is it a legacy pattern?"
+        return f"{seen}: look at columns, rows, tag, gap and numbered_from"
     if sum(len(_markers(grey, board)[1]) for grey in negative) >= 2:
         return f"it is printed the other way round: expected inverted: {'false' if board.inverted else 'true'}"
     return _other_dictionary(looked, board)
@@ -367,5 +368,3 @@ def _turned_over(negative: list[NDArray[np.uint8]], board: Board) -> str:
     if any(_FINDERS[board.kind](grey, board) is not None for grey in negative):
         return f"it is printed the other way round: expected inverted: {'false' if board.inverted else 'true'}"
     return "the whole board must be in the image, with a white margin" if not board.inverted else ""
-
-

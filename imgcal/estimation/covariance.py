@@ -123,8 +123,8 @@ def joint_information(estimate: Estimate) -> Tensor:
     if estimate.modes is not None:
         # Woodbury: modes, known only so well, take from what is known of the cameras that follow them.
         follow = information.new_zeros(len(estimate.modes.offset), len(information))
-        cameras = estimate.modes.follow.flatten(1)
-        follow[:, : cameras.shape[1]] = cameras
+        of_cameras = estimate.modes.follow.flatten(1)
+        follow[:, : of_cameras.shape[1]] = of_cameras
         precise = torch.linalg.inv(torch.from_numpy(estimate.modes.covariance) * estimate.inflation**2)
         across = follow @ information
         information = information - across.mT @ torch.linalg.solve(precise + across @ follow.mT, across)

@@ -19,8 +19,8 @@ from imgcal.estimation.linearization import (
     pose_at,
     rig_at,
 )
-from imgcal.estimation.pose_initialization import initial_pose
 from imgcal.estimation.modes import ModeEvidence
+from imgcal.estimation.pose_initialization import initial_pose
 from imgcal.estimation.robust_losses import NamedLoss
 from imgcal.geometry import RigidTransform
 from imgcal.messages import brief

@@ -118,8 +118,10 @@ def mode_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> Mode
         return None
     offset = np.zeros(len(problem.modes)) if problem.mode_offset is None else problem.mode_offset.numpy()
     information = found.information.numpy() + np.eye(len(offset))
-    covariance = np.linalg.inv(information)
-    return ModeEvidence(offset, covariance, covariance @ (found.pull.numpy() - offset), found.follow)
+    covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
+    return ModeEvidence(
+        np.asarray(offset, dtype=np.float64), covariance, covariance @ (found.pull.numpy() - offset), found.follow
+    )
 
 
 def bent(problem: Problem, evidence: ModeEvidence) -> Problem:

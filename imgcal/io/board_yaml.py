@@ -29,7 +29,7 @@ class _Printed(StrictModel):
     columns: Count
     rows: Count
     inverted: bool = False
-    bend: Annotated[list[Deflection], Field(min_length=2, max_length=2)] = [0.0, 0.0]
+    bend: Annotated[list[Deflection], Field(min_length=2, max_length=2)] = Field(default_factory=lambda: [0.0, 0.0])
     warp: Annotated[float, Field(ge=0, le=limits.TOLERANCE.high, allow_inf_nan=False)] | None = None
 
     def shared(self) -> dict[str, Any]:
@@ -48,7 +48,7 @@ class _Charuco(_Printed):
 
     def board(self) -> Board:
         """Make the value."""
-        own = {"dictionary": self.dictionary, "first_id": self.first_id, "legacy": self.legacy}
+        own: dict[str, Any] = {"dictionary": self.dictionary, "first_id": self.first_id, "legacy": self.legacy}
         return Board("charuco", pitch=self.square, marker=self.marker, **own, **self.shared())
 
 
@@ -63,8 +63,8 @@ class _AprilGrid(_Printed):
 
     def board(self) -> Board:
         """Make the value."""
-        own = {"dictionary": self.dictionary, "first_id": self.first_id, "border": self.border}
-        size = {"pitch": self.tag + self.gap, "marker": self.tag}
+        own: dict[str, Any] = {"dictionary": self.dictionary, "first_id": self.first_id, "border": self.border}
+        size: dict[str, Any] = {"pitch": self.tag + self.gap, "marker": self.tag}
         return Board("aprilgrid", **size, **own, from_bottom=self.numbered_from == "bottom", **self.shared())
 
 

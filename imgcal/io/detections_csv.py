@@ -1,7 +1,8 @@
 """Detections: CSV or CSV.gz with the header `snapshot,camera,u,v`.
 
-Optional columns: `sigma` (pixels; without it `DEFAULT_SIGMA` holds for every blob), `fiducial` (row of the object file, or
-what its own column `fiducial` calls it; empty = unlabelled), `radius` (pixels, empty = unknown) and `flags` (sum of `BlobFlag` bits).
+Optional columns: `sigma` (pixels; without it `DEFAULT_SIGMA` holds for every blob), `fiducial` (row of the object file,
+or what its own column `fiducial` calls it; empty = unlabelled), `radius` (pixels, empty = unknown) and `flags` (sum of
+`BlobFlag` bits).
 
 Convention: a snapshot or camera without any blob has no row, so a file does not know of it; cameras come back when the
 file is read with its rig.

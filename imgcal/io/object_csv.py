@@ -1,7 +1,7 @@
 """Calibration objects: CSV with the header `x,y,z` (mm), optional columns `name`, `radius` and `tolerance` (mm).
 
-A column `fiducial` says by which whole numbers detections know the points; without it, by their rows. Printed boards are
-YAML files: `board_yaml`.
+A column `fiducial` says by which whole numbers detections know the points; without it, by their rows. Printed boards
+are YAML files: `board_yaml`.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import torch
 
 from imgcal.errors import InputError
 from imgcal.io.atomic import write_text
-from imgcal.io.csv_file import Chunk, read_chunks
 from imgcal.io.board_yaml import board_from_yaml, board_text
+from imgcal.io.csv_file import Chunk, read_chunks
 from imgcal.io.names import LONGEST_NAME, check_regular, find_file, title_of
 from imgcal.io.resources import data_path, shipped_names
 from imgcal.messages import shortened
@@ -103,7 +103,13 @@ def _read(path: Path, content: bytes | None = None) -> CalibrationObject:
         if not _is_name(name) or name in names[:row]:
             chunk.fail(row, f"name: found {shortened(name)!r}, expected {NAME}")
     return CalibrationObject(
-        torch.from_numpy(points), palette(count).double(), radius, title_of(path), names, tolerance, labels=_labels(chunk)
+        torch.from_numpy(points),
+        palette(count).double(),
+        radius,
+        title_of(path),
+        names,
+        tolerance,
+        labels=_labels(chunk),
     )
 
 

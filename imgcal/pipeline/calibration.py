@@ -55,8 +55,10 @@ class Bend:
 
     def __str__(self) -> str:
         """Say it in words."""
+        shape = "bent" if self.is_certain else "flat, as far as can be told"
         return (
-            f"the board is {'bent' if self.is_certain else 'flat, as far as can be told'}: its middle is off by {self.x:+.2g} +- {self.x_sigma:.1g} mm along x and "
+            f"the board is {shape}: its middle is "
+            f"off by {self.x:+.2g} +- {self.x_sigma:.1g} mm along x and "
             f"{self.y:+.2g} +- {self.y_sigma:.1g} mm along y"
         )
 

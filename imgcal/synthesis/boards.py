@@ -137,13 +137,17 @@ def render_board(
         cam_from_object = single.cam_from_rig[0] @ rig_from_object
         seen = single.project(rig_from_object.apply(torch.from_numpy(outline)))
         ahead = (cam_from_object.apply(torch.from_numpy(outline))[:, 2] > 1).all()
-        facing = float((cam_from_object.translation / cam_from_object.translation.norm()) @ cam_from_object.rotation[:, 2])
+        facing = float(
+            (cam_from_object.translation / cam_from_object.translation.norm()) @ cam_from_object.rotation[:, 2]
+        )
         if bool(ahead) and facing > 0:
             uv = seen.uv[0].numpy()
             first = np.clip(np.floor(uv.min(0)) - 2, 0, (width, height)).astype(int)
             last = np.clip(np.ceil(uv.max(0)) + 3, 0, (width, height)).astype(int)
             if (last > first).all():
-                image[first[1] : last[1], first[0] : last[0]] = _window(board, single, cam_from_object, first, last, ink)
+                image[first[1] : last[1], first[0] : last[0]] = _window(
+                    board, single, cam_from_object, first, last, ink
+                )
         image = cv2.GaussianBlur(image, (0, 0), ink.blur)
         noise = torch.randn(image.shape, generator=generator, dtype=torch.float32).numpy()
         frames[name] = np.clip(np.rint(image + ink.noise * noise), 0, 255).astype(np.uint8)
@@ -222,7 +226,9 @@ def is_white(board: Board, xy: Floats) -> NDArray[np.bool_]:
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
     if board.kind == "charuco":
         count = (board.columns * board.rows + 1) // 2
-        ids = np.arange(board.first_id, board.first_id + count - (0 if board.legacy else board.columns * board.rows % 2))
+        ids = np.arange(
+            board.first_id, board.first_id + count - (0 if board.legacy else board.columns * board.rows % 2)
+        )
         made = cv2.aruco.CharucoBoard(
             (board.columns, board.rows), board.pitch, board.marker, dictionary, ids.astype(np.int32)
         )

@@ -7,7 +7,9 @@ from imgcal.errors import InputError
 from imgcal.io import save_object
 from imgcal.io.board_yaml import board_text
 
-CHARUCO = "format: imgcal-board/1\ntype: charuco\ncolumns: 4\nrows: 5\nsquare: 54\nmarker: 40.5\ndictionary: DICT_4X4_50\n"
+CHARUCO = (
+    "format: imgcal-board/1\ntype: charuco\ncolumns: 4\nrows: 5\nsquare: 54\nmarker: 40.5\ndictionary: DICT_4X4_50\n"
+)
 
 
 @pytest.mark.parametrize("kind", ["charuco", "aprilgrid", "checkerboard", "circles"])

@@ -60,7 +60,7 @@ def test_a_print_of_another_size_is_named():
     big = CalibrationObject.of_board(Board("charuco", 5, 7, 120.0, 90.0, "DICT_4X4_50"))
     small = CalibrationObject.of_board(Board("charuco", 5, 7, 110.0, 82.0, "DICT_4X4_50"))
     truth = simulate_board(rig, big, 30, generator, None)
-    with pytest.raises(RefusedError, match="as if it were .* % larger than its file says"):
+    with pytest.raises(RefusedError, match=r"as if it were .* % larger than its file says"):
         calibrate(labelled(truth, 0.1), rig, small)
 
 
@@ -87,7 +87,9 @@ def test_cameras_with_clocks_of_their_own_are_recognized(late):
     random, count = np.random.default_rng(1), 40
     time = np.cumsum(np.where(np.arange(count) % 13 < 6, 0.05, 0.4))  # slow, then fast
     moments = time[:, None] + late * np.gradient(time)[:, None] * random.standard_normal((count, 4))
-    step = torch.from_numpy(np.stack([60 * np.sin(moments), 25 * np.cos(0.8 * moments), 20 * np.sin(0.5 * moments)], -1))
+    step = torch.from_numpy(
+        np.stack([60 * np.sin(moments), 25 * np.cos(0.8 * moments), 20 * np.sin(0.5 * moments)], -1)
+    )
     points = truth.rig_from_object[0].apply(obj.points)
     uv = torch.stack([rig.expand(count).project(points + step[:, c, None]).uv[:, c] for c in range(4)], 1)
     seen = true_detections(replace(truth, rig_from_object=_repeated(truth, count), uv=uv, visible=None))
