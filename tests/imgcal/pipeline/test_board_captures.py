@@ -25,9 +25,8 @@ def test_the_warp_of_a_board_is_found(tmp_path):
     with gzip.open(folder / "detections.csv.gz", "rt") as file:
         rows = [row for row in csv.DictReader(file) if int(row["snapshot"]) % 6 == 1 and float(row["weight"]) > 0]
     lines = ["snapshot,camera,u,v,sigma,fiducial"]
-    lines += [
-        ",".join((r["snapshot"], "camera", r["u"], r["v"], str(0.3 / float(r["weight"])), r["fiducial"])) for r in rows
-    ]
+    for row in rows:
+        lines += [f"{row['snapshot']},camera,{row['u']},{row['v']},{0.3 / float(row['weight'])},{row['fiducial']}"]
     (tmp_path / "seen.csv").write_text("\n".join(lines))
     board = CalibrationObject.of_board(Board("checkerboard", 11, 11, 77.0))
     found = calibrate(load_detections(tmp_path / "seen.csv", rig, board.rows), rig, board)
