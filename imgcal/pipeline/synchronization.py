@@ -1,7 +1,7 @@
 """Whether cameras expose at moments of their own, as webcams do: what moves fits no rig then, and the faster the worse.
 
 Each image by itself is sound. Against the other cameras it is shifted as a whole, by as much as the object moved
-between their exposures, this way in one snapshot and that way in the next. Wrong lenses, objects and noise know no speed.
+between their exposures, this way in one snapshot and that way in the next. Wrong lenses and objects know no speed.
 """
 
 from __future__ import annotations
