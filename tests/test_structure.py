@@ -51,8 +51,6 @@ TESTED_ELSEWHERE = {
     "imgcal/cli/arguments.py": "values only; test_imports, cli/test_help",
     "imgcal/cli/describe.py": "cli/test_calibrate reads the reports that it makes",
     "imgcal/cli/detect.py": "cli/test_main, test_warmup",
-    "imgcal/pipeline/board_turns.py": "pipeline/test_boards",
-    "imgcal/synthesis/boards.py": "pipeline/test_boards, detection/test_boards",
     "imgcal/pipeline/calibration.py": "pipeline/test_recalibration",
     "imgcal/pipeline/fitting.py": "pipeline/test_recalibration, test_from_scratch",
     "imgcal/cli/findings.py": "cli/test_calibrate; pipeline/test_motion, test_knowledge",

@@ -47,6 +47,8 @@ PLACED = RigPrior(focal_length=0.005, principal_point=5.0, distortion=0.02, rota
 """How far a rig that was made from these may be off, while all the others are labelled."""
 WIDE_ROTATION = 0.05  # rad: of the prior about the first rig, which was made from the same data: next to nothing
 WIDE_POSITION = 0.05  # the same in parts of the largest distance between cameras
+FARTHEST_CENTRE = 5.0
+"""Prior standard deviations that the principal point of a lens may be off."""
 LARGEST_FOCAL_STD = 0.02  # relative
 LARGEST_ROTATION_STD = 0.01  # rad
 LARGEST_POSITION_STD = 0.02  # of the largest distance between cameras
@@ -135,6 +137,7 @@ def _fit(
     std = ordinary_lens(_wide(first, cameras).std(start))
     std[0, :6] = 0.0  # whose frame is the rig's
     fit = fit_as_timed(labelled, labelled.detections, start, obj, options, prior_std=std)
+    require_central(fit, cameras)
     require_determined(fit)
     return fit
 
@@ -245,6 +248,20 @@ def _apart(rig: CameraRig) -> float:
 def _wide(rig: CameraRig, cameras: CameraRig) -> RigPrior:
     assert cameras.prior is not None
     return replace(cameras.prior, rotation=WIDE_ROTATION, position=WIDE_POSITION * _apart(rig))
+
+
+def require_central(fit: Calibration, cameras: CameraRig) -> None:
+    """Raise `RefusedError` where lenses would have to make up for an object that is not as its file says."""
+    assert cameras.prior is not None
+    off = (fit.rig.principal_point - cameras.principal_point).norm(dim=-1)
+    camera, usual = int(off.argmax()), cameras.prior.principal_point
+    if float(off[camera]) > FARTHEST_CENTRE * usual:
+        raise RefusedError(
+            f"start without a factory calibration: the principal point of camera {cameras.camera_names[camera]} would "
+            f"be {float(off[camera]):.0f} px from where it was expected, {float(off[camera]) / usual:.1f} times as far "
+            "as lenses are: the object's coordinates are not exact, or the size of the image is wrong; measure the "
+            "object anew"
+        )
 
 
 def require_determined(fit: Calibration) -> None:
