@@ -48,7 +48,7 @@ def drop_merged(labelled: Associations, poses: RigidTransform, rig: CameraRig, o
     where = snapshot[doubtful], camera[doubtful]
     places, labels = image.uv.numpy()[where], detections.fiducial[rows[doubtful]]  # (M, N, 2), (M,)
     apart = np.linalg.norm(places - places[np.arange(len(labels)), labels, None], axis=-1)
-    near = hidden[where] & (apart < merging_distance(labelled)[rows[doubtful], None])
+    near = hidden[where] & (apart < merging_distance(labelled, rows[doubtful])[:, None])
     merged = rows[doubtful[near.any(-1)]]
     if not len(merged):
         return labelled
@@ -59,18 +59,18 @@ def drop_merged(labelled: Associations, poses: RigidTransform, rig: CameraRig, o
     return without_snapshots(left, bare.tolist()) if len(bare) else left
 
 
-def merging_distance(labelled: Associations) -> NDArray[np.float64]:
-    """Distance (px) between two markers below which each blob may be both of them: (M,).
+def merging_distance(labelled: Associations, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Distance (px) between two markers below which a blob may be both of them, for M blobs: (M,).
 
     Markers merge where their discs touch. Where a blob's radius is not known, the capture says how close two labelled
     blobs of its camera can be.
     """
     detections = labelled.detections
-    reach = 2 * detections.radius + BLUR
+    reach, camera = 2 * detections.radius[rows] + BLUR, detections.camera[rows]
     unknown = np.isnan(reach)
-    for camera in np.unique(detections.camera[unknown]):
-        rows = np.flatnonzero((detections.camera == camera) & (detections.fiducial >= 0))
-        reach[unknown & (detections.camera == camera)] = _closest(detections.uv[rows], detections.snapshot[rows])
+    for one in np.unique(camera[unknown]):
+        own = np.flatnonzero((detections.camera == one) & (detections.fiducial >= 0))
+        reach[unknown & (camera == one)] = _closest(detections.uv[own], detections.snapshot[own])
     return reach
 
 

@@ -16,11 +16,16 @@ Source: the delete-block jackknife (Kunsch, Annals of Statistics 1989), studenti
 as the bias-reduced cluster-robust covariances are (Bell and McCaffrey, Survey Methodology 2002). Errors that go on
 across the border between two blocks are added by the flat-top window of Politis and Romano (1995): twice the scatter of
 the double blocks less that of the single ones.
+
+To first order the difference is C times the block's pull, and 1 - 1/blocks makes up for what the fit has taken of a
+block: within a twentieth where blocks are alike. That takes one inverse instead of one for each block, and is enough to
+see that there is nothing to measure.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import accumulate
 
 import torch
 from torch import Tensor
@@ -38,6 +43,8 @@ SURE = 4.0
 """Standard deviations by which the scatter of some blocks must exceed what independent noise makes it."""
 OVERLAP = 2 / 3
 """Blocks that overlap all but fully tell as much as this share of those which do not."""
+WORTH = 2.0
+"""Standard deviations by which it must do so to first order, which needs no inverse for each block, to be measured."""
 LEAST_SAID = 1e-6
 """Variance that leaving out a block adds to a parameter, in units of its prior, below which it is not looked at."""
 
@@ -64,18 +71,49 @@ def block_scatter(problem: Problem, solution: Solution, loss: NamedLoss) -> Bloc
         size *= 2
     if snapshots // size < LEAST_BLOCKS:
         return BlockScatter()
-    parts = [_evidence(problem, solution.state, first, first + size, loss) for first in range(0, snapshots, size)]
-    information, pull = (torch.stack(part) for part in zip(*parts, strict=True))
-    cameras, joined = problem.prior_std[0].numel(), 1
+    information, pull = _evidence(problem, solution.state, size, loss)
+    if snapshots % size:
+        rest = _evidence(problem, solution.state, snapshots % size, loss, snapshots - snapshots % size)
+        information, pull = torch.cat((information, rest[0])), torch.cat((pull, rest[1]))
+    cameras, lengths = problem.prior_std[0].numel(), _doubled(snapshots // size // LEAST_BLOCKS)
+    if not _is_worth_measuring(information, pull, lengths, cameras):
+        return BlockScatter()
     found, before, sure = BlockScatter(), None, False
-    while snapshots // (size * joined) >= LEAST_BLOCKS:
+    for joined in lengths:
         scatter, deviation = _scatter(information, pull, joined, cameras)
         whole = scatter if before is None else max(2 * scatter - before, scatter)
         sure = sure or scatter > 1 + SURE * deviation
         if sure and whole > found.factor**2:
             found = BlockScatter(whole**0.5, size * joined)
-        before, joined = scatter, 2 * joined
+        before = scatter
     return found
+
+
+def _doubled(most: int) -> list[int]:
+    """Powers of two up to `most`."""
+    return [2**power for power in range(most.bit_length())]
+
+
+def _is_worth_measuring(information: Tensor, pull: Tensor, lengths: list[int], cameras: int) -> bool:
+    """Tell whether blocks of any length scatter more than noise would make them, to first order; shapes as below."""
+    total = information.sum(0)
+    total.diagonal().add_(1)
+    covariance = torch.cholesky_inverse(torch.linalg.cholesky(total))
+    noise = (covariance - covariance @ covariance)[:cameras, :cameras]  # of the estimate; the rest is the prior's
+    known = noise.diagonal() > LEAST_SAID
+    count = int(known.sum())
+    if not count:
+        return False
+    scale = noise.diagonal()[known].rsqrt()
+    spread = float((noise[known][:, known] * scale[:, None] * scale).square().sum()) / count**2
+    reached = torch.zeros(len(pull) + 1, count, dtype=pull.dtype, device=pull.device)
+    reached[1:] = ((pull @ covariance)[:, :cameras][:, known] * scale).cumsum(0)
+    for joined in lengths:
+        change, blocks = reached[joined:] - reached[:-joined], len(pull) / joined
+        scatter = float(change.square().mean()) * blocks / (1 - 1 / blocks)
+        if scatter > 1 + WORTH * (2 * max(OVERLAP * joined, 1.0) * spread / len(change)) ** 0.5:
+            return True
+    return False
 
 
 def _scatter(information: Tensor, pull: Tensor, joined: int, cameras: int) -> tuple[float, float]:
@@ -92,11 +130,12 @@ def _scatter(information: Tensor, pull: Tensor, joined: int, cameras: int) -> tu
     """
     total = information.sum(0)
     total.diagonal().add_(1)
-    rows = torch.arange(len(pull) - joined + 1)[:, None] + torch.arange(joined)
-    change, expected, covariance = [], [], torch.linalg.inv(total)[:cameras, :cameras]
-    for row in rows:
-        without = torch.linalg.inv(total - information[row].sum(0))[:cameras]
-        change.append(without @ pull[row].sum(0))
+    summed = [torch.zeros_like(total), *accumulate(information)]
+    covariance = torch.cholesky_inverse(torch.linalg.cholesky(total))[:cameras, :cameras]
+    change, expected = [], []
+    for first, last in zip(summed, summed[joined:], strict=False):
+        without = torch.cholesky_inverse(torch.linalg.cholesky(total - (last - first)))[:cameras]
+        change.append(without @ pull[len(change) : len(change) + joined].sum(0))
         expected.append(without[:, :cameras] - covariance)
     variance = torch.stack([block.diagonal() for block in expected]).sum(0)
     known = variance > LEAST_SAID
@@ -108,25 +147,56 @@ def _scatter(information: Tensor, pull: Tensor, joined: int, cameras: int) -> tu
     return average, (2 * max(OVERLAP * joined, 1.0) * squares) ** 0.5
 
 
-def _evidence(problem: Problem, state: State, first: int, last: int, loss: NamedLoss) -> tuple[Tensor, Tensor]:
-    """What snapshots `first` to `last` (excluded) say about the whitened parameters of cameras and object, D in all.
+def _evidence(problem: Problem, state: State, size: int, loss: NamedLoss, first: int = 0) -> tuple[Tensor, Tensor]:
+    """What blocks of snapshots say about the whitened parameters of cameras and object, D in all.
+
+    Args:
+        problem: one rig.
+        state: its minimum.
+        size: snapshots in a block; B blocks of them, what is left over is left out.
+        loss: of the fit.
+        first: the first snapshot of the first block.
 
     Returns:
-        (D, D) information and (D,) pull, their poses marginalized, without the prior.
+        (B, D, D) information and (B, D) pull, their poses marginalized, without the prior.
     """
-    part = replace(problem, uv=problem.uv[:, first:last], root_weight=problem.root_weight[:, first:last])
-    there = replace(state, rotation=state.rotation[:, first:last], centre=state.centre[:, first:last])
-    equations = equations_at(part, there, loss)
-    own, coupling = equations.object, equations.coupling[0].permute(0, 3, 1, 2).flatten(2)  # (S, 6, K C)
-    information = torch.block_diag(*equations.camera[0])
-    pull = (state.offset - equations.camera_gradient)[0].flatten()
-    if own is not None and state.object_offset is not None:
-        across = own.camera[0].flatten(0, 1)
-        information = torch.cat((torch.cat((information, across), 1), torch.cat((across.mT, own.own[0]), 1)))
-        pull = torch.cat((pull, (state.object_offset - own.gradient)[0]))
-        coupling = torch.cat((coupling, own.pose[0]), 2)
-    factor = torch.linalg.cholesky(equations.pose[0])
-    taken = torch.linalg.solve_triangular(factor, coupling, upper=False).flatten(0, 1)
-    residue = torch.linalg.solve_triangular(factor, equations.pose_gradient[0, ..., None], upper=False).flatten()
-    information = information - torch.eye(len(pull), dtype=pull.dtype, device=pull.device) - taken.mT @ taken
-    return information, pull + taken.mT @ residue
+    count = (problem.uv.shape[1] - first) // size
+    rows = slice(first, first + count * size)
+
+    def repeated(tensor: Tensor) -> Tensor:
+        return tensor.expand(count, *tensor.shape[1:])
+
+    def parted(tensor: Tensor) -> Tensor:
+        return tensor[0, rows].unflatten(0, (count, size))
+
+    own_std, own_offset = problem.object_prior_std, state.object_offset
+    blocks = replace(
+        problem,
+        uv=parted(problem.uv),
+        root_weight=parted(problem.root_weight),
+        factory=problem.factory.map_tensors(lambda tensor, _: repeated(tensor)),
+        prior_std=repeated(problem.prior_std),
+        object_prior_std=None if own_std is None else repeated(own_std),
+    )
+    there = State(
+        repeated(state.offset), parted(state.rotation), parted(state.centre),
+        None if own_offset is None else repeated(own_offset),
+    )  # fmt: skip
+    equations = equations_at(blocks, there, loss)
+    own, coupling = equations.object, equations.coupling.permute(0, 1, 4, 2, 3).flatten(3)  # (B, S, 6, K C)
+    _, cameras, free, _ = equations.camera.shape
+    apart = coupling.new_zeros(count, cameras, free, cameras, free)
+    apart.diagonal(dim1=1, dim2=3).copy_(equations.camera.permute(0, 2, 3, 1))
+    information = apart.flatten(3).flatten(1, 2)
+    pull = (there.offset - equations.camera_gradient).flatten(1)
+    if own is not None and there.object_offset is not None:
+        across = own.camera.flatten(1, 2)
+        information = torch.cat((torch.cat((information, across), 2), torch.cat((across.mT, own.own), 2)), 1)
+        pull = torch.cat((pull, there.object_offset - own.gradient), 1)
+        coupling = torch.cat((coupling, own.pose), 3)
+    factor = torch.linalg.cholesky(equations.pose)
+    taken = torch.linalg.solve_triangular(factor, coupling, upper=False).flatten(1, 2)
+    residue = torch.linalg.solve_triangular(factor, equations.pose_gradient[..., None], upper=False).flatten(1, 3)
+    information.diagonal(dim1=1, dim2=2).sub_(1)
+    information = torch.baddbmm(information, taken.mT, taken, alpha=-1)
+    return information, pull + (taken.mT @ residue[..., None])[..., 0]

@@ -16,7 +16,6 @@ from torch import Tensor
 
 from imgcal.errors import RefusedError
 from imgcal.estimation import Estimate, correlation_time
-from imgcal.geometry import RigidTransform, rotation_from_vector
 
 Floats = NDArray[np.float64]
 
@@ -30,8 +29,8 @@ LARGEST_SHARE = 0.5
 """Of the variance of the sizes, what may be left once they are explained by the step: the rest has other causes."""
 UNKNOWN_SIZE = 0.1
 """Relative standard deviation from which on a snapshot says nothing about the size: one camera alone."""
-TURN, WAY, GROWTH = 1e-6, 1e-3, 1e-6
-"""Steps of the differences: rad, mm, relative."""
+WAY = 1e-3
+"""Step of the differences, mm."""
 
 
 @dataclass(frozen=True)
@@ -101,6 +100,8 @@ def require_one_size(fit: Estimate, names: tuple[str, ...]) -> None:
     Raises:
         RefusedError: there is a moment from which on the object has another size.
     """
+    if len(names) < 2 * LEAST_SNAPSHOTS:
+        return
     step = find_step(*measure_sizes(fit))
     if step is not None:
         how = "larger" if step.change > 0 else "smaller"
@@ -115,15 +116,11 @@ def require_one_size(fit: Estimate, names: tuple[str, ...]) -> None:
 def _differences(fit: Estimate) -> Tensor:
     """Derivatives (S, C, N, 2, 7) of the images by turn (rad), way (mm) and relative growth of the object."""
     points = fit.points_object - fit.points_object.mean(0)
-    rotation = fit.rig_from_object.rotation
-    poses = RigidTransform(rotation, fit.rig_from_object.apply(fit.points_object.mean(0, keepdim=True))[:, 0])
-    rigs = fit.rig.expand(len(rotation))
-    steps = torch.diag(torch.tensor([TURN] * 3 + [WAY] * 3 + [GROWTH], dtype=points.dtype))
-
-    def image(step: Tensor) -> Tensor:
-        turned = rotation @ rotation_from_vector(step[:3])
-        return rigs.project_values(
-            RigidTransform(turned, poses.translation + step[3:6]).apply((1 + step[6]) * points)
-        ).uv
-
-    return torch.stack([(image(step) - image(-step)) / (2 * float(step.sum())) for step in steps], -1)
+    arms = points @ fit.rig_from_object.rotation.mT  # (S, N, 3), from the centroid, in the rig frame
+    places = fit.rig_from_object.apply(fit.points_object)
+    rigs = fit.rig.expand(len(arms))
+    steps = WAY * torch.eye(3, dtype=points.dtype)
+    images = [(rigs.project_values(places + step).uv, rigs.project_values(places - step).uv) for step in steps]
+    by_place = torch.stack([(after - before) / (2 * WAY) for after, before in images], -1)  # (S, C, N, 2, 3)
+    by_turn = torch.cross(arms[:, None, :, None].expand_as(by_place), by_place, dim=-1)
+    return torch.cat((by_turn, by_place, (by_place * arms[:, None, :, None]).sum(-1, keepdim=True)), -1)

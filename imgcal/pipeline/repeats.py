@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imgcal.association import Associations
 from imgcal.types import Detections
@@ -60,23 +61,33 @@ def without_repeats(detections: Detections) -> tuple[Detections, Repeats]:
     order = order[kept[order]]
     image = np.stack([detections.snapshot[order], detections.camera[order]])
     begins = np.flatnonzero(np.r_[True, (np.diff(image, axis=1) != 0).any(0)]) if len(order) else np.empty(0, int)
+    ends = np.append(begins[1:], len(order))
     first: dict[tuple[int, bytes], int] = {}
-    images, originals, own = 0, dict[int, set[int]](), set[int]()
-    for part in np.split(order, begins[1:]) if len(order) else ():
-        snapshot, camera = int(detections.snapshot[part[0]]), int(detections.camera[part[0]])
-        earlier = snapshot
-        if len(part) >= LEAST_BLOBS:
-            earlier = first.setdefault((camera, detections.uv[part].tobytes()), snapshot)
-        if earlier == snapshot:
-            own.add(snapshot)
-            continue
-        kept[part] = False
-        images += 1
-        originals.setdefault(snapshot, set()).add(earlier)
+    originals = dict[int, set[int]]()
+    images = 0
+    for number in _alike(detections.uv[order], image[1], begins):
+        part = order[begins[number] : ends[number]]
+        snapshot, camera = (int(value) for value in image[:, begins[number]])
+        earlier = first.setdefault((camera, detections.uv[part].tobytes()), snapshot)
+        if earlier != snapshot:
+            kept[part] = False
+            images += 1
+            originals.setdefault(snapshot, set()).add(earlier)
+    own = set(np.unique(detections.snapshot[kept]).tolist()) if originals else set()
     names = detections.snapshot_names
     whole = tuple((names[s], names[min(of)]) for s, of in sorted(originals.items()) if s not in own)
     repeats = Repeats(rows, images, whole)
     return (detections if kept.all() else detections.select(kept)), repeats
+
+
+def _alike(uv: NDArray[np.float64], camera: NDArray[np.int64], begins: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Find images (I,), each from a row of `begins` on, that may be copies: the sums of their blobs are the same."""
+    if not len(begins):
+        return begins
+    sizes = np.diff(np.append(begins, len(uv)))
+    sums = np.column_stack((camera[begins], sizes, np.add.reduceat(uv, begins)))
+    _, inverse, counts = np.unique(sums, axis=0, return_inverse=True, return_counts=True)
+    return np.flatnonzero((counts[inverse.reshape(-1)] > 1) & (sizes >= LEAST_BLOBS))
 
 
 def name_repeats(labelled: Associations, repeats: Repeats) -> Associations:

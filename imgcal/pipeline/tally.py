@@ -118,16 +118,16 @@ def _placed(labelled: Associations, poses: RigidTransform, rig: CameraRig, obj: 
     places, open_ = image.uv.numpy(), image.visible.numpy().copy()
     row = np.full(len(labelled.snapshots), -1)
     row[used] = np.arange(len(used))
-    snapshot, reach = row[detections.snapshot], merging_distance(labelled)
+    snapshot = row[detections.snapshot]
     labels = np.flatnonzero((detections.fiducial >= 0) & (snapshot >= 0))
     open_[snapshot[labels], detections.camera[labels], detections.fiducial[labels]] = False
     counts = np.zeros((len(labelled.snapshots), rig.num_cameras), dtype=np.int64)
     blobs = np.flatnonzero((detections.fiducial < 0) & (snapshot >= 0) & detections.usable)
     blobs = blobs[open_[snapshot[blobs], detections.camera[blobs]].any(-1)]
-    for blob in blobs:
+    for blob, reach in zip(blobs, merging_distance(labelled, blobs), strict=True):
         s, c = snapshot[blob], detections.camera[blob]
         away = np.where(open_[s, c], np.hypot(*(places[s, c] - detections.uv[blob]).T), np.inf)
-        merged = np.flatnonzero(away < reach[blob])
+        merged = np.flatnonzero(away < reach)
         mine = merged if len(merged) > 1 else np.flatnonzero(away < PLACED)
         open_[s, c, mine] = False
         counts[used[s], c] += len(mine) > 0

@@ -80,9 +80,10 @@ def test_a_snapshot_that_has_no_label_left_is_refused():
 def test_without_radii_the_closest_two_blobs_of_a_camera_say_how_close_markers_can_be():
     labelled = seen(np.nan, merged=False)
     table = labelled.detections
-    reach = merging_distance(labelled)
+    reach = merging_distance(labelled, np.arange(len(table)))
     apart = np.linalg.norm(table.uv[:, None] - table.uv, axis=-1) + 1e9 * np.eye(len(table))
     for camera in range(3):
         own = np.flatnonzero((table.camera == camera) & (table.snapshot == 0))
         assert reach[own] == pytest.approx(min(apart[np.ix_(own, own)].min(), MOST_REACH))
-    assert merging_distance(labels(replace(table, radius=np.full(len(table), 3.0)))) == pytest.approx(8.0)
+    known = labels(replace(table, radius=np.full(len(table), 3.0)))
+    assert merging_distance(known, np.array([0, 3])) == pytest.approx(8.0)
