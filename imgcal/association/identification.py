@@ -241,7 +241,9 @@ def _against_motions(scene: Scene, best: Fits, known_pose: bool) -> tuple[Fits, 
         The best labelling found, and its margin over the best of its neighbours.
     """
     shifts = lattice_shifts(scene.obj)
-    pattern = pattern_prior(scene.std, scene.rig, scene.rig.working_distance or _guess_distance(scene))
+    _, pose = rig_and_pose(scene, best, 0)
+    distance = scene.rig.working_distance or float(np.median(_distances(scene.rig, _one(pose), scene.obj)))
+    pattern = pattern_prior(scene.std, scene.rig, distance)
     turns = [] if known_pose else near_turns(scene.obj, 2 * pattern.shape * scene.obj.size)
     if not shifts and not turns:
         return best, np.inf

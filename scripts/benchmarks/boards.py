@@ -9,16 +9,17 @@ from __future__ import annotations
 import csv
 import gzip
 import os
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+import tyro
 
 from imgcal.association import associate, observations_of
 from imgcal.detection import detect
-from imgcal.errors import RefusedError
+from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import EstimationOptions, estimate
 from imgcal.formats import load_rig
 from imgcal.io import load_detections, load_object, read_frame
@@ -107,15 +108,30 @@ def webcams(folder: Path) -> dict[str, Any]:
     return result
 
 
+@dataclass(frozen=True)
+class Options:
+    """Where the figures go."""
+
+    out: Path = RESULT
+
+
 def main() -> None:
-    """Measure, and write the figures."""
-    captures, work = Path(os.environ["IMGCAL_CAPTURES"]), ROOT / "out" / "work"
+    """Measure, and write the figures.
+
+    Raises:
+        InputError: no captures.
+    """
+    options = tyro.cli(Options, description=__doc__)
+    folder = os.environ.get("IMGCAL_CAPTURES")
+    if not folder:
+        raise InputError("IMGCAL_CAPTURES: found nothing, expected the folder of the captures")
+    captures, work = Path(folder), ROOT / "out" / "work"
     work.mkdir(parents=True, exist_ok=True)
     figures = {
         "board-186-views": large_board(captures / "board-186-views", work),
         "charuco-four-cameras": webcams(captures / "charuco-four-cameras"),
     }
-    write_json(RESULT, {**surroundings(), "unit": "px", **figures})
+    write_json(options.out, {**surroundings(), "unit": "px", **figures})
 
 
 if __name__ == "__main__":

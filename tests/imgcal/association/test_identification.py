@@ -177,6 +177,14 @@ def test_tracking_starts_from_a_candidate_and_falls_back(o10: CameraRig, asymmet
     assert agreements(found.labels, truth, asymmetric)[1] == 0
 
 
+def test_three_blobs_in_every_camera_near_a_guessed_pose(o10: CameraRig) -> None:
+    rig, obj = replace(o10, working_distance=None), load_object(data_path("objects", "asymmetric8.csv"))
+    made, [(blobs, truth)] = snapshots(o10, obj, 1, 3, 0)
+    found = track(blobs, rig, obj, DRIFT.std(o10), made.rig_from_object[0], pose_known=False)
+    assert found.accepted, found.reason
+    assert agreements(found.labels, truth, obj)[1] == 0
+
+
 def test_a_shifted_lattice_ends_in_the_right_answer_or_none(o10: CameraRig) -> None:
     # The rows of the lattice look alike: only its ends tell where it is, and only the prior tells one camera's shift.
     lattice = np.stack(np.meshgrid(np.arange(12) * 12.0, np.arange(9) * 12.0, [0.0, 30.0]), axis=-1).reshape(-1, 3)

@@ -40,8 +40,8 @@ def test_values(text, expected):
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("[" * 100_000, f"more than {MOST_DEPTH} levels"),
-        ("{a: " * 100_000, f"more than {MOST_DEPTH} levels"),
+        ("[" * 100, f"more than {MOST_DEPTH} levels"),
+        ("{a: " * 100, f"more than {MOST_DEPTH} levels"),
         ("- " * 100_000, f"more than {MOST_DEPTH} levels"),
         ("a: &a [*a]", "alias"),
         ("a: *b", "alias"),
@@ -69,6 +69,13 @@ def test_what_no_file_of_ours_holds(text, problem):
         read_values(text.encode())
     assert problem in caught.value.problem
     assert len(caught.value.problem) < 200
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "{a: " * 100_000])
+def test_brackets_deeper_than_any_stack(text):
+    # libyaml looks ahead for the end of a key, and newer versions stop there by themselves.
+    with pytest.raises(yaml.MarkedYAMLError, match=f"more than {MOST_DEPTH} levels|maximum nesting depth"):
+        read_values(text.encode())
 
 
 def bomb(first: str, step: str) -> str:
