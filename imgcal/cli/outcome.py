@@ -65,7 +65,7 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         "covariance": {
             "from": "scatter between blocks of snapshots" if calibration.block_length else "noise of the blobs",
             "block_length": calibration.block_length,
-            "inflation": calibration.estimate.inflation,
+            "inflation": calibration.estimate.mean_inflation,
         },
         "predicted_error": calibration.predicted_error.summary(),
         "scale": calibration.scale.values,

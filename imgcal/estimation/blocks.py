@@ -8,9 +8,11 @@ with the estimate from all. Were the residuals independent, the difference would
     C_without - C,    C = (1 + sum H_b)^-1,    C_without = (1 + sum H_b - H_block)^-1,
 
 where H_b is a block's information about the (whitened) parameters once its poses have adapted, and 1 that of the prior.
-The squared differences over these variances, averaged over all parameters, are the factor by which the noise's part of
-the covariance is too small; one for all parameters keeps what the covariance says about their relations. Leaving a
-block out, rather than summing the residuals' pulls, counts what the fit has taken of a block that it rests on.
+The squared differences over these variances, averaged over the parameters of a camera, are the factor by which the
+noise's part of its covariance is too small; one for all parameters keeps what the covariance says about their
+relations. A camera's own average, of few blocks, counts as much as that of all cameras: lenses differ widely, but six
+blocks know a camera's factor only roughly. Leaving a block out, rather than summing the residuals' pulls, counts what
+the fit has taken of a block that it rests on.
 
 Source: the delete-block jackknife (Kunsch, Annals of Statistics 1989), studentized by its value for independent noise,
 as the bias-reduced cluster-robust covariances are (Bell and McCaffrey, Survey Methodology 2002). Errors that go on
@@ -26,6 +28,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import accumulate
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -41,6 +44,8 @@ MANY_BLOCKS = 32
 """Blocks at first, and less than twice as many: each costs a factorization; they are then joined two by two."""
 SURE = 4.0
 """Standard deviations by which the scatter of some blocks must exceed what independent noise makes it."""
+OWN = 0.5
+"""Weight of a camera's own scatter; the rest is that of all cameras."""
 OVERLAP = 2 / 3
 """Blocks that overlap all but fully tell as much as this share of those which do not."""
 WORTH = 2.0
@@ -53,7 +58,7 @@ LEAST_SAID = 1e-6
 class BlockScatter:
     """Scatter of the blocks' influences, over what the noise makes it."""
 
-    factor: float = 1.0  # on the standard deviations that the noise gives the parameters; at least 1
+    factor: Tensor | None = None  # (C,) on the standard deviations that noise gives a camera's parameters; at least 1
     length: int = 0  # snapshots in a block, where they scatter most; 0 = no more than the noise makes them
 
 
@@ -75,18 +80,23 @@ def block_scatter(problem: Problem, solution: Solution, loss: NamedLoss) -> Bloc
     if snapshots % size:
         rest = _evidence(problem, solution.state, snapshots % size, loss, snapshots - snapshots % size)
         information, pull = torch.cat((information, rest[0])), torch.cat((pull, rest[1]))
-    cameras, lengths = problem.prior_std[0].numel(), _doubled(snapshots // size // LEAST_BLOCKS)
-    if not _is_worth_measuring(information, pull, lengths, cameras):
+    cameras, lengths = problem.prior_std[0], _doubled(snapshots // size // LEAST_BLOCKS)
+    if not _is_worth_measuring(information, pull, lengths, cameras.numel()):
         return BlockScatter()
-    found, before, sure = BlockScatter(), None, False
+    largest, most, length, sure = torch.ones_like(cameras[:, 0]), 1.0, 0, False
+    before: Scatter | None = None
     for joined in lengths:
-        scatter, deviation = _scatter(information, pull, joined, cameras)
-        whole = scatter if before is None else max(2 * scatter - before, scatter)
-        sure = sure or scatter > 1 + SURE * deviation
-        if sure and whole > found.factor**2:
-            found = BlockScatter(whole**0.5, size * joined)
+        scatter = _scatter(information, pull, joined, cameras.shape)
+        whole, by_camera = scatter.average, scatter.by_camera
+        if before is not None:
+            whole = max(2 * whole - before.average, whole)
+            by_camera = torch.maximum(2 * by_camera - before.by_camera, by_camera)
+        sure = sure or scatter.average > 1 + SURE * scatter.deviation
+        if sure:
+            largest = torch.maximum(largest, by_camera)
+            most, length = max((most, length), (whole, size * joined))
         before = scatter
-    return found
+    return BlockScatter(largest.sqrt(), length) if length else BlockScatter()
 
 
 def _doubled(most: int) -> list[int]:
@@ -116,35 +126,44 @@ def _is_worth_measuring(information: Tensor, pull: Tensor, lengths: list[int], c
     return False
 
 
-def _scatter(information: Tensor, pull: Tensor, joined: int, cameras: int) -> tuple[float, float]:
+class Scatter(NamedTuple):
+    """Squared changes of the parameters without each block over what independent noise makes them."""
+
+    average: float
+    deviation: float  # standard deviation of the average, for independent noise
+    by_camera: Tensor  # (C,) half a camera's own average, half that of all
+
+
+def _scatter(information: Tensor, pull: Tensor, joined: int, shape: torch.Size) -> Scatter:
     """Squared changes of the parameters without each block over what independent noise makes them, averaged.
 
     Args:
         information: (B, D, D) of short blocks.
         pull: (B, D) of the same.
         joined: how many short blocks make a block; these overlap, and begin with each short one.
-        cameras: number of the first parameters, those of the cameras, that are looked at.
-
-    Returns:
-        The average, and its standard deviation for independent noise.
+        shape: (C, K) of the cameras' parameters, which come first; only these are looked at.
     """
+    wide = shape.numel()
     total = information.sum(0)
     total.diagonal().add_(1)
     summed = [torch.zeros_like(total), *accumulate(information)]
-    covariance = torch.cholesky_inverse(torch.linalg.cholesky(total))[:cameras, :cameras]
+    covariance = torch.cholesky_inverse(torch.linalg.cholesky(total))[:wide, :wide]
     change, expected = [], []
     for first, last in zip(summed, summed[joined:], strict=False):
-        without = torch.cholesky_inverse(torch.linalg.cholesky(total - (last - first)))[:cameras]
+        without = torch.cholesky_inverse(torch.linalg.cholesky(total - (last - first)))[:wide]
         change.append(without @ pull[len(change) : len(change) + joined].sum(0))
-        expected.append(without[:, :cameras] - covariance)
+        expected.append(without[:, :wide] - covariance)
     variance = torch.stack([block.diagonal() for block in expected]).sum(0)
     known = variance > LEAST_SAID
     if not bool(known.any()):
-        return 1.0, 1.0
+        return Scatter(1.0, 1.0, torch.ones(shape[0], dtype=pull.dtype, device=pull.device))
     scale = torch.where(known, variance.clamp_min(LEAST_SAID).rsqrt(), 0.0) / known.sum() ** 0.5
-    average = float((torch.stack(change) * scale).square().sum())
+    ratio = (torch.stack(change) * scale).square().sum(0)
+    average, share = float(ratio.sum()), known.view(shape).sum(1) / known.sum()
+    own = torch.where(share > 0, ratio.view(shape).sum(1) / share.clamp_min(1e-9), average)
     squares = sum(float((block * scale[:, None] * scale).square().sum()) for block in expected)
-    return average, (2 * max(OVERLAP * joined, 1.0) * squares) ** 0.5
+    deviation = (2 * max(OVERLAP * joined, 1.0) * squares) ** 0.5
+    return Scatter(average, deviation, OWN * own + (1 - OWN) * average)
 
 
 def _evidence(problem: Problem, state: State, size: int, loss: NamedLoss, first: int = 0) -> tuple[Tensor, Tensor]:

@@ -54,10 +54,13 @@ def camera_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
     """
     cameras = estimate.rig.num_cameras
     covariance = whitened_covariance(estimate.solution)
-    if estimate.inflation > 1:
+    if estimate.inflation is not None:
         # The prior's unit information contributes the covariance's square; only the rest comes from the observations.
-        by_prior = covariance @ covariance
-        covariance = by_prior + estimate.inflation**2 * (covariance - by_prior)
+        by_prior, factor = (
+            covariance @ covariance,
+            estimate.inflation.repeat_interleave(covariance.shape[-1] // cameras),
+        )
+        covariance = by_prior + factor[:, None] * (covariance - by_prior) * factor
     covariance = covariance + _by_modes(estimate)
     scale = _unwhitening(estimate).flatten(1, 2)  # (B, K C, K): one block a camera
     blocks = covariance.unflatten(1, (cameras, -1)).unflatten(-1, (cameras, -1))
@@ -76,7 +79,7 @@ def _by_modes(estimate: Estimate) -> Tensor:
     if estimate.modes is None:
         return estimate.problem.prior_std.new_zeros(())
     follow = estimate.modes.follow.flatten(1)
-    spread = torch.from_numpy(estimate.modes.covariance).to(follow) * estimate.inflation**2
+    spread = torch.from_numpy(estimate.modes.covariance).to(follow) * estimate.mean_inflation**2
     return (follow.mT @ spread @ follow)[None]
 
 
@@ -119,13 +122,17 @@ def joint_information(estimate: Estimate) -> Tensor:
         raise RefusedError(UNDETERMINED)
     information = (reduced.kept @ reduced.kept.mT)[0]
     prior = torch.eye(len(information), dtype=information.dtype)
-    information = prior + (information - prior) / estimate.inflation**2
+    if estimate.inflation is not None:
+        factor = torch.full_like(information[0], estimate.mean_inflation)
+        offset = estimate.solution.state.offset[0]
+        factor[: offset.numel()] = estimate.inflation.repeat_interleave(offset.shape[1])
+        information = prior + (information - prior) / factor[:, None] / factor
     if estimate.modes is not None:
         # Woodbury: modes, known only so well, take from what is known of the cameras that follow them.
         follow = information.new_zeros(len(estimate.modes.offset), len(information))
         of_cameras = estimate.modes.follow.flatten(1)
         follow[:, : of_cameras.shape[1]] = of_cameras
-        precise = torch.linalg.inv(torch.from_numpy(estimate.modes.covariance) * estimate.inflation**2)
+        precise = torch.linalg.inv(torch.from_numpy(estimate.modes.covariance) * estimate.mean_inflation**2)
         across = follow @ information
         information = information - across.mT @ torch.linalg.solve(precise + across @ follow.mT, across)
     by_step = torch.linalg.inv(_unwhitening(_with_least_std(estimate, LEAST_STD))[0])  # whitened offsets by parameters

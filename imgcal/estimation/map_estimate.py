@@ -77,10 +77,16 @@ class Estimate:
     points_object: Tensor  # (*B, N, 3) mm, the fiducials as estimated; as given where the object is exact
     problem: Problem  # (B,) flattened, as solved
     solution: levenberg_marquardt.Solution  # (B,) flattened: state and normal equations at the minimum
-    inflation: float = field(default=1.0, kw_only=True)
-    """Factor on what noise adds to standard deviations, where blocks of snapshots scatter more: `block_scatter`."""
+    inflation: Tensor | None = field(default=None, kw_only=True)
+    """(C,) factors on what noise adds to each camera's standard deviations, where blocks of snapshots scatter more:
+    `block_scatter`; None = they do not."""
     modes: ModeEvidence | None = field(default=None, kw_only=True)
     """How well the object's modes are known, and what follows them; None = it has none."""
+
+    @property
+    def mean_inflation(self) -> float:
+        """Root mean square of `inflation`: what the object, which all cameras see, is inflated by; 1 = none."""
+        return 1.0 if self.inflation is None else float(self.inflation.square().mean().sqrt())
 
     def covariance(self, reference: int = 0) -> Tensor:
         """Covariance of the cameras relative to one of them: (*B, K C, K C); see `relative_covariance`."""

@@ -61,7 +61,7 @@ class DriftInformation:
             solution.state.offset.flatten(1),
             problem.prior_std.flatten(1),
             unit_of(problem.factory).expand(problem.prior_std.shape).flatten(1),
-            torch.full((len(problem.prior_std),), estimate.inflation, dtype=torch.float64),
+            torch.full((len(problem.prior_std),), estimate.mean_inflation, dtype=torch.float64),
         )
 
     @classmethod

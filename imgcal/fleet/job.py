@@ -257,7 +257,7 @@ def columns_of(result: Calibration) -> dict[str, Any]:
         "unit": unit_of(result.factory).flatten().tolist(),
         "whitened_offset": solution.state.offset.flatten().tolist(),
         "information_factor": factor[upper[0], upper[1]].float().numpy(),  # thousands: no list of Python's
-        "inflation": float(estimate.inflation),
+        "inflation": estimate.mean_inflation,
         "rms_px": float(result.rms),
         "chi2_per_dof": float(result.chi2_per_dof),
         "snapshots": len(result.labelled.used),

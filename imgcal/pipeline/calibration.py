@@ -166,7 +166,7 @@ class Calibration:
             return None
         std, known = board.warp_std, np.sqrt(modes.covariance.diagonal())
         (x, y), (dx, dy), (sx, sy) = board.bend, (std * modes.offset).tolist(), (std * known).tolist()
-        factor = self.estimate.inflation
+        factor = self.estimate.mean_inflation
         return Bend(x + dx, y + dy, min(factor * sx, std), min(factor * sy, std))
 
     @property

@@ -87,7 +87,11 @@ def _outcome(found: Calibration, truth: CameraRig, shares: Tensor) -> str:
     ratio = (wrong / stated).square()
     if float(ratio[ratio.isfinite()].mean()) <= WRONG**2:
         return "right"
-    return "said" if found.displaced or found.moved or found.prior_scale or found.estimate.inflation > 1 else "silent"
+    return (
+        "said"
+        if found.displaced or found.moved or found.prior_scale or found.estimate.inflation is not None
+        else "silent"
+    )
 
 
 def _normalize(found: Calibration, truth: CameraRig, squares: dict[str, list[float]], inside: list[float]) -> None:

@@ -50,7 +50,7 @@ class Block:
     def covariance(self, inflated: bool) -> Tensor:
         """Covariance of all parameters (K C, K C), with or without what the scatter of the snapshots adds."""
         found = self.calibration.estimate
-        return camera_covariance(found if inflated else replace(found, inflation=1.0), curved=False)
+        return camera_covariance(found if inflated else replace(found, inflation=None), curved=False)
 
 
 def calibrated(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> Block:
@@ -111,7 +111,7 @@ def measure(blocks: Sequence[Block]) -> dict[str, Any]:
             {
                 "snapshots": len(block.calibration.labelled.used),
                 "rms_px": 2**0.5 * float(block.calibration.rms),
-                "inflation": block.calibration.estimate.inflation,
+                "inflation": block.calibration.estimate.mean_inflation,
                 "block_length": block.calibration.block_length,
                 "said_to_move": block.said_to_move,
             }
@@ -153,7 +153,7 @@ def main() -> None:
             print(f"frames {first}-{first + options.length - 1}: refused: {error}")
             continue
         found = blocks[-1].calibration
-        print(f"frames {first}-{first + options.length - 1}: {found}, sigmas times {found.estimate.inflation:.2f}")
+        print(f"frames {first}-{first + options.length - 1}: {found}, sigmas times {found.estimate.mean_inflation:.2f}")
     result = measure(blocks)
     stretch = {"capture": CAPTURE, "first_frame": options.first, "frames_per_block": options.length}
     before |= {"seconds": round(time.monotonic() - began)}

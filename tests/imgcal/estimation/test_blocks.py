@@ -68,9 +68,24 @@ def test_inflation_leaves_the_prior_and_the_relations_alone(simulate) -> None:
     case = simulate(snapshots=10, cameras=3)
     case.observations.seen[:, 2] = False
     found = estimate(case.observations, case.factory, case.obj, prior_std=case.prior_std)
-    plain, larger = (camera_covariance(replace(found, inflation=f), curved=False) for f in (1.0, 2.0))
+    plain, larger = (
+        camera_covariance(replace(found, inflation=factor), curved=False)
+        for factor in (None, torch.full((3,), 2.0, dtype=torch.float64))
+    )
     std, more = (torch.as_tensor(np.sqrt(c.diagonal().numpy())).view(3, 15) for c in (plain, larger))
     torch.testing.assert_close(more[2], std[2])  # a camera that saw nothing knows what its prior knows
     assert (more[:2, 6:8] > 1.8 * std[:2, 6:8]).all()
     scale = larger.diagonal().sqrt()
     assert torch.linalg.eigvalsh(larger / (scale[:, None] * scale)).min() > 0
+
+
+def test_the_camera_whose_lens_is_bad_gets_the_larger_factor(simulate) -> None:
+    case, _ = wandering(simulate, 1, 96)
+    one = case.observations.of_snapshots(0)
+    clean = case.truth[0].expand(96).project(case.poses[0].apply(case.obj.points)).uv
+    uv = one.uv.clone()
+    uv[:, 1:] = clean[:, 1:] + 0.075 * torch.randn(clean[:, 1:].shape, generator=torch.Generator().manual_seed(1))
+    one = replace(one, uv=uv, sigma=torch.full_like(one.sigma, 0.075))
+    factor = scatter(estimate(one, case.factory, case.obj, case.poses[0], prior_std=case.prior_std)).factor
+    assert factor is not None
+    assert factor[0] > 1.2 * factor[1:].max()

@@ -47,7 +47,10 @@ def test_the_frame_of_the_truth_does_not_matter(calibrated):
 
 def test_large_errors_that_are_owned_up_to_are_not_wrong(calibrated, scene):
     result, _ = calibrated
-    unsure = replace(result, estimate=replace(result.estimate, inflation=1e8))
+    unsure = replace(
+        result,
+        estimate=replace(result.estimate, inflation=torch.full((result.rig.num_cameras,), 1e8, dtype=torch.float64)),
+    )
     wrong, rms, _, claimed = judge(unsure, scene.rig)
     assert not wrong and rms > 1 and claimed > 1
 

@@ -45,7 +45,9 @@ def test_a_scattered_estimate_starts_a_wider_belief(made) -> None:
     _, obj, _, _ = made
     fit = batch(made, 6)
     std = belief_of(posterior_of(fit, obj), obj).std()
-    wider = belief_of(posterior_of(replace(fit, inflation=2.0), obj), obj).std()
+    wider = belief_of(
+        posterior_of(replace(fit, inflation=torch.full((fit.rig.num_cameras,), 2.0, dtype=torch.float64)), obj), obj
+    ).std()
     assert 1.3 < float((wider / std)[:, 6].median()) < 2.001
 
 
