@@ -148,7 +148,8 @@ def _scatter(information: Tensor, pull: Tensor, joined: int, shape: torch.Size) 
     total.diagonal().add_(1)
     summed = [torch.zeros_like(total), *accumulate(information)]
     covariance = torch.cholesky_inverse(torch.linalg.cholesky(total))[:wide, :wide]
-    change, expected = [], []
+    change: list[Tensor] = []
+    expected: list[Tensor] = []
     for first, last in zip(summed, summed[joined:], strict=False):
         without = torch.cholesky_inverse(torch.linalg.cholesky(total - (last - first)))[:wide]
         change.append(without @ pull[len(change) : len(change) + joined].sum(0))
