@@ -140,7 +140,7 @@ class Calibrate:
     imgcal calibrate my_capture --cameras cameras.yaml --object wand4 --out result
     """
 
-    input: Annotated[Path, tyro.conf.Positional]  #: capture folder or detections file
+    input: Annotated[Path, tyro.conf.Positional]  #: capture folder, detections file, or a shipped sample (sample:O10)
     object: str  #: object: file, or the name of a shipped one
     out: Path  #: folder to write
     rig: str | None = None  #: factory rig: file, or the name of a shipped one
@@ -233,7 +233,7 @@ class Score:
     Example: imgcal score my_capture --rig out/rig.yaml --object object.csv
     """
 
-    input: Annotated[Path, tyro.conf.Positional]  #: capture folder or detections file
+    input: Annotated[Path, tyro.conf.Positional]  #: capture folder, detections file, or a shipped sample (sample:O10)
     rig: str  #: rig file, or the name of a shipped rig
     object: str  #: object file, or the name of a shipped object
     snapshots: str | None = None  #: A:B, numbers in file order from 0, B excluded
@@ -249,7 +249,7 @@ class Render:
     Example: imgcal render my_capture --rig O10 --object asymmetric8 --out coded --size 224
     """
 
-    input: Annotated[Path, tyro.conf.Positional]  #: capture folder or detections file
+    input: Annotated[Path, tyro.conf.Positional]  #: capture folder, detections file, or a shipped sample (sample:O10)
     rig: str  #: rig file, or the name of a shipped rig
     object: str  #: object file, or the name of a shipped object
     out: Path  #: folder to write

@@ -11,7 +11,7 @@ from .object_csv import load_object, object_from_text, object_text, save_object
 from .own_folder import holding
 from .posterior_file import read_posterior, write_posterior
 from .publication import PREVIOUS, keep_previous, publishing
-from .resources import data_path, shipped_names
+from .resources import data_path, sample_path, shipped_names
 from .rig_yaml import RigCovariance, load_rig, load_rig_covariance, rig_from_text, rig_text, save_rig
 from .safetensors_file import read_tensors, read_texts, write_tensors
 from .validation import StrictModel, StrictRecord, validated
@@ -78,6 +78,7 @@ __all__ = [
     "replacing",
     "rig_from_text",
     "rig_text",
+    "sample_path",
     "save_cameras",
     "save_capture_settings",
     "save_detections",

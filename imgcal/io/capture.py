@@ -21,6 +21,7 @@ from imgcal.io.detections_csv import load_detections
 from imgcal.io.frames import IMAGE_SUFFIXES, TIFF_SUFFIXES, VIDEO_SUFFIXES, Frame, Video, count_frames, read_frame
 from imgcal.io.names import is_file_name, natural_key, nearest
 from imgcal.io.publication import is_unfinished
+from imgcal.io.resources import sample_path
 from imgcal.io.validation import StrictModel, validated
 from imgcal.io.yaml_file import read_yaml, yaml_text
 from imgcal.messages import listed
@@ -129,7 +130,7 @@ def open_capture(folder: str | Path, rig: CameraRig | None = None, videos_differ
     """Find the frames of a capture.
 
     Args:
-        folder: the folder that holds `frames/`.
+        folder: the folder that holds `frames/`, or the name of a shipped sample: `sample:O10`.
         rig: gives the cameras, their order and image sizes; a camera without files is allowed. None = what is there.
         videos_differ: accept videos (and TIFFs of several pages) whose numbers of frames or time stamps differ; their
             frames go together by number.
@@ -143,7 +144,7 @@ def open_capture(folder: str | Path, rig: CameraRig | None = None, videos_differ
         >>> len(capture.camera_names), len(capture.snapshot_names)
         (10, 4)
     """
-    folder = Path(folder)
+    folder = sample_path(folder)
     frames = folder / "frames"
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder, expected a capture that holds frames/<camera name>/")
@@ -187,8 +188,11 @@ def open_input(
     fiducials: int | Sequence[int] | None = None,
     videos_differ: bool = False,
 ) -> Capture | Detections:
-    """Open what a user gives to a command: a capture folder or a detections file; arguments as for their functions."""
-    path = Path(path)
+    """Open what a user gives to a command: a capture folder, a detections file, or a sample by its name (`sample:O10`).
+
+    Arguments as for `open_capture` and `load_detections`.
+    """
+    path = sample_path(path)
     if path.is_dir():
         return open_capture(path, rig, videos_differ)
     if not path.is_file():

@@ -8,10 +8,12 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from imgcal.errors import InputError
-from imgcal.io.resources import data_path, shipped_names
+from imgcal.io.resources import data_path, sample_path, shipped_names
 
 MOST_NAMES = 8  # that a message lists
 MODEL, SUFFIX = "model.safetensors", ".safetensors"  # what `imgcal train` calls a network in the folder of a run
+IN_SAMPLE = {"rigs": "rig.yaml", "objects": "object.csv"}
+"""Files of a sample capture, by the kind of shipped data that each of them is."""
 LONGEST_NAME = 200  # bytes: file systems end at 255, and something is put behind
 
 
@@ -73,14 +75,15 @@ def find_file(path: str | Path, kind: str, suffix: str) -> Path:
     """Find a file by its path or, when there is none, by the bare name of a shipped one.
 
     Args:
-        path: a path, or a name such as "O10".
+        path: a path, a name such as "O10", or that of a sample capture, such as "sample:O10", for the file in it.
         kind: the folder of the shipped data, "rigs" or "objects".
         suffix: of the shipped files.
 
     Raises:
         InputError: neither exists.
     """
-    path = Path(path)
+    sample = sample_path(path)
+    path = sample / IN_SAMPLE[kind] if sample != Path(path) and kind in IN_SAMPLE else Path(path)
     if path.is_file():
         return path
     shipped = shipped_names(kind, suffix)

@@ -1,7 +1,10 @@
 from pathlib import Path
 
-from imgcal.io import load_object, load_rig, resources
-from imgcal.io.resources import data_path, shipped_names
+import pytest
+
+from imgcal.errors import InputError
+from imgcal.io import load_object, load_rig, open_capture, open_input, resources
+from imgcal.io.resources import data_path, sample_path, shipped_names
 
 
 def test_what_ships_is_there_and_can_be_read() -> None:
@@ -22,3 +25,18 @@ def test_an_installed_package_carries_its_data(tmp_path: Path, monkeypatch) -> N
     assert data_path("rigs", "a.yaml") == tmp_path / "data" / "rigs" / "a.yaml"  # a checkout: beside the package
     (tmp_path / "imgcal" / "data").mkdir()
     assert data_path("rigs", "a.yaml") == tmp_path / "imgcal" / "data" / "rigs" / "a.yaml"
+
+
+def test_a_sample_is_found_by_its_name_from_any_folder(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder, rig = data_path("samples", "O10"), load_rig("sample:O10")
+    assert sample_path("sample:O10") == folder and sample_path("sample") == Path("sample")
+    assert rig.name == load_rig(folder / "rig.yaml").name != load_rig("O10").name
+    assert bool((load_object("sample:O10").points == load_object(folder / "object.csv").points).all())
+    assert open_input("sample:O10", rig).folder == open_capture("sample:O10", rig).folder == folder
+
+
+@pytest.mark.parametrize("load", [load_rig, load_object, open_input])
+def test_a_sample_that_does_not_exist_is_refused_with_those_that_do(load) -> None:
+    with pytest.raises(InputError, match="sample:O11: no such sample, expected sample:O10"):
+        load("sample:O11")
