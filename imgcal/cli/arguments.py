@@ -322,6 +322,30 @@ class Describe:
 
 
 @dataclass(frozen=True)
+class Harvest:
+    """Make training data of a calibrated capture: crops of its frames in which every marker's place is known.
+
+    The object's pose in a snapshot comes from all cameras, so that frames in which detection fails are labelled, too.
+    Writes OUT/train.safetensors, OUT/held_out.safetensors (other snapshots, never their neighbours; of fewer than five
+    snapshots, other cameras) and OUT/README.md, which says what is in them.
+    Example: imgcal harvest my_capture --rig out/rig.yaml --object object.csv --out dataset
+    then: imgcal train ir-cnn --from dataset --out adapted
+    and: imgcal calibrate my_capture --rig factory.yaml --object object.csv --detector adapted --out out2
+    """
+
+    capture: Annotated[Path, tyro.conf.Positional]  #: capture folder, or a shipped sample (sample:O10)
+    rig: str  #: the calibrated rig: what `imgcal calibrate` wrote
+    object: str  #: object file, or the name of a shipped object
+    out: Path  #: folder to write
+    snapshots: str | None = None  #: A:B, numbers in file order from 0, B excluded
+    detector: str = "auto"  #: who finds the object where blobs decide nothing: auto, both, or classical for nobody
+    size: int = 96  #: crop pixels, each way: as the network takes them
+    seed: int = 0  #: of the crops' places
+    videos_differ: bool = False  #: accept videos whose lengths or time stamps differ: frames go together by number
+    detection: Annotated[DetectionOptions, tyro.conf.arg(name="")] = field(default_factory=DetectionOptions)
+
+
+@dataclass(frozen=True)
 class Train:
     """Train a network as an experiment file says.
 
@@ -334,6 +358,9 @@ class Train:
     experiment: Annotated[str, tyro.conf.Positional]  #: experiment file, or the name of a shipped experiment
     out: Path  #: folder to write
     resume: bool = False  #: go on with the training in OUT
+    dataset: Annotated[Path | None, tyro.conf.arg(name="from")] = None
+    """dataset of `imgcal harvest`: the shipped network of the experiment's name is trained further on your own frames,
+    mixed with rendered ones, for some minutes; what it says of held-out frames decides which weights are kept"""
     set: Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="KEY=VALUE ...")] = ()
     """values of the experiment to change, such as training.steps=100"""
     minutes: float | None = None  #: train so long; the same as --set training.minutes=...

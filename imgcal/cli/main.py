@@ -64,6 +64,10 @@ COMMANDS = {
         "Write a trained network for another runtime: ONNX, or a program of torch.export.",
     ),
     "describe": ("imgcal.cli.experiment_keys", "List every key of an experiment file: type, default and meaning."),
+    "harvest": (
+        "imgcal.cli.harvest",
+        "Make training data of a calibrated capture: crops of its frames in which every marker's place is known.",
+    ),
     "train": ("imgcal.cli.train", "Train a network as an experiment file says."),
     "evaluate": (
         "imgcal.cli.evaluate",

@@ -25,9 +25,10 @@ class Train(arguments.Train):
         import torch
 
         from imgcal.cli.training_folder import RESULT, STATE, train_in
-        from imgcal.training import finished, load_experiment
+        from imgcal.training import adaptation, finished, load_experiment
 
-        changes = [change for changes in self.set for change in changes]
+        changes = [] if self.dataset is None else adaptation(self.experiment, self.dataset)
+        changes += [change for changes in self.set for change in changes]
         changes += [] if self.minutes is None else [f"training.minutes={float(self.minutes)!r}"]
         experiment = load_experiment(self.experiment, changes)
         check_folder(self.out)

@@ -13,7 +13,7 @@ from .captures import (
 )
 from .colour_coding import GREY_LEVELS, ImageOptions, render_views
 from .corruption import Corrupted, Corruption
-from .crops import CropTruth, Scenes, render_crops, sample_scenes, second_look
+from .crops import CropTruth, Scenes, degrade_crops, render_crops, sample_scenes, second_look
 from .difficulty import DIFFICULTIES, Difficulty
 from .drawing import host_generator
 from .hand_held import HandHeld
@@ -62,6 +62,7 @@ __all__ = [
     "Truth",
     "arranged_positions",
     "arranged_rig",
+    "degrade_crops",
     "expose_patches",
     "host_generator",
     "look_at",

@@ -153,6 +153,76 @@ def _photograph(place: Tensor, radius: Tensor, draw: Draw) -> tuple[Tensor, Tens
     return level.masked_fill(outside, torch.nan), ~hidden & least & ~flat
 
 
+def degrade_crops(
+    crops: Tensor, place: Tensor, radius: Tensor, seen: Tensor, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Make crops of real frames harder: blurred, moved, dark, noisy, behind drapes, among dots that are no markers.
+
+    Args:
+        crops: (P, S, S) light, in which the ground is about 0 and a marker about 1; NaN outside the image.
+        place: (P, N, 2) crop pixels, where the markers are.
+        radius: (P, N) crop pixels.
+        seen: (P, N) bool, markers that the crops show.
+        generator: source of randomness; each crop gets a mixture of its own.
+
+    Returns:
+        Crops, and which markers they still show.
+    """
+    draw, count = Draw(generator), len(crops)
+    outside, light = crops.isnan(), crops.nan_to_num()
+    size = torch.where(seen, radius, torch.nan).nanmedian(-1).values.nan_to_num(1.0).clamp(0.4, 4.0)
+    light = _smear(light, draw.often(0.4, 1.5, count) * size, draw.often(0.4, 2.0, count) * size, draw)
+    batch, dots = torch.Size((count, 1)), 28
+    shown = draw.unit(*batch, dots) < draw.often(0.5, 1.0, *batch)[..., None] ** 1.5
+    spots = _Spots(
+        draw.between(-2, SIZE + 1, *batch, dots, 2),
+        size[:, None, None] * draw.between(-0.5, 0.5, *batch, dots).exp(),
+        shown * draw.between(0.4, 1.1, *batch, dots),
+        torch.zeros(*batch, dots, 2, device=crops.device),
+        torch.full((*batch, dots), 9.0, device=crops.device),
+    )
+    light = light + _drawn(spots, draw.between(0.3, 0.8, *batch), draw)[:, 0]
+    cover, level = _drapes(count, draw)
+    light = light + cover * (level[:, None, None] - light)
+    where = place.round().clamp(0, SIZE - 1).long()
+    hidden = cover.flatten(1).gather(1, where[..., 1] * SIZE + where[..., 0]) > 0.5
+    dark = draw.often(0.4, 1.0, count)[:, None, None] * light.clamp(min=0)
+    noise = torch.where(draw.unit(count) < 0.5, draw.between(math.log(0.003), math.log(0.5), count).exp(), 0.0)
+    light = light + noise[:, None, None] * (1 + dark).sqrt() * draw.normal(*light.shape)
+    return light.masked_fill(outside, torch.nan), seen & ~hidden
+
+
+def _smear(light: Tensor, spread: Tensor, length: Tensor, draw: Draw) -> Tensor:
+    """Blur images (P, S, S) by Gaussians of standard deviation `spread` (P,), longer by `length` (P,) one way."""
+    reach = PATCH // 2
+    steps = torch.arange(-reach, reach + 1, device=light.device, dtype=light.dtype)
+    angle = draw.between(0, math.pi, len(light))[:, None, None]
+    along = steps * angle.cos() + steps[:, None] * angle.sin()
+    across = steps[:, None] * angle.cos() - steps * angle.sin()
+    across_variance = spread.square().clamp(min=0.02)[:, None, None]
+    along_variance = across_variance + length.square()[:, None, None]
+    kernel = torch.exp(-along.square() / (2 * along_variance) - across.square() / (2 * across_variance))
+    kernel = kernel / kernel.sum((1, 2), keepdim=True)
+    padded = functional.pad(light[None], (reach,) * 4, mode="replicate")
+    return functional.conv2d(padded, kernel[:, None], groups=len(light))[0]
+
+
+def _drapes(count: int, draw: Draw) -> tuple[Tensor, Tensor]:
+    """Draw oblongs with edges over images, most of them without any: cover (P, S, S) in [0, 1], light (P,) of them."""
+    steps = torch.arange(SIZE, device=draw.generator.device, dtype=torch.float32)
+    cover = torch.zeros(count, SIZE, SIZE, device=steps.device)
+    some = draw.unit(count) < 0.35
+    for _ in range(4):
+        angle = draw.between(0, math.pi, count)[:, None, None]
+        middle, half = draw.between(0, SIZE, count, 2), draw.between(0.05, 0.35, count, 2) * SIZE
+        x, y = steps - middle[:, 0, None, None], steps[:, None] - middle[:, 1, None, None]
+        along, across = x * angle.cos() + y * angle.sin(), y * angle.cos() - x * angle.sin()
+        inside = torch.minimum(half[:, 0, None, None] - along.abs(), half[:, 1, None, None] - across.abs())
+        there = (some & (draw.unit(count) < 0.5))[:, None, None]
+        cover = torch.maximum(cover, torch.sigmoid(4 * inside) * there)
+    return cover, torch.where(draw.unit(count) < 0.5, draw.between(-0.3, 0.0, count), draw.between(0.5, 1.3, count))
+
+
 @dataclass(frozen=True)
 class _Spots:
     place: Tensor  # (B, C, M, 2) crop pixels

@@ -2,6 +2,8 @@ from .callbacks import Callbacks, DivergedError
 from .engine import Run, finished, prepare, progress, train, train_step
 from .experiment import Experiment
 from .experiment_file import KINDS, changed, load_experiment, save_experiment
+from .frame_dataset import CARD, HELD_OUT, TRAIN, FrameDataset, adaptation, load_frames, load_splits
+from .harvest import harvest
 from .infrared_task import InfraredExperiment, InfraredTask
 from .measurer_task import MeasurerExperiment, MeasurerTask
 from .rigs import RigExperiment, RigTask, experiment_of
@@ -9,10 +11,14 @@ from .state import TrainingState, load_state, save_state
 from .task import Loss, Result, Task
 
 __all__ = [
+    "CARD",
+    "HELD_OUT",
     "KINDS",
+    "TRAIN",
     "Callbacks",
     "DivergedError",
     "Experiment",
+    "FrameDataset",
     "InfraredExperiment",
     "InfraredTask",
     "Loss",
@@ -24,10 +30,14 @@ __all__ = [
     "Run",
     "Task",
     "TrainingState",
+    "adaptation",
     "changed",
     "experiment_of",
     "finished",
+    "harvest",
     "load_experiment",
+    "load_frames",
+    "load_splits",
     "load_state",
     "prepare",
     "progress",

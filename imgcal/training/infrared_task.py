@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 
 from imgcal.errors import InputError
@@ -20,8 +21,9 @@ from imgcal.networks import (
     normalized,
     warm_start,
 )
-from imgcal.synthesis import host_generator, render_crops, sample_scenes, second_look
-from imgcal.training.experiment import Experiment
+from imgcal.synthesis import degrade_crops, host_generator, render_crops, sample_scenes, second_look
+from imgcal.training.experiment import Experiment, Fraction
+from imgcal.training.frame_dataset import FrameDataset, expect_elsewhere, load_splits, turn
 from imgcal.training.infrared import evidence_at_best, queries_of, query_losses
 from imgcal.training.task import Loss, Task
 
@@ -37,6 +39,8 @@ class InfraredExperiment(Experiment):
 
     task: Literal["infrared"] = "infrared"
     network: InfraredConfig = InfraredConfig()
+    frames: Annotated[str, Field(min_length=1)] | None = None  # folder that `imgcal harvest` wrote: frames of your own
+    frames_share: Fraction = 0.5  # share of the batches that are of these, made harder; the others are rendered
 
     def make_task(self, device: torch.device, batch_size: int, weights: torch.Generator, fresh: bool) -> InfraredTask:
         """Build the network and its source of crops; see `Experiment.make_task`."""
@@ -70,6 +74,8 @@ class InfraredTask(Task[CropBatch, Evidence]):
         "validation_missed": "validation missed {:.3f}",
     }
     network: InfraredNetwork
+    own: FrameDataset | None = None  # crops of real frames to learn from
+    held_out: FrameDataset | None = None  # crops of other moments, to validate on
 
     def __init__(
         self,
@@ -98,11 +104,25 @@ class InfraredTask(Task[CropBatch, Evidence]):
         self.network = network.to(device)
         self.device = device
         self.sizes = experiment.training.validation_sizes(batch_size)
+        self.share = experiment.frames_share
+        if experiment.frames is not None:
+            self.own, self.held_out = (part.to(device) for part in load_splits(experiment.frames))
+            self._check_size(experiment.frames)
+
+    def _check_size(self, folder: str) -> None:
+        """Raise `InputError` where the crops of a dataset are not of the network's size."""
+        assert self.own is not None
+        found, expected = self.own.crops.shape[-1], self.network.config.crop
+        if found != expected:
+            raise InputError(f"{folder}: found crops of {found} pixels, expected {expected} as the network takes them")
 
     def batch(self, count: int, generator: torch.Generator) -> CropBatch:
         """Make crops of random rigs and objects; all objects of a batch have as many fiducials."""
         low, high = FIDUCIALS
         host = host_generator(generator)
+        if self.own is not None and float(torch.rand((), generator=host)) < self.share:
+            rows = torch.randint(len(self.own), (count,), generator=generator, device=self.device)
+            return self._batch_of_frames(self.own.select(rows), generator)
         fiducials = int(torch.randint(low, high + 1, (), generator=host))
         second = float(torch.rand((), generator=host)) < SECOND_LOOKS
         truth = render_crops(sample_scenes(max(count // CAMERAS, 1), CAMERAS, fiducials, generator), generator)
@@ -110,6 +130,15 @@ class InfraredTask(Task[CropBatch, Evidence]):
         crops, place, seen = (part.flatten(0, 1) for part in (truth.crops, truth.place, truth.seen))
         window = self.network.config.close_window if second else None
         return CropBatch(normalized(crops), queries_of(truth), place, seen, window)
+
+    def _batch_of_frames(self, crops: FrameDataset, generator: torch.Generator) -> CropBatch:
+        """Make crops of real frames harder, and ask for their fiducials from elsewhere."""
+        crops = turn(crops, generator)
+        light, seen = degrade_crops(crops.crops.float(), crops.place, crops.radius, crops.seen, generator)
+        second = float(torch.rand((), generator=host_generator(generator))) < SECOND_LOOKS
+        window = self.network.config.close_window if second else None
+        queries = expect_elsewhere(crops, generator, near=second)
+        return CropBatch(normalized(light), queries, crops.place, seen, window)
 
     def predict(self, network: nn.Module, batch: CropBatch) -> Evidence:
         """Say where the fiducials are."""
@@ -133,8 +162,7 @@ class InfraredTask(Task[CropBatch, Evidence]):
         if not self.sizes:
             return {}
         generator = torch.Generator(self.device).manual_seed(VALIDATION_SEED)
-        batches = (self.batch(size, generator) for size in self.sizes)
-        counts = torch.stack([_counts(predict(batch), batch) for batch in batches]).sum(0)
+        counts = torch.stack([_counts(predict(batch), batch) for batch in self._validation(generator)]).sum(0)
         right, wrong, nees = torch.stack(_shares(counts)).tolist()
         return {
             "validation_missed": 1 - right + wrong,
@@ -142,6 +170,15 @@ class InfraredTask(Task[CropBatch, Evidence]):
             "validation_wrong": wrong,
             "validation_nees": nees,
         }
+
+    def _validation(self, generator: torch.Generator) -> Iterator[CropBatch]:
+        """Make the crops to validate on: of held-out frames, harder, where there are any; else rendered ones."""
+        for size in self.sizes:
+            if self.held_out is None:
+                yield self.batch(size, generator)
+            else:
+                rows = torch.randint(len(self.held_out), (size,), generator=generator, device=self.device)
+                yield self._batch_of_frames(self.held_out.select(rows), generator)
 
     def result(self, network: nn.Module, metrics: Mapping[str, Any]) -> InfraredCheckpoint:
         """Weights and configuration."""

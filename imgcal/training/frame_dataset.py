@@ -1,0 +1,165 @@
+"""Crops of a user's own frames in which every marker's place is known, to train networks on: one file a split."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from imgcal.errors import InputError
+from imgcal.io import read_tensors, shipped_names, write_tensors
+from imgcal.networks import Queries
+
+FORMAT = "imgcal-frames/1"
+TRAIN, HELD_OUT, CARD = "train.safetensors", "held_out.safetensors", "README.md"
+ADAPTATION = (
+    "training.steps=400",
+    "training.validate_every=50",
+    "training.save_every=100",
+    "training.validation_rigs=96",
+    "training.patience=4",
+    "optimizer.lr=1.0e-3",
+    "optimizer.ema=0.98",
+)
+"""A short training that ends where held-out frames gain no more: some minutes of one core."""
+LARGEST_SHIFT = 14.0
+"""Crop pixels, each axis, by which a camera that has drifted is off: a window of the network reaches 22."""
+NARROW = 3.0
+"""Crop pixels, standard deviation of the shift of most cameras."""
+
+
+@dataclass(frozen=True)
+class FrameDataset:
+    """Crops of frames with the projections of an object's fiducials: M crops, up to N fiducials each.
+
+    Light is measured from the ground of a crop in units of its markers: the ground is about 0, a marker about 1.
+    """
+
+    crops: Tensor  # (M, S, S) float16, NaN outside the image
+    place: Tensor  # (M, N, 2) float32, crop pixels: where the calibrated rig has the fiducials
+    sigma: Tensor  # (M, N) float32, crop pixels: standard deviation of each axis of `place`
+    radius: Tensor  # (M, N) float32, crop pixels, of the markers' images
+    depth: Tensor  # (M, N) float32, distance from the camera's plane over the mean of all fiducials, minus 1
+    asked: Tensor  # (M, N) bool: a fiducial, in the crop; else only padding
+    seen: Tensor  # (M, N) bool: the frame shows the marker
+    camera: Tensor  # (M,) int64, number in the rig
+    snapshot: Tensor  # (M,) int64, number in the capture
+
+    def __len__(self) -> int:
+        return len(self.crops)
+
+    def select(self, rows: Tensor) -> FrameDataset:
+        """Keep the crops of these rows."""
+        return FrameDataset(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    def to(self, device: torch.device) -> FrameDataset:
+        """Move to a device."""
+        return FrameDataset(*(getattr(self, field.name).to(device) for field in fields(self)))
+
+    def save(self, path: str | Path, about: Mapping[str, Any]) -> None:
+        """Write a file in one step; `about` are plain values that say where the crops are from."""
+        tensors = {field.name: getattr(self, field.name) for field in fields(self)}
+        write_tensors(path, tensors, FORMAT, {"about": json.dumps(about)})
+
+
+def load_frames(path: str | Path) -> FrameDataset:
+    """Read crops that `FrameDataset.save` wrote.
+
+    Raises:
+        InputError: no such file, another one, or tensors that do not belong together.
+    """
+    tensors, _ = read_tensors(path, FORMAT)
+    names = [field.name for field in fields(FrameDataset)]
+    if set(tensors) != set(names):
+        raise InputError(f"{path}: found tensors {', '.join(sorted(tensors))}, expected {', '.join(names)}")
+    found = FrameDataset(**tensors)
+    count, fiducials = len(found), found.place.shape[1]
+    shapes = {
+        "crops": (count, *found.crops.shape[1:2] * 2),
+        "place": (count, fiducials, 2),
+        **dict.fromkeys(("sigma", "radius", "depth", "asked", "seen"), (count, fiducials)),
+        **dict.fromkeys(("camera", "snapshot"), (count,)),
+    }
+    for name, shape in shapes.items():
+        if tuple(tensors[name].shape) != shape:
+            raise InputError(f"{path}: {name}: found shape {tuple(tensors[name].shape)}, expected {shape}")
+    if not count:
+        raise InputError(f"{path}: found no crops, expected some")
+    return found
+
+
+def load_splits(folder: str | Path) -> tuple[FrameDataset, FrameDataset]:
+    """Read a dataset of `imgcal harvest`: the crops to learn from, and those that were held out.
+
+    Raises:
+        InputError: see `load_frames`; or crops of different sizes.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder, expected a dataset of `imgcal harvest`")
+    train, held_out = load_frames(folder / TRAIN), load_frames(folder / HELD_OUT)
+    if train.crops.shape[1:] != held_out.crops.shape[1:]:
+        raise InputError(f"{folder}: found crops of different sizes in {TRAIN} and {HELD_OUT}")
+    return train, held_out
+
+
+def turn(crops: FrameDataset, generator: torch.Generator) -> FrameDataset:
+    """Turn and mirror all crops alike, by a multiple of 90 degrees that is drawn: markers look the same either way."""
+    quarters, mirrored = (int(n) for n in torch.randint(0, 4, (2,), generator=generator, device=generator.device))
+    light, place, last = crops.crops, crops.place, crops.crops.shape[-1] - 1
+    if mirrored % 2:
+        light, place = light.flip(-1), torch.stack((last - place[..., 0], place[..., 1]), -1)
+    for _ in range(quarters):  # counterclockwise: columns become rows
+        light, place = light.rot90(1, (-2, -1)), torch.stack((place[..., 1], last - place[..., 0]), -1)
+    values = {field.name: getattr(crops, field.name) for field in fields(crops)}
+    return FrameDataset(**values | {"crops": light, "place": place})
+
+
+def expect_elsewhere(crops: FrameDataset, generator: torch.Generator, near: bool) -> Queries:
+    """Ask for the fiducials where a rig that has drifted would expect them.
+
+    Args:
+        crops: M crops.
+        generator: source of randomness.
+        near: as a rig that was fitted to a first look expects them.
+    """
+    count, device = len(crops), crops.place.device
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(shape, generator=generator, device=device)
+
+    def unit(*shape: int) -> Tensor:
+        return torch.rand(shape, generator=generator, device=device)
+
+    asked = crops.asked[..., None].to(crops.place)
+    centre = (crops.place * asked).sum(1, keepdim=True) / asked.sum(1, keepdim=True).clamp(min=1)
+    spread = torch.where(unit(count, 1, 1) < 0.3, 0.15, 0.02)  # turned or tilted a lot, or a little
+    strain = spread * normal(count, 2, 2) * (0.2 if near else 1.0)
+    wide = unit(count, 1, 1) < 0.5
+    shift = torch.where(wide, LARGEST_SHIFT * (2 * unit(count, 1, 2) - 1), NARROW * normal(count, 1, 2))
+    shift = 0.8 * normal(count, 1, 2) if near else shift.clamp(-LARGEST_SHIFT, LARGEST_SHIFT)
+    expected = crops.place + (crops.place - centre) @ strain + shift
+    size = crops.crops.shape[-1]
+    inside = ((expected > -0.5) & (expected < size - 0.5)).all(-1)
+    radius = crops.radius * (1 + 0.1 * normal(count, 1))
+    return Queries(expected, radius.clamp(min=0.05), crops.depth, crops.asked & inside)
+
+
+def adaptation(name: str, folder: str | Path) -> list[str]:
+    """Return the changes of an experiment that train its shipped network further on frames of one's own.
+
+    Args:
+        name: of the experiment.
+        folder: a dataset of `imgcal harvest`.
+
+    Examples:
+        >>> adaptation("ir-cnn", "dataset")[:2]
+        ['frames="dataset"', 'training.init_from="ir-cnn"']
+    """
+    starts = [f"training.init_from={json.dumps(name)}"] if name in shipped_names("models", ".safetensors") else []
+    return [f"frames={json.dumps(str(folder))}", *starts, *ADAPTATION]

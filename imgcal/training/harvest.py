@@ -1,0 +1,236 @@
+"""Training data out of a calibrated capture: the rig and the object's poses say where every marker is in every frame.
+
+A snapshot's pose comes from all cameras together, so frames in which detection failed get labels, too. What a network
+then learns is the user's own markers, lamps, lenses and walls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from imgcal.association import Associations, PipelineOptions, Progress, Sight, associate, observations_of
+from imgcal.detection import DetectionOptions, Frame
+from imgcal.errors import RefusedError
+from imgcal.estimation import estimate
+from imgcal.geometry import RigidTransform, rotation_from_vector
+from imgcal.matching import measure_markers
+from imgcal.networks import Expectation, Tiles, cut_crops
+from imgcal.training.frame_dataset import FrameDataset
+from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
+
+COPIES = 3
+"""Crops of each place, each with another corner and another reduction."""
+TURN_DEG, ASIDE = 1.5, 0.01
+"""Standard deviations of the poses that crops are placed by: degrees, and parts of the distance to the object."""
+LEAST_SEEN = 3
+"""Markers that a crop must show."""
+LARGEST_SIGMA = 1.0
+"""Crop pixels: a projection that is known less well is no label."""
+FARTHEST = 4.0
+"""Standard deviations (and 1.5 pixels) from its projection at which a measured marker is another one's."""
+HELD_OUT = 5
+"""One stretch of so many snapshots in a row of stretches is held out."""
+LEAST_SNAPSHOTS = 5
+"""Snapshots that can be split; of fewer, cameras are held out."""
+
+
+def harvest(
+    frames: Callable[[int], Mapping[str, Frame | None]],
+    detections: Detections,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    options: PipelineOptions = PipelineOptions(),
+    *,
+    detection: DetectionOptions = DetectionOptions(),
+    sight: Sight | None = None,
+    size: int = 96,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> tuple[FrameDataset, FrameDataset]:
+    """Cut labelled crops out of the frames of a calibrated rig.
+
+    Args:
+        frames: those of a snapshot by its number: camera name -> (H, W).
+        detections: blobs of all snapshots, cameras as in the rig.
+        rig: the calibrated rig, held fixed.
+        obj: the object.
+        options: how sure the labels must be that poses come from.
+        detection: how blobs were found.
+        sight: who looks at frames of which blobs decide nothing; None = such snapshots give no crops.
+        size: crop pixels, each way.
+        seed: of the crops' places.
+        progress: wraps the loops over snapshots.
+
+    Returns:
+        Crops to learn from, and crops that are held out: of other snapshots, never neighbours in time; of other cameras
+        where there are fewer than five snapshots.
+
+    Raises:
+        RefusedError: no snapshot can be decided, no pose fits, or one of the two would be empty.
+    """
+    rig, options = rig.to(torch.float64), options.of_object(obj)
+    labelled = associate(detections, rig, obj, options, progress, sight)
+    observations, poses = fit_poses(labelled, rig, obj, options)
+    generator = torch.Generator().manual_seed(seed)
+    numbers: Iterable[int] = range(len(labelled.used))
+    parts = []
+    for row in progress(numbers, len(labelled.used)) if progress else numbers:
+        snapshot = labelled.used[row]
+        shown = frames(snapshot)
+        seen, sigma = find_visible(shown, rig, obj, poses[row : row + 1], observations.of_snapshots([row]), detection)
+        for _ in range(COPIES):
+            part = _cut(shown, rig, obj, poses[row : row + 1], seen, sigma, detection, size, generator)
+            parts.append(replace(part, snapshot=torch.full_like(part.snapshot, snapshot)))
+    return split(_join(parts), len(detections.snapshot_names), rig.num_cameras)
+
+
+def fit_poses(
+    labelled: Associations, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
+) -> tuple[Observations, RigidTransform]:
+    """Fit the object's pose in every decided snapshot, the rig held fixed: observations (S, C, N), poses (S,).
+
+    Raises:
+        RefusedError: no pose fits.
+    """
+    observations, poses = observations_of(labelled, rig, obj)
+    fixed = torch.zeros(*rig.distortion.shape[:-1], rig.num_parameters, dtype=rig.distortion.dtype)
+    fit = estimate(observations, rig, obj.taken_as_exact(), poses, prior_std=fixed, options=options.estimation)
+    if not bool(fit.converged):
+        raise RefusedError("harvest: in some snapshot no pose of the object fits: the rig or the object is another one")
+    return observations, fit.rig_from_object
+
+
+def find_visible(
+    frames: Mapping[str, Frame | None],
+    rig: CameraRig,
+    obj: CalibrationObject,
+    pose: RigidTransform,
+    labels: Observations,
+    detection: DetectionOptions,
+) -> tuple[Tensor, Tensor]:
+    """Find which projected fiducials a frame shows, and how well each projection is known.
+
+    Args:
+        frames: of the snapshot.
+        rig: the calibrated rig.
+        obj: the object.
+        pose: (1,) of the object.
+        labels: (1, C, N) what was identified.
+        detection: how blobs were found.
+
+    Returns:
+        Whether a marker is there (C, N), and the standard deviation (C, 1) in pixels: the RMS distance of the labels of
+        the camera from the projections; of all cameras where one has none.
+    """
+    expected = Expectation.of(rig, obj, pose)
+    uv, known = expected.uv[0], labels.seen[0]
+    squared = (labels.uv[0] - uv).square().mean(-1)
+    count = known.sum(1, keepdim=True)
+    usual = (squared[known].mean() if bool(known.any()) else uv.new_tensor(1.0)).sqrt()
+    own = (torch.where(known, squared, 0.0).sum(1, keepdim=True) / count.clamp(min=1)).sqrt()
+    sigma = torch.where(count > 0, own, usual)
+    seen = known & (squared.sqrt() < 1.5 + FARTHEST * usual)
+    for camera, name in enumerate(rig.camera_names):
+        frame, visible = frames.get(name), expected.visible[0, camera]
+        if frame is None or not bool(visible.any()):
+            seen[camera] = False
+            continue
+        radius = expected.radius[0, camera].clamp(0.5, 64).numpy()
+        found = measure_markers(
+            frame, uv[camera].numpy(), radius, detection.polarity == "dark", (known[camera] & visible).numpy()
+        )
+        apart = np.linalg.norm(found.uv - uv[camera].numpy(), axis=1)
+        near = apart < 1.5 + FARTHEST * (found.sigma + float(usual))
+        seen[camera] |= torch.from_numpy(found.seen & np.nan_to_num(near).astype(bool))
+    return seen & expected.visible[0], sigma
+
+
+def split(crops: FrameDataset, snapshots: int, cameras: int) -> tuple[FrameDataset, FrameDataset]:
+    """Hold out stretches of snapshots, with a gap on both sides of each; of few snapshots, cameras.
+
+    Raises:
+        RefusedError: one of the two would be empty.
+    """
+    if snapshots >= LEAST_SNAPSHOTS:
+        stretch = max(snapshots // (2 * HELD_OUT), 1)
+        number = crops.snapshot // stretch
+        held_out = number % HELD_OUT == HELD_OUT - 1
+        gap = max(stretch // 10, 1) if stretch > 1 else 0
+        within = crops.snapshot % stretch
+        # What borders on a held-out stretch belongs to neither.
+        beside = ((number % HELD_OUT == HELD_OUT - 2) & (within >= stretch - gap)) | (
+            (number % HELD_OUT == 0) & (number > 0) & (within < gap)
+        )
+        train = ~held_out & ~beside
+    else:
+        held_out = crops.camera >= cameras - max(cameras // 3, 1)
+        train = ~held_out
+    if not bool(train.any() and held_out.any()):
+        raise RefusedError(
+            f"harvest: found {int(train.sum())} crops to learn from and {int(held_out.sum())} to hold out in "
+            f"{snapshots} snapshots of {cameras} cameras, expected some of both: capture more snapshots"
+        )
+    return crops.select(train), crops.select(held_out)
+
+
+def _cut(
+    frames: Mapping[str, Frame | None],
+    rig: CameraRig,
+    obj: CalibrationObject,
+    pose: RigidTransform,
+    seen: Tensor,
+    sigma: Tensor,
+    detection: DetectionOptions,
+    size: int,
+    generator: torch.Generator,
+) -> FrameDataset:
+    """Cut the crops of a snapshot, placed as a pose near the true one would place them."""
+    turn = np.deg2rad(TURN_DEG) * torch.randn(1, 3, generator=generator, dtype=torch.float64)
+    far = (rig.positions - pose.translation).norm(dim=-1).mean()
+    aside = ASIDE * far * torch.randn(1, 3, generator=generator, dtype=torch.float64)
+    near = RigidTransform(rotation_from_vector(turn) @ pose.rotation, pose.translation + aside)
+    tiles = Tiles.of_object(rig, obj, near, size)
+    queries = tiles.of(Expectation.of(rig, obj, pose, tiles.usual)).queries(tiles.placement)
+    names = tuple(rig.camera_names[camera] for camera in tiles.camera.tolist())
+    light = cut_crops(frames, names, tiles.placement, inverted=detection.polarity == "dark")
+    shown = seen[tiles.camera[:, None], tiles.fiducial] & queries.asked
+    blur = (sigma[tiles.camera] / tiles.placement.scale[:, None]).float().expand_as(queries.radius)
+    light, usable = _in_units_of_markers(light, queries.place, shown)
+    kept = (usable & (blur[:, 0] < LARGEST_SIGMA)).nonzero()[:, 0]
+    nowhere = torch.zeros(len(kept), dtype=torch.int64)
+    return FrameDataset(
+        light[kept].half(), queries.place[kept], blur[kept], queries.radius[kept], queries.depth[kept],
+        queries.asked[kept], shown[kept], tiles.camera[kept], nowhere,
+    )  # fmt: skip
+
+
+def _in_units_of_markers(light: Tensor, place: Tensor, shown: Tensor) -> tuple[Tensor, Tensor]:
+    """Measure light (T, S, S) from its ground, in units of the median marker; say where there are enough markers."""
+    size = light.shape[-1]
+    ground = light.flatten(1).nanmedian(1).values.nan_to_num()
+    where = place.round().clamp(0, size - 1).long()
+    peak = light.flatten(1).gather(1, where[..., 1] * size + where[..., 0]) - ground[:, None]
+    level = peak.masked_fill(~shown, torch.nan).nanmedian(1).values.nan_to_num()
+    usable = (shown.sum(1) >= LEAST_SEEN) & (level > 0)
+    scale = torch.where(usable, level, 1.0)
+    return ((light - ground[:, None, None]) / scale[:, None, None]).clamp(-100, 100), usable
+
+
+def _join(parts: list[FrameDataset]) -> FrameDataset:
+    """Put crops after one another, with as many fiducials as the largest has."""
+    most = max((part.place.shape[1] for part in parts), default=0)
+
+    def padded(values: Tensor) -> Tensor:
+        if values.ndim < 2 or values.dtype == torch.float16:
+            return values
+        rest = [0, 0] * (values.ndim - 2)
+        return functional.pad(values, [*rest, 0, most - values.shape[1]])
+
+    names = [field.name for field in fields(FrameDataset)]
+    return FrameDataset(*(torch.cat([padded(getattr(part, name)) for part in parts]) for name in names))
