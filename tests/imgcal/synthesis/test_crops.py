@@ -1,6 +1,6 @@
 import torch
 
-from imgcal.synthesis import render_crops, sample_scenes
+from imgcal.synthesis import degrade_crops, render_crops, sample_scenes
 from imgcal.synthesis.crops import SIZE
 
 
@@ -41,3 +41,21 @@ def test_what_is_expected_is_near_and_wrong() -> None:
     assert float((truth.place - truth.expected - common).norm(dim=-1).median()) < 0.5 * float(apart.median())
     assert bool((truth.radius > 0).all())
     assert float(truth.depth.mean(-1).abs().max()) < 1e-4
+
+
+def test_degraded_crops_hide_what_they_say_and_stay_empty_outside() -> None:
+    generator, count = torch.Generator().manual_seed(0), 64
+    place = torch.randint(20, 76, (count, 4, 2), generator=generator).float()
+    steps = torch.arange(96.0)
+    apart = (steps - place[..., 0, None]).square()[:, :, None] + (steps - place[..., 1, None]).square()[..., None]
+    light = torch.exp(-apart / 8).sum(1)
+    light[:, :, :10] = torch.nan
+    seen = torch.ones(count, 4, dtype=torch.bool)
+    crops, shown = degrade_crops(light, place, torch.full((count, 4), 3.0), seen, generator)
+    assert torch.equal(crops.isnan(), light.isnan())
+    assert 0.03 < 1 - shown.float().mean() < 0.3  # behind drapes
+    column, row = place.long().unbind(-1)
+    there = crops[torch.arange(count)[:, None], row, column]
+    # A quarter of the crops or so is left nearly as it was; the others are darker, noisier, blurred.
+    assert (there[shown] > 0.8).float().mean() > 0.3
+    assert there[shown].std() > 0.1

@@ -7,7 +7,18 @@ import torch
 from imgcal.errors import InputError
 from imgcal.io import model_file, read_tensors
 from imgcal.networks import Evidence, load_infrared
-from imgcal.training import Callbacks, InfraredExperiment, Result, Run, TrainingState, load_experiment, train
+from imgcal.training import (
+    HELD_OUT,
+    TRAIN,
+    Callbacks,
+    FrameDataset,
+    InfraredExperiment,
+    Result,
+    Run,
+    TrainingState,
+    load_experiment,
+    train,
+)
 from imgcal.training.infrared_task import CropBatch
 
 TINY = (
@@ -110,3 +121,26 @@ def test_a_batch_depends_on_the_generator_alone() -> None:
     for name, tensor in task.batch(4, generator).tensors().items():
         assert torch.equal(tensor, first[name])
     assert not torch.equal(first["crops"], other["crops"])
+
+
+def test_frames_of_ones_own_are_mixed_with_rendered_ones_and_held_out_ones_judge(tmp_path: Path) -> None:
+    place = torch.rand(6, 5, 2, generator=torch.Generator().manual_seed(0)) * 60 + 18
+    one, yes = torch.ones(6, 5), torch.ones(6, 5, dtype=torch.bool)
+    number = torch.arange(6)
+    crops = FrameDataset(torch.zeros(6, 96, 96).half(), place, 0.1 * one, 2 * one, 0 * one, yes, yes, number, number)
+    for name in (TRAIN, HELD_OUT):
+        crops.save(tmp_path / name, {})
+    own = load_experiment("ir-cnn", (*TINY, f"frames={tmp_path}", "frames_share=0.5"))
+    task = own.make_task(torch.device("cpu"), 4, torch.Generator(), False)
+    generator = torch.Generator().manual_seed(1)
+    shapes = [task.batch(4, generator).place.shape for _ in range(40)]
+    assert 8 < sum(shape[1] == 5 and shape[0] == 4 for shape in shapes) < 35
+    kept = Kept()
+    train(own, kept)
+    assert kept.rows[-1]["validation_missed"] >= 0
+    plain = load_experiment("ir-cnn", TINY).make_task(torch.device("cpu"), 4, torch.Generator(), False)
+    with pytest.raises(InputError, match="found crops of 96 pixels, expected 144"):
+        load_experiment("ir-cnn", (*TINY, f"frames={tmp_path}", "network.crop=144")).make_task(
+            torch.device("cpu"), 4, torch.Generator(), False
+        )
+    assert plain.own is None
