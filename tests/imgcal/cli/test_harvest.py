@@ -1,0 +1,28 @@
+from imgcal.cli.main import main
+from imgcal.training import load_splits
+
+
+def test_a_calibrated_capture_becomes_a_dataset_with_a_card(workplace, tmp_path, capsys):
+    rig, out = workplace.capture / "truth" / "rig.yaml", tmp_path / "dataset"
+    given = ["harvest", str(workplace.capture), "--rig", str(rig), "--object", str(workplace.object)]
+    assert main([*given, "--out", str(out)]) == 0
+    train, held_out = load_splits(out)
+    card = (out / "README.md").read_text()
+    said = capsys.readouterr().err
+    for part in (train, held_out):
+        assert len(part) and f"| {len(part)} | {int(part.seen.sum())} |" in card
+        assert f"{len(part)} crops with {int(part.seen.sum())} markers" in said
+    assert main([*given, "--out", str(out)]) == 0  # again: the same files
+    assert (load_splits(out)[0].crops.nan_to_num() == train.crops.nan_to_num()).all()
+
+
+def test_what_cannot_be_harvested_leaves_nothing(workplace, tmp_path, capsys):
+    out = tmp_path / "dataset"
+    given = ["harvest", str(workplace.capture), "--rig", str(workplace.rig), "--object", "cube27", "--out", str(out)]
+    assert main(given) == 3
+    assert "imgcal: " in capsys.readouterr().err and not out.exists()
+
+
+def test_train_from_a_folder_that_is_no_dataset_is_one_line(tmp_path, capsys):
+    assert main(["train", "ir-cnn", "--from", str(tmp_path), "--out", str(tmp_path / "run")]) == 2
+    assert "train.safetensors" in capsys.readouterr().err
