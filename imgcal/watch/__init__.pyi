@@ -6,6 +6,7 @@ from .hook import Hook
 from .intake import Intake, Known
 from .json_lines import JsonLines
 from .loop import EVENTS, STATE, Keeper, Page, Progress, Watch
+from .marker_files import MarkerFile
 from .metrics import Metrics, Tally
 from .open_igt_link import OpenIGTLink, listening_address
 from .pose_files import PoseFile
@@ -35,6 +36,7 @@ __all__ = [
     "JsonLines",
     "Keeper",
     "Known",
+    "MarkerFile",
     "Metrics",
     "OpenIGTLink",
     "Page",
