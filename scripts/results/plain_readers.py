@@ -18,7 +18,9 @@ import cv2
 import numpy as np
 import yaml
 
-Projection = Callable[[Any], Any]  # (N, 3) points in the file's frame and unit -> (N, 2) pixels, (0, 0) a pixel's centre
+Projection = Callable[
+    [Any], Any
+]  # (N, 3) points in the file's frame and unit -> (N, 2) pixels, (0, 0) a pixel's centre
 HALF = 0.5  # COLMAP's pixels begin there
 
 

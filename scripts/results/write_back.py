@@ -1,17 +1,15 @@
 """A recalibrated rig goes back into the user's own file: `python -m scripts.results.write_back`.
 
 Originals are the real files of IMGCAL_FORMATS, and one written by hand for the formats of which there is none. Each is
-read, its rig drifts, a simulated capture of that is calibrated (where the cameras see something together; else the drift
-itself is taken for the result), and the rig goes back into the file. The new file is read by imgcal and by readers that
-share nothing with it (`plain_readers.py`), and compared with the original byte by byte. Then originals are damaged until
-300 of them have been refused. Writes docs/results/write_back.json and the table of docs/formats.md.
+read and its rig drifts. A simulated capture of that is calibrated, and the rig goes back into the file; where the
+cameras see nothing together, the drift itself is taken for the result. The new file is read by imgcal and by readers
+that share nothing with it (`plain_readers.py`), and compared with the original byte by byte. Then originals are damaged
+until 300 of them have been refused. Writes docs/results/write_back.json and the table of docs/formats.md.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
-import io
 import json
 import os
 import re
@@ -28,7 +26,6 @@ import numpy as np
 import torch
 
 from imgcal import RigPrior, calibrate, load_object, load_rig, save_rig
-from imgcal.cli.main import main as imgcal
 from imgcal.errors import InputError, RefusedError
 from imgcal.formats import (
     ForeignRig,

@@ -54,7 +54,7 @@ def test_independent_readers_find_the_points_and_which_are_missing(tmp_path, mar
 
 
 def test_residual_and_cameras_stand_where_the_format_has_them(tmp_path):
-    """Cameras in the high byte, residual in units of POINT:SCALE in the low one (c3d.org); ezc3d takes them reversed."""
+    """Cameras in the high byte, residual in units of POINT:SCALE in the low one (c3d.org); ezc3d has them reversed."""
     path = tmp_path / "trial.c3d"
     points, error, cameras = some(40, 5)
     file = C3DFile(path, list("abcde"), 100.0, 3200.0)
