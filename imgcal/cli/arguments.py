@@ -189,6 +189,7 @@ class Watch:
     a folder that is being filled with frames/<camera>/<snapshot>.png, or that holds a video a camera;
     tcp://host:port or ipc://path, frames or blobs from another process through ZeroMQ;
     qtm://host, markers from Qualisys' QTM as it measures or plays;
+    lsl://name, blobs through the Lab Streaming Layer;
     - for blobs on standard input, a line of JSON each: {"camera": "cam01", "time": 12.5, "uv": [[u, v], ...]};
     a rosbag2 folder or .mcap file; a table of blobs (.csv, .csv.gz).
 

@@ -36,6 +36,7 @@ from imgcal.watch import (
     Intake,
     JsonLines,
     Known,
+    LabStreaming,
     MarkerFile,
     Metrics,
     OpenIGTLink,
@@ -169,6 +170,9 @@ class Watch(arguments.Watch):
             self._check_options("an address")
             if self.input.startswith("qtm://"):
                 return Qualisys(self.input, rig)
+            if self.input.startswith("lsl://"):
+                self._require("pylsl", "an address")
+                return LabStreaming(self.input)
             self._require("zmq", "an address")
             return ZeroMQ((self.input,))
         path = Path(self.input)

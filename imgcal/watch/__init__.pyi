@@ -5,6 +5,7 @@ from .folder import Folder
 from .hook import Hook
 from .intake import Intake, Known
 from .json_lines import JsonLines
+from .lab_streaming import LabStreaming
 from .loop import EVENTS, STATE, Keeper, Page, Progress, Watch
 from .marker_files import MarkerFile
 from .metrics import Metrics, Tally
@@ -36,6 +37,7 @@ __all__ = [
     "JsonLines",
     "Keeper",
     "Known",
+    "LabStreaming",
     "MarkerFile",
     "Metrics",
     "OpenIGTLink",
