@@ -293,6 +293,8 @@ class Convert:
     """names of the cameras to keep, in the order to write them (default: all)"""
     out_unit: str | None = None
     """unit to write, where the format leaves that to its user; with --into, of the lengths in that"""
+    hold_distortion: bool = False
+    """write a rig file whose calibrations keep the distortion of the lenses, so that they can go back into SOURCE"""
     fit_limit: float = LIMIT
     """px that a lens may be off, anywhere in its image, where another model takes its place by a fit"""
 

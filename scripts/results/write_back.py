@@ -42,6 +42,7 @@ from imgcal.formats import (
     worst_difference,
     written_back,
 )
+from imgcal.formats.limits import HELD_DISTORTION
 from imgcal.synthesis import PhysicalDrift, simulate_volume, true_detections
 from imgcal.types import CameraRig
 from scripts.fuzz.cases import Case
@@ -55,7 +56,6 @@ RESULT, PAGE = RESULTS / "write_back.json", ROOT / "docs" / "formats.md"
 NUMBER = re.compile(r"(?<![\w.])[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
 ROUNDING = 1e-3  # px that the digits of a file may cost beside the loss of its lens model
 LIMIT, ALLOWED = 0.05, 0.5  # px that a lens may be off: as imgcal has it, and where a user allows more
-HELD = 1e-6  # spread of the distortion in the rig file's prior, which keeps the lens as it is
 CALIBRATED, CALIBRATED_HELD, DRIFTED = "calibration", "calibration, distortion held", "drift"
 DAMAGED = 300
 SNAPSHOTS, NOISE = 40, 0.05  # of the simulated capture; px
@@ -172,7 +172,7 @@ def recalibrate_into(one: Original, rig: CameraRig, folder: Path) -> tuple[Updat
     Returns:
         The new files, where their rig comes from, and the limit. The rig is in `rig.yaml`.
     """
-    held = replace(rig, prior=replace(rig.prior or RigPrior(), distortion=HELD))
+    held = replace(rig, prior=replace(rig.prior or RigPrior(), distortion=HELD_DISTORTION))
     refused = ""
     for how, before, limit in (
         (CALIBRATED, rig, LIMIT),

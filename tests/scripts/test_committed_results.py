@@ -1,6 +1,6 @@
 """Results of benchmarks as they are committed: whole, within what they promise, and on their pages."""
 
-from scripts.benchmarks import honesty_moves, honesty_prediction, image_quality
+from scripts.benchmarks import honesty_moves, honesty_prediction, image_quality, open_igt_link, qualisys_stream
 from scripts.output import read_json
 from scripts.results import formats, write_back
 
@@ -72,3 +72,16 @@ def test_rigs_go_back_into_the_files_of_every_tool():
     assert damaged["refused"] >= 300 and damaged["faults"] == [] and damaged["sound_and_right"] > 0
     assert set(damaged["refused_by_format"]) == names
     assert write_back.table(result) in write_back.PAGE.read_text("utf-8")
+
+
+def test_qtm_gives_the_events_of_a_file_and_a_client_every_pose():
+    stream = read_json(qualisys_stream.RESULT)
+    assert (stream["cameras"], stream["rate_hz"], stream["events_that_differ"], stream["rigs_differ_in"]) == (
+        10,
+        100,
+        0,
+        None,
+    )
+    assert stream["frames_lost"] and stream["unreadable_packets"] and stream["reconnections"] >= qualisys_stream.BREAKS
+    assert set(stream["moved"]) == {stream["turned"]} and stream["snapshots"] >= 1900
+    assert abs(read_json(open_igt_link.RESULT)["published"]["poses_a_second"] - 60) < 0.1
