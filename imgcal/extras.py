@@ -11,6 +11,7 @@ EXTRAS = {
     "report": ("jinja2", "matplotlib"),
     "live": ("uvicorn",),
     "onnx": ("onnx", "onnxruntime"),
+    "lsl": ("pylsl",),
 }
 """Libraries of each extra, by the names that they are imported by; `pyproject.toml` has the versions."""
 

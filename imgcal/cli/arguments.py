@@ -189,6 +189,7 @@ class Watch:
     a folder that is being filled with frames/<camera>/<snapshot>.png, or that holds a video a camera;
     tcp://host:port or ipc://path, frames or blobs from another process through ZeroMQ;
     qtm://host, markers from Qualisys' QTM as it measures or plays;
+    lsl://name, blobs through the Lab Streaming Layer;
     - for blobs on standard input, a line of JSON each: {"camera": "cam01", "time": 12.5, "uv": [[u, v], ...]};
     a rosbag2 folder or .mcap file; a table of blobs (.csv, .csv.gz).
 
@@ -215,7 +216,8 @@ class Watch:
     serve: str | None = None  #: [HOST:]PORT of the live page; the host is 127.0.0.1 if not given
     poses: tuple[str, ...] = ()
     """where the object's pose of each snapshot goes: FILE.csv, FILE.jsonl, tcp://HOST:PORT (ZeroMQ) or
-    igtl://[HOST:]PORT (OpenIGTLink: 3D Slicer, PLUS); several are possible"""
+    igtl://[HOST:]PORT (OpenIGTLink: 3D Slicer, PLUS); its markers as 3D points: FILE.c3d, FILE.trc; several are
+    possible"""
     hook: str | None = None
     """command to run for each event, without a shell; the event is its standard input, a line of JSON"""
     detector: str = "classical"  #: who finds the fiducials in frames, as for imgcal calibrate
@@ -291,6 +293,8 @@ class Convert:
     """names of the cameras to keep, in the order to write them (default: all)"""
     out_unit: str | None = None
     """unit to write, where the format leaves that to its user; with --into, of the lengths in that"""
+    hold_distortion: bool = False
+    """write a rig file whose calibrations keep the distortion of the lenses, so that they can go back into SOURCE"""
     fit_limit: float = LIMIT
     """px that a lens may be off, anywhere in its image, where another model takes its place by a fit"""
 

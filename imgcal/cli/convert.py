@@ -41,7 +41,7 @@ class Convert(arguments.Convert):
         print(f"{title}: {len(rig.cameras)} camera{'s' if len(rig.cameras) > 1 else ''}; frame: {rig.frame}")
         for note in rig.notes:
             print(f"note: {note}")
-        made = converted(rig, to, self.out.stem, self.fit_limit, self.out_unit)
+        made = converted(rig, to, self.out.stem, self.fit_limit, self.out_unit, hold_distortion=self.hold_distortion)
         for note in made.notes:
             print(f"note: {note}")
         written = self._write(made.files)
@@ -54,6 +54,7 @@ class Convert(arguments.Convert):
     def _write_back(self) -> None:
         """Replace the numbers in a copy of the user's own file."""
         self._check_limit()
+        self._check_held()
         if self.to == OURS:
             raise InputError("--to: found imgcal, expected the format of what --into names")
         rig, _ = self._read()
@@ -81,6 +82,10 @@ class Convert(arguments.Convert):
             )
         print(f"wrote {where}; re-read: worst difference {made.reread:.1e} px on {made.points} points")
 
+    def _check_held(self) -> None:
+        if self.hold_distortion:
+            raise InputError("--hold-distortion: only for a rig file of ours (--out rig.yaml), to calibrate with")
+
     def _check_limit(self) -> None:
         if not 0 < self.fit_limit < float("inf"):
             raise InputError(f"--fit-limit: found {self.fit_limit}, expected pixels > 0")
@@ -92,6 +97,7 @@ class Convert(arguments.Convert):
             raise InputError(f"--to: not given, and {self.out.name} does not say it; expected one of imgcal, {able}")
         if to != OURS:
             format_named(to)
+            self._check_held()
         self._check_limit()
         return to
 

@@ -36,6 +36,8 @@ from imgcal.watch import (
     Intake,
     JsonLines,
     Known,
+    LabStreaming,
+    MarkerFile,
     Metrics,
     OpenIGTLink,
     PoseFile,
@@ -56,6 +58,7 @@ from imgcal.watch import (
 )
 from imgcal.watch import Watch as Loop
 
+MARKER_SUFFIXES = (".c3d", ".trc")
 USUAL_RATE = 30.0  # snapshots a second of a table of blobs
 
 # What kind of input an option is for.
@@ -93,7 +96,7 @@ class Watch(arguments.Watch):
             keeper, restored = self._keeper(folder, rig, obj)
             stack.enter_context(keeper)
             stack.enter_context(intake).opened()  # before anything is written
-            poses = [stack.enter_context(Poses(name, _pose_sink(name))) for name in self.poses]
+            poses = [stack.enter_context(Poses(name, _pose_sink(name, rig, obj))) for name in self.poses]
             page = None
             if self.serve is not None:
                 from imgcal.live_page import LivePage, parse_address  # brings a server along, which is not in the core
@@ -167,6 +170,9 @@ class Watch(arguments.Watch):
             self._check_options("an address")
             if self.input.startswith("qtm://"):
                 return Qualisys(self.input, rig)
+            if self.input.startswith("lsl://"):
+                self._require("pylsl", "an address")
+                return LabStreaming(self.input)
             self._require("zmq", "an address")
             return ZeroMQ((self.input,))
         path = Path(self.input)
@@ -300,19 +306,21 @@ def metrics_address(text: str) -> tuple[str, int]:
     return host.strip("[]") or "127.0.0.1", int(port)
 
 
-def _pose_sink(name: str) -> PoseSink:
+def _pose_sink(name: str, rig: CameraRig, obj: CalibrationObject) -> PoseSink:
     """Open what poses are to go to, by its name.
 
     Raises:
         InputError: it cannot be opened, or is no name of any.
     """
     scheme, separator, _ = name.partition("://")
+    if not separator and Path(name).suffix.lower() in MARKER_SUFFIXES:
+        return MarkerFile(Path(name), rig, obj)
     if not separator:
         return PoseFile(Path(name))
     if scheme == "igtl":
         return OpenIGTLink(*listening_address(name))
     if scheme not in ("tcp", "ipc"):
-        expected = "FILE.csv, FILE.jsonl, tcp://HOST:PORT or igtl://[HOST:]PORT"
+        expected = "FILE.csv, FILE.jsonl, FILE.c3d, FILE.trc, tcp://HOST:PORT or igtl://[HOST:]PORT"
         raise InputError(f"--poses: found {shortened(name)!r}, expected {expected}")
     if missing("zmq"):
         raise InputError(f"--poses: {shortened(name)} {advice('zmq')}")

@@ -1,3 +1,4 @@
 """How well one lens must stand for another."""
 
+HELD_DISTORTION = 1e-6  # spread of coefficients that are to stay as they are: no image shows it
 LIMIT = 0.05  # px, anywhere in the image, that another lens model may be off

@@ -159,7 +159,7 @@ def _check_fits(
                 f"camera {camera}: {title} cannot say its lens ({describe_lens(found[camera].lens)}): the nearest with "
                 f"the file's {len(lenses[camera].coefficients)} coefficients is off {off}, more than the limit of "
                 f"{limit:g} px",
-                command="--fit-limit allows more",
+                command="--fit-limit allows more; or convert the file with --hold-distortion and calibrate again",
                 python="`limit` allows more",
             )
 

@@ -10,11 +10,12 @@ from imgcal.errors import InputError
 from imgcal.formats.conversion import NATIVE, Held, describe_lens, from_camera_rig, held_by, to_camera_rig
 from imgcal.formats.foreign_rig import ForeignRig, FormatError
 from imgcal.formats.format import Files, Format
-from imgcal.formats.limits import LIMIT
+from imgcal.formats.limits import HELD_DISTORTION, LIMIT
 from imgcal.formats.registry import FORMATS, format_named, read_foreign_rig
 from imgcal.formats.units import in_millimetres, millimetres
 from imgcal.formats.verification import worst_difference
 from imgcal.io import RigCovariance, rig_from_text, rig_text
+from imgcal.types import RigPrior
 
 OURS = "imgcal"
 MOST_PX = 1e-6  # that a file may be off when it is read back: the digits of a double
@@ -31,7 +32,15 @@ class Written:
     points: int  # known points that were compared
 
 
-def converted(rig: ForeignRig, to: str, name: str, limit: float = LIMIT, unit: str | None = None) -> Written:
+def converted(
+    rig: ForeignRig,
+    to: str,
+    name: str,
+    limit: float = LIMIT,
+    unit: str | None = None,
+    *,
+    hold_distortion: bool = False,
+) -> Written:
     """Make the files of a format, read them back, and compare.
 
     Args:
@@ -40,6 +49,7 @@ def converted(rig: ForeignRig, to: str, name: str, limit: float = LIMIT, unit: s
         name: of the rig, where there is a place for it.
         limit: pixels that a fitted lens may be off.
         unit: of the lengths in the files, where the format leaves that to its user; None = its custom.
+        hold_distortion: write a rig file of ours whose prior keeps the distortion of the lenses in calibrations.
 
     Raises:
         InputError: the format is only read, or it cannot hold so many cameras.
@@ -47,7 +57,10 @@ def converted(rig: ForeignRig, to: str, name: str, limit: float = LIMIT, unit: s
     """
     if to == OURS:
         held = held_by(rig, NATIVE, "a rig file of ours", limit)
-        text = rig_text(to_camera_rig(held.rig, name), name, _kept_covariance(held))
+        made = to_camera_rig(held.rig, name)
+        if hold_distortion:
+            made = replace(made, prior=replace(made.prior or RigPrior(), distortion=HELD_DISTORTION))
+        text = rig_text(made, name, _kept_covariance(held))
         back = from_camera_rig(rig_from_text(text, name))
         lost = rig.covariance is not None and _kept_covariance(held) is None
         notes = ["standard deviations are left out: they are those of other lens parameters"] if lost else []

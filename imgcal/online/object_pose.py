@@ -30,6 +30,8 @@ class ObjectPose:
     covariance: Tensor  # (6, 6) of w (rad) and v (mm)
     markers: int  # fiducials that some camera saw
     cameras: int  # that saw some of them
+    points_object: Tensor | None = None  # (N, 3) mm, the fiducials as they are known now
+    seen: NDArray[np.bool_] | None = None  # (C, N), which camera saw which fiducial
 
     def matrix(self) -> NDArray[np.float64]:
         """The pose as (4, 4), translation in mm."""
@@ -42,6 +44,14 @@ class ObjectPose:
         """RMS error that is to be expected: of the rotation (rad), of the object's origin (mm)."""
         variance = self.covariance.diagonal().clamp_min(0)
         return float(variance[:3].sum().sqrt()), float(variance[3:].sum().sqrt())
+
+    def points_rig(self) -> tuple[Tensor, Tensor]:
+        """Where the fiducials are: (N, 3) mm in the rig's frame, and the RMS error (N,) mm that is to be expected."""
+        assert self.points_object is not None
+        turned = self.points_object @ self.rig_from_object.rotation.mT
+        by_pose = torch.cat((-cross_matrix(turned), torch.eye(3).to(turned).expand(len(turned), 3, 3)), dim=-1)
+        variance = torch.einsum("nij,jk,nik->n", by_pose, self.covariance.to(turned), by_pose)
+        return turned + self.rig_from_object.translation, variance.clamp_min(0).sqrt()
 
 
 def object_pose(
@@ -92,8 +102,10 @@ def object_pose(
     follows[:, : count * width] += _common_motion(belief, rig_from_object, trusted)
     half = torch.linalg.solve_triangular(belief.factor, follows.mT, upper=False)
     covariance = torch.cholesky_inverse(factor) + half.mT @ half
-    seen = len(np.unique(blobs.fiducial[rows])), len(np.unique(blobs.camera[rows]))
-    return ObjectPose(rig_from_object, covariance, *seen)
+    seen = np.zeros((count, len(belief.points_object)), dtype=bool)
+    seen[blobs.camera[rows], blobs.fiducial[rows]] = True
+    markers, cameras = int(seen.any(0).sum()), int(seen.any(1).sum())
+    return ObjectPose(rig_from_object, covariance, markers, cameras, belief.points_object, seen)
 
 
 def _jacobians(

@@ -5,7 +5,9 @@ from .folder import Folder
 from .hook import Hook
 from .intake import Intake, Known
 from .json_lines import JsonLines
+from .lab_streaming import LabStreaming
 from .loop import EVENTS, STATE, Keeper, Page, Progress, Watch
+from .marker_files import MarkerFile
 from .metrics import Metrics, Tally
 from .open_igt_link import OpenIGTLink, listening_address
 from .pose_files import PoseFile
@@ -35,6 +37,8 @@ __all__ = [
     "JsonLines",
     "Keeper",
     "Known",
+    "LabStreaming",
+    "MarkerFile",
     "Metrics",
     "OpenIGTLink",
     "Page",

@@ -27,7 +27,7 @@ class PoseFile:
             InputError: it cannot be written, ends in another suffix, or is a table of something else.
         """
         if path.suffix.lower() not in SUFFIXES:
-            raise InputError(f"{path}: expected a name that ends in {' or '.join(SUFFIXES)}")
+            raise InputError(f"{path}: expected a name that ends in .csv, .jsonl, .c3d or .trc")
         self._path, self._table = path, path.suffix.lower() == ".csv"
         header = ",".join(COLUMNS)
         try:

@@ -15,6 +15,8 @@ import zmq
 import imgcal
 from imgcal.geometry import RigidTransform, rotation_from_vector
 
+RATE = 60.0  # snapshots a second
+
 rig, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
 bump = torch.zeros(rig.num_cameras, 15, dtype=torch.float64)
 bump[1, 0] = math.radians(0.3)  # the second camera turns by 0.3 degrees
@@ -22,6 +24,7 @@ snapshots = int(sys.argv[2]) if len(sys.argv) > 2 else 100_000
 
 with zmq.Context() as context, context.socket(zmq.PUB) as socket:  # who publishes never waits for those who read
     socket.bind(sys.argv[1])
+    began = time.monotonic()
     for snapshot in range(snapshots):
         swing = [math.sin(snapshot * rate) for rate in (0.011, 0.017, 0.023, 0.013, 0.019, 0.007)]
         turn, shift = torch.tensor(swing, dtype=torch.float64).split(3)
@@ -33,4 +36,4 @@ with zmq.Context() as context, context.socket(zmq.PUB) as socket:  # who publish
             uv = seen.uv[camera][seen.visible[camera]]
             blobs = (uv + 0.05 * torch.randn_like(uv)).tolist()
             socket.send_string(json.dumps({"camera": name, "time": now, "uv": blobs, "sigma": 0.05}))
-        time.sleep(1 / 60)
+        time.sleep(max(0.0, began + (snapshot + 1) / RATE - time.monotonic()))  # by the clock: work takes time, too

@@ -28,6 +28,11 @@ LONGEST = 1100  # characters of the line
 
 def run(case: Case) -> str:
     """Run a case in this process; says what was wrong, in words, or nothing."""
+    return attempt(case)[1]
+
+
+def attempt(case: Case) -> tuple[object, str]:
+    """Run a case in this process; its exit code, and what was wrong, in words, or nothing."""
     before = _listing(case.folder)
     torch.set_num_threads(1)  # an experiment may have set another number for the whole process
     with _written() as texts, warnings.catch_warnings():
@@ -36,7 +41,7 @@ def run(case: Case) -> str:
             code: object = main(case.arguments)
         except BaseException as error:
             code = f"{type(error).__name__}: {error}"
-    return judge(case, code, texts[1], before)
+    return code, judge(case, code, texts[1], before)
 
 
 def judge(case: Case, code: object, error: str, before: set[Path]) -> str:

@@ -1,8 +1,8 @@
 """Results of benchmarks as they are committed: whole, within what they promise, and on their pages."""
 
-from scripts.benchmarks import honesty_moves, honesty_prediction, image_quality
+from scripts.benchmarks import honesty_moves, honesty_prediction, image_quality, open_igt_link, qualisys_stream
 from scripts.output import read_json
-from scripts.results import formats
+from scripts.results import formats, write_back
 
 
 def test_moves_are_whole_and_shown():
@@ -57,3 +57,31 @@ def test_image_quality_has_no_false_alarm_and_finds_every_fault():
         assert all(run["events"] == [] for run in runs.pop(name)), name
     for name, every in runs.items():
         assert all(run["seconds"] <= image_quality.IN_TIME[name] and run["false"] == 0 for run in every), name
+
+
+def test_rigs_go_back_into_the_files_of_every_tool():
+    result = read_json(write_back.RESULT)
+    names = {row["format"] for row in result["files"]}
+    assert names == set(write_back.READERS) >= {"vicon", "motive", "qualisys"}
+    assert {row["format"] for row in result["files"] if row["real"]} >= names - {"vicon", "caliscope-config"}
+    for row in result["files"]:
+        assert row["recalibrated"] == row["cameras"] and row["moved_px"] > 0.5 and row["numbers"] > 0, row
+        allowed = row["loss_px"] + write_back.ROUNDING
+        assert row["loss_px"] <= row["limit_px"] and max(row["own_reader_px"], row["reader_px"]) <= allowed, row
+    damaged = result["damaged"]
+    assert damaged["refused"] >= 300 and damaged["faults"] == [] and damaged["sound_and_right"] > 0
+    assert set(damaged["refused_by_format"]) == names
+    assert write_back.table(result) in write_back.PAGE.read_text("utf-8")
+
+
+def test_qtm_gives_the_events_of_a_file_and_a_client_every_pose():
+    stream = read_json(qualisys_stream.RESULT)
+    assert (stream["cameras"], stream["rate_hz"], stream["events_that_differ"], stream["rigs_differ_in"]) == (
+        10,
+        100,
+        0,
+        None,
+    )
+    assert stream["frames_lost"] and stream["unreadable_packets"] and stream["reconnections"] >= qualisys_stream.BREAKS
+    assert set(stream["moved"]) == {stream["turned"]} and stream["snapshots"] >= 1900
+    assert abs(read_json(open_igt_link.RESULT)["published"]["poses_a_second"] - 60) < 0.1

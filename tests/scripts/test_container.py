@@ -5,6 +5,8 @@ import re
 import runpy
 import shlex
 import socket
+import subprocess
+import sys
 from pathlib import Path
 
 import numba
@@ -95,3 +97,12 @@ def test_health_is_whether_the_page_answers(address):
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     assert not answers(port)
+
+
+@pytest.mark.slow
+def test_the_steps_of_the_image_run_and_its_page_answers():
+    """Copying, building, installing, compiling, starting, health: all but the base image and pip's downloads."""
+    done = subprocess.run([sys.executable, FOLDER / "steps.py"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "RUN imgcal warmup" in done.stdout and ": healthy\n" in done.stdout
+    assert done.stdout.endswith("all steps run, and the page answers\n")

@@ -2,13 +2,18 @@
 
 import os
 import runpy
+import shutil
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+from imgcal.io import model_file
+from imgcal.networks import load_measurer, load_program, save_onnx
 from imgcal.watch.wire import exposure_from_pixels
 from tests.imgcal.watch.test_poses import record
 
@@ -55,3 +60,45 @@ def test_the_bridge_to_ros_gives_poses_in_metres():
     assert 2 * turn[:3] / np.linalg.norm(turn[:3]) * np.arccos(turn[3]) == pytest.approx([0.1, -0.2, 0.3])
     assert np.diag(covariance.reshape(6, 6)) == pytest.approx([1e-8] * 3 + [1e-6] * 3)
     assert bridge["pose_values"](record(2, "no_object").to_json()) is None
+
+
+def openvino_and_compiler():
+    """The folder of OpenVINO's wheel, which has headers, and a compiler; skips where one is missing."""
+    found = find_spec("openvino")
+    if found is None:
+        pytest.skip("no openvino (extra dev): nobody has the headers of a runtime of ONNX")
+    compiler = next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
+    if compiler is None:
+        pytest.skip("no C++ compiler")
+    return Path(found.origin).parent, compiler
+
+
+def test_the_example_in_cpp_measures_as_pytorch_does(tmp_path):
+    folder, compiler = openvino_and_compiler()
+    program = tmp_path / "run_onnx"
+    (library,) = (folder / "libs").glob("libopenvino.so.*")
+    source = ROOT / "scripts" / "examples" / "run_onnx.cpp"
+    build = [compiler, "-std=c++17", f"-I{folder / 'include'}", source, library, f"-Wl,-rpath,{folder / 'libs'}"]
+    subprocess.run([*build, "-o", program], check=True)
+    save_onnx(load_program(model_file("measurer-cnn"), 1, 8), tmp_path / "measurer.onnx")
+    python, measurer = runpy.run_path(str(source.with_suffix(".py"))), load_measurer(model_file("measurer-cnn")).network
+    random = np.random.default_rng(0)
+    v, u = np.mgrid[0:24, 0:24]
+    for radius in (1.5, 3.0):
+        true = 11.5 + random.uniform(-2, 2, 2)
+        patch = (
+            20 + 180 / (1 + np.exp(3 * (np.hypot(u - true[0], v - true[1]) - radius))) + random.normal(0, 2, u.shape)
+        )
+        given = " ".join(f"{value:.9g}" for value in [radius, *patch.astype(np.float32).ravel()])
+        asked = [program, tmp_path / "measurer.onnx"]
+        done = subprocess.run(asked, input=given, capture_output=True, text=True, check=True)
+        normal = torch.from_numpy(python["normalized"](patch.astype(np.float32)[None].astype(float)))
+        with torch.no_grad():
+            found = measurer(normal, torch.tensor([radius]))
+        expected = [*found.offset[0].tolist(), float(found.log_sigma[0].exp()), float(found.valid[0].sigmoid())]
+        assert [float(word) for word in done.stdout.split()] == pytest.approx(expected, abs=1e-4)
+        assert np.hypot(*(np.array(expected[:2]) + 11.5 - true)) < 0.3
+    wrong = subprocess.run(
+        [program, tmp_path / "measurer.onnx"], input="3 1 2", capture_output=True, text=True, check=False
+    )
+    assert wrong.returncode == 2 and "expected a radius and 576 grey values" in wrong.stderr

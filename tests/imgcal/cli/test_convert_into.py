@@ -1,10 +1,13 @@
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
+from imgcal import calibrate
 from imgcal.cli.main import main
-from imgcal.io import load_rig, save_rig
+from imgcal.io import load_object, load_rig, save_rig
+from imgcal.synthesis import PhysicalDrift, simulate_volume, true_detections
 from tests.imgcal.formats import originals
 from tests.imgcal.formats.rigs import brown, rig_of
 
@@ -64,3 +67,30 @@ def test_what_is_refused(
     assert (code, error.count("\n")) == (2, 1), error
     assert said in error
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_calibration_that_holds_the_distortion_goes_back_where_another_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    original, held, free = tmp_path / "original.xcp", tmp_path / "held.yaml", tmp_path / "free.yaml"
+    lens = brown(-0.05, 0.02)
+    original.write_bytes(originals.vicon(rig_of(lens, lens, lens, lens, names=("1", "2", "3", "4"))))
+    assert run(capsys, original, "--hold-distortion", "--out", held)[0] == 0
+    assert run(capsys, original, "--out", free)[0] == 0
+    outcomes = []
+    for path in (held, free):
+        factory = load_rig(path)
+        generator = torch.Generator().manual_seed(0)
+        truth = simulate_volume(
+            factory, load_object("asymmetric8"), 12, generator, PhysicalDrift(0.1, 1.0, 1e-3, 0.5, 0)
+        )
+        seen = true_detections(truth)
+        noise = 0.2 * torch.randn(seen.uv.shape, generator=generator, dtype=torch.float64).numpy()
+        found = calibrate(replace(seen, uv=seen.uv + noise), factory, load_object("asymmetric8")).rig
+        save_rig(found, path)
+        outcomes.append(run(capsys, path, "--into", original, "--out", tmp_path / f"{path.stem}.xcp"))
+    assert (outcomes[0][0], outcomes[1][0]) == (0, 3)
+    assert "or convert the file with --hold-distortion and calibrate again" in outcomes[1][2]
+    for more in (["--into", original, "--out", tmp_path / "x.xcp"], ["--to", "kalibr", "--out", tmp_path / "x.yaml"]):
+        code, _, err = run(capsys, held, "--hold-distortion", *more)
+        assert code == 2 and "--hold-distortion: only for a rig file of ours" in err

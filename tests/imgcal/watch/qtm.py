@@ -3,6 +3,7 @@
 import socket
 import struct
 import threading
+import time
 
 import numpy as np
 
@@ -35,10 +36,14 @@ def general(serials, sizes, fov=None):
 
 
 class Qtm:
-    """Gives each connection the next of several streams of bytes, the last one again and again; then closes it."""
+    """Gives each connection the next of several streams, the last one again and again; then closes it.
+
+    A stream is bytes, which are sent at once, or pairs of seconds since the beginning and bytes that are sent then.
+    """
 
     def __init__(self, parameters, *streams, answer=None):
         self.parameters, self.streams, self.answer = parameters, streams, answer
+        self.began = None
         self.commands, self.connections = [], 0
         self._listening = socket.create_server(("127.0.0.1", 0))
         self.address = f"qtm://127.0.0.1:{self._listening.getsockname()[1]}"
@@ -76,5 +81,8 @@ class Qtm:
             return
         xml = packet(2, self.parameters.encode() + b"\0")
         connection.sendall(packet(1, b"Version set to 1.20\0") + xml + packet(6, b"\x03"))
-        for at in range(0, len(stream), 7001):  # wherever a packet ends
-            connection.sendall(stream[at : at + 7001])
+        self.began = time.monotonic() if self.began is None else self.began
+        for seconds, part in [(0.0, stream)] if isinstance(stream, bytes) else stream:
+            time.sleep(max(0.0, self.began + seconds - time.monotonic()))
+            for at in range(0, len(part), 7001):  # wherever a packet ends
+                connection.sendall(part[at : at + 7001])

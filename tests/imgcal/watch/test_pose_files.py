@@ -41,7 +41,7 @@ def test_files_that_are_none_of_ours_are_left_alone(tmp_path):
         with pytest.raises(InputError, match=r"found .* expected a new file or"):
             PoseFile(tmp_path / name)
         assert (tmp_path / name).read_text() == content
-    with pytest.raises(InputError, match=r"ends in \.csv or \.jsonl"):
+    with pytest.raises(InputError, match=r"ends in \.csv, \.jsonl, \.c3d or \.trc"):
         PoseFile(tmp_path / "poses.txt")
     with pytest.raises(InputError, match="cannot be written"):
         PoseFile(tmp_path / "nowhere" / "poses.csv")

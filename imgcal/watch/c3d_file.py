@@ -1,0 +1,154 @@
+"""C3D, the file of markers in 3D that biomechanics exchanges: written frame by frame, readable after a kill.
+
+Source: The C3D File Format, user guide, https://www.c3d.org: floating-point points, Intel byte order.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+BLOCK = 512  # bytes
+PARAMETERS_AT = 2  # block of the parameters, counted from 1
+INTEL = 84
+MOST_FRAMES = 65_534  # that its header can count: one more means to some readers that it does not say
+MOST_LABELS = 255  # in one parameter; further ones stand in LABELS2, LABELS3, ...
+MOST_BYTE, MASKED_CAMERAS = 255, 7
+INVALID = -1.0
+CHARACTER, INTEGER, REAL = -1, 2, 4
+
+
+class C3DFile:
+    """Points in millimetres; the fourth number of each says how surely it is known, and which cameras saw it.
+
+    The counts of frames in the file are brought up to date after each call of `append`.
+    """
+
+    def __init__(self, path: Path, labels: Sequence[str], rate: float, reach: float) -> None:
+        """Make the file.
+
+        Args:
+            path: must not exist.
+            labels: of the points.
+            rate: frames a second.
+            reach: mm, that coordinates do not exceed: what a file with integers made from this one can say.
+
+        Raises:
+            OSError: it cannot be made.
+        """
+        self.frames, self._scale = 0, max(reach, 1.0) / 32_000
+        self._points = len(labels)
+        parameters, self._counts = _parameters(labels, rate, self._scale)
+        blocks = -(-len(parameters) // BLOCK)
+        self._data_at = PARAMETERS_AT + blocks
+        self._set_in = self._counts["POINT:DATA_START"]
+        content = bytearray(BLOCK) + parameters.ljust(blocks * BLOCK, b"\0")
+        content[BLOCK : BLOCK + 4] = bytes((1, 80, blocks, INTEL))
+        struct.pack_into("<BB", content, 0, PARAMETERS_AT, 80)
+        struct.pack_into("<HHHHH", content, 2, self._points, 0, 1, 0, 0)
+        struct.pack_into("<fHHf", content, 12, -self._scale, self._data_at, 0, rate)
+        struct.pack_into("<H", content, BLOCK + self._set_in, self._data_at)
+        flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
+        self._file = os.fdopen(os.open(path, flags, 0o644), "r+b")
+        self._file.write(content)
+        self._file.flush()
+
+    def append(self, points: NDArray[np.float64], error: NDArray[np.float64], cameras: NDArray[np.int64]) -> None:
+        """Add frames.
+
+        Args:
+            points: (F, N, 3) mm; NaN = not seen.
+            error: (F, N) mm that a point is expected to be wrong.
+            cameras: (F, N) bits of the first seven cameras that saw it.
+
+        Raises:
+            OSError: they cannot be written, or there would be more than the format can count.
+        """
+        if self.frames + len(points) > MOST_FRAMES:
+            raise OSError(f"a C3D file holds no more than {MOST_FRAMES:,} frames")
+        valid = np.isfinite(points).all(-1)
+        steps = np.ceil(np.where(valid, error, 0) / self._scale).clip(1, MOST_BYTE)  # 0 means: not measured
+        rows = np.empty((*points.shape[:2], 4), "<f4")
+        rows[..., :3] = np.where(valid[..., None], points, 0.0)
+        rows[..., 3] = np.where(valid, 256 * (cameras & (2**MASKED_CAMERAS - 1)) + steps, INVALID)
+        self._file.seek((self._data_at - 1) * BLOCK + self.frames * self._points * 16)
+        self._file.write(rows.tobytes())
+        self._file.flush()  # the frames are there before they are counted
+        self.frames += len(points)
+        self._file.seek(8)
+        self._file.write(struct.pack("<H", self.frames))
+        for name in ("POINT:FRAMES", "TRIAL:ACTUAL_END_FIELD"):
+            self._file.seek(BLOCK + self._counts[name])
+            self._file.write(struct.pack("<H", self.frames))
+        self._file.flush()
+
+    def close(self) -> None:
+        """Fill the last block, and close."""
+        if not self._file.closed:
+            self._file.seek(0, os.SEEK_END)
+            self._file.write(b"\0" * (-self._file.tell() % BLOCK))
+            self._file.close()
+
+
+def _parameters(labels: Sequence[str], rate: float, scale: float) -> tuple[bytes, dict[str, int]]:
+    """The section of parameters, and where in it the values of each begin."""
+    groups: dict[str, dict[str, tuple[int, tuple[int, ...], bytes]]] = {
+        "POINT": {
+            "USED": _whole(len(labels)),
+            "SCALE": _real(-scale),
+            "RATE": _real(rate),
+            "DATA_START": _whole(0),
+            "FRAMES": _whole(0),
+            "UNITS": _text("mm"),
+            **_labels("LABELS", labels),
+            **_labels("DESCRIPTIONS", labels),  # some readers want them
+        },
+        "ANALOG": {"USED": _whole(0), "GEN_SCALE": _real(1.0), "RATE": _real(0.0)},
+        "TRIAL": {"ACTUAL_START_FIELD": _whole(1, 0), "ACTUAL_END_FIELD": _whole(0, 0), "CAMERA_RATE": _real(rate)},
+        "MANUFACTURER": {"COMPANY": _text("imgcal"), "SOFTWARE": _text("imgcal")},
+    }
+    section, places, last = bytearray(4), {}, 0
+    for number, (group, parameters) in enumerate(groups.items(), start=1):
+        section += struct.pack("bb", len(group), -number) + group.encode()
+        last = len(section)
+        section += struct.pack("<HB", 3, 0)  # the way to the next entry, no description
+        for name, (kind, sizes, values) in parameters.items():
+            section += struct.pack("bb", len(name), number) + name.encode()
+            last = len(section)
+            body = struct.pack("bB", kind, len(sizes)) + bytes(sizes)
+            places[f"{group}:{name}"] = last + 2 + len(body)
+            section += struct.pack("<H", 2 + len(body) + len(values) + 1) + body + values + b"\0"
+    struct.pack_into("<H", section, last, 0)  # there is no next one
+    return bytes(section), places
+
+
+def _whole(*values: int) -> tuple[int, tuple[int, ...], bytes]:
+    """Integers of 16 bits."""
+    sizes = () if len(values) == 1 else (len(values),)
+    return INTEGER, sizes, struct.pack(f"<{len(values)}H", *values)
+
+
+def _real(value: float) -> tuple[int, tuple[int, ...], bytes]:
+    return REAL, (), struct.pack("<f", value)
+
+
+def _text(value: str) -> tuple[int, tuple[int, ...], bytes]:
+    return CHARACTER, (len(value),), value.encode("ascii", "replace")
+
+
+def _texts(values: Sequence[str]) -> tuple[int, tuple[int, ...], bytes]:
+    """Texts of one length, filled up with blanks."""
+    width = min(max(map(len, values)), MOST_LABELS)
+    cells = [value.encode("ascii", "replace")[:width].ljust(width) for value in values]
+    return CHARACTER, (width, len(values)), b"".join(cells)
+
+
+def _labels(name: str, values: Sequence[str]) -> dict[str, tuple[int, tuple[int, ...], bytes]]:
+    """As many parameters as it takes: NAME, NAME2, ..."""
+    parts = [values[at : at + MOST_LABELS] for at in range(0, len(values), MOST_LABELS)]
+    return {f"{name}{number if number > 1 else ''}": _texts(part) for number, part in enumerate(parts, start=1)}

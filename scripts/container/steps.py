@@ -1,0 +1,174 @@
+"""Run the Dockerfile's steps where nothing builds images: `python scripts/container/steps.py`.
+
+In a folder that stands for the image's root: what .dockerignore lets through is copied, the package is built and
+installed, loops are compiled as the user without rights (where that can be), the image's command is started, and its
+health check is asked until it says yes. Other packages are those of this environment: what pip would bring from its
+index, and the base image itself, are not tried.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import shutil
+import socket
+import subprocess
+import sys
+import sysconfig
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+TOP = Path(__file__).resolve().parents[2]
+DOCKERFILE = Path(__file__).with_name("Dockerfile")
+ROOTS = re.compile(r"(?<![\w./-])/(opt|var|data|source)\b")  # folders of the image
+UID = 10001
+HEALTHY_WITHIN = 180.0  # s
+
+
+def main() -> None:
+    """Run every step; a failure ends with its exit code."""
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder).chmod(0o755)
+        image = Image(Path(folder))
+        for keyword, rest in instructions(DOCKERFILE.read_text()):
+            began = time.monotonic()
+            image.step(keyword, rest)
+            print(f"{time.monotonic() - began:6.1f} s  {keyword} {rest[:100]}", flush=True)
+        image.start()
+    print("all steps run, and the page answers")
+
+
+def instructions(text: str) -> Iterator[tuple[str, str]]:
+    """Keyword and rest of every instruction."""
+    for line in re.sub(r"\\\n\s*", "", text).splitlines():
+        if line.strip() and not line.startswith("#"):
+            keyword, rest = line.split(maxsplit=1)
+            yield keyword, rest
+
+
+@dataclass
+class Image:
+    """A folder that stands for the root of an image."""
+
+    root: Path
+    environment: dict[str, str] = field(default_factory=lambda: {"PATH": os.environ["PATH"], "LANG": "C.UTF-8"})
+    values: dict[str, str] = field(default_factory=dict)  # of ARG
+    user: int | None = None
+    start_with: dict[str, list[str]] = field(default_factory=dict)  # ENTRYPOINT, CMD, HEALTHCHECK
+
+    def step(self, keyword: str, rest: str) -> None:
+        """Do what an instruction says."""
+        match keyword:
+            case "ARG":
+                name, _, value = rest.partition("=")
+                self.values[name] = value
+            case "ENV":
+                for pair in shlex.split(self._with_values(rest)):
+                    name, _, value = pair.partition("=")
+                    self.environment[name] = self._inside(value)
+            case "COPY" if not rest.startswith("--from"):
+                *sources, target = rest.split()
+                for source in sources:
+                    self._copy(source, self.root / target.lstrip("/"), target.endswith("/"))
+            case "RUN":
+                self._run(self._with_values(rest))
+            case "USER":
+                self.user = UID if self._may_run_as(UID) else None
+            case "ENTRYPOINT" | "CMD" | "HEALTHCHECK":
+                self.start_with[keyword] = json.loads(rest[rest.index("[") :])
+
+    def start(self) -> None:
+        """Start the image's command, and ask its health check until it says yes.
+
+        Raises:
+            SystemExit: it never does.
+        """
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            port = str(free.getsockname()[1])
+        command = [part.replace("8765", port) for part in (*self.start_with["ENTRYPOINT"], *self.start_with["CMD"])]
+        check = [self._inside(part).replace("8765", port) for part in self.start_with["HEALTHCHECK"]]
+        began = time.monotonic()
+        with subprocess.Popen(self._found(command), cwd=self.root / "data", **self._as_user()) as process:
+            try:
+                while subprocess.run(self._found(check), check=False, **self._as_user()).returncode:
+                    if process.poll() is not None or time.monotonic() - began > HEALTHY_WITHIN:
+                        raise SystemExit(f"{shlex.join(command)}: never healthy, exit code {process.poll()}")
+                    time.sleep(0.5)
+                print(f"{time.monotonic() - began:6.1f} s  {shlex.join(command)}: healthy", flush=True)
+                process.terminate()
+                process.wait(timeout=30)
+            finally:
+                process.kill()
+
+    def _copy(self, source: str, target: Path, is_folder: bool) -> None:
+        """Copy what .dockerignore sends to the builder."""
+        sent = [line[1:] for line in (TOP / ".dockerignore").read_text().splitlines() if line.startswith("!")]
+        if not any(source == one or source.startswith(f"{one}/") for one in sent):
+            raise SystemExit(f"COPY {source}: .dockerignore keeps it from the builder")
+        if (TOP / source).is_dir():
+            shutil.copytree(TOP / source, target, ignore=shutil.ignore_patterns("__pycache__"))
+            return
+        target = target / Path(source).name if is_folder else target
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(TOP / source, target)
+
+    def _run(self, command: str) -> None:
+        """Run a command in the image; installing is done with the packages of this environment."""
+        python = self.root / "opt" / "imgcal" / "bin" / "python"
+        if "-m venv" in command:
+            subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(python.parents[1])], check=True)
+            (packages,) = python.parents[1].glob("lib/python*/site-packages")
+            (packages / "environment.pth").write_text(sysconfig.get_path("purelib") + "\n")
+        elif "pip install" in command:
+            if "/source" in command:
+                install = ["-m", "pip", "--python", str(python), "install", "--quiet", "--no-deps"]
+                subprocess.run([sys.executable, *install, str(self.root / "source")], check=True)
+        else:
+            command = re.sub(r"useradd [^&]*&& ", "", command)
+            owner = f"-o {UID} -g {UID} " if os.geteuid() == 0 else ""
+            asked = self._inside(command.replace("-o imgcal -g imgcal ", owner))
+            subprocess.run(["sh", "-c", asked], check=True, **self._as_user())
+
+    def _may_run_as(self, user: int) -> bool:
+        """Tell whether a user without rights can be had, and can read this Python."""
+        if os.geteuid() != 0:
+            return False
+        python = [str(self.root / "opt" / "imgcal" / "bin" / "python"), "-c", "import torch"]
+        try:
+            done = subprocess.run(python, user=user, group=user, extra_groups=[], capture_output=True, check=False)
+        except OSError:
+            done = None
+        if done is None or done.returncode:
+            print("        note: other users cannot read this Python, so that all runs as root", flush=True)
+            return False
+        return True
+
+    def _as_user(self) -> dict[str, Any]:
+        environment = self.environment | {"HOME": str(self.root / "data")}
+        if self.user is None:
+            return {"env": environment}
+        return {"env": environment, "user": self.user, "group": self.user, "extra_groups": []}
+
+    def _found(self, command: list[str]) -> list[str]:
+        """The command with its program in the image's PATH."""
+        program = shutil.which(command[0], path=self.environment["PATH"])
+        return [program or command[0], *command[1:]]
+
+    def _with_values(self, text: str) -> str:
+        """Put ARG and ENV in: $NAME."""
+        known = self.values | self.environment
+        return re.sub(r"\$(\w+)", lambda match: known.get(match[1], match[0]), text)
+
+    def _inside(self, text: str) -> str:
+        """Paths of the image as they are in the folder."""
+        return ROOTS.sub(lambda match: f"{self.root}/{match[1]}", text)
+
+
+if __name__ == "__main__":
+    main()

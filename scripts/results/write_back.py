@@ -1,0 +1,367 @@
+"""A recalibrated rig goes back into the user's own file: `python -m scripts.results.write_back`.
+
+Originals are the real files of IMGCAL_FORMATS, and one written by hand for the formats of which there is none. Each is
+read and its rig drifts. A simulated capture of that is calibrated, and the rig goes back into the file; where the
+cameras see nothing together, the drift itself is taken for the result. The new file is read by imgcal and by readers
+that share nothing with it (`plain_readers.py`), and compared with the original byte by byte. Then originals are damaged
+until 300 of them have been refused. Writes docs/results/write_back.json and the table of docs/formats.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+import torch
+
+from imgcal import RigPrior, calibrate, load_object, load_rig, save_rig
+from imgcal.errors import InputError, RefusedError
+from imgcal.formats import (
+    ForeignRig,
+    Lens,
+    Updated,
+    converted,
+    from_camera_rig,
+    in_millimetres,
+    known_points,
+    millimetres,
+    read_foreign_rig,
+    to_camera_rig,
+    with_image_sizes,
+    worst_difference,
+    written_back,
+)
+from imgcal.formats.limits import HELD_DISTORTION
+from imgcal.synthesis import PhysicalDrift, simulate_volume, true_detections
+from imgcal.types import CameraRig
+from scripts.fuzz.cases import Case
+from scripts.fuzz.mutations import mutated
+from scripts.fuzz.verdict import attempt
+from scripts.output import RESULTS, ROOT, command, fill, markdown, read_json, surroundings, write_json
+from scripts.results.plain_readers import READERS
+from tests.imgcal.formats import originals, rigs
+
+RESULT, PAGE = RESULTS / "write_back.json", ROOT / "docs" / "formats.md"
+NUMBER = re.compile(r"(?<![\w.])[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
+ROUNDING = 1e-3  # px that the digits of a file may cost beside the loss of its lens model
+LIMIT, ALLOWED = 0.05, 0.5  # px that a lens may be off: as imgcal has it, and where a user allows more
+CALIBRATED, CALIBRATED_HELD, DRIFTED = "calibration", "calibration, distortion held", "drift"
+DAMAGED = 300
+SNAPSHOTS, NOISE = 40, 0.05  # of the simulated capture; px
+ASSUMED_SIZE = {"opencv-stereo": (1280, 720), "easymocap": (1920, 1080), "colmap-rig-config": (2048, 1088)}
+
+
+@dataclass(frozen=True)
+class Original:
+    """A calibration that a user has."""
+
+    name: str  # of its format
+    path: Path
+    unit: str | None  # where the file does not say
+    is_real: bool
+
+    @property
+    def files(self) -> list[Path]:
+        """All that belongs to it."""
+        return sorted(self.path.iterdir()) if self.path.is_dir() else [self.path]
+
+    @property
+    def label(self) -> str:
+        """For tables."""
+        return self.path.name if self.is_real else "written by hand"
+
+
+def main() -> None:
+    """Measure, and rewrite the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--damaged", type=int, default=DAMAGED, help="damaged originals that have to be refused")
+    given = parser.parse_args()
+    result: dict[str, Any] = {**surroundings(), "snapshots": SNAPSHOTS, "noise_px": NOISE, "files": []}
+    with tempfile.TemporaryDirectory() as place:
+        cases = list(every_original(Path(place) / "originals"))
+        recalibrated = []
+        for number, one in enumerate(cases):
+            folder = Path(place) / str(number)
+            folder.mkdir()
+            row = write_and_compare(one, folder)
+            recalibrated.append((one, folder / "rig.yaml"))
+            result["files"].append(row)
+            print(json.dumps(row), flush=True)
+        result["damaged"] = damage(recalibrated, given.damaged, Path(place) / "case")
+        print(result["damaged"])
+    write_json(RESULT, result)
+    fill(PAGE, {"written back": table(read_json(RESULT))})
+
+
+def every_original(folder: Path) -> Iterator[Original]:
+    """The real files, and one written by hand for the formats that have none."""
+    found = set()
+    for expected in sorted(Path(os.environ["IMGCAL_FORMATS"]).rglob("*.expected.json")):
+        path = expected.with_name(expected.name.removesuffix(".expected.json"))
+        rig = read_foreign_rig(path)
+        note = json.loads(expected.read_text("utf-8"))["unit_note"]
+        unit = rig.unit or ("mm" if "mm" in note.split(";")[0] else "m")
+        found.add(rig.format)
+        yield Original(rig.format, path, None if rig.unit else unit, True)
+    folder.mkdir()
+    for name in sorted(READERS.keys() - found):
+        content = by_hand(name)
+        path = folder / f"{name}{'.xcp' if name == 'vicon' else '.toml'}"
+        path.write_bytes(content)
+        yield Original(name, path, None, False)
+
+
+def by_hand(name: str) -> bytes:
+    """A file of a format: four cameras that look at one place."""
+    lens = Lens((1010.5, 1010.5), (641.3, 478.9), (-0.05, 0.02, 1e-4, -2e-4, 0.003))
+    rig = rigs.rig_of(*[lens] * 4, names=("0", "1", "2", "3"))
+    if name == "vicon":
+        return originals.vicon(rig)
+    return next(iter(converted(rig, name, "rig").files.values()))
+
+
+def write_and_compare(one: Original, folder: Path) -> dict[str, Any]:
+    """Drift, calibrate, write back, read again: a row of the table; leaves the recalibrated rig in `rig.yaml`."""
+    old = read_foreign_rig(one.path, one.name)
+    known = in_millimetres(old, str(one.path), one.unit)
+    known = with_image_sizes(known, str(one.path), sizes_of(one, known))
+    rig = to_camera_rig(converted_lenses(known), "rig")
+    made, how, limit = recalibrate_into(one, rig, folder)
+    ours = from_camera_rig(load_rig(folder / "rig.yaml"))
+    out = folder / "new"
+    if one.path.is_dir():
+        out.mkdir()
+    for name, content in made.files.items():
+        (out / name if one.path.is_dir() else out).write_bytes(content)
+    loss = made.loss.worst if made.loss is not None else 0.0
+    own = worst_difference(ours, again(one, out, ours))[0]
+    return {
+        "format": one.name,
+        "file": one.label,
+        "real": one.is_real,
+        "cameras": len(old.cameras),
+        "recalibrated": len(made.changed),
+        "how": how,
+        "moved_px": moved(known, ours),
+        "limit_px": limit,
+        "loss_px": loss,
+        "own_reader_px": own,
+        "reader": READERS[one.name][0],
+        "reader_px": by_plain_reader(one, out, old, ours),
+        "numbers": compare_bytes(one, out),
+    }
+
+
+def recalibrate_into(one: Original, rig: CameraRig, folder: Path) -> tuple[Updated, str, float]:
+    """Do what a user does until the file's lens model can say the new rig.
+
+    He calibrates and writes back; where the lens is refused, he calibrates with the distortion held, and at last allows
+    a larger loss.
+
+    Returns:
+        The new files, where their rig comes from, and the limit. The rig is in `rig.yaml`.
+    """
+    held = replace(rig, prior=replace(rig.prior or RigPrior(), distortion=HELD_DISTORTION))
+    refused = ""
+    for how, before, limit in (
+        (CALIBRATED, rig, LIMIT),
+        (CALIBRATED_HELD, held, LIMIT),
+        (CALIBRATED_HELD, held, ALLOWED),
+    ):
+        try:
+            save_rig(recalibrate(before), folder / "rig.yaml")
+            return put_back(one, folder, limit), how, limit
+        except (InputError, RefusedError) as error:
+            refused = str(error)
+    save_rig(drifted(rig), folder / "rig.yaml")
+    return put_back(one, folder, LIMIT), f"{DRIFTED} ({refused})", LIMIT
+
+
+def put_back(one: Original, folder: Path, limit: float) -> Updated:
+    """Write `rig.yaml` into the original.
+
+    Raises:
+        RefusedError: the lens of the file is off by more than the limit.
+    """
+    ours = from_camera_rig(load_rig(folder / "rig.yaml"))
+    return written_back(ours, [one.path], datetime.now(), name=one.name, unit=one.unit, limit=limit)
+
+
+def converted_lenses(rig: ForeignRig) -> ForeignRig:
+    """The rig with lenses that a rig file of ours can say, as `imgcal convert` makes it."""
+    from imgcal.formats.conversion import NATIVE, held_by
+
+    return held_by(rig, NATIVE, "imgcal rig").rig
+
+
+def sizes_of(one: Original, rig: ForeignRig) -> dict[str, tuple[int, int]]:
+    """Image sizes where the file does not have them."""
+    return {"": ASSUMED_SIZE[one.name]} if any(camera.image_size is None for camera in rig.cameras) else {}
+
+
+def recalibrate(rig: CameraRig) -> CameraRig:
+    """Let a rig drift, and calibrate a simulated capture of it.
+
+    Raises:
+        InputError, RefusedError: the cameras see nothing together that would decide, or are but one.
+    """
+    generator = torch.Generator().manual_seed(0)
+    obj = load_object("asymmetric8")
+    truth = simulate_volume(rig, obj, SNAPSHOTS, generator, drift_of(rig))
+    seen = true_detections(truth)
+    noise = NOISE * torch.randn(seen.uv.shape, generator=generator, dtype=torch.float64).numpy()
+    return calibrate(replace(seen, uv=seen.uv + noise), rig, obj).rig
+
+
+def drift_of(rig: CameraRig) -> PhysicalDrift:
+    """How far cameras wander: a tenth of a degree, a thousandth of the rig's size and of the focal length."""
+    centres = rig.cam_from_rig.inverse().translation
+    size = float((centres - centres.mean(0)).norm(dim=-1).max()) or 1000.0
+    return PhysicalDrift(0.1, 1e-3 * size, 1e-3, 0.5, distortion=0.0)
+
+
+def drifted(rig: CameraRig) -> CameraRig:
+    """The rig after such a drift, as if it had been found without an error."""
+    return drift_of(rig).apply(rig, torch.Generator().manual_seed(0))
+
+
+def again(one: Original, out: Path, ours: ForeignRig) -> ForeignRig:
+    """What imgcal reads from the new file, in millimetres."""
+    back = in_millimetres(read_foreign_rig(out, one.name), str(out), one.unit)
+    sizes = {camera.name: camera.image_size for camera in ours.cameras}
+    return replace(back, cameras=tuple(replace(camera, image_size=sizes[camera.name]) for camera in back.cameras))
+
+
+def moved(before: ForeignRig, after: ForeignRig) -> float:
+    """How far the images of known points have moved, so that something had to be written: px."""
+    return worst_difference(before, after)[0]
+
+
+def by_plain_reader(one: Original, out: Path, old: ForeignRig, ours: ForeignRig) -> float:
+    """The worst distance between where an independent reader and the rig project known points: px."""
+    alone = len(old.cameras) == 1  # and has no pose
+    placed = ours.seen_from_first(old.root or 0) if alone or old.root is not None else ours
+    scale = 1.0 / millimetres(one.unit or old.unit or "mm")
+    projections = READERS[one.name][1](out)
+    worst = 0.0
+    for camera, points in zip(placed.cameras, known_points(placed), strict=True):
+        away = projections[camera.name](points * scale) - camera.project(points)
+        worst = max(worst, float(np.linalg.norm(away, axis=-1).max()))
+    return worst
+
+
+def compare_bytes(one: Original, out: Path) -> int:
+    """Count the numbers that have changed.
+
+    Raises:
+        InputError: something else has.
+    """
+    count = 0
+    for file in one.files:
+        before, after = file.read_bytes(), (out / file.name if one.path.is_dir() else out).read_bytes()
+        if file.suffix == ".bin":
+            if len(before) != len(after):
+                raise InputError(f"{file}: found {len(after)} bytes, expected {len(before)}")
+            count += different_doubles(before, after)
+            continue
+        texts = [content.decode("utf-16" if content[:2] == b"\xff\xfe" else "utf-8") for content in (before, after)]
+        if NUMBER.sub("#", texts[0]) != NUMBER.sub("#", texts[1]):
+            raise InputError(f"{file}: found other changes than numbers")
+        count += sum(a != b for a, b in zip(*map(NUMBER.findall, texts), strict=True))
+    return count
+
+
+def different_doubles(before: bytes, after: bytes) -> int:
+    """Runs of bytes that differ, each within the eight of a number."""
+    places = np.flatnonzero(np.frombuffer(before, np.uint8) != np.frombuffer(after, np.uint8))
+    count, end = 0, -1
+    for place in places:
+        if place >= end:
+            count, end = count + 1, place + 8
+    return count
+
+
+def damage(recalibrated: Sequence[tuple[Original, Path]], enough: int, folder: Path) -> dict[str, Any]:
+    """Damage originals until enough of them are refused, and judge how the command ends.
+
+    What is still sound after the damage must be written, and be right.
+    """
+    counts = {"refused": 0, "lens_refused": 0, "sound_and_right": 0}
+    faults: list[str] = []
+    kinds: dict[str, int] = {}
+    number = 0
+    while counts["refused"] < enough:
+        one, rig = recalibrated[number % len(recalibrated)]
+        random = Random(f"write back {number}")
+        number += 1
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        place = folder / one.path.name
+        (shutil.copytree if one.path.is_dir() else shutil.copyfile)(one.path, place)
+        file = random.choice([place / path.name for path in one.files] if place.is_dir() else [place])
+        file.chmod(0o644)
+        file.write_bytes(mutated(file.read_bytes(), file.suffix, random))
+        shutil.copyfile(rig, folder / "rig.yaml")
+        unit = [] if one.unit is None else ["--out-unit", one.unit]
+        arguments = ["convert", str(folder / "rig.yaml"), "--into", str(place), "--to", one.name]
+        case = Case(folder, [*arguments, "--out", str(folder / "out"), *unit], one.name)
+        code, fault = attempt(case)
+        if not fault and code == 0:
+            fault = wrong(one, folder)
+        if fault:
+            faults.append(f"{number - 1} {one.label}: {fault}")
+        counts[("sound_and_right", "", "refused", "lens_refused")[code if isinstance(code, int) else 1]] += 1
+        if code == 2:
+            kinds[one.name] = kinds.get(one.name, 0) + 1
+    return {"tried": number, **counts, "faults": faults, "refused_by_format": kinds}
+
+
+def wrong(one: Original, folder: Path) -> str:
+    """Tell what is wrong with a file that was written from a damaged original, or nothing."""
+    ours = from_camera_rig(load_rig(folder / "rig.yaml"))
+    try:
+        back = again(one, folder / "out", ours)
+        off = worst_difference(ours, back)[0]
+    except (InputError, KeyError, ValueError) as error:
+        return f"cannot be read: {error}"
+    return "" if off <= 0.05 + ROUNDING else f"off by {off:.3g} px"
+
+
+def table(result: dict[str, Any]) -> str:
+    """What was compared, file by file."""
+    rows = []
+    for row in result["files"]:
+        loss = f"{row['loss_px']:.1e}" if row["loss_px"] else "exact"
+        cameras = f"{row['recalibrated']} of {row['cameras']}"
+        own, other = f"{row['own_reader_px']:.1e}", f"{row['reader']}: {row['reader_px']:.1e}"
+        source = row["how"].partition(" (")[0]
+        rows.append((f"`{row['format']}`", row["file"], cameras, source, loss, own, other, f"{row['numbers']:,}"))
+    damaged = result["damaged"]
+    head = (
+        "format", "original", "cameras", "new rig from", "lens loss, px", "read by us, worst px",
+        "independent reader, worst px", "numbers changed",
+    )  # fmt: skip
+    return "\n".join(
+        (
+            markdown(head, rows),
+            "",
+            f"Damaged originals: {damaged['tried']} tried, {damaged['refused']} refused with one line and exit code 2, "
+            f"{damaged['sound_and_right']} still sound and written right, {damaged['lens_refused']} refused for the "
+            f"lens (exit code 3), {len(damaged['faults'])} faults. Nothing was written where one was refused.",
+        )
+    )
+
+
+if __name__ == "__main__":
+    command(main)
