@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,12 @@ class PaddedBlobs:
     row: NDArray[np.int64]  # (C, M) row of the detections, -1 where padded
     count: NDArray[np.int64]  # (C,)
     rows: int  # rows of the detections, usable or not
+
+    @cached_property
+    def noise(self) -> tuple[NDArray[np.float64], float]:
+        """Variance of each blob's place (C, M) px^2, and the usual one."""
+        variance, valid = self.sigma**2, self.row >= 0
+        return variance, float(np.median(variance[valid])) if valid.any() else 0.0
 
     def only(self, camera: int) -> PaddedBlobs:
         """Keep one camera; labels keep their numbers."""

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import permutations
 
 import numpy as np
@@ -61,14 +62,40 @@ def fiducial_triples(obj: CalibrationObject, generator: np.random.Generator) -> 
     """List the triples to try: all of them; of many fiducials those of the outer ones, or a random choice of these."""
     points = obj.points.double().cpu().numpy()
     count = len(points)
-    outer = ConvexHull(points).vertices if many(obj) and not obj.planar else np.arange(count)
-    if _orders(len(outer)) <= MOST_FIDUCIAL_TRIPLES:
-        triples = outer[list(permutations(range(len(outer)), 3))]
-    else:
-        triples = outer[generator.integers(0, len(outer), (MOST_FIDUCIAL_TRIPLES, 3))]
-        triples = triples[(triples != np.roll(triples, 1, axis=1)).all(1)]
-    if len(obj.symmetries) > 1:
-        permuted = np.stack([motion.permutation[triples] for motion in obj.symmetries])  # (G, T, 3)
+    symmetries = tuple(motion.permutation.astype(np.int64).tobytes() for motion in obj.symmetries)
+    outer = many(obj) and not obj.planar
+    found = _every_triple(points.tobytes(), symmetries, outer)
+    if found is None:
+        among = _outer(points, outer)
+        triples = among[generator.integers(0, len(among), (MOST_FIDUCIAL_TRIPLES, 3))]
+        found = _told_apart(points, triples[(triples != np.roll(triples, 1, axis=1)).all(1)], symmetries)
+    return FiducialTriples(*found, points, generator.permutation(count))
+
+
+Triples = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
+"""Triples, sides and frames of `FiducialTriples`."""
+
+
+@lru_cache(maxsize=4)
+def _every_triple(coordinates: bytes, symmetries: tuple[bytes, ...], outer: bool) -> Triples | None:
+    """All ordered triples, once for each object: snapshots are many, objects few. None = there are too many."""
+    points = np.frombuffer(coordinates).reshape(-1, 3)
+    among = _outer(points, outer)
+    if _orders(len(among)) > MOST_FIDUCIAL_TRIPLES:
+        return None
+    return _told_apart(points, among[list(permutations(range(len(among)), 3))], symmetries)
+
+
+def _outer(points: NDArray[np.float64], outer: bool) -> NDArray[np.int64]:
+    """Fiducials to make triples of: the outermost ones, or all."""
+    return ConvexHull(points).vertices if outer else np.arange(len(points))
+
+
+def _told_apart(points: NDArray[np.float64], triples: NDArray[np.int64], symmetries: tuple[bytes, ...]) -> Triples:
+    """Triples (T, 3) that are not in line, one of each set that symmetries cannot tell apart, and their shape."""
+    count = len(points)
+    if len(symmetries) > 1:
+        permuted = np.stack([np.frombuffer(motion, dtype=np.int64)[triples] for motion in symmetries])  # (G, T, 3)
         triples = triples[(permuted @ [count * count, count, 1]).argmin(0) == 0]
     a, b = points[triples[:, 1]] - points[triples[:, 0]], points[triples[:, 2]] - points[triples[:, 0]]
     normal = np.cross(a, b)
@@ -78,7 +105,7 @@ def fiducial_triples(obj: CalibrationObject, generator: np.random.Generator) -> 
     along = a / np.linalg.norm(a, axis=1, keepdims=True)
     frames = np.stack((along, np.cross(normal, along), normal), axis=-1)
     sides = np.stack([(side * side).sum(1) for side in (a, b, a - b)], axis=1)
-    return FiducialTriples(triples, sides, frames, points, generator.permutation(count))
+    return triples, sides, frames
 
 
 def many(obj: CalibrationObject) -> bool:

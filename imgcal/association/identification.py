@@ -29,6 +29,7 @@ from imgcal.association.verify import (
     certain,
     evidence,
     join,
+    pose_of,
     predictions,
     refine,
     rig_and_pose,
@@ -153,7 +154,7 @@ def relocalize(
     for number in range(options.rounds):
         fresh = search.round(min(FIRST_HYPOTHESES << number, MOST_HYPOTHESES), generator)
         if fresh is not None:
-            fits = fresh if fits is None else _best(scene, join(fits, fresh), 2 * VERIFIED)
+            fits = fresh if fits is None else _best(scene, join((fits, fresh)), 2 * VERIFIED)
             result = _decide(scene, fits, options, known_pose=False)
             # Where two labellings explain enough, more hypotheses will not tell them apart.
             undecided += result.undecided
@@ -165,8 +166,8 @@ def relocalize(
 
 
 def _best(scene: Scene, fits: Fits, count: int) -> Fits:
-    """Keep the labellings with the most evidence."""
-    if len(fits.labels) == 1:
+    """Keep the labellings with the most evidence, if there are more than so many."""
+    if len(fits.labels) <= count:
         return fits
     return fits.select(np.argsort(-evidence(scene, fits), kind="stable")[:count])
 
@@ -174,8 +175,7 @@ def _best(scene: Scene, fits: Fits, count: int) -> Fits:
 def _decide(scene: Scene, fits: Fits, options: IdentityOptions, known_pose: bool) -> Identity:
     """Accept the best labelling or say why not."""
     odds = (options.label_odds, options.least_label_odds)
-    fits = _best(scene, fits, len(fits.labels))
-    best = settle_labels(scene, fits.select(np.array([0])))
+    best = settle_labels(scene, _best(scene, fits, 1))
     chosen = certain(scene, best, *odds)
     share, refusal, margin = _share(scene, chosen), None, -np.inf
     if share >= options.least_share:
@@ -223,12 +223,8 @@ def _share(scene: Scene, fits: Fits) -> float:
 
 def _margin(scene: Scene, best: Fits, others: Fits) -> float:
     """Log odds of a labelling against the best different one, and against all blobs being clutter."""
-    weights = evidence(scene, others)
-    rivals = [
-        weight
-        for weight, labels in zip(weights, others.labels, strict=True)
-        if differ(scene.obj, best.labels[0], labels)
-    ]
+    different = [differ(scene.obj, best.labels[0], labels) for labels in others.labels]
+    rivals = evidence(scene, others.select(np.flatnonzero(different))) if any(different) else ()
     return float(evidence(scene, best)[0] - max([0.0, *rivals]))
 
 
@@ -241,14 +237,14 @@ def _against_motions(scene: Scene, best: Fits, known_pose: bool) -> tuple[Fits, 
         The best labelling found, and its margin over the best of its neighbours.
     """
     shifts = lattice_shifts(scene.obj)
-    _, pose = rig_and_pose(scene, best, 0)
+    pose = pose_of(scene, best, 0)
     distance = scene.rig.working_distance or float(np.median(_distances(scene.rig, _one(pose), scene.obj)))
     pattern = pattern_prior(scene.std, scene.rig, distance)
     turns = [] if known_pose else near_turns(scene.obj, 2 * pattern.shape * scene.obj.size)
     if not shifts and not turns:
         return best, np.inf
     for _ in range(MOST_STEPS):
-        _, pose = rig_and_pose(scene, best, 0)
+        pose = pose_of(scene, best, 0)
         labels = best.labels[0]
         alone = _shifted_alone(scene, best, shifts, 6 * pattern.shift)
         together = _preferred(labels, alone)
@@ -285,7 +281,7 @@ def _shifted_alone(
     Returns:
         Margin against the labelling in that camera, camera, labels (C, N) of all cameras; margin 0 = it cannot tell.
     """
-    _, pose = rig_and_pose(scene, best, 0)
+    pose = pose_of(scene, best, 0)
     labels, uv, found = best.labels[0], predictions(best), []
     for camera in range(scene.rig.num_cameras):
         near = [motion for motion in shifts if displacement(uv, motion)[camera] < reach[camera]]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.association.blobs import PaddedBlobs
-from imgcal.estimation import Problem, Solution
+from imgcal.estimation import Problem, Solution, lm_cpu
 from imgcal.geometry import NEAREST_DEPTH, kernels, lens_codes, lens_kernels
 from renderers.compiling import njit
 
@@ -33,8 +33,14 @@ class Innovations:
     complexity: NDArray[np.float64]  # (K,) log of det of posterior precision over prior precision
 
     def select(self, rows: NDArray[np.int64]) -> Innovations:
-        """Keep the given labellings."""
-        return Innovations(*(getattr(self, field.name)[rows] for field in fields(self)))
+        """Keep the given labellings; a single one is not copied."""
+        chosen = one_or_some(rows)
+        return Innovations(*(getattr(self, field.name)[chosen] for field in fields(self)))
+
+
+def one_or_some(rows: NDArray[np.int64]) -> slice | NDArray[np.int64]:
+    """Index that keeps rows of an array: as a view where it is one, which may be many megabytes."""
+    return slice(rows[0], rows[0] + 1) if len(rows) == 1 else rows
 
 
 def innovations(
@@ -51,11 +57,10 @@ def innovations(
     """
     count, cameras, fiducials = labels.shape
     radius_squared = np.zeros(fiducials) if problem.radius_squared is None else problem.radius_squared.numpy()
-    valid = blobs.row >= 0
-    noise = blobs.sigma**2
-    typical = float(np.median(noise[valid])) if valid.any() else 0.0
+    noise, typical = blobs.noise
     shape = (count, cameras, fiducials)
-    squared, log_det, own = np.full((*shape, blobs.uv.shape[1]), np.inf), np.zeros(shape), np.full(shape, np.inf)
+    # Filled below, all of it; it may be many megabytes.
+    squared, log_det, own = np.empty((*shape, blobs.uv.shape[1])), np.zeros(shape), np.full(shape, np.inf)
     residual, freedom, uv = np.zeros(shape), np.zeros(shape), np.zeros((*shape, 2))
     complexity = np.full(count, np.inf)
     equations, state = solution.equations, solution.state
@@ -66,7 +71,7 @@ def innovations(
         for tensor in (
             factory.cam_from_rig.rotation,
             step[..., :3],
-            factory.positions + step[..., 3:6],
+            lm_cpu.positions_of(factory) + step[..., 3:6],
             factory.focal_length + step[..., 6:8],
             factory.principal_point + step[..., 8:10],
             factory.distortion + step[..., 10:],
@@ -75,7 +80,10 @@ def innovations(
             state.centre[:, 0],
         )
     ]
-    for k in np.flatnonzero(np.isfinite(equations.cost.numpy())):
+    for k, fitted in enumerate(np.isfinite(equations.cost.numpy())):
+        if not fitted:
+            squared[k] = np.inf
+            continue
         # Lower factors of the cameras' blocks, of the couplings' and of the pose's: see schur.reduce.
         eliminated = equations.camera[k].numpy().copy()
         whitened = equations.coupling[k, 0].numpy().copy()
@@ -88,6 +96,8 @@ def innovations(
                 (blobs.uv, noise, typical, blobs.count, labels[k], sigma[k] ** 2),
                 (squared[k], log_det[k], own[k], residual[k], freedom[k], uv[k]),
             )
+        else:
+            squared[k] = np.inf
     return Innovations(squared, log_det, own, residual, freedom, uv, complexity)
 
 

@@ -5,8 +5,10 @@ Only after such a fit can a label be judged: the factory rig alone is off by ten
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property, reduce
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,8 +19,8 @@ from imgcal.association.ambiguities import lattice_shifts
 from imgcal.association.assignment import assign
 from imgcal.association.blobs import PaddedBlobs
 from imgcal.association.hypotheses import Poses
-from imgcal.association.innovation import THRESHOLD, Innovations, contested, innovations
-from imgcal.estimation import Problem, State, lm_cpu, pose_at
+from imgcal.association.innovation import THRESHOLD, Innovations, contested, innovations, one_or_some
+from imgcal.estimation import Problem, Solution, State, lm_cpu, pose_at
 from imgcal.geometry import RigidTransform
 from imgcal.types import CalibrationObject, CameraRig
 
@@ -74,30 +76,27 @@ class Fits:
     innovations: Innovations | None = None  # of these labels at this state
 
     def select(self, rows: NDArray[np.int64]) -> Fits:
-        """Keep the given labellings."""
-        state = State(self.state.offset[rows], self.state.rotation[rows], self.state.centre[rows])
+        """Keep the given labellings; a single one is not copied."""
+        chosen = one_or_some(rows)
+        state = State(self.state.offset[chosen], self.state.rotation[chosen], self.state.centre[chosen])
         found = None if self.innovations is None else self.innovations.select(rows)
-        return Fits(self.labels[rows], state, self.sigma[rows], self.cost[rows], found)
+        return Fits(self.labels[chosen], state, self.sigma[chosen], self.cost[chosen], found)
 
 
-def join(first: Fits, second: Fits) -> Fits:
+def join(parts: Sequence[Fits]) -> Fits:
     """Put fitted labellings of one snapshot together."""
-    a, b = first.state, second.state
-    state = State(torch.cat((a.offset, b.offset)), torch.cat((a.rotation, b.rotation)), torch.cat((a.centre, b.centre)))
-    found = Innovations(
-        *(
-            np.concatenate((getattr(_found(first), f.name), getattr(_found(second), f.name)))
-            for f in fields(Innovations)
-        )
+    if len(parts) == 1:
+        return parts[0]
+    states, found = [part.state for part in parts], [_found(part) for part in parts]
+    columns = ("offset", "rotation", "centre")
+    state = State(*(torch.cat([getattr(state, name) for state in states]) for name in columns))
+    innovations = Innovations(
+        *(np.concatenate([getattr(one, field.name) for one in found]) for field in fields(Innovations))
     )
-    joined = (
-        np.concatenate(pair)
-        for pair in zip(
-            (first.labels, first.sigma, first.cost), (second.labels, second.sigma, second.cost), strict=True
-        )
+    labels, sigma, cost = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("labels", "sigma", "cost")
     )
-    labels, sigma, cost = joined
-    return Fits(labels, state, sigma, cost, found)
+    return Fits(labels, state, sigma, cost, innovations)
 
 
 def start(scene: Scene, poses: Poses, labels: NDArray[np.int64]) -> Fits:
@@ -175,8 +174,12 @@ def predictions(fits: Fits) -> NDArray[np.float64]:
 
 def rig_and_pose(scene: Scene, fits: Fits, row: int) -> tuple[CameraRig, RigidTransform]:
     """Give the rig and rig_from_object of one labelling, without batch axes."""
-    problem = problem_of(scene, fits)
-    return lm_cpu.rig_at(problem, fits.state.offset)[row], pose_at(problem, fits.state)[row, 0]
+    return lm_cpu.rig_at(scene.problem, fits.state.offset[row : row + 1])[0], pose_of(scene, fits, row)
+
+
+def pose_of(scene: Scene, fits: Fits, row: int) -> RigidTransform:
+    """Give rig_from_object of one labelling, without batch axes."""
+    return pose_at(scene.problem, fits.state)[row, 0]
 
 
 def _found(fits: Fits) -> Innovations:
@@ -213,15 +216,33 @@ def problem_of(scene: Scene, fits: Fits) -> Problem:
 def fit(scene: Scene, fits: Fits) -> Fits:
     """Fit labellings as they are."""
     # One after the other: starting threads for a few small fits takes longer than the fits on a busy machine.
-    bare = replace(fits, innovations=None)
-    return reduce(join, [_fit_one(scene, bare.select(np.array([k]))) for k in range(len(fits.labels))])
-
-
-def _fit_one(scene: Scene, fits: Fits) -> Fits:
     problem = problem_of(scene, fits)
-    solution = lm_cpu.minimize(problem, fits.state, "cauchy", THRESHOLD, 8, 1e-3)
+    if len(fits.labels) == 1:
+        solution = _minimized(problem, fits.state)
+    else:
+        bare = replace(fits, innovations=None)
+        each = (bare.select(np.array([k])) for k in range(len(fits.labels)))
+        solution = _together([_minimized(problem_of(scene, one), one.state) for one in each])
     found = innovations(scene.blobs, fits.labels, fits.sigma, problem, solution)
     return replace(fits, state=solution.state, cost=solution.equations.cost.numpy(), innovations=found)
+
+
+def _minimized(problem: Problem, state: State) -> Solution:
+    return lm_cpu.minimize(problem, state, "cauchy", THRESHOLD, 8, 1e-3)
+
+
+def _together(solutions: Sequence[Solution]) -> Solution:
+    """Solutions of several labellings as one, with a batch axis."""
+
+    def cat(parts: Sequence[Any]) -> Any:
+        """Put records of tensors together, field by field."""
+        names = [field.name for field in fields(parts[0])]
+        columns = {name: [getattr(part, name) for part in parts] for name in names}
+        return type(parts[0])(**{k: None if v[0] is None else torch.cat(v) for k, v in columns.items()})
+
+    converged = torch.cat([solution.converged for solution in solutions])
+    state, equations = (cat([getattr(solution, name) for solution in solutions]) for name in ("state", "equations"))
+    return Solution(state, equations, converged, max(solution.iterations for solution in solutions))
 
 
 def _residual_sigma(scene: Scene, fits: Fits) -> NDArray[np.float64]:

@@ -53,6 +53,15 @@ class WorkingVolume:
 
 
 @dataclass(frozen=True)
+class ErrorMaps:
+    """Predicted errors over whole images, at some depths of each camera."""
+
+    px: Tensor  # (C, D, H, W) pixels; nan where a pixel belongs to no ray
+    depths: Tensor  # (C, D) mm; nan for a camera that sees nothing of the volume
+    inside: Tensor  # (C, D, H, W) bool, in the working volume
+
+
+@dataclass(frozen=True)
 class PredictedError:
     """Errors to expect of a rig, after the rigid motion of the whole rig that makes them smallest.
 
@@ -80,9 +89,6 @@ class PredictedError:
     mm: Tensor  # (X, Y, Z) mm; nan where fewer than two cameras see the point
     mm_with_noise: Tensor  # (X, Y, Z) mm, when each pixel is measured with `noise`, too
     noise: float  # px, median standard deviation of the observations, each axis
-    maps: Tensor  # (C, D, H, W) pixels over the image; nan where a pixel belongs to no ray
-    map_depths: Tensor  # (C, D) mm; nan for a camera that sees nothing of the volume
-    map_inside: Tensor  # (C, D, H, W) bool, in the working volume
 
     def __repr__(self) -> str:
         """Give the medians: `PredictedError(0.003 mm, 0.002 px, 10 cameras)`."""
@@ -136,6 +142,12 @@ class PredictedError:
         others = self.uncertainty.without(self.exceptions)
         points = self.volume.grid().flatten(0, -2)
         return others.point_error(points, others.rig.project(points).visible).view(self.mm.shape)
+
+    @cached_property
+    def maps(self) -> ErrorMaps:
+        """Errors over each camera's whole image; worked out when they are first asked for."""
+        projection = self.uncertainty.rig.project(self.volume.grid().flatten(0, -2))
+        return _maps(self.uncertainty, self.volume, torch.where(projection.visible, projection.depth, torch.nan))
 
     @property
     def seen_share(self) -> float:
@@ -215,7 +227,6 @@ def predicted_error(
     projection = rig.project(points)
     seen, noise = projection.visible, _noise(found)
     px, mm, mm_with_noise = uncertainty.errors(points, seen, noise)
-    maps, depths, inside = _maps(uncertainty, volume, torch.where(seen, projection.depth, torch.nan))
     return PredictedError(
         volume=volume,
         camera_names=rig.camera_names,
@@ -224,9 +235,6 @@ def predicted_error(
         mm=mm.view(shape),
         mm_with_noise=mm_with_noise.view(shape),
         noise=noise,
-        maps=maps,
-        map_depths=depths,
-        map_inside=inside,
     )
 
 
@@ -256,8 +264,8 @@ def working_volume(calibration: Estimate) -> WorkingVolume:
     return WorkingVolume(centres.amin(0) - reach, centres.amax(0) + reach)
 
 
-def _maps(uncertainty: RigUncertainty, volume: WorkingVolume, depths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Errors over whole images at some depths, the depths, and what lies in the volume.
+def _maps(uncertainty: RigUncertainty, volume: WorkingVolume, depths: Tensor) -> ErrorMaps:
+    """Errors over whole images at some depths.
 
     Args:
         uncertainty: of the rig.
@@ -273,7 +281,7 @@ def _maps(uncertainty: RigUncertainty, volume: WorkingVolume, depths: Tensor) ->
     shape = (len(MAP_DEPTHS), *MAP_SIZE)
     error = uncertainty.pixel_error(points).unflatten(1, shape)
     inside = volume.contains(points).unflatten(1, shape)
-    return torch.where(valid.unflatten(1, MAP_SIZE)[:, None], error, torch.nan), shown, inside
+    return ErrorMaps(torch.where(valid.unflatten(1, MAP_SIZE)[:, None], error, torch.nan), shown, inside)
 
 
 def _rays(rig: CameraRig, size: tuple[int, int]) -> tuple[Tensor, Tensor]:

@@ -15,13 +15,15 @@ parameter curvature, Bates and Watts (J. R. Stat. Soc. B 1980), by sampling inst
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache
 
 import torch
 from torch import Tensor
 
-from imgcal.estimation.levenberg_marquardt import Factorization, taken
+from imgcal.estimation.levenberg_marquardt import Factorization
 from imgcal.estimation.linearization import (
     POSE_PARAMETERS,
     Problem,
@@ -42,6 +44,8 @@ MOST_PAIRS, LEAST_PAIRS = 256, 64
 """Drawn for one snapshot; for many, where the posterior is narrow and hardly curved."""
 AT_ONCE, POINTS_AT_ONCE = 16, 2**16
 """Pairs that are projected together: more where they show so few points in all."""
+MOST_KEPT_NUMBERS = 2**17
+"""Random numbers that are kept for the next estimate of the same size: drawing them takes as long as using them."""
 
 
 def curvature_covariance(estimate: Estimate, quantity: Callable[[CameraRig, Tensor], Tensor]) -> Tensor:
@@ -58,35 +62,48 @@ def curvature_covariance(estimate: Estimate, quantity: Callable[[CameraRig, Tens
     problem, solution = estimate.problem, estimate.solution
     factorization = solution.factorization
     pairs = max(LEAST_PAIRS, MOST_PAIRS // problem.uv.shape[1])
-    generator = torch.Generator(problem.uv.device).manual_seed(0)  # the same estimate has the same covariance
-    x = _draw(factorization, solution.state, pairs, generator)
+    x = _draw(factorization, solution.state, pairs)
     follow = _follow(problem, solution.state, factorization, x)
-    there, back = (quantity(*_moved_rigs(problem, solution.state, x, follow, sign)) for sign in (1, -1))
+    there, back = quantity(*_moved_rigs(problem, solution.state, _both_ways(x), follow)).chunk(2, dim=1)
     even = 0.5 * (there + back)
     result = even.mT @ even / pairs
     return result.reshape(*estimate.chi2.shape, *result.shape[1:])
 
 
-def _moved_rigs(problem: Problem, state: State, x: Step, follow: Step, sign: int) -> tuple[CameraRig, Tensor]:
-    """Rigs (B, K) and fiducials (B, K, N, 3) mm after steps of the cameras and of the object."""
+def _both_ways(x: Step) -> Step:
+    """Steps (B, K, ...) and behind them their opposites: (B, 2 K, ...)."""
+    return x.map(lambda part: torch.cat((part, -part), dim=1))
+
+
+def _many(problem: Problem) -> Problem:
+    """The problem for many rigs each: its cameras have an axis behind the batch, (B, 1)."""
     factory = problem.factory.map_tensors(lambda tensor, _: tensor.unsqueeze(1))
-    many = replace(problem, factory=factory, prior_std=problem.prior_std.unsqueeze(1))
-    rigs = rig_at(many, state.offset.unsqueeze(1) + sign * x.camera + follow.camera)
+    return replace(problem, factory=factory, prior_std=problem.prior_std.unsqueeze(1))
+
+
+def _moved_rigs(problem: Problem, state: State, x: Step, follow: Step) -> tuple[CameraRig, Tensor]:
+    """Rigs (B, 2 K) and fiducials (B, 2 K, N, 3) mm after steps both ways, and what follows them either way."""
+    camera = (state.offset.unsqueeze(1) + x.camera).unflatten(1, (2, -1)) + follow.camera.unsqueeze(1)
+    rigs = rig_at(_many(problem), camera.flatten(1, 2))
     points = points_at(problem, state).unsqueeze(1).expand(-1, x.camera.shape[1], -1, -1)
     if x.object is not None and follow.object is not None and problem.object_prior_std is not None:
-        step = (sign * x.object + follow.object) * problem.object_prior_std.unsqueeze(1)
-        points = points + problem.points * step[..., -1, None, None] + step[..., :-1].unflatten(-1, (-1, 3))
+        moved = (x.object.unflatten(1, (2, -1)) + follow.object.unsqueeze(1)).flatten(1, 2)
+        points = points + _own_shift(problem, moved)
     return rigs, points
 
 
-def _draw(factorization: Factorization, state: State, pairs: int, generator: torch.Generator) -> Step:
+def _own_shift(problem: Problem, offset: Tensor) -> Tensor:
+    """How offsets of the object (B, K, M) shift its fiducials: (B, K, N, 3) mm."""
+    assert problem.object_prior_std is not None
+    step = offset * problem.object_prior_std.unsqueeze(1)
+    return problem.points * step[..., -1, None, None] + step[..., :-1].unflatten(-1, (-1, 3))
+
+
+def _draw(factorization: Factorization, state: State, pairs: int) -> Step:
     """Draw steps from the flat posterior: camera (B, K, C, parameters), pose (B, K, S, 6), object (B, K, M)."""
     reduced = factorization.reduced
     batch, count, size, wide = reduced.whitened.shape
-    kept, eliminated = (
-        torch.randn(shape, generator=generator, dtype=reduced.kept.dtype, device=reduced.kept.device)
-        for shape in ((batch, wide, pairs), (batch, count, size, pairs))
-    )
+    kept, eliminated = _normal((batch, wide, pairs), (batch, count, size, pairs), like=reduced.kept)
     kept = torch.linalg.solve_triangular(reduced.kept.mT, kept, upper=True)
     eliminated = eliminated - reduced.whitened @ kept.unsqueeze(1)
     eliminated = torch.linalg.solve_triangular(reduced.eliminated.mT, eliminated, upper=True).permute(0, 3, 1, 2)
@@ -95,6 +112,21 @@ def _draw(factorization: Factorization, state: State, pairs: int, generator: tor
     if factorization.cameras_first:
         return Step(eliminated, blocks.unflatten(-1, (-1, POSE_PARAMETERS)), border if own else None)
     return Step(blocks.unflatten(-1, state.offset.shape[1:]), eliminated, border if own else None)
+
+
+def _normal(*shapes: tuple[int, ...], like: Tensor) -> tuple[Tensor, ...]:
+    """Standard normal numbers, always the same ones: the same estimate has the same covariance."""
+    if sum(math.prod(shape) for shape in shapes) <= MOST_KEPT_NUMBERS:
+        return _kept_normal(shapes, like.dtype, like.device)
+    return _new_normal(shapes, like.dtype, like.device)
+
+
+def _new_normal(shapes: tuple[tuple[int, ...], ...], dtype: torch.dtype, device: torch.device) -> tuple[Tensor, ...]:
+    generator = torch.Generator(device).manual_seed(0)
+    return tuple(torch.randn(shape, generator=generator, dtype=dtype, device=device) for shape in shapes)
+
+
+_kept_normal = lru_cache(maxsize=4)(_new_normal)
 
 
 def _follow(problem: Problem, state: State, factorization: Factorization, x: Step) -> Step:
@@ -107,7 +139,7 @@ def _follow(problem: Problem, state: State, factorization: Factorization, x: Ste
     together = max(AT_ONCE, POINTS_AT_ONCE // at.residual[..., 0, :].numel())
     for first in range(0, x.camera.shape[1], together):
         some = Step(*(part if part is None else part[:, first : first + together] for part in x))  # type: ignore[arg-type]
-        there, back = (_residual(problem, state, some, sign) for sign in (1, -1))
+        there, back = _residual(problem, state, _both_ways(some)).chunk(2, dim=1)
         bend = 0.5 * (there + back) - at.residual.unsqueeze(1)  # (B, K, S, C, 2, N)
         right = -torch.einsum("bscirn,bkscrn->bksci", by_rig, bend)
         camera, pose, own = right[..., :-POSE_PARAMETERS].sum(2), right[..., -POSE_PARAMETERS:].sum(3), None
@@ -120,15 +152,18 @@ def _follow(problem: Problem, state: State, factorization: Factorization, x: Ste
     return Step(cameras, poses, torch.cat(objects, dim=1) if objects else None)
 
 
-def _residual(problem: Problem, state: State, step: Step, sign: int) -> Tensor:
+def _residual(problem: Problem, state: State, step: Step) -> Tensor:
     """Residuals (B, K, S, C, 2, N) px after steps (B, K, ...)."""
-    batch, pairs = step.camera.shape[:2]
-    rows = torch.arange(batch, device=step.camera.device).repeat_interleave(pairs)
-    many = problem.select(rows)
-    there = retract(many, taken(state, rows), *step.map(lambda part: sign * part.flatten(0, 1)))
-    points = pose_at(many, there).apply((points_at(many, there) + problem.centroid).unsqueeze(1))  # (B K, S, N, 3)
+    many = _many(problem)
+    one = State(state.offset.unsqueeze(1), state.rotation.unsqueeze(1), state.centre.unsqueeze(1))
+    there = retract(many, one, step.camera, step.pose)
+    own = points_at(problem, state).unsqueeze(1)
+    if step.object is not None:
+        own = own + _own_shift(problem, step.object)
+    points = pose_at(many, there).apply((own + problem.centroid).unsqueeze(2)).flatten(0, 1)  # (B K, S, N, 3)
     snapshots, fiducials = points.shape[1:3]
     radius = None if problem.radius_squared is None else problem.radius_squared.sqrt().repeat(snapshots)
-    uv = rig_at(many, there.offset).project_values(points.flatten(1, 2), radius).uv  # (B K, C, S N, 2)
-    uv = uv.unflatten(2, (snapshots, fiducials)).permute(0, 2, 1, 4, 3).unflatten(0, (batch, pairs))
+    rigs = rig_at(many, there.offset).reshape(len(points))
+    uv = rigs.project_values(points.flatten(1, 2), radius).uv  # (B K, C, S N, 2)
+    uv = uv.unflatten(2, (snapshots, fiducials)).permute(0, 2, 1, 4, 3).unflatten(0, (len(problem.uv), -1))
     return uv - problem.uv.unsqueeze(1)

@@ -174,11 +174,14 @@ def _object_of(problem: Problem, state: State, rows: int) -> tuple[Tensor, State
 def _given(problem: Problem) -> tuple[Tensor, ...]:
     factory = problem.factory
     pinhole = (factory.focal_length, factory.principal_point, factory.distortion)
-    # The rig's own `positions` are those of tensors, and wait for a dozen of small operations.
-    rotation, translation = factory.cam_from_rig.rotation.detach(), factory.cam_from_rig.translation.detach()
-    positions = -(rotation.numpy().swapaxes(-1, -2) @ translation.numpy()[..., None])[..., 0]
-    rig = (rotation, torch.from_numpy(positions), *pinhole)
+    rig = (factory.cam_from_rig.rotation.detach(), positions_of(factory), *pinhole)
     return (problem.uv, problem.root_weight, *rig, problem.prior_std)
+
+
+def positions_of(rig: CameraRig) -> Tensor:
+    """The rig's `positions`, without gradients: those of tensors wait for a dozen of small operations."""
+    rotation, translation = rig.cam_from_rig.rotation.detach().numpy(), rig.cam_from_rig.translation.detach().numpy()
+    return torch.from_numpy(-(rotation.swapaxes(-1, -2) @ translation[..., None])[..., 0])
 
 
 def _parts(state: State) -> tuple[Tensor, ...]:

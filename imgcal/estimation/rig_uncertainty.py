@@ -122,17 +122,40 @@ def uncertainty_over(rig: CameraRig, covariance: Tensor, points: Tensor) -> RigU
     shared = seen.sum(0) >= 2
     px_weight, mm_weight = seen.to(points), shared.to(points)
     px_rows, mm_rows = pixels.flatten(1, 2), triangulation.flatten(0, 1)
-    px_covariance = mm_covariance = covariance
-    for _ in range(ROUNDS):
-        weighted = px_weight.repeat_interleave(2, dim=1)[..., None] * px_rows
-        metric = torch.block_diag(*(px_rows.mT @ weighted))
-        px_covariance = _aligned_if_possible(covariance, motion, metric)
-        rows = mm_weight.sqrt().repeat_interleave(3)[:, None] * mm_rows
-        mm_covariance = _aligned_if_possible(covariance, motion, rows.mT @ rows)
-        found = RigUncertainty(rig, covariance, points, px_weight, mm_weight, px_covariance, mm_covariance)
+    by_motion = motion.unflatten(0, (rig.num_cameras, -1))
+    px_moved, mm_moved = px_rows @ by_motion, mm_rows @ motion
+    mm_spread = mm_rows @ covariance
+
+    def aligned() -> tuple[Tensor, Tensor]:
+        """Covariance after the alignment in pixels, and what measures the motion of the one in mm."""
+        weighted = px_weight.repeat_interleave(2, dim=1)[..., None] * px_moved
+        px_best = _best_if_possible(motion, (px_rows.mT @ weighted).flatten(0, 1))
+        mm_best = _best_if_possible(motion, mm_rows.mT @ (mm_weight.repeat_interleave(3)[:, None] * mm_moved))
+        return _without_motion(covariance, motion, px_best), mm_best
+
+    px_covariance, mm_best = aligned()
+    for _ in range(ROUNDS - 1):
+        # Of the points no more is asked than how far the alignment before leaves them off.
         px_weight = _weight(_pixel_error(pixels, px_covariance), seen)
-        mm_weight = _weight(_length(_point_variance(triangulation, mm_covariance), seen), shared)
-    return found
+        variance = _aligned_variance(mm_rows, mm_spread, mm_moved, mm_best, covariance)
+        mm_weight = _weight(_length(variance.unflatten(0, (-1, 3)).sum(-1), seen), shared)
+        px_covariance, mm_best = aligned()
+    mm_covariance = _without_motion(covariance, motion, mm_best)
+    return RigUncertainty(rig, covariance, points, px_weight, mm_weight, px_covariance, mm_covariance)
+
+
+def _aligned_variance(rows: Tensor, spread: Tensor, moved: Tensor, best: Tensor, covariance: Tensor) -> Tensor:
+    """Variance (R,) of what rows (R, K C) say of the parameters, once a motion is taken out that `best` measures.
+
+    Args:
+        rows: derivatives by the parameters.
+        spread: (R, K C) rows times the covariance.
+        moved: (R, 6) rows times the motion.
+        best: (6, K C), see `_best_motion`.
+        covariance: (K C, K C).
+    """
+    across, own = spread @ best.mT, best @ covariance @ best.mT
+    return (spread * rows).sum(-1) + ((moved @ own - 2 * across) * moved).sum(-1)
 
 
 def _weight(error: Tensor, valid: Tensor) -> Tensor:
@@ -159,22 +182,38 @@ def aligned_covariance(covariance: Tensor, motion: Tensor, metric: Tensor) -> Te
     Raises:
         RefusedError: the metric does not determine the motion.
     """
-    weighted = metric @ motion
+    return _without_motion(covariance, motion, _best_motion(motion, metric @ motion))
+
+
+def _without_motion(covariance: Tensor, motion: Tensor, best: Tensor) -> Tensor:
+    """Covariance (K, K) of what is left of the parameters once the motion that `best` (6, K) measures is taken out."""
+    left = covariance - motion @ (best @ covariance)
+    return left - (left @ best.mT) @ motion.mT
+
+
+def _best_motion(motion: Tensor, weighted: Tensor) -> Tensor:
+    """How the motion that fits parameters best follows from them: (6, K), (G^T H G)^-1 G^T H.
+
+    Args:
+        motion: (K, 6), G.
+        weighted: (K, 6), H G.
+
+    Raises:
+        RefusedError: the metric does not determine the motion.
+    """
     normal = motion.mT @ weighted
     scale = normal.diagonal().clamp_min(torch.finfo(normal.dtype).tiny).rsqrt()
     factor, failed = torch.linalg.cholesky_ex(scale[:, None] * normal * scale)
     if bool(failed):
         raise RefusedError("predicted error: too little of the working volume is seen by the cameras to compare rigs")
-    best = scale[:, None] * torch.cholesky_solve(scale[:, None] * weighted.mT, factor)
-    projector = torch.eye(len(covariance), dtype=covariance.dtype, device=covariance.device) - motion @ best
-    return projector @ covariance @ projector.mT
+    return scale[:, None] * torch.cholesky_solve(scale[:, None] * weighted.mT, factor)
 
 
-def _aligned_if_possible(covariance: Tensor, motion: Tensor, metric: Tensor) -> Tensor:
+def _best_if_possible(motion: Tensor, weighted: Tensor) -> Tensor:
     try:
-        return aligned_covariance(covariance, motion, metric)
+        return _best_motion(motion, weighted)
     except RefusedError:
-        return torch.full_like(covariance, torch.nan)
+        return torch.full_like(motion.mT, torch.nan)
 
 
 def rigid_motion(rig: CameraRig, centre: Tensor) -> Tensor:
@@ -205,16 +244,16 @@ def pixel_jacobian(rig: CameraRig, points: Tensor) -> Tensor:
     x, y = xy.unbind(-1)
     xd, yd, jxx, jxy, jyy, _ = distort_with_jacobian(x, y, rig.distortion, rig.lens_model)
     focal = rig.focal_length[:, None]
-    by_xy = torch.stack((jxx, jxy, jxy, jyy), -1).unflatten(-1, (2, 2)) * focal[..., None]
-    by_point = torch.cat((by_xy, -(by_xy @ xy[..., None])), -1) / depth[..., None]  # (C, P, 2, 3) of the camera frame
-    along = in_camera[..., None, :].expand_as(by_point)
+    per_depth = focal / depth  # (C, P, 2)
+    by_x, by_y = per_depth * torch.stack((jxx, jxy), -1), per_depth * torch.stack((jxy, jyy), -1)
+    by_point = torch.stack((by_x, by_y, -(by_x * x[..., None] + by_y * y[..., None])), -1)  # (C, P, 2, 3)
     jacobian = by_point.new_zeros(*by_point.shape[:-1], rig.num_parameters)
-    jacobian[..., 0:3] = torch.linalg.cross(along, by_point)
-    jacobian[..., 3:6] = -(by_point @ rotation[:, None])
-    jacobian[..., 6:8] = torch.diag_embed(torch.stack((xd, yd), -1))
-    jacobian[..., 8:10] = torch.eye(2, dtype=xy.dtype, device=xy.device)
+    jacobian[..., 0:3] = torch.linalg.cross(in_camera[..., None, :], by_point)
+    jacobian[..., 3:6] = (by_point.flatten(1, 2) @ -rotation).view(by_point.shape)
+    jacobian[..., 0, 6], jacobian[..., 1, 7] = xd, yd
+    jacobian[..., 0, 8] = jacobian[..., 1, 9] = 1
     by_coefficients = torch.stack(distort_by_coefficients(x, y, rig.distortion, rig.lens_model), dim=-2)
-    jacobian[..., 10:] = by_coefficients * focal[..., None]
+    torch.mul(by_coefficients, focal[..., None], out=jacobian[..., 10:])
     return jacobian
 
 
@@ -234,9 +273,12 @@ def _triangulation(pixels: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
     by_point = pixels[..., 3:6] * -seen.to(pixels)[..., None, None]  # (C, P, 2, 3)
     stacked = by_point.transpose(0, 1).flatten(1, 2)  # (P, 2 C, 3)
     inverse = inverse_or_zero(stacked.mT @ stacked)
-    response = inverse @ by_point.mT @ pixels  # (C, P, 3, K)
+    first, second = (inverse @ by_point.mT).unsqueeze(-2).unbind(-1)  # (C, P, 3, 1): mm by pixel
+    along, across = pixels.unsqueeze(-3).unbind(-2)  # (C, P, 1, K)
+    response = pixels.new_empty(len(stacked), 3, len(pixels), pixels.shape[-1])  # as its rows are multiplied later
+    torch.mul(first, along, out=response.permute(2, 0, 1, 3)).addcmul_(second, across)
     variance = inverse.diagonal(dim1=-2, dim2=-1).sum(-1)
-    return response.permute(1, 2, 0, 3).flatten(-2), variance
+    return response.flatten(-2), variance
 
 
 def inverse_or_zero(information: Tensor) -> Tensor:

@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import imgcal
+from imgcal.errors import InputError
 from imgcal.extras import missing
 from imgcal.live_page.address import Address, checked_token
 from imgcal.live_page.commands import Action, Command
@@ -97,9 +98,11 @@ class LivePage:
             problem: gets what could not be shown, once of each kind, from another thread; a warning if not given.
 
         Raises:
-            InputError: the address is taken, or the token too short.
+            InputError: the address is taken, the token too short, or the system is Windows.
             ModuleNotFoundError: the libraries of the extra `live` are not installed.
         """
+        if sys.platform == "win32":
+            raise InputError("live page: not on Windows, where its server gets no open sockets; run it in WSL")
         if library := missing("uvicorn"):
             raise ModuleNotFoundError(f"No module named {library!r}", name=library)
         self._token = checked_token(token)

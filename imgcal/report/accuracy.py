@@ -101,7 +101,7 @@ def camera_map(predicted: PredictedError, camera: int, image_size: Array, limits
     width, height = (float(x) for x in image_size)
     scale = 240 / width
     rows, columns = MAP_SIZE
-    error, inside = predicted.maps[camera, MAP].numpy(), predicted.map_inside[camera, MAP].numpy()
+    error, inside = predicted.maps.px[camera, MAP].numpy(), predicted.maps.inside[camera, MAP].numpy()
     parts = [svg.box(1, 1, 240, height * scale, "panel")]
     for kind, chosen in (("pale", ~inside), ("", inside)):
         parts.append(_cells(error, chosen, 1, 1, 240 / columns, height * scale / rows, limits, kind))

@@ -20,6 +20,7 @@ import tyro
 
 from imgcal.errors import InputError
 from imgcal.io import write_text
+from scripts.benchmarks import comparison
 from scripts.benchmarks.effort import Effort
 from scripts.output import ROOT, command, make_folder, markdown, read_json, replaced, surroundings, write_json
 
@@ -32,6 +33,7 @@ BENCHMARKS = {
     "identity": 3,
     "end_to_end": 3,
     "networks": 2,
+    "footprint": 1,
 }
 PAGE = ROOT / "docs" / "benchmarks.md"
 RESULTS = ROOT / "docs" / "benchmarks"
@@ -53,13 +55,19 @@ class Options:
     """Benchmarks to run; all of them if none is named."""
     smoke: bool = False
     """Next to nothing of each, in two minutes: whether it runs, not how fast."""
+    compare: bool = False
+    """Measure into out/compare, leave the committed results and the page alone, and fail where a cell has become slower
+    beside its peers than it was when they were committed (1.15 times): before a release, and after every change."""
     out: Path | None = None
     """Folder of the results, NAME.json and NAME.png; docs/benchmarks, or out/benchmarks of a smoke run."""
 
     @property
     def folder(self) -> Path:
         """Where the results lie."""
-        return self.out or (ROOT / "out" / "benchmarks" if self.smoke else RESULTS)
+        if self.out is not None:
+            return self.out
+        aside = "compare" if self.compare else "benchmarks" if self.smoke else None
+        return RESULTS if aside is None else ROOT / "out" / aside
 
     @property
     def page(self) -> Path:
@@ -71,7 +79,7 @@ def main(arguments: list[str]) -> int:
     """Run the named benchmarks, each in its own process, and rewrite the page.
 
     Raises:
-        InputError: unknown name.
+        InputError: unknown name, or nothing to compare with.
     """
     options = tyro.cli(Options, args=arguments, prog="scripts/benchmark", description=__doc__)
     for name in options.names:
@@ -85,9 +93,12 @@ def main(arguments: list[str]) -> int:
         for name in options.names or BENCHMARKS:
             again = [name, "--out", str(options.folder), *["--smoke"] * options.smoke]
             failed += [name] * bool(run([sys.executable, "-m", "scripts.benchmarks", *again], cwd=ROOT).returncode)
-    _rewrite(options)
+    if not options.compare:
+        _rewrite(options)
     for name in failed:
         print(f"{name}: failed, its old result stays", file=sys.stderr)
+    if options.compare and not failed:
+        return comparison.report(options.folder, options.names or tuple(BENCHMARKS))
     return len(failed)
 
 

@@ -50,6 +50,20 @@ def test_of_triples_that_symmetry_cannot_tell_apart_one_is_tried() -> None:
     assert turned == set(permutations(range(8), 3))
 
 
+def test_triples_that_are_kept_are_those_of_the_same_object_and_draw_no_numbers(asymmetric8) -> None:
+    generator = rng()
+    first = fiducial_triples(asymmetric8, generator)
+    turned = replace(asymmetric8, points=asymmetric8.points.roll(1, dims=1).contiguous())
+    other, again = fiducial_triples(turned, rng()), fiducial_triples(asymmetric8, generator)
+    np.testing.assert_array_equal(first.triples, again.triples)
+    np.testing.assert_array_equal(first.frames, again.frames)
+    np.testing.assert_allclose(other.sides, first.sides)
+    assert not np.allclose(other.frames, first.frames)
+    drawn = rng()
+    np.testing.assert_array_equal(first.order, drawn.permutation(8))
+    np.testing.assert_array_equal(again.order, drawn.permutation(8))
+
+
 def test_triples_in_line_are_left_out() -> None:
     points = np.array([[0.0, 0, 0], [10, 0, 0], [20, 0, 0], [0, 15, 3]])
     found = fiducial_triples(make_object(points), rng()).triples

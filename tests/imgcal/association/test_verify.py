@@ -1,6 +1,6 @@
 """Labellings of one snapshot: fitted, judged and compared, against the truth and against what cannot matter."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -168,7 +168,7 @@ def test_labellings_are_joined_and_selected(scene, snapshot) -> None:
     truth = snapshot.labels(scene.blobs, 8)
     first = fit(scene, started(scene, snapshot, truth))
     second = fit(scene, started(scene, snapshot, truth[:, ::-1], np.roll(truth, 1, axis=1)))
-    both = join(first, second)
+    both = join([first, second])
     assert len(both.labels) == 3
     again = both.select(np.array([1, 2]))
     for name in ("labels", "sigma", "cost"):
@@ -176,6 +176,23 @@ def test_labellings_are_joined_and_selected(scene, snapshot) -> None:
     assert torch.equal(again.state.rotation, second.state.rotation)
     np.testing.assert_array_equal(again.innovations.squared, second.innovations.squared)
     np.testing.assert_array_equal(evidence(scene, both)[0], evidence(scene, first)[0])
+
+
+def test_several_labellings_are_fitted_as_each_by_itself(scene, snapshot) -> None:
+    truth = snapshot.labels(scene.blobs, 8)
+    labels = (truth, truth[:, ::-1], np.roll(truth, 1, axis=1))
+    together = fit(scene, started(scene, snapshot, *labels))
+    for k, one in enumerate(labels):
+        alone = fit(scene, started(scene, snapshot, one))
+        part = together.select(np.array([k]))
+        assert np.array_equal(part.cost, alone.cost) and torch.equal(part.state.offset, alone.state.offset)
+        for field in fields(part.innovations):
+            found, expected = getattr(part.innovations, field.name), getattr(alone.innovations, field.name)
+            np.testing.assert_array_equal(found, expected)
+        rig, pose = rig_and_pose(scene, together, k)
+        other, there = rig_and_pose(scene, alone, 0)
+        assert torch.equal(rig.focal_length, other.focal_length) and torch.equal(pose.translation, there.translation)
+    assert np.shares_memory(together.select(np.array([1])).innovations.squared, together.innovations.squared)
 
 
 def test_what_was_not_fitted_is_not_judged(scene, snapshot) -> None:

@@ -43,9 +43,9 @@ def predicted(calibration):
 
 def test_shapes(predicted):
     assert predicted.px.shape == (10, GRID, GRID, GRID) and predicted.mm.shape == (GRID, GRID, GRID)
-    assert predicted.maps.shape == (10, len(MAP_DEPTHS), *MAP_SIZE) == predicted.map_inside.shape
-    assert predicted.map_depths.shape == (10, len(MAP_DEPTHS))
-    assert (predicted.map_depths.diff(dim=1) > 0).all()
+    assert predicted.maps.px.shape == (10, len(MAP_DEPTHS), *MAP_SIZE) == predicted.maps.inside.shape
+    assert predicted.maps.depths.shape == (10, len(MAP_DEPTHS))
+    assert (predicted.maps.depths.diff(dim=1) > 0).all()
 
 
 def test_the_summary_is_plain_and_in_order(predicted):
@@ -65,9 +65,9 @@ def test_more_snapshots_say_more(predicted, o10, asymmetric8):
 
 
 def test_the_corners_of_images_are_known_worse_than_their_middle(predicted):
-    middle, corner = predicted.maps[:, 1, 8, 12], predicted.maps[:, 1, 0, 0]
+    middle, corner = predicted.maps.px[:, 1, 8, 12], predicted.maps.px[:, 1, 0, 0]
     assert (corner > 10 * middle).all()
-    assert predicted.map_inside[:, 1, 8, 12].all() and not predicted.map_inside[:, 1, 0, 0].any()
+    assert predicted.maps.inside[:, 1, 8, 12].all() and not predicted.maps.inside[:, 1, 0, 0].any()
 
 
 def test_maps_say_the_same_as_the_uncertainty_at_a_point(predicted):
@@ -75,11 +75,11 @@ def test_maps_say_the_same_as_the_uncertainty_at_a_point(predicted):
     uv = torch.tensor([(column + 0.5) / 24 * 2048 - 0.5, (row + 0.5) / 16 * 1088 - 0.5], dtype=F64)
     one = rig.select([camera])
     xy, _ = undistort(((uv - one.principal_point) / one.focal_length)[:, None], one.distortion)
-    point = torch.cat((xy[0], torch.ones(1, 1, dtype=F64)), 1) * predicted.map_depths[camera, depth]
+    point = torch.cat((xy[0], torch.ones(1, 1, dtype=F64)), 1) * predicted.maps.depths[camera, depth]
     point = one.cam_from_rig[0].inverse().apply(point)
     torch.testing.assert_close(one.project(point).uv[0, 0], uv)
     found = predicted.uncertainty.pixel_error(point)[camera, 0]
-    torch.testing.assert_close(predicted.maps[camera, depth, row, column], found)
+    torch.testing.assert_close(predicted.maps.px[camera, depth, row, column], found)
 
 
 def test_the_working_volume_holds_the_object_and_its_place(calibration, asymmetric8):

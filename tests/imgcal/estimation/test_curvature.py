@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from imgcal.estimation import EstimationOptions, estimate
+from imgcal.estimation import EstimationOptions, curvature, estimate
 from imgcal.estimation.curvature import curvature_covariance
 from imgcal.synthesis.rigs import PhysicalDrift, RelativeDrift
 
@@ -54,3 +54,10 @@ def test_what_nothing_moves_has_none_and_what_moves_twice_as_much_has_four_times
     point = pixels(found)
     doubled = curvature_covariance(found, lambda rigs, points: 2 * point(rigs, points))
     torch.testing.assert_close(doubled, 4 * curvature_covariance(found, point))
+
+
+def test_numbers_too_many_to_keep_are_drawn_again(simulate, monkeypatch) -> None:
+    found = at_truth(simulate, 1.0)
+    kept = curvature_covariance(found, pixels(found))
+    monkeypatch.setattr(curvature, "MOST_KEPT_NUMBERS", 0)
+    assert torch.equal(kept, curvature_covariance(found, pixels(found)))

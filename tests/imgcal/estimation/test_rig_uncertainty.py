@@ -2,7 +2,14 @@ import pytest
 import torch
 
 from imgcal.errors import RefusedError
-from imgcal.estimation.rig_uncertainty import aligned_covariance, pixel_jacobian, rigid_motion, uncertainty_over
+from imgcal.estimation.rig_uncertainty import (
+    ROUNDS,
+    RigUncertainty,
+    aligned_covariance,
+    pixel_jacobian,
+    rigid_motion,
+    uncertainty_over,
+)
 from imgcal.evaluation.true_error import true_error
 from imgcal.geometry.transforms import RigidTransform
 
@@ -131,3 +138,37 @@ def test_all_errors_in_one_pass_are_those_of_each(rig, points):
     expected = (found.pixel_error(points), found.point_error(points, seen), found.point_error(points, seen, 0.3))
     for one, other in zip(found.errors(points, seen, 0.3), expected, strict=True):
         torch.testing.assert_close(one, other, equal_nan=True)
+
+
+def test_alignment_in_six_dimensions_is_that_of_the_whole_covariance(o10, points):
+    rig = o10.select(range(5))
+    covariance, _ = covariance_of(rig, 1e-4)
+    covariance[30:45, 30:45] *= 25
+    points = points * torch.tensor([3.0, 2.0, 1.0], dtype=F64)  # some of them outside of images
+    points = points[rig.project(points).visible.sum(0) >= 2]
+    seen = rig.project(points).visible
+    assert not seen.all() and seen.sum(0).min() >= 2
+    motion, pixels = rigid_motion(rig, points.mean(0)), pixel_jacobian(rig, points)
+    px_weight, mm_weight = seen.to(points), torch.ones(len(points), dtype=F64)
+    by_point = -pixels[..., 3:6] * seen[..., None, None]
+    inverse = torch.linalg.inv(torch.einsum("cpri,cprj->pij", by_point, by_point))
+    response = torch.einsum("pij,cprj,cprk->pick", inverse, by_point, pixels).flatten(2)  # (P, 3, K C)
+
+    def aligned(px_weight, mm_weight):
+        px_metric = torch.block_diag(*torch.einsum("cprk,cprl,cp->ckl", pixels, pixels, px_weight))
+        mm_metric = torch.einsum("pik,pil,p->kl", response, response, mm_weight)
+        parts = (aligned_covariance(covariance, motion, metric) for metric in (px_metric, mm_metric))
+        return RigUncertainty(rig, covariance, points, px_weight, mm_weight, *parts)
+
+    plain = aligned(px_weight, mm_weight)
+    for _ in range(ROUNDS - 1):
+        errors = plain.pixel_error(points), plain.point_error(points, seen)
+        medians = errors[0][seen].median(), errors[1].median()
+        px_weight, mm_weight = ((m / e).clamp_max(1).square() for m, e in zip(medians, errors, strict=True))
+        plain = aligned(px_weight * seen, mm_weight)
+    found = uncertainty_over(rig, covariance, points)
+    assert (px_weight < 1).any() and (mm_weight < 1).any()
+    torch.testing.assert_close(found.px_weight, plain.px_weight)
+    torch.testing.assert_close(found.mm_weight, plain.mm_weight)
+    for one, other in ((found.px_covariance, plain.px_covariance), (found.mm_covariance, plain.mm_covariance)):
+        torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-9 * float(other.abs().max()))

@@ -18,6 +18,12 @@ def test_a_taken_address_is_an_error_before_anything_is_started(served, o10, asy
         LivePage(o10, asymmetric8, served.address)
 
 
+def test_windows_is_refused_in_a_line(o10, asymmetric8, monkeypatch):
+    monkeypatch.setattr("imgcal.live_page.live_page.sys.platform", "win32")
+    with pytest.raises(InputError, match="live page: not on Windows"):
+        LivePage(o10, asymmetric8, Address(port=0))
+
+
 def test_the_server_is_started_again_where_it_ended(served, o10, asymmetric8):
     reader = Stream(served)
     first = reader.wait("hello")["instance"]

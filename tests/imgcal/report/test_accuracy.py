@@ -94,9 +94,9 @@ def test_every_cell_of_a_map_is_drawn_once(content):
 
 
 def test_a_camera_that_looks_elsewhere_says_so(content):
-    maps = content.predicted.maps.clone()
-    maps[1] = torch.nan
-    markup = camera_map(replace(content.predicted, maps=maps), 1, content.image_size[1], np.ones(5))
+    predicted = replace(content.predicted)
+    predicted.maps.px[1] = torch.nan
+    markup = camera_map(predicted, 1, content.image_size[1], np.ones(5))
     assert "sees nothing of the volume" in markup
 
 
