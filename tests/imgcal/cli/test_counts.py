@@ -2,6 +2,7 @@
 
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -167,3 +168,18 @@ def test_a_camera_bumped_before_the_last_snapshot_is_in_the_result_and_on_the_te
     said = "camera cam04 stopped fitting at snapshot"
     assert code == 0 and result["doubtful"] == [{"camera": "cam04", "snapshots": [f"{last:05d}"]}]
     assert said in capsys.readouterr().err and said[1:] in (folder / "out" / "report.html").read_text()
+
+
+def documented_keys():
+    """Keys in the table of docs/files.md."""
+    page = (Path(__file__).parents[3] / "docs" / "files.md").read_text()
+    rows = re.findall(r"^\| (`.*?`) \|", page.partition("## Results")[2], re.MULTILINE)
+    return {key for row in rows for key in re.findall(r"`(\w+)`", row)}
+
+
+def test_every_key_of_a_result_is_documented_and_there(room):
+    _, run, truth, moved = room
+    code, result = run(damage.blobs(truth, labelled=True), "--no-report")
+    assert code == 0 and set(result) == documented_keys()
+    code, refused = run(damage.blobs(moved), "--no-report")
+    assert code == 3 and set(refused) == documented_keys()
