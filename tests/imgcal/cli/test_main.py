@@ -70,7 +70,7 @@ def test_debug_may_stand_anywhere_and_is_no_argument_of_the_command(tmp_path, ca
         (["simulate"], "--rig"),
         (["simulate", "--rig"], "--rig"),
         (["simulate", "--rig", "O10", "--objekt", "cube8", "--out", "x"], "--objekt"),
-        (["simulate", "--rig", "O10", "--object", "cube8", "--out", "x", "--snapshots", "many"], "'many'"),
+        (["simulate", "--rig", "O10", "--object", "cube8", "--out", "x", "--snapshots", "many"], "found many"),
         (["simulate", "--rig", "O10", "--object", "cube8", "--out", "x", "--sensor.bit-depth", "9"], "'9'"),
         (["simulate", "--rig", "O10", "--object", "cube8", "--out", "x", "--sensor.blur", "-1"], "blur"),
     ],
