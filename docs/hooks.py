@@ -1,11 +1,13 @@
 """What the pages get beyond MkDocs' plugins, so that they open from a folder, without a network or a server.
 
 Equations become MathML, which browsers draw by themselves; the search finds its worker beside the pages; the trailing
-comment of a field, where its shape and unit stand, becomes its description in the API.
+comment of a field, where its shape and unit stand, becomes its description in the API. Drawings, which are images on
+GitHub, become part of the page, and take its colours.
 """
 
 import html
 import re
+from pathlib import Path
 from typing import Any
 
 from griffe import Attribute, Docstring, Extension
@@ -15,7 +17,14 @@ from mkdocs.utils import get_relative_url
 MATH = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
 NAMESPACE = re.compile(r' xmlns="[^"]*"')  # HTML knows what <math> is
 SHIM = re.compile(r'<script src="[^"]*iframe-worker/shim"></script>')  # the theme would fetch it from the network
+DRAWING = re.compile(r"!\[[^\]]*\]\((assets/\w+\.svg)\)")
+STYLE = re.compile(r"<style>.*?</style>\n?", re.DOTALL)  # for the drawing as an image by itself
 COMMENT = re.compile(r"\s#:?\s+(?!type:|noqa|fmt:)(.+)$")
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Put drawings into the page."""
+    return DRAWING.sub(lambda found: STYLE.sub("", (Path(__file__).parent / found[1]).read_text()), markdown)
 
 
 def on_page_content(content: str, **_: Any) -> str:

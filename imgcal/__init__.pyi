@@ -4,10 +4,10 @@ from .errors import InputError, RefusedError
 from .estimation import Estimate, EstimationOptions, PredictedError, WorkingVolume, estimate, predicted_error
 from .formats import load_rig
 from .geometry import Projection, RigidTransform
-from .io import load_detections, load_object, open_capture, save_detections, save_rig
+from .io import load_detections, load_object, open_capture, save_detections, save_object, save_rig
 from .online import Event, Recalibrator, RigKeeper, RigState
-from .pipeline import Calibration, calibrate, score
-from .types import CalibrationObject, CameraRig, Detections, Observations, RigPrior
+from .pipeline import Calibration, calibrate, calibrate_from_scratch, score
+from .types import CalibrationObject, CameraRig, Detections, DriftRate, Observations, RigPrior
 
 __version__: str
 
@@ -17,6 +17,7 @@ __all__ = [
     "CameraRig",
     "DetectionOptions",
     "Detections",
+    "DriftRate",
     "Estimate",
     "EstimationOptions",
     "Event",
@@ -33,6 +34,7 @@ __all__ = [
     "RigidTransform",
     "WorkingVolume",
     "calibrate",
+    "calibrate_from_scratch",
     "detect",
     "estimate",
     "load_detections",
@@ -41,6 +43,7 @@ __all__ = [
     "open_capture",
     "predicted_error",
     "save_detections",
+    "save_object",
     "save_rig",
     "score",
 ]

@@ -10,7 +10,10 @@ from imgcal.io import load_object, load_rig
 from imgcal.types.calibration_object import CalibrationObject
 from imgcal.types.rig import CameraRig
 
-LEFT_OUT = pytest.StashKey[int]()
+LEFT_OUT = pytest.StashKey[dict[str, int]]()
+SLOW = tuple(
+    line for line in (Path(__file__).parent / "slow_tests.txt").read_text().splitlines() if not line.startswith("#")
+)
 CHROMIUM = shutil.which("chromium")
 ARGUMENTS = [
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
@@ -20,25 +23,45 @@ ARGUMENTS = [
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--benchmarks", action="store_true", help="run the smokes of the benchmarks (minutes), too")
+    parser.addoption("--slow", action="store_true", help="run the tests that take long, too; CI=true does the same")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Run slow tests in CI, and where paths are given; workers have the option from the process that started them."""
+    whole = config.args_source is pytest.Config.ArgsSource.TESTPATHS
+    if not hasattr(config, "workerinput") and (os.environ.get("CI") or not whole):
+        config.option.slow = True
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out the benchmarks' smokes, unless they are asked for: by --benchmarks, by -m, or by their file's name."""
-    named = any("test_benchmark" in argument for argument in config.args)
-    if config.getoption("--benchmarks") or config.option.markexpr or named:
+    """Leave out benchmarks' smokes and slow tests, unless they are asked for: by an option, by -m, or by name."""
+    for item in items:
+        if item.nodeid.startswith(SLOW):
+            item.add_marker(pytest.mark.slow)
+    if config.option.markexpr:
         return
-    left = [item for item in items if item.get_closest_marker("benchmark")]
-    if left:
-        config.stash[LEFT_OUT] = len(left)
-        config.hook.pytest_deselected(items=left)
-        items[:] = [item for item in items if item not in set(left)]
+    named = any("test_benchmark" in argument for argument in config.args)
+    wanted = {
+        "benchmark": config.getoption("--benchmarks") or named,
+        "slow": config.getoption("--slow"),
+    }
+    counts = {}
+    for marker in (marker for marker, run in wanted.items() if not run):
+        left = [item for item in items if item.get_closest_marker(marker)]
+        if left:
+            counts[marker] = len(left)
+            config.hook.pytest_deselected(items=left)
+            items[:] = [item for item in items if item not in set(left)]
+    config.stash[LEFT_OUT] = counts
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-    if left := config.stash.get(LEFT_OUT, 0):
-        terminalreporter.write_line(
-            f"{left} smokes of benchmarks were left out: run them with --benchmarks", yellow=True
-        )
+    left = config.stash.get(LEFT_OUT, {})
+    options = {"benchmark": "smokes of benchmarks", "slow": "slow tests"}
+    for marker, what in options.items():
+        if marker in left:
+            option = "--slow" if marker == "slow" else "--benchmarks"
+            terminalreporter.write_line(f"{left[marker]} {what} were left out: run them with {option}", yellow=True)
 
 
 @pytest.fixture(scope="session")

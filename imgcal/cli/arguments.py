@@ -183,7 +183,7 @@ class Calibrate:
 
 @dataclass(frozen=True)
 class Watch:
-    """Keep a running rig calibrated: every snapshot is learnt from, and what moves is told.
+    """Keep a running rig calibrated: learn from every snapshot, and report cameras that move.
 
     INPUT is what the cameras write or send:
     a folder that is being filled with frames/<camera>/<snapshot>.png, or that holds a video a camera;

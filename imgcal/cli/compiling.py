@@ -12,7 +12,7 @@ from pathlib import Path
 import imgcal
 from imgcal.machine import usable_cores
 
-HINT = "compiling for this machine, once for each kind of lens; `imgcal warmup --all-lenses` does it ahead of time"
+HINT = "compiling for this machine: 10 to 60 s, once; `imgcal warmup` compiles everything ahead of time"
 HELP = "from imgcal.online import warm_up_fits; warm_up_fits()"
 NEEDED_LAST = "lm_cpu.*"  # files of the cache that show that there is nothing to help with
 

@@ -9,6 +9,7 @@ from imgcal.estimation import Gauge
 from imgcal.io import RigCovariance
 from imgcal.messages import listed
 from imgcal.pipeline import Calibration, Knowledge, Motion, knowledge_of, motion_since_factory
+from imgcal.types import MovedCamera
 
 
 @dataclass(frozen=True)
@@ -18,6 +19,7 @@ class Findings:
     motion: Motion
     knowledge: Knowledge
     from_scratch: bool = False  # there was no factory calibration since which a camera could have moved
+    moved: tuple[MovedCamera, ...] = ()  # during the capture
     untimed: tuple[str, ...] = ()  # cameras of which nothing tells whether their frames are of the same moments
 
     @property
@@ -25,7 +27,9 @@ class Findings:
         """The form that scripts read."""
         motion, known = self.motion, self.knowledge
         reference = motion.gauge.reference
+        since_factory = () if self.from_scratch else motion.moves
         return {
+            "moved": [move.as_values() for move in (*since_factory, *self.moved)],
             "motion": None
             if self.from_scratch
             else {
@@ -68,4 +72,4 @@ UNKNOWN: dict[str, Any] = {"motion": None, "timing_untested": None, "knowledge":
 def findings(calibration: Calibration, gauge: Gauge, covariance: RigCovariance) -> Findings:
     """Look at what was found."""
     motion, knowledge = motion_since_factory(calibration, gauge), knowledge_of(calibration, covariance.std)
-    return Findings(motion, knowledge, calibration.from_scratch, calibration.untimed)
+    return Findings(motion, knowledge, calibration.from_scratch, calibration.moved, calibration.untimed)

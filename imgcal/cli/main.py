@@ -9,10 +9,10 @@ import re
 import sys
 import traceback
 import warnings
-from dataclasses import make_dataclass
+from dataclasses import fields, is_dataclass, make_dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, Protocol, Union
+from typing import Annotated, Any, Protocol, Union, get_type_hints
 
 import tyro
 
@@ -44,7 +44,7 @@ COMMANDS = {
     ),
     "watch": (
         "imgcal.cli.watch",
-        "Keep a running rig calibrated: every snapshot is learnt from, and what moves is told.",
+        "Keep a running rig calibrated: learn from every snapshot, and report cameras that move.",
     ),
     "score": (
         "imgcal.cli.score",
@@ -144,7 +144,7 @@ def parse(arguments: list[str]) -> Runnable:
     except SystemExit as stop:
         if stop.code in (None, DONE):
             raise
-        raise InputError(_undrawn(drawn.getvalue())) from None
+        raise InputError(_undrawn(drawn.getvalue(), arguments[0] if arguments else "")) from None
 
 
 def _understood(arguments: list[str]) -> Runnable:
@@ -176,17 +176,30 @@ def _summary(name: str) -> Any:
     return make_dataclass(name.capitalize(), (), namespace={"__doc__": COMMANDS[name][1]})
 
 
-def _undrawn(box: str) -> str:
+def _undrawn(box: str, first: str = "") -> str:
     """Take the words from the box that tyro draws about a command line."""
     rows = (line.strip("│╭╮╰╯─| ") for line in box.splitlines()[1:])
     text = " ".join(row for row in rows if row.strip("-+"))
     problem, _, hint = text.partition("For full helptext, ")
     problem = problem.partition("Argument helptext:")[0].replace("__tyro-dummy-inner__.", "")
     command = re.search(r"imgcal[a-z ]* --help", hint)
-    return f"{_in_brief(problem.strip())}; see {command[0] if command else 'imgcal --help'}"
+    return f"{_in_brief(problem.strip(), first)}; see {command[0] if command else 'imgcal --help'}"
 
 
-def _in_brief(problem: str) -> str:
+def options_of(command: str) -> list[str]:
+    """List the options of a command, without importing the command itself."""
+    if command not in COMMANDS:
+        return []
+
+    def names(kind: Any) -> list[str]:
+        hints = get_type_hints(kind)
+        nested = [name for hint in hints.values() if is_dataclass(hint) for name in names(hint)]
+        return [f"--{field.name.replace('_', '-')}" for field in fields(kind)] + nested
+
+    return names(_arguments(command))
+
+
+def _in_brief(problem: str, command: str = "") -> str:
     """Say what is wrong with a command line: the first thing, in a few words."""
     if unknown := re.search(r"Unrecognized options: (.*?)(?: Perhaps you meant:? (.*))?$", problem):
         words, near = unknown[1].split(", "), re.search(r"--[\w.-]+", unknown[2] or "")
@@ -194,7 +207,8 @@ def _in_brief(problem: str) -> str:
         if not options:
             return f"found {quoted(' '.join(words))!r}, expected no more than was given before it"
         option = options[0].split()[0]
-        return f"unknown option `{shortened(option)}`" + (f"; did you mean `{near[0]}`?" if near else "")
+        close = [near[0]] if near else difflib.get_close_matches(option.partition("=")[0], options_of(command), 1)
+        return f"unknown option `{shortened(option)}`" + (f"; did you mean `{close[0]}`?" if close else "")
     if problem.startswith("Missing from"):
         entries = problem.partition(": ")[2].split("(required)")[:-1]
         parts = [entry.split() for entry in entries]
@@ -204,6 +218,13 @@ def _in_brief(problem: str) -> str:
         r"Error parsing (\S+): .*input length (\d+) did not match expected argument count (\d+)", problem
     ):
         return f"{count[1]}: found {count[2]} values, expected {count[3]}"
+    if number := re.search(r"Error parsing (\S+): .*(?:base 10|to float): '(.*?)'", problem):
+        kind = "an integer" if "base 10" in problem else "a number"
+        return f"{number[1]}: found {shortened(number[2])}, expected {kind}"
+    if union := re.search(r"Error parsing (\S+): no type matching .* from \[(.*?)\]\. Got errors", problem):
+        numbers = re.search(r"tuple\[((?:(?:float|int)(?:, )?)+)\]", problem)
+        expected = f"{len(numbers[1].split(', '))} numbers" if numbers else "another value"
+        return f"{union[1]}: found {shortened(union[2].replace(chr(39), '').replace(',', ''))}, expected {expected}"
     return re.sub(r"\[/?[a-z ]+\]", "", problem)
 
 

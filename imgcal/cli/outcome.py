@@ -47,7 +47,6 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         "snapshots_used": len(used),
         "snapshots_rejected": len(snapshots) - len(used),
         "rejected": {s.name: s.reason for s in snapshots if s.status == "refused"},
-        "moved": [move.as_values() for move in calibration.moved],
         "late": [vars(late) for late in calibration.late],
         "doubtful": [camera.as_values() for camera in calibration.doubtful],
         "unsynchronized": None if calibration.unsynchronized is None else calibration.unsynchronized.values,

@@ -101,9 +101,9 @@ class Estimate:
 
     @property
     def rms(self) -> Tensor:
-        """RMS reprojection error of the seen fiducials, over both axes: (*B) pixels."""
+        """RMS length of the residuals of the seen fiducials, as OpenCV's calibrateCamera returns it: (*B) pixels."""
         count = (self.problem.root_weight > 0).flatten(1).sum(1).clamp_min(1).reshape(self.chi2.shape)
-        return (self.residual.square().flatten(len(self.chi2.shape)).sum(-1) / (2 * count)).sqrt()
+        return (self.residual.square().flatten(len(self.chi2.shape)).sum(-1) / count).sqrt()
 
     def __repr__(self) -> str:
         """Say what it is, and shapes instead of walls of numbers."""
@@ -275,6 +275,11 @@ def make_problem(
             f"observations: found uv {tuple(observations.uv.shape)} and seen {tuple(observations.seen.shape)}, "
             f"expected (..., snapshots, {rig.num_cameras} cameras, {obj.num_fiducials} fiducials) and the same with "
             "coordinates"
+        )
+    if observations.shake is not None:
+        raise InputError(
+            "observations: found `shake`, which only a running rig (`RigKeeper`) takes into account: estimate from "
+            "observations without it"
         )
     batch = observations.seen.shape[:-3]
     count = batch.numel()

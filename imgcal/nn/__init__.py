@@ -9,7 +9,7 @@ from imgcal.nn import pytrees  # noqa: F401  registers the value types
 from imgcal.nn.map_estimate import MapEstimate, MapSolution
 from imgcal.nn.project_rig import ProjectRig
 from imgcal.nn.render_and_compare import RefinedImages, RenderAndCompare
-from imgcal.nn.reprojection_loss import ReprojectionLoss, project_fiducials, reprojection_re
+from imgcal.nn.reprojection_loss import ReprojectionLoss, project_fiducials, rms_per_axis
 from imgcal.nn.soft_positions import SoftPositions
 from imgcal.nn.splat_renderer import SplatRenderer
 
@@ -23,5 +23,5 @@ __all__ = [
     "SoftPositions",
     "SplatRenderer",
     "project_fiducials",
-    "reprojection_re",
+    "rms_per_axis",
 ]

@@ -59,7 +59,7 @@ class ReprojectionLoss(nn.Module):
             uv = project_fiducials(_exact(prediction).cameras_from_object, obj)
             if isinstance(target, Prediction):
                 target = project_fiducials(_exact(target).cameras_from_object, obj)
-            each = reprojection_re(uv - target, seen)
+            each = rms_per_axis(uv - target, seen)
         if self.reduction == "none":
             return each
         return each.mean() if self.reduction == "mean" else each.sum()
@@ -86,7 +86,7 @@ def project_fiducials(cameras: CameraRig, obj: CalibrationObject) -> Tensor:
     return project_kornia(points, *lens, cameras.image_size, radius, cameras.lens_model).uv
 
 
-def reprojection_re(difference: Tensor, seen: Tensor | None = None) -> Tensor:
+def rms_per_axis(difference: Tensor, seen: Tensor | None = None) -> Tensor:
     """Root mean squared coordinate of differences, for each rig.
 
     Args:

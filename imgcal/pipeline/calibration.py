@@ -102,7 +102,7 @@ class Calibration:
 
     def __repr__(self) -> str:
         """Say what was found: the rig, its error before and after, how the fiducials were identified."""
-        before, after = (2**0.5 * float(rms) for rms in (self.before.rms, self.rms))
+        before, after = float(self.before.rms), float(self.rms)
         used = f"{len(self.labelled.used)} of {len(self.labelled.snapshots)} snapshots"
         return (
             f"{type(self).__name__}({self.rig!r}, RMS {before:.4g} -> {after:.2g} px, chi2/dof "
@@ -139,7 +139,7 @@ class Calibration:
 
     @property
     def rms(self) -> Tensor:
-        """RMS reprojection error of the seen fiducials, over both axes: () pixels."""
+        """RMS length of the residuals of the seen fiducials, as OpenCV's calibrateCamera returns it: () pixels."""
         return self.estimate.rms
 
     @property

@@ -186,7 +186,7 @@ def _fitted_once(
     require_cameras(found.seen, rig, options)
     require_near_prior(fit, prior, rig, found.prior_scale, options)
     require_most_labels(labels, found.seen, rig)
-    require_fit(found.additive_noise, outliers / max(int(labels.sum()), 1), 2**0.5 * float(fit.rms), options)
+    require_fit(found.additive_noise, outliers / max(int(labels.sum()), 1), float(fit.rms), options)
     return Calibration(
         estimate=fit,
         labelled=labelled,

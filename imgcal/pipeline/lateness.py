@@ -158,7 +158,7 @@ class _View:
         valid = np.flatnonzero(self.seen.any(-1).numpy() & (source >= 0) & (source < len(number)))
         poses = self.poses[torch.as_tensor(source[valid])]
         fit = _fit(self.uv[valid], self.seen[valid], self.single, self.points, poses)
-        return 2**0.5 * float(fit.rms)
+        return float(fit.rms)
 
 
 def _slip(view: _View) -> tuple[int, int] | None:

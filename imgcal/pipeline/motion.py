@@ -9,6 +9,7 @@ from torch import Tensor
 
 from imgcal.estimation import Gauge
 from imgcal.pipeline.calibration import Calibration
+from imgcal.types import MovedCamera
 
 MOVED = 3.0
 """A value has moved when its change from the factory is larger than this many standard deviations."""
@@ -39,6 +40,25 @@ class Motion:
         beyond = ((self.change.abs() > MOVED * self.std) & (self.std > 0))[:, :6].any(dim=-1)
         far = self.rotation_deg + self.position_mm / 10
         return tuple(int(c) for c in far.argsort(descending=True) if beyond[c])
+
+    @property
+    def moves(self) -> tuple[MovedCamera, ...]:
+        """The same cameras with the change that is surest: a rotation (deg) or a position (mm)."""
+        return tuple(self._move(c) for c in self.moved)
+
+    def _move(self, camera: int) -> MovedCamera:
+        change, std = self.change[camera, :6].view(2, 3), self.std[camera, :6].view(2, 3)
+        size = change.norm(dim=-1)
+        sigma = (change * std).norm(dim=-1) / size.clamp_min(1e-30)  # of the length, along the change itself
+        turned = bool(size[0] * sigma[1] >= size[1] * sigma[0])
+        row, unit = (0, 180 / math.pi) if turned else (1, 1.0)
+        return MovedCamera(
+            self.camera_names[camera],
+            None,
+            "rotation" if turned else "position",
+            float(size[row]) * unit,
+            float(sigma[row]) * unit,
+        )
 
     @property
     def sentence(self) -> str:

@@ -123,7 +123,7 @@ def _scored(labelled: Associations, rig: CameraRig, obj: CalibrationObject, opti
         if not bool(fit.converged):
             raise RefusedError(
                 "score: in some snapshot no pose of the object fits what the cameras see (RMS "
-                f"{2**0.5 * float(fit.rms):.3g} px): the rig or the object is not the one in the images"
+                f"{float(fit.rms):.3g} px): the rig or the object is not the one in the images"
             )
         poses = fit.rig_from_object
         points = poses.apply(obj.points.to(rig.focal_length))

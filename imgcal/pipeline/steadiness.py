@@ -75,7 +75,7 @@ def steady_part(
     total, first = len(labelled.snapshots), 0
     names = [snapshot.name for snapshot in labelled.snapshots]
     for _ in range(MOST_MOVES):
-        first = max(names.index(move.snapshot) for move in found)
+        first = max(names.index(move.snapshot) for move in found if move.snapshot is not None)
         explained = _are_explained(found, detections, first, rig, obj, options)
         if not (options.after_last_move and explained):
             raise MovedError(moved, total - first, total, explained, labelled.detections)

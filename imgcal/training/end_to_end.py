@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from imgcal.errors import InputError
-from imgcal.nn import project_fiducials, reprojection_re
+from imgcal.nn import project_fiducials, rms_per_axis
 from imgcal.refinement import as_prediction, refine_points
 from imgcal.training.data import RigBatch, Source
 from imgcal.training.losses import RefinedLoss
@@ -45,7 +45,7 @@ def refined_loss(
         sigma = config.sigma * prediction.log_sigma.double().exp()
         fit = refine_points(prediction, batch.views, source.factory, source.obj, prior_std, sigma)
         truth = project_fiducials(batch.truth.cameras_from_object, source.obj).double()
-        re = reprojection_re(project_fiducials(as_prediction(fit).cameras_from_object, source.obj) - truth)
+        re = rms_per_axis(project_fiducials(as_prediction(fit).cameras_from_object, source.obj) - truth)
         counts = fit.converged & (re < WORST)
         error = torch.where(counts, torch.log1p(torch.where(counts, re, 0.0)), 0.0)
         return config.weight * (error.sum() / counts.sum().clamp_min(1)).float()

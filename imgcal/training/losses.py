@@ -18,7 +18,7 @@ from torch import Tensor
 
 from imgcal.geometry import geodesic_angle
 from imgcal.io import StrictModel
-from imgcal.nn import project_fiducials, reprojection_re
+from imgcal.nn import project_fiducials, rms_per_axis
 from imgcal.types import CalibrationObject, CameraRig, Prediction, pack21
 
 # Parameters of smaller spread (rad, mm, pixels, pixels, 1) are fixed: float32 cannot tell their offsets from rounding.
@@ -111,7 +111,7 @@ def compound(
         predicted = _stacked(predictions)  # (T, B)
         cameras, true_cameras = predicted.cameras_from_object, truth.cameras_from_object
         difference = project_fiducials(cameras, obj) - project_fiducials(true_cameras, obj)
-        re = reprojection_re(difference)  # (T, B)
+        re = rms_per_axis(difference)  # (T, B)
         if config.kind == "robust":
             terms = _robust_terms(predicted, truth, re, config.robust, prior_std)
             gamma = config.robust.gamma
@@ -129,7 +129,7 @@ def compound(
 
 def reprojection_rmse(difference: Tensor) -> Tensor:
     """L_eps of the paper: one RMSE over all of (B, C, N, 2) pixels."""
-    return reprojection_re(difference.flatten(0, -3))
+    return rms_per_axis(difference.flatten(0, -3))
 
 
 def parameter_rmse(predicted: CameraRig, truth: CameraRig, lambda_scale: float = 1000.0) -> Tensor:

@@ -14,7 +14,7 @@ from imgcal.errors import InputError
 from imgcal.formats import load_rig
 from imgcal.io import load_object, object_text, rig_text, validated
 from imgcal.networks import Checkpoint, Network, NetworkSpec, build_network, warm_start, without_pretrained
-from imgcal.nn import project_fiducials, reprojection_re
+from imgcal.nn import project_fiducials, rms_per_axis
 from imgcal.synthesis import Corruption, share_of_good_rigs
 from imgcal.training.data import Levels, RigBatch, Source, object_to
 from imgcal.training.end_to_end import refined_loss
@@ -143,7 +143,7 @@ class RigTask(Task[RigBatch, Passes]):
     def errors(self, predicted: Prediction, batch: RigBatch) -> Tensor:
         """RE of each rig of a batch: (B,) pixels."""
         found, true = (project_fiducials(one.cameras_from_object, self.source.obj) for one in (predicted, batch.truth))
-        return reprojection_re(found - true)
+        return rms_per_axis(found - true)
 
     def result(self, network: nn.Module, metrics: Mapping[str, Any]) -> Checkpoint:
         """Weights with their rig, object and experiment."""

@@ -21,7 +21,7 @@ class MovedCamera:
     """One camera, the first snapshot that it saw from its new place, and how far it went."""
 
     camera: str
-    snapshot: str  # name of the first snapshot after the move
+    snapshot: str | None  # name of the first snapshot after the move; None = it moved before the capture
     kind: Kind  # what explains the change best; unknown = nothing of what it saw afterwards could be labelled
     size: float | None = None  # in `unit`; None = not known
     sigma: float | None = None  # one standard deviation of the size
@@ -44,7 +44,8 @@ class MovedCamera:
 
     def __str__(self) -> str:
         """Say it in words."""
-        where = f"camera {self.camera} moved before snapshot {self.snapshot}"
+        moment = "the capture" if self.snapshot is None else f"snapshot {self.snapshot}"
+        where = f"camera {self.camera} moved before {moment}"
         if self.size is None or self.sigma is None:
             return where
         return f"{where} ({self.kind.replace('_', ' ')} {self.size:.3g} +- {self.sigma:.1g} {self.unit})"

@@ -110,7 +110,7 @@ class Observations:
     uv: Tensor  # (*B, S, C, N, 2) pixels; any finite value where not seen
     sigma: Tensor  # (*B, S, C, N) pixels, one standard deviation of each axis
     seen: Tensor  # (*B, S, C, N) bool
-    shake: Tensor | None = None  # (S, C) pixels, one sd of a shift that all points share; `absorb` knows of it
+    shake: Tensor | None = None  # (*B, S, C) pixels, sd of a shift that all points of an image share (`absorb` only)
 
     __repr__ = brief_repr
 

@@ -146,7 +146,7 @@ class Ours:
             result = self.live.update(self.stream.frames[snapshot])
         except RefusedError:
             return Outcome(None)
-        return Outcome(result.rig, 2**0.5 * float(result.rms))
+        return Outcome(result.rig, float(result.rms))
 
 
 class Classical:
@@ -230,7 +230,8 @@ def misfit(rig: CameraRig, obj: CalibrationObject, uv: Tensor, seen: NDArray[np.
     """RE (px) on image points (S, C, N, 2): the rig is held, only the object's poses are fitted."""
     shown = torch.ones(uv.shape[:-1], dtype=torch.bool) if seen is None else torch.from_numpy(seen)
     observations = Observations(uv, torch.full_like(uv[..., 0], NOISE), shown)
-    return float(estimate(observations, rig, obj, prior_std=torch.zeros(rig.num_cameras, 15, dtype=uv.dtype)).rms)
+    held = torch.zeros(rig.num_cameras, 15, dtype=uv.dtype)
+    return float(estimate(observations, rig, obj, prior_std=held).rms) / 2**0.5
 
 
 def _compared(

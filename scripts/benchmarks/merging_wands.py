@@ -209,7 +209,7 @@ def run(item: Item) -> dict[str, Any]:
         said |= {"outcome": "refused", "reason": str(error)[:200]}
     else:
         doubtful = [[d.camera, d.snapshots[0]] for d in getattr(result, "doubtful", ())]
-        said |= {"outcome": "accepted", "rms_px": math.sqrt(2) * float(result.rms), "doubtful": doubtful}
+        said |= {"outcome": "accepted", "rms_px": float(result.rms), "doubtful": doubtful}
     if bump is not None:
         said["outcome"] = _judged(said, bump, made)
     return said | {"cpu_s": time.process_time() - began}

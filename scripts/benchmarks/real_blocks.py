@@ -110,7 +110,7 @@ def measure(blocks: Sequence[Block]) -> dict[str, Any]:
         "blocks": [
             {
                 "snapshots": len(block.calibration.labelled.used),
-                "rms_px": 2**0.5 * float(block.calibration.rms),
+                "rms_px": float(block.calibration.rms),
                 "inflation": block.calibration.estimate.mean_inflation,
                 "block_length": block.calibration.block_length,
                 "said_to_move": block.said_to_move,

@@ -7,7 +7,6 @@ has been run with the same code is not run again (`out/work/real_stream`).
 
 from __future__ import annotations
 
-import math
 import time
 from collections import Counter
 from dataclasses import dataclass
@@ -255,7 +254,7 @@ def main() -> None:
     runs = [row for row in found if "degrees" in row]
     result = {
         **surroundings(),
-        "calibration_rms_px": math.sqrt(2) * rms,
+        "calibration_rms_px": rms,
         "gates": {"final_to_batch": WORST_FINAL, "worst_to_start": WORST_ON_THE_WAY, "false": 0},
         "untouched": [row for row in found if "degrees" not in row],
         "bumps": summarize(runs),

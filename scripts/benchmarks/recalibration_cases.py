@@ -168,4 +168,4 @@ def _misfit(rigs: CameraRig, observations: Observations, cases: Cases) -> np.nda
     every = Observations(*(value.flatten(0, 1)[:, None] for value in parts))
     repeated = rigs.map_tensors(lambda tensor, _: tensor.repeat_interleave(snapshots, 0))
     found = estimate(every, repeated, cases.obj, prior_std=held, options=SQUARED)
-    return found.rms.unflatten(0, (-1, snapshots)).square().mean(1).sqrt().nan_to_num(math.inf).numpy()
+    return (found.rms.unflatten(0, (-1, snapshots)).square().mean(1) / 2).sqrt().nan_to_num(math.inf).numpy()

@@ -101,7 +101,7 @@ def run(item: Item) -> dict[str, Any]:
         "nees_median": float(np.median(chi2s) / VALUES) if len(chi2s) else None,
         "beyond_3_sigma": int((chi2s > SURELY).sum()),
         "lost": sum(event["event"] == "camera_lost" for event in events),
-        "calibration_rms_px": math.sqrt(2) * float(calibration.rms),
+        "calibration_rms_px": float(calibration.rms),
         "calibration_nees": _calibration_nees(calibration, stream),
         "s_to_calibrate": taught,
         "cpu_s": time.process_time() - began,

@@ -13,6 +13,6 @@ snapshots = list(simulate_frames(truth, obj, FrameModel(clutter=ClutterModel()),
 frames = {camera: [snapshot[camera] for snapshot in snapshots] for camera in factory.camera_names}
 
 result = imgcal.calibrate(frames, factory, obj)
-print(f"identity {result.identity}, reprojection error {result.before.rms:.2f} px -> {result.rms:.3f} px (each axis)")
+print(f"identity {result.identity}, reprojection error {result.before.rms:.2f} px -> {result.rms:.3f} px")
 for stage, seconds in result.seconds.items():
     print(f"{stage}: {1000 * seconds:.1f} ms")

@@ -2,6 +2,7 @@
 
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -38,7 +39,9 @@ def test_blobs_labels_and_outliers_are_counted(room):
     bad = np.flatnonzero((table.camera == CAMERA) & (table.fiducial >= 0) & (table.snapshot % 5 == 0))
     table.uv[bad] += (9.0, -7.0)
     code, result = run(table, "--no-report")
-    assert code == 0 and result["moved"] == []
+    assert code == 0
+    assert {move["camera"] for move in result["moved"]} == set(result["motion"]["cameras_moved"])
+    assert all(move["snapshot"] is None for move in result["moved"])  # none during the capture
     own = result["per_camera"]["cam04"]
     assert own["blobs"] == int((table.camera == CAMERA).sum())
     assert own["labelled"] == int(((table.camera == CAMERA) & (table.fiducial >= 0)).sum())
@@ -129,7 +132,7 @@ def test_the_rig_since_the_last_move(room, capsys):
     assert code == 0 and result["status"] == "ok"
     assert result["snapshots_used"] == 8 and result["snapshots_rejected"] == 12
     assert result["rejected"]["00011"] == "taken before a camera moved"
-    assert [move["camera"] for move in result["moved"]] == ["cam04"]
+    assert [move["camera"] for move in result["moved"] if move["snapshot"] is not None] == ["cam04"]
     assert "camera cam04 moved before snapshot 00012" in capsys.readouterr().out
     assert "During the capture camera cam04 moved before snapshot 00012" in (folder / "out" / "report.html").read_text()
 
@@ -165,3 +168,18 @@ def test_a_camera_bumped_before_the_last_snapshot_is_in_the_result_and_on_the_te
     said = "camera cam04 stopped fitting at snapshot"
     assert code == 0 and result["doubtful"] == [{"camera": "cam04", "snapshots": [f"{last:05d}"]}]
     assert said in capsys.readouterr().err and said[1:] in (folder / "out" / "report.html").read_text()
+
+
+def documented_keys():
+    """Keys in the table of docs/files.md."""
+    page = (Path(__file__).parents[3] / "docs" / "files.md").read_text()
+    rows = re.findall(r"^\| (`.*?`) \|", page.partition("## Results")[2], re.MULTILINE)
+    return {key for row in rows for key in re.findall(r"`(\w+)`", row)}
+
+
+def test_every_key_of_a_result_is_documented_and_there(room):
+    _, run, truth, moved = room
+    code, result = run(damage.blobs(truth, labelled=True), "--no-report")
+    assert code == 0 and set(result) == documented_keys()
+    code, refused = run(damage.blobs(moved), "--no-report")
+    assert code == 3 and set(refused) == documented_keys()

@@ -36,7 +36,14 @@ def test_batch_shapes(simulate, batch: tuple[int, ...], snapshots: int, cameras:
     uv = uv.unflatten(-2, (snapshots, 8)).movedim(-3, -4)
     seen = case.observations.seen
     torch.testing.assert_close(found.residual[seen], (uv - case.observations.uv)[seen], rtol=0, atol=1e-8)
-    torch.testing.assert_close(found.rms**2 * 2 * seen.sum((-1, -2, -3)), found.residual.square().sum((-1, -2, -3, -4)))
+    torch.testing.assert_close(found.rms**2 * seen.sum((-1, -2, -3)), found.residual.square().sum((-1, -2, -3, -4)))
+
+
+def test_shake_is_refused_instead_of_ignored(simulate) -> None:
+    case = simulate(snapshots=2, cameras=4)
+    shaken = replace(case.observations, shake=torch.full(case.observations.seen.shape[:2], 0.1))
+    with pytest.raises(InputError, match="shake"):
+        run(replace(case, observations=shaken))
 
 
 def test_batch_equals_one_by_one(simulate) -> None:

@@ -32,6 +32,9 @@ def test_the_bumped_camera_is_named_even_if_it_is_the_first(camera, o10, asymmet
     others = [i for i in range(10) if i != camera]
     assert motion.position_mm[others].max() < 2
     assert f"1 of 10 cameras moved relative to the others: {name} (0.4" in motion.sentence
+    (move,) = motion.moves
+    assert (move.camera, move.snapshot, move.kind, move.unit) == (name, None, "position", "mm")  # the surer of both
+    assert move.size == pytest.approx(float(motion.position_mm[camera])) and 0 < move.sigma < 0.1 * move.size
     # A reference camera has moved all others when it is itself that was bumped.
     relative = motion_since_factory(result, Gauge.of_camera(camera, 10))
     assert len(relative.moved) == 9 and camera not in relative.moved
@@ -39,7 +42,7 @@ def test_the_bumped_camera_is_named_even_if_it_is_the_first(camera, o10, asymmet
 
 def test_a_steady_rig_has_not_moved(o10, asymmetric8):
     motion = motion_since_factory(bumped(o10, asymmetric8, []))
-    assert motion.moved == () and "no camera has moved" in motion.sentence
+    assert motion.moved == motion.moves == () and "no camera has moved" in motion.sentence
 
 
 def test_one_camera_moves_relative_to_nothing(o10, asymmetric8):

@@ -18,10 +18,10 @@ from imgcal.types.rig import PARAMETERS
 def test_residuals_agree_with_the_estimate(content: ReportContent) -> None:
     used = content.used
     assert 0 < used.sum() < len(used)
-    rms = np.sqrt(np.mean(content.residual_after[used] ** 2))
+    rms = np.sqrt((content.residual_after[used] ** 2).sum(-1).mean())
     assert rms == pytest.approx(content.rms_after, rel=1e-6)
-    assert np.sqrt(np.mean(content.residual_before[used] ** 2)) == pytest.approx(content.rms_before, rel=1e-6)
-    assert content.whitened.std() == pytest.approx(rms / 0.05, rel=1e-2)
+    assert np.sqrt((content.residual_before[used] ** 2).sum(-1).mean()) == pytest.approx(content.rms_before, rel=1e-6)
+    assert content.whitened.std() == pytest.approx(rms / (2**0.5 * 0.05), rel=1e-2)
 
 
 def test_rms_by_group(content: ReportContent) -> None:

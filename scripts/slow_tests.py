@@ -1,0 +1,61 @@
+"""Choose the tests that a newcomer's run leaves out, from what a whole run has measured.
+
+    python -m pytest --slow --numprocesses auto --dist loadfile --durations=0 > durations.log
+    python -m scripts.slow_tests durations.log          # rewrites tests/slow_tests.txt
+
+The slowest tests are named until the rest fits into the budget.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from imgcal.io import write_text
+from scripts.output import ROOT
+
+LIST = ROOT / "tests" / "slow_tests.txt"
+LINE = re.compile(r"^\s*([\d.]+)s (?:call|setup|teardown)\s+(\S+?)(?:\[.*\])?\s*$")
+HEAD = """# Tests that take long, by the beginning of their node ids. CI=true or `scripts/test --slow` runs them.
+# Rewritten from measured durations by: python -m scripts.slow_tests DURATIONS.log
+"""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Rewrite the list of slow tests."""
+
+    log: Annotated[Path, tyro.conf.Positional]  #: output of pytest with --durations=0
+    seconds: float = 400.0  #: what the rest may take, of one core
+    out: Path = LIST
+
+
+def slowest(log: str, seconds: float) -> list[str]:
+    """Name tests, the slowest first, until the others take at most so many seconds; cases of a test count together."""
+    spent: dict[str, float] = {}
+    for line in log.splitlines():
+        if found := LINE.match(line):
+            spent[found[2]] = spent.get(found[2], 0.0) + float(found[1])
+    left, named = sum(spent.values()), list[str]()
+    for name, took in sorted(spent.items(), key=lambda one: -one[1]):
+        if left <= seconds:
+            break
+        named.append(name)
+        left -= took
+    return named
+
+
+def main() -> None:
+    """Read, choose, write."""
+    options = tyro.cli(Options, description=__doc__)
+    named = slowest(options.log.read_text(), options.seconds)
+    write_text(options.out, HEAD + "".join(f"{name}\n" for name in sorted(named)))
+    print(f"{len(named)} tests in {options.out}")
+
+
+if __name__ == "__main__":
+    main()
