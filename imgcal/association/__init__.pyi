@@ -3,7 +3,7 @@ from .ambiguities import lattice_shifts, near_turns
 from .assignment import distances_to_nearest, mutual_nearest
 from .blobs import pattern_prior
 from .identification import identify, relocalize, track
-from .merging import drop_merged, merging_distance
+from .merging import drop_merged, find_merged, merging_distance
 from .options import PipelineOptions
 from .orientation import oriented
 from .proposals import Proposal, Proposer, Sight, Snapshot, judge, rows_of
@@ -34,6 +34,7 @@ __all__ = [
     "associate",
     "distances_to_nearest",
     "drop_merged",
+    "find_merged",
     "identify",
     "is_few_and_flat",
     "judge",

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from imgcal.association.series import Associations, without_snapshots
 from imgcal.geometry import RigidTransform
-from imgcal.types import BlobFlag, CalibrationObject, CameraRig
+from imgcal.types import BlobFlag, CalibrationObject, CameraRig, Detections
 
 BLUR = 2.0
 """Pixels between the edges of two discs, up to which their images may merge: blur, and errors of the prediction."""
@@ -57,6 +57,34 @@ def drop_merged(labelled: Associations, poses: RigidTransform, rig: CameraRig, o
     left = replace(labelled, detections=replace(detections, fiducial=fiducial, flags=flags))
     bare = np.flatnonzero(~np.isin(used, detections.snapshot[np.setdiff1d(rows, merged)]))
     return without_snapshots(left, bare.tolist()) if len(bare) else left
+
+
+def find_merged(
+    blobs: Detections, seen: NDArray[np.bool_], uv: NDArray[np.float64], visible: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Find fiducials of one snapshot whose blobs may be several fiducials in one.
+
+    Args:
+        blobs: labelled.
+        seen: (C, N) fiducials that have a blob.
+        uv: (C, N, 2) pixels, where all of them should be.
+        visible: (C, N) whether they are in view.
+
+    Returns:
+        (C, N) bool.
+    """
+    cameras, fiducials = (visible & ~seen & seen.any(1, keepdims=True)).nonzero()
+    found = np.zeros_like(seen)
+    if not len(cameras):
+        return found
+    reach = np.zeros(seen.shape)
+    named = np.flatnonzero(blobs.fiducial >= 0)
+    radius = blobs.radius[named]
+    reach[blobs.camera[named], blobs.fiducial[named]] = np.where(np.isnan(radius), MOST_REACH, 2 * radius + BLUR)
+    apart = np.linalg.norm(uv[cameras] - uv[cameras, fiducials][:, None], axis=-1)  # (M, N)
+    rows, near = (seen[cameras] & (apart < reach[cameras])).nonzero()
+    found[cameras[rows], near] = True
+    return found
 
 
 def merging_distance(labelled: Associations, rows: NDArray[np.int64]) -> NDArray[np.float64]:

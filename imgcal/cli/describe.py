@@ -18,7 +18,7 @@ from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
 from imgcal.io import Frame
 from imgcal.pipeline import EARLIER, Calibration, rms_length
-from imgcal.report import ReportContent, SnapshotSummary
+from imgcal.report import NOT_IDENTIFIED, ReportContent, SnapshotSummary
 from imgcal.types import CalibrationObject, CameraRig, Detections, MovedError
 
 Pictures = Mapping[str, Frame | None]
@@ -34,9 +34,11 @@ def describe_refusal(
 ) -> ReportContent:
     """Say why there is no calibration, beside what was seen."""
     moves: tuple[str, ...] = ()
-    reason, sound = refusal.for_command, len(detections.snapshot_names)
+    count, reason = len(detections.snapshot_names), refusal.for_command
+    rejected = [reason if reason.startswith(NOT_IDENTIFIED) else ""] * count
     if isinstance(refusal, MovedError):
-        moves, sound = tuple(map(str, refusal.moved)), len(detections.snapshot_names) - refusal.since
+        moves = tuple(map(str, refusal.moved))
+        rejected = [EARLIER] * (count - refusal.since) + [""] * refusal.since
         if refusal.labelled is not None:
             detections = refusal.labelled
     detections = matched_to_rig(detections, rig)
@@ -50,8 +52,8 @@ def describe_refusal(
         detections=detections,
         labels=detections.fiducial,
         snapshots=tuple(
-            SnapshotSummary(name, int(blobs), 0, "" if moves and s >= sound else EARLIER if moves else reason)
-            for s, (name, blobs) in enumerate(zip(detections.snapshot_names, found, strict=True))
+            SnapshotSummary(name, int(blobs), 0, why)
+            for name, blobs, why in zip(detections.snapshot_names, found, rejected, strict=True)
         ),
         moves=moves,
         object_points=obj.points.double().numpy(),

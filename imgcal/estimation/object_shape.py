@@ -41,8 +41,13 @@ NARROW = 1e-4
 """Of the object's size: a fiducial that is off by less is in its place."""
 MOST_FIDUCIALS = 64
 """Of an object whose shape is asked about: boards and clouds with more are taken as they are measured."""
+WIDEST = 2.0
+"""Factor on the variance of a common tolerance, at most, for how few displacements it was learnt from."""
 COMPLEXITY = 3.0
 """Log evidence that each further tolerance must gain."""
+LEAD = 5.0
+"""Log odds from which some fiducials are taken to be exact beside others that are off: those hold the scale alone then.
+Wands of five fiducials that are all off reach 3.7 in 800."""
 SNAPSHOTS_TO_BEND = 8
 """From which the pulls of single snapshots are compared with each other."""
 LEAST_NOISE = 0.01
@@ -249,13 +254,16 @@ def learnt_tolerances(shape: ShapeEvidence) -> Array:
     """
     size = float(np.sqrt(np.square(shape.places).sum(1).mean()))
     floor = np.maximum(shape.tolerance, NARROW * size)
-    common = np.maximum(_learn_one(shape, size), shape.tolerance)
+    one, freedom = _learn_one(shape, size)
+    common = np.maximum(one, shape.tolerance)
     alone = _learn_each(shape, size, floor)
     alone = np.where(alone > 1.5 * floor, alone, shape.tolerance)
     off = int((alone > shape.tolerance).sum())
-    if shape.log_evidence(alone) - COMPLEXITY * off >= shape.log_evidence(common) - COMPLEXITY:
+    if shape.log_evidence(alone) - COMPLEXITY * off >= shape.log_evidence(common) - COMPLEXITY + LEAD:
         return alone
-    return common
+    # What no image shows, the scale, is as uncertain as a tolerance is that few displacements have shown: its
+    # distribution is Student's, of which the variance is kept.
+    return np.maximum(one * (freedom / max(freedom - 2, freedom / WIDEST)) ** 0.5, shape.tolerance)
 
 
 def _learn_each(shape: ShapeEvidence, size: float, floor: Array) -> Array:
@@ -273,18 +281,18 @@ def _learn_each(shape: ShapeEvidence, size: float, floor: Array) -> Array:
     return prior_std
 
 
-def _learn_one(shape: ShapeEvidence, size: float) -> float:
-    """Iterate one tolerance (mm) for all fiducials."""
+def _learn_one(shape: ShapeEvidence, size: float) -> tuple[float, float]:
+    """Iterate one tolerance (mm) for all fiducials; and tell how many displacements have shown it."""
     _, variance, displacement = shape.directions
-    prior_std = WIDE * size
+    prior_std, freedom = WIDE * size, 0.0
     for _ in range(ROUNDS):
         kept = prior_std**2 / (variance + prior_std**2)  # of each displacement
-        previous = prior_std
-        prior_std = float(np.sqrt(np.square(kept * displacement).sum() / max(kept.sum(), 1e-3)))
+        previous, freedom = prior_std, max(float(kept.sum()), 1e-3)
+        prior_std = float(np.sqrt(np.square(kept * displacement).sum() / freedom))
         prior_std = min(max(prior_std, NARROW * size), 10 * WIDE * size)
         if abs(prior_std / previous - 1) < 0.01:
             break
-    return prior_std
+    return prior_std, freedom
 
 
 @dataclass(frozen=True)

@@ -226,8 +226,8 @@ class RigMonitor:
         if quarantine.unsynchronized:
             return found
         quarantine.release()
-        if verdict.lead < LEAD and verdict.harmless and self._pending is None:
-            # What was known leaves room for it, so it is learnt as any snapshot is.
+        if verdict.harmless and self._pending is None:
+            # What was known leaves room for it, so it is learnt as any snapshot is: else it would be asked for ever.
             quiet = verdict.explained[Steady.name]
             return MonitorUpdate(self._restart(quiet.before, quiet.snapshots, case.pauses[-case.count :]))
         if verdict.best.name == Moved.name and self._shows_move(case):

@@ -1,5 +1,7 @@
 """Which labels of a snapshot fit a rig that is known: single ones that do not are strays, most of a camera's a move.
 
+A blob that may be two fiducials in one lies between them, by less than shows: it has no label, either.
+
 Where a camera turns, shifts or zooms a little, its image of the object is turned, shifted or stretched as a whole. What
 is left of each camera's residuals without such a motion of its image tells strays; the motion itself, against that of
 most cameras, tells whether the camera is where it was.
@@ -16,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from imgcal.association import PipelineOptions, to_observations
+from imgcal.association import PipelineOptions, find_merged, to_observations
 from imgcal.estimation import EstimationOptions, fit_pose
 from imgcal.geometry import RigidTransform, kernels
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
@@ -37,7 +39,7 @@ ROUNDS = 6
 class Checked:
     """Labels of a snapshot, and how they go with a rig."""
 
-    blobs: Detections  # strays have lost their labels
+    blobs: Detections  # strays, and blobs that may be two fiducials in one, have lost their labels
     given: Detections  # the same, with all labels
     rig_from_object: RigidTransform  # (1,) most probable for the rig as it is known
     off: NDArray[np.bool_]  # (C,) the labels agree with each other, and lie elsewhere
@@ -84,6 +86,8 @@ def check_labels(
     distance = np.linalg.norm(fit.residual, axis=-1)
     limit = options.identity_error + MOST_APART * float(np.median(distance[there])) if there.any() else 0.0
     stray |= there & ~told[:, None] & (distance > limit)
+    image = rig.expand(1).project_values(fit.rig_from_object.apply(obj.points), obj.radius)
+    stray |= find_merged(named, there & ~stray, image.uv[0].numpy(), image.visible[0].numpy())
     rows = named.fiducial >= 0
     lost = stray[named.camera[rows], named.fiducial[rows]]
     fiducial = named.fiducial.copy()

@@ -1,9 +1,10 @@
-from .content import ReportContent, SnapshotSummary
+from .content import NOT_IDENTIFIED, ReportContent, SnapshotSummary
 from .fleet_page import Taught, write_fleet_report
 from .page import render, write_report
 from .rig_view import DrawnRig, rig_scene, rig_view_script
 
 __all__ = [
+    "NOT_IDENTIFIED",
     "DrawnRig",
     "ReportContent",
     "SnapshotSummary",

@@ -18,6 +18,9 @@ from imgcal.types import CameraRig, Detections
 
 Array = NDArray[np.float64]
 
+NOT_IDENTIFIED = "identity"
+"""Refusals that begin so could not tell which blob is which; the others had labels, which the report does not know."""
+
 
 @dataclass(frozen=True)
 class SnapshotSummary:

@@ -11,7 +11,7 @@ import numpy as np
 from imgcal.pipeline import MOVED
 from imgcal.report.accuracy import advice, length, sentences
 from imgcal.report.charts import duration
-from imgcal.report.content import ReportContent
+from imgcal.report.content import NOT_IDENTIFIED, ReportContent
 from imgcal.report.sightings import sightings
 from imgcal.report.svg import grouped, pixels
 
@@ -20,8 +20,8 @@ SMALL_CHI2 = 0.5  # below, the noise was overstated
 MOST_FIGURES = 6  # at the top of the page: one row
 FEW_OBSERVATIONS = 15  # of a camera: fewer than its parameters
 
-NOT_IDENTIFIED = "identity"
-"""Refusals that begin so could not tell which blob is which; the others had labels, which the report does not know."""
+ABOUT_OBJECT = ("object:", "estimation: the object", "estimation: fiducial")
+"""Refusals that begin so found that the object is not what its file says."""
 
 IDENTITY = {
     "coded": "The fiducials came labelled with the input.",
@@ -190,8 +190,11 @@ def _refused(content: ReportContent) -> Verdict:
     labelled = int((content.labels >= 0).sum())
     total = len(content.snapshots)
     used = sum(not s.reason for s in content.snapshots)
+    about_all = not content.moves and not content.reason.startswith(NOT_IDENTIFIED)
     figures = [
-        KeyFigure(f"{used} / {total}", "snapshots since the last move" if content.moves else "snapshots accepted"),
+        KeyFigure(grouped(total), "snapshots")
+        if about_all
+        else KeyFigure(f"{used} / {total}", f"snapshots {'since the last move' if content.moves else 'accepted'}"),
         KeyFigure(grouped(len(d)), "blobs found"),
         *([KeyFigure(grouped(labelled), "blobs labelled")] if content.reason.startswith(NOT_IDENTIFIED) else []),
         KeyFigure(f"{int((blobs > 0).sum())} / {len(blobs)}", "cameras with blobs"),
@@ -225,6 +228,12 @@ def _helpful(content: ReportContent) -> list[str]:
             f"{grouped(total - labelled)} of {grouped(total)} blobs could not be labelled: cover or mask reflections, "
             "and check that the object file is that of the object in the images."
         )
+    if content.reason.startswith(ABOUT_OBJECT):
+        return [
+            *steps,
+            "Check that the object file is that of the object in the images, and that it was one and the same object "
+            "all the time; measure it again.",
+        ]
     steps.append("Check that the factory file belongs to this rig and that no camera was exchanged.")
     steps.append("Capture more snapshots, the whole object in view of as many cameras as possible, in varied poses.")
     return steps

@@ -3,7 +3,8 @@
 Run as `python -m scripts.benchmarks.merging_wands`. Rings, domes and rows of cameras see a wand, carried by hand or put
 anywhere. Where the discs of two markers touch, a camera has one blob, round and sharp, between them: as its detector
 gives it, with the sigma of one marker and no flag. In steady captures nothing moves; in the others one camera is turned
-by 0.1 to 1 degree before a snapshot drawn at random.
+by 0.1 to 1 degree before a snapshot drawn at random. What has been run with the same code is not run again
+(`out/work/merging_wands`).
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ from numpy.typing import NDArray
 
 import imgcal
 from imgcal import RefusedError
-from imgcal.fleet import workers
+from imgcal.fleet import Kept, workers
 from imgcal.synthesis import HandHeld, PhysicalDrift, Truth, arranged_rig, simulate_volume
 from imgcal.types import CalibrationObject, CameraRig, Detections, MovedError
-from scripts.output import ROOT, command, markdown, surroundings, write_json
+from scripts.output import ROOT, WORK, command, markdown, surroundings, write_json
 
 RESULT = ROOT / "docs" / "benchmarks" / "merging_wands.json"
 SHAPES: tuple[Literal["ring", "dome", "row"], ...] = ("ring", "dome", "row")
@@ -235,7 +236,8 @@ def measure(seeds: int, moved: int, last: int, cores: int | None) -> dict[str, A
     items = [Item(seed, False) for seed in range(seeds)] + [Item(1000 + seed, True) for seed in range(moved)]
     items += [Item(2000 + seed, True, 1 + seed % 2) for seed in range(last)]
     rows = []
-    with workers(None, cores, None) as mapped:
+    kept = Kept(WORK / "merging_wands", Path(__file__).read_text("utf-8"))
+    with workers(None, cores, kept) as mapped:
         for row in mapped(run, items):
             rows.append(row)
             print(_brief(row), flush=True)

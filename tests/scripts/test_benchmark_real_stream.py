@@ -40,16 +40,28 @@ def test_points_that_are_turned_out_of_the_image_are_gone():
 
 
 def test_a_bump_is_right_only_in_time_and_where_it_was():
-    judged = judge([event(130), event(150, change="rotation", size=0.3)], "cam02", "rotation", 100, 120, 1.0)
+    seeing = range(120, 600)
+    judged = judge([event(130), event(150, change="rotation", size=0.3)], "cam02", "rotation", 100, seeing, 1.0)
     assert (judged["in_time"], judged["right_kind"], judged["others_blamed"]) == (True, True, [])
-    assert judged["delay_s"] == pytest.approx(10 / 60)
-    late = judge([event(190)], "cam02", "rotation", 100, 120, 1.0)
+    assert judged["delay_s"] == judged["seen_s"] == pytest.approx(10 / 60)
+    late = judge([event(190)], "cam02", "rotation", 100, seeing, 1.0)
     assert (late["in_time"], late["right_kind"]) == (False, False)
-    wrong = judge([event(130, camera="cam03"), event(80), event(140, "drift")], "cam02", "rotation", 100, 120, 1.0)
+    wrong = judge([event(130, camera="cam03"), event(80), event(140, "drift")], "cam02", "rotation", 100, seeing, 1.0)
     assert (wrong["delay_s"], wrong["others_blamed"], wrong["false_before"]) == (None, ["cam03"], 1)
     assert wrong["other_events"] == {"drift": 1}
-    quiet = judge([event(50, "camera_lost"), event(130, "camera_back")], "cam02", "rotation", 100, 120, 1.0)
+    quiet = judge([event(50, "camera_lost"), event(130, "camera_back")], "cam02", "rotation", 100, seeing, 1.0)
     assert (quiet["false_before"], quiet["other_events"]) == (0, {})
     rows = [{"stride": 1, "degrees": 0.3, **found} for found in (judged, late, wrong)]
     (row,) = summarize(rows)
     assert (row["bumps"], row["in_time"], row["right"], row["others_blamed"]) == (3, 1, 1, 1)
+
+
+def test_only_the_time_in_which_the_bumped_camera_sees_the_object_counts():
+    seeing = [*range(120, 144, 3), *range(300, 400, 3)]
+    found = judge([event(303)], "cam02", "rotation", 100, seeing, 1.0, stride=3)
+    assert (found["delay_s"], found["seen_s"], found["in_time"]) == (
+        pytest.approx(183 / 60),
+        pytest.approx(27 / 60),
+        True,
+    )
+    assert not judge([event(399)], "cam02", "rotation", 100, seeing, 1.0, stride=3)["in_time"]

@@ -9,6 +9,7 @@ import torch
 from imgcal.estimation import EstimationOptions, estimate, modes, object_shape
 from imgcal.estimation.object_shape import (
     ScaleEvidence,
+    ShapeEvidence,
     learnt_tolerances,
     object_evidence,
     offsets,
@@ -132,3 +133,23 @@ def test_the_scale_of_a_single_camera_is_not_known_in_either_way(simulate) -> No
     found = estimate(case.observations, case.factory, case.obj, case.poses, prior_std=wide)
     expected = shape_evidence(found.problem, found.solution, LOSS).scale_error
     assert scale_evidence(found.problem, found.solution, LOSS).scale_error == pytest.approx(expected, rel=1e-2)
+
+
+def test_the_scale_of_an_object_that_no_image_shows_is_as_uncertain_as_few_fiducials_leave_it() -> None:
+    places = np.array([[160.0, 0, 0], [0, 0, 0], [-80, 0, 0], [0, -120, 0], [0, -240, 0]])
+    places -= places.mean(0)
+    turns = [np.cross(axis, places).ravel() for axis in np.eye(3)]
+    shifts = [np.tile(axis, len(places)) for axis in np.eye(3)]
+    unseen, _ = np.linalg.qr(np.stack([*shifts, *turns, places.ravel()], 1))
+    scale = unseen[:, -1]
+    seen = np.eye(places.size) - unseen @ unseen.T
+    information = 1e4 * seen + 1e-2 * np.outer(scale, scale)  # mm^-2: the cameras hardly know the scale
+    random, squared = np.random.default_rng(1), []
+    for _ in range(400):
+        off = random.normal(0, 0.24, places.size)
+        pull = information @ (seen @ off + seen @ random.normal(0, 0.01, places.size))
+        shape = ShapeEvidence(information, pull, places, places, np.zeros(len(places)), 1.0, 100.0)
+        tolerance = learnt_tolerances(shape)
+        covariance = np.linalg.inv(information + np.diag(np.repeat(np.maximum(tolerance, 1e-4) ** -2.0, 3)))
+        squared.append((scale @ (off - covariance @ pull)) ** 2 / (scale @ covariance @ scale))
+    assert 0.8 < np.mean(squared) < 1.2

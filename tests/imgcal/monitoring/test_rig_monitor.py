@@ -11,7 +11,7 @@ from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
 from imgcal.monitoring import CHANGES, Change, RigFilter, RigMonitor
 from imgcal.monitoring.change_search import ALARM_CHI2
-from imgcal.monitoring.explanations import Diagnosis
+from imgcal.monitoring.explanations import Diagnosis, Steady, weigh
 from imgcal.monitoring.pending_change import PendingChange
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import CameraRig, Observations
@@ -222,3 +222,17 @@ def test_a_bump_of_which_it_cannot_be_told_yet_is_not_learnt_as_drift() -> None:
     told = watched(Stream(rig, obj, 5, Conditions(rate=1.0, shake=0.3, labelled=True), [bump]), 180)
     assert told and {camera for _, camera in told} == {1}
     assert 150 <= told[0][0] <= 160
+
+
+def test_a_camera_that_was_held_and_surely_stands_still_is_learnt_from_what_it_saw_meanwhile(monkeypatch) -> None:
+    made = Stream(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), 4, Conditions(labelled=True))
+    seen, _ = made.labelled(0, 40)
+    poses = made.poses_at(torch.arange(40, dtype=torch.float64) / 60)
+    monitor, learnt = RigMonitor(RigFilter(made.factory, made.obj)), []
+    restart = monitor.filter.restart
+    monitor.filter.restart = lambda *given, **new: learnt.append(len(given[1])) or restart(*given, **new)  # type: ignore[method-assign, func-returns-value]
+    monkeypatch.setattr(Diagnosis, "decide", lambda _, case, patient: weigh(case, [Steady()]))
+    for number in range(40):
+        held = (2,) if number == 30 else ()
+        monitor.update(seen.of_snapshots([number]), poses[number : number + 1], 1 / 60, moved=held)
+    assert not monitor.quarantine.cameras and learnt == [1]

@@ -56,3 +56,30 @@ def test_labels_of_a_camera_that_do_not_agree_are_all_dropped() -> None:
     checked = check_labels(replace(blobs, fiducial=fiducial), rig, obj, pose, PipelineOptions())
     assert not (checked.blobs.fiducial[rows] >= 0).any()
     assert not checked.off.any()
+
+
+@pytest.mark.parametrize(("radius", "apart"), [(2.0, 5.0), (math.nan, 5.0), (2.0, 9.0)])
+def test_a_blob_that_may_be_two_fiducials_has_no_label(radius: float, apart: float) -> None:
+    rig, obj, blobs, pose = scene()
+    camera, first, second = 3, 0, 1
+    # The object is such that this camera sees two fiducials near each other, and one blob for both.
+    there = pose.apply(obj.points)[0]
+    seen = rig.project(there)
+    way = rig.positions[camera] - there[first]
+    beside = torch.linalg.cross(way, rig.cam_from_rig.rotation[camera, 1])
+    step = apart * float(seen.depth[camera, first]) / float(rig.focal_length[camera, 0])
+    near = there[first] + 20 * way / way.norm() + step * beside / beside.norm()
+    points = obj.points.clone()
+    points[second] = pose.inverse().apply(near[None])[0]
+    obj = replace(obj, points=points)
+    exact = rig.project(pose.apply(points)[0]).uv.numpy()
+    fiducial, uv = blobs.fiducial, exact[blobs.camera, blobs.fiducial]
+    merged = (blobs.camera == camera) & (fiducial == first)
+    assert merged.sum() == 1
+    assert np.linalg.norm(exact[camera, first] - exact[camera, second]) < 1.3 * apart
+    uv[merged] = exact[camera, [first, second]].mean(0) if apart < 8 else uv[merged]
+    kept = ~((blobs.camera == camera) & (fiducial == second))
+    blobs = replace(blobs, uv=uv, radius=np.full(len(blobs), radius)).select(kept)
+    checked = check_labels(blobs, rig, obj, pose, PipelineOptions())
+    gone = np.flatnonzero(checked.blobs.fiducial != blobs.fiducial)
+    assert gone.tolist() == (np.flatnonzero(merged[kept]).tolist() if apart < 8 else [])

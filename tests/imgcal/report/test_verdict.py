@@ -100,3 +100,17 @@ def test_a_refusal_that_is_not_about_identity_says_nothing_of_labels(refused_con
     verdict = judge(by_prior)
     assert not any("label" in step for step in verdict.next_steps)
     assert not any("labelled" in figure.name for figure in verdict.figures)
+
+
+def test_advice_of_a_refusal_is_about_its_own_reason(refused_content: ReportContent) -> None:
+    unread = tuple(replace(snapshot, reason="") for snapshot in refused_content.snapshots)
+    for reason in (
+        "object: all cameras have moved together",
+        "estimation: fiducial 3 (row of the object file): 40 of 50",
+    ):
+        verdict = judge(replace(refused_content, reason=reason, snapshots=unread))
+        assert "object" in verdict.next_steps[0] and not any("factory" in step for step in verdict.next_steps)
+    verdict = judge(replace(refused_content, reason="estimation: no minimum after 40 iterations", snapshots=unread))
+    assert any("factory" in step for step in verdict.next_steps)
+    figure = next(figure for figure in verdict.figures if "snapshots" in figure.name)
+    assert (figure.value, figure.name) == (str(len(unread)), "snapshots")  # none of them was accepted, or rejected
