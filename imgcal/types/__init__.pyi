@@ -1,6 +1,7 @@
 from . import limits
 from .board import Board, BoardKind
 from .calibration_object import CalibrationObject, Symmetry
+from .lights import MOST_LIGHTS, Lights
 from .limits import BLOB_RADIUS, FIDUCIAL_RADIUS, MOST_PIXELS, SIGMA, Range, check_object, check_observations, check_rig
 from .moved_camera import Kind, MovedCamera, MovedError
 from .observations import UNUSABLE, BlobFlag, BlobKind, Detections, Observations
@@ -24,6 +25,7 @@ __all__ = [
     "BLOB_RADIUS",
     "CROP_MARGIN",
     "FIDUCIAL_RADIUS",
+    "MOST_LIGHTS",
     "MOST_PIXELS",
     "PARAMETERS",
     "PARAMETER_NAMES",
@@ -41,6 +43,7 @@ __all__ = [
     "Detections",
     "DriftRate",
     "Kind",
+    "Lights",
     "MovedCamera",
     "MovedError",
     "Observations",
