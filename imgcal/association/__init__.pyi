@@ -3,6 +3,7 @@ from .ambiguities import lattice_shifts, near_turns
 from .assignment import distances_to_nearest, mutual_nearest
 from .blobs import pattern_prior
 from .identification import identify, relocalize, track
+from .light_places import LightPlaces, find_places
 from .merging import drop_merged, merging_distance
 from .options import PipelineOptions
 from .orientation import oriented
@@ -22,6 +23,7 @@ __all__ = [
     "Associations",
     "Identity",
     "IdentityOptions",
+    "LightPlaces",
     "PipelineOptions",
     "Progress",
     "Proposal",
@@ -34,6 +36,7 @@ __all__ = [
     "associate",
     "distances_to_nearest",
     "drop_merged",
+    "find_places",
     "identify",
     "is_few_and_flat",
     "judge",

@@ -1,0 +1,159 @@
+"""Which blobs of a snapshot show the same light, in a rig that is kept calibrated; cameras that see lights elsewhere.
+
+A camera that was bumped agrees no longer with the places on which the others agree: its blobs are all shifted alike.
+The shift with which most of them fit is looked for, and the camera is off by it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from imgcal.association import LightPlaces, find_places
+from imgcal.errors import RefusedError
+from imgcal.geometry import RigidTransform
+from imgcal.online.keeper_memory import KeeperMemory
+from imgcal.online.label_checks import MOST_APART, Checked
+from imgcal.online.light_tracks import LightTracks
+from imgcal.online.sightings import well_inside
+from imgcal.types import CameraRig, Detections
+
+Array = NDArray[np.float64]
+
+WINDOW = 60.0
+"""Pixels by which a camera's image may be shifted that is looked for."""
+ALIKE, STRETCH = 1.5, 0.1
+"""Pixels, and share of the shift, by which a blob may be from its light once all are shifted back."""
+FOLLOWED = 3.0
+"""Pixels around the last shift of a camera within which it is looked for first."""
+LEAST_FITTING = 0.5
+"""Share of the lights that a camera could show which must fit where it stands; else a shift is looked for."""
+
+
+def label_lights(memory: KeeperMemory, tracks: LightTracks, blobs: Detections) -> tuple[Checked, frozenset[int]]:
+    """Label the blobs of a snapshot with the numbers of their lights.
+
+    Args:
+        memory: what is known of the rig.
+        tracks: what is known of the lights, which changes.
+        blobs: of one snapshot; labels that they have do not count.
+
+    Returns:
+        The labels, and the cameras that see blobs where no light is, by whatever shift of their image.
+
+    Raises:
+        RefusedError: three cameras agree on no light.
+    """
+    rig, time = memory.belief.rig, memory.time
+    error = np.hypot(memory.options.identity_error, memory.noise.additive)
+    moving = ~tracks.is_still(blobs.camera, blobs.uv)
+    rows = np.flatnonzero(moving)
+    found = find_places(blobs.select(rows), rig, error)
+    if not len(found.points):
+        tracks.mark_still(blobs.camera, blobs.uv, np.zeros(len(blobs), dtype=bool), time)
+        some = len(np.unique(blobs.camera[rows]))
+        seen = "no blob that moves is seen" if not some else f"{some} cameras see blobs that move"
+        raise RefusedError(f"identity: found no light on which three cameras agree: {seen}")
+    numbers = tracks.number_lights(found.points, time)
+    label, straight = np.full(len(blobs), -1, dtype=np.int64), np.full((len(blobs), 2), np.nan)
+    label[rows], straight[rows] = found.label, found.straight
+    tracks.mark_still(blobs.camera, blobs.uv, label >= 0, time)
+    found = replace(found, label=label, straight=straight)
+    scene = _Scene(rig, blobs, found)
+    usual, off = scene.compare(memory.options.identity_error)
+    astray = set()
+    for camera in scene.misfits():
+        shift = scene.find_shift(camera, tracks.shift[camera])
+        if shift is None:
+            if scene.bare(camera) >= 3:
+                astray.add(camera)
+            continue
+        tracks.shift[camera] = shift
+        off[camera] = np.linalg.norm(shift) > memory.options.identity_error + MOST_APART * usual
+    tracks.shift[~off] = 0.0
+    named = np.where(found.label >= 0, numbers[found.label], -1)
+    place = np.full((memory.obj.num_fiducials, 3), np.nan)
+    place[numbers[numbers >= 0]] = found.points[numbers >= 0]
+    pose = RigidTransform(torch.eye(3, dtype=torch.float64).expand(1, len(place), 3, 3), torch.from_numpy(place)[None])
+    labelled = replace(blobs, fiducial=named)
+    return Checked(labelled, labelled, pose, off, usual, int((named >= 0).sum())), frozenset(astray)
+
+
+class _Scene:
+    """A snapshot: where its lights should be in every camera, and which blobs have their labels."""
+
+    def __init__(self, rig: CameraRig, blobs: Detections, found: LightPlaces) -> None:
+        self.blobs, self.found = blobs, found
+        points = torch.from_numpy(found.points)
+        in_camera = rig.cam_from_rig.apply(points).numpy()  # (C, L, 3)
+        focal = rig.focal_length.mean(-1).numpy()[:, None, None]
+        depth = np.where(in_camera[..., 2:] > 1.0, in_camera[..., 2:], np.nan)
+        self.expected = focal * in_camera[..., :2] / depth  # (C, L, 2) px without distortion
+        uv = rig.expand(1).project_values(points[None]).uv[0].numpy()
+        self.inside = well_inside(np.where(np.isfinite(self.expected), uv, np.nan), rig)
+
+    def bare(self, camera: int) -> int:
+        """Count the blobs of a camera that may be lights and have no label."""
+        return int(((self.blobs.camera == camera) & (self.found.label < 0) & np.isfinite(self.found.straight[:, 0])).sum())
+
+    def compare(self, least: float) -> tuple[float, NDArray[np.bool_]]:
+        """Say how far off (px) the image of a camera is in the median, and which are clearly farther: (C,)."""
+        rows = np.flatnonzero(self.found.label >= 0)
+        camera = self.blobs.camera[rows]
+        rest = self.found.straight[rows] - self.expected[camera, self.found.label[rows]]
+        cameras = len(self.expected)
+        count = np.bincount(camera, minlength=cameras)
+        shift = np.stack([np.bincount(camera, rest[:, axis], cameras) for axis in (0, 1)], -1)
+        size = np.linalg.norm(shift, axis=-1) / np.maximum(count, 1)
+        usual = float(np.median(size[count > 0]))
+        return usual, (count > 1) & (size > least + MOST_APART * usual)
+
+    def misfits(self) -> list[int]:
+        """Cameras that show fewer lights where they stand than they could, for the blobs that they have."""
+        cameras = len(self.expected)
+        labelled = np.bincount(self.blobs.camera[self.found.label >= 0], minlength=cameras)
+        bare = np.array([self.bare(camera) for camera in range(cameras)])
+        could = np.minimum(self.inside.sum(1), labelled + bare)
+        return np.flatnonzero((labelled < LEAST_FITTING * could) & (bare > 0)).tolist()
+
+    def find_shift(self, camera: int, last: Array) -> Array | None:
+        """Label the blobs of a camera by the shift (2,) px with which most of them are lights; None = there is none.
+
+        Lights that this camera has a say in are left out where two others do not agree on them. The shift must fit
+        more lights than any other, or be near the last one.
+        """
+        found, blobs = self.found, self.blobs
+        rows = np.flatnonzero((blobs.camera == camera) & np.isfinite(found.straight[:, 0]))
+        others = np.bincount(found.label[(found.label >= 0) & (blobs.camera != camera)], minlength=len(found.points))
+        lights = np.flatnonzero((others >= 3) & np.isfinite(self.expected[camera, :, 0]))
+        if not len(rows) or not len(lights):
+            return None
+        way = found.straight[rows][:, None] - self.expected[camera, lights]  # (B, L, 2)
+        tried = way.reshape(-1, 2)
+        size = np.linalg.norm(tried, axis=1)
+        tried = tried[size < WINDOW]
+        if not len(tried):
+            return None
+        followed = bool(last.any()) and bool((np.linalg.norm(tried - last, axis=1) < FOLLOWED).any())
+        if followed:
+            tried = tried[np.linalg.norm(tried - last, axis=1) < FOLLOWED]
+        reach = ALIKE + STRETCH * np.linalg.norm(tried, axis=1)
+        near = np.linalg.norm(way[None] - tried[:, None, None], axis=-1) < reach[:, None, None]  # (T, B, L)
+        count = np.minimum(near.any(1).sum(1), near.any(2).sum(1))
+        best = int(count.argmax())
+        apart = np.linalg.norm(tried - tried[best], axis=1) > 2 * reach[best]
+        inside = int(self.inside[camera, lights].sum())
+        if not followed and (apart & (count >= count[best])).any():
+            return None
+        if count[best] < max(1, min(2, inside, len(rows))):
+            return None
+        shift = np.median(way[near[best]], axis=0)
+        distance = np.linalg.norm(way - shift, axis=-1)
+        found.label[rows] = -1
+        for b, light in enumerate(distance.argmin(1).tolist()):
+            if distance[b, light] < reach[best] and distance[:, light].argmin() == b:
+                found.label[rows[b]] = lights[light]
+        return np.asarray(shift)
