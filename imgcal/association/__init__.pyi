@@ -1,9 +1,9 @@
 from .alone import is_few_and_flat, labels_by_shape
 from .ambiguities import lattice_shifts, near_turns
 from .assignment import distances_to_nearest, mutual_nearest
-from .blobs import pattern_prior
+from .blobs import pattern_prior, undistorted
 from .identification import identify, relocalize, track
-from .light_places import LightPlaces, find_places
+from .lights import Lights, align_rig, associate_lights, image_error
 from .merging import drop_merged, merging_distance
 from .options import PipelineOptions
 from .orientation import oriented
@@ -23,7 +23,7 @@ __all__ = [
     "Associations",
     "Identity",
     "IdentityOptions",
-    "LightPlaces",
+    "Lights",
     "PipelineOptions",
     "Progress",
     "Proposal",
@@ -33,11 +33,13 @@ __all__ = [
     "SnapshotIdentity",
     "Status",
     "Tracker",
+    "align_rig",
     "associate",
+    "associate_lights",
     "distances_to_nearest",
     "drop_merged",
-    "find_places",
     "identify",
+    "image_error",
     "is_few_and_flat",
     "judge",
     "labels_by_shape",
@@ -53,5 +55,6 @@ __all__ = [
     "rows_of",
     "to_observations",
     "track",
+    "undistorted",
     "without_snapshots",
 ]
