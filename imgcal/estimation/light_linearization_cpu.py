@@ -74,7 +74,10 @@ def linearize_lights(given, places, blocks, loss, threshold, shake):
                 image = lens_kernels.image_of(
                     lenses, c, point[0], point[1], max(point[2], NEAREST_DEPTH), radius_squared[n], coefficients
                 )
-                residual[c, 0, n], residual[c, 1, n] = fx * image[5] + cx - uv[c, 0, n], fy * image[6] + cy - uv[c, 1, n]
+                residual[c, 0, n], residual[c, 1, n] = (
+                    fx * image[5] + cx - uv[c, 0, n],
+                    fy * image[6] + cy - uv[c, 1, n],
+                )
             cost += _take_shift(residual[c], root_weight[c], shake[c], loss, threshold, shift)
             shared[:] = 0.0
             shared_place[:] = 0.0

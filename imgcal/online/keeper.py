@@ -33,7 +33,7 @@ from imgcal.online.sequential_test import SequentialTest
 from imgcal.online.sightings import Look
 from imgcal.online.snapshot_labels import Labelled, labelled_snapshot
 from imgcal.pipeline import DetectorName, checked_frames
-from imgcal.types import CalibrationObject, CameraRig, Detections, DriftRate, Lights
+from imgcal.types import CalibrationObject, CameraRig, Detections, DriftRate, UnknownLights
 
 GREATEST_TIME = 2.0**37
 
@@ -69,7 +69,7 @@ class RigKeeper:
 
         Args:
             rig: the factory calibration, without batch axes.
-            obj: the calibration object, or `Lights`: whatever moves through the volume.
+            obj: the calibration object, or `UnknownLights`: whatever moves through the volume.
             options: how sure labels must be, and how to minimize.
             detection: how blobs are found.
             detector: who finds the fiducials in frames, as for `calibrate`.
@@ -78,7 +78,7 @@ class RigKeeper:
         """
         self.options = _for_keeping(options)
         self._memory = KeeperMemory.of(rig, obj, drift, self.options)
-        usual = () if isinstance(obj, Lights) else default_tests(rig.num_cameras)  # all of them ask for a body
+        usual = () if isinstance(obj, UnknownLights) else default_tests(rig.num_cameras)  # all of them ask for a body
         self.tests = tuple(usual if tests is None else tests)
         clocks = (test for test in self.tests if isinstance(test, ClockOffsets))
         self._clock = next(clocks, ClockOffsets(rig.num_cameras))

@@ -31,9 +31,9 @@ from imgcal.types import (
     CameraRig,
     Detections,
     DriftRate,
-    Lights,
     Observations,
     RigPrior,
+    UnknownLights,
     check_object,
     check_rig,
 )
@@ -82,7 +82,7 @@ class KeeperMemory:
         cls, rig: CameraRig, obj: CalibrationObject, drift: DriftRate | None, options: PipelineOptions
     ) -> KeeperMemory:
         """Begin with a factory calibration."""
-        if not isinstance(obj, Lights):
+        if not isinstance(obj, UnknownLights):
             obj.require_rigid("for a running rig")
         rig = rig.to(torch.float64)
         calibration, rig = calibration_of(rig), replace(rig, posterior=None)
@@ -94,7 +94,7 @@ class KeeperMemory:
             relearning=Relearning(rig.camera_names), drift_watch=DriftWatch(rig.camera_names),
             doubts=ObjectDoubts(obj.num_fiducials), search=Search(rig.num_cameras),
             looks=np.zeros(rig.num_cameras, dtype=np.int64), before=monitor.filter.belief,
-            lights=LightTracks.of(obj.num_fiducials, rig.num_cameras) if isinstance(obj, Lights) else None,
+            lights=LightTracks.of(obj.num_fiducials, rig.num_cameras) if isinstance(obj, UnknownLights) else None,
         )  # fmt: skip
         if calibration is not None:
             memory.looks[:], memory.learnt = LEAST_LOOKS, calibration.time

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from imgcal.association import LightPlaces, find_places
+from imgcal.association import Lights, associate_lights, undistorted
 from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
 from imgcal.online.keeper_memory import KeeperMemory
@@ -23,6 +23,10 @@ from imgcal.types import CameraRig, Detections
 
 Array = NDArray[np.float64]
 
+LEAST_MARGIN = 5.0
+"""Log odds of a light against the best other one that takes one of its blobs."""
+ASTRAY_SECONDS, ASTRAY_BLOBS = 2.0, 3
+"""For how long a camera must see that many blobs where no light is before it may be said to have moved far."""
 WINDOW = 60.0
 """Pixels by which a camera's image may be shifted that is looked for."""
 ALIKE, STRETCH = 1.5, 0.1
@@ -51,43 +55,51 @@ def label_lights(memory: KeeperMemory, tracks: LightTracks, blobs: Detections) -
     error = np.hypot(memory.options.identity_error, memory.noise.additive)
     moving = ~tracks.is_still(blobs.camera, blobs.uv)
     rows = np.flatnonzero(moving)
-    found = find_places(blobs.select(rows), rig, error)
-    if not len(found.points):
+    found = associate_lights(blobs.select(rows), rig, error)
+    found = found.select((found.margin >= LEAST_MARGIN) & (found.cameras >= 3))
+    found = found.select(np.argsort(-found.cameras, kind="stable"))
+    if not len(found):
         tracks.mark_still(blobs.camera, blobs.uv, np.zeros(len(blobs), dtype=bool), time)
         some = len(np.unique(blobs.camera[rows]))
         seen = "no blob that moves is seen" if not some else f"{some} cameras see blobs that move"
         raise RefusedError(f"identity: found no light on which three cameras agree: {seen}")
-    numbers = tracks.number_lights(found.points, time)
-    label, straight = np.full(len(blobs), -1, dtype=np.int64), np.full((len(blobs), 2), np.nan)
-    label[rows], straight[rows] = found.label, found.straight
-    tracks.mark_still(blobs.camera, blobs.uv, label >= 0, time)
-    found = replace(found, label=label, straight=straight)
-    scene = _Scene(rig, blobs, found)
+    numbers = tracks.number_lights(found.point, time)
+    scene = _Scene(rig, blobs, found, rows)
+    tracks.mark_still(blobs.camera, blobs.uv, scene.label >= 0, time)
     usual, off = scene.compare(memory.options.identity_error)
-    astray = set()
+    lost = np.zeros(len(off), dtype=bool)
     for camera in scene.misfits():
         shift = scene.find_shift(camera, tracks.shift[camera])
         if shift is None:
-            if scene.bare(camera) >= 3:
-                astray.add(camera)
+            lost[camera] = scene.bare(camera) >= ASTRAY_BLOBS
             continue
         tracks.shift[camera] = shift
         off[camera] = np.linalg.norm(shift) > memory.options.identity_error + MOST_APART * usual
     tracks.shift[~off] = 0.0
-    named = np.where(found.label >= 0, numbers[found.label], -1)
+    tracks.astray = np.where(lost, np.where(tracks.astray <= time, tracks.astray, time), np.nan)
+    astray = frozenset(np.flatnonzero(time - tracks.astray >= ASTRAY_SECONDS).tolist())
+    named = np.where(scene.label >= 0, numbers[scene.label], -1)
     place = np.full((memory.obj.num_fiducials, 3), np.nan)
-    place[numbers[numbers >= 0]] = found.points[numbers >= 0]
+    place[numbers[numbers >= 0]] = found.point[numbers >= 0]
     pose = RigidTransform(torch.eye(3, dtype=torch.float64).expand(1, len(place), 3, 3), torch.from_numpy(place)[None])
     labelled = replace(blobs, fiducial=named)
-    return Checked(labelled, labelled, pose, off, usual, int((named >= 0).sum())), frozenset(astray)
+    return Checked(labelled, labelled, pose, off, usual, int((named >= 0).sum())), astray
 
 
 class _Scene:
     """A snapshot: where its lights should be in every camera, and which blobs have their labels."""
 
-    def __init__(self, rig: CameraRig, blobs: Detections, found: LightPlaces) -> None:
-        self.blobs, self.found = blobs, found
-        points = torch.from_numpy(found.points)
+    def __init__(self, rig: CameraRig, blobs: Detections, lights: Lights, rows: NDArray[np.int64]) -> None:
+        """Begin with the lights that were found among some rows of the blobs."""
+        self.camera, self.count = blobs.camera, len(lights)
+        self.straight = np.full((len(blobs), 2), np.nan)  # (M, 2) px without distortion; nan = no light
+        usable = rows[blobs.usable[rows]]
+        self.straight[usable] = undistorted(blobs.uv[usable], blobs.camera[usable], rig)
+        self.straight[~np.isfinite(self.straight).all(1)] = np.nan
+        self.label = np.full(len(blobs), -1, dtype=np.int64)  # (M,) number among the lights
+        light, camera = np.nonzero(lights.row >= 0)
+        self.label[rows[lights.row[light, camera]]] = light
+        points = torch.from_numpy(lights.point)
         in_camera = rig.cam_from_rig.apply(points).numpy()  # (C, L, 3)
         focal = rig.focal_length.mean(-1).numpy()[:, None, None]
         depth = np.where(in_camera[..., 2:] > 1.0, in_camera[..., 2:], np.nan)
@@ -97,13 +109,13 @@ class _Scene:
 
     def bare(self, camera: int) -> int:
         """Count the blobs of a camera that may be lights and have no label."""
-        return int(((self.blobs.camera == camera) & (self.found.label < 0) & np.isfinite(self.found.straight[:, 0])).sum())
+        return int(((self.camera == camera) & (self.label < 0) & np.isfinite(self.straight[:, 0])).sum())
 
     def compare(self, least: float) -> tuple[float, NDArray[np.bool_]]:
         """Say how far off (px) the image of a camera is in the median, and which are clearly farther: (C,)."""
-        rows = np.flatnonzero(self.found.label >= 0)
-        camera = self.blobs.camera[rows]
-        rest = self.found.straight[rows] - self.expected[camera, self.found.label[rows]]
+        rows = np.flatnonzero(self.label >= 0)
+        camera = self.camera[rows]
+        rest = self.straight[rows] - self.expected[camera, self.label[rows]]
         cameras = len(self.expected)
         count = np.bincount(camera, minlength=cameras)
         shift = np.stack([np.bincount(camera, rest[:, axis], cameras) for axis in (0, 1)], -1)
@@ -114,7 +126,7 @@ class _Scene:
     def misfits(self) -> list[int]:
         """Cameras that show fewer lights where they stand than they could, for the blobs that they have."""
         cameras = len(self.expected)
-        labelled = np.bincount(self.blobs.camera[self.found.label >= 0], minlength=cameras)
+        labelled = np.bincount(self.camera[self.label >= 0], minlength=cameras)
         bare = np.array([self.bare(camera) for camera in range(cameras)])
         could = np.minimum(self.inside.sum(1), labelled + bare)
         return np.flatnonzero((labelled < LEAST_FITTING * could) & (bare > 0)).tolist()
@@ -125,13 +137,12 @@ class _Scene:
         Lights that this camera has a say in are left out where two others do not agree on them. The shift must fit
         more lights than any other, or be near the last one.
         """
-        found, blobs = self.found, self.blobs
-        rows = np.flatnonzero((blobs.camera == camera) & np.isfinite(found.straight[:, 0]))
-        others = np.bincount(found.label[(found.label >= 0) & (blobs.camera != camera)], minlength=len(found.points))
+        rows = np.flatnonzero((self.camera == camera) & np.isfinite(self.straight[:, 0]))
+        others = np.bincount(self.label[(self.label >= 0) & (self.camera != camera)], minlength=self.count)
         lights = np.flatnonzero((others >= 3) & np.isfinite(self.expected[camera, :, 0]))
         if not len(rows) or not len(lights):
             return None
-        way = found.straight[rows][:, None] - self.expected[camera, lights]  # (B, L, 2)
+        way = self.straight[rows][:, None] - self.expected[camera, lights]  # (B, L, 2)
         tried = way.reshape(-1, 2)
         size = np.linalg.norm(tried, axis=1)
         tried = tried[size < WINDOW]
@@ -152,8 +163,8 @@ class _Scene:
             return None
         shift = np.median(way[near[best]], axis=0)
         distance = np.linalg.norm(way - shift, axis=-1)
-        found.label[rows] = -1
+        self.label[rows] = -1
         for b, light in enumerate(distance.argmin(1).tolist()):
             if distance[b, light] < reach[best] and distance[:, light].argmin() == b:
-                found.label[rows[b]] = lights[light]
+                self.label[rows[b]] = lights[light]
         return np.asarray(shift)

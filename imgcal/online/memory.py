@@ -50,7 +50,7 @@ MODULES = frozenset(
         "online.sightings",
         "online.window",
         "types.calibration_object",
-        "types.lights",
+        "types.unknown_lights",
         "types.observations",
         "types.rig",
         "types.volume",

@@ -1,7 +1,6 @@
 from . import limits
 from .board import Board, BoardKind
 from .calibration_object import CalibrationObject, Symmetry
-from .lights import MOST_LIGHTS, Lights
 from .limits import BLOB_RADIUS, FIDUCIAL_RADIUS, MOST_PIXELS, SIGMA, Range, check_object, check_observations, check_rig
 from .moved_camera import Kind, MovedCamera, MovedError
 from .observations import UNUSABLE, BlobFlag, BlobKind, Detections, Observations
@@ -19,6 +18,7 @@ from .rig import (
     parameter_names,
 )
 from .sameness import object_difference, rig_difference
+from .unknown_lights import MOST_LIGHTS, UnknownLights
 from .volume import Volume
 
 __all__ = [
@@ -43,7 +43,6 @@ __all__ = [
     "Detections",
     "DriftRate",
     "Kind",
-    "Lights",
     "MovedCamera",
     "MovedError",
     "Observations",
@@ -52,6 +51,7 @@ __all__ = [
     "RigPosterior",
     "RigPrior",
     "Symmetry",
+    "UnknownLights",
     "Views",
     "Volume",
     "check_object",

@@ -1,4 +1,4 @@
-"""`Lights`: markers of which nothing is known, each of them with a place of its own in every snapshot."""
+"""`UnknownLights`: markers of which nothing is known, each of them with a place of its own in every snapshot."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ MOST_LIGHTS = 16
 
 
 @dataclass(frozen=True, repr=False)
-class Lights(CalibrationObject):
+class UnknownLights(CalibrationObject):
     """Up to N lights at once: not a body. Fiducial n is whichever light has the number n in a snapshot.
 
     The pose of such an object is one place for each light: a transform (S, N) whose translation is where the light is,
     nan for a number that no light has.
 
     Examples:
-        >>> lights = Lights.of(4)
+        >>> lights = UnknownLights.of(4)
         >>> lights.num_fiducials, lights.pose_rank, lights.exact
         (4, 3, True)
     """
 
     @classmethod
-    def of(cls, count: int = MOST_LIGHTS) -> Lights:
+    def of(cls, count: int = MOST_LIGHTS) -> UnknownLights:
         """Make room for so many lights."""
         return cls(torch.zeros(count, 3, dtype=torch.float64), torch.ones(count, 3, dtype=torch.float64), name="lights")
