@@ -24,8 +24,8 @@ def linearize_lights(given, places, blocks, loss, threshold, shake):
 
     Args:
         given: squared radii (N,) of the lights, the lenses' models, pixels (C, 2, N) and the roots of their weights
-            (C, N), rotation, position, focal length, principal point and distortion of the cameras, and the units (C, K)
-            of their errors.
+            (C, N), rotation, position, focal length, principal point and distortion of the cameras, and the units
+            (C, K) of their errors.
         places: (N, 3) mm.
         blocks: of this snapshot, filled: information of each camera (C, K, K) with one added to its diagonal, coupling
             (3 N, D), information of the places (3 N, 3 N), one on the diagonal for a light that nobody sees; gradients

@@ -4,7 +4,7 @@ The state is every camera's parameters and, where the object has tolerances, the
 eliminated from each snapshot. Several snapshots may be absorbed at once: they are then linearized where they lead
 together, which is what `RigFilter` does with its first ones.
 
-Of lights, each has a place of its own in each snapshot, which is eliminated; one that a single camera sees says nothing.
+Each light has a place of its own in each snapshot, which is eliminated; one that a single camera sees says nothing.
 """
 
 from __future__ import annotations

@@ -229,7 +229,7 @@ def _evaluate(shared, seen, known_rig, known, rigs, states, blocks, distance, b,
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _linearize(given, state, centre, blocks, loss, threshold, shake):
-    """Linearize one snapshot, of an object or of lights; which it is, the axes of the centre say when it is compiled."""
+    """Linearize one snapshot, of an object or of lights: the axes of the centre say which, when it is compiled."""
     if centre.ndim == 2:
         return linearize_rig(given, state, blocks, False, loss, threshold, shake)
     (_, radius_squared, lenses, uv, root_weight, rotation, position, focal, principal, distortion, unit, _) = given
