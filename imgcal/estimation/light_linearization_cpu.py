@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from imgcal.estimation.linearization_cpu import _loss, _take_shift
+from imgcal.estimation.linearization_cpu import loss_and_slope, take_shift
 from imgcal.geometry import NEAREST_DEPTH, kernels, lens_kernels
 from renderers.compiling import njit
 
@@ -78,7 +78,7 @@ def linearize_lights(given, places, blocks, loss, threshold, shake):
                     fx * image[5] + cx - uv[c, 0, n],
                     fy * image[6] + cy - uv[c, 1, n],
                 )
-            cost += _take_shift(residual[c], root_weight[c], shake[c], loss, threshold, shift)
+            cost += take_shift(residual[c], root_weight[c], shake[c], loss, threshold, shift)
             shared[:] = 0.0
             shared_place[:] = 0.0
         for n in range(lights):
@@ -97,7 +97,7 @@ def linearize_lights(given, places, blocks, loss, threshold, shake):
             residual[c, 0, n], residual[c, 1, n] = ru, rv
             if shaken:
                 ru, rv = ru - shift[0], rv - shift[1]
-            value, slope = _loss((ru * ru + rv * rv) * weight * weight, loss, threshold)
+            value, slope = loss_and_slope((ru * ru + rv * rv) * weight * weight, loss, threshold)
             cost += 0.5 * value
             weight *= np.sqrt(slope)
             fx_w, fy_w = fx * weight, fy * weight

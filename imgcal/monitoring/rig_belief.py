@@ -104,6 +104,15 @@ class RigBelief:
         """One standard deviation of every parameter: (C, K)."""
         return self.covariance().diagonal().clamp_min(0).sqrt().view(self.unit.shape)
 
+    def scale_std(self) -> float:
+        """One standard deviation of the rig's size, relative: what lights say nothing about."""
+        away = self.rig.positions - self.rig.positions.mean(0)
+        by_step = torch.zeros_like(self.unit)
+        by_step[:, 3:6] = away / away.square().sum()
+        by_error = ((step_by_error(self.rig) * self.unit[:, None]).mT @ by_step[..., None]).flatten()
+        padded = torch.cat((by_error, by_error.new_zeros(len(self.factor) - len(by_error))))
+        return float(torch.linalg.solve_triangular(self.factor, padded[:, None], upper=False).norm())
+
     @property
     def pose_freedom(self) -> int:
         """Numbers of the pose in a snapshot that are let free, at most: six, or a place for each light."""

@@ -277,6 +277,8 @@ class RigKeeper:
                 take_health(memory, event)
         health = health_of(memory)
         sentence = sentence_of(health, memory.monitor.filter.count)
+        if memory.lights is not None and memory.monitor.filter.count:
+            sentence += f"; their scale is known to +- {100 * memory.belief.scale_std():.2g} %, by no light"
         return replace(state, cameras=health, events=tuple(events), sentence=sentence)
 
     def accept_as_factory(self) -> Event:

@@ -10,9 +10,11 @@ With `--lights`, nothing is known of the wand: its markers are lights, each of w
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections import Counter
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,7 @@ from imgcal.fleet import Kept, workers
 from imgcal.types import UnknownLights
 from scripts.benchmarks import wand_recording
 from scripts.benchmarks.wand_recording import FOLLOWED, RATE, SEEN, calibrated, recording, turned
-from scripts.output import ROOT, WORK, command, markdown, surroundings, write_json
+from scripts.output import ROOT, WORK, command, make_folder, markdown, surroundings, write_json
 
 RESULT = ROOT / "docs" / "benchmarks" / "real_stream.json"
 LIGHTS_RESULT = RESULT.with_name("real_stream_lights.json")
@@ -95,6 +97,7 @@ def untouched(case: Case) -> dict[str, Any]:
         "final_px": [final, final_median],
         "final_to_batch": final / batch,
         "worst_to_start": max(score[1] for score in scores) / batch,
+        "scale_percent": [100 * part for part in state.scale],
         "at_end": dict(Counter(state.cameras.values())),
         "refused": dict(refused),
         "scores_px": scores,
@@ -111,8 +114,10 @@ def bumped(case: Case) -> dict[str, Any]:
     seeing = [n for n in FOLLOWED[:: case.stride] if n >= BUMPED and given.counts[n, case.camera] >= SEEN]
     first = seeing[0]
     events = []
-    with start(known.calibration, case.lights) as keeper:
+    with begun(case.stride) if case.lights else start(known.calibration) as keeper:
         for number in FOLLOWED[:: case.stride]:
+            if case.lights and number < BUMPED:
+                continue
             if number > first + AFTER * RATE:
                 break
             blobs = given.frame(number)
@@ -126,6 +131,23 @@ def bumped(case: Case) -> dict[str, Any]:
         **judge(events, name, "rotation", BUMPED, first, limit),
         "frames_seen_in_time": sum(number <= first + limit * RATE for number in seeing),
     }
+
+
+def begun(stride: int) -> imgcal.RigKeeper:
+    """Go on with a keeper of lights that has followed the stream up to the bump: that is the same for all cameras."""
+    return imgcal.RigKeeper.restore(_followed(stride))
+
+
+@lru_cache
+def _followed(stride: int) -> Path:
+    given, file = recording(), WORK / "real_stream" / f"lights_{stride}_{os.getpid()}.json"
+    make_folder(file.parent)
+    with start(calibrated().calibration, lights=True) as keeper:
+        for number in FOLLOWED[::stride]:
+            if number < BUMPED:
+                keeper.update(given.frame(number), time=number / RATE)
+        keeper.save(file)
+    return file
 
 
 def judge(events: list[dict[str, Any]], camera: str, kind: str, since: int, seen: int, limit: float) -> dict[str, Any]:
