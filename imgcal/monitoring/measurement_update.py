@@ -75,9 +75,12 @@ def absorb(
         raise RefusedError(f"estimation: {WHY_NOT[found.status]}")
     own, factor = torch.from_numpy(found.own), torch.from_numpy(found.factor)
     now = RigBelief(_rig_of(found.rig, belief.rig), belief.obj, own, factor, unit)
+    carried = found.carried
+    if carried.shape[1] < 6:  # of a single light
+        carried = np.concatenate((carried, np.zeros((len(carried), 6 - carried.shape[1], carried.shape[2]))), 1)
     brought = SnapshotInformation(
         _rig_of(found.from_rig, belief.rig), torch.from_numpy(found.from_own), unit,
-        *(torch.from_numpy(part) for part in (found.camera, found.border, found.carried, found.pull)),
+        *(torch.from_numpy(part) for part in (found.camera, found.border, carried, found.pull)),
     )  # fmt: skip
     # What the properties would make of it, at hand.
     half_log_determinant = float(np.log(found.factor.diagonal()).sum())

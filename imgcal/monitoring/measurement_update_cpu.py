@@ -161,8 +161,7 @@ def _absorb(shared, seen, known_rig, known, rigs, states, blocks, matrices, brou
         for i in range(wide):
             gain += 0.5 * step[i] * right[i]
         for s in range(len(half)):
-            for i in range(half.shape[1]):
-                gain += 0.5 * half[s, i] ** 2
+            gain += _half_square(states[2], half[s])
         _move(unit, rigs, states, blocks, half, step, poses, b, t)
         trial = _evaluate(shared, seen, known_rig, known, rigs, states, blocks, distance, t, loss, threshold)
         if trial <= cost + slack * max(1.0, cost):
@@ -182,6 +181,19 @@ def _absorb(shared, seen, known_rig, known, rigs, states, blocks, matrices, brou
             if damping > most_damping:
                 break
     return best, 3, cost
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _half_square(centre, half):
+    """Half of the squared length of a pose's numbers (P,)."""
+    gain = 0.0
+    if centre.ndim == 3:
+        for i in range(6):
+            gain += 0.5 * half[i] ** 2
+    else:
+        for i in range(len(half)):
+            gain += 0.5 * half[i] ** 2
+    return gain
 
 
 @njit(cache=True, fastmath=kernels.FAST)
@@ -282,8 +294,7 @@ def _gather(unit, known, rigs, states, blocks, gathered, half, pull, b):
                 pull[s, at + i] = -camera_gradient[b, s, c, i]
                 for j in range(i + 1):
                     gathered[at + i, at + j] += block[i, j]
-            for i in range(coupling.shape[3]):
-                times_basis(coupling[b, s, 0, i, at : at + free], basis[c])
+            _take_steps(states[2], coupling[b, s, 0], at, free, basis[c])
             for i in range(size):
                 times_basis(border[b, s, i, at : at + free], basis[c])
         for i in range(size):
@@ -295,15 +306,51 @@ def _gather(unit, known, rigs, states, blocks, gathered, half, pull, b):
                 border[b, s, j, first_own + i] = border[b, s, i, first_own + j]
         if not kernels.cholesky(pose[b, s, 0]):
             return 1
-        _take_pose_out(pose[b, s, 0], pose_gradient[b, s, 0], coupling[b, s, 0], half[s], pull[s])
+        _take_out(states[2], pose[b, s, 0], pose_gradient[b, s, 0], coupling[b, s, 0], half[s], pull[s])
         kernels.subtract_gram(gathered, coupling[b, s, 0])
     return 0
 
 
 @njit(cache=True, fastmath=kernels.FAST)
-def _take_pose_out(lower, gradient, carried, half, pull):
+def _take_steps(centre, coupling, at, free, basis):
+    """Multiply a camera's part of the coupling (P, D) of a pose by the steps by its errors."""
+    if centre.ndim == 3:
+        for i in range(6):
+            times_basis(coupling[i, at : at + free], basis)
+    else:
+        for i in range(len(coupling)):
+            times_basis(coupling[i, at : at + free], basis)
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _take_out(centre, lower, gradient, carried, half, pull):
     """Solve by the factor (P, P) of a pose for its gradient (P,) and its coupling (P, D); add what that pulls (D,)."""
+    if centre.ndim == 3:
+        _take_pose_out(lower, gradient, carried, half, pull)
+    else:
+        _take_places_out(lower, gradient, carried, half, pull)
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _take_places_out(lower, gradient, carried, half, pull):
+    """Do the work of `_take_pose_out` for any number of places: most of the factor is zero."""
     for i in range(len(lower)):
+        value, inverse = gradient[i], 1 / lower[i, i]
+        for k in range(i):
+            if lower[i, k] != 0.0:
+                value -= lower[i, k] * half[k]
+                for j in range(len(pull)):
+                    carried[i, j] -= lower[i, k] * carried[k, j]
+        half[i] = value * inverse
+        for j in range(len(pull)):
+            carried[i, j] *= inverse
+            pull[j] += carried[i, j] * half[i]
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _take_pose_out(lower, gradient, carried, half, pull):
+    """Do that for the six numbers of an object's pose."""
+    for i in range(6):
         value, inverse = gradient[i], 1 / lower[i, i]
         for k in range(i):
             value -= lower[i, k] * half[k]
@@ -345,32 +392,49 @@ def _move(unit, rigs, states, blocks, half, step, poses, b, t):
             distortion[t, c, i] = distortion[b, c, i] + step[at + 10 + i] * unit[c, 10 + i]
     for i in range(own.shape[1]):
         own[t, i] = own[b, i] + step[cameras * free + i]
-    for s in range(len(half)):
-        carried, lower = coupling[b, s, 0], pose[b, s, 0]
-        for i in range(len(lower)):
-            value = half[s, i]
-            for j in range(len(step)):
-                value += carried[i, j] * step[j]
-            poses[s, i] = -value
-        for i in range(len(lower) - 1, -1, -1):
-            for k in range(i + 1, len(lower)):
-                poses[s, i] -= lower[k, i] * poses[s, k]
-            poses[s, i] /= lower[i, i]
-        _move_pose(centre, turned, poses[s], s, b, t)
+    _move_poses(centre, turned, coupling, pose, half, step, poses, b, t)
 
 
 @njit(cache=True, fastmath=kernels.FAST)
-def _move_pose(centre, turned, step, s, b, t):
-    """Write the pose of row b plus a step (P,) to row t, of an object or of lights."""
+def _move_poses(centre, turned, coupling, pose, half, step, poses, b, t):
+    """Write the poses of row b, of an object or of lights, to row t as they follow a step (D,)."""
     if centre.ndim == 3:
-        away = max(1.0, np.sqrt(centre[b, s, 0] ** 2 + centre[b, s, 1] ** 2 + centre[b, s, 2] ** 2))
-        for i in range(3):
-            centre[t, s, i] = centre[b, s, i] + step[3 + i] * away
         turn, left = np.empty((3, 3)), np.empty((3, 3))
-        kernels.exponential(step, turn, left)
-        kernels.multiply(turn, turned[b, s], turned[t, s])
+        for s in range(len(half)):
+            carried, lower = coupling[b, s, 0], pose[b, s, 0]
+            for i in range(6):
+                value = half[s, i]
+                for j in range(len(step)):
+                    value += carried[i, j] * step[j]
+                poses[s, i] = -value
+            for i in range(5, -1, -1):
+                for k in range(i + 1, 6):
+                    poses[s, i] -= lower[k, i] * poses[s, k]
+                poses[s, i] /= lower[i, i]
+            away = max(1.0, np.sqrt(centre[b, s, 0] ** 2 + centre[b, s, 1] ** 2 + centre[b, s, 2] ** 2))
+            for i in range(3):
+                centre[t, s, i] = centre[b, s, i] + poses[s, 3 + i] * away
+            kernels.exponential(poses[s], turn, left)
+            kernels.multiply(turn, turned[b, s], turned[t, s])
     else:
+        for s in range(len(half)):
+            _move_places(centre, coupling[b, s, 0], pose[b, s, 0], half[s], step, poses[s], s, b, t)
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _move_places(centre, carried, lower, half, step, places, s, b, t):
+    """Write the places of a snapshot's lights to row t as they follow a step (D,)."""
+    if centre.ndim == 4:
+        for i in range(len(lower)):
+            value = half[i]
+            for j in range(len(step)):
+                value += carried[i, j] * step[j]
+            places[i] = -value
+        for i in range(len(lower) - 1, -1, -1):
+            for k in range(i + 1, len(lower)):
+                places[i] -= lower[k, i] * places[k]
+            places[i] /= lower[i, i]
         for n in range(centre.shape[2]):
             away = max(1.0, np.sqrt(centre[b, s, n, 0] ** 2 + centre[b, s, n, 1] ** 2 + centre[b, s, n, 2] ** 2))
             for i in range(3):
-                centre[t, s, n, i] = centre[b, s, n, i] + step[3 * n + i] * away
+                centre[t, s, n, i] = centre[b, s, n, i] + places[3 * n + i] * away

@@ -179,7 +179,7 @@ def put(ring, totals, number, brought, at):
         ring: see `screen`.
         totals: see `screen`.
         number: of the snapshot.
-        brought: camera (C, P, P), carried (P, D), border (M, D) and pull (D,) of it.
+        brought: camera (C, P, P), carried (P, D), at least six rows, border (M, D) and pull (D,) of it.
         at: (D,) error.
     """
     row = number % len(ring[0])
@@ -192,11 +192,10 @@ def put(ring, totals, number, brought, at):
     wide = cameras * size
     for i in range(len(at)):
         weighted[i] = pull[i]
-    count = len(new_carried)
-    for q in range(count, len(carried)):
+    for q in range(len(new_carried), len(carried)):
         for i in range(len(at)):
             carried[q, i] = 0.0
-    for q in range(count):
+    for q in range(len(new_carried)):
         value = 0.0
         for i in range(len(at)):
             carried[q, i] = new_carried[q, i]
@@ -211,8 +210,12 @@ def put(ring, totals, number, brought, at):
                 entry = camera[c, i, j]
                 value += entry * at[first + j]
                 camera_total[c, i, j] = camera_before[c, i, j] + entry
-                for q in range(count):
-                    entry -= new_carried[q, first + i] * new_carried[q, first + j]
+                if len(new_carried) == 6:
+                    for q in range(6):
+                        entry -= new_carried[q, first + i] * new_carried[q, first + j]
+                else:  # of lights
+                    for q in range(len(new_carried)):
+                        entry -= new_carried[q, first + i] * new_carried[q, first + j]
                 own_total[c, i, j] = own_before[c, i, j] + entry
             weighted[first + i] += value
     for m in range(len(border)):

@@ -33,6 +33,9 @@ ALIKE, STRETCH = 1.5, 0.1
 """Pixels, and share of the shift, by which a blob may be from its light once all are shifted back."""
 FOLLOWED = 3.0
 """Pixels around the last shift of a camera within which it is looked for first."""
+WENT, TOGETHER = 20.0, 3
+"""Pixels that lights must go in the image while their shift stays the same, or lights that it must fit together: else
+some other blob may happen to be there."""
 LEAST_FITTING = 0.5
 """Share of the lights that a camera could show which must fit where it stands; else a shift is looked for."""
 
@@ -66,16 +69,26 @@ def label_lights(memory: KeeperMemory, tracks: LightTracks, blobs: Detections) -
     numbers = tracks.number_lights(found.point, time)
     scene = _Scene(rig, blobs, found, rows)
     tracks.mark_still(blobs.camera, blobs.uv, scene.label >= 0, time)
-    usual, off = scene.compare(memory.options.identity_error)
-    lost = np.zeros(len(off), dtype=bool)
-    for camera in scene.misfits():
-        shift = scene.find_shift(camera, tracks.shift[camera])
-        if shift is None:
+    usual, sought = scene.usual_shift(), scene.misfits()
+    lost, off = np.zeros((2, rig.num_cameras), dtype=bool)
+    for camera in sought:
+        found_at = scene.find_shift(camera, tracks.shift[camera])
+        if found_at is None:
             lost[camera] = scene.bare(camera) >= ASTRAY_BLOBS
             continue
+        shift, labels = found_at
+        middle = scene.expected[camera, labels[labels >= 0]].mean(0)
+        followed = np.linalg.norm(shift - tracks.shift[camera]) < FOLLOWED
+        if not followed:
+            tracks.shift_at[camera] = middle
         tracks.shift[camera] = shift
-        off[camera] = np.linalg.norm(shift) > memory.options.identity_error + MOST_APART * usual
-    tracks.shift[~off] = 0.0
+        together = (labels >= 0).sum() >= TOGETHER
+        if followed and (together or np.linalg.norm(middle - tracks.shift_at[camera]) >= WENT):
+            scene.label[blobs.camera == camera] = labels
+            off[camera] = np.linalg.norm(shift) > memory.options.identity_error + MOST_APART * usual
+    fits = np.bincount(blobs.camera[scene.label >= 0], minlength=len(off)) > 0
+    fits[sought] = False
+    tracks.shift[fits] = 0.0
     tracks.astray = np.where(lost, np.where(tracks.astray <= time, tracks.astray, time), np.nan)
     astray = frozenset(np.flatnonzero(time - tracks.astray >= ASTRAY_SECONDS).tolist())
     named = np.where(scene.label >= 0, numbers[scene.label], -1)
@@ -111,17 +124,14 @@ class _Scene:
         """Count the blobs of a camera that may be lights and have no label."""
         return int(((self.camera == camera) & (self.label < 0) & np.isfinite(self.straight[:, 0])).sum())
 
-    def compare(self, least: float) -> tuple[float, NDArray[np.bool_]]:
-        """Say how far off (px) the image of a camera is in the median, and which are clearly farther: (C,)."""
+    def usual_shift(self) -> float:
+        """How far off (px) the image of a camera is, in the median of all cameras; less is left to the filter."""
         rows = np.flatnonzero(self.label >= 0)
         camera = self.camera[rows]
         rest = self.straight[rows] - self.expected[camera, self.label[rows]]
-        cameras = len(self.expected)
-        count = np.bincount(camera, minlength=cameras)
-        shift = np.stack([np.bincount(camera, rest[:, axis], cameras) for axis in (0, 1)], -1)
-        size = np.linalg.norm(shift, axis=-1) / np.maximum(count, 1)
-        usual = float(np.median(size[count > 0]))
-        return usual, (count > 1) & (size > least + MOST_APART * usual)
+        count = np.bincount(camera, minlength=len(self.expected))
+        shift = np.stack([np.bincount(camera, rest[:, axis], len(count)) for axis in (0, 1)], -1)
+        return float(np.median(np.linalg.norm(shift[count > 0], axis=-1) / count[count > 0]))
 
     def misfits(self) -> list[int]:
         """Cameras that show fewer lights where they stand than they could, for the blobs that they have."""
@@ -131,8 +141,8 @@ class _Scene:
         could = np.minimum(self.inside.sum(1), labelled + bare)
         return np.flatnonzero((labelled < LEAST_FITTING * could) & (bare > 0)).tolist()
 
-    def find_shift(self, camera: int, last: Array) -> Array | None:
-        """Label the blobs of a camera by the shift (2,) px with which most of them are lights; None = there is none.
+    def find_shift(self, camera: int, last: Array) -> tuple[Array, NDArray[np.int64]] | None:
+        """Find the shift (2,) px with which most blobs of a camera are lights; and which ones; None = there is none.
 
         Lights that this camera has a say in are left out where two others do not agree on them. The shift must fit
         more lights than any other, or be near the last one.
@@ -163,8 +173,9 @@ class _Scene:
             return None
         shift = np.median(way[near[best]], axis=0)
         distance = np.linalg.norm(way - shift, axis=-1)
-        self.label[rows] = -1
+        labels = np.full(int((self.camera == camera).sum()), -1, dtype=np.int64)
+        mine = np.searchsorted(np.flatnonzero(self.camera == camera), rows)
         for b, light in enumerate(distance.argmin(1).tolist()):
             if distance[b, light] < reach[best] and distance[:, light].argmin() == b:
-                self.label[rows[b]] = lights[light]
-        return np.asarray(shift)
+                labels[mine[b]] = lights[light]
+        return shift, labels

@@ -38,6 +38,7 @@ class LightTracks:
     velocity: Array  # (N, 3) mm/s
     time: Array  # (N,) s, when it was seen last
     shift: Array  # (C, 2) px by which a camera sees lights elsewhere than where the others say that they are
+    shift_at: Array  # (C, 2) px, where such lights should have been when that was first seen
     astray: Array  # (C,) s, since when no shift of its image makes lights of what a camera sees; nan = it does not
     still: Array = field(repr=False)  # (C, MOST_STILL, 4) px, px, s, s: a blob's place, since when and until when; nan
 
@@ -46,7 +47,7 @@ class LightTracks:
         """Begin with nothing seen."""
         return cls(
             np.full((lights, 3), np.nan), np.zeros((lights, 3)), np.zeros(lights), np.zeros((cameras, 2)),
-            np.full(cameras, np.nan), np.full((cameras, MOST_STILL, 4), np.nan),
+            np.zeros((cameras, 2)), np.full(cameras, np.nan), np.full((cameras, MOST_STILL, 4), np.nan),
         )  # fmt: skip
 
     def number_lights(self, points: Array, time: float) -> NDArray[np.int64]:
