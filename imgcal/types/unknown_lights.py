@@ -26,6 +26,11 @@ class UnknownLights(CalibrationObject):
     """
 
     @classmethod
+    def of_light(cls, light: CalibrationObject) -> UnknownLights:
+        """Take an object of one fiducial: a light that may be anywhere, and is the only one."""
+        return cls(torch.zeros(1, 3, dtype=torch.float64), light.colours.double(), light.radius, light.name)
+
+    @classmethod
     def of(cls, count: int = MOST_LIGHTS) -> UnknownLights:
         """Make room for so many lights."""
         return cls(torch.zeros(count, 3, dtype=torch.float64), torch.ones(count, 3, dtype=torch.float64), name="lights")
