@@ -1,8 +1,9 @@
 from .alone import is_few_and_flat, labels_by_shape
 from .ambiguities import lattice_shifts, near_turns
 from .assignment import distances_to_nearest, mutual_nearest
-from .blobs import pattern_prior
+from .blobs import pattern_prior, undistorted
 from .identification import identify, relocalize, track
+from .lights import Lights, align_rig, associate_lights, image_error
 from .merging import drop_merged, find_merged, merging_distance
 from .options import PipelineOptions
 from .orientation import oriented
@@ -22,6 +23,7 @@ __all__ = [
     "Associations",
     "Identity",
     "IdentityOptions",
+    "Lights",
     "PipelineOptions",
     "Progress",
     "Proposal",
@@ -31,11 +33,14 @@ __all__ = [
     "SnapshotIdentity",
     "Status",
     "Tracker",
+    "align_rig",
     "associate",
+    "associate_lights",
     "distances_to_nearest",
     "drop_merged",
     "find_merged",
     "identify",
+    "image_error",
     "is_few_and_flat",
     "judge",
     "labels_by_shape",
@@ -51,5 +56,6 @@ __all__ = [
     "rows_of",
     "to_observations",
     "track",
+    "undistorted",
     "without_snapshots",
 ]

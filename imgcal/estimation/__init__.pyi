@@ -20,6 +20,7 @@ from .gauge import aligned
 from .held_rig import HeldRigFit, fit_pose
 from .implicit import attach_gradient, map_cost
 from .levenberg_marquardt import Solution
+from .light_linearization_cpu import linearize_lights
 from .linearization import (
     POSE_PARAMETERS,
     NormalEquations,
@@ -110,6 +111,7 @@ __all__ = [
     "inverse_or_zero",
     "joint_information",
     "linearize",
+    "linearize_lights",
     "linearize_rig",
     "lm_cpu",
     "make_estimate",

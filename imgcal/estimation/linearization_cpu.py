@@ -130,7 +130,7 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold, shake):
             if shaken:
                 camera_at = (rotation_cam, position0[c], parameters, coefficients, (fx, fy, cx, cy))
                 _project(given, state, c, s, scale, camera_at, residual[s, c])
-                cost += _take_shift(residual[s, c], root_weight[s, c], shake[s, c], loss, threshold, shift)
+                cost += take_shift(residual[s, c], root_weight[s, c], shake[s, c], loss, threshold, shift)
                 shared[:] = 0
                 shared_own[:] = 0
             for n in range(fiducials):
@@ -160,7 +160,7 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold, shake):
                     continue
                 if shaken:
                     ru, rv = ru - shift[0], rv - shift[1]
-                value, slope = _loss((ru * ru + rv * rv) * weight * weight, loss, threshold)
+                value, slope = loss_and_slope((ru * ru + rv * rv) * weight * weight, loss, threshold)
                 cost += 0.5 * value
                 weight *= np.sqrt(slope)
                 fx_w, fy_w = fx * weight, fy * weight
@@ -301,7 +301,7 @@ def _project(given, state, c, s, scale, camera_at, residual):
 
 
 @njit(cache=True, fastmath=kernels.FAST)
-def _take_shift(residual, root_weight, shake, loss, threshold, shift):
+def take_shift(residual, root_weight, shake, loss, threshold, shift):
     """Write the most probable shift of a camera's image (2,), and return what it costs."""
     shift[:] = 0
     for _ in range(SHIFTS):
@@ -311,7 +311,7 @@ def _take_shift(residual, root_weight, shake, loss, threshold, shift):
             if weight == 0:
                 continue
             du, dv = residual[0, n] - shift[0], residual[1, n] - shift[1]
-            _, slope = _loss((du * du + dv * dv) * weight, loss, threshold)
+            _, slope = loss_and_slope((du * du + dv * dv) * weight, loss, threshold)
             total += weight * slope
             u += weight * slope * residual[0, n]
             v += weight * slope * residual[1, n]
@@ -372,7 +372,7 @@ def _distribute(products, gradient, c, s, free, camera, coupling, pose, camera_g
 
 
 @njit(cache=True, fastmath=kernels.FAST)
-def _loss(squared, loss, threshold):
+def loss_and_slope(squared, loss, threshold):
     """Robust loss and its slope, like `robust_losses.LOSSES`."""
     if loss == 1:
         if squared <= threshold**2:

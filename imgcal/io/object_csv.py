@@ -22,12 +22,13 @@ from imgcal.io.csv_file import Chunk, read_chunks
 from imgcal.io.names import LONGEST_NAME, check_regular, find_file, title_of
 from imgcal.io.resources import data_path, shipped_names
 from imgcal.messages import shortened
-from imgcal.types import CalibrationObject, limits
+from imgcal.types import CalibrationObject, UnknownLights, limits
 from renderers.palette import palette
 
 SMALLEST = 1e-3  # mm, extent of an object
 LARGEST_LABEL = 2**31 - 1
 BOARD_SUFFIXES = (".yaml", ".yml")
+LIGHTS = "lights"  # in place of a file: nothing is known of what is seen
 NAME = "a different name for every point"
 
 
@@ -36,7 +37,7 @@ def load_object(path: str | Path) -> CalibrationObject:
 
     Args:
         path: a CSV file, the YAML file of a printed board, or the bare name of a shipped object such as "cube8" when
-            there is no such file.
+            there is no such file; "lights" = nothing is known, and every blob may be a marker of its own.
 
     Returns:
         The object in float64; colours from `renderers.palette`.
@@ -53,6 +54,8 @@ def load_object(path: str | Path) -> CalibrationObject:
     path = Path(path)
     if not path.exists() and str(path) in shipped_names("objects", ".yaml"):
         path = data_path("objects", f"{path}.yaml")
+    if str(path) == LIGHTS and not path.exists():
+        return UnknownLights.of()
     if path.suffix.lower() in BOARD_SUFFIXES:
         check_regular(path)
         if not path.is_file():

@@ -17,7 +17,7 @@ from imgcal.estimation import EstimationOptions
 from imgcal.geometry import RigidTransform
 from imgcal.monitoring.measurement_update import absorb, stack_snapshots
 from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief
-from imgcal.types import Observations
+from imgcal.types import Observations, UnknownLights
 
 EARLY_SNAPSHOTS, EARLY_SECONDS = 12, 1.0
 """Snapshots before a change, and seconds since the beginning, below both of which a camera that has moved looks like a
@@ -116,6 +116,15 @@ class Case:
         if not self.cameras:
             raise RefusedError("no camera is suspected")
         return tuple(dict.fromkeys((self.cameras[:1], self.cameras)))
+
+    def require_body(self) -> None:
+        """Refuse what only fiducials that keep their distances can tell.
+
+        Raises:
+            RefusedError: lights are seen.
+        """
+        if isinstance(self.before.obj, UnknownLights):
+            raise RefusedError("each light goes its own way")
 
     @property
     def too_early(self) -> bool:

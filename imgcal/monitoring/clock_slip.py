@@ -52,6 +52,7 @@ class ClockSlipped(Explanation):
 
     def variants(self, case: Case) -> Sequence[Callable[[], Variant]]:
         """Put the blobs of the cameras where they would have been in time."""
+        case.require_body()
         return [partial(_slip, case, start, cameras) for start in case.starts for cameras in case.camera_sets]
 
     def premature(self, case: Case, found: Explained) -> str | None:
@@ -104,7 +105,7 @@ def _slip(case: Case, start: Start, cameras: Sequence[int]) -> Variant:
 def image_of(belief: RigBelief, rig_from_object: RigidTransform, camera: int) -> Tensor:
     """Where a camera sees the fiducials of an object in poses (S,): (S, N, 2) pixels."""
     alone = belief.rig.select([camera]).expand(len(rig_from_object.translation))
-    return alone.project_values(rig_from_object.apply(belief.points_object), belief.obj.radius).uv[:, 0]
+    return alone.project_values(belief.points_at(rig_from_object), belief.obj.radius).uv[:, 0]
 
 
 @dataclass(frozen=True)

@@ -3,14 +3,18 @@
 The state is every camera's parameters and, where the object has tolerances, the object's; the object's pose is
 eliminated from each snapshot. Several snapshots may be absorbed at once: they are then linearized where they lead
 together, which is what `RigFilter` does with its first ones.
+
+Each light has a place of its own in each snapshot, which is eliminated; one that a single camera sees says nothing.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from imgcal.errors import RefusedError
 from imgcal.estimation import EstimationOptions, lm_cpu
@@ -20,7 +24,7 @@ from imgcal.monitoring.measurement_update_cpu import DAMPED, MOST_DAMPING, SLACK
 from imgcal.monitoring.rig_arrays import RigArrays
 from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief
 from imgcal.monitoring.snapshot_information import SnapshotInformation
-from imgcal.types import CameraRig, Observations
+from imgcal.types import CameraRig, Observations, UnknownLights
 
 
 def absorb(
@@ -34,7 +38,7 @@ def absorb(
     Args:
         belief: what was known before.
         observations: (S, C, N) of the object that the belief is about.
-        rig_from_object: (S,) first guess of the object's poses.
+        rig_from_object: (S,) first guess of the object's poses; (S, N) of lights, see `UnknownLights`.
         options: how to minimize.
 
     Raises:
@@ -45,28 +49,38 @@ def absorb(
         given = f"{rig_from_object.translation.shape[0]} poses of {observations.seen.shape[0]} snapshots"
         raise ValueError(f"rig_from_object: found {given}, expected one of each")
     constants, unit, shake = belief.constants, belief.unit, observations.shake
+    given, shown = rig_from_object, None
+    if isinstance(belief.obj, UnknownLights):
+        observations, rig_from_object, shown = _shown_lights(observations, rig_from_object)
     seen = observations.seen.numpy()
     uv = np.where(seen[..., None], observations.uv.numpy(), 0.0).astype(np.float64, copy=False)
     uv = np.ascontiguousarray(uv.swapaxes(-1, -2))
     sigma = np.where(seen, observations.sigma.numpy(), np.inf)
     rotation = np.ascontiguousarray(rig_from_object.rotation.detach().double().reshape(-1, 3, 3).numpy())
     translation = rig_from_object.translation.detach().double().reshape(-1, 3).numpy()
+    centre, shared = translation + rotation @ constants.centroid, constants.shared
+    if shown is not None:
+        centre, rotation = centre.reshape(len(seen), -1, 3), rotation[: len(seen)]
+        shared = (*(part[: seen.shape[2]] for part in shared[:2]), shared[2])
     shaken = np.empty((0, 0)) if shake is None else np.ascontiguousarray(shake.double().numpy())
     loss = (lm_cpu.LOSS_CODES[options.loss], float(options.threshold))
     found = measurement_update_cpu.absorb(
-        constants.shared,
+        shared,
         (uv, (1 / sigma).astype(np.float64, copy=False), shaken),
         (belief.arrays, unit.numpy(), belief.object_offset.numpy(), constants.own_std, belief.information.numpy()),
-        (rotation, translation + rotation @ constants.centroid),
+        (rotation, centre),
         (*loss, options.max_iterations, options.tolerance, SLACK, DAMPED, STALLED, MOST_DAMPING),
     )
     if found.status:
         raise RefusedError(f"estimation: {WHY_NOT[found.status]}")
     own, factor = torch.from_numpy(found.own), torch.from_numpy(found.factor)
     now = RigBelief(_rig_of(found.rig, belief.rig), belief.obj, own, factor, unit)
+    carried = found.carried
+    if carried.shape[1] < 6:  # of a single light
+        carried = np.concatenate((carried, np.zeros((len(carried), 6 - carried.shape[1], carried.shape[2]))), 1)
     brought = SnapshotInformation(
         _rig_of(found.from_rig, belief.rig), torch.from_numpy(found.from_own), unit,
-        *(torch.from_numpy(part) for part in (found.camera, found.border, found.carried, found.pull)),
+        *(torch.from_numpy(part) for part in (found.camera, found.border, carried, found.pull)),
     )  # fmt: skip
     # What the properties would make of it, at hand.
     half_log_determinant = float(np.log(found.factor.diagonal()).sum())
@@ -74,13 +88,19 @@ def absorb(
     vars(now).update(information=information, arrays=found.rig, constants=constants)
     vars(now).update(half_log_determinant=half_log_determinant)
     vars(brought).update(arrays=found.from_rig)
-    translation = found.centre - found.rotation @ constants.centroid
-    poses = RigidTransform(torch.from_numpy(found.rotation), torch.from_numpy(translation))
     residual = torch.from_numpy(np.where(seen[..., None], found.residual.swapaxes(-1, -2), 0.0))
     evidence = belief.half_log_determinant - half_log_determinant - found.cost
     if shake is not None:
         evidence -= float(np.log1p(shake.numpy() ** 2 * np.square(1 / sigma).sum(-1)).sum())
-    dof = 2 * int(np.count_nonzero(seen)) - 6 * len(seen)
+    freedom = constants.pose_rank * len(seen)
+    if shown is None:
+        translation = found.centre - found.rotation @ constants.centroid
+        poses = RigidTransform(torch.from_numpy(found.rotation), torch.from_numpy(translation))
+    else:
+        freedom = 3 * int(seen.any(1).sum())
+        poses = shown.places(given, torch.from_numpy(found.centre))
+        residual = shown.of_all(residual, given.translation.shape[1])
+    dof = 2 * int(np.count_nonzero(seen)) - freedom
     return MeasurementUpdate(now, poses, residual, 2 * found.cost, dof, evidence, belief, brought)
 
 
@@ -108,3 +128,48 @@ def stack_snapshots(snapshots: Sequence[tuple[Observations, RigidTransform]]) ->
         parts = [still.expand(len(part.seen), -1) if part.shake is None else part.shake for part in observations]
         shake = torch.cat(parts)
     return Observations(uv, sigma, seen, shake), RigidTransform.cat(poses)
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """Which lights of each snapshot are in the equations, and in which column."""
+
+    number: Tensor  # (S, M) of the light in a column
+    used: Tensor  # (S, M) bool: the column is not empty
+
+    def places(self, given: RigidTransform, centre: Tensor) -> RigidTransform:
+        """Put places (S, M, 3) in the stead of those that were given, (S, N)."""
+        places = given.translation.detach().double().clone()
+        snapshot, column = self.used.nonzero(as_tuple=True)
+        places[snapshot, self.number[snapshot, column]] = centre[snapshot, column]
+        return RigidTransform(given.rotation.detach().double(), places)
+
+    def of_all(self, residual: Tensor, count: int) -> Tensor:
+        """Put residuals (S, C, M, 2) among those of all lights: (S, C, N, 2)."""
+        every = residual.new_zeros(*residual.shape[:2], count, 2)
+        snapshot, column = self.used.nonzero(as_tuple=True)
+        every[snapshot, :, self.number[snapshot, column]] = residual[snapshot, :, column]
+        return every
+
+
+def _shown_lights(
+    observations: Observations, rig_from_object: RigidTransform
+) -> tuple[Observations, RigidTransform, _Shown]:
+    """Keep the lights that two cameras see: (S, C, M) and (S, M), M as many as the fullest snapshot has.
+
+    Raises:
+        RefusedError: there are none.
+    """
+    known = (observations.seen.sum(1) >= 2) & rig_from_object.translation.isfinite().all(-1)  # (S, N)
+    most = int(known.sum(1).max())
+    if not most:
+        raise RefusedError("estimation: no light is seen by two cameras")
+    used, number = known.int().sort(dim=1, descending=True, stable=True)
+    used, number = used[:, :most] > 0, number[:, :most]
+    column = number[:, None].expand(-1, observations.seen.shape[1], -1)
+    seen = observations.seen.gather(2, column) & used[:, None]
+    uv = observations.uv.gather(2, column[..., None].expand(-1, -1, -1, 2))
+    kept = Observations(uv, observations.sigma.gather(2, column), seen, observations.shake)
+    snapshot = torch.arange(len(number))[:, None]
+    places = rig_from_object.translation.detach().double()[snapshot, number].nan_to_num()
+    return kept, RigidTransform(rig_from_object.rotation.detach()[snapshot, number], places), _Shown(number, used)

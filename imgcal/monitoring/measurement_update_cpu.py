@@ -3,6 +3,9 @@
 `measurement_update_in_tensors` says the same in tensors, and is what this is tested against. K parameters a camera, M
 of the object, D = K C + M; S snapshots, each linearized as a rig of its own (`linearization_cpu.linearize_rig`). All
 states and equations have two rows: the best so far, and the one that is tried.
+
+A snapshot's pose has P numbers: six of an object. Of N lights it has 3 N, a place for each, and no rotation
+(`light_linearization_cpu.linearize_lights`); their centres are (S, N, 3) then.
 """
 
 # Compiled functions take their types from their arguments.
@@ -17,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imgcal.estimation import blocks_of, linearize_rig
+from imgcal.estimation import blocks_of, linearize_lights, linearize_rig
 from imgcal.geometry import kernels
 from imgcal.monitoring.rig_arrays import RigArrays
 from imgcal.monitoring.rig_error_cpu import times_basis, write_basis, write_error
@@ -52,7 +55,7 @@ class Minimum:
     status: int  # FOUND, ...
     rig: RigArrays
     rotation: Array  # (S, 3, 3) rig_from_object
-    centre: Array  # (S, 3) mm, the object's centroid in the rig
+    centre: Array  # (S, 3) mm, the object's centroid in the rig; (S, N, 3) of lights
     own: Array  # (M,) the object's offset
     residual: Array  # (S, C, 2, N) pixels, predicted minus observed
     cost: float
@@ -60,7 +63,7 @@ class Minimum:
     factor: Array  # (D, D) its lower Cholesky factor
     camera: Array  # (S, C, K, K) what each snapshot brought: see `SnapshotInformation`
     border: Array  # (S, M, D)
-    carried: Array  # (S, 6, D)
+    carried: Array  # (S, P, D)
     pull: Array  # (S, D)
     from_rig: RigArrays  # where that is linearized
     from_own: Array  # (M,)
@@ -81,7 +84,7 @@ def absorb(
             `linearization_cpu.linearize_rig`.
         known: the rig, units (C, K) of its errors, offset (M,) of the object and its prior standard deviation (M,), and
             the information (D, D) about both.
-        poses: first guess, rotation (S, 3, 3) and centre (S, 3).
+        poses: first guess, rotation (S, 3, 3) and centre (S, 3); of lights (S, N, 3).
         options: code and threshold of the loss, iterations at most, tolerance, by how much the cost may rise,
             the damping up to which a small step shows the minimum, that once a step has failed, and the greatest one.
     """
@@ -89,16 +92,17 @@ def absorb(
     rig, unit, own, own_std, information = known
     (count, cameras, _, fiducials), free = uv.shape, unit.shape[1]
     size = len(own)
-    wide = cameras * free + size
+    wide, freedom = cameras * free + size, 6 if poses[1].ndim == 2 else 3 * fiducials
     rigs = tuple(np.stack((part, part)) for part in rig.parts)
     states = (np.zeros((cameras, free)), *(np.stack((part, part)) for part in (*poses, own)))
     blocks = (
-        np.empty((2, count, cameras, free, free)), np.empty((2, count, 1, 6, wide)), np.empty((2, count, 1, 6, 6)),
-        np.empty((2, count, size, wide)), np.empty((2, count, cameras, free)), np.empty((2, count, 1, 6)),
+        np.empty((2, count, cameras, free, free)), np.empty((2, count, 1, freedom, wide)),
+        np.empty((2, count, 1, freedom, freedom)), np.empty((2, count, size, wide)),
+        np.empty((2, count, cameras, free)), np.empty((2, count, 1, freedom)),
         np.empty((2, count, size)), np.empty((2, count, 1, cameras, 2, fiducials)),
     )  # fmt: skip
     factor, gathered = np.empty((wide, wide)), np.empty((wide, wide))
-    brought = (np.empty((count, 6)), np.empty((count, wide)), np.empty((2, wide)))
+    brought = (np.empty((count, freedom)), np.empty((count, wide)), np.empty((2, wide)))
     best, status, cost = _absorb(
         shared, seen, rig.parts, (unit, own, own_std, information), rigs, states, blocks,
         (factor, gathered), brought, options,
@@ -131,7 +135,7 @@ def _absorb(shared, seen, known_rig, known, rigs, states, blocks, matrices, brou
     factor, gathered = matrices
     half, pull, distance = brought
     wide = len(prior)
-    step, right, poses = np.empty(wide), np.empty(wide), np.empty((len(half), 6))
+    step, right, poses = np.empty(wide), np.empty(wide), np.empty(half.shape)
     damping, best = 0.0, 0
     cost = _evaluate(shared, seen, known_rig, known, rigs, states, blocks, distance, 0, loss, threshold)
     fresh = True
@@ -157,8 +161,7 @@ def _absorb(shared, seen, known_rig, known, rigs, states, blocks, matrices, brou
         for i in range(wide):
             gain += 0.5 * step[i] * right[i]
         for s in range(len(half)):
-            for i in range(6):
-                gain += 0.5 * half[s, i] ** 2
+            gain += _half_square(states[2], half[s])
         _move(unit, rigs, states, blocks, half, step, poses, b, t)
         trial = _evaluate(shared, seen, known_rig, known, rigs, states, blocks, distance, t, loss, threshold)
         if trial <= cost + slack * max(1.0, cost):
@@ -178,6 +181,19 @@ def _absorb(shared, seen, known_rig, known, rigs, states, blocks, matrices, brou
             if damping > most_damping:
                 break
     return best, 3, cost
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _half_square(centre, half):
+    """Half of the squared length of a pose's numbers (P,)."""
+    gain = 0.0
+    if centre.ndim == 3:
+        for i in range(6):
+            gain += 0.5 * half[i] ** 2
+    else:
+        for i in range(len(half)):
+            gain += 0.5 * half[i] ** 2
+    return gain
 
 
 @njit(cache=True, fastmath=kernels.FAST)
@@ -208,7 +224,7 @@ def _evaluate(shared, seen, known_rig, known, rigs, states, blocks, distance, b,
             unit, own_std,
         )  # fmt: skip
         state = (offset, turned[b, s : s + 1], centre[b, s : s + 1], own[b])
-        cost += linearize_rig(given, state, blocks_of(row, s), False, loss, threshold, shake[s : s + 1])
+        cost += _linearize(given, state, state[2], blocks_of(row, s), loss, threshold, shake[s : s + 1])
         for i in range(len(own0)):
             cost -= 0.5 * own[b, i] ** 2
     write_error(rotation[b], position[b], focal[b], principal[b], distortion[b], known_rig, unit, distance[b])
@@ -221,6 +237,22 @@ def _evaluate(shared, seen, known_rig, known, rigs, states, blocks, distance, b,
             value += prior[i, j] * distance[b, j]
         cost += 0.5 * value * distance[b, i]
     return cost
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _linearize(given, state, centre, blocks, loss, threshold, shake):
+    """Linearize one snapshot, of an object or of lights: the axes of the centre say which, when it is compiled."""
+    if centre.ndim == 2:
+        return linearize_rig(given, state, blocks, False, loss, threshold, shake)
+    (_, radius_squared, lenses, uv, root_weight, rotation, position, focal, principal, distortion, unit, _) = given
+    camera, coupling, pose, _, camera_gradient, pose_gradient, _, residual = blocks
+    lights = (
+        radius_squared, lenses, uv[0], root_weight[0], rotation, position, focal, principal, distortion, unit,
+    )  # fmt: skip
+    return linearize_lights(
+        lights, centre[0], (camera, coupling[0], pose[0], camera_gradient, pose_gradient[0], residual[0]),
+        loss, threshold, shake.ravel(),
+    )  # fmt: skip
 
 
 @njit(cache=True, fastmath=kernels.FAST)
@@ -262,8 +294,7 @@ def _gather(unit, known, rigs, states, blocks, gathered, half, pull, b):
                 pull[s, at + i] = -camera_gradient[b, s, c, i]
                 for j in range(i + 1):
                     gathered[at + i, at + j] += block[i, j]
-            for i in range(6):
-                times_basis(coupling[b, s, 0, i, at : at + free], basis[c])
+            _take_steps(states[2], coupling[b, s, 0], at, free, basis[c])
             for i in range(size):
                 times_basis(border[b, s, i, at : at + free], basis[c])
         for i in range(size):
@@ -275,14 +306,50 @@ def _gather(unit, known, rigs, states, blocks, gathered, half, pull, b):
                 border[b, s, j, first_own + i] = border[b, s, i, first_own + j]
         if not kernels.cholesky(pose[b, s, 0]):
             return 1
-        _take_pose_out(pose[b, s, 0], pose_gradient[b, s, 0], coupling[b, s, 0], half[s], pull[s])
+        _take_out(states[2], pose[b, s, 0], pose_gradient[b, s, 0], coupling[b, s, 0], half[s], pull[s])
         kernels.subtract_gram(gathered, coupling[b, s, 0])
     return 0
 
 
 @njit(cache=True, fastmath=kernels.FAST)
+def _take_steps(centre, coupling, at, free, basis):
+    """Multiply a camera's part of the coupling (P, D) of a pose by the steps by its errors."""
+    if centre.ndim == 3:
+        for i in range(6):
+            times_basis(coupling[i, at : at + free], basis)
+    else:
+        for i in range(len(coupling)):
+            times_basis(coupling[i, at : at + free], basis)
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _take_out(centre, lower, gradient, carried, half, pull):
+    """Solve by the factor (P, P) of a pose for its gradient (P,) and its coupling (P, D); add what that pulls (D,)."""
+    if centre.ndim == 3:
+        _take_pose_out(lower, gradient, carried, half, pull)
+    else:
+        _take_places_out(lower, gradient, carried, half, pull)
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _take_places_out(lower, gradient, carried, half, pull):
+    """Do the work of `_take_pose_out` for any number of places: most of the factor is zero."""
+    for i in range(len(lower)):
+        value, inverse = gradient[i], 1 / lower[i, i]
+        for k in range(i):
+            if lower[i, k] != 0.0:
+                value -= lower[i, k] * half[k]
+                for j in range(len(pull)):
+                    carried[i, j] -= lower[i, k] * carried[k, j]
+        half[i] = value * inverse
+        for j in range(len(pull)):
+            carried[i, j] *= inverse
+            pull[j] += carried[i, j] * half[i]
+
+
+@njit(cache=True, fastmath=kernels.FAST)
 def _take_pose_out(lower, gradient, carried, half, pull):
-    """Solve by the factor (6, 6) of a pose for its gradient (6,) and its coupling (6, D); add what that pulls (D,)."""
+    """Do that for the six numbers of an object's pose."""
     for i in range(6):
         value, inverse = gradient[i], 1 / lower[i, i]
         for k in range(i):
@@ -325,19 +392,49 @@ def _move(unit, rigs, states, blocks, half, step, poses, b, t):
             distortion[t, c, i] = distortion[b, c, i] + step[at + 10 + i] * unit[c, 10 + i]
     for i in range(own.shape[1]):
         own[t, i] = own[b, i] + step[cameras * free + i]
-    for s in range(len(half)):
-        carried, lower = coupling[b, s, 0], pose[b, s, 0]
-        for i in range(6):
-            value = half[s, i]
+    _move_poses(centre, turned, coupling, pose, half, step, poses, b, t)
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _move_poses(centre, turned, coupling, pose, half, step, poses, b, t):
+    """Write the poses of row b, of an object or of lights, to row t as they follow a step (D,)."""
+    if centre.ndim == 3:
+        turn, left = np.empty((3, 3)), np.empty((3, 3))
+        for s in range(len(half)):
+            carried, lower = coupling[b, s, 0], pose[b, s, 0]
+            for i in range(6):
+                value = half[s, i]
+                for j in range(len(step)):
+                    value += carried[i, j] * step[j]
+                poses[s, i] = -value
+            for i in range(5, -1, -1):
+                for k in range(i + 1, 6):
+                    poses[s, i] -= lower[k, i] * poses[s, k]
+                poses[s, i] /= lower[i, i]
+            away = max(1.0, np.sqrt(centre[b, s, 0] ** 2 + centre[b, s, 1] ** 2 + centre[b, s, 2] ** 2))
+            for i in range(3):
+                centre[t, s, i] = centre[b, s, i] + poses[s, 3 + i] * away
+            kernels.exponential(poses[s], turn, left)
+            kernels.multiply(turn, turned[b, s], turned[t, s])
+    else:
+        for s in range(len(half)):
+            _move_places(centre, coupling[b, s, 0], pose[b, s, 0], half[s], step, poses[s], s, b, t)
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _move_places(centre, carried, lower, half, step, places, s, b, t):
+    """Write the places of a snapshot's lights to row t as they follow a step (D,)."""
+    if centre.ndim == 4:
+        for i in range(len(lower)):
+            value = half[i]
             for j in range(len(step)):
                 value += carried[i, j] * step[j]
-            poses[s, i] = -value
-        for i in range(5, -1, -1):
-            for k in range(i + 1, 6):
-                poses[s, i] -= lower[k, i] * poses[s, k]
-            poses[s, i] /= lower[i, i]
-        away = max(1.0, np.sqrt(centre[b, s, 0] ** 2 + centre[b, s, 1] ** 2 + centre[b, s, 2] ** 2))
-        for i in range(3):
-            centre[t, s, i] = centre[b, s, i] + poses[s, 3 + i] * away
-        kernels.exponential(poses[s], turn, left)
-        kernels.multiply(turn, turned[b, s], turned[t, s])
+            places[i] = -value
+        for i in range(len(lower) - 1, -1, -1):
+            for k in range(i + 1, len(lower)):
+                places[i] -= lower[k, i] * places[k]
+            places[i] /= lower[i, i]
+        for n in range(centre.shape[2]):
+            away = max(1.0, np.sqrt(centre[b, s, n, 0] ** 2 + centre[b, s, n, 1] ** 2 + centre[b, s, n, 2] ** 2))
+            for i in range(3):
+                centre[t, s, n, i] = centre[b, s, n, i] + places[3 * n + i] * away

@@ -86,6 +86,7 @@ class ObjectChanged(Explanation):
 
     def variants(self, case: Case) -> Sequence[Callable[[], Variant]]:
         """Let a part of the object free: each question takes as long as all that is known of the object."""
+        case.require_body()
         known: tuple[int | None, float] = (None, ONE_MM)
         if case.before.obj.num_fiducials > PRINT_FIDUCIALS:
             return [partial(_free_part, case, *known)]

@@ -22,8 +22,8 @@ def screen(ring, totals, number, count, at, change, parts, ages, scores):
     which it does not reach. Where more is known than they brought, the score is at least half of the true one.
 
     Args:
-        ring: of the K latest snapshots, number k in row k % K, see `SnapshotInformation`: carried (K, 6, D), by which
-            the unknown poses take information away; border (K, M, D), information of the object; weighted (K, D),
+        ring: of the K latest snapshots, number k in row k % K, see `SnapshotInformation`: carried (K, P, D), P >= 6, by
+            which the unknown poses take information away; border (K, M, D), information of the object; weighted (K, D),
             pull at the chart's origin.
         totals: sums over those before number k, in row k % (K + 1): of the information of each camera, were the poses
             known, and the same, the poses let free; both (K + 1, C, P, P).
@@ -40,10 +40,10 @@ def screen(ring, totals, number, count, at, change, parts, ages, scores):
     cameras, size, rows = camera_total.shape[1], camera_total.shape[2], camera_total.shape[0]
     wide, last = cameras * size, number % camera_total.shape[0]
     sums, pull, block = np.zeros(len(at)), np.zeros(size), np.zeros((size, size))
-    free, work, row = np.zeros(6), np.zeros((3, size, size)), 0
+    free, work, row = np.zeros(carried.shape[1]), np.zeros((3, size, size)), 0
     for n in range(count):
         k = (number - 1 - n) % len(carried)
-        for q in range(6):
+        for q in range(len(free)):
             free[q] = 0.0
             for i in range(len(at)):
                 free[q] += carried[k, q, i] * at[i]
@@ -52,6 +52,10 @@ def screen(ring, totals, number, count, at, change, parts, ages, scores):
                 carried[k, 0, i] * free[0] + carried[k, 1, i] * free[1] + carried[k, 2, i] * free[2]
                 + carried[k, 3, i] * free[3] + carried[k, 4, i] * free[4] + carried[k, 5, i] * free[5]
             )  # fmt: skip
+        for q in range(6, len(free)):  # of lights
+            if free[q] != 0.0:
+                for i in range(wide):
+                    sums[i] += carried[k, q, i] * free[q]
         for m in range(border.shape[1]):
             for i in range(wide):
                 sums[i] -= border[k, m, i] * at[wide + m]
@@ -175,7 +179,7 @@ def put(ring, totals, number, brought, at):
         ring: see `screen`.
         totals: see `screen`.
         number: of the snapshot.
-        brought: camera (C, P, P), carried (6, D), border (M, D) and pull (D,) of it.
+        brought: camera (C, P, P), carried (P, D), at least six rows, border (M, D) and pull (D,) of it.
         at: (D,) error.
     """
     row = number % len(ring[0])
@@ -188,7 +192,10 @@ def put(ring, totals, number, brought, at):
     wide = cameras * size
     for i in range(len(at)):
         weighted[i] = pull[i]
-    for q in range(6):
+    for q in range(len(new_carried), len(carried)):
+        for i in range(len(at)):
+            carried[q, i] = 0.0
+    for q in range(len(new_carried)):
         value = 0.0
         for i in range(len(at)):
             carried[q, i] = new_carried[q, i]
@@ -203,8 +210,12 @@ def put(ring, totals, number, brought, at):
                 entry = camera[c, i, j]
                 value += entry * at[first + j]
                 camera_total[c, i, j] = camera_before[c, i, j] + entry
-                for q in range(6):
-                    entry -= new_carried[q, first + i] * new_carried[q, first + j]
+                if len(new_carried) == 6:
+                    for q in range(6):
+                        entry -= new_carried[q, first + i] * new_carried[q, first + j]
+                else:  # of lights
+                    for q in range(len(new_carried)):
+                        entry -= new_carried[q, first + i] * new_carried[q, first + j]
                 own_total[c, i, j] = own_before[c, i, j] + entry
             weighted[first + i] += value
     for m in range(len(border)):
@@ -234,6 +245,11 @@ def add_row(ring, totals, number, information, weighted):
                 a * carried[0, j] + b * carried[1, j] + c * carried[2, j]
                 + d * carried[3, j] + e * carried[4, j] + f * carried[5, j]
             )  # fmt: skip
+    for q in range(6, len(carried)):  # of lights
+        for i in range(len(weighted)):
+            if carried[q, i] != 0.0:
+                for j in range(len(weighted)):
+                    information[i, j] -= carried[q, i] * carried[q, j]
     for k in range(cameras):
         first = k * size
         for i in range(size):

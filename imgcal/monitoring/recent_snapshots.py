@@ -69,7 +69,7 @@ class RecentSnapshots:
         self.walk, self._belief = walk, belief
         self.lasting = lasting
         self._unit = belief.unit.numpy()
-        self._carried = np.zeros((KEPT_SNAPSHOTS, 6, wide))
+        self._carried = np.zeros((KEPT_SNAPSHOTS, belief.pose_freedom, wide))
         self._border = np.zeros((KEPT_SNAPSHOTS, wide - cameras * free, wide))
         self._weighted = np.zeros((KEPT_SNAPSHOTS, wide))  # pull, as it would be at the chart's origin
         self._ring = (self._carried, self._border, self._weighted)

@@ -21,7 +21,7 @@ from imgcal.geometry import RigidTransform
 from imgcal.monitoring.measurement_update_cpu import NOTHING_KNOWN, WHY_NOT
 from imgcal.monitoring.rig_arrays import RigArrays
 from imgcal.monitoring.snapshot_information import SnapshotInformation, add_blocks
-from imgcal.types import CalibrationObject, CameraRig, DriftRate, RigPrior
+from imgcal.types import CalibrationObject, CameraRig, DriftRate, RigPrior, UnknownLights
 
 LEAST_STD = (1e-9,) * 3 + (1e-6,) * 3 + (1e-6,) * 4
 LEAST_COEFFICIENT = 1e-9
@@ -35,6 +35,7 @@ class ObjectArrays:
     shared: tuple[NDArray[np.float64] | None, ...]  # see `linearization_cpu`
     centroid: NDArray[np.float64]  # (3,) mm
     own_std: NDArray[np.float64]  # (M,) prior standard deviation of the object's offset
+    pose_rank: int  # numbers of a pose that the object shows
 
     @classmethod
     def of(cls, obj: CalibrationObject, rig: CameraRig) -> ObjectArrays:
@@ -44,7 +45,7 @@ class ObjectArrays:
         squared = None if obj.radius is None else obj.radius.double().square()
         none = obj.points.new_zeros(0)
         problem = Problem(none, none, obj.points - centroid, centroid, squared, rig, none)
-        return cls(lm_cpu.shared_given(problem), centroid.numpy(), own_std.numpy())
+        return cls(lm_cpu.shared_given(problem), centroid.numpy(), own_std.numpy(), obj.pose_rank)
 
 
 @dataclass(frozen=True)
@@ -103,6 +104,26 @@ class RigBelief:
         """One standard deviation of every parameter: (C, K)."""
         return self.covariance().diagonal().clamp_min(0).sqrt().view(self.unit.shape)
 
+    def scale_std(self) -> float:
+        """One standard deviation of the rig's size, relative: what lights say nothing about."""
+        away = self.rig.positions - self.rig.positions.mean(0)
+        by_step = torch.zeros_like(self.unit)
+        by_step[:, 3:6] = away / away.square().sum()
+        by_error = ((step_by_error(self.rig) * self.unit[:, None]).mT @ by_step[..., None]).flatten()
+        padded = torch.cat((by_error, by_error.new_zeros(len(self.factor) - len(by_error))))
+        return float(torch.linalg.solve_triangular(self.factor, padded[:, None], upper=False).norm())
+
+    @property
+    def pose_freedom(self) -> int:
+        """Numbers of the pose in a snapshot that are let free, at most: six, or a place for each light."""
+        return 3 * max(self.obj.num_fiducials, 2) if isinstance(self.obj, UnknownLights) else 6
+
+    def points_at(self, rig_from_object: RigidTransform) -> Tensor:
+        """Where the fiducials of an object in poses (S,) are, or lights (S, N): (S, N, 3) mm in the rig's frame."""
+        if isinstance(self.obj, UnknownLights):
+            return rig_from_object.translation
+        return rig_from_object.apply(self.points_object)
+
     @property
     def points_object(self) -> Tensor:
         """The fiducials as they are known now: (N, 3) mm."""
@@ -118,10 +139,10 @@ class MeasurementUpdate:
     """What some snapshots have taught."""
 
     belief: RigBelief
-    rig_from_object: RigidTransform  # (S,) the object's poses
+    rig_from_object: RigidTransform  # (S,) the object's poses; (S, N) of lights, see `UnknownLights`
     residual: Tensor  # (S, C, N, 2) pixels, predicted minus observed; zero where not seen
     chi2: float  # sum of squared whitened residuals (robust), and of the change in standard deviations of the belief
-    dof: int  # 2 observations - 6 snapshots: what chi2 is expected to be
+    dof: int  # 2 observations less the freedom of all poses: what chi2 is expected to be
     evidence: float  # log probability of what was seen, up to what is the same for every belief before it (Laplace)
     before: RigBelief  # what they were absorbed into
     brought: SnapshotInformation  # what they say by themselves

@@ -1,7 +1,7 @@
 """What snapshots say by themselves about cameras and object, linearized: `SnapshotInformation`.
 
 The sum of their information, less what their poses take, and their pull. Both are kept snapshot by snapshot in the form
-in which they are small: a block a camera, less the outer product of six rows.
+in which they are small: a block a camera, less the outer product of a row for each number of the pose (six).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class SnapshotInformation:
     unit: Tensor  # (C, K) rad, mm, pixels, 1
     camera: Tensor  # (S, C, K, K) information of each camera, were the poses known
     border: Tensor  # (S, M, D) the same of the object
-    carried: Tensor  # (S, 6, D) by which the unknown poses take information away: minus its outer product
+    carried: Tensor  # (S, P, D) by which the unknown poses take information away: minus its outer product
     pull: Tensor  # (S, D) derivative of the log probability
 
     def __len__(self) -> int:

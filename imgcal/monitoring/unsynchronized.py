@@ -37,6 +37,7 @@ class Unsynchronized(Explanation):
 
     def variants(self, case: Case) -> Sequence[Callable[[], Variant]]:
         """Let the cameras see the object in poses of their own."""
+        case.require_body()
         if case.count < LEAST_SNAPSHOTS:
             raise RefusedError("a single snapshot is explained by a move as well")
         return [partial(_unsynchronize, case, start, cameras) for start in case.starts for cameras in case.camera_sets]

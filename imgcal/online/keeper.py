@@ -33,7 +33,7 @@ from imgcal.online.sequential_test import SequentialTest
 from imgcal.online.sightings import Look
 from imgcal.online.snapshot_labels import Labelled, labelled_snapshot
 from imgcal.pipeline import DetectorName, checked_frames
-from imgcal.types import CalibrationObject, CameraRig, Detections, DriftRate
+from imgcal.types import CalibrationObject, CameraRig, Detections, DriftRate, UnknownLights
 
 GREATEST_TIME = 2.0**37
 
@@ -69,16 +69,19 @@ class RigKeeper:
 
         Args:
             rig: the factory calibration, without batch axes.
-            obj: the calibration object.
+            obj: the calibration object, or `UnknownLights`: whatever moves through the volume.
             options: how sure labels must be, and how to minimize.
             detection: how blobs are found.
             detector: who finds the fiducials in frames, as for `calibrate`.
             drift: how fast values wander; None = as the rig says.
             tests: what else watches each snapshot; None = `default_tests`.
         """
+        if obj.pose_rank == 3 and not isinstance(obj, UnknownLights):
+            obj = UnknownLights.of_light(obj)
         self.options = _for_keeping(options)
         self._memory = KeeperMemory.of(rig, obj, drift, self.options)
-        self.tests = tuple(default_tests(rig.num_cameras) if tests is None else tests)
+        usual = () if isinstance(obj, UnknownLights) else default_tests(rig.num_cameras)  # all of them ask for a body
+        self.tests = tuple(usual if tests is None else tests)
         clocks = (test for test in self.tests if isinstance(test, ClockOffsets))
         self._clock = next(clocks, ClockOffsets(rig.num_cameras))
         self._labelling = Labelling(self._memory.factory, obj, self.options, detection, detector)
@@ -148,7 +151,8 @@ class RigKeeper:
         try:
             labelled, shown, lag = self._labelled(detections, lag, frames)
             found = learnt_from(memory, labelled.checked)
-            self._labelling.follow(memory.poses[-1][1][0])
+            if memory.lights is None:
+                self._labelling.follow(memory.poses[-1][1][0])
         except RefusedError as reason:
             self._labelling.follows, refused = False, str(reason)
         events, memory.pending = memory.pending, []
@@ -235,7 +239,7 @@ class RigKeeper:
             lag=lag,
             predicted=predicted,
             residual=residual,
-            rig_from_object=None if pose is None else pose[0],
+            rig_from_object=None if pose is None or memory.lights is not None else pose[0],
             events=(),
             clock_offset=offset,
             clock_offset_sigma=sigma,
@@ -275,6 +279,8 @@ class RigKeeper:
                 take_health(memory, event)
         health = health_of(memory)
         sentence = sentence_of(health, memory.monitor.filter.count)
+        if memory.lights is not None and memory.monitor.filter.count:
+            sentence += f"; their scale is known to +- {100 * memory.belief.scale_std():.2g} %, by no light"
         return replace(state, cameras=health, events=tuple(events), sentence=sentence)
 
     def accept_as_factory(self) -> Event:

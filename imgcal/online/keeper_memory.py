@@ -18,6 +18,7 @@ from imgcal.monitoring import RigBelief, RigFilter, RigMonitor, belief_of, calib
 from imgcal.online.drift_watch import DriftWatch
 from imgcal.online.events import Event
 from imgcal.online.late_cameras import POSES
+from imgcal.online.light_tracks import LightTracks
 from imgcal.online.memory import require_alike
 from imgcal.online.noise_level import NoiseLevel
 from imgcal.online.object_doubts import ObjectDoubts
@@ -32,6 +33,7 @@ from imgcal.types import (
     DriftRate,
     Observations,
     RigPrior,
+    UnknownLights,
     check_object,
     check_rig,
 )
@@ -62,6 +64,7 @@ class KeeperMemory:
     search: Search
     looks: NDArray[np.int64]  # (C,) snapshots learnt from each camera where it stands
     before: RigBelief  # from before what is being decided
+    lights: LightTracks | None = None  # None = an object is known
     count: int = 0
     learnt: float | None = None  # s, time of the last snapshot that was learnt
     times: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=512))  # number in the filter, time
@@ -79,7 +82,8 @@ class KeeperMemory:
         cls, rig: CameraRig, obj: CalibrationObject, drift: DriftRate | None, options: PipelineOptions
     ) -> KeeperMemory:
         """Begin with a factory calibration."""
-        obj.require_rigid("for a running rig")
+        if not isinstance(obj, UnknownLights):
+            obj.require_rigid("for a running rig")
         rig = rig.to(torch.float64)
         calibration, rig = calibration_of(rig), replace(rig, posterior=None)
         start = None if calibration is None else (belief_of(calibration, obj), calibration.snapshots)
@@ -90,9 +94,11 @@ class KeeperMemory:
             relearning=Relearning(rig.camera_names), drift_watch=DriftWatch(rig.camera_names),
             doubts=ObjectDoubts(obj.num_fiducials), search=Search(rig.num_cameras),
             looks=np.zeros(rig.num_cameras, dtype=np.int64), before=monitor.filter.belief,
+            lights=LightTracks.of(obj.num_fiducials, rig.num_cameras) if isinstance(obj, UnknownLights) else None,
         )  # fmt: skip
         if calibration is not None:
             memory.looks[:], memory.learnt = LEAST_LOOKS, calibration.time
+        if calibration is not None or memory.lights is not None:
             memory.noise.trust()
         return memory
 
@@ -150,7 +156,7 @@ class KeeperMemory:
         """Where the rig puts the fiducials of an object in a pose (1,): (C, N, 2) pixels; None = nan."""
         if pose is None:
             return np.full((self.prior.num_cameras, self.obj.num_fiducials, 2), np.nan)
-        points = pose.apply(self.belief.points_object)
+        points = self.belief.points_at(pose)
         uv: NDArray[np.float64] = self.belief.rig.expand(1).project_values(points, self.obj.radius).uv[0].numpy()
         return uv
 

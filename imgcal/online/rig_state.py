@@ -85,6 +85,15 @@ class RigState:
         return self.gauge.difference(self.rig, self.factory)
 
     @cached_property
+    def scale(self) -> tuple[float, float]:
+        """Size of the rig against the factory's, relative, and one standard deviation of it.
+
+        Lights of which nothing is known say nothing of it: it stays as well known as it was, or becomes less so.
+        """
+        now, before = (rig.positions - rig.positions.mean(0) for rig in (self.rig, self.factory))
+        return float((now.norm() / before.norm()) - 1), self.belief.scale_std()
+
+    @cached_property
     def std(self) -> Tensor:
         """One standard deviation of `moved`, and so of the cameras against most of the others: (C, K)."""
         return self.gauge.spread(self.rig, self.belief.covariance())

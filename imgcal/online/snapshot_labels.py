@@ -17,6 +17,7 @@ from imgcal.online.keeper_memory import KeeperMemory
 from imgcal.online.label_checks import Checked, check_labels
 from imgcal.online.labelling import LEAST_FOLLOWED, Labelling
 from imgcal.online.learning import ask_clocks, ask_object
+from imgcal.online.light_labels import label_lights
 from imgcal.online.object_doubts import object_event
 from imgcal.types import Detections
 
@@ -51,6 +52,8 @@ def labelled_snapshot(
     Raises:
         RefusedError: it cannot be told which blob is which, or labels fit in no camera.
     """
+    if memory.lights is not None:
+        return Labelled(*label_lights(memory, memory.lights, usable))
     coded = usable.fiducial.copy() if (usable.fiducial >= 0).any() else None
     followed = None if coded is not None else _followed(memory, labelling, usable)
     if followed is not None:

@@ -18,12 +18,14 @@ from .rig import (
     parameter_names,
 )
 from .sameness import object_difference, rig_difference
+from .unknown_lights import MOST_LIGHTS, UnknownLights
 from .volume import Volume
 
 __all__ = [
     "BLOB_RADIUS",
     "CROP_MARGIN",
     "FIDUCIAL_RADIUS",
+    "MOST_LIGHTS",
     "MOST_PIXELS",
     "PARAMETERS",
     "PARAMETER_NAMES",
@@ -49,6 +51,7 @@ __all__ = [
     "RigPosterior",
     "RigPrior",
     "Symmetry",
+    "UnknownLights",
     "Views",
     "Volume",
     "check_object",

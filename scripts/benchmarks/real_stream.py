@@ -4,6 +4,8 @@ Run as `python -m scripts.benchmarks.real_stream`. Frames 0-2399, every eighth, 
 that and follows frames 2400-4799. Nothing moved in this recording, so every event but a loss of the wand is false. A
 camera that is turned can only be known to be so while it sees the wand: delays count that time. What has been run with
 the same code is not run again (`out/work/real_stream`).
+
+With `--lights`, nothing is known of the wand: its markers are lights, each of which may be anywhere.
 """
 
 from __future__ import annotations
@@ -23,11 +25,13 @@ import tyro
 
 import imgcal
 from imgcal.fleet import Kept, workers
+from imgcal.types import UnknownLights
 from scripts.benchmarks import wand_recording
 from scripts.benchmarks.wand_recording import FOLLOWED, RATE, SEEN, calibrated, recording, turned
-from scripts.output import ROOT, WORK, command, markdown, surroundings, write_json
+from scripts.output import ROOT, WORK, command, make_folder, markdown, surroundings, write_json
 
 RESULT = ROOT / "docs" / "benchmarks" / "real_stream.json"
+LIGHTS_RESULT = RESULT.with_name("real_stream_lights.json")
 QUIET = ("camera_lost", "camera_back")
 """Events that are true: cameras lose the wand. Each is to be reported once."""
 BUMPED = 3000
@@ -36,16 +40,16 @@ AFTER = 6.0
 """Seconds in which a turned camera sees the wand that it is followed for, or to the end of the recording."""
 LIMITS = {0.1: 5.0}
 """Seconds of seeing the wand within which a turn (degrees) must be reported; others: `LIMIT`."""
-LIMIT = 1.0
+LIMIT, LIGHTS_LIMIT = 1.0, 2.0
 SCORE_EVERY = 100
 """Frames between scores."""
 WORST_FINAL, WORST_ON_THE_WAY = 1.0, 1.2
 """Gates: final rig to the calibration, and any rig on the way to that which it started from."""
 
 
-def start(calibration: imgcal.Calibration) -> imgcal.RigKeeper:
-    """Begin to keep a rig that has just been calibrated."""
-    return imgcal.RigKeeper(calibration.rig, calibration.obj)
+def start(calibration: imgcal.Calibration, lights: bool = False) -> imgcal.RigKeeper:
+    """Begin to keep a rig that has just been calibrated; `lights`: nothing is known of what it will see."""
+    return imgcal.RigKeeper(calibration.rig, UnknownLights.of() if lights else calibration.obj)
 
 
 @dataclass(frozen=True)
@@ -55,24 +59,26 @@ class Case:
     stride: int  # every which frame
     camera: int | None = None  # that is turned; None = nothing is touched
     degrees: float = 0.0
+    lights: bool = False  # nothing is known of the wand
 
     @property
     def key(self) -> str:
         """What its result is found by."""
-        return f"stride {self.stride}, camera {self.camera}, {self.degrees} degrees"
+        seen = "lights, " if self.lights else ""
+        return f"{seen}stride {self.stride}, camera {self.camera}, {self.degrees} degrees"
 
 
 def run(case: Case) -> dict[str, Any]:
     """Run one case."""
-    return untouched(case.stride) if case.camera is None else bumped(case)
+    return untouched(case) if case.camera is None else bumped(case)
 
 
-def untouched(stride: int) -> dict[str, Any]:
+def untouched(case: Case) -> dict[str, Any]:
     """Follow the stream as it is; list all events, score the rig on the way."""
-    given, known = recording(), calibrated()
+    given, known, stride = recording(), calibrated(), case.stride
     batch, batch_median = known.score(known.calibration.rig)
     events, scores, refused, began = [], [], Counter[str](), time.process_time()
-    with start(known.calibration) as keeper:
+    with start(known.calibration, case.lights) as keeper:
         for count, number in enumerate(FOLLOWED[::stride]):
             state = keeper.update(given.frame(number), time=number / RATE)
             events += [plain(event, number) for event in state.events]
@@ -94,6 +100,7 @@ def untouched(stride: int) -> dict[str, Any]:
         "final_px": [final, final_median],
         "final_to_batch": final / batch,
         "worst_to_start": max(score[1] for score in scores) / batch,
+        "scale_percent": [100 * part for part in state.scale],
         "at_end": dict(Counter(state.cameras.values())),
         "refused": dict(refused),
         "scores_px": scores,
@@ -109,7 +116,7 @@ def bumped(case: Case) -> dict[str, Any]:
     name, frames = given.factory.camera_names[case.camera], FOLLOWED[:: case.stride]
     seeing = [n for n in frames if n >= BUMPED and given.counts[n, case.camera] >= SEEN]
     last = seeing[: math.ceil(AFTER * RATE / case.stride)][-1]
-    events, saved = kept_until_bump(case.stride)
+    events, saved = kept_until_bump(case.stride, case.lights)
     with tempfile.TemporaryDirectory() as folder:
         (path := Path(folder) / "keeper.json").write_bytes(saved)
         keeper = imgcal.RigKeeper.restore(path)
@@ -117,7 +124,7 @@ def bumped(case: Case) -> dict[str, Any]:
         for number in (n for n in frames if BUMPED <= n <= last):
             blobs = turned(given.frame(number), known.calibration.rig, case.camera, case.degrees)
             events = [*events, *(plain(e, number) for e in keeper.update(blobs, time=number / RATE).events)]
-    limit = LIMITS.get(case.degrees, LIMIT)
+    limit = LIGHTS_LIMIT if case.lights else LIMITS.get(case.degrees, LIMIT)
     return {
         "stride": case.stride,
         "degrees": case.degrees,
@@ -126,10 +133,10 @@ def bumped(case: Case) -> dict[str, Any]:
 
 
 @lru_cache(maxsize=1)
-def kept_until_bump(stride: int) -> tuple[list[dict[str, Any]], bytes]:
+def kept_until_bump(stride: int, lights: bool) -> tuple[list[dict[str, Any]], bytes]:
     """Follow the stream until a camera is turned: all events, and the state of the keeper."""
     given, events = recording(), []
-    with start(calibrated().calibration) as keeper, tempfile.TemporaryDirectory() as folder:
+    with start(calibrated().calibration, lights) as keeper, tempfile.TemporaryDirectory() as folder:
         for number in (n for n in FOLLOWED[::stride] if n < BUMPED):
             events += [plain(e, number) for e in keeper.update(given.frame(number), time=number / RATE).events]
         keeper.save(path := Path(folder) / "keeper.json")
@@ -261,7 +268,8 @@ class Options:
     cameras: tuple[int, ...] = tuple(range(10))  #: that are turned, each in a run of its own
     cores: int = 1
     fresh: bool = False  #: calibrate again, though the last calibration is kept
-    out: Path = RESULT
+    lights: bool = False  #: follow the markers as lights of which nothing is known
+    out: Path | None = None  #: default: docs/benchmarks/real_stream.json, or real_stream_lights.json
 
 
 def main() -> None:
@@ -270,8 +278,8 @@ def main() -> None:
     known = calibrated(options.fresh)
     texts = [Path(str(module)).read_text("utf-8") for module in (__file__, wand_recording.__file__)]
     rms = float(known.calibration.rms)
-    cases = [Case(stride) for stride in options.strides] + [
-        Case(stride, camera, degrees)
+    cases = [Case(stride, lights=options.lights) for stride in options.strides] + [
+        Case(stride, camera, degrees, options.lights)
         for stride in options.bump_strides
         for degrees in options.bumps
         for camera in options.cameras
@@ -290,7 +298,7 @@ def main() -> None:
         "bumps": summarize(runs),
         "bump_runs": runs,
     }
-    write_json(options.out, result)
+    write_json(options.out or (LIGHTS_RESULT if options.lights else RESULT), result)
     print("\n\n".join(tables(result).values()))
 
 

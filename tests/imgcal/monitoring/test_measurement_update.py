@@ -5,7 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from imgcal.errors import RefusedError
+from imgcal.estimation import step_by_error
+from imgcal.geometry import RigidTransform
 from imgcal.monitoring import RigBelief, absorb
+from imgcal.types import CalibrationObject, Observations
+from tests.imgcal.monitoring.lights import ROOM, lights_of
 from tests.imgcal.monitoring.made_snapshots import SQUARED, batch, made_snapshots, part, snapshots, worst
 
 
@@ -38,3 +43,59 @@ def test_a_snapshot_has_one_pose(made) -> None:
     factory, obj, truth, observations = made
     with pytest.raises(ValueError, match="found 2 poses of 1 snapshots"):
         absorb(RigBelief.of_prior(factory, obj), part(observations, 0, 1), truth.rig_from_object[:2])
+
+
+def test_lights_of_a_snapshot_say_what_objects_of_one_fiducial_say() -> None:
+    factory, obj, truth, observations = made_snapshots()
+    given, truth_poses = part(observations, 0, 5), truth.rig_from_object[:5]
+    places = truth_poses.apply(obj.points) + 1.0
+    lights, seen, at = lights_of(given, places)
+    together = absorb(RigBelief.of_prior(factory, lights), seen, at)
+    one = CalibrationObject(torch.zeros(1, 3, dtype=torch.float64), torch.ones(1, 3, dtype=torch.float64))
+    rows = [tensor.transpose(1, 2).flatten(0, 1)[:, :, None] for tensor in (given.uv, given.sigma, given.seen)]
+    known = rows[2].sum((1, 2)) > 1
+    eye = torch.eye(3, dtype=torch.float64).expand(int(known.sum()), 3, 3)
+    alone = RigidTransform(eye, places.flatten(0, 1)[known])
+    apart = absorb(RigBelief.of_prior(factory, one), Observations(*(row[known] for row in rows)), alone)
+    torch.testing.assert_close(together.belief.information, apart.belief.information, rtol=1e-8, atol=1e-6)
+    torch.testing.assert_close(together.brought.information(), apart.brought.information(), rtol=1e-8, atol=1e-4)
+    torch.testing.assert_close(together.brought.pull.sum(0), apart.brought.pull.sum(0), rtol=1e-6, atol=1e-5)
+    assert len(together.brought) == 5
+    assert together.dof == apart.dof
+    assert together.chi2 == pytest.approx(apart.chi2)
+    assert together.evidence == pytest.approx(apart.evidence)
+    found = together.rig_from_object.translation[:, ROOM:].flatten(0, 1)[known]
+    torch.testing.assert_close(found, apart.rig_from_object.translation, rtol=0, atol=1e-6)
+    assert bool(together.rig_from_object.translation[:, :ROOM].isnan().all())
+    torch.testing.assert_close(
+        together.residual.transpose(1, 2)[:, ROOM:].flatten(0, 1)[known], apart.residual[:, :, 0]
+    )
+
+
+def test_lights_say_nothing_of_the_size_of_the_rig_nor_of_where_it_is() -> None:
+    factory, obj, truth, observations = made_snapshots()
+    places = truth.rig_from_object[:8].apply(obj.points)
+    lights, seen, at = lights_of(part(observations, 0, 8), places)
+    prior = RigBelief.of_prior(factory, lights)
+    found = absorb(prior, seen, at)
+    rig, information = found.brought.rig, found.brought.information()
+    by_error = step_by_error(rig) * prior.unit[:, None]
+    away, size = rig.positions, torch.zeros_like(prior.unit)
+    size[:, 3:6] = away
+    sideways = torch.zeros_like(prior.unit)
+    sideways[:, 3:6] = torch.linalg.cross(away, torch.ones_like(away))
+    said = [
+        float(error @ information @ error)
+        for error in (torch.linalg.solve(by_error, step[..., None]).flatten() for step in (size, sideways))
+    ]
+    assert abs(said[0]) < 1e-9 * said[1]
+    assert found.belief.scale_std() > 0.9 * prior.scale_std()
+
+
+def test_lights_that_no_two_cameras_see_are_refused() -> None:
+    factory, obj, truth, observations = made_snapshots()
+    lights, seen, at = lights_of(part(observations, 0, 1), truth.rig_from_object[:1].apply(obj.points))
+    alone = torch.zeros_like(seen.seen)
+    alone[:, 0] = seen.seen[:, 0]
+    with pytest.raises(RefusedError, match="no light is seen by two cameras"):
+        absorb(RigBelief.of_prior(factory, lights), replace(seen, seen=alone), at)

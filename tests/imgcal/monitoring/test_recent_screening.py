@@ -25,17 +25,23 @@ def test_the_error_between_rigs_is_that_of_tensors() -> None:
         np.testing.assert_allclose(error - 1, expected, rtol=1e-7, atol=1e-9 * max(size, 1e-3))
 
 
-@pytest.fixture
-def ring() -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...], np.ndarray]:
-    """A ring of three snapshots, into which five have been put; totals; and each snapshot's information (5, D, D)."""
+@pytest.fixture(params=[6, 12])
+def ring(request) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...], np.ndarray]:
+    """A ring of three snapshots, into which five have been put; totals; and each snapshot's information (5, D, D).
+
+    Each takes as many numbers of poses out as it has: of twelve, some have fewer.
+    """
     generator = np.random.default_rng(3)
     wide = 15 * CAMERAS
     size = wide + OWN
-    rows = (np.zeros((3, 6, size)), np.zeros((3, OWN, size)), np.zeros((3, size)))
+    rows = (np.zeros((3, request.param, size)), np.zeros((3, OWN, size)), np.zeros((3, size)))
     totals = (np.zeros((4, CAMERAS, 15, 15)), np.zeros((4, CAMERAS, 15, 15)))
     full = np.zeros((SNAPSHOTS, size, size))
     for number in range(SNAPSHOTS):
-        root, carried = generator.normal(size=(CAMERAS, 15, 40)), generator.normal(size=(6, size))
+        root, carried = (
+            generator.normal(size=(CAMERAS, 15, 40)),
+            generator.normal(size=(6 + number % (request.param - 5), size)),
+        )
         camera, border = root @ root.swapaxes(-1, -2), generator.normal(size=(OWN, size))
         border[:, wide:] += border[:, wide:].T.copy()
         full[number] = -carried.T @ carried

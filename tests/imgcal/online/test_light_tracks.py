@@ -1,0 +1,39 @@
+import numpy as np
+
+from imgcal.online.light_tracks import LONGEST, STILL_SECONDS, LightTracks
+
+
+def test_lights_keep_their_numbers_while_they_move() -> None:
+    tracks = LightTracks.of(lights=4, cameras=2)
+    start, speed = (
+        np.array([[0.0, 0.0, 900.0], [140.0, 0.0, 900.0]]),
+        np.array([[1500.0, 0.0, 0.0], [-1500.0, 0.0, 0.0]]),
+    )
+    assert tracks.number_lights(start, 0.0).tolist() == [0, 1]
+    for frame in range(1, 12):  # they pass each other
+        there = start + speed * frame / 60
+        order = [1, 0] if frame % 2 else [0, 1]
+        assert tracks.number_lights(there[order], frame / 60).tolist() == order
+
+
+def test_a_number_is_free_again_once_its_light_is_gone() -> None:
+    tracks = LightTracks.of(lights=2, cameras=1)
+    here, elsewhere = np.array([[0.0, 0.0, 500.0]]), np.array([[900.0, 0.0, 500.0], [0.0, 900.0, 500.0]])
+    assert tracks.number_lights(here, 0.0).tolist() == [0]
+    assert tracks.number_lights(elsewhere, 0.1).tolist() == [1, -1]  # the first may come back to where it was
+    assert tracks.number_lights(here, 0.2).tolist() == [0]
+    assert sorted(tracks.number_lights(elsewhere, 0.3 + LONGEST).tolist()) == [0, 1]
+    assert tracks.number_lights(np.empty((0, 3)), 2.0).tolist() == []
+
+
+def test_blobs_that_never_move_are_known_after_a_while() -> None:
+    tracks = LightTracks.of(lights=2, cameras=2)
+    camera, generator = np.array([0, 1, 1]), np.random.default_rng(1)
+    doorway = np.array([[100.0, 100.0], [300.0, 40.0]])
+    for frame in range(100):
+        time = frame / 30
+        uv = np.concatenate((doorway + 0.1 * generator.normal(size=(2, 2)), [[500.0 - 3 * frame, 200.0]]))
+        still = tracks.is_still(camera, uv)
+        assert still.tolist() == [time > STILL_SECONDS + 1 / 60] * 2 + [False]
+        tracks.mark_still(camera, uv, np.array([False, False, frame % 2 > 0]), time)
+    assert tracks.is_still(camera, np.concatenate((doorway + 7.0, [[0.0, 0.0]]))).tolist() == [False] * 3
