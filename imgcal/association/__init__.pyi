@@ -3,6 +3,7 @@ from .ambiguities import lattice_shifts, near_turns
 from .assignment import distances_to_nearest, mutual_nearest
 from .blobs import pattern_prior
 from .identification import identify, relocalize, track
+from .lights import Lights, align_rig, associate_lights, image_error
 from .merging import drop_merged, merging_distance
 from .options import PipelineOptions
 from .orientation import oriented
@@ -22,6 +23,7 @@ __all__ = [
     "Associations",
     "Identity",
     "IdentityOptions",
+    "Lights",
     "PipelineOptions",
     "Progress",
     "Proposal",
@@ -31,10 +33,13 @@ __all__ = [
     "SnapshotIdentity",
     "Status",
     "Tracker",
+    "align_rig",
     "associate",
+    "associate_lights",
     "distances_to_nearest",
     "drop_merged",
     "identify",
+    "image_error",
     "is_few_and_flat",
     "judge",
     "labels_by_shape",

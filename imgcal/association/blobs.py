@@ -66,10 +66,7 @@ def gather(detections: Detections, rig: CameraRig) -> PaddedBlobs:
     rows = np.flatnonzero(detections.usable)
     places = np.column_stack((detections.camera[rows], detections.uv[rows]))
     rows = rows[np.sort(np.unique(places, axis=0, return_index=True)[1])]
-    ideal = np.empty((len(rows), 2), dtype=np.float32)
-    lens = (rig.focal_length.numpy(), rig.principal_point.numpy(), rig.distortion.numpy())
-    lenses = lens_codes(rig.lens_model, *rig.distortion.shape)
-    _undistort(detections.uv[rows], detections.camera[rows], *lens, lenses, ideal)
+    ideal = undistorted(detections.uv[rows], detections.camera[rows], rig)
     finite = np.isfinite(ideal).all(-1)  # a lens that was fitted to next to nothing may show no such place
     rows, ideal = rows[finite], ideal[finite]
     order = np.argsort(detections.camera[rows], kind="stable")
@@ -85,6 +82,14 @@ def gather(detections: Detections, rig: CameraRig) -> PaddedBlobs:
     padded.uv[at], padded.ideal[at], padded.row[at] = detections.uv[rows], ideal, rows
     padded.sigma[at], padded.radius[at] = detections.sigma[rows], detections.radius[rows]
     return padded
+
+
+def undistorted(uv: NDArray[np.float64], camera: NDArray[np.int64], rig: CameraRig) -> NDArray[np.float32]:
+    """Pixels (R, 2) from the principal point, without distortion; not finite where a lens can show no such place."""
+    ideal = np.empty((len(uv), 2), dtype=np.float32)
+    lens = (rig.focal_length.numpy(), rig.principal_point.numpy(), rig.distortion.numpy())
+    _undistort(uv, camera, *lens, lens_codes(rig.lens_model, *rig.distortion.shape), ideal)
+    return ideal
 
 
 @njit(cache=True)

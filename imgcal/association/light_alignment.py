@@ -1,0 +1,138 @@
+"""Compiled sums for a rig that is brought nearer to blobs without labels: epipolar lines, each blob on the likeliest."""
+
+# Compiled functions take their types from their arguments.
+# ruff: noqa: ANN001, ANN202
+# mypy: allow-untyped-defs
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from renderers.compiling import njit
+
+FREE = 10
+"""Parameters of a camera that take part: rotation, position, focal lengths, principal point."""
+CUT = 9.0
+"""Squared standard deviations beyond which a blob is not on a line."""
+REDUNDANCY = 0.4
+"""Of pairs of cameras: ten cameras that see a point make 45 distances of 20 coordinates, less three of the point."""
+
+
+@njit(cache=True, error_model="numpy")
+def epipolar_equations(xy, start, rotation, position, focal, scale, width, chance, information, gradient):
+    """Fill in the normal equations of whitened parameters, and return the cost and the sum of weights.
+
+    Args:
+        xy: (M, 2) blobs of all moments in the order of moments and cameras, on the plane z = 1 without distortion.
+        start: (S, C + 1) where the blobs of each camera begin.
+        rotation: (C, 3, 3) cam_from_rig.
+        position: (C, 3) mm.
+        focal: (C, 2) px.
+        scale: (C, FREE) standard deviation of each parameter.
+        width: px, of the distance of a blob from the epipolar line of the same marker.
+        chance: weight of no partner, in units of a partner right on the line.
+        information: (C FREE, C FREE).
+        gradient: (C FREE,).
+    """
+    cameras = len(focal)
+    most = 0
+    for s in range(len(start)):
+        for c in range(cameras):
+            most = max(most, start[s, c + 1] - start[s, c])
+    weight, distance = np.empty((most, most)), np.empty((most, most))
+    by_row, by_column = np.empty(most), np.empty(most)
+    jacobian = np.empty(2 * FREE)
+    cost, total = 0.0, 0.0
+    information[:] = 0.0
+    gradient[:] = 0.0
+    for s in range(len(start)):
+        for a in range(cameras):
+            for b in range(a + 1, cameras):
+                na, nb = start[s, a + 1] - start[s, a], start[s, b + 1] - start[s, b]
+                if na == 0 or nb == 0:
+                    continue
+                for j in range(nb):
+                    by_column[j] = 0.0
+                for i in range(na):
+                    by_row[i] = 0.0
+                    for j in range(nb):
+                        e = _distance(
+                            xy[start[s, a] + i], xy[start[s, b] + j], rotation[a], rotation[b],
+                            position[a], position[b], focal[a], focal[b], jacobian, False,
+                        )  # fmt: skip
+                        square = (e / width) ** 2
+                        w = math.exp(-0.5 * square) if square < CUT else 0.0
+                        weight[i, j], distance[i, j] = w, e
+                        by_row[i] += w
+                        by_column[j] += w
+                for i in range(na):
+                    cost -= math.log(by_row[i] + chance)
+                    for j in range(nb):
+                        if weight[i, j] <= 0:
+                            continue
+                        r = weight[i, j] / (max(by_row[i], by_column[j]) + chance)
+                        if r < 0.02:
+                            continue
+                        total += r
+                        _distance(
+                            xy[start[s, a] + i], xy[start[s, b] + j], rotation[a], rotation[b],
+                            position[a], position[b], focal[a], focal[b], jacobian, True,
+                        )  # fmt: skip
+                        for k in range(FREE):
+                            jacobian[k] *= scale[a, k]
+                            jacobian[FREE + k] *= scale[b, k]
+                        r *= REDUNDANCY / width**2
+                        for k in range(2 * FREE):
+                            row = a * FREE + k if k < FREE else b * FREE + k - FREE
+                            first = r * jacobian[k]
+                            gradient[row] += first * distance[i, j]
+                            for m in range(2 * FREE):
+                                column = a * FREE + m if m < FREE else b * FREE + m - FREE
+                                information[row, column] += first * jacobian[m]
+    return cost, total
+
+
+@njit(cache=True, error_model="numpy")
+def _distance(one, two, rotation1, rotation2, position1, position2, focal1, focal2, jacobian, with_jacobian):
+    """Distance (px) of two blobs from being one point (Sampson's), inf behind a camera; its derivatives if wanted."""
+    x1, y1, x2, y2 = one[0], one[1], two[0], two[1]
+    ax = rotation1[0, 0] * x1 + rotation1[1, 0] * y1 + rotation1[2, 0]
+    ay = rotation1[0, 1] * x1 + rotation1[1, 1] * y1 + rotation1[2, 1]
+    az = rotation1[0, 2] * x1 + rotation1[1, 2] * y1 + rotation1[2, 2]
+    bx = rotation2[0, 0] * x2 + rotation2[1, 0] * y2 + rotation2[2, 0]
+    by = rotation2[0, 1] * x2 + rotation2[1, 1] * y2 + rotation2[2, 1]
+    bz = rotation2[0, 2] * x2 + rotation2[1, 2] * y2 + rotation2[2, 2]
+    px, py, pz = position2[0] - position1[0], position2[1] - position1[1], position2[2] - position1[2]
+    # normals: n1 = d2 x b, n2 = b x d1; t = d1 . n1 = d2 . n2
+    n1x, n1y, n1z = by * pz - bz * py, bz * px - bx * pz, bx * py - by * px
+    n2x, n2y, n2z = py * az - pz * ay, pz * ax - px * az, px * ay - py * ax
+    t = ax * n1x + ay * n1y + az * n1z
+    q10 = rotation1[0, 0] * n1x + rotation1[0, 1] * n1y + rotation1[0, 2] * n1z
+    q11 = rotation1[1, 0] * n1x + rotation1[1, 1] * n1y + rotation1[1, 2] * n1z
+    q20 = rotation2[0, 0] * n2x + rotation2[0, 1] * n2y + rotation2[0, 2] * n2z
+    q21 = rotation2[1, 0] * n2x + rotation2[1, 1] * n2y + rotation2[1, 2] * n2z
+    spread = math.sqrt((q10 / focal1[0]) ** 2 + (q11 / focal1[1]) ** 2 + (q20 / focal2[0]) ** 2 + (q21 / focal2[1]) ** 2)
+    if not spread > 0:
+        return np.inf
+    if not with_jacobian:
+        # before both cameras: along1 and along2 of the nearest points, up to a positive factor
+        aa, bb, ab = ax * ax + ay * ay + az * az, bx * bx + by * by + bz * bz, ax * bx + ay * by + az * bz
+        pa, pb = px * ax + py * ay + pz * az, px * bx + py * by + pz * bz
+        if pa * bb - pb * ab <= 0 or pa * ab - pb * aa <= 0:
+            return np.inf
+        return t / spread
+    q12 = rotation1[2, 0] * n1x + rotation1[2, 1] * n1y + rotation1[2, 2] * n1z
+    q22 = rotation2[2, 0] * n2x + rotation2[2, 1] * n2y + rotation2[2, 2] * n2z
+    cx, cy, cz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx  # d1 x d2
+    # rotations: -(m x q)
+    jacobian[0], jacobian[1], jacobian[2] = -(y1 * q12 - q11) / spread, -(q10 - x1 * q12) / spread, -(x1 * q11 - y1 * q10) / spread
+    jacobian[3], jacobian[4], jacobian[5] = -cx / spread, -cy / spread, -cz / spread
+    jacobian[6], jacobian[7] = -q10 * x1 / focal1[0] / spread, -q11 * y1 / focal1[1] / spread
+    jacobian[8], jacobian[9] = -q10 / focal1[0] / spread, -q11 / focal1[1] / spread
+    jacobian[10], jacobian[11], jacobian[12] = -(y2 * q22 - q21) / spread, -(q20 - x2 * q22) / spread, -(x2 * q21 - y2 * q20) / spread
+    jacobian[13], jacobian[14], jacobian[15] = cx / spread, cy / spread, cz / spread
+    jacobian[16], jacobian[17] = -q20 * x2 / focal2[0] / spread, -q21 * y2 / focal2[1] / spread
+    jacobian[18], jacobian[19] = -q20 / focal2[0] / spread, -q21 / focal2[1] / spread
+    return t / spread

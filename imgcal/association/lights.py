@@ -1,0 +1,230 @@
+"""Markers of which nothing is known: which blobs of different cameras are the same one, moment by moment.
+
+`associate_lights` needs a rig that is right to a few pixels (how many, it is told). Where the rig is farther off than
+markers are apart, `align_rig` brings it nearer first, from the blobs of many moments at once and without labels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.association.blobs import undistorted
+from imgcal.association.light_alignment import FREE, epipolar_equations
+from imgcal.association.light_search import find_all_lights
+from imgcal.types import CameraRig, Detections
+
+Array = NDArray[np.float64]
+
+LEAST_ODDS = 6.0
+"""Log odds against false blobs from which a place is a marker."""
+OWN_ERROR = 0.3
+"""px: what centres may be off beyond their sigma (partly hidden markers) while blobs are told apart."""
+STEPS, SHRINK = 26, 0.85
+"""Of `align_rig`, and how much narrower each takes the lines."""
+NARROWEST = 1.0
+"""px, width of the lines at the end."""
+CHANCE = 0.5
+"""Weight of no partner on a line, in units of a partner right on it."""
+MOST_PAIRS = 400_000
+"""Of blobs, that each step of `align_rig` looks at: it takes moments evenly from all."""
+
+
+@dataclass(frozen=True)
+class Lights:
+    """Markers found at some moments, the likeliest of each moment first."""
+
+    row: NDArray[np.int64]  # (R, C) row of the detections in each camera, -1 = none
+    moment: NDArray[np.int64]  # (R,) number of the snapshot
+    point: Array  # (R, 3) mm in the rig's frame
+    odds: Array  # (R,) log odds against false blobs
+    margin: Array  # (R,) log odds against the best other place that takes one of its blobs; inf = there is none
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+    def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Lights:
+        """Keep the given rows (mask or indices)."""
+        return Lights(self.row[rows], self.moment[rows], self.point[rows], self.odds[rows], self.margin[rows])
+
+    @property
+    def cameras(self) -> NDArray[np.int64]:
+        """Number of cameras that show each: (R,)."""
+        return np.asarray((self.row >= 0).sum(1))
+
+
+@dataclass(frozen=True)
+class SortedBlobs:
+    """Usable blobs in the order of moments and cameras, on the plane z = 1 without distortion."""
+
+    xy: Array  # (M, 2)
+    start: NDArray[np.int64]  # (S, C + 1) where the blobs of each moment and camera begin
+    row: NDArray[np.int64]  # (M,) row of the detections
+
+
+def associate_lights(
+    detections: Detections, rig: CameraRig, error: NDArray[np.float64], least_odds: float = LEAST_ODDS
+) -> Lights:
+    """Find the markers of each moment: blobs of three cameras or more that may be one place.
+
+    Each blob belongs to one marker at most. Blobs beside which another one may be the marker as well are left out.
+
+    Args:
+        detections: blobs of one moment or more, cameras as in the rig; labels are not looked at.
+        rig: without batch axes, float64.
+        error: (C,) px, one standard deviation of what rig and blobs may be off in each camera, see `image_error`; the
+            nearer the rig, the denser the markers may be.
+        least_odds: log odds against false blobs that a marker must have.
+
+    Returns:
+        One row a marker and moment.
+
+    Examples:
+        >>> import imgcal
+        >>> from imgcal.synthesis import simulate_volume, true_detections
+        >>> rig, wand = imgcal.load_rig("room10"), imgcal.load_object("wand4")
+        >>> seen = true_detections(simulate_volume(rig, wand, 3, torch.Generator().manual_seed(0), None))
+        >>> found = associate_lights(seen, rig, np.full(10, 0.5))
+        >>> len(found), bool((np.ptp(seen.fiducial[found.row[0][found.row[0] >= 0]]) == 0))
+        (12, True)
+    """
+    blobs = sort_blobs(detections, rig)
+    cameras = rig.num_cameras
+    most = max(len(blobs.xy) // 3, 1)
+    chosen, point = np.full((most, cameras), -1), np.empty((most, 3))
+    odds, margin, moment = np.empty(most), np.empty(most), np.empty(most, dtype=np.int64)
+    focal = rig.focal_length.double().numpy()
+    rotation, position = rig.cam_from_rig.rotation.double().numpy(), rig.positions.double().numpy()
+    half = 0.5 * rig.image_size.double().numpy() / focal
+    gate = np.asarray(error, dtype=np.float64) / focal.mean(1)
+    count = find_all_lights(
+        blobs.xy, blobs.start, np.ascontiguousarray(rotation), np.ascontiguousarray(position), gate, half, least_odds,
+        chosen, point, odds, margin, moment,
+    )  # fmt: skip
+    chosen = chosen[:count]
+    row = np.where(chosen >= 0, blobs.row[np.maximum(chosen, 0)] if len(blobs.row) else -1, -1)
+    found = Lights(row, moment[:count], point[:count], odds[:count], margin[:count])
+    return found.select(found.cameras >= 2)
+
+
+def sort_blobs(detections: Detections, rig: CameraRig) -> SortedBlobs:
+    """Arrange the usable blobs for compiled loops."""
+    rows = np.flatnonzero(detections.usable)
+    camera, snapshot = detections.camera[rows], detections.snapshot[rows]
+    ideal = undistorted(detections.uv[rows], camera, rig).astype(np.float64)
+    xy = ideal / rig.focal_length.double().mean(1).numpy()[camera, None]
+    good = np.isfinite(xy).all(1)
+    rows, camera, snapshot, xy = rows[good], camera[good], snapshot[good], xy[good]
+    moments, cameras = len(detections.snapshot_names), rig.num_cameras
+    cell = snapshot * cameras + camera
+    order = np.argsort(cell, kind="stable")
+    ends = np.concatenate(([0], np.cumsum(np.bincount(cell, minlength=moments * cameras))))
+    start = ends[np.arange(moments)[:, None] * cameras + np.arange(cameras + 1)]
+    return SortedBlobs(np.ascontiguousarray(xy[order]), start, rows[order])
+
+
+def image_error(rig: CameraRig, std: Tensor) -> Array:
+    """How far blobs may be from where a rig has them: (C,) px, one standard deviation.
+
+    Args:
+        rig: without batch axes.
+        std: (C, K) one standard deviation of each value, as `RigPrior.std` gives it.
+    """
+    spread, size = std.double().numpy(), rig.image_size.double().numpy()
+    focal, position = rig.focal_length.double().mean(1).numpy(), rig.positions.double().numpy()
+    distance = np.linalg.norm(position - position.mean(0), axis=1).mean() or 1000.0
+    turned, moved = spread[:, :3].mean(1) * focal, spread[:, 3:6].mean(1) * focal / distance
+    zoomed, shifted = spread[:, 6:8].mean(1) / focal * size.mean(1) * 0.3, spread[:, 8:10].mean(1)
+    return np.asarray(np.sqrt(turned**2 + moved**2 + zoomed**2 + shifted**2))
+
+
+def align_rig(
+    detections: Detections, rig: CameraRig, std: Tensor, first: CameraRig | None = None, seed: int = 0
+) -> tuple[CameraRig, float]:
+    """Bring a rig nearer to blobs without labels, so that most of them lie on epipolar lines of blobs of all others.
+
+    Each blob is laid onto the likeliest lines of each other camera, lines as wide as the rig is off at first and
+    narrower step by step; what is least squares then is solved by Gauss and Newton, with the factory's prior.
+
+    Args:
+        detections: blobs of many moments; labels are not looked at.
+        rig: the factory rig.
+        std: (C, K) its prior.
+        first: where to begin; None = the factory rig.
+        seed: of the choice of moments.
+
+    Returns:
+        The rig, and the mean log likelihood of a blob in a pair of cameras: larger is better.
+    """
+    blobs = sort_blobs(detections, rig)
+    counts = np.diff(blobs.start, axis=1)
+    pairs = (counts.sum(1) ** 2 - (counts**2).sum(1)) // 2
+    order = np.random.default_rng(seed).permutation(np.flatnonzero(pairs > 0))
+    order = order[np.cumsum(pairs[order]) <= max(MOST_PAIRS, int(pairs[order[:1]].sum()))]
+    size, whitening = FREE * rig.num_cameras, std[:, :FREE].double()
+    scale = np.ascontiguousarray(whitening.numpy())
+    information, gradient = np.empty((size, size)), np.empty(size)
+    now = rig if first is None else first
+    width = float(np.sqrt(2) * np.median(image_error(rig, std)))
+    cost, weight = 0.0, 1.0
+    for _ in range(STEPS):
+        there = sort_blobs(detections.select(np.isin(detections.snapshot, order)), now)
+        focal, rotation, position = (
+            np.ascontiguousarray(t.double().numpy())
+            for t in (now.focal_length, now.cam_from_rig.rotation, now.positions)
+        )
+        cost, weight = epipolar_equations(
+            there.xy, there.start[order], rotation, position, focal, scale, width, CHANCE, information, gradient
+        )
+        change = now.local(rig)[:, :FREE].double()
+        offset = torch.where(whitening > 0, change / whitening.clamp_min(1e-30), 0.0).reshape(-1).numpy()
+        step = -np.linalg.solve(information + np.eye(size), gradient + offset)
+        whole = torch.zeros_like(std)
+        whole[:, :FREE] = torch.from_numpy(step.reshape(-1, FREE)) * whitening
+        now = now.retract(whole)
+        width = max(width * SHRINK, NARROWEST)
+    return now, -cost / max(weight, 1.0)
+
+
+def background_rows(detections: Detections, still: float = 1.0, share: float = 0.5) -> NDArray[np.bool_]:
+    """Mark the blobs that never move in their camera's image: lamps, doorways, reflections.
+
+    Args:
+        detections: blobs of some moments.
+        still: px, as far apart blobs of two moments may be and count as one that stands still.
+        share: of the moments in which a camera has blobs, in which one must be there.
+
+    Returns:
+        (M,) bool.
+    """
+    marked = np.zeros(len(detections), dtype=bool)
+    for camera in np.unique(detections.camera):
+        rows = np.flatnonzero(detections.camera == camera)
+        moments = len(np.unique(detections.snapshot[rows]))
+        if moments < LEAST_MOMENTS:
+            continue
+        cell = np.floor(detections.uv[rows] / still).astype(np.int64)
+        _, which, _ = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+        places: dict[tuple[int, int], set[int]] = {}
+        for (u, v), snapshot in zip(cell.tolist(), detections.snapshot[rows].tolist(), strict=True):
+            places.setdefault((u, v), set()).add(snapshot)
+        near = [
+            len(set().union(*(places.get((u + du, v + dv), set()) for du in (-1, 0, 1) for dv in (-1, 0, 1))))
+            for u, v in cell.tolist()
+        ]
+        marked[rows] = np.array(near) >= share * moments
+        del which
+    return marked
+
+
+LEAST_MOMENTS = 8
+"""Of a camera, from which on something can be said never to move."""
+
+
+def without_rows(detections: Detections, rows: NDArray[np.bool_]) -> Detections:
+    """Leave some blobs out."""
+    return replace(detections, uv=detections.uv).select(~rows)
