@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.association.blobs import undistorted
-from imgcal.association.light_alignment import FREE, epipolar_equations
+from imgcal.association.light_alignment import FREE, epipolar_equations, image_equations
 from imgcal.association.light_search import find_all_lights
 from imgcal.types import CameraRig, Detections
 
@@ -24,13 +24,13 @@ LEAST_ODDS = 6.0
 """Log odds against false blobs from which a place is a marker."""
 OWN_ERROR = 0.3
 """px: what centres may be off beyond their sigma (partly hidden markers) while blobs are told apart."""
-STEPS, SHRINK = 26, 0.85
+STEPS, SHRINK = 20, 0.8
 """Of `align_rig`, and how much narrower each takes the lines."""
 NARROWEST = 1.0
 """px, width of the lines at the end."""
 CHANCE = 0.5
 """Weight of no partner on a line, in units of a partner right on it."""
-MOST_PAIRS = 400_000
+MOST_PAIRS = 150_000
 """Of blobs, that each step of `align_rig` looks at: it takes moments evenly from all."""
 
 
@@ -190,6 +190,63 @@ def align_rig(
     return now, -cost / max(weight, 1.0)
 
 
+def align_camera(
+    detections: Detections, rig: CameraRig, std: Tensor, now: CameraRig, camera: int, lights: Lights
+) -> CameraRig:
+    """Bring one camera nearer to markers that the others see: each blob is laid onto the likeliest of them.
+
+    Args:
+        detections: blobs of the same moments; labels are not looked at.
+        rig: the factory rig, from whose values the camera starts.
+        std: (C, K) its prior.
+        now: the rig in whose frame the markers are.
+        camera: which.
+        lights: markers that others see.
+
+    Returns:
+        `now` with another camera.
+    """
+    blobs = sort_blobs(detections.select(detections.camera == camera), rig)
+    order = np.argsort(lights.moment, kind="stable")
+    moments = len(detections.snapshot_names)
+    point_start = np.concatenate(([0], np.cumsum(np.bincount(lights.moment, minlength=moments))))
+    points = np.ascontiguousarray(lights.point[order])
+    start = np.append(blobs.start[:, camera], blobs.start[-1, camera + 1])
+    whitening = std[camera, :FREE].double()
+    information, gradient = np.empty((FREE, FREE)), np.empty(FREE)
+    moved = rig
+    width = 1.5 * float(image_error(rig, std)[camera])
+    counts = np.diff(start)
+    density = float(counts[counts > 0].mean()) / float(_spread_area(blobs, start) * rig.focal_length[camera].prod())
+    for _ in range(STEPS):
+        own = sort_blobs(detections.select(detections.camera == camera), moved)
+        focal = moved.focal_length[camera].double()
+        uv = own.xy * focal.mean().item()
+        chance = max(CHANCE, 1.0) * min(2 * np.pi * width**2 * density, 1.0) + 0.05
+        image_equations(
+            uv, start, points, point_start, np.ascontiguousarray(moved.cam_from_rig.rotation[camera].double().numpy()),
+            np.ascontiguousarray(moved.positions[camera].double().numpy()), np.full(2, focal.mean().item()),
+            np.ascontiguousarray(whitening.numpy()), width, chance, information, gradient,
+        )  # fmt: skip
+        change = moved.local(rig)[camera, :FREE].double()
+        offset = torch.where(whitening > 0, change / whitening.clamp_min(1e-30), 0.0).numpy()
+        step = -np.linalg.solve(information + np.eye(FREE), gradient + offset)
+        whole = torch.zeros_like(std)
+        whole[camera, :FREE] = torch.from_numpy(step) * whitening
+        moved = moved.retract(whole)
+        width = max(width * SHRINK, NARROWEST)
+    step = torch.zeros_like(std)
+    step[camera] = moved.local(now)[camera]
+    return now.retract(step)
+
+
+def _spread_area(blobs: SortedBlobs, start: NDArray[np.int64]) -> float:
+    """Area that the blobs of one moment cover, on the plane z = 1: the median over moments, four deviations wide."""
+    parts = [blobs.xy[a:b] for a, b in zip(start, start[1:], strict=False) if b - a > 2]
+    sides = [16 * float(np.prod(np.std(part, axis=0))) for part in parts]
+    return max(float(np.median(sides)) if sides else 1.0, 1e-4)
+
+
 def background_rows(detections: Detections, still: float = 1.0, share: float = 0.5) -> NDArray[np.bool_]:
     """Mark the blobs that never move in their camera's image: lamps, doorways, reflections.
 
@@ -228,3 +285,69 @@ LEAST_MOMENTS = 8
 def without_rows(detections: Detections, rows: NDArray[np.bool_]) -> Detections:
     """Leave some blobs out."""
     return replace(detections, uv=detections.uv).select(~rows)
+
+
+def predicted_misses(
+    lights: Lights, detections: Detections, rig: CameraRig, camera: int, error: Array, near: float, far: float
+) -> tuple[int, float, float]:
+    """Compare the blobs of one camera with where markers that the others have found should be.
+
+    Args:
+        lights: found without this camera.
+        detections: blobs of the same moments.
+        rig: the rig they were found with.
+        camera: which.
+        error: (C,) px, as for `associate_lights`.
+        near: standard deviations up to which a blob is in its place.
+        far: standard deviations up to which it is beside it.
+
+    Returns:
+        How many markers are in the camera's view; the share of these that have a blob in their place, and the share
+        whose nearest blob is beside it, both less what shifted places have by chance.
+    """
+    blobs = sort_blobs(detections, rig)
+    one, focal = rig.select([camera]), float(rig.focal_length[camera].mean())
+    points = torch.from_numpy(lights.point)
+    image = one.project(points)
+    inside = image.visible[0].numpy()
+    size = one.image_size[0].double().numpy()
+    uv = image.uv[0].numpy()
+    inside &= ((uv > VIEW * size) & (uv < (1 - VIEW) * size)).all(-1)
+    there = one.cam_from_rig.apply(points)[0] if points.ndim == 2 else points
+    xy = (there[:, :2] / there[:, 2:]).numpy()
+    sigma = error[camera] * np.sqrt(1 + _uncertainty(lights, rig, camera))
+    counts = np.zeros((1 + len(SHIFTS), 2))
+    for k, (du, dv) in enumerate(((0.0, 0.0), *SHIFTS)):
+        shifted = xy + np.array([du, dv]) / focal
+        for row in np.flatnonzero(inside):
+            own = slice(blobs.start[lights.moment[row], camera], blobs.start[lights.moment[row], camera + 1])
+            away = np.linalg.norm(blobs.xy[own] - shifted[row], axis=1) * focal / sigma[row]
+            least = away.min(initial=np.inf)
+            counts[k] += least < near, near <= least < far
+    total = int(inside.sum())
+    if total == 0:
+        return 0, 0.0, 0.0
+    share = counts / total
+    chance = share[1:].mean(0)
+    found = (share[0, 0] - chance[0]) / max(1 - chance[0], 1e-9)
+    # Only where no blob is in its place may one be beside it.
+    beside = share[0, 1] - chance[1] * (1 - share[0, 0]) / max(1 - chance[0], 1e-9)
+    return total, float(found), float(beside)
+
+
+SHIFTS = ((60.0, 0.0), (-60.0, 0.0), (0.0, 60.0), (0.0, -60.0), (45.0, 45.0), (-45.0, -45.0))
+"""px: places beside predicted ones that tell how often a blob is there by chance."""
+VIEW = 0.03
+"""Of the image's size, from its border: as far predicted markers may be out of view."""
+
+
+def _uncertainty(lights: Lights, rig: CameraRig, camera: int) -> Array:
+    """Variance of the predicted images (R,), in units of that of a blob, roughly: the larger of both axes."""
+    position = rig.positions.double().numpy()
+    ray = lights.point[:, None] - position  # (R, C, 3)
+    away = np.linalg.norm(ray, axis=-1, keepdims=True)
+    ray = ray / away
+    across = (np.eye(3) - ray[..., :, None] * ray[..., None, :]) / away[..., None] ** 2
+    information = (across * (lights.row >= 0)[..., None, None]).sum(1)
+    covariance = np.linalg.inv(information + 1e-12 * np.eye(3))
+    return np.asarray(np.linalg.eigvalsh(across[:, camera] @ covariance @ across[:, camera] * away[:, camera, :, None] ** 2)[:, -1])

@@ -25,6 +25,8 @@ from imgcal.messages import shortened
 from imgcal.types import CalibrationObject, limits
 from renderers.palette import palette
 
+LIGHTS = "lights"
+"""Names unknown markers instead of a file."""
 SMALLEST = 1e-3  # mm, extent of an object
 LARGEST_LABEL = 2**31 - 1
 BOARD_SUFFIXES = (".yaml", ".yml")
@@ -35,8 +37,8 @@ def load_object(path: str | Path) -> CalibrationObject:
     """Read a calibration object.
 
     Args:
-        path: a CSV file, the YAML file of a printed board, or the bare name of a shipped object such as "cube8" when
-            there is no such file.
+        path: a CSV file, the YAML file of a printed board, or, when there is no such file, the bare name of a shipped
+            object such as "cube8" or "lights": every blob may be a marker of its own, and nothing is known of them.
 
     Returns:
         The object in float64; colours from `renderers.palette`.
@@ -51,6 +53,8 @@ def load_object(path: str | Path) -> CalibrationObject:
         (torch.Size([8, 3]), None)
     """
     path = Path(path)
+    if str(path) == LIGHTS and not path.exists():
+        return CalibrationObject.unknown(LIGHTS)
     if not path.exists() and str(path) in shipped_names("objects", ".yaml"):
         path = data_path("objects", f"{path}.yaml")
     if path.suffix.lower() in BOARD_SUFFIXES:
