@@ -1,7 +1,7 @@
-"""Compiled sums for a rig that is brought nearer to blobs without labels: epipolar lines, each blob on the likeliest."""
+"""Compiled sums that bring a rig nearer to blobs without labels: each blob lies on the likeliest epipolar lines."""
 
 # Compiled functions take their types from their arguments.
-# ruff: noqa: ANN001, ANN202
+# ruff: noqa: ANN001, ANN201, ANN202
 # mypy: allow-untyped-defs
 
 from __future__ import annotations
@@ -113,7 +113,8 @@ def _distance(one, two, rotation1, rotation2, position1, position2, focal1, foca
     q11 = rotation1[1, 0] * n1x + rotation1[1, 1] * n1y + rotation1[1, 2] * n1z
     q20 = rotation2[0, 0] * n2x + rotation2[0, 1] * n2y + rotation2[0, 2] * n2z
     q21 = rotation2[1, 0] * n2x + rotation2[1, 1] * n2y + rotation2[1, 2] * n2z
-    spread = math.sqrt((q10 / focal1[0]) ** 2 + (q11 / focal1[1]) ** 2 + (q20 / focal2[0]) ** 2 + (q21 / focal2[1]) ** 2)
+    own = (q10 / focal1[0]) ** 2 + (q11 / focal1[1]) ** 2
+    spread = math.sqrt(own + (q20 / focal2[0]) ** 2 + (q21 / focal2[1]) ** 2)
     if not spread > 0:
         return np.inf
     if not with_jacobian:
@@ -127,19 +128,23 @@ def _distance(one, two, rotation1, rotation2, position1, position2, focal1, foca
     q22 = rotation2[2, 0] * n2x + rotation2[2, 1] * n2y + rotation2[2, 2] * n2z
     cx, cy, cz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx  # d1 x d2
     # rotations: -(m x q)
-    jacobian[0], jacobian[1], jacobian[2] = -(y1 * q12 - q11) / spread, -(q10 - x1 * q12) / spread, -(x1 * q11 - y1 * q10) / spread
-    jacobian[3], jacobian[4], jacobian[5] = -cx / spread, -cy / spread, -cz / spread
-    jacobian[6], jacobian[7] = -q10 * x1 / focal1[0] / spread, -q11 * y1 / focal1[1] / spread
-    jacobian[8], jacobian[9] = -q10 / focal1[0] / spread, -q11 / focal1[1] / spread
-    jacobian[10], jacobian[11], jacobian[12] = -(y2 * q22 - q21) / spread, -(q20 - x2 * q22) / spread, -(x2 * q21 - y2 * q20) / spread
-    jacobian[13], jacobian[14], jacobian[15] = cx / spread, cy / spread, cz / spread
-    jacobian[16], jacobian[17] = -q20 * x2 / focal2[0] / spread, -q21 * y2 / focal2[1] / spread
-    jacobian[18], jacobian[19] = -q20 / focal2[0] / spread, -q21 / focal2[1] / spread
+    jacobian[0], jacobian[1], jacobian[2] = q11 - y1 * q12, x1 * q12 - q10, y1 * q10 - x1 * q11
+    jacobian[3], jacobian[4], jacobian[5] = -cx, -cy, -cz
+    jacobian[6], jacobian[7] = -q10 * x1 / focal1[0], -q11 * y1 / focal1[1]
+    jacobian[8], jacobian[9] = -q10 / focal1[0], -q11 / focal1[1]
+    jacobian[10], jacobian[11], jacobian[12] = q21 - y2 * q22, x2 * q22 - q20, y2 * q20 - x2 * q21
+    jacobian[13], jacobian[14], jacobian[15] = cx, cy, cz
+    jacobian[16], jacobian[17] = -q20 * x2 / focal2[0], -q21 * y2 / focal2[1]
+    jacobian[18], jacobian[19] = -q20 / focal2[0], -q21 / focal2[1]
+    for k in range(2 * FREE):
+        jacobian[k] /= spread
     return t / spread
 
 
 @njit(cache=True, error_model="numpy")
-def image_equations(uv, start, point, point_start, rotation, position, focal, scale, width, chance, information, gradient):
+def image_equations(
+    uv, start, point, point_start, rotation, position, focal, scale, width, chance, information, gradient
+):
     """Fill in the normal equations of one camera's whitened parameters; return the sum of weights.
 
     Args:

@@ -1,7 +1,7 @@
 """Compiled search for markers of which nothing is known: places on which the rays of three cameras or more agree."""
 
 # Compiled functions take their types from their arguments.
-# ruff: noqa: ANN001, ANN202
+# ruff: noqa: ANN001, ANN201, ANN202
 # mypy: allow-untyped-defs
 
 from __future__ import annotations
@@ -272,9 +272,7 @@ def _solve(ray, position, gate, hit, place, information):
         if hit[c] < 0:
             continue
         d = ray[hit[c]]
-        away = (
-            (place[0] - position[c, 0]) ** 2 + (place[1] - position[c, 1]) ** 2 + (place[2] - position[c, 2]) ** 2
-        )
+        away = (place[0] - position[c, 0]) ** 2 + (place[1] - position[c, 1]) ** 2 + (place[2] - position[c, 2]) ** 2
         weight = 1 / (max(away, 1.0) * gate[c] ** 2)
         for i in range(3):
             for j in range(3):

@@ -6,11 +6,12 @@ markers are apart, `align_rig` brings it nearer first, from the blobs of many mo
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from imgcal.association.blobs import undistorted
@@ -30,6 +31,13 @@ NARROWEST = 1.0
 """px, width of the lines at the end."""
 CHANCE = 0.5
 """Weight of no partner on a line, in units of a partner right on it."""
+SHIFTS = ((60.0, 0.0), (-60.0, 0.0), (0.0, 60.0), (0.0, -60.0), (45.0, 45.0), (-45.0, -45.0))
+"""px: places beside predicted ones that tell how often a blob is there by chance."""
+VIEW = 0.03
+"""Of the image's size, from its border: as far predicted markers may be out of view."""
+LEAST_MOMENTS, STILL, SHARE_OF_MOMENTS = 8, 1.0, 0.5
+"""Moments of a camera from which on something can be said never to move; px that it may; and in how many of them it
+must be there."""
 MOST_PAIRS = 150_000
 """Of blobs, that each step of `align_rig` looks at: it takes moments evenly from all."""
 
@@ -247,44 +255,37 @@ def _spread_area(blobs: SortedBlobs, start: NDArray[np.int64]) -> float:
     return max(float(np.median(sides)) if sides else 1.0, 1e-4)
 
 
-def background_rows(detections: Detections, still: float = 1.0, share: float = 0.5) -> NDArray[np.bool_]:
+def background_rows(detections: Detections) -> NDArray[np.bool_]:
     """Mark the blobs that never move in their camera's image: lamps, doorways, reflections.
 
     Args:
         detections: blobs of some moments.
-        still: px, as far apart blobs of two moments may be and count as one that stands still.
-        share: of the moments in which a camera has blobs, in which one must be there.
 
     Returns:
         (M,) bool.
+
+    Examples:
+        >>> moments = np.arange(20)
+        >>> lamp, light = np.tile([[300.0, 200.0]], (20, 1)), np.column_stack((10.0 * moments, np.full(20, 50.0)))
+        >>> blobs = Detections(
+        ...     np.concatenate((lamp, light)), np.full(40, 0.1), np.zeros(40, dtype=int), np.tile(moments, 2),
+        ...     np.full(40, -1), np.full(40, np.nan), np.zeros(40, dtype=np.uint8), ("left",), tuple(map(str, moments)),
+        ... )
+        >>> background_rows(blobs).sum()
+        20
     """
     marked = np.zeros(len(detections), dtype=bool)
     for camera in np.unique(detections.camera):
         rows = np.flatnonzero(detections.camera == camera)
-        moments = len(np.unique(detections.snapshot[rows]))
+        uv, snapshot = detections.uv[rows], detections.snapshot[rows]
+        moments = len(np.unique(snapshot))
         if moments < LEAST_MOMENTS:
             continue
-        cell = np.floor(detections.uv[rows] / still).astype(np.int64)
-        _, which, _ = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
-        places: dict[tuple[int, int], set[int]] = {}
-        for (u, v), snapshot in zip(cell.tolist(), detections.snapshot[rows].tolist(), strict=True):
-            places.setdefault((u, v), set()).add(snapshot)
-        near = [
-            len(set().union(*(places.get((u + du, v + dv), set()) for du in (-1, 0, 1) for dv in (-1, 0, 1))))
-            for u, v in cell.tolist()
-        ]
-        marked[rows] = np.array(near) >= share * moments
-        del which
+        near = cKDTree(uv).query_ball_point(uv, STILL, return_length=True)
+        for k in np.flatnonzero(near >= SHARE_OF_MOMENTS * moments):  # few: markers move on
+            there = np.square(uv - uv[k]).sum(1) <= STILL**2
+            marked[rows[k]] = len(np.unique(snapshot[there])) >= SHARE_OF_MOMENTS * moments
     return marked
-
-
-LEAST_MOMENTS = 8
-"""Of a camera, from which on something can be said never to move."""
-
-
-def without_rows(detections: Detections, rows: NDArray[np.bool_]) -> Detections:
-    """Leave some blobs out."""
-    return replace(detections, uv=detections.uv).select(~rows)
 
 
 def predicted_misses(
@@ -313,7 +314,7 @@ def predicted_misses(
     size = one.image_size[0].double().numpy()
     uv = image.uv[0].numpy()
     inside &= ((uv > VIEW * size) & (uv < (1 - VIEW) * size)).all(-1)
-    there = one.cam_from_rig.apply(points)[0] if points.ndim == 2 else points
+    there = (points - one.positions[0]) @ one.cam_from_rig.rotation[0].mT
     xy = (there[:, :2] / there[:, 2:]).numpy()
     sigma = error[camera] * np.sqrt(1 + _uncertainty(lights, rig, camera))
     counts = np.zeros((1 + len(SHIFTS), 2))
@@ -335,12 +336,6 @@ def predicted_misses(
     return total, float(found), float(beside)
 
 
-SHIFTS = ((60.0, 0.0), (-60.0, 0.0), (0.0, 60.0), (0.0, -60.0), (45.0, 45.0), (-45.0, -45.0))
-"""px: places beside predicted ones that tell how often a blob is there by chance."""
-VIEW = 0.03
-"""Of the image's size, from its border: as far predicted markers may be out of view."""
-
-
 def _uncertainty(lights: Lights, rig: CameraRig, camera: int) -> Array:
     """Variance of the predicted images (R,), in units of that of a blob, roughly: the larger of both axes."""
     position = rig.positions.double().numpy()
@@ -350,4 +345,5 @@ def _uncertainty(lights: Lights, rig: CameraRig, camera: int) -> Array:
     across = (np.eye(3) - ray[..., :, None] * ray[..., None, :]) / away[..., None] ** 2
     information = (across * (lights.row >= 0)[..., None, None]).sum(1)
     covariance = np.linalg.inv(information + 1e-12 * np.eye(3))
-    return np.asarray(np.linalg.eigvalsh(across[:, camera] @ covariance @ across[:, camera] * away[:, camera, :, None] ** 2)[:, -1])
+    one = across[:, camera] * away[:, camera, :, None]
+    return np.asarray(np.linalg.eigvalsh(one @ covariance @ one)[:, -1])

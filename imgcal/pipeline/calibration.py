@@ -24,7 +24,7 @@ from imgcal.monitoring import posterior_of
 from imgcal.pipeline.doubtful import DoubtfulCamera, doubtful_at_end
 from imgcal.pipeline.initialization import Initialization
 from imgcal.pipeline.lateness import LEAST_BETTER, LateCamera, timing_motion
-from imgcal.pipeline.lights import FoundLights
+from imgcal.pipeline.lights import FoundLights, count_moments
 from imgcal.pipeline.object_checks import CERTAIN, displaced, lost_fiducials
 from imgcal.pipeline.repeats import Repeats
 from imgcal.pipeline.scale import Scale, scale_of
@@ -231,10 +231,7 @@ class Calibration:
     @cached_property
     def moments(self) -> tuple[int, int]:
         """Number of snapshots used and of all; of unknown markers those of which some marker is used."""
-        snapshots, used = self.labelled.snapshots, self.labelled.used
-        if self.lights is None:
-            return len(used), len(snapshots)
-        return len({snapshots[row].name for row in used}), len(self.lights.detections.snapshot_names)
+        return count_moments(self.labelled, self.lights)
 
     @cached_property
     def predicted_error(self) -> PredictedError:

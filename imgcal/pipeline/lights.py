@@ -160,6 +160,14 @@ def find_lights(
     return FoundLights(rows_of_lights(found, moving, verified), detections, blob, background, agreement, starts)
 
 
+def count_moments(labelled: Associations, lights: FoundLights | None) -> tuple[int, int]:
+    """Count snapshots used and all; of unknown markers, whose rows share snapshots, those of which a row is used."""
+    snapshots, used = labelled.snapshots, labelled.used
+    if lights is None:
+        return len(used), len(snapshots)
+    return len({snapshots[row].name for row in used}), len(lights.detections.snapshot_names)
+
+
 def rows_of_lights(lights: Lights, detections: Detections, rig: CameraRig) -> Associations:
     """Make a snapshot of each marker at each moment; it has the name of the moment, and only the marker's blobs."""
     row, camera = np.nonzero(lights.row >= 0)
@@ -179,9 +187,7 @@ def _error(rig: CameraRig, pixels: float) -> NDArray[np.float64]:
     return np.full(rig.num_cameras, pixels)
 
 
-def _verified_rig(
-    detections: Detections, rig: CameraRig, obj: CalibrationObject
-) -> tuple[CameraRig, Agreement, int]:
+def _verified_rig(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> tuple[CameraRig, Agreement, int]:
     """Find the rig on which moments and cameras that took no part agree.
 
     Raises:

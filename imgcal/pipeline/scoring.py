@@ -12,7 +12,7 @@ from imgcal.detection import DetectionOptions
 from imgcal.errors import RefusedError
 from imgcal.estimation import estimate
 from imgcal.pipeline.board_turns import settle_turns
-from imgcal.pipeline.lights import find_lights
+from imgcal.pipeline.lights import FoundLights, count_moments, find_lights
 from imgcal.pipeline.sources import Frames, blobs_of
 from imgcal.pipeline.units import require_solvable, require_units
 from imgcal.types import CalibrationObject, CameraRig, Detections
@@ -41,6 +41,12 @@ class RigScore:
     labelled: Associations
     residual: Tensor  # (S, C, N, 2) pixels
     seen: Tensor  # (S, C, N) bool
+    lights: FoundLights | None = None  # of unknown markers: S is one marker at one moment each
+
+    @property
+    def moments(self) -> tuple[int, int]:
+        """Number of snapshots used and of all; of unknown markers those of which some marker is used."""
+        return count_moments(self.labelled, self.lights)
 
     @property
     def distances(self) -> Tensor:
@@ -107,7 +113,8 @@ def score(
     detections = settle_turns(blobs_of(source, rig, obj, detection), rig, obj)
     if obj.unknown_markers:
         with require_solvable():
-            return _scored(find_lights(detections, rig, obj, options).labelled, rig, obj, options)
+            lights = find_lights(detections, rig, obj, options)
+            return replace(_scored(lights.labelled, rig, obj, options), lights=lights)
     try:
         with require_solvable():
             return _scored(associate(detections, rig, obj, options, progress), rig, obj, options)

@@ -14,7 +14,6 @@ from imgcal.errors import InputError
 from imgcal.geometry import pose_rank
 from imgcal.types.board import Board
 
-
 ANY_LABEL = 1_000_000
 """Labels of a table of unknown markers are below this; nothing is made of them."""
 
