@@ -23,8 +23,8 @@ Array = NDArray[np.float64]
 
 LEAST_ODDS = 6.0
 """Log odds against false blobs from which a place is a marker."""
-OWN_ERROR = 0.3
-"""px: what centres may be off beyond their sigma (partly hidden markers) while blobs are told apart."""
+LEAST_CAMERAS = 3
+"""That must agree on a marker."""
 STEPS, SHRINK = 20, 0.8
 """Of `align_rig`, and how much narrower each takes the lines."""
 NARROWEST = 1.0
@@ -75,7 +75,11 @@ class SortedBlobs:
 
 
 def associate_lights(
-    detections: Detections, rig: CameraRig, error: NDArray[np.float64], least_odds: float = LEAST_ODDS
+    detections: Detections,
+    rig: CameraRig,
+    error: NDArray[np.float64],
+    least_odds: float = LEAST_ODDS,
+    least_cameras: int = LEAST_CAMERAS,
 ) -> Lights:
     """Find the markers of each moment: blobs of three cameras or more that may be one place.
 
@@ -87,6 +91,7 @@ def associate_lights(
         error: (C,) px, one standard deviation of what rig and blobs may be off in each camera, see `image_error`; the
             nearer the rig, the denser the markers may be.
         least_odds: log odds against false blobs that a marker must have.
+        least_cameras: that must agree on it; two rays that happen to meet are no witness of each other.
 
     Returns:
         One row a marker and moment.
@@ -110,7 +115,7 @@ def associate_lights(
     half = 0.5 * rig.image_size.double().numpy() / focal
     gate = np.asarray(error, dtype=np.float64) / focal.mean(1)
     count = find_all_lights(
-        blobs.xy, blobs.start, np.ascontiguousarray(rotation), np.ascontiguousarray(position), gate, half, least_odds,
+        blobs.xy, blobs.start, np.ascontiguousarray(rotation), np.ascontiguousarray(position), gate, half, least_odds, least_cameras,
         chosen, point, odds, margin, moment,
     )  # fmt: skip
     chosen = chosen[:count]

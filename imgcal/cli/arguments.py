@@ -152,6 +152,9 @@ class Calibrate:
     focal length or field of view is known (imgcal rig cameras writes such a file), or a calibration whose places do not
     count; carry the whole object through what neighbouring cameras see together; the rig's frame is that of its first
     camera"""
+    distance: tuple[str, str, float] | None = None
+    """with --cameras and --object lights: CAMERA CAMERA MM, the distance of two cameras, which gives the scale; without
+    it the rig is known up to scale. The first is in the origin of the rig's frame, the second on its x axis"""
     snapshots: str | None = None  #: A:B, numbers in file order from 0, B excluded
     videos_differ: bool = False  #: accept videos whose lengths or time stamps differ: frames go together by number
     detector: str = "classical"

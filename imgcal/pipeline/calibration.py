@@ -27,7 +27,7 @@ from imgcal.pipeline.lateness import LEAST_BETTER, LateCamera, timing_motion
 from imgcal.pipeline.lights import FoundLights, count_moments
 from imgcal.pipeline.object_checks import CERTAIN, displaced, lost_fiducials
 from imgcal.pipeline.repeats import Repeats
-from imgcal.pipeline.scale import Scale, scale_of
+from imgcal.pipeline.scale import KnownDistance, Scale, scale_of
 from imgcal.pipeline.synchronization import Unsynchronized
 from imgcal.pipeline.tally import Tally, tally
 from imgcal.types import (
@@ -100,6 +100,7 @@ class Calibration:
     late: tuple[LateCamera, ...] = ()  # whose frames, from some snapshot on, are of other moments: these took no part
     unsynchronized: Unsynchronized | None = None  # cameras expose at moments of their own; None = no sign of it
     repeats: Repeats = Repeats()  # exact copies of earlier images: these took no part
+    distance: KnownDistance | None = None  # of two cameras, which the scale rests on where nothing else knows it
     lights: FoundLights | None = None  # of unknown markers: snapshots used are one marker at one moment each
 
     def __repr__(self) -> str:
@@ -241,6 +242,8 @@ class Calibration:
     @cached_property
     def scale(self) -> Scale:
         """What the size of the rig rests on, and what an error of the object's file would add to the predicted one."""
+        if self.distance is not None:
+            return self.distance.scale
         return scale_of(self.estimate, self.obj, self.scale_sigma, self.predicted_error.volume)
 
     @property

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from imgcal.association import (
     Associations,
@@ -51,7 +52,7 @@ other moments."""
 STARTS = len(SPREAD)
 NEAR, FAR = 4.0, 24.0
 """Standard deviations up to which a blob is where a marker was predicted, and up to which it is a near miss."""
-LEAST_PREDICTED = 20
+LEAST_PREDICTED = 10
 """Markers predicted for one camera from which on it can be judged."""
 LEAST_SHARE = 0.25
 """Of the predicted markers of a camera: those with a blob in their place, chance apart."""
@@ -153,7 +154,7 @@ def find_lights(
     background = background_rows(detections)
     moving = detections.select(~background)
     verified, agreement, starts = _verified_rig(moving, rig, obj)
-    found = associate_lights(moving, verified, _error(rig, FINEST))
+    found = associate_lights(moving, verified, even_error(rig))
     if not len(found):
         raise RefusedError(NOTHING)
     blob = np.flatnonzero(~background)[found.row[found.row >= 0]]
@@ -183,7 +184,8 @@ def rows_of_lights(lights: Lights, detections: Detections, rig: CameraRig) -> As
     return Associations(blobs, snapshots)
 
 
-def _error(rig: CameraRig, pixels: float) -> NDArray[np.float64]:
+def even_error(rig: CameraRig, pixels: float = FINEST) -> NDArray[np.float64]:
+    """Let every camera be off by the same, px: (C,)."""
     return np.full(rig.num_cameras, pixels)
 
 
@@ -193,13 +195,7 @@ def _verified_rig(detections: Detections, rig: CameraRig, obj: CalibrationObject
     Raises:
         RefusedError: there is none, or another one explains the blobs as well.
     """
-    held = np.arange(len(detections.snapshot_names)) % HELD_OUT == HELD_OUT - 1
-    if held.sum() < 2:
-        raise RefusedError(
-            f"unknown markers: found {len(held)} snapshots, expected at least {2 * HELD_OUT}: some must take no part, "
-            "to prove the others right"
-        )
-    learnt, tested = (detections.select(part[detections.snapshot]) for part in (~held, held))
+    learnt, tested = held_out(detections)
     std = (rig.prior or RigPrior()).std(rig)
     generator = torch.Generator().manual_seed(0)
     best = agreement_of(tested, rig)
@@ -223,6 +219,31 @@ NOTHING = (
     "unknown markers: no blobs of three cameras agree on places: the rig is farther off than its prior says, or the "
     "markers are too many or too few"
 )
+
+
+def held_out(detections: Detections) -> tuple[Detections, Detections]:
+    """Part blobs by moments: those from which a rig is made, and those that take no part.
+
+    Raises:
+        RefusedError: there are too few moments.
+    """
+    held = np.arange(len(detections.snapshot_names)) % HELD_OUT == HELD_OUT - 1
+    if held.sum() < 2:
+        raise RefusedError(
+            f"unknown markers: found {len(held)} snapshots, expected at least {2 * HELD_OUT}: some must take no part, "
+            "to prove the others right"
+        )
+    return detections.select(~held[detections.snapshot]), detections.select(held[detections.snapshot])
+
+
+def require_agreement(agreement: Agreement, rig: CameraRig) -> None:
+    """Refuse where moments and cameras that took no part do not agree.
+
+    Raises:
+        RefusedError: says which cameras, and how far they are from it.
+    """
+    if not bool(agreement.agrees.all()):
+        raise RefusedError(_why(agreement, rig))
 
 
 def _why(agreement: Agreement | None, rig: CameraRig) -> str:
@@ -252,24 +273,46 @@ def _followed(
     std = (factory.prior or RigPrior()).std(factory)
     now, _ = align_rig(detections, factory, std, first, seed)
     error = min(AFTER_ALIGNMENT, float(np.median(image_error(factory, std))))
-    last, again = False, JOINED
+    return narrow(detections, factory, std, now, obj, error, JOINED)
+
+
+def narrow(
+    detections: Detections,
+    factory: CameraRig,
+    std: Tensor,
+    now: CameraRig,
+    obj: CalibrationObject,
+    error: float,
+    joined: int,
+) -> CameraRig | None:
+    """Label and fit by turns, looking narrower each time.
+
+    Args:
+        detections: blobs of many moments.
+        factory: the rig that the prior is about.
+        std: (C, K) the prior.
+        now: where to begin.
+        obj: one point.
+        error: px, what that may be off.
+        joined: times that cameras which show few of the markers are brought back.
+
+    Returns:
+        The rig; None = too few markers are found.
+    """
     while True:
-        found = associate_lights(detections, now, _error(factory, error))
-        lost = _lost(found, now) if again else []
-        again -= 1
+        found = associate_lights(detections, now, even_error(factory, error))
+        lost = _lost(found, now) if joined > 0 else []
+        joined -= 1
         if lost:
             for camera in lost:
                 now = align_camera(detections, factory, std, now, camera, found)
             continue
-        fit = _fit(found, detections, factory, now, obj)
-        if fit is None:
-            return None
+        fit = _fit(found, detections, factory, std, now, obj)
+        if fit is None or error == FINEST:
+            return None if fit is None else fit.rig
         now = fit.rig
-        if last:
-            return now
         spread = float(fit.residual.norm(dim=-1)[fit.problem.root_weight[0] > 0].median()) / 1.1774
         error = max(FINEST, min(NARROWER * error, 3 * spread))
-        last = error == FINEST
 
 
 def _lost(lights: Lights, rig: CameraRig) -> list[int]:
@@ -282,7 +325,12 @@ def _lost(lights: Lights, rig: CameraRig) -> list[int]:
 
 
 def _fit(
-    lights: Lights, detections: Detections, factory: CameraRig, first: CameraRig, obj: CalibrationObject
+    lights: Lights,
+    detections: Detections,
+    factory: CameraRig,
+    std: Tensor,
+    first: CameraRig,
+    obj: CalibrationObject,
 ) -> Estimate | None:
     """Fit a rig to the markers that most cameras see; None = too few."""
     if len(lights) < LEAST_ROWS:
@@ -297,7 +345,7 @@ def _fit(
     points = torch.from_numpy(chosen.point)
     poses = RigidTransform(torch.eye(3, dtype=points.dtype).expand(len(points), 3, 3), points)
     options = EstimationOptions(loss="cauchy", max_iterations=40)
-    return estimate(observations, factory, obj.taken_as_exact(), poses, initial_rig=first, options=options)
+    return estimate(observations, factory, obj, poses, prior_std=std, initial_rig=first, options=options)
 
 
 def agreement_of(detections: Detections, rig: CameraRig) -> Agreement:
@@ -310,12 +358,12 @@ def agreement_of(detections: Detections, rig: CameraRig) -> Agreement:
     moments = np.unique(detections.snapshot)
     some = moments[np.linspace(0, len(moments) - 1, min(len(moments), MOST_TESTED)).astype(int)]
     blobs = detections.select(np.isin(detections.snapshot, some))
-    error = _error(rig, FINEST)
+    error = even_error(rig)
     predicted = np.zeros(rig.num_cameras, dtype=np.int64)
     found, missed = np.zeros(rig.num_cameras), np.zeros(rig.num_cameras)
     for camera in range(rig.num_cameras):
         others = blobs.select(blobs.camera != camera)
-        lights = associate_lights(others, rig, error)
+        lights = associate_lights(others, rig, error, least_cameras=min(3, rig.num_cameras - 1))
         counts = predicted_misses(lights, blobs, rig, camera, error, NEAR, FAR)
         predicted[camera], found[camera], missed[camera] = counts
     return Agreement(predicted, found, missed)

@@ -126,6 +126,8 @@ def score(
 def _scored(labelled: Associations, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions) -> RigScore:
     """Fit a pose in each labelled snapshot."""
     observations, poses = observations_of(labelled, rig, obj)
+    if obj.unknown_markers:
+        poses = None  # those are of the rig by which the markers were found
     fixed = torch.zeros(*rig.distortion.shape[:-1], rig.num_parameters, dtype=rig.distortion.dtype)
     # What is reported is an RMS in pixels: centres count alike, however well each was measured.
     even = replace(observations, sigma=torch.full_like(observations.sigma, options.identity_error))

@@ -24,7 +24,7 @@ def found_in(scene: Scene, moment: int) -> tuple[np.ndarray, np.ndarray, np.ndar
     count = find_lights(
         there.xy, there.start[0], np.ascontiguousarray(rig.cam_from_rig.rotation.numpy()),
         np.ascontiguousarray(rig.positions.numpy()), np.full(cameras, GATE) / focal.mean(1),
-        0.5 * rig.image_size.double().numpy() / focal, 6.0, chosen, point, np.empty(most), np.empty(most),
+        0.5 * rig.image_size.double().numpy() / focal, 6.0, 3, chosen, point, np.empty(most), np.empty(most),
     )  # fmt: skip
     chosen = chosen[:count]
     return np.where(chosen >= 0, rows[there.row[np.maximum(chosen, 0)]], -1), point[:count], chosen
