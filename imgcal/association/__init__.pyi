@@ -3,7 +3,7 @@ from .ambiguities import lattice_shifts, near_turns
 from .assignment import distances_to_nearest, mutual_nearest
 from .blobs import pattern_prior, undistorted
 from .identification import identify, relocalize, track
-from .lights import Lights, align_rig, associate_lights, image_error
+from .lights import Lights, align_camera, align_rig, associate_lights, background_rows, image_error, predicted_misses
 from .merging import drop_merged, find_merged, merging_distance
 from .options import PipelineOptions
 from .orientation import oriented
@@ -33,9 +33,11 @@ __all__ = [
     "SnapshotIdentity",
     "Status",
     "Tracker",
+    "align_camera",
     "align_rig",
     "associate",
     "associate_lights",
+    "background_rows",
     "distances_to_nearest",
     "drop_merged",
     "find_merged",
@@ -52,6 +54,7 @@ __all__ = [
     "observations_of",
     "oriented",
     "pattern_prior",
+    "predicted_misses",
     "relocalize",
     "rows_of",
     "to_observations",

@@ -1,7 +1,7 @@
-"""Compiled sums for a rig that is brought nearer to blobs without labels: epipolar lines, each blob on the likeliest."""
+"""Compiled sums that bring a rig nearer to blobs without labels: each blob lies on the likeliest epipolar lines."""
 
 # Compiled functions take their types from their arguments.
-# ruff: noqa: ANN001, ANN202
+# ruff: noqa: ANN001, ANN201, ANN202
 # mypy: allow-untyped-defs
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def epipolar_equations(xy, start, rotation, position, focal, scale, width, chanc
                         if weight[i, j] <= 0:
                             continue
                         r = weight[i, j] / (max(by_row[i], by_column[j]) + chance)
-                        if r < 0.02:
+                        if r < 0.05:
                             continue
                         total += r
                         _distance(
@@ -113,7 +113,8 @@ def _distance(one, two, rotation1, rotation2, position1, position2, focal1, foca
     q11 = rotation1[1, 0] * n1x + rotation1[1, 1] * n1y + rotation1[1, 2] * n1z
     q20 = rotation2[0, 0] * n2x + rotation2[0, 1] * n2y + rotation2[0, 2] * n2z
     q21 = rotation2[1, 0] * n2x + rotation2[1, 1] * n2y + rotation2[1, 2] * n2z
-    spread = math.sqrt((q10 / focal1[0]) ** 2 + (q11 / focal1[1]) ** 2 + (q20 / focal2[0]) ** 2 + (q21 / focal2[1]) ** 2)
+    own = (q10 / focal1[0]) ** 2 + (q11 / focal1[1]) ** 2
+    spread = math.sqrt(own + (q20 / focal2[0]) ** 2 + (q21 / focal2[1]) ** 2)
     if not spread > 0:
         return np.inf
     if not with_jacobian:
@@ -127,12 +128,93 @@ def _distance(one, two, rotation1, rotation2, position1, position2, focal1, foca
     q22 = rotation2[2, 0] * n2x + rotation2[2, 1] * n2y + rotation2[2, 2] * n2z
     cx, cy, cz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx  # d1 x d2
     # rotations: -(m x q)
-    jacobian[0], jacobian[1], jacobian[2] = -(y1 * q12 - q11) / spread, -(q10 - x1 * q12) / spread, -(x1 * q11 - y1 * q10) / spread
-    jacobian[3], jacobian[4], jacobian[5] = -cx / spread, -cy / spread, -cz / spread
-    jacobian[6], jacobian[7] = -q10 * x1 / focal1[0] / spread, -q11 * y1 / focal1[1] / spread
-    jacobian[8], jacobian[9] = -q10 / focal1[0] / spread, -q11 / focal1[1] / spread
-    jacobian[10], jacobian[11], jacobian[12] = -(y2 * q22 - q21) / spread, -(q20 - x2 * q22) / spread, -(x2 * q21 - y2 * q20) / spread
-    jacobian[13], jacobian[14], jacobian[15] = cx / spread, cy / spread, cz / spread
-    jacobian[16], jacobian[17] = -q20 * x2 / focal2[0] / spread, -q21 * y2 / focal2[1] / spread
-    jacobian[18], jacobian[19] = -q20 / focal2[0] / spread, -q21 / focal2[1] / spread
+    jacobian[0], jacobian[1], jacobian[2] = q11 - y1 * q12, x1 * q12 - q10, y1 * q10 - x1 * q11
+    jacobian[3], jacobian[4], jacobian[5] = -cx, -cy, -cz
+    jacobian[6], jacobian[7] = -q10 * x1 / focal1[0], -q11 * y1 / focal1[1]
+    jacobian[8], jacobian[9] = -q10 / focal1[0], -q11 / focal1[1]
+    jacobian[10], jacobian[11], jacobian[12] = q21 - y2 * q22, x2 * q22 - q20, y2 * q20 - x2 * q21
+    jacobian[13], jacobian[14], jacobian[15] = cx, cy, cz
+    jacobian[16], jacobian[17] = -q20 * x2 / focal2[0], -q21 * y2 / focal2[1]
+    jacobian[18], jacobian[19] = -q20 / focal2[0], -q21 / focal2[1]
+    for k in range(2 * FREE):
+        jacobian[k] /= spread
     return t / spread
+
+
+@njit(cache=True, error_model="numpy")
+def image_equations(
+    uv, start, point, point_start, rotation, position, focal, scale, width, chance, information, gradient
+):
+    """Fill in the normal equations of one camera's whitened parameters; return the sum of weights.
+
+    Args:
+        uv: (M, 2) px, its blobs in the order of moments, from the principal point and without distortion.
+        start: (S + 1,) where the blobs of each moment begin.
+        point: (P, 3) mm, markers that other cameras see, in the order of moments.
+        point_start: (S + 1,) where those of each moment begin.
+        rotation: (3, 3) cam_from_rig.
+        position: (3,) mm.
+        focal: (2,) px.
+        scale: (FREE,) standard deviation of each parameter.
+        width: px, of the distance of a blob from the image of its marker.
+        chance: weight of no partner, in units of a partner in its place.
+        information: (FREE, FREE).
+        gradient: (FREE,).
+    """
+    information[:] = 0.0
+    gradient[:] = 0.0
+    total, most, most_points = 0.0, 0, 0
+    for s in range(len(start) - 1):
+        most = max(most, start[s + 1] - start[s])
+        most_points = max(most_points, point_start[s + 1] - point_start[s])
+    weight = np.empty((most_points, most))
+    by_row, by_column = np.empty(most_points), np.empty(most)
+    across, down = np.empty(FREE), np.empty(FREE)
+    for s in range(len(start) - 1):
+        for j in range(start[s + 1] - start[s]):
+            by_column[j] = 0.0
+        for i in range(point_start[s + 1] - point_start[s]):
+            by_row[i] = 0.0
+            x, y, _ = _camera_point(rotation, position, point[point_start[s] + i])
+            for j in range(start[s + 1] - start[s]):
+                blob = start[s] + j
+                square = ((x * focal[0] - uv[blob, 0]) ** 2 + (y * focal[1] - uv[blob, 1]) ** 2) / width**2
+                weight[i, j] = math.exp(-0.5 * square) if square < CUT else 0.0
+                by_row[i] += weight[i, j]
+                by_column[j] += weight[i, j]
+        for i in range(point_start[s + 1] - point_start[s]):
+            x, y, z = _camera_point(rotation, position, point[point_start[s] + i])
+            for j in range(start[s + 1] - start[s]):
+                r = weight[i, j] / (max(by_row[i], by_column[j]) + chance)
+                if r < 0.02:
+                    continue
+                total += r
+                blob = start[s] + j
+                eu, ev = x * focal[0] - uv[blob, 0], y * focal[1] - uv[blob, 1]
+                fx, fy = focal[0], focal[1]
+                across[0], across[1], across[2] = -fx * x * y, fx * (1 + x * x), -fx * y
+                down[0], down[1], down[2] = -fy * (1 + y * y), fy * x * y, fy * x
+                for k in range(3):
+                    across[3 + k] = -fx / z * (rotation[0, k] - x * rotation[2, k])
+                    down[3 + k] = -fy / z * (rotation[1, k] - y * rotation[2, k])
+                across[6], across[7], across[8], across[9] = x, 0.0, 1.0, 0.0
+                down[6], down[7], down[8], down[9] = 0.0, y, 0.0, 1.0
+                for k in range(FREE):
+                    across[k] *= scale[k]
+                    down[k] *= scale[k]
+                r /= width**2
+                for k in range(FREE):
+                    gradient[k] += r * (across[k] * eu + down[k] * ev)
+                    for m in range(FREE):
+                        information[k, m] += r * (across[k] * across[m] + down[k] * down[m])
+    return total
+
+
+@njit(cache=True, error_model="numpy")
+def _camera_point(rotation, position, point):
+    """A point on the plane z = 1 of a camera, and its depth, 1 mm at least."""
+    x, y, z = point[0] - position[0], point[1] - position[1], point[2] - position[2]
+    depth = max(rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z, 1.0)
+    across = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z
+    down = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z
+    return across / depth, down / depth, depth

@@ -1,7 +1,7 @@
 """Compiled search for markers of which nothing is known: places on which the rays of three cameras or more agree."""
 
 # Compiled functions take their types from their arguments.
-# ruff: noqa: ANN001, ANN202
+# ruff: noqa: ANN001, ANN201, ANN202
 # mypy: allow-untyped-defs
 
 from __future__ import annotations
@@ -18,8 +18,6 @@ FIRST_REACH = 6.0
 """The same about the middle of two rays, which says less of where a third camera sees it."""
 HIDDEN = 0.25
 """Chance that a camera in whose view a marker is does not show it."""
-LEAST_CAMERAS = 3
-"""That must agree on a place: two rays that happen to meet are no witness of each other."""
 ROUNDS = 3
 """Of choosing blobs near a place and placing it anew."""
 CERTAIN = 4
@@ -35,7 +33,7 @@ NEIGHBOUR = 3
 
 
 @njit(cache=True, error_model="numpy")
-def find_lights(xy, start, rotation, position, gate, half, least, chosen, point, odds, margin):
+def find_lights(xy, start, rotation, position, gate, half, least, witnesses, chosen, point, odds, margin):
     """Fill in the places of one moment, the likeliest first, and return their number.
 
     Args:
@@ -46,6 +44,7 @@ def find_lights(xy, start, rotation, position, gate, half, least, chosen, point,
         gate: (C,) one standard deviation of what rig and blobs may be off, on the plane z = 1.
         half: (C, 2) half of what the camera sees, on the plane z = 1.
         least: log odds against false blobs that a place must have.
+        witnesses: cameras that must agree on a place.
         chosen: (R, C) blob in each camera, -1 = none.
         point: (R, 3) mm.
         odds: (R,) log odds of the place against false blobs.
@@ -68,9 +67,9 @@ def find_lights(xy, start, rotation, position, gate, half, least, chosen, point,
                     if not _meet(ray[i], ray[j], position[a], position[b], gate[a], gate[b], place):
                         continue
                     value, seen = _explore(
-                        xy, start, ray, density, rotation, position, gate, half, used, volume, place, hit
+                        xy, start, ray, density, rotation, position, gate, half, used, volume, witnesses, place, hit
                     )
-                    if seen < LEAST_CAMERAS or value < least or count == MOST_PLACES:
+                    if seen < witnesses or value < least or count == MOST_PLACES:
                         continue
                     if count == most:
                         most *= 2
@@ -119,8 +118,10 @@ def find_lights(xy, start, rotation, position, gate, half, least, chosen, point,
                 _note_rival(hits[k], found[k], owner, odds, margin, rows)
             for axis in range(3):
                 place[axis] = places[k, axis]
-            value, seen = _explore(xy, start, ray, density, rotation, position, gate, half, used, volume, place, hit)
-            if seen < LEAST_CAMERAS or value < least:
+            value, seen = _explore(
+                xy, start, ray, density, rotation, position, gate, half, used, volume, witnesses, place, hit
+            )
+            if seen < witnesses or value < least:
                 continue
             found[k] = value
             for axis in range(3):
@@ -136,7 +137,7 @@ def find_lights(xy, start, rotation, position, gate, half, least, chosen, point,
 
 
 @njit(cache=True, error_model="numpy")
-def find_all_lights(xy, start, rotation, position, gate, half, least, chosen, point, odds, margin, moment):
+def find_all_lights(xy, start, rotation, position, gate, half, least, witnesses, chosen, point, odds, margin, moment):
     """Do the work of `find_lights` for moments whose blobs follow each other: `start` (S, C + 1); return the rows.
 
     `moment` (R,) is filled with the number of each row's moment; blobs are counted over all moments.
@@ -145,7 +146,7 @@ def find_all_lights(xy, start, rotation, position, gate, half, least, chosen, po
     for s in range(len(start)):
         first, last = start[s, 0], start[s, -1]
         count = find_lights(
-            xy[first:last], start[s] - first, rotation, position, gate, half, least,
+            xy[first:last], start[s] - first, rotation, position, gate, half, least, witnesses,
             chosen[rows:], point[rows:], odds[rows:], margin[rows:],
         )  # fmt: skip
         for row in range(rows, rows + count):
@@ -216,7 +217,7 @@ def _meet(d1, d2, p1, p2, gate1, gate2, place):
 
 
 @njit(cache=True, error_model="numpy")
-def _explore(xy, start, ray, density, rotation, position, gate, half, used, volume, place, hit):
+def _explore(xy, start, ray, density, rotation, position, gate, half, used, volume, witnesses, place, hit):
     """Choose the blobs near a place and move it to where these see it, by turns; return log odds and cameras."""
     seen, value, information = 0, -np.inf, np.empty((3, 3))
     for turn in range(ROUNDS + 1):
@@ -241,7 +242,7 @@ def _explore(xy, start, ray, density, rotation, position, gate, half, used, volu
                 value += math.log((1 - HIDDEN) / (2 * math.pi * variance * density[nearest])) - 0.5 * least / variance
             elif abs(x) < half[c, 0] and abs(y) < half[c, 1]:
                 value += math.log(HIDDEN)
-        if seen < 2 or (turn == 1 and seen < LEAST_CAMERAS and before < LEAST_CAMERAS):
+        if seen < 2 or (turn == 1 and seen < witnesses and before < witnesses):
             return -np.inf, seen
         if turn == ROUNDS:
             break
@@ -272,9 +273,7 @@ def _solve(ray, position, gate, hit, place, information):
         if hit[c] < 0:
             continue
         d = ray[hit[c]]
-        away = (
-            (place[0] - position[c, 0]) ** 2 + (place[1] - position[c, 1]) ** 2 + (place[2] - position[c, 2]) ** 2
-        )
+        away = (place[0] - position[c, 0]) ** 2 + (place[1] - position[c, 1]) ** 2 + (place[2] - position[c, 2]) ** 2
         weight = 1 / (max(away, 1.0) * gate[c] ** 2)
         for i in range(3):
             for j in range(3):

@@ -6,15 +6,16 @@ markers are apart, `align_rig` brings it nearer first, from the blobs of many mo
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from imgcal.association.blobs import undistorted
-from imgcal.association.light_alignment import FREE, epipolar_equations
+from imgcal.association.light_alignment import FREE, epipolar_equations, image_equations
 from imgcal.association.light_search import find_all_lights
 from imgcal.types import CameraRig, Detections
 
@@ -22,15 +23,22 @@ Array = NDArray[np.float64]
 
 LEAST_ODDS = 6.0
 """Log odds against false blobs from which a place is a marker."""
-OWN_ERROR = 0.3
-"""px: what centres may be off beyond their sigma (partly hidden markers) while blobs are told apart."""
-STEPS, SHRINK = 26, 0.85
+LEAST_CAMERAS = 3
+"""That must agree on a marker."""
+STEPS, SHRINK = 20, 0.8
 """Of `align_rig`, and how much narrower each takes the lines."""
 NARROWEST = 1.0
 """px, width of the lines at the end."""
 CHANCE = 0.5
 """Weight of no partner on a line, in units of a partner right on it."""
-MOST_PAIRS = 400_000
+SHIFTS = ((60.0, 0.0), (-60.0, 0.0), (0.0, 60.0), (0.0, -60.0), (45.0, 45.0), (-45.0, -45.0))
+"""px: places beside predicted ones that tell how often a blob is there by chance."""
+VIEW = 0.03
+"""Of the image's size, from its border: as far predicted markers may be out of view."""
+LEAST_MOMENTS, STILL, SHARE_OF_MOMENTS = 8, 1.0, 0.5
+"""Moments of a camera from which on something can be said never to move; px that it may; and in how many of them it
+must be there."""
+MOST_PAIRS = 150_000
 """Of blobs, that each step of `align_rig` looks at: it takes moments evenly from all."""
 
 
@@ -67,7 +75,11 @@ class SortedBlobs:
 
 
 def associate_lights(
-    detections: Detections, rig: CameraRig, error: NDArray[np.float64], least_odds: float = LEAST_ODDS
+    detections: Detections,
+    rig: CameraRig,
+    error: NDArray[np.float64],
+    least_odds: float = LEAST_ODDS,
+    least_cameras: int = LEAST_CAMERAS,
 ) -> Lights:
     """Find the markers of each moment: blobs of three cameras or more that may be one place.
 
@@ -79,6 +91,7 @@ def associate_lights(
         error: (C,) px, one standard deviation of what rig and blobs may be off in each camera, see `image_error`; the
             nearer the rig, the denser the markers may be.
         least_odds: log odds against false blobs that a marker must have.
+        least_cameras: that must agree on it; two rays that happen to meet are no witness of each other.
 
     Returns:
         One row a marker and moment.
@@ -102,7 +115,7 @@ def associate_lights(
     half = 0.5 * rig.image_size.double().numpy() / focal
     gate = np.asarray(error, dtype=np.float64) / focal.mean(1)
     count = find_all_lights(
-        blobs.xy, blobs.start, np.ascontiguousarray(rotation), np.ascontiguousarray(position), gate, half, least_odds,
+        blobs.xy, blobs.start, np.ascontiguousarray(rotation), np.ascontiguousarray(position), gate, half, least_odds, least_cameras,
         chosen, point, odds, margin, moment,
     )  # fmt: skip
     chosen = chosen[:count]
@@ -190,41 +203,152 @@ def align_rig(
     return now, -cost / max(weight, 1.0)
 
 
-def background_rows(detections: Detections, still: float = 1.0, share: float = 0.5) -> NDArray[np.bool_]:
+def align_camera(
+    detections: Detections, rig: CameraRig, std: Tensor, now: CameraRig, camera: int, lights: Lights
+) -> CameraRig:
+    """Bring one camera nearer to markers that the others see: each blob is laid onto the likeliest of them.
+
+    Args:
+        detections: blobs of the same moments; labels are not looked at.
+        rig: the factory rig, from whose values the camera starts.
+        std: (C, K) its prior.
+        now: the rig in whose frame the markers are.
+        camera: which.
+        lights: markers that others see.
+
+    Returns:
+        `now` with another camera.
+    """
+    blobs = sort_blobs(detections.select(detections.camera == camera), rig)
+    order = np.argsort(lights.moment, kind="stable")
+    moments = len(detections.snapshot_names)
+    point_start = np.concatenate(([0], np.cumsum(np.bincount(lights.moment, minlength=moments))))
+    points = np.ascontiguousarray(lights.point[order])
+    start = np.append(blobs.start[:, camera], blobs.start[-1, camera + 1])
+    whitening = std[camera, :FREE].double()
+    information, gradient = np.empty((FREE, FREE)), np.empty(FREE)
+    moved = rig
+    width = 1.5 * float(image_error(rig, std)[camera])
+    counts = np.diff(start)
+    density = float(counts[counts > 0].mean()) / float(_spread_area(blobs, start) * rig.focal_length[camera].prod())
+    for _ in range(STEPS):
+        own = sort_blobs(detections.select(detections.camera == camera), moved)
+        focal = moved.focal_length[camera].double()
+        uv = own.xy * focal.mean().item()
+        chance = max(CHANCE, 1.0) * min(2 * np.pi * width**2 * density, 1.0) + 0.05
+        image_equations(
+            uv, start, points, point_start, np.ascontiguousarray(moved.cam_from_rig.rotation[camera].double().numpy()),
+            np.ascontiguousarray(moved.positions[camera].double().numpy()), np.full(2, focal.mean().item()),
+            np.ascontiguousarray(whitening.numpy()), width, chance, information, gradient,
+        )  # fmt: skip
+        change = moved.local(rig)[camera, :FREE].double()
+        offset = torch.where(whitening > 0, change / whitening.clamp_min(1e-30), 0.0).numpy()
+        step = -np.linalg.solve(information + np.eye(FREE), gradient + offset)
+        whole = torch.zeros_like(std)
+        whole[camera, :FREE] = torch.from_numpy(step) * whitening
+        moved = moved.retract(whole)
+        width = max(width * SHRINK, NARROWEST)
+    step = torch.zeros_like(std)
+    step[camera] = moved.local(now)[camera]
+    return now.retract(step)
+
+
+def _spread_area(blobs: SortedBlobs, start: NDArray[np.int64]) -> float:
+    """Area that the blobs of one moment cover, on the plane z = 1: the median over moments, four deviations wide."""
+    parts = [blobs.xy[a:b] for a, b in zip(start, start[1:], strict=False) if b - a > 2]
+    sides = [16 * float(np.prod(np.std(part, axis=0))) for part in parts]
+    return max(float(np.median(sides)) if sides else 1.0, 1e-4)
+
+
+def background_rows(detections: Detections) -> NDArray[np.bool_]:
     """Mark the blobs that never move in their camera's image: lamps, doorways, reflections.
 
     Args:
         detections: blobs of some moments.
-        still: px, as far apart blobs of two moments may be and count as one that stands still.
-        share: of the moments in which a camera has blobs, in which one must be there.
 
     Returns:
         (M,) bool.
+
+    Examples:
+        >>> moments = np.arange(20)
+        >>> lamp, light = np.tile([[300.0, 200.0]], (20, 1)), np.column_stack((10.0 * moments, np.full(20, 50.0)))
+        >>> blobs = Detections(
+        ...     np.concatenate((lamp, light)), np.full(40, 0.1), np.zeros(40, dtype=int), np.tile(moments, 2),
+        ...     np.full(40, -1), np.full(40, np.nan), np.zeros(40, dtype=np.uint8), ("left",), tuple(map(str, moments)),
+        ... )
+        >>> background_rows(blobs).sum()
+        20
     """
     marked = np.zeros(len(detections), dtype=bool)
     for camera in np.unique(detections.camera):
         rows = np.flatnonzero(detections.camera == camera)
-        moments = len(np.unique(detections.snapshot[rows]))
+        uv, snapshot = detections.uv[rows], detections.snapshot[rows]
+        moments = len(np.unique(snapshot))
         if moments < LEAST_MOMENTS:
             continue
-        cell = np.floor(detections.uv[rows] / still).astype(np.int64)
-        _, which, _ = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
-        places: dict[tuple[int, int], set[int]] = {}
-        for (u, v), snapshot in zip(cell.tolist(), detections.snapshot[rows].tolist(), strict=True):
-            places.setdefault((u, v), set()).add(snapshot)
-        near = [
-            len(set().union(*(places.get((u + du, v + dv), set()) for du in (-1, 0, 1) for dv in (-1, 0, 1))))
-            for u, v in cell.tolist()
-        ]
-        marked[rows] = np.array(near) >= share * moments
-        del which
+        near = cKDTree(uv).query_ball_point(uv, STILL, return_length=True)
+        for k in np.flatnonzero(near >= SHARE_OF_MOMENTS * moments):  # few: markers move on
+            there = np.square(uv - uv[k]).sum(1) <= STILL**2
+            marked[rows[k]] = len(np.unique(snapshot[there])) >= SHARE_OF_MOMENTS * moments
     return marked
 
 
-LEAST_MOMENTS = 8
-"""Of a camera, from which on something can be said never to move."""
+def predicted_misses(
+    lights: Lights, detections: Detections, rig: CameraRig, camera: int, error: Array, near: float, far: float
+) -> tuple[int, float, float]:
+    """Compare the blobs of one camera with where markers that the others have found should be.
+
+    Args:
+        lights: found without this camera.
+        detections: blobs of the same moments.
+        rig: the rig they were found with.
+        camera: which.
+        error: (C,) px, as for `associate_lights`.
+        near: standard deviations up to which a blob is in its place.
+        far: standard deviations up to which it is beside it.
+
+    Returns:
+        How many markers are in the camera's view; the share of these that have a blob in their place, and the share
+        whose nearest blob is beside it, both less what shifted places have by chance.
+    """
+    blobs = sort_blobs(detections, rig)
+    one, focal = rig.select([camera]), float(rig.focal_length[camera].mean())
+    points = torch.from_numpy(lights.point)
+    image = one.project(points)
+    inside = image.visible[0].numpy()
+    size = one.image_size[0].double().numpy()
+    uv = image.uv[0].numpy()
+    inside &= ((uv > VIEW * size) & (uv < (1 - VIEW) * size)).all(-1)
+    there = (points - one.positions[0]) @ one.cam_from_rig.rotation[0].mT
+    xy = (there[:, :2] / there[:, 2:]).numpy()
+    sigma = error[camera] * np.sqrt(1 + _uncertainty(lights, rig, camera))
+    counts = np.zeros((1 + len(SHIFTS), 2))
+    for k, (du, dv) in enumerate(((0.0, 0.0), *SHIFTS)):
+        shifted = xy + np.array([du, dv]) / focal
+        for row in np.flatnonzero(inside):
+            own = slice(blobs.start[lights.moment[row], camera], blobs.start[lights.moment[row], camera + 1])
+            away = np.linalg.norm(blobs.xy[own] - shifted[row], axis=1) * focal / sigma[row]
+            least = away.min(initial=np.inf)
+            counts[k] += least < near, near <= least < far
+    total = int(inside.sum())
+    if total == 0:
+        return 0, 0.0, 0.0
+    share = counts / total
+    chance = share[1:].mean(0)
+    found = (share[0, 0] - chance[0]) / max(1 - chance[0], 1e-9)
+    # Only where no blob is in its place may one be beside it.
+    beside = share[0, 1] - chance[1] * (1 - share[0, 0]) / max(1 - chance[0], 1e-9)
+    return total, float(found), float(beside)
 
 
-def without_rows(detections: Detections, rows: NDArray[np.bool_]) -> Detections:
-    """Leave some blobs out."""
-    return replace(detections, uv=detections.uv).select(~rows)
+def _uncertainty(lights: Lights, rig: CameraRig, camera: int) -> Array:
+    """Variance of the predicted images (R,), in units of that of a blob, roughly: the larger of both axes."""
+    position = rig.positions.double().numpy()
+    ray = lights.point[:, None] - position  # (R, C, 3)
+    away = np.linalg.norm(ray, axis=-1, keepdims=True)
+    ray = ray / away
+    across = (np.eye(3) - ray[..., :, None] * ray[..., None, :]) / away[..., None] ** 2
+    information = (across * (lights.row >= 0)[..., None, None]).sum(1)
+    covariance = np.linalg.inv(information + 1e-12 * np.eye(3))
+    one = across[:, camera] * away[:, camera, :, None]
+    return np.asarray(np.linalg.eigvalsh(one @ covariance @ one)[:, -1])

@@ -39,8 +39,9 @@ class Simulate:
     rig: str  #: factory rig: file, or the name of a shipped one (O10, O6, U7, T4, room10)
     object: str
     """object: file, or the name of a shipped one (asymmetric8, cube8, cube27, sphere64, wand4; printed boards: charuco,
-    aprilgrid, checkerboard, circles)"""
+    aprilgrid, checkerboard, circles); lights = a body with markers of which nothing is known (--lights)"""
     out: Path  #: folder to write; must not hold a capture yet
+    lights: int = 15  #: number of markers on the body, with --object lights
     snapshots: int = 10  #: number of poses of the object
     seed: int = 0  #: the same seed gives the same capture
     drift: Literal["physical", "relative", "none"] | None = None
@@ -141,7 +142,9 @@ class Calibrate:
     """
 
     input: Annotated[Path, tyro.conf.Positional]  #: capture folder, detections file, or a shipped sample (sample:O10)
-    object: str  #: object: file, or the name of a shipped one
+    object: str
+    """object: file, or the name of a shipped one; lights = every blob may be a marker of its own, and nothing is known
+    of them: the scale then rests on the factory positions of the cameras"""
     out: Path  #: folder to write
     rig: str | None = None  #: factory rig: file, or the name of a shipped one
     cameras: Path | None = None
@@ -149,6 +152,9 @@ class Calibrate:
     focal length or field of view is known (imgcal rig cameras writes such a file), or a calibration whose places do not
     count; carry the whole object through what neighbouring cameras see together; the rig's frame is that of its first
     camera"""
+    distance: tuple[str, str, float] | None = None
+    """with --cameras and --object lights: CAMERA CAMERA MM, the distance of two cameras, which gives the scale; without
+    it the rig is known up to scale. The first is in the origin of the rig's frame, the second on its x axis"""
     snapshots: str | None = None  #: A:B, numbers in file order from 0, B excluded
     videos_differ: bool = False  #: accept videos whose lengths or time stamps differ: frames go together by number
     detector: str = "classical"
@@ -239,7 +245,7 @@ class Score:
 
     input: Annotated[Path, tyro.conf.Positional]  #: capture folder, detections file, or a shipped sample (sample:O10)
     rig: str  #: rig file, or the name of a shipped rig
-    object: str  #: object file, or the name of a shipped object
+    object: str  #: object file, or the name of a shipped object; lights = every blob may be a marker of its own
     snapshots: str | None = None  #: A:B, numbers in file order from 0, B excluded
     videos_differ: bool = False  #: accept videos whose lengths or time stamps differ: frames go together by number
     detection: Annotated[DetectionOptions, tyro.conf.arg(name="")] = field(default_factory=DetectionOptions)

@@ -101,7 +101,7 @@ class Calibrate(arguments.Calibrate):
         outcome: Calibration | RefusedError
         try:
             if self.cameras is not None:
-                outcome = calibrate_from_scratch(detections, rig, obj, options, progress=bar)
+                outcome = calibrate_from_scratch(detections, rig, obj, options, progress=bar, distance=self.distance)
                 rig = outcome.factory
             else:
                 outcome = calibrate(
@@ -189,6 +189,8 @@ class Calibrate(arguments.Calibrate):
             found = "neither" if self.rig is None else "both"
             raise InputError(f"found {found} of --rig and --cameras, expected one: a factory calibration, or none")
         if self.rig is not None:
+            if self.distance is not None:
+                raise InputError("--distance: found it beside --rig, whose cameras give the scale; expected --cameras")
             return open_rig(self.rig)
         if self.first_guess != "none" or self.detector != "classical":
             option = "--detector" if self.first_guess == "none" else "--first-guess"

@@ -17,8 +17,11 @@ def counts_by_camera(counts: Tally, camera: int) -> dict[str, int]:
 
 def counts_by_snapshot(calibration: Calibration) -> dict[str, dict[str, int]]:
     """Count over all cameras: snapshot name -> numbers."""
-    snapshots = calibration.labelled.snapshots
-    return {snapshot.name: _counts(calibration.tally, np.s_[s]) for s, snapshot in enumerate(snapshots)}
+    found: dict[str, dict[str, int]] = {}
+    for s, snapshot in enumerate(calibration.labelled.snapshots):
+        counts, before = _counts(calibration.tally, np.s_[s]), found.get(snapshot.name)  # markers share their moment
+        found[snapshot.name] = counts if before is None else {key: counts[key] + before[key] for key in counts}
+    return found
 
 
 def blobs_by_camera(detections: Detections, rig: CameraRig) -> dict[str, dict[str, Any]]:

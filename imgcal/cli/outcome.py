@@ -44,8 +44,9 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         "model_error_px": calibration.additive_noise,
         "outliers": calibration.outliers,
         "prior_too_narrow": dict(calibration.prior_scale),
-        "snapshots_used": len(used),
-        "snapshots_rejected": len(snapshots) - len(used),
+        "snapshots_used": calibration.moments[0],
+        "snapshots_rejected": calibration.moments[1] - calibration.moments[0],
+        "lights": _lights_summary(calibration),
         "rejected": {s.name: s.reason for s in snapshots if s.status == "refused"},
         "late": [vars(late) for late in calibration.late],
         "doubtful": [camera.as_values() for camera in calibration.doubtful],
@@ -70,6 +71,30 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         "scale": calibration.scale.values,
         "repeats": calibration.repeats.values,
         "seconds": seconds,
+    }
+
+
+def _lights_summary(calibration: Calibration) -> dict[str, Any] | None:
+    lights = calibration.lights
+    if lights is None:
+        return None
+    names, agreement = calibration.rig.camera_names, lights.agreement
+    return {
+        "markers": len(calibration.labelled.used),  # one at each moment
+        "background_blobs": dict(zip(names, lights.background_of.tolist(), strict=True)),
+        "blobs_left_over": dict(zip(names, lights.left_over_of.tolist(), strict=True)),
+        "held_out": {
+            name: {"predicted": predicted, "found": round(found, 4), "beside": round(beside, 4)}
+            for name, predicted, found, beside in zip(
+                names,
+                agreement.predicted.tolist(),
+                agreement.found.tolist(),
+                agreement.near_misses.tolist(),
+                strict=True,
+            )
+        },
+        "starts": lights.starts,
+        "note": lights.note,
     }
 
 
@@ -104,6 +129,7 @@ def refused_summary(
         "prior_too_narrow": {},
         "snapshots_used": 0,
         "snapshots_rejected": len(detections.snapshot_names),
+        "lights": None,
         "rejected": {},
         "moved": [move.as_values() for move in moved],
         "late": [],
@@ -153,6 +179,16 @@ def print_outcome(result: dict[str, Any], found: Findings, out: Path, report: bo
         f"identity {result['identity']}, {result['snapshots_used']} snapshots used, "
         f"{result['snapshots_rejected']} rejected"
     )
+    if result["lights"]:
+        lights = result["lights"]
+        shares = [camera["found"] for camera in lights["held_out"].values()]
+        print(
+            f"{lights['markers']} markers used; in snapshots that took no part, {100 * min(shares):.0f} to "
+            f"{100 * max(shares):.0f} % of those that the other cameras find in a camera's view are seen there, chance "
+            "apart"
+        )
+        if lights["note"]:
+            print(f"note: {lights['note']}", file=sys.stderr)
     for line in found.lines:
         print(line)
     if result["unsynchronized"]:

@@ -44,7 +44,7 @@ def summary(scored: RigScore, rig: CameraRig) -> dict[str, object]:
             "points": int(seen.sum()),
             "outliers": int(outlier.sum()),
         }
-    used = len(scored.labelled.used)
+    used, total = scored.moments
     return {
         "median_px": float(scored.distances.median()),
         "p95_px": float(torch.quantile(scored.distances, 0.95)),
@@ -53,6 +53,6 @@ def summary(scored: RigScore, rig: CameraRig) -> dict[str, object]:
         "rms_px_with_outliers": rms_length(scored.residual, scored.seen),
         "points": int(scored.seen.sum()),
         "snapshots_used": used,
-        "snapshots_rejected": len(scored.labelled.snapshots) - used,
+        "snapshots_rejected": total - used,
         "per_camera": per_camera,
     }

@@ -30,6 +30,7 @@ from imgcal.synthesis import (
     PoseRange,
     RelativeDrift,
     Truth,
+    place_markers,
     render_board,
     simulate_board,
     simulate_shots,
@@ -37,7 +38,7 @@ from imgcal.synthesis import (
     simulate_volume,
     true_detections,
 )
-from imgcal.types import FIDUCIAL_RADIUS, CalibrationObject, CameraRig
+from imgcal.types import FIDUCIAL_RADIUS, CalibrationObject, CameraRig, limits
 
 WRITTEN = ("capture.yaml", "rig.yaml", "object.csv", "board.yaml", "truth", "frames")
 
@@ -49,7 +50,8 @@ class Simulate(arguments.Simulate):
 
     def run(self) -> None:
         """Simulate and write."""
-        for name, least, most in (("snapshots", 1, MOST_SNAPSHOTS), ("seed", 0, 2**63 - 1)):
+        bounds = (("snapshots", 1, MOST_SNAPSHOTS), ("seed", 0, 2**63 - 1), ("lights", 1, limits.MOST_FIDUCIALS))
+        for name, least, most in bounds:
             if not least <= getattr(self, name) <= most:
                 found = shortened(str(getattr(self, name)))
                 raise InputError(f"--{name}: found {found}, expected at least {least} and at most {most}")
@@ -69,9 +71,14 @@ class Simulate(arguments.Simulate):
             raise InputError(f"{self.out}: found a capture there already, expected a new folder")
         rig, obj = open_rig(self.rig), load_object(self.object)
         generator = torch.Generator().manual_seed(self.seed)
+        are_known = not obj.unknown_markers
+        if not are_known:
+            obj = place_markers(rig, self.lights, generator)
         truth = self._truth(rig, obj, generator)
         with publishing(self.out, WRITTEN, mark="frames") as out:
             self._write(truth, rig, obj, generator, out)
+            name = "object.csv" if obj.board is None else "board.yaml"
+            save_object(obj, out / name if are_known else out / "truth" / name)
         print(f"{self.snapshots} snapshots of {rig.num_cameras} cameras written to {self.out}", file=sys.stderr)
 
     def _write(
@@ -81,7 +88,6 @@ class Simulate(arguments.Simulate):
             out, self.sensor.bit_depth if obj.board is None else 8, note=f"simulated, seed {self.seed}"
         )
         save_rig(rig, out / "rig.yaml")
-        save_object(obj, out / ("object.csv" if obj.board is None else "board.yaml"))
         _write_truth(truth, out / "truth")
         if obj.board is not None:
             for snapshot in progress(range(self.snapshots), self.snapshots, "rendering frames"):

@@ -51,6 +51,7 @@ from .object_shape import SNAPSHOTS_TO_BEND, FiducialOffset, ScaleEvidence, Shap
 from .pose_initialization import initial_pose
 from .pose_support import ON_A_LINE, UndeterminedPosesError, has_poses, require_poses
 from .rig_error import displaced, error_between, step_by_error
+from .rig_from_points import PointStart, cold_start_from_points, in_frame_of_pair, prior_of_pair
 from .rig_initialization import K3, ColdStart, cold_start, ordinary_lens, poses_alone
 from .rig_uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian, rigid_motion, uncertainty_over
 from .robust_losses import squared
@@ -76,6 +77,7 @@ __all__ = [
     "HeldRigFit",
     "NormalEquations",
     "ObjectQuestion",
+    "PointStart",
     "PredictedError",
     "Problem",
     "RigUncertainty",
@@ -94,6 +96,7 @@ __all__ = [
     "camera_covariance",
     "camera_std",
     "cold_start",
+    "cold_start_from_points",
     "correlation_time",
     "displaced",
     "effective_size",
@@ -106,6 +109,7 @@ __all__ = [
     "fit_pose",
     "flat_std",
     "has_poses",
+    "in_frame_of_pair",
     "initial_pose",
     "initial_state",
     "inverse_or_zero",
@@ -130,6 +134,7 @@ __all__ = [
     "pose_covariance",
     "poses_alone",
     "predicted_error",
+    "prior_of_pair",
     "relative_covariance",
     "relative_difference",
     "relative_jacobian",

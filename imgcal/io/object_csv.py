@@ -22,9 +22,11 @@ from imgcal.io.csv_file import Chunk, read_chunks
 from imgcal.io.names import LONGEST_NAME, check_regular, find_file, title_of
 from imgcal.io.resources import data_path, shipped_names
 from imgcal.messages import shortened
-from imgcal.types import CalibrationObject, UnknownLights, limits
+from imgcal.types import CalibrationObject, limits
 from renderers.palette import palette
 
+LIGHTS = "lights"
+"""Names unknown markers instead of a file."""
 SMALLEST = 1e-3  # mm, extent of an object
 LARGEST_LABEL = 2**31 - 1
 BOARD_SUFFIXES = (".yaml", ".yml")
@@ -36,8 +38,8 @@ def load_object(path: str | Path) -> CalibrationObject:
     """Read a calibration object.
 
     Args:
-        path: a CSV file, the YAML file of a printed board, or the bare name of a shipped object such as "cube8" when
-            there is no such file; "lights" = nothing is known, and every blob may be a marker of its own.
+        path: a CSV file, the YAML file of a printed board, or, when there is no such file, the bare name of a shipped
+            object such as "cube8" or "lights": every blob may be a marker of its own, and nothing is known of them.
 
     Returns:
         The object in float64; colours from `renderers.palette`.
@@ -52,10 +54,10 @@ def load_object(path: str | Path) -> CalibrationObject:
         (torch.Size([8, 3]), None)
     """
     path = Path(path)
+    if str(path) == LIGHTS and not path.exists():
+        return CalibrationObject.unknown(LIGHTS)
     if not path.exists() and str(path) in shipped_names("objects", ".yaml"):
         path = data_path("objects", f"{path}.yaml")
-    if str(path) == LIGHTS and not path.exists():
-        return UnknownLights.of()
     if path.suffix.lower() in BOARD_SUFFIXES:
         check_regular(path)
         if not path.is_file():

@@ -24,7 +24,7 @@ from imgcal.monitoring.change_search import (
 from imgcal.monitoring.change_test import JUMPS, LARGE
 from imgcal.monitoring.clock_slip import image_of
 from imgcal.monitoring.drift_pace import DriftLearning, DriftPaces
-from imgcal.monitoring.explanations import LEAD, Diagnosis, Moved, Steady, Verdict, doubtful_cameras, weigh
+from imgcal.monitoring.explanations import Diagnosis, Moved, Steady, Verdict, doubtful_cameras, weigh
 from imgcal.monitoring.noise_correlation import NoiseCorrelation
 from imgcal.monitoring.object_change import MISFIT_LEAD, Misfit, ObjectChanged, never_fitted
 from imgcal.monitoring.pending_change import Change, PendingChange, free_cameras

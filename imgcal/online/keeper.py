@@ -77,7 +77,7 @@ class RigKeeper:
             tests: what else watches each snapshot; None = `default_tests`.
         """
         if obj.pose_rank == 3 and not isinstance(obj, UnknownLights):
-            obj = UnknownLights.of_light(obj)
+            obj = UnknownLights.of() if obj.unknown_markers else UnknownLights.of_light(obj)
         self.options = _for_keeping(options)
         self._memory = KeeperMemory.of(rig, obj, drift, self.options)
         usual = () if isinstance(obj, UnknownLights) else default_tests(rig.num_cameras)  # all of them ask for a body

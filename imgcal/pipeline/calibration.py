@@ -24,9 +24,10 @@ from imgcal.monitoring import posterior_of
 from imgcal.pipeline.doubtful import DoubtfulCamera, doubtful_at_end
 from imgcal.pipeline.initialization import Initialization
 from imgcal.pipeline.lateness import LEAST_BETTER, LateCamera, timing_motion
+from imgcal.pipeline.lights import FoundLights, count_moments
 from imgcal.pipeline.object_checks import CERTAIN, displaced, lost_fiducials
 from imgcal.pipeline.repeats import Repeats
-from imgcal.pipeline.scale import Scale, scale_of
+from imgcal.pipeline.scale import KnownDistance, Scale, scale_of
 from imgcal.pipeline.synchronization import Unsynchronized
 from imgcal.pipeline.tally import Tally, tally
 from imgcal.types import (
@@ -99,11 +100,13 @@ class Calibration:
     late: tuple[LateCamera, ...] = ()  # whose frames, from some snapshot on, are of other moments: these took no part
     unsynchronized: Unsynchronized | None = None  # cameras expose at moments of their own; None = no sign of it
     repeats: Repeats = Repeats()  # exact copies of earlier images: these took no part
+    distance: KnownDistance | None = None  # of two cameras, which the scale rests on where nothing else knows it
+    lights: FoundLights | None = None  # of unknown markers: snapshots used are one marker at one moment each
 
     def __repr__(self) -> str:
         """Say what was found: the rig, its error before and after, how the fiducials were identified."""
         before, after = float(self.before.rms), float(self.rms)
-        used = f"{len(self.labelled.used)} of {len(self.labelled.snapshots)} snapshots"
+        used = "{} of {} snapshots".format(*self.moments)
         return (
             f"{type(self).__name__}({self.rig!r}, RMS {before:.4g} -> {after:.2g} px, chi2/dof "
             f"{float(self.chi2_per_dof):.2f}, identity {self.identity}, {used})"
@@ -212,7 +215,10 @@ class Calibration:
 
     @property
     def labelled_detections(self) -> Detections:
-        """All blobs with the labels that they got; those left out as outliers have the flag `BlobFlag.OUTLIER`."""
+        """All blobs with the labels that they got; those left out as outliers have the flag `BlobFlag.OUTLIER`.
+
+        The label of an unknown marker holds at its moment only.
+        """
         detections, used = self.labelled.detections, self.labelled.used
         row = np.full(len(self.labelled.snapshots), -1)
         row[used] = np.arange(len(used))
@@ -220,7 +226,13 @@ class Calibration:
         outlier = (s >= 0) & (n >= 0)
         outlier[outlier] = ~self.observations.seen.numpy()[s[outlier], c[outlier], n[outlier]]
         marked = detections.flags | np.where(outlier, int(BlobFlag.OUTLIER), 0).astype(np.uint8)
-        return replace(detections, flags=marked)
+        found = replace(detections, flags=marked)
+        return found if self.lights is None else self.lights.to_moments(found)
+
+    @cached_property
+    def moments(self) -> tuple[int, int]:
+        """Number of snapshots used and of all; of unknown markers those of which some marker is used."""
+        return count_moments(self.labelled, self.lights)
 
     @cached_property
     def predicted_error(self) -> PredictedError:
@@ -230,6 +242,8 @@ class Calibration:
     @cached_property
     def scale(self) -> Scale:
         """What the size of the rig rests on, and what an error of the object's file would add to the predicted one."""
+        if self.distance is not None:
+            return self.distance.scale
         return scale_of(self.estimate, self.obj, self.scale_sigma, self.predicted_error.volume)
 
     @property

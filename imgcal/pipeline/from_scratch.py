@@ -25,11 +25,12 @@ from imgcal.association import (
     to_observations,
 )
 from imgcal.detection import DetectionOptions
-from imgcal.errors import RefusedError
+from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import K3, ColdStart, cold_start, ordinary_lens
 from imgcal.messages import listed
 from imgcal.pipeline.board_turns import require_one_turn
 from imgcal.pipeline.calibration import Calibration
+from imgcal.pipeline.lights_from_scratch import calibrate_lights_from_scratch
 from imgcal.pipeline.recalibration import fit_as_timed, late_cameras, require_same_moments
 from imgcal.pipeline.repeats import name_repeats, without_repeats
 from imgcal.pipeline.sources import Frames, blobs_of
@@ -63,6 +64,7 @@ def calibrate_from_scratch(
     *,
     detection: DetectionOptions = DetectionOptions(),
     progress: Progress | None = None,
+    distance: tuple[str, str, float] | None = None,
 ) -> Calibration:
     """Calibrate cameras of which nothing is known but images and a rough focal length.
 
@@ -76,6 +78,8 @@ def calibrate_from_scratch(
         options: how sure the result must be.
         detection: how blobs are found in frames.
         progress: wraps loops over snapshots.
+        distance: of unknown markers: names of two cameras and their distance, mm; None = the rig is known up to scale.
+            Its frame has the first of these in the origin, and the second on the x axis.
 
     Returns:
         As from `calibrate`; its `factory` is the first rig that was made from the data.
@@ -94,9 +98,18 @@ def calibrate_from_scratch(
         >>> abs(float(apart[0] - apart[1])) < 1  # mm
         True
     """
-    obj.require_rigid("to calibrate without a factory calibration")
+    if distance is not None and not obj.unknown_markers:
+        raise InputError("distance: found an object of known size, expected unknown markers, which know no scale")
+    if not obj.unknown_markers:
+        obj.require_rigid("to calibrate without a factory calibration")
     started, cameras, options = time.perf_counter(), _with_prior(cameras), options.of_object(obj)
     detections, repeats = without_repeats(blobs_of(source, cameras, obj, detection))
+    if obj.unknown_markers:
+        found = time.perf_counter()
+        with require_solvable():
+            fit = calibrate_lights_from_scratch(detections, cameras, obj, options, distance)
+        seconds = {"detection": found - started, "estimation": time.perf_counter() - found}
+        return _for_what_comes_after(replace(fit, repeats=repeats), cameras, seconds)
     require_one_turn(cameras, obj)
     found = time.perf_counter()
     is_labelled = (detections.fiducial >= 0).any()
@@ -120,12 +133,16 @@ def calibrate_from_scratch(
         "identity": identified - found,
         "estimation": time.perf_counter() - identified,
     }
+    fit = replace(fit, labelled=name_repeats(fit.labelled, repeats), repeats=repeats, late=late)
+    return _for_what_comes_after(fit, cameras, seconds)
+
+
+def _for_what_comes_after(fit: Calibration, cameras: CameraRig, seconds: dict[str, float]) -> Calibration:
+    """Give the rig a name and a volume; what was known before is no prior for what comes after, the defaults are."""
     volume = fit.predicted_error.volume
     box = Volume.box(_corner(volume.low), _corner(volume.high))
-    # What was known before is no prior for what comes after; the defaults are.
     rig = replace(fit.rig, name=cameras.name, prior=None, volume=box)
-    fit = replace(fit, labelled=name_repeats(fit.labelled, repeats), repeats=repeats)
-    return replace(fit, estimate=replace(fit.estimate, rig=rig), seconds=seconds, from_scratch=True, late=late)
+    return replace(fit, estimate=replace(fit.estimate, rig=rig), seconds=seconds, from_scratch=True)
 
 
 def _fit(

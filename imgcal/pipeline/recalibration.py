@@ -15,7 +15,7 @@ from torch import Tensor
 
 from imgcal.association import Associations, PipelineOptions, Progress, associate
 from imgcal.detection import DetectionOptions
-from imgcal.errors import RefusedError
+from imgcal.errors import InputError, RefusedError
 from imgcal.geometry import RigidTransform
 from imgcal.pipeline.arrangement import arrange
 from imgcal.pipeline.board_turns import settle_turns
@@ -23,8 +23,9 @@ from imgcal.pipeline.calibration import Calibration
 from imgcal.pipeline.fitting import fit_labelled, fit_steady
 from imgcal.pipeline.initialization import Initializer
 from imgcal.pipeline.lateness import LateCamera, late_camera, suspects
+from imgcal.pipeline.lights import find_lights
 from imgcal.pipeline.measuring import LearnedMeasurer
-from imgcal.pipeline.repeats import name_repeats, without_repeats
+from imgcal.pipeline.repeats import Repeats, name_repeats, without_repeats
 from imgcal.pipeline.sources import Detector, Frames, blobs_of, checked_frames, sight_of
 from imgcal.pipeline.synchronization import NOTICEABLE, find_unsynchronized
 from imgcal.pipeline.tally import Tally, tally
@@ -84,7 +85,11 @@ def calibrate(
     blobs = settle_turns(blobs_of(source, rig, obj, detection, measurer), rig, obj)
     detections, repeats = without_repeats(blobs)
     found = time.perf_counter()
+    if obj.unknown_markers and detector != "classical":
+        raise InputError(f"detector {detector}: found unknown markers, expected an object with a pattern to look for")
     sight = sight_of(detector, source, detection, measurer)
+    if obj.unknown_markers:
+        return _of_lights(detections, repeats, rig, obj, options, found - started)
     labelled: Associations | None = None
     try:
         with require_solvable():
@@ -112,6 +117,28 @@ def calibrate(
     }
     late = late_cameras(detections, fit.tally, rig, obj, options)
     return replace(fit, labelled=name_repeats(fit.labelled, repeats), seconds=seconds, late=late, repeats=repeats)
+
+
+def _of_lights(
+    detections: Detections,
+    repeats: Repeats,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    options: PipelineOptions,
+    detecting: float,
+) -> Calibration:
+    """Calibrate from markers of which nothing is known; `detecting` has taken so many seconds."""
+    started = time.perf_counter()
+    with require_solvable():
+        lights = find_lights(detections, rig, obj, options)
+        identified = time.perf_counter()
+        fit = fit_steady(lights.labelled, lights.labelled.detections, rig, obj, options)
+    seconds = {
+        "detection": detecting,
+        "identity": identified - started,
+        "estimation": time.perf_counter() - identified,
+    }
+    return replace(fit, lights=lights, seconds=seconds, repeats=repeats)
 
 
 def fit_as_timed(

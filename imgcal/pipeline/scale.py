@@ -23,17 +23,45 @@ PERCENT = 0.01
 
 
 @dataclass(frozen=True)
+class KnownDistance:
+    """The distance of two cameras that gives a rig its scale."""
+
+    first: str  # camera
+    second: str
+    length: float  # mm
+    is_given: bool  # by somebody who measured it; else nothing is known of the scale
+
+    @property
+    def scale(self) -> Scale:
+        """What the size of the rig rests on."""
+        source: Literal["distance", "none"] = "distance" if self.is_given else "none"
+        return Scale(source, 0.0 if self.is_given else math.inf, None, None, None, distance=self)
+
+    def __str__(self) -> str:
+        """Say it in words."""
+        if self.is_given:
+            return f"scale rests on the distance of {self.first} and {self.second}, {self.length:g} mm, taken as exact"
+        return (
+            f"scale is unknown: {self.first} and {self.second} were put {self.length:g} mm apart, and all lengths are "
+            "in this unit; --distance gives the true one"
+        )
+
+
+@dataclass(frozen=True)
 class Scale:
     """Where the scale comes from, and how far it can be trusted."""
 
-    source: Literal["object", "cameras"]
+    source: Literal["object", "cameras", "distance", "none"]
     sigma: float  # relative, one standard deviation, given what is granted to the object's file
     noticed_from: float | None  # relative error of the object's scale that would be noticed; None = none would
     px_per_percent: float | None  # median error that 1 % of the object adds over the working volume; None = unknown
     mm_per_percent: float | None
+    distance: KnownDistance | None = None  # of two cameras, where there was no factory calibration
 
     def __str__(self) -> str:
         """One sentence for people; empty where the cameras know an object's scale: the prediction has its error."""
+        if self.distance is not None:
+            return str(self.distance)
         if self.source == "cameras" and self.px_per_percent is None:
             return f"scale rests on the cameras' factory positions alone, which know it to {100 * self.sigma:.2g} %"
         if self.source == "cameras" or not self.px_per_percent:
@@ -51,7 +79,7 @@ class Scale:
         """The form that scripts read."""
         return {
             "from": self.source,
-            "sigma_percent": 100 * self.sigma,
+            "sigma_percent": _finite(100 * self.sigma),
             "noticed_from_percent": None if self.noticed_from is None else 100 * self.noticed_from,
             "px_per_percent": self.px_per_percent,
             "mm_per_percent": self.mm_per_percent,

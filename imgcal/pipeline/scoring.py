@@ -12,6 +12,7 @@ from imgcal.detection import DetectionOptions
 from imgcal.errors import RefusedError
 from imgcal.estimation import estimate
 from imgcal.pipeline.board_turns import settle_turns
+from imgcal.pipeline.lights import FoundLights, count_moments, find_lights
 from imgcal.pipeline.sources import Frames, blobs_of
 from imgcal.pipeline.units import require_solvable, require_units
 from imgcal.types import CalibrationObject, CameraRig, Detections
@@ -19,8 +20,8 @@ from imgcal.types import CalibrationObject, CameraRig, Detections
 OUTLYING = 10.0
 """Times the median distance: of noise alone, one in 10^30 is so far off."""
 ROUNDS = 5
-LEAST_POINTS = 6
-"""Of a snapshot, for its pose."""
+LEAST_POINTS, LEAST_OF_LIGHT = 6, 2
+"""Of a snapshot, for its pose; and where it shows one point."""
 
 
 def rms_length(residual: Tensor, seen: Tensor) -> float | None:
@@ -40,6 +41,12 @@ class RigScore:
     labelled: Associations
     residual: Tensor  # (S, C, N, 2) pixels
     seen: Tensor  # (S, C, N) bool
+    lights: FoundLights | None = None  # of unknown markers: S is one marker at one moment each
+
+    @property
+    def moments(self) -> tuple[int, int]:
+        """Number of snapshots used and of all; of unknown markers those of which some marker is used."""
+        return count_moments(self.labelled, self.lights)
 
     @property
     def distances(self) -> Tensor:
@@ -104,6 +111,10 @@ def score(
     """
     rig, options = rig.to(torch.float64), options.of_object(obj)
     detections = settle_turns(blobs_of(source, rig, obj, detection), rig, obj)
+    if obj.unknown_markers:
+        with require_solvable():
+            lights = find_lights(detections, rig, obj, options)
+            return replace(_scored(lights.labelled, rig, obj, options), lights=lights)
     try:
         with require_solvable():
             return _scored(associate(detections, rig, obj, options, progress), rig, obj, options)
@@ -115,9 +126,12 @@ def score(
 def _scored(labelled: Associations, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions) -> RigScore:
     """Fit a pose in each labelled snapshot."""
     observations, poses = observations_of(labelled, rig, obj)
+    if obj.unknown_markers:
+        poses = None  # those are of the rig by which the markers were found
     fixed = torch.zeros(*rig.distortion.shape[:-1], rig.num_parameters, dtype=rig.distortion.dtype)
     # What is reported is an RMS in pixels: centres count alike, however well each was measured.
     even = replace(observations, sigma=torch.full_like(observations.sigma, options.identity_error))
+    least = LEAST_OF_LIGHT if obj.pose_rank == 3 else LEAST_POINTS
     for _ in range(ROUNDS):
         fit = estimate(even, rig, obj.taken_as_exact(), poses, prior_std=fixed, options=options.estimation)
         if not bool(fit.converged):
@@ -131,7 +145,7 @@ def _scored(labelled: Associations, rig: CameraRig, obj: CalibrationObject, opti
         scored = RigScore(labelled, torch.where(observations.seen[..., None], residual, 0.0), observations.seen)
         # The poses, too, are those of most fiducials: what is far off must not pull them.
         kept = observations.seen & ~scored.outliers
-        if bool((kept == even.seen).all()) or bool((kept.flatten(1).sum(1) < LEAST_POINTS).any()):
+        if bool((kept == even.seen).all()) or bool((kept.flatten(1).sum(1) < least).any()):
             break
         even = replace(even, seen=kept)
     return scored

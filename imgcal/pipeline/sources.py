@@ -46,6 +46,8 @@ def blobs_of(
     if isinstance(source, Detections):
         if measurer is not None:
             raise InputError(f"measurer {measurer.name}: found blobs without frames, expected frames to look at")
+        if obj.unknown_markers and len(source):
+            source = replace(source, fiducial=np.full(len(source), -1))
         return checked_detections(source, rig, obj)
     frames = checked_frames(source, rig)
     if not frames:

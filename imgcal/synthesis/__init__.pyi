@@ -31,7 +31,7 @@ from .rigs import (
     synthesize_at_once,
 )
 from .simulated_rig import SimulatedRig
-from .volumes import sample_path, sample_volume, seen_volume, simulate_volume
+from .volumes import place_markers, sample_path, sample_volume, seen_volume, simulate_volume
 
 __all__ = [
     "DIFFICULTIES",
@@ -66,6 +66,7 @@ __all__ = [
     "expose_patches",
     "host_generator",
     "look_at",
+    "place_markers",
     "render_board",
     "render_crops",
     "render_patches",

@@ -19,9 +19,12 @@ from imgcal.synthesis.captures import Motion, Truth
 from imgcal.synthesis.hand_held import HandHeld
 from imgcal.synthesis.rigs import Drift
 from imgcal.types import CalibrationObject, CameraRig, Volume
+from renderers import palette
 
 Floats = NDArray[np.float64]
 
+BODY = 0.3
+"""Side of a body with markers, in parts of the volume's shortest side, or of the working distance."""
 MOMENT = 1e-3
 """Seconds between the two poses whose difference is the velocity."""
 DEPTHS = (0.3, 10.0)
@@ -107,6 +110,29 @@ def simulate_volume(
     poses = _about(centroid, poses)
     seen = true_rig.expand(snapshots).project(poses.apply(points), obj.radius)
     return Truth(true_rig, poses, seen.uv, seen.visible, motion)
+
+
+def place_markers(rig: CameraRig, count: int, generator: torch.Generator) -> CalibrationObject:
+    """Put markers on a body, anywhere within a box that fits the rig: what stands for markers that nobody measured.
+
+    Args:
+        rig: has a volume, or a working distance, or cameras that see the same.
+        count: number of markers, N.
+        generator: source of randomness.
+
+    Examples:
+        >>> import imgcal
+        >>> body = place_markers(imgcal.load_rig("room10"), 15, torch.Generator().manual_seed(0))
+        >>> body.num_fiducials, float(body.points.abs().max()) < 500  # mm
+        (15, True)
+    """
+    if rig.volume is None and rig.working_distance is not None:
+        side = BODY * rig.working_distance
+    else:
+        volume = rig.volume or seen_volume(rig)
+        side = BODY * min(b - a for a, b in zip(volume.low, volume.high, strict=True))
+    unit = torch.rand(count, 3, generator=generator, dtype=torch.float64)
+    return CalibrationObject((unit - 0.5) * side, palette(count).double(), name="body")
 
 
 def sample_volume(volume: Volume, count: int, generator: torch.Generator) -> Tensor:

@@ -14,6 +14,9 @@ from imgcal.errors import InputError
 from imgcal.geometry import pose_rank
 from imgcal.types.board import Board
 
+ANY_LABEL = 1_000_000
+"""Labels of a table of unknown markers are below this; nothing is made of them."""
+
 
 @dataclass(frozen=True)
 class Symmetry:
@@ -50,9 +53,12 @@ class CalibrationObject:
     board: Board | None = None  # the printed pattern whose points these are; None = markers
     modes: Tensor | None = None  # (K, N, 3) mm: shapes of which it has as much as a standard normal says; None = rigid
     labels: tuple[int, ...] = ()  # what tables call the fiducials; empty = by their rows
+    unknown_markers: bool = False  # every blob may be one of these points, any number at a moment: see `unknown`
 
     def __repr__(self) -> str:
         """Say what it is: `CalibrationObject('cube8': 8 fiducials)`; points, radii and tolerances are attributes."""
+        if self.unknown_markers:
+            return f"CalibrationObject({self.name!r}: unknown markers)"
         exact = "" if self.tolerance is None else ", with tolerances"
         return f"CalibrationObject({self.name!r}: {len(self.points)} fiducials{exact})"
 
@@ -85,6 +91,14 @@ class CalibrationObject:
         points, modes = torch.from_numpy(board.points), torch.from_numpy(board.modes)
         colours = palette(len(points)).double()
         return cls(points, colours, name=name, board=board, modes=modes if len(modes) else None)
+
+    @classmethod
+    def unknown(cls, name: str = "lights") -> CalibrationObject:
+        """Make the object that says: every blob may be a marker of its own, and nothing is known of them.
+
+        Each marker at each moment is then an object of one point.
+        """
+        return cls(torch.zeros(1, 3).double(), torch.ones(1, 3).double(), name=name, unknown_markers=True)
 
     @property
     def exact(self) -> bool:
@@ -121,7 +135,9 @@ class CalibrationObject:
 
     @property
     def rows(self) -> int | tuple[int, ...]:
-        """What tables call the fiducials: so many rows, or numbers of their own."""
+        """What tables call the fiducials: so many rows, or numbers of their own. Unknown markers have any."""
+        if self.unknown_markers:
+            return ANY_LABEL
         return self.labels or self.num_fiducials
 
     @cached_property

@@ -28,7 +28,7 @@ from imgcal.fleet import Kept, workers
 from imgcal.types import UnknownLights
 from scripts.benchmarks import wand_recording
 from scripts.benchmarks.wand_recording import FOLLOWED, RATE, SEEN, calibrated, recording, turned
-from scripts.output import ROOT, WORK, command, make_folder, markdown, surroundings, write_json
+from scripts.output import ROOT, WORK, command, markdown, surroundings, write_json
 
 RESULT = ROOT / "docs" / "benchmarks" / "real_stream.json"
 LIGHTS_RESULT = RESULT.with_name("real_stream_lights.json")

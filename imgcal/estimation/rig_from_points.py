@@ -1,0 +1,267 @@
+"""A first rig from one point that was moved before cameras of which only rough focal lengths are known.
+
+Two cameras that see the point together are related by an essential matrix, up to scale; all others are placed by the
+points that these two see, one after the other; a robust joint fit frees focal lengths first and the rest of the lens
+then. Nothing gives the scale: two cameras are put at a distance of choice.
+
+Source: Hartley and Zisserman, "Multiple View Geometry", chapters 9 and 18; for the order Snavely, Seitz and Szeliski,
+"Photo Tourism", 2006.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.errors import RefusedError
+from imgcal.estimation.map_estimate import Estimate, EstimationOptions, estimate
+from imgcal.estimation.rig_initialization import FINE, ROUGH, ordinary_lens, require_connected
+from imgcal.geometry import RigidTransform, undistort
+from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior
+
+Array = NDArray[np.float64]
+
+FOCALS = (1.0, 0.85, 1.18, 0.72, 1.4)
+"""Factors on the rough focal lengths that are tried."""
+CONSISTENT = 4.0
+"""px: what a blob may be off its epipolar line or its place while cameras are placed."""
+LEAST_COMMON = 16
+"""Points that two cameras must see together, and that a camera must see of those that are placed."""
+LEAST_ANGLE = 0.06
+"""rad: angle between the rays of two cameras, usually, from which on they can begin."""
+MOST_USED = 600
+"""Moments in the joint fits: those that most cameras see, evenly over the capture."""
+WIDE_ROTATION = 0.5  # rad, of the prior about a rig that was chained together
+APART = 1000.0
+"""mm: distance of two cameras of a rig without scale."""
+
+
+@dataclass(frozen=True)
+class PointStart:
+    """A rig made from points alone, up to scale."""
+
+    rig: CameraRig  # in the frame that `in_frame_of_pair` says
+    pair: tuple[int, int]  # cameras that are 1000 mm apart
+    spread: float  # px, robust spread of the residuals
+
+
+def cold_start_from_points(
+    observations: Observations, cameras: CameraRig, pair: tuple[int, int] | None = None
+) -> PointStart:
+    """Find where cameras are, up to scale, and their lenses, with no other start than rough focal lengths.
+
+    Args:
+        observations: (S, C, 1) of one point; some may be of something else.
+        cameras: image sizes, lenses as far as they are known, and a prior that says how far, float64; where they are is
+            not looked at.
+        pair: the cameras that are put 1000 mm apart; None = the first, and the one that is farthest from it.
+
+    Raises:
+        RefusedError: two cameras or fewer, or cameras that have too few points in common with the others.
+
+    Examples:
+        >>> import imgcal
+        >>> from imgcal.synthesis import simulate_volume
+        >>> rig = imgcal.load_rig("room10").select([0, 2, 5, 7])
+        >>> light = CalibrationObject.unknown()
+        >>> truth = simulate_volume(rig, light, 150, torch.Generator().manual_seed(0), None)
+        >>> seen = Observations(truth.uv, torch.full(truth.uv.shape[:-1], 0.1).double(), truth.visible)
+        >>> found = cold_start_from_points(seen, rig, (0, 1)).rig
+        >>> ratio = (found.positions[2] - found.positions[0]).norm() / 1000
+        >>> expected = (rig.positions[2] - rig.positions[0]).norm() / (rig.positions[1] - rig.positions[0]).norm()
+        >>> abs(float(ratio / expected - 1)) < 0.01
+        True
+    """
+    if cameras.num_cameras < 3:
+        raise RefusedError(
+            f"start without a factory calibration: found {cameras.num_cameras} cameras, expected at least 3: what two "
+            "see of points decides too little"
+        )
+    uv, seen = observations.uv[:, :, 0].double().numpy(), observations.seen[:, :, 0].numpy()
+    best: PointStart | None = None
+    for factor in FOCALS:
+        rays = _rays(uv, seen, cameras, factor)
+        placed = _chained(rays, seen, cameras.focal_length.mean(1).numpy() * factor)
+        if placed is None:
+            continue
+        rig = replace(cameras, focal_length=factor * cameras.focal_length, cam_from_rig=placed)
+        found = _joint(observations, in_frame_of_pair(rig, pair), cameras)
+        if found is not None and (best is None or found.spread < best.spread):
+            best = found
+        if best is not None and best.spread < FINE:
+            break
+    if best is None:
+        common = [int((seen[:, [c]] & np.delete(seen, c, 1)).any(1).sum()) for c in range(cameras.num_cameras)]
+        require_connected([c for c, count in enumerate(common) if count < LEAST_COMMON], cameras)
+        raise RefusedError(
+            "start without a factory calibration: no cameras see enough points together from different sides: carry "
+            "the light through all of what neighbouring cameras see"
+        )
+    return best
+
+
+def in_frame_of_pair(rig: CameraRig, pair: tuple[int, int] | None) -> tuple[CameraRig, tuple[int, int]]:
+    """Move and scale a rig so that one camera is in the origin, and another one 1000 mm away along x.
+
+    Returns:
+        The rig and the pair: as given, or the first camera and the one that is farthest from it.
+    """
+    positions = rig.positions
+    first, second = pair or (0, int((positions - positions[0]).norm(dim=-1).argmax()))
+    way = positions[second] - positions[first]
+    along = way / way.norm()
+    down = rig.cam_from_rig.rotation[first, 1]  # as far as possible, y is the first camera's
+    across = torch.linalg.cross(along, down)
+    across = across / across.norm()
+    turn = torch.stack((along, torch.linalg.cross(across, along), across))  # new_from_rig
+    moved = (APART / way.norm()) * (positions - positions[first]) @ turn.mT
+    rotation = rig.cam_from_rig.rotation @ turn.mT
+    placed = RigidTransform(rotation, -(rotation @ moved[..., None])[..., 0])
+    return replace(rig, cam_from_rig=placed), (first, second)
+
+
+def prior_of_pair(rig: CameraRig, pair: tuple[int, int], prior: RigPrior, rotation: float, position: float) -> Tensor:
+    """Spread (C, K) about a rig in the frame of its pair: the first camera's place and the distance are fixed.
+
+    Args:
+        rig: in the frame of the pair.
+        pair: which.
+        prior: of the lenses.
+        rotation: rad, of all other cameras.
+        position: mm, the same.
+    """
+    std = ordinary_lens(replace(prior, rotation=rotation, position=position).std(rig))
+    std[pair[0], :6] = 0.0
+    std[pair[1], 3] = 0.0  # to first order, that is the distance
+    return std
+
+
+def _rays(uv: Array, seen: NDArray[np.bool_], cameras: CameraRig, factor: float) -> Array:
+    """Undistorted coordinates (S, C, 2) on the plane z = 1."""
+    xy = (torch.from_numpy(uv) - cameras.principal_point) / (factor * cameras.focal_length)
+    straight, _ = undistort(xy.movedim(0, 1), cameras.distortion, cameras.lens_model)
+    return np.where(seen[..., None], straight.movedim(0, 1).numpy(), 0.0)
+
+
+def _chained(rays: Array, seen: NDArray[np.bool_], focal: Array) -> RigidTransform | None:
+    """Place all cameras, one after the other; None = not all can be."""
+    cameras = len(focal)
+    slack = CONSISTENT / float(focal.mean())
+    start = _first_pair(rays, seen, slack)
+    if start is None:
+        return None
+    (a, b), rotation, translation = start
+    placed: dict[int, tuple[Array, Array]] = {a: (np.eye(3), np.zeros(3)), b: (rotation, translation)}
+    while len(placed) < cameras:
+        points, known = _triangulated(rays, seen, placed, slack)
+        counts = [-1 if c in placed else int((known & seen[:, c]).sum()) for c in range(cameras)]
+        camera = int(np.argmax(counts))
+        if counts[camera] < LEAST_COMMON:
+            return None
+        rows = known & seen[:, camera]
+        good, vector, shift, inliers = cv2.solvePnPRansac(
+            points[rows], rays[rows, camera], np.eye(3), np.zeros(4), reprojectionError=3 * slack,
+            iterationsCount=300, flags=cv2.SOLVEPNP_SQPNP,
+        )  # fmt: skip
+        if not good or inliers is None or len(inliers) < LEAST_COMMON:
+            return None
+        placed[camera] = cv2.Rodrigues(vector)[0], shift[:, 0]
+    order = range(cameras)
+    turns, shifts = np.stack([placed[c][0] for c in order]), np.stack([placed[c][1] for c in order])
+    return RigidTransform(torch.from_numpy(turns), torch.from_numpy(shifts))
+
+
+def _first_pair(rays: Array, seen: NDArray[np.bool_], slack: float) -> tuple[tuple[int, int], Array, Array] | None:
+    """Two cameras to begin with: many points in common, seen from different sides."""
+    best, worth = None, 0.0
+    cameras = seen.shape[1]
+    for a in range(cameras):
+        for b in range(a + 1, cameras):
+            rows = seen[:, a] & seen[:, b]
+            if rows.sum() < LEAST_COMMON:
+                continue
+            one, two = np.ascontiguousarray(rays[rows, a]), np.ascontiguousarray(rays[rows, b])
+            matrix, mask = cv2.findEssentialMat(one, two, np.eye(3), cv2.RANSAC, 0.999, slack)
+            if matrix is None or matrix.shape != (3, 3):
+                continue
+            count, rotation, translation, mask = cv2.recoverPose(matrix, one, two, np.eye(3), mask=mask)
+            if count < LEAST_COMMON:
+                continue
+            inside = mask.ravel() > 0
+            d1 = np.column_stack((one, np.ones(len(one)))) @ rotation.T
+            d2 = np.column_stack((two, np.ones(len(two))))
+            cosine = (d1 * d2).sum(1) / np.linalg.norm(d1, axis=1) / np.linalg.norm(d2, axis=1)
+            angle = float(np.median(np.arccos(np.clip(cosine[inside], -1, 1))))
+            value = count * min(np.sin(angle), 0.5) * count / len(one)
+            if angle > LEAST_ANGLE and value > worth:
+                best, worth = ((a, b), rotation, translation[:, 0]), value
+    return best
+
+
+def _triangulated(
+    rays: Array, seen: NDArray[np.bool_], placed: dict[int, tuple[Array, Array]], slack: float
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Points (S, 3) where the rays of the placed cameras pass nearest, and which of them are known (S,)."""
+    information, target = np.zeros((len(rays), 3, 3)), np.zeros((len(rays), 3))
+    for camera, (rotation, translation) in placed.items():
+        d = np.column_stack((rays[:, camera], np.ones(len(rays)))) @ rotation
+        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        across = (np.eye(3) - d[:, :, None] * d[:, None]) * seen[:, camera, None, None]
+        information += across
+        target += across @ (-rotation.T @ translation)
+    known = seen[:, list(placed)].sum(1) >= 2
+    known &= np.linalg.det(information) > 1e-4
+    points = np.zeros((len(rays), 3))
+    points[known] = np.linalg.solve(information[known], target[known][..., None])[..., 0]
+    for camera, (rotation, translation) in placed.items():
+        there = points @ rotation.T + translation
+        off = np.linalg.norm(there[:, :2] - rays[:, camera] * there[:, 2:], axis=1)
+        known &= ~seen[:, camera] | ((there[:, 2] > 0) & (off < 3 * slack * np.abs(there[:, 2])))
+    return points, known
+
+
+def _joint(
+    observations: Observations, start: tuple[CameraRig, tuple[int, int]], cameras: CameraRig
+) -> PointStart | None:
+    """Fit all cameras and points together: focal lengths first, then all; None = no fit comes to rest."""
+    rig, pair = start
+    rows = _used(observations.seen[:, :, 0])
+    some = Observations(observations.uv[rows], observations.sigma[rows], observations.seen[rows])
+    light, fit = CalibrationObject(torch.zeros(1, 3).double(), torch.ones(1, 3).double(), name="light"), None
+    position = 0.5 * float(torch.cdist(rig.positions, rig.positions).max())
+    prior = cameras.prior or RigPrior()
+    given = replace(rig, focal_length=cameras.focal_length)  # about which the prior is
+    std = prior_of_pair(given, pair, prior, WIDE_ROTATION, position)
+    held = std.clone()
+    held[:, 8:] = 0.0
+    poses = None
+    for noise, spread in ((ROUGH, held), (ROUGH, std), (FINE, std)):
+        part = replace(some, sigma=torch.full_like(some.sigma, noise))
+        options = EstimationOptions(loss="cauchy", max_iterations=60)
+        fit = estimate(part, given, light, poses, prior_std=spread, initial_rig=rig, options=options)
+        rig, poses = fit.rig, fit.rig_from_object
+    assert fit is not None
+    placed, _ = in_frame_of_pair(fit.rig, pair)
+    return PointStart(replace(placed, prior=cameras.prior), pair, _spread(fit))
+
+
+def _spread(fit: Estimate) -> float:
+    """Robust spread of each component of the residuals, px."""
+    seen = fit.problem.root_weight[0] > 0
+    return float(fit.residual.norm(dim=-1)[seen].median()) / 1.1774
+
+
+def _used(seen: Tensor) -> Tensor:
+    """Moments (U,) that two cameras see at least; where there are many, those that most see, evenly over time."""
+    count = seen.sum(1)
+    rows = (count >= 2).nonzero().flatten()
+    if len(rows) <= MOST_USED:
+        return rows
+    parts: Sequence[Tensor] = torch.tensor_split(rows, MOST_USED)
+    return torch.stack([part[count[part].argmax()] for part in parts])

@@ -1,0 +1,369 @@
+"""Markers of which nothing is known: every blob may be one. Which blobs belong together, and whether that can be true.
+
+That labels fit the rig which was made from them proves nothing: dense markers fit many rigs. What proves it are moments
+that took no part, seen by cameras that took no part: the markers that the other cameras find there must be where blobs
+of the camera are, far oftener than by chance, and near misses must be few.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.association import (
+    Associations,
+    Lights,
+    PipelineOptions,
+    SnapshotIdentity,
+    align_camera,
+    align_rig,
+    associate_lights,
+    background_rows,
+    image_error,
+    predicted_misses,
+)
+from imgcal.errors import RefusedError
+from imgcal.estimation import Estimate, EstimationOptions, estimate
+from imgcal.geometry import RigidTransform
+from imgcal.messages import listed
+from imgcal.types import CalibrationObject, CameraRig, Detections, Observations, RigPrior
+
+HELD_OUT = 4
+"""Every so many-th moment takes no part in the rig that is tried."""
+MOST_ROWS = 500
+"""Markers in a fit on the way: those that most cameras see, evenly over the moments."""
+LEAST_ROWS = 12
+"""Markers below which a fit on the way says nothing."""
+FINEST = 0.4
+"""px: what rig and blobs may be off in the end, while blobs are told apart."""
+AFTER_ALIGNMENT = 3.0
+"""px: the same when the rig has been aligned to blobs without labels."""
+NARROWER = 0.55
+"""By how much each round looks narrower at least."""
+JOINED, LOST = 3, 0.6
+"""Times that cameras are brought back, and the share of the usual part of their markers below which they are lost."""
+SPREAD = (0.0, 0.0, 0.5, 0.5)
+"""Of the rigs from which the search begins, in standard deviations of the prior about the factory's; each looks at
+other moments."""
+STARTS = len(SPREAD)
+NEAR, FAR = 4.0, 24.0
+"""Standard deviations up to which a blob is where a marker was predicted, and up to which it is a near miss."""
+LEAST_PREDICTED = 10
+"""Markers predicted for one camera from which on it can be judged."""
+LEAST_SHARE = 0.25
+"""Of the predicted markers of a camera: those with a blob in their place, chance apart."""
+LEAST_NEAR = 0.8
+"""Of the blobs beside predicted markers, chance apart: those that are in their place."""
+SAME_RIG = 1.0
+"""px: median distance of images up to which two rigs are one."""
+MOST_TESTED = 40
+"""Held-out moments that are looked at camera by camera."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How well markers that the other cameras find are where each camera has blobs, in moments that took no part."""
+
+    predicted: NDArray[np.int64]  # (C,) markers in view of the camera, found by others
+    found: NDArray[np.float64]  # (C,) share of these with a blob in their place, chance apart
+    near_misses: NDArray[np.float64]  # (C,) share of these with a blob beside their place, chance apart
+
+    @property
+    def judged(self) -> NDArray[np.bool_]:
+        """Tell which cameras can be judged: (C,)."""
+        return self.predicted >= LEAST_PREDICTED
+
+    @property
+    def agrees(self) -> NDArray[np.bool_]:
+        """Tell which cameras agree with the others: (C,)."""
+        near = self.found >= LEAST_NEAR * (self.found + np.maximum(self.near_misses, 0))
+        return self.judged & (self.found >= LEAST_SHARE) & near
+
+    @property
+    def score(self) -> float:
+        """One number to compare rigs by: mean share found, camera by camera; 0 for those that cannot be judged."""
+        return float(np.where(self.judged, self.found - np.maximum(self.near_misses, 0), 0.0).mean())
+
+
+@dataclass(frozen=True)
+class FoundLights:
+    """Unknown markers of some moments, as the estimate takes them: a row is one marker at one moment."""
+
+    labelled: Associations  # its snapshots are the rows, and each is named after its moment
+    detections: Detections  # all blobs of all moments
+    blob: NDArray[np.int64]  # (K,) which of these each blob of `labelled` is
+    background: NDArray[np.bool_]  # (M,) blobs that never move in their image
+    agreement: Agreement
+    starts: int  # that were tried; 0 = the rig was right as it was given
+
+    @property
+    def background_of(self) -> NDArray[np.int64]:
+        """Blobs of each camera that never move: (C,)."""
+        return self._count(self.background)
+
+    @property
+    def left_over_of(self) -> NDArray[np.int64]:
+        """Blobs of each camera that move and are in no marker: (C,)."""
+        free = self.detections.usable & ~self.background
+        free[self.blob] = False
+        return self._count(free)
+
+    @property
+    def note(self) -> str:
+        """What is left out as background, in words; empty where nothing is."""
+        counts = self.background_of
+        parts = [f"{counts[c]} in {name}" for c, name in enumerate(self.detections.camera_names) if counts[c]]
+        return f"blobs that never move are taken for background and left out: {', '.join(parts)}" if parts else ""
+
+    def to_moments(self, rows: Detections) -> Detections:
+        """Put the blobs of rows, some of them without their labels, back among all others.
+
+        A label is the number of a marker at its moment: what has the same one at another moment is not the same marker.
+        """
+        fiducial, flags = np.full(len(self.detections), -1), self.detections.flags.copy()
+        names = [snapshot.name for snapshot in self.labelled.snapshots]
+        number = np.zeros(len(names), dtype=np.int64)
+        for row in range(1, len(names)):
+            number[row] = number[row - 1] + 1 if names[row] == names[row - 1] else 0
+        fiducial[self.blob] = np.where(rows.fiducial >= 0, number[rows.snapshot], -1)
+        flags[self.blob] = rows.flags
+        return replace(self.detections, fiducial=fiducial, flags=flags)
+
+    def _count(self, rows: NDArray[np.bool_]) -> NDArray[np.int64]:
+        return np.bincount(self.detections.camera[rows], minlength=len(self.detections.camera_names))
+
+
+def find_lights(
+    detections: Detections, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions = PipelineOptions()
+) -> FoundLights:
+    """Find the markers of each moment from a factory rig that may be off by more than markers are apart.
+
+    Args:
+        detections: blobs of all moments; labels are not looked at.
+        rig: the factory rig, float64.
+        obj: one point.
+        options: how sure the result must be.
+
+    Raises:
+        RefusedError: the blobs cannot decide which of them belong together.
+    """
+    background = background_rows(detections)
+    moving = detections.select(~background)
+    verified, agreement, starts = _verified_rig(moving, rig, obj)
+    found = associate_lights(moving, verified, even_error(rig))
+    if not len(found):
+        raise RefusedError(NOTHING)
+    blob = np.flatnonzero(~background)[found.row[found.row >= 0]]
+    return FoundLights(rows_of_lights(found, moving, verified), detections, blob, background, agreement, starts)
+
+
+def count_moments(labelled: Associations, lights: FoundLights | None) -> tuple[int, int]:
+    """Count snapshots used and all; of unknown markers, whose rows share snapshots, those of which a row is used."""
+    snapshots, used = labelled.snapshots, labelled.used
+    if lights is None:
+        return len(used), len(snapshots)
+    return len({snapshots[row].name for row in used}), len(lights.detections.snapshot_names)
+
+
+def rows_of_lights(lights: Lights, detections: Detections, rig: CameraRig) -> Associations:
+    """Make a snapshot of each marker at each moment; it has the name of the moment, and only the marker's blobs."""
+    row, camera = np.nonzero(lights.row >= 0)
+    blobs = detections.select(lights.row[row, camera])
+    names = tuple(detections.snapshot_names[moment] for moment in lights.moment)
+    blobs = replace(blobs, snapshot=row, fiducial=np.zeros(len(row), dtype=np.int64), snapshot_names=names)
+    places = torch.from_numpy(lights.point).to(rig.focal_length)
+    still = torch.eye(3, dtype=places.dtype)
+    snapshots = tuple(
+        SnapshotIdentity(name, "unique", f"{cameras} cameras agree", 1, RigidTransform(still, place))
+        for name, cameras, place in zip(names, lights.cameras.tolist(), places, strict=True)
+    )
+    return Associations(blobs, snapshots)
+
+
+def even_error(rig: CameraRig, pixels: float = FINEST) -> NDArray[np.float64]:
+    """Let every camera be off by the same, px: (C,)."""
+    return np.full(rig.num_cameras, pixels)
+
+
+def _verified_rig(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> tuple[CameraRig, Agreement, int]:
+    """Find the rig on which moments and cameras that took no part agree.
+
+    Raises:
+        RefusedError: there is none, or another one explains the blobs as well.
+    """
+    learnt, tested = held_out(detections)
+    std = (rig.prior or RigPrior()).std(rig)
+    generator = torch.Generator().manual_seed(0)
+    best = agreement_of(tested, rig)
+    if bool(best.agrees.all()):
+        return rig, best, 0
+    best = best if best.judged.any() else None
+    for start in range(STARTS):
+        random = torch.randn(std.shape, generator=generator, dtype=std.dtype)
+        trial = _followed(learnt, rig, rig.retract(SPREAD[start] * random * std), obj, start)
+        if trial is None:
+            continue
+        agreement = agreement_of(tested, trial)
+        if bool(agreement.agrees.all()):
+            return trial, agreement, start + 1
+        if best is None or agreement.score > best.score:
+            best = agreement
+    raise RefusedError(_why(best, rig))
+
+
+NOTHING = (
+    "unknown markers: no blobs of three cameras agree on places: the rig is farther off than its prior says, or the "
+    "markers are too many or too few"
+)
+
+
+def held_out(detections: Detections) -> tuple[Detections, Detections]:
+    """Part blobs by moments: those from which a rig is made, and those that take no part.
+
+    Raises:
+        RefusedError: there are too few moments.
+    """
+    held = np.arange(len(detections.snapshot_names)) % HELD_OUT == HELD_OUT - 1
+    if held.sum() < 2:
+        raise RefusedError(
+            f"unknown markers: found {len(held)} snapshots, expected at least {2 * HELD_OUT}: some must take no part, "
+            "to prove the others right"
+        )
+    return detections.select(~held[detections.snapshot]), detections.select(held[detections.snapshot])
+
+
+def require_agreement(agreement: Agreement, rig: CameraRig) -> None:
+    """Refuse where moments and cameras that took no part do not agree.
+
+    Raises:
+        RefusedError: says which cameras, and how far they are from it.
+    """
+    if not bool(agreement.agrees.all()):
+        raise RefusedError(_why(agreement, rig))
+
+
+def _why(agreement: Agreement | None, rig: CameraRig) -> str:
+    if agreement is None:
+        return NOTHING
+    unjudged = [rig.camera_names[c] for c in np.flatnonzero(~agreement.judged)]
+    if unjudged and not (agreement.judged & ~agreement.agrees).any():
+        return (
+            f"unknown markers: camera {listed(unjudged)}: in the snapshots that took no part, the other cameras find "
+            f"too few markers in its view to judge it by (expected {LEAST_PREDICTED}): capture more, or leave it out"
+        )
+    bad = np.flatnonzero(agreement.judged & ~agreement.agrees)
+    worst = int(bad[np.argmin(agreement.found[bad])])
+    return (
+        f"unknown markers: camera {listed([rig.camera_names[c] for c in bad])}: of {agreement.predicted[worst]} "
+        f"markers that the other cameras find in view of {rig.camera_names[worst]}, in snapshots that took no part, "
+        f"{100 * max(agreement.found[worst], 0):.0f} % have a blob in their place and "
+        f"{100 * max(agreement.near_misses[worst], 0):.0f} % one beside it: which blobs belong together cannot be "
+        "decided; show fewer markers at once, or give a rig that is nearer"
+    )
+
+
+def _followed(
+    detections: Detections, factory: CameraRig, first: CameraRig, obj: CalibrationObject, seed: int
+) -> CameraRig | None:
+    """Follow one start: align the rig without labels, then label and fit by turns, narrower each time."""
+    std = (factory.prior or RigPrior()).std(factory)
+    now, _ = align_rig(detections, factory, std, first, seed)
+    error = min(AFTER_ALIGNMENT, float(np.median(image_error(factory, std))))
+    return narrow(detections, factory, std, now, obj, error, JOINED)
+
+
+def narrow(
+    detections: Detections,
+    factory: CameraRig,
+    std: Tensor,
+    now: CameraRig,
+    obj: CalibrationObject,
+    error: float,
+    joined: int,
+) -> CameraRig | None:
+    """Label and fit by turns, looking narrower each time.
+
+    Args:
+        detections: blobs of many moments.
+        factory: the rig that the prior is about.
+        std: (C, K) the prior.
+        now: where to begin.
+        obj: one point.
+        error: px, what that may be off.
+        joined: times that cameras which show few of the markers are brought back.
+
+    Returns:
+        The rig; None = too few markers are found.
+    """
+    while True:
+        found = associate_lights(detections, now, even_error(factory, error))
+        lost = _lost(found, now) if joined > 0 else []
+        joined -= 1
+        if lost:
+            for camera in lost:
+                now = align_camera(detections, factory, std, now, camera, found)
+            continue
+        fit = _fit(found, detections, factory, std, now, obj)
+        if fit is None or error == FINEST:
+            return None if fit is None else fit.rig
+        now = fit.rig
+        spread = float(fit.residual.norm(dim=-1)[fit.problem.root_weight[0] > 0].median()) / 1.1774
+        error = max(FINEST, min(NARROWER * error, 3 * spread))
+
+
+def _lost(lights: Lights, rig: CameraRig) -> list[int]:
+    """Cameras that show few of the markers in their view."""
+    visible = rig.project(torch.from_numpy(lights.point)).visible.numpy()  # (C, R)
+    shown = (lights.row >= 0).T & visible
+    share = shown.sum(1) / np.maximum(visible.sum(1), 1)
+    usual = float(np.median(share))
+    return np.flatnonzero(share < LOST * usual).tolist()
+
+
+def _fit(
+    lights: Lights,
+    detections: Detections,
+    factory: CameraRig,
+    std: Tensor,
+    first: CameraRig,
+    obj: CalibrationObject,
+) -> Estimate | None:
+    """Fit a rig to the markers that most cameras see; None = too few."""
+    if len(lights) < LEAST_ROWS:
+        return None
+    turn = np.random.default_rng(0).random(len(lights))
+    order = np.lexsort((turn, -np.minimum(lights.cameras, 5)))
+    chosen = lights.select(np.sort(order[:MOST_ROWS]))
+    seen = chosen.row >= 0
+    uv = np.where(seen[..., None], detections.uv[np.maximum(chosen.row, 0)], 0.0)
+    sigma = np.hypot(detections.sigma[np.maximum(chosen.row, 0)], 0.3)
+    observations = Observations(*(torch.from_numpy(a[:, :, None]) for a in (uv, sigma, seen)))
+    points = torch.from_numpy(chosen.point)
+    poses = RigidTransform(torch.eye(3, dtype=points.dtype).expand(len(points), 3, 3), points)
+    options = EstimationOptions(loss="cauchy", max_iterations=40)
+    return estimate(observations, factory, obj, poses, prior_std=std, initial_rig=first, options=options)
+
+
+def agreement_of(detections: Detections, rig: CameraRig) -> Agreement:
+    """Compare what each camera sees with what all the others say that it should.
+
+    Args:
+        detections: blobs of moments that took no part in the rig.
+        rig: to be judged.
+    """
+    moments = np.unique(detections.snapshot)
+    some = moments[np.linspace(0, len(moments) - 1, min(len(moments), MOST_TESTED)).astype(int)]
+    blobs = detections.select(np.isin(detections.snapshot, some))
+    error = even_error(rig)
+    predicted = np.zeros(rig.num_cameras, dtype=np.int64)
+    found, missed = np.zeros(rig.num_cameras), np.zeros(rig.num_cameras)
+    for camera in range(rig.num_cameras):
+        others = blobs.select(blobs.camera != camera)
+        lights = associate_lights(others, rig, error, least_cameras=min(3, rig.num_cameras - 1))
+        counts = predicted_misses(lights, blobs, rig, camera, error, NEAR, FAR)
+        predicted[camera], found[camera], missed[camera] = counts
+    return Agreement(predicted, found, missed)

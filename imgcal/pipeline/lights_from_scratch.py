@@ -1,0 +1,183 @@
+"""Calibration without a factory calibration from one light that was moved around, or from several unknown markers.
+
+Images that show one moving blob place the cameras; with the rig that they give, all other blobs are put together, and
+moments and cameras that took no part must agree, as with a factory calibration. The rig has no scale until somebody
+gives the distance of two cameras.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from imgcal.association import PipelineOptions, associate_lights, background_rows
+from imgcal.errors import InputError, RefusedError
+from imgcal.estimation import cold_start_from_points, in_frame_of_pair, prior_of_pair
+from imgcal.geometry import RigidTransform
+from imgcal.pipeline.calibration import Calibration
+from imgcal.pipeline.fitting import fit_steady
+from imgcal.pipeline.lights import (
+    AFTER_ALIGNMENT,
+    NOTHING,
+    FoundLights,
+    agreement_of,
+    even_error,
+    held_out,
+    narrow,
+    require_agreement,
+    rows_of_lights,
+)
+from imgcal.pipeline.scale import KnownDistance
+from imgcal.types import CalibrationObject, CameraRig, Detections, Observations, RigPrior
+
+WIDE_ROTATION, WIDE_POSITION = 0.2, 0.2
+"""Of the prior about a first rig that was made from the same data: rad, and parts of the largest distance."""
+LARGEST_FOCAL_STD, LARGEST_ROTATION_STD, LARGEST_POSITION_STD = 0.08, 0.06, 0.1
+"""What a result may leave open: relative, rad, and parts of the largest distance between cameras. The direction of a
+long lens and its principal point are nearly one: an error of 30 px is as good as one of 0.025 rad."""
+LEAST_ALONE = 24
+"""Moments at which two cameras see one moving blob each."""
+
+
+def check_distance(distance: tuple[str, str, float], cameras: CameraRig) -> KnownDistance:
+    """Return the distance between two cameras that somebody gives, if it can be one.
+
+    Raises:
+        InputError: a camera that does not exist, twice the same, or no length.
+    """
+    first, second, length = distance
+    for name in (first, second):
+        if name not in cameras.camera_names:
+            raise InputError(f"distance: found camera {name:.80}, expected one of {', '.join(cameras.camera_names)}")
+    if first == second or not 1.0 <= length <= 1e6:
+        raise InputError(
+            f"distance: found {first} {second} {length:g}, expected two different cameras and their distance, 1 to "
+            "1e6 mm"
+        )
+    return KnownDistance(first, second, float(length), is_given=True)
+
+
+def calibrate_lights_from_scratch(
+    detections: Detections,
+    cameras: CameraRig,
+    obj: CalibrationObject,
+    options: PipelineOptions,
+    distance: tuple[str, str, float] | None = None,
+) -> Calibration:
+    """Do what `calibrate_from_scratch` does where nothing is known of the markers.
+
+    Args:
+        detections: blobs; labels are not looked at.
+        cameras: images and rough lenses, with a prior, float64.
+        obj: one point.
+        options: how sure the result must be.
+        distance: names of two cameras and their distance, mm; None = the rig is known up to scale.
+
+    Returns:
+        The rig in a frame in which the first of the two cameras is in the origin, and the second one on the x axis.
+
+    Raises:
+        RefusedError: the blobs cannot decide.
+        InputError: no such distance.
+    """
+    known = None if distance is None else check_distance(distance, cameras)
+    names = cameras.camera_names
+    pair = None if known is None else (names.index(known.first), names.index(known.second))
+    background = background_rows(detections)
+    moving = detections.select(~background)
+    learnt, tested = held_out(moving)
+    assert cameras.prior is not None
+    start = cold_start_from_points(_alone(learnt, cameras), cameras, pair)
+    first, pair = start.rig, start.pair
+    error = min(max(AFTER_ALIGNMENT * start.spread, 1.0), AFTER_ALIGNMENT)
+    trial = narrow(learnt, first, _wide(first, pair, cameras.prior), first, obj, error, joined=0)
+    if trial is None:
+        raise RefusedError(NOTHING)
+    agreement = agreement_of(tested, trial)
+    require_agreement(agreement, trial)
+    if known is None:
+        known = KnownDistance(names[pair[0]], names[pair[1]], 1000.0, is_given=False)
+    first = _scaled(in_frame_of_pair(trial, pair)[0], known.length / 1000.0)
+    found = associate_lights(moving, first, even_error(first))
+    lights = FoundLights(
+        rows_of_lights(found, moving, first),
+        detections,
+        np.flatnonzero(~background)[found.row[found.row >= 0]],
+        background,
+        agreement,
+        starts=1,
+    )
+    placed = replace(first, prior=_prior(first, cameras.prior))
+    std = _wide(first, pair, cameras.prior)
+    fit = fit_steady(lights.labelled, lights.labelled.detections, placed, obj, options, prior_std=std)
+    fit = replace(fit, lights=lights, distance=known)
+    _require_determined(fit, pair[0])
+    return fit
+
+
+def _alone(detections: Detections, cameras: CameraRig) -> Observations:
+    """What images with one usable blob show, of the moments at which two such images are.
+
+    Raises:
+        RefusedError: there are few.
+    """
+    moments, count = len(detections.snapshot_names), cameras.num_cameras
+    rows = np.flatnonzero(detections.usable)
+    image = detections.snapshot[rows] * count + detections.camera[rows]
+    alone = rows[np.bincount(image, minlength=moments * count)[image] == 1]
+    uv, sigma, seen = (
+        np.zeros((moments, count, 1, 2)),
+        np.ones((moments, count, 1)),
+        np.zeros((moments, count, 1), bool),
+    )
+    at = detections.snapshot[alone], detections.camera[alone], np.zeros(len(alone), dtype=np.int64)
+    uv[at], sigma[at], seen[at] = detections.uv[alone], detections.sigma[alone], True
+    kept: NDArray[np.bool_] = seen.sum((1, 2)) >= 2
+    if kept.sum() < LEAST_ALONE:
+        raise RefusedError(
+            f"start without a factory calibration: found {int(kept.sum())} snapshots in which two cameras see one "
+            f"moving blob each, expected at least {LEAST_ALONE}: carry one light alone through what the cameras see"
+        )
+    return Observations(*(torch.from_numpy(column[kept]) for column in (uv, sigma, seen)))
+
+
+def _scaled(rig: CameraRig, factor: float) -> CameraRig:
+    placed = RigidTransform(rig.cam_from_rig.rotation, factor * rig.cam_from_rig.translation)
+    return replace(rig, cam_from_rig=placed)
+
+
+def _apart(rig: CameraRig) -> float:
+    """Largest distance between two cameras, mm."""
+    return float(torch.cdist(rig.positions, rig.positions).max())
+
+
+def _prior(rig: CameraRig, lenses: RigPrior) -> RigPrior:
+    return replace(lenses, rotation=WIDE_ROTATION, position=WIDE_POSITION * _apart(rig))
+
+
+def _wide(rig: CameraRig, pair: tuple[int, int], lenses: RigPrior) -> torch.Tensor:
+    return prior_of_pair(rig, pair, lenses, WIDE_ROTATION, WIDE_POSITION * _apart(rig))
+
+
+def _require_determined(fit: Calibration, reference: int) -> None:
+    """Raise `RefusedError` where a camera is known so badly that the result would be a guess."""
+    rig = fit.rig
+    std = fit.estimate.covariance(reference).diagonal().clamp_min(0).sqrt().unflatten(0, (rig.num_cameras, -1))
+    relative = torch.stack(
+        (
+            (std[:, 6:8] / rig.focal_length).amax(1) / LARGEST_FOCAL_STD,
+            std[:, 0:3].amax(1) / LARGEST_ROTATION_STD,
+            std[:, 3:6].amax(1) / (LARGEST_POSITION_STD * _apart(rig)),
+        )
+    )
+    if bool((relative <= 1).all()):
+        return
+    kind, camera = divmod(int(relative.nan_to_num(torch.inf).argmax()), rig.num_cameras)
+    what = ("focal length", "direction", "position")[kind]
+    raise RefusedError(
+        f"start without a factory calibration: the data say too little about the {what} of camera "
+        f"{rig.camera_names[camera]}: carry the light through more of what it sees, nearer and farther"
+    )

@@ -1,0 +1,265 @@
+"""Markers of which nothing is known: how many captures are calibrated, refused and wrong, and how good the rigs are.
+
+Run as `python -m scripts.benchmarks.lights campaign|accuracy|stream`; each writes its part of
+docs/benchmarks/lights.json and goes on where it was stopped (out/work/lights.jsonl). Rig room10, factory values off by
+half a degree, 2 mm, 1 % and 5 px times the drift, blobs with a noise of 0.1 px, a quarter of them hidden, three false
+ones in each image, no labels. `stream` needs IMGCAL_CAPTURES.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+import torch
+import tyro
+from numpy.typing import NDArray
+from torch import Tensor
+
+import imgcal
+from imgcal import CalibrationObject, CameraRig, Detections, Observations, RefusedError, RigPrior, estimate
+from imgcal.estimation import relative_covariance, relative_difference
+from imgcal.geometry import RigidTransform
+from imgcal.synthesis import PhysicalDrift, simulate_volume
+from scripts.benchmarks.wand_recording import calibrated, recording
+from scripts.output import ROOT, WORK, command, make_folder, read_json, surroundings, write_json
+
+RESULT, DONE = ROOT / "docs" / "benchmarks" / "lights.json", WORK / "lights.jsonl"
+LIGHTS = CalibrationObject.unknown()
+NOISE, HIDDEN, FALSE = 0.1, 0.25, 3
+BODY = (500.0, 400.0, 1700.0)
+"""mm: the box in which the markers of a body are."""
+COUNTS, DRIFTS, SEEDS = (5, 15, 40, 100), (0.3, 1.0, 2.0), 5
+MOMENTS = {5: 60, 15: 40, 40: 24, 100: 12}
+WRONG_MM, WRONG_TIMES = 2.0, 5.0
+"""A rig is wrong whose median error is larger than this, and than so many times what it claims."""
+POINTS = 300
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A capture with its truth."""
+
+    factory: CameraRig
+    rig: CameraRig
+    detections: Detections  # in the order of moments
+    fiducial: NDArray[np.int64]  # (M,) marker of each blob, -1 = false
+    uv: Tensor  # (S, C, N, 2) without noise
+    visible: Tensor  # (S, C, N)
+    points: Tensor  # (S, N, 3) mm
+
+
+def simulate(markers: int, moments: int, drift: float, seed: int) -> Scene:
+    """Simulate a capture of a body in a room; one marker is a light that is carried around."""
+    generator, random = torch.Generator().manual_seed(seed), np.random.default_rng(seed)
+    physical = PhysicalDrift(0.5 * drift, 2.0 * drift, 0.01 * drift, 5.0 * drift, 0.005 * drift)
+    spread = (physical.focal_length, physical.principal_point, physical.distortion)
+    prior = RigPrior(*spread, float(np.deg2rad(physical.rotation_deg)), physical.position)
+    factory = replace(imgcal.load_rig("room10"), prior=prior)
+    rig = physical.apply(factory, generator)
+    box = torch.tensor(BODY if markers > 1 else (0.0, 0.0, 0.0), dtype=torch.float64)
+    body = (torch.rand(markers, 3, generator=generator, dtype=torch.float64) - 0.5) * box
+    obj = CalibrationObject(body, torch.ones(markers, 3).double())
+    truth = simulate_volume(rig, obj, moments, generator, None)
+    assert truth.visible is not None
+    seen = truth.visible.numpy() & (random.random(truth.visible.shape) > HIDDEN)
+    snapshot, camera, fiducial = np.nonzero(seen)
+    exact = truth.uv.numpy()[seen]
+    false = FALSE * moments * rig.num_cameras
+    size = rig.image_size[0].double().numpy() - 1
+    uv = np.concatenate((exact + NOISE * random.standard_normal(exact.shape), random.random((false, 2)) * size))
+    number = np.arange(false)
+    snapshot = np.concatenate((snapshot, number % moments))
+    camera = np.concatenate((camera, number // moments % rig.num_cameras))
+    fiducial = np.concatenate((fiducial, np.full(false, -1)))
+    order = np.lexsort((random.random(len(uv)), camera, snapshot))
+    count = len(order)
+    blobs = Detections(
+        uv[order], np.full(count, NOISE), camera[order], snapshot[order], np.full(count, -1), np.full(count, np.nan),
+        np.zeros(count, dtype=np.uint8), rig.camera_names, tuple(f"{moment:05d}" for moment in range(moments)),
+    )  # fmt: skip
+    points = truth.rig_from_object.apply(body)
+    return Scene(factory, rig, blobs, fiducial[order], truth.uv, truth.visible, points)
+
+
+def triangulation_error(rig: CameraRig, scene: Scene) -> float:
+    """Median error (mm) of points triangulated from exact images, after a rigid alignment."""
+    uv, seen, points = scene.uv.flatten(0, 0), scene.visible, scene.points
+    uv, seen = uv.permute(0, 2, 1, 3).flatten(0, 1), seen.permute(0, 2, 1).flatten(0, 1)
+    points = points.flatten(0, 1)
+    rows = (seen.sum(1) >= 2).nonzero().flatten()
+    rows = rows[torch.linspace(0, len(rows) - 1, min(POINTS, len(rows))).long()]
+    there, truth = (
+        Observations(uv[rows][:, :, None], torch.ones(len(rows), rig.num_cameras, 1).double(), seen[rows][..., None]),
+        points[rows],
+    )
+    start = RigidTransform(torch.eye(3).double().expand(len(rows), 3, 3), truth)
+    fixed = torch.zeros(rig.num_cameras, rig.num_parameters, dtype=torch.float64)
+    found = estimate(there, rig, replace(LIGHTS, unknown_markers=False), start, prior_std=fixed).rig_from_object
+    a, b = found.translation - found.translation.mean(0), truth - truth.mean(0)
+    u, _, vt = torch.linalg.svd(a.T @ b)
+    turn = u @ torch.diag(torch.tensor([1.0, 1.0, float(torch.det(u @ vt))]).double()) @ vt
+    return float((a @ turn - b).norm(dim=1).median())
+
+
+def with_labels(scene: Scene) -> imgcal.Estimate:
+    """Estimate the rig from the same blobs, told which of them belong together."""
+    right = np.flatnonzero(scene.fiducial >= 0)
+    blobs, marker = scene.detections, scene.fiducial[right]
+    markers = scene.uv.shape[2]
+    row = blobs.snapshot[right] * markers + marker
+    shape = (scene.uv.shape[0] * markers, scene.rig.num_cameras, 1)
+    uv, seen = np.zeros((*shape, 2)), np.zeros(shape, dtype=bool)
+    uv[row, blobs.camera[right], 0], seen[row, blobs.camera[right], 0] = blobs.uv[right], True
+    kept = seen.sum((1, 2)) >= 3
+    given = Observations(
+        torch.from_numpy(uv[kept]), torch.full(shape, NOISE).double()[: int(kept.sum())], torch.from_numpy(seen[kept])
+    )
+    points = scene.points.flatten(0, 1)[torch.from_numpy(kept)]
+    start = RigidTransform(torch.eye(3).double().expand(len(points), 3, 3), points)
+    return estimate(given, scene.factory, replace(LIGHTS, unknown_markers=False), start)
+
+
+def normalized_error(found: imgcal.Estimate, truth: CameraRig) -> float:
+    """Mean square of the rig's error, relative to its first camera, over its covariance."""
+    error, covariance = relative_difference(found.rig, truth).flatten(), relative_covariance(found)
+    std = covariance.diagonal().clamp_min(0).sqrt()
+    known = std > 1e-12
+    scaled = (error / std.clamp_min(1e-30))[known]
+    values, vectors = torch.linalg.eigh((covariance / (std[:, None] * std).clamp_min(1e-60))[known][:, known])
+    along = (vectors.mT @ scaled).square() / values
+    return float(along[values > 1e-9].mean())
+
+
+def examine(scene: Scene) -> dict[str, Any]:
+    """Calibrate a capture and compare with the truth."""
+    started = time.process_time()
+    result: dict[str, Any] = {"factory_mm": triangulation_error(scene.factory, scene)}
+    try:
+        found = imgcal.calibrate(scene.detections, scene.factory, LIGHTS)
+    except RefusedError as error:
+        return result | {"status": "refused", "reason": str(error)[:160], "cpu_s": time.process_time() - started}
+    assert found.lights is not None
+    labels = found.labelled_detections.fiducial
+    truth, kept = scene.fiducial, labels >= 0
+    key = scene.detections.snapshot * 1000 + labels
+    _, group = np.unique(key[kept], return_inverse=True)
+    main = np.array([np.bincount(truth[kept][group == g] + 1).argmax() - 1 for g in range(group.max() + 1)])
+    wrong = (truth[kept] != main[group]) | (truth[kept] < 0)
+    error, claimed = triangulation_error(found.rig, scene), found.predicted_error.median_mm
+    is_wrong = error > WRONG_MM and error > WRONG_TIMES * claimed
+    return result | {
+        "status": "wrong" if is_wrong else "calibrated",
+        "error_mm": error,
+        "claimed_mm": claimed,
+        "labels": int(kept.sum()),
+        "labels_of": int((truth >= 0).sum()),
+        "wrong_labels": int(wrong.sum()),
+        "starts": found.lights.starts,
+        "nees": normalized_error(found.estimate, scene.rig),
+        "scale_sigma_percent": 100 * found.scale.sigma,
+        "cpu_s": time.process_time() - started,
+    }
+
+
+def campaign() -> Iterable[dict[str, Any]]:
+    """Captures of all kinds, easy ones first."""
+    for seed in range(SEEDS):
+        for markers in COUNTS:
+            for drift in DRIFTS:
+                yield {
+                    "part": "campaign",
+                    "markers": markers,
+                    "moments": MOMENTS[markers],
+                    "drift": drift,
+                    "seed": seed,
+                }
+
+
+def accuracy() -> Iterable[dict[str, Any]]:
+    """The cases whose accuracy is compared with the estimate that is told the labels."""
+    for seed in range(SEEDS):
+        for markers, moments in ((1, 450), (1, 2000), (40, 50)):
+            yield {"part": "accuracy", "markers": markers, "moments": moments, "drift": 1.0, "seed": 100 + seed}
+
+
+def run(case: dict[str, Any]) -> dict[str, Any]:
+    """Simulate and examine one case."""
+    scene = simulate(case["markers"], case["moments"], case["drift"], case["seed"])
+    found = examine(scene)
+    if case["part"] == "accuracy":
+        told = with_labels(scene)
+        found |= {"told_mm": triangulation_error(told.rig, scene), "told_nees": normalized_error(told, scene.rig)}
+    return case | found
+
+
+def stream() -> dict[str, Any]:
+    """The recorded wand: fitted without labels on the first half, scored on the second with the whole wand."""
+    reference, given = calibrated(), recording()
+    labelled = reference.calibration.labelled_detections
+    captures = {"all as unknown markers": given.chosen(range(0, 2400, 8))}
+    for marker in range(given.obj.num_fiducials):
+        captures[f"marker {marker} alone"] = labelled.select(labelled.fiducial == marker)
+    rows: dict[str, Any] = {"whole wand known": {"held_out_px": reference.score(reference.calibration.rig)[0]}}
+    for name, blobs in captures.items():
+        found = imgcal.calibrate(replace(blobs, flags=np.zeros_like(blobs.flags)), given.factory, LIGHTS)
+        rms, median = reference.score(found.rig)
+        rows[name] = {"markers": len(found.labelled.used), "held_out_px": rms, "median_px": median}
+    return rows
+
+
+def tables(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Count and take medians."""
+    result: dict[str, Any] = {}
+    for row in rows:
+        key = f"{row['markers']} markers x {row['moments']}, drift {row['drift']:g}"
+        entry = result.setdefault(row["part"], {}).setdefault(
+            key, {"calibrated": 0, "refused": 0, "wrong": 0, "rows": []}
+        )
+        entry[row["status"]] += 1
+        entry["rows"].append(row)
+    for part in result.values():
+        for entry in part.values():
+            for name in ("error_mm", "claimed_mm", "factory_mm", "told_mm", "nees", "told_nees", "cpu_s"):
+                values = [row[name] for row in entry["rows"] if name in row]
+                if values:
+                    entry[f"median_{name}"] = float(np.median(values))
+            entry["wrong_labels"] = sum(row.get("wrong_labels", 0) for row in entry["rows"])
+            entry["labels"] = sum(row.get("labels", 0) for row in entry["rows"])
+    return result
+
+
+@dataclass(frozen=True)
+class Options:
+    """Captures of unknown markers, counted as calibrated, refused and wrong."""
+
+    part: tyro.conf.Positional[Literal["campaign", "accuracy", "stream"]]
+
+
+def main() -> None:
+    """Measure, and write the figures."""
+    options = tyro.cli(Options, description=__doc__)
+    torch.set_num_threads(1)
+    result = read_json(RESULT) if RESULT.is_file() else {}
+    if options.part == "stream":
+        write_json(RESULT, surroundings() | result | {"stream": stream()})
+        return
+    make_folder(DONE.parent)
+    done = [json.loads(line) for line in DONE.read_text().splitlines()] if DONE.is_file() else []
+    for case in campaign() if options.part == "campaign" else accuracy():
+        if any(case.items() <= row.items() for row in done):
+            continue
+        row = run(case)
+        done.append(row)
+        with DONE.open("a") as file:
+            file.write(json.dumps(row) + "\n")
+        print(row, flush=True)
+    write_json(RESULT, surroundings() | result | tables(done))
+
+
+if __name__ == "__main__":
+    command(main)

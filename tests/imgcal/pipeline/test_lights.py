@@ -1,0 +1,90 @@
+"""Calibration from markers of which nothing is known: right where it answers, one line where it refuses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import imgcal
+from imgcal import InputError, RefusedError
+from scripts.benchmarks.lights import LIGHTS, Scene, simulate, triangulation_error
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return simulate(markers=12, moments=24, drift=1.0, seed=2)
+
+
+@pytest.fixture(scope="module")
+def result(scene: Scene) -> imgcal.Calibration:
+    return imgcal.calibrate(scene.detections, scene.factory, LIGHTS)
+
+
+def test_rig_is_found(scene: Scene, result: imgcal.Calibration) -> None:
+    assert triangulation_error(scene.factory, scene) > 4
+    assert triangulation_error(result.rig, scene) < 2
+    assert 0.9 < float(result.chi2_per_dof) < 1.1
+    assert result.moments == (24, 24)
+    assert result.scale.source == "cameras"
+
+
+def test_labels_hold_at_their_moment(scene: Scene, result: imgcal.Calibration) -> None:
+    labelled = result.labelled_detections
+    assert len(labelled) == len(scene.detections)
+    kept = labelled.fiducial >= 0
+    assert kept.sum() > 0.95 * (scene.fiducial >= 0).sum()
+    assert (scene.fiducial[kept] >= 0).mean() > 0.995
+    rows = np.stack((labelled.snapshot, labelled.camera, labelled.fiducial))[:, kept]
+    assert len(np.unique(rows, axis=1).T) == kept.sum()  # one blob a camera, moment and marker
+
+
+def test_held_out_moments_and_cameras_agree(result: imgcal.Calibration) -> None:
+    assert result.lights is not None
+    agreement = result.lights.agreement
+    assert agreement.agrees.all()
+    assert (agreement.found > 0.6).all()
+    assert (np.abs(agreement.near_misses) < 0.05).all()
+
+
+def test_a_recalibrated_rig_is_right_at_once(scene: Scene, result: imgcal.Calibration) -> None:
+    again = imgcal.calibrate(scene.detections, result.rig, LIGHTS)
+    assert again.lights is not None
+    assert again.lights.starts == 0
+
+
+def test_labels_of_the_input_are_not_looked_at(scene: Scene, result: imgcal.Calibration) -> None:
+    misled = replace(scene.detections, fiducial=np.arange(len(scene.detections)) % 7)
+    found = imgcal.calibrate(misled, scene.factory, LIGHTS)
+    assert torch.equal(found.rig.focal_length, result.rig.focal_length)
+
+
+def test_score(scene: Scene, result: imgcal.Calibration) -> None:
+    good, poor = (imgcal.score(scene.detections, rig, LIGHTS) for rig in (result.rig, scene.factory))
+    assert float(good.distances.median()) < 0.15
+    assert float(poor.distances.median()) > 4
+    assert good.moments == (24, 24)
+
+
+def test_blobs_of_nothing_are_refused(scene: Scene) -> None:
+    random = np.random.default_rng(0)
+    noise = replace(scene.detections, uv=random.random(scene.detections.uv.shape) * [1279, 1023])
+    with pytest.raises(RefusedError, match="unknown markers: "):
+        imgcal.calibrate(noise, scene.factory, LIGHTS)
+
+
+def test_a_camera_of_another_moment_is_refused(scene: Scene) -> None:
+    late = scene.detections.camera == 5
+    snapshot = np.where(late, (scene.detections.snapshot + 1) % 24, scene.detections.snapshot)
+    with pytest.raises(RefusedError, match=r"unknown markers: camera .*cam06"):
+        imgcal.calibrate(replace(scene.detections, snapshot=snapshot), scene.factory, LIGHTS)
+
+
+def test_few_snapshots_are_refused(scene: Scene) -> None:
+    with pytest.raises(RefusedError, match="found 4 snapshots, expected at least 8"):
+        imgcal.calibrate(scene.detections.of_snapshots(0, 4), scene.factory, LIGHTS)
+
+
+def test_a_pattern_to_look_for_is_asked_for(scene: Scene) -> None:
+    with pytest.raises(InputError, match="unknown markers"):
+        imgcal.calibrate(scene.detections, scene.factory, LIGHTS, detector="matched")
