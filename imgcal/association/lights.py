@@ -7,6 +7,7 @@ markers are apart, `align_rig` brings it nearer first, from the blobs of many mo
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -115,8 +116,8 @@ def associate_lights(
     half = 0.5 * rig.image_size.double().numpy() / focal
     gate = np.asarray(error, dtype=np.float64) / focal.mean(1)
     count = find_all_lights(
-        blobs.xy, blobs.start, np.ascontiguousarray(rotation), np.ascontiguousarray(position), gate, half, least_odds, least_cameras,
-        chosen, point, odds, margin, moment,
+        blobs.xy, blobs.start, np.ascontiguousarray(rotation), np.ascontiguousarray(position), gate, half, least_odds,
+        least_cameras, chosen, point, odds, margin, moment,
     )  # fmt: skip
     chosen = chosen[:count]
     row = np.where(chosen >= 0, blobs.row[np.maximum(chosen, 0)] if len(blobs.row) else -1, -1)
@@ -255,7 +256,7 @@ def align_camera(
 
 def _spread_area(blobs: SortedBlobs, start: NDArray[np.int64]) -> float:
     """Area that the blobs of one moment cover, on the plane z = 1: the median over moments, four deviations wide."""
-    parts = [blobs.xy[a:b] for a, b in zip(start, start[1:], strict=False) if b - a > 2]
+    parts = [blobs.xy[a:b] for a, b in pairwise(start) if b - a > 2]
     sides = [16 * float(np.prod(np.std(part, axis=0))) for part in parts]
     return max(float(np.median(sides)) if sides else 1.0, 1e-4)
 

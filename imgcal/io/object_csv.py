@@ -30,7 +30,6 @@ LIGHTS = "lights"
 SMALLEST = 1e-3  # mm, extent of an object
 LARGEST_LABEL = 2**31 - 1
 BOARD_SUFFIXES = (".yaml", ".yml")
-LIGHTS = "lights"  # in place of a file: nothing is known of what is seen
 NAME = "a different name for every point"
 
 
