@@ -64,9 +64,12 @@ class LightTracks:
                 break
             number[light] = known
             distance[light], distance[:, known] = np.inf, np.inf
-        free = iter(np.flatnonzero(~np.isin(np.arange(len(self.place)), number) & np.isnan(self.place[:, 0])).tolist())
-        for light in np.flatnonzero(number < 0).tolist():
-            number[light] = next(free, -1)
+        left = np.flatnonzero(~np.isin(np.arange(len(self.place)), number))  # free ones first, then those long hidden
+        left = left[np.lexsort((self.time[left], np.isfinite(self.place[left, 0])))]
+        self.place[left[: (number < 0).sum()]] = np.nan
+        free = iter(sorted(left[: (number < 0).sum()].tolist()))
+        for unnumbered in np.flatnonzero(number < 0).tolist():
+            number[unnumbered] = next(free, -1)
         kept = number >= 0
         mine, there = number[kept], points[kept]
         passed = since[mine, None]

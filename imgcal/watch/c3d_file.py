@@ -71,7 +71,7 @@ class C3DFile:
         """
         if self.frames + len(points) > MOST_FRAMES:
             raise OSError(f"a C3D file holds no more than {MOST_FRAMES:,} frames")
-        valid = np.isfinite(points).all(-1)
+        valid = np.asarray(np.isfinite(points).all(-1))
         steps = np.ceil(np.where(valid, error, 0) / self._scale).clip(1, MOST_BYTE)  # 0 means: not measured
         rows = np.empty((*points.shape[:2], 4), "<f4")
         rows[..., :3] = np.where(valid[..., None], points, 0.0)

@@ -13,6 +13,7 @@ import imgcal
 from imgcal.errors import InputError
 from imgcal.monitoring import CHANGES
 from imgcal.online import Event, RigKeeper, RigState
+from imgcal.synthesis import simulate_volume, true_detections
 from imgcal.types import CameraRig, Detections, RigPrior
 from scripts.benchmarks.rig_streams import Bump, Conditions, Slip, Stream
 
@@ -387,3 +388,58 @@ def test_a_small_turn_during_a_long_pause_is_decided_within_a_second(degrees: fl
                 assert state.cameras["cam02"] in ("ok", "relearning")
     error = state.gauge.difference(state.rig, made.rig)[1, :3].norm()
     assert math.degrees(float(error)) < 0.5 * degrees
+
+
+def lights(count: int, bumped: int | None = None) -> tuple[CameraRig, list[Detections]]:
+    """A rig of ten cameras, and snapshots of four markers of which nothing is known; camera 2 is bumped at one."""
+    rig, wand = imgcal.load_rig("room10"), imgcal.load_object("wand4")
+    rig = replace(rig, prior=RigPrior(0.001, 0.5, 0.002, 0.0005, 0.5))
+    seen = true_detections(simulate_volume(rig, wand, count, torch.Generator().manual_seed(4), None))
+    noise = np.random.default_rng(4).normal(size=seen.uv.shape)
+    moved = (seen.camera == 2) & (seen.snapshot >= (count if bumped is None else bumped))
+    uv = seen.uv + 0.1 * noise + np.where(moved[:, None], (6.0, -4.0), 0.0)
+    blobs = replace(seen, uv=uv, sigma=np.full(len(seen), 0.1), fiducial=np.full(len(seen), -1))
+    return rig, [blobs.of_snapshots(s, s + 1) for s in range(count)]
+
+
+def test_lights_of_which_nothing_is_known_keep_a_rig_calibrated(tmp_path: Path) -> None:
+    rig, snapshots = lights(24)
+    states, file = [], tmp_path / "state.json"
+    with RigKeeper(rig, imgcal.load_object("lights")) as keeper:
+        for number, blobs in enumerate(snapshots):
+            if number == 20:
+                keeper.save(file)
+            states.append(keeper.update(blobs, number / 10))
+    assert not [event for state in states for event in state.events]
+    assert all(state.refused is None and state.rig_from_object is None for state in states)
+    assert states[-1].sentence.startswith("all 10 cameras are calibrated; their scale is known to +- 0.0")
+    first, last = states[0], states[-1]
+    assert float((last.std[:, :3] / first.std[:, :3]).max()) < 0.9
+    assert normalized(last, rig) < 1.6
+    size, sigma = last.scale
+    assert abs(size) < 3 * sigma
+    assert sigma > 0.9 * first.scale[1]
+    with RigKeeper.restore(file) as again:
+        for number in range(20, 24):
+            state = again.update(snapshots[number], number / 10)
+            assert torch.equal(state.belief.factor, states[number].belief.factor)
+            np.testing.assert_array_equal(state.detections.fiducial, states[number].detections.fiducial)
+
+
+def test_lights_reveal_a_camera_that_was_bumped() -> None:
+    rig, snapshots = lights(60, bumped=30)
+    with RigKeeper(rig, imgcal.load_object("lights")) as keeper:
+        events = [event for number, blobs in enumerate(snapshots) for event in keeper.update(blobs, number / 10).events]
+    assert {(event.kind, event.camera) for event in events if event.kind != "relearnt"} == {("moved", "cam03")}
+    assert 30 <= events[0].snapshot <= 45
+
+
+def test_one_light_is_followed_whatever_its_file_says_of_its_place() -> None:
+    rig, snapshots = lights(8)
+    one = imgcal.CalibrationObject(torch.tensor([[3.0, 0.0, 0.0]]), torch.ones(1, 3), name="lamp")
+    with RigKeeper(rig, one) as keeper:
+        states = [keeper.update(blobs, number / 10) for number, blobs in enumerate(snapshots)]
+    assert keeper.obj.num_fiducials == 1
+    learnt = [state for state in states if state.refused is None]
+    assert len(learnt) > 4
+    assert all(int(state.detections.fiducial.max()) == 0 for state in learnt)
