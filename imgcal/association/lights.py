@@ -277,7 +277,7 @@ def background_rows(detections: Detections) -> NDArray[np.bool_]:
         ...     np.concatenate((lamp, light)), np.full(40, 0.1), np.zeros(40, dtype=int), np.tile(moments, 2),
         ...     np.full(40, -1), np.full(40, np.nan), np.zeros(40, dtype=np.uint8), ("left",), tuple(map(str, moments)),
         ... )
-        >>> background_rows(blobs).sum()
+        >>> int(background_rows(blobs).sum())
         20
     """
     marked = np.zeros(len(detections), dtype=bool)
