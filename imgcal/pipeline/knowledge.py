@@ -13,6 +13,8 @@ FIELDS = 8
 """An image is divided into 8 x 8 fields to count how much of it was reached."""
 UNDETERMINED = 0.8
 """A value is not determined by the data when its standard deviation is still this share of the prior's."""
+HELD = 1e-5
+"""A value whose prior is narrower is held: nobody asks the data for it."""
 LITTLE = 0.5
 """Share of its image that a camera has seen the object in, below which it is said where to go."""
 LEAST_SEEN = 4
@@ -93,7 +95,7 @@ def knowledge_of(calibration: Calibration, std: Tensor) -> Knowledge:
     """
     rig = calibration.rig
     prior = calibration.estimate.problem.prior_std[0]
-    unknown = ((std > UNDETERMINED * prior) & (prior > 0))[:, 6:]
+    unknown = ((std > UNDETERMINED * prior) & (prior > HELD))[:, 6:]
     undetermined: dict[str, tuple[str, ...]] = {}
     for number, camera in unknown.mT.nonzero().tolist():
         name = rig.parameter_names_of(camera)[6 + number]  # lenses differ in what a number means

@@ -43,8 +43,10 @@ class LabStreaming:
         found = NAME.fullmatch(self.address)
         if found is None:
             raise InputError(f"{shortened(self.address)}: expected lsl://NAME, the name of one or more streams")
-        import pylsl  # not in the core
-
+        try:
+            import pylsl  # not in the core
+        except (OSError, RuntimeError) as error:  # its wheels for some machines bring no library along
+            raise InputError(f"{self.address}: pylsl finds no liblsl, which has to be installed: {error}") from error
         resolver = pylsl.ContinuousResolver(prop="name", value=found[1])
         streams: dict[str, _Stream | None] = {}  # by LSL's own number of a stream; None = of no use
         looked = float("-inf")

@@ -286,7 +286,7 @@ def different_doubles(before: bytes, after: bytes) -> int:
     """Runs of bytes that differ, each within the eight of a number."""
     places = np.flatnonzero(np.frombuffer(before, np.uint8) != np.frombuffer(after, np.uint8))
     count, end = 0, -1
-    for place in places:
+    for place in places.tolist():
         if place >= end:
             count, end = count + 1, place + 8
     return count

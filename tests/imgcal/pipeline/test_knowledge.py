@@ -9,6 +9,7 @@ from imgcal.geometry import RigidTransform
 from imgcal.io import load_object, load_rig
 from imgcal.pipeline import Knowledge, calibrate, knowledge_of
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
+from imgcal.types import RigPrior
 
 
 def std_of(result):
@@ -64,6 +65,14 @@ def test_all_is_known_where_the_object_was_everywhere():
     assert known.sentences == () and known.advice == ""
     some = replace(known, undetermined={"k2": ("a",), "k3": ("a", "b")})
     assert some.sentences == ("Not determined by these data, the factory's values stand: k2 in a; k3 in all cameras.",)
+
+
+def test_a_lens_that_is_held_is_not_said_to_be_undetermined(narrow):
+    truth, result = narrow
+    rig = load_rig("T4")
+    held = replace(rig, prior=replace(result.rig.prior or RigPrior(), distortion=1e-6))
+    known = knowledge_of(found := calibrate(true_detections(truth), held, load_object("asymmetric8")), std_of(found))
+    assert not set(known.undetermined) & {"k1", "k2", "p1", "p2", "k3"}
 
 
 def test_a_wide_capture_covers_more(narrow):
