@@ -249,9 +249,9 @@ def align_camera(
         whole[camera, :FREE] = torch.from_numpy(step) * whitening
         moved = moved.retract(whole)
         width = max(width * SHRINK, NARROWEST)
-    step = torch.zeros_like(std)
-    step[camera] = moved.local(now)[camera]
-    return now.retract(step)
+    change = torch.zeros_like(std)
+    change[camera] = moved.local(now)[camera]
+    return now.retract(change)
 
 
 def _spread_area(blobs: SortedBlobs, start: NDArray[np.int64]) -> float:

@@ -171,7 +171,7 @@ def _chained(rays: Array, seen: NDArray[np.bool_], focal: Array) -> RigidTransfo
         )  # fmt: skip
         if not good or inliers is None or len(inliers) < LEAST_COMMON:
             return None
-        placed[camera] = cv2.Rodrigues(vector)[0], shift[:, 0]
+        placed[camera] = np.asarray(cv2.Rodrigues(vector)[0], np.float64), np.asarray(shift[:, 0], np.float64)
     order = range(cameras)
     turns, shifts = np.stack([placed[c][0] for c in order]), np.stack([placed[c][1] for c in order])
     return RigidTransform(torch.from_numpy(turns), torch.from_numpy(shifts))
@@ -179,8 +179,8 @@ def _chained(rays: Array, seen: NDArray[np.bool_], focal: Array) -> RigidTransfo
 
 def _first_pair(rays: Array, seen: NDArray[np.bool_], slack: float) -> tuple[tuple[int, int], Array, Array] | None:
     """Two cameras to begin with: many points in common, seen from different sides."""
-    best, worth = None, 0.0
-    cameras = seen.shape[1]
+    best: tuple[tuple[int, int], Array, Array] | None = None
+    worth, cameras = 0.0, seen.shape[1]
     for a in range(cameras):
         for b in range(a + 1, cameras):
             rows = seen[:, a] & seen[:, b]
@@ -200,7 +200,8 @@ def _first_pair(rays: Array, seen: NDArray[np.bool_], slack: float) -> tuple[tup
             angle = float(np.median(np.arccos(np.clip(cosine[inside], -1, 1))))
             value = count * min(np.sin(angle), 0.5) * count / len(one)
             if angle > LEAST_ANGLE and value > worth:
-                best, worth = ((a, b), rotation, translation[:, 0]), value
+                found = np.asarray(rotation, np.float64), np.asarray(translation[:, 0], np.float64)
+                best, worth = ((a, b), *found), value
     return best
 
 

@@ -46,8 +46,8 @@ def absorb(
         ValueError: there are not as many poses as snapshots.
     """
     if rig_from_object.translation.shape[0] != observations.seen.shape[0]:
-        given = f"{rig_from_object.translation.shape[0]} poses of {observations.seen.shape[0]} snapshots"
-        raise ValueError(f"rig_from_object: found {given}, expected one of each")
+        counts = f"{rig_from_object.translation.shape[0]} poses of {observations.seen.shape[0]} snapshots"
+        raise ValueError(f"rig_from_object: found {counts}, expected one of each")
     constants, unit, shake = belief.constants, belief.unit, observations.shake
     given, shown = rig_from_object, None
     if isinstance(belief.obj, UnknownLights):
@@ -61,7 +61,7 @@ def absorb(
     centre, shared = translation + rotation @ constants.centroid, constants.shared
     if shown is not None:
         centre, rotation = centre.reshape(len(seen), -1, 3), rotation[: len(seen)]
-        shared = (*(part[: seen.shape[2]] for part in shared[:2]), shared[2])
+        shared = (*(None if part is None else part[: seen.shape[2]] for part in shared[:2]), shared[2])
     shaken = np.empty((0, 0)) if shake is None else np.ascontiguousarray(shake.double().numpy())
     loss = (lm_cpu.LOSS_CODES[options.loss], float(options.threshold))
     found = measurement_update_cpu.absorb(

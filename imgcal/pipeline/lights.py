@@ -198,10 +198,10 @@ def _verified_rig(detections: Detections, rig: CameraRig, obj: CalibrationObject
     learnt, tested = held_out(detections)
     std = (rig.prior or RigPrior()).std(rig)
     generator = torch.Generator().manual_seed(0)
-    best = agreement_of(tested, rig)
-    if bool(best.agrees.all()):
-        return rig, best, 0
-    best = best if best.judged.any() else None
+    factory = agreement_of(tested, rig)
+    if bool(factory.agrees.all()):
+        return rig, factory, 0
+    best = factory if factory.judged.any() else None
     for start in range(STARTS):
         random = torch.randn(std.shape, generator=generator, dtype=std.dtype)
         trial = _followed(learnt, rig, rig.retract(SPREAD[start] * random * std), obj, start)

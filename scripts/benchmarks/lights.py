@@ -150,11 +150,11 @@ def examine(scene: Scene) -> dict[str, Any]:
     _, group = np.unique(key[kept], return_inverse=True)
     main = np.array([np.bincount(truth[kept][group == g] + 1).argmax() - 1 for g in range(group.max() + 1)])
     wrong = (truth[kept] != main[group]) | (truth[kept] < 0)
-    error, claimed = triangulation_error(found.rig, scene), found.predicted_error.median_mm
-    is_wrong = error > WRONG_MM and error > WRONG_TIMES * claimed
+    off, claimed = triangulation_error(found.rig, scene), found.predicted_error.median_mm
+    is_wrong = off > WRONG_MM and off > WRONG_TIMES * claimed
     return result | {
         "status": "wrong" if is_wrong else "calibrated",
-        "error_mm": error,
+        "error_mm": off,
         "claimed_mm": claimed,
         "labels": int(kept.sum()),
         "labels_of": int((truth >= 0).sum()),

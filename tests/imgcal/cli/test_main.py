@@ -140,7 +140,8 @@ def test_an_interruption_during_start_up_is_one_line(slow, arguments, tmp_path):
         (["simulate", "--rig", "T4", "--object", "cube8", "--out", "o", "--snapshots", "2x"],
          "--snapshots: found 2x, expected an integer; see imgcal simulate --help"),
         (["calibrate"],
-         "missing PATH (capture folder or detections file), --object, --out; see imgcal calibrate --help"),
+         "missing PATH (capture folder, detections file, or a shipped sample (sample:O10)), --object, --out; "
+         "see imgcal calibrate --help"),
     ],
 )  # fmt: skip
 def test_a_mistyped_command_line_is_answered_briefly(arguments, expected, capsys):

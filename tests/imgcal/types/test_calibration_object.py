@@ -121,12 +121,10 @@ def test_a_stick_has_two_ends_and_a_light_has_no_symmetry() -> None:
     np.testing.assert_allclose(moved, pair.points.double().numpy()[::-1], atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("points", "found"), [([[0.0, 0, 0]], "one fiducial"), ([[0.0, 0, 0], [500, 0, 0]], "2 fiduc")]
-)
-def test_lights_and_sticks_are_refused_where_they_are_not_supported_yet(points, found):
-    obj = CalibrationObject(torch.tensor(points, dtype=torch.float64), torch.ones(len(points), 3).double(), name="it")
-    with pytest.raises(InputError, match=f"object it: found {found}.* for a running rig"):
+def test_sticks_are_refused_where_they_are_not_supported_yet():
+    points = torch.tensor([[0.0, 0, 0], [500, 0, 0]], dtype=torch.float64)
+    obj = CalibrationObject(points, torch.ones(2, 3).double(), name="it")
+    with pytest.raises(InputError, match=r"object it: found 2 fiducials on one line.* for a running rig"):
         imgcal.RigKeeper(imgcal.load_rig("T4"), obj)
     with pytest.raises(InputError, match="without a factory calibration"):
         calibrate_from_scratch({}, imgcal.load_rig("T4"), obj)
