@@ -131,9 +131,11 @@ def _scored(labelled: Associations, rig: CameraRig, obj: CalibrationObject, opti
     fixed = torch.zeros(*rig.distortion.shape[:-1], rig.num_parameters, dtype=rig.distortion.dtype)
     # What is reported is an RMS in pixels: centres count alike, however well each was measured.
     even = replace(observations, sigma=torch.full_like(observations.sigma, options.identity_error))
-    least = LEAST_OF_LIGHT if obj.pose_rank == 3 else LEAST_POINTS
+    least, solver = LEAST_POINTS, options.estimation
+    if obj.pose_rank == 3:  # plain triangulation: a robust one has several minima where a rig is far off
+        least, solver = LEAST_OF_LIGHT, replace(options.estimation, loss="squared")
     for _ in range(ROUNDS):
-        fit = estimate(even, rig, obj.taken_as_exact(), poses, prior_std=fixed, options=options.estimation)
+        fit = estimate(even, rig, obj.taken_as_exact(), poses, prior_std=fixed, options=solver)
         if not bool(fit.converged):
             raise RefusedError(
                 "score: in some snapshot no pose of the object fits what the cameras see (RMS "
