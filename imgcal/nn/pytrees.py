@@ -126,4 +126,4 @@ register(
     CameraRig,
     ("image_size", "camera_names", "name", "working_distance", "prior", "drift_rate", "volume", "lens_model"),
 )
-register(CalibrationObject, ("name", "fiducial_names", "scale_tolerance"))
+register(CalibrationObject, ("name", "fiducial_names", "scale_tolerance", "unknown_markers"))
