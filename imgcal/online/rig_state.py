@@ -88,7 +88,8 @@ class RigState:
     def scale(self) -> tuple[float, float]:
         """Size of the rig against the factory's, relative, and one standard deviation of it.
 
-        Lights of which nothing is known say nothing of it: it stays as well known as it was, or becomes less so.
+        Lights of which nothing is known say nothing of it by themselves. It goes along with what they teach of the
+        cameras as far as a calibration has left both open together.
         """
         now, before = (rig.positions - rig.positions.mean(0) for rig in (self.rig, self.factory))
         return float((now.norm() / before.norm()) - 1), self.belief.scale_std()
