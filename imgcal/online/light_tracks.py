@@ -65,7 +65,8 @@ class LightTracks:
             number[light] = known
             distance[light], distance[:, known] = np.inf, np.inf
         left = np.flatnonzero(~np.isin(np.arange(len(self.place)), number))  # free ones first, then those long hidden
-        left = left[np.lexsort((self.time[left], np.isfinite(self.place[left, 0])))]
+        hidden = np.isfinite(self.place[left, 0])
+        left = left[np.lexsort((np.where(hidden, self.time[left], 0.0), hidden))]
         self.place[left[: (number < 0).sum()]] = np.nan
         free = iter(sorted(left[: (number < 0).sum()].tolist()))
         for unnumbered in np.flatnonzero(number < 0).tolist():
