@@ -49,7 +49,6 @@ TESTED_ELSEWHERE = {
     "imgcal/association/options.py": "values only",
     "imgcal/association/result.py": "values only",
     "imgcal/cli/arguments.py": "values only; test_imports, cli/test_help",
-    "imgcal/cli/describe.py": "cli/test_calibrate reads the reports that it makes",
     "imgcal/cli/detect.py": "cli/test_main, test_warmup",
     "imgcal/pipeline/calibration.py": "pipeline/test_recalibration",
     "imgcal/pipeline/fitting.py": "pipeline/test_recalibration, test_from_scratch",

@@ -129,7 +129,7 @@ def test_an_exact_object_of_many_fiducials_is_asked_about_its_scale_alone(monkey
 
 def test_the_scale_of_a_single_camera_is_not_known_in_either_way(simulate) -> None:
     case = simulate(snapshots=1, cameras=1, missing=0.0)
-    wide = 1e5 * case.prior_std
+    wide = 1e4 * case.prior_std
     found = estimate(case.observations, case.factory, case.obj, case.poses, prior_std=wide)
     expected = shape_evidence(found.problem, found.solution, LOSS).scale_error
     assert scale_evidence(found.problem, found.solution, LOSS).scale_error == pytest.approx(expected, rel=1e-2)

@@ -7,7 +7,7 @@ import torch
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.io import load_rig
-from imgcal.nn import project_fiducials, reprojection_re
+from imgcal.nn import project_fiducials, rms_per_axis
 from imgcal.synthesis.rigs import RelativeDrift, synthesize
 from imgcal.training.losses import (
     ExtraLoss,
@@ -100,7 +100,7 @@ def test_the_reprojection_gradient_reaches_the_object_pose(truth, asymmetric8):
     pose = RigidTransform(rotation_from_vector(vector), shift) @ truth.rig_from_object
     cameras = truth.rig.from_object(pose)
     difference = project_fiducials(cameras, asymmetric8) - project_fiducials(truth.cameras_from_object, asymmetric8)
-    reprojection_re(difference).sum().backward()
+    rms_per_axis(difference).sum().backward()
     for grad in (vector.grad, shift.grad):
         assert grad.isfinite().all() and (grad != 0).all()
 
@@ -121,7 +121,7 @@ def test_re_is_the_mean_over_axes_cameras_and_fiducials():
     difference[0, ..., 0] = 3.0  # every u off by 3: RE = 3 / sqrt(2)
     difference[1, 0, 0, 1] = 4.0
     expected = torch.tensor([3 / math.sqrt(2), 4 / math.sqrt(2 * C * N)])
-    torch.testing.assert_close(reprojection_re(difference), expected)
+    torch.testing.assert_close(rms_per_axis(difference), expected)
     torch.testing.assert_close(reprojection_rmse(difference), expected.square().mean().sqrt())
 
 
