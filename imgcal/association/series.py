@@ -47,6 +47,53 @@ class Associations:
         return [i for i, snapshot in enumerate(self.snapshots) if snapshot.status != "refused"]
 
     @property
+    def moments(self) -> NDArray[np.int64]:
+        """Number of the input's snapshot that each row is of: (S,).
+
+        With one object, rows are snapshots. With several, a row is an object that was identified in a snapshot.
+        """
+        return np.array([row if s.moment < 0 else s.moment for row, s in enumerate(self.snapshots)], dtype=np.int64)
+
+    @property
+    def part_of_rows(self) -> NDArray[np.int64]:
+        """Number of the object that each of the used rows shows: (U,)."""
+        return np.array([self.snapshots[row].part for row in self.used], dtype=np.int64)
+
+    def columns(self, obj: CalibrationObject) -> NDArray[np.bool_]:
+        """Mark the fiducials that each used row may show: (U, 1, N)."""
+        return (obj.part_of == self.part_of_rows[:, None])[:, None]
+
+    @property
+    def before_rows(self) -> NDArray[np.int64]:
+        """Of each used row, the used row of the same object one snapshot earlier, -1 = there is none: (U,)."""
+        keys = list(zip(self.moments[self.used].tolist(), self.part_of_rows.tolist(), strict=True))
+        rows = {key: row for row, key in enumerate(keys)}
+        return np.array([rows.get((moment - 1, part), -1) for moment, part in keys], dtype=np.int64)
+
+    def by_moment(self) -> Detections:
+        """The detections numbered by the input's snapshots instead of by rows."""
+        if all(snapshot.moment < 0 for snapshot in self.snapshots):
+            return self.detections
+        moments = self.moments
+        names = dict(zip(moments.tolist(), self.detections.snapshot_names, strict=True))
+        every = tuple(names[moment] for moment in range(len(names)))
+        return replace(self.detections, snapshot=moments[self.detections.snapshot], snapshot_names=every)
+
+    def repeated(self) -> Detections:
+        """The detections in which blobs without a label belong to every row of their snapshot."""
+        detections, moments = self.detections, self.moments
+        rows = [np.flatnonzero(moments == moment) for moment in range(int(moments[-1]) + 1 if len(moments) else 0)]
+        if all(len(of_one) == 1 for of_one in rows):
+            return detections
+        several = [row for of_one in rows if len(of_one) > 1 for row in of_one]
+        left = np.flatnonzero((detections.fiducial < 0) & np.isin(detections.snapshot, several))
+        where = [np.setdiff1d(rows[moments[s]], s) for s in detections.snapshot[left]]
+        more = np.repeat(left, [len(part) for part in where])
+        table = detections.select(np.concatenate((np.arange(len(detections)), more)))
+        table.snapshot[len(detections) :] = np.concatenate([*where, np.empty(0, dtype=np.int64)])
+        return table
+
+    @property
     def identity(self) -> str:
         """How identity was decided as a whole: as the least certain snapshot was.
 
@@ -92,6 +139,13 @@ def associate(
         >>> found.identity, bool((found.detections.fiducial == seen.fiducial).all())
         ('unique', True)
     """
+    if obj.parts:
+        from imgcal.association.several import associate_several  # it builds on this module
+
+        labelled = associate_several(detections, rig, obj, options, progress)
+        if not labelled.used:
+            raise RefusedError(f"identity: {_why(labelled.snapshots)}")
+        return labelled
     count = len(detections.snapshot_names)
     if obj.pose_rank < 6:
         sight = None  # it looks for patterns, and these objects have none

@@ -187,13 +187,13 @@ class Calibration:
         """Fiducials that were hardly found where the others were."""
         points = self.rig_from_object.apply(self.points_object)
         visible = self.rig.expand(len(points)).project(points, self.obj.radius).visible
-        return lost_fiducials(self.observations.seen.numpy(), visible.numpy())
+        return lost_fiducials(self.observations.seen.numpy(), visible.numpy() & self.labelled.columns(self.obj))
 
     @property
     def untimed(self) -> tuple[str, ...]:
         """Cameras whose frames may be of other moments than the others' without a trace: too little motion."""
         seen = self.observations.seen
-        moved = timing_motion(self.observations.uv, seen, self.labelled.used)
+        moved = timing_motion(self.observations.uv, seen, self.labelled.before_rows)
         shown = seen.any(0).any(-1)
         names = zip(self.rig.camera_names, moved.tolist(), shown.tolist(), strict=True)
         return tuple(name for name, motion, is_shown in names if is_shown and motion < LEAST_BETTER)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -40,7 +41,7 @@ from imgcal.types import (
 def calibrate(
     source: Detections | Frames,
     rig: CameraRig,
-    obj: CalibrationObject,
+    obj: CalibrationObject | Sequence[CalibrationObject],
     options: PipelineOptions = PipelineOptions(),
     *,
     detection: DetectionOptions = DetectionOptions(),
@@ -54,7 +55,7 @@ def calibrate(
     Args:
         source: blobs, labelled or not, or frames in memory (see `imgcal.detect`).
         rig: the factory calibration, without batch axes.
-        obj: the calibration object.
+        obj: the calibration object; or several, any of which may be in view of any snapshot.
         options: how sure the result must be.
         detection: how blobs are found in frames.
         initializer: network whose first guess the estimate starts from (`load_initializer`).
@@ -79,12 +80,15 @@ def calibrate(
         >>> result.identity, result.rig.camera_names == factory.camera_names
         ('coded', True)
     """
+    obj = as_one(obj)
     started, rig, options = time.perf_counter(), rig.to(torch.float64), options.of_object(obj)
     source = source if isinstance(source, Detections) else checked_frames(source, rig)
     blobs = settle_turns(blobs_of(source, rig, obj, detection, measurer), rig, obj)
     detections, repeats = without_repeats(blobs)
     found = time.perf_counter()
     sight = sight_of(detector, source, detection, measurer)
+    if obj.parts and (sight is not None or initializer is not None):
+        obj.require_rigid("for detectors and networks that look for a pattern")
     labelled: Associations | None = None
     try:
         with require_solvable():
@@ -100,7 +104,7 @@ def calibrate(
                 return calibrate(
                     detections, rig, obj, options, initializer=initializer, progress=progress, detector=sight
                 )
-        if obj.pose_rank == 6:  # the extent of what is seen says nothing of a light, and little of a stick
+        if obj.pose_rank == 6 and not obj.parts:  # the extent of what is seen says nothing of a light, and little of a stick
             require_units(error, detections, rig, obj)
         if labelled is not None:
             require_same_moments(error, detections, labelled, rig, obj, options)
@@ -110,8 +114,13 @@ def calibrate(
         "identity": identified - found,
         "estimation": time.perf_counter() - identified,
     }
-    late = late_cameras(detections, fit.tally, rig, obj, options)
+    late = late_cameras(detections, fit.tally, rig, obj, options, labelled=fit.labelled)
     return replace(fit, labelled=name_repeats(fit.labelled, repeats), seconds=seconds, late=late, repeats=repeats)
+
+
+def as_one(obj: CalibrationObject | Sequence[CalibrationObject]) -> CalibrationObject:
+    """One object, or several put together."""
+    return obj if isinstance(obj, CalibrationObject) else CalibrationObject.of_several(obj)
 
 
 def fit_as_timed(
@@ -177,7 +186,7 @@ def require_same_moments(
     counts = tally(arranged.labelled, labels, arranged.poses, rig, obj)
     moves = error.moved if isinstance(error, MovedError) else ()
     moved = tuple((move.camera, detections.snapshot_names.index(move.snapshot)) for move in moves)
-    for slipped in late_cameras(detections, counts, rig, obj, options, moved):
+    for slipped in late_cameras(detections, counts, rig, obj, options, moved, arranged.labelled):
         raise RefusedError(
             str(slipped),
             python="give the frames of each moment, or leave the camera out (rig.select)",
@@ -192,6 +201,7 @@ def late_cameras(
     obj: CalibrationObject,
     options: PipelineOptions,
     moved: tuple[tuple[str, int], ...] = (),
+    labelled: Associations | None = None,
 ) -> tuple[LateCamera, ...]:
     """Find cameras that do not agree with the others because their frames are of other moments.
 
@@ -202,15 +212,28 @@ def late_cameras(
         obj: the calibration object.
         options: how sure a result must be.
         moved: cameras that are said to have moved, and the number of the snapshot from which on.
+        labelled: rows that `counts` are of, where several objects were in view; the one seen most often is asked.
     """
+    asked = suspects(counts, rig.camera_names, moved)
+    if obj.parts and asked and labelled is not None:
+        moments = labelled.moments
+        where = {name: snapshot for name, snapshot in moved}
+        asked = {c: where.get(rig.camera_names[c], int(moments[min(row, len(moments) - 1)])) for c, row in asked.items()}
+        detections, obj = _of_part(detections, obj, int(np.bincount(labelled.part_of_rows).argmax()))
 
     def others(blobs: Detections) -> tuple[list[int], RigidTransform]:
         fit = fit_labelled(associate(blobs, rig, obj, options), rig, obj, replace(options, blind_cameras=True))
         return fit.labelled.used, fit.rig_from_object
 
-    asked = suspects(counts, rig.camera_names, moved)
     found = (late_camera(detections, rig, obj, camera, around, others) for camera, around in asked.items())
     return tuple(late for late in found if late is not None)
+
+
+def _of_part(detections: Detections, obj: CalibrationObject, part: int) -> tuple[Detections, CalibrationObject]:
+    """Keep the labels of one of several objects: the rest is clutter."""
+    first = int(np.searchsorted(obj.part_of, part))
+    own = (detections.fiducial >= 0) & (obj.part_of[detections.fiducial] == part)
+    return replace(detections, fiducial=np.where(own, detections.fiducial - first, -1)), obj.parts[part]
 
 
 def _as_given(labelled: Associations) -> Detections:

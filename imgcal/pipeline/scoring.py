@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -71,7 +72,7 @@ class RigScore:
 def score(
     source: Detections | Frames,
     rig: CameraRig,
-    obj: CalibrationObject,
+    obj: CalibrationObject | Sequence[CalibrationObject],
     options: PipelineOptions = PipelineOptions(),
     progress: Progress | None = None,
     *,
@@ -82,7 +83,7 @@ def score(
     Args:
         source: blobs, labelled or not, or frames in memory (see `imgcal.detect`).
         rig: the rig to be scored; its prior is used for identity only.
-        obj: the calibration object.
+        obj: the calibration object; or several, any of which may be in view of any snapshot.
         options: how sure identity must be.
         progress: wraps the loop over snapshots.
         detection: how blobs are found in frames.
@@ -102,13 +103,15 @@ def score(
         >>> float(imgcal.score(blobs, factory, obj).distances.mean()) > 5
         True
     """
+    obj = obj if isinstance(obj, CalibrationObject) else CalibrationObject.of_several(obj)
     rig, options = rig.to(torch.float64), options.of_object(obj)
     detections = settle_turns(blobs_of(source, rig, obj, detection), rig, obj)
     try:
         with require_solvable():
             return _scored(associate(detections, rig, obj, options, progress), rig, obj, options)
     except RefusedError as error:
-        require_units(error, detections, rig, obj)
+        if obj.pose_rank == 6 and not obj.parts:  # as in `calibrate`
+            require_units(error, detections, rig, obj)
         raise
 
 
