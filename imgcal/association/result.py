@@ -31,7 +31,9 @@ class Identity:
     hypotheses: int = 0  # that were tried where no pose was known
     undecided: bool = False  # refused because a different labelling explains the blobs nearly as well
     evidence: float = 0.0  # natural logarithm of the odds against all blobs being clutter
-    rival: NDArray[np.int64] | None = None  # (M,) labels of the best labelling of other blobs, nearly as good; see below
+    rival: NDArray[np.int64] | None = (
+        None  # (M,) labels of the best labelling of other blobs, nearly as good; see below
+    )
 
     @property
     def accepted(self) -> bool:

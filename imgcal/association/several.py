@@ -165,9 +165,7 @@ def place_objects(
         if snapshot.status == "refused":
             reason = reason or snapshot.reason
             continue
-        found.append(
-            (replace(snapshot, moment=moment, part=part), np.where(labels >= 0, labels + tracker.first, -1))
-        )
+        found.append((replace(snapshot, moment=moment, part=part), np.where(labels >= 0, labels + tracker.first, -1)))
     return sorted(found, key=lambda row: row[0].part), reason
 
 

@@ -210,9 +210,7 @@ class Tracker:
         guesses = [] if known else [RigidTransform.identity(dtype=self.rig.focal_length.dtype)]
         return identify(blobs, self.rig, self.obj, self.prior_std, known, self.options.identity, guesses)
 
-    def conclude(
-        self, proposed: Identity, blobs: Detections, name: str
-    ) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
+    def conclude(self, proposed: Identity, blobs: Detections, name: str) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
         """Draw the conclusions from what `propose` found in these blobs."""
         return self._concluded(self._taken_over(proposed), blobs, name)
 

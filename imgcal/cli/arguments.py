@@ -37,9 +37,9 @@ class Simulate:
     """
 
     rig: str  #: factory rig: file, or the name of a shipped one (O10, O6, U7, T4, room10)
-    object: str
+    object: Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
     """object: file, or the name of a shipped one (asymmetric8, cube8, cube27, sphere64, wand4; printed boards: charuco,
-    aprilgrid, checkerboard, circles)"""
+    aprilgrid, checkerboard, circles); several, each of which moves by itself: --object A B"""
     out: Path  #: folder to write; must not hold a capture yet
     snapshots: int = 10  #: number of poses of the object
     seed: int = 0  #: the same seed gives the same capture
@@ -138,10 +138,12 @@ class Calibrate:
     in OUT moves to OUT/previous. OUT changes when all is written; any other failure leaves it as it was.
     Examples: imgcal calibrate my_capture --rig factory.yaml --object object.csv --out result
     imgcal calibrate my_capture --cameras cameras.yaml --object wand4 --out result
+    imgcal calibrate my_capture --rig factory.yaml --object pointer.csv reference.csv --out result
     """
 
     input: Annotated[Path, tyro.conf.Positional]  #: capture folder or detections file
-    object: str  #: object: file, or the name of a shipped one
+    object: Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
+    """object: file, or the name of a shipped one; several, any of which may be in view: INPUT --object A B"""
     out: Path  #: folder to write
     rig: str | None = None  #: factory rig: file, or the name of a shipped one
     cameras: Path | None = None
@@ -235,7 +237,8 @@ class Score:
 
     input: Annotated[Path, tyro.conf.Positional]  #: capture folder or detections file
     rig: str  #: rig file, or the name of a shipped rig
-    object: str  #: object file, or the name of a shipped object
+    object: Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
+    """object file, or the name of a shipped object; several, any of which may be in view: INPUT --object A B"""
     snapshots: str | None = None  #: A:B, numbers in file order from 0, B excluded
     videos_differ: bool = False  #: accept videos whose lengths or time stamps differ: frames go together by number
     detection: Annotated[DetectionOptions, tyro.conf.arg(name="")] = field(default_factory=DetectionOptions)

@@ -10,15 +10,23 @@ from imgcal.pipeline import DOUBTFUL, Calibration, Tally
 from imgcal.types import CameraRig, Detections
 
 
-def counts_by_camera(counts: Tally, camera: int) -> dict[str, int]:
+def counts_by_camera(calibration: Calibration, camera: int) -> dict[str, int]:
     """Count over all snapshots."""
-    return _counts(counts, np.s_[:, camera])
+    # Rows of one snapshot have its blobs in common: each blob counts once.
+    blobs = int((calibration.labelled.detections.camera == camera).sum())
+    return _counts(calibration.tally, np.s_[:, camera]) | {"blobs": blobs}
 
 
 def counts_by_snapshot(calibration: Calibration) -> dict[str, dict[str, int]]:
     """Count over all cameras: snapshot name -> numbers."""
-    snapshots = calibration.labelled.snapshots
-    return {snapshot.name: _counts(calibration.tally, np.s_[s]) for s, snapshot in enumerate(snapshots)}
+    labelled, counts = calibration.labelled, dict[str, dict[str, int]]()
+    blobs = np.bincount(labelled.detections.snapshot, minlength=len(labelled.snapshots)).tolist()
+    for s, snapshot in enumerate(labelled.snapshots):
+        # Rows of one snapshot have its blobs in common: each blob counts once.
+        own = _counts(calibration.tally, np.s_[s]) | {"blobs": blobs[s]}
+        earlier = counts.get(snapshot.name, dict.fromkeys(own, 0))
+        counts[snapshot.name] = {name: earlier[name] + value for name, value in own.items()}
+    return counts
 
 
 def blobs_by_camera(detections: Detections, rig: CameraRig) -> dict[str, dict[str, Any]]:

@@ -23,6 +23,9 @@ from imgcal.errors import InputError, RefusedError
 from imgcal.extras import advice
 from imgcal.messages import one_line, quoted, shortened
 
+SEVERAL_OBJECTS = ("simulate", "calibrate", "score")
+"""Commands whose `--object` may be several."""
+
 DONE, UNUSABLE, REFUSED, INTERRUPTED = 0, 2, 3, 130
 
 DEBUG, VERSION = "--debug", "--version"
@@ -149,7 +152,7 @@ def _understood(arguments: list[str]) -> Runnable:
         print(f"imgcal {imgcal.__version__}")
         raise SystemExit(DONE)
     if first in COMMANDS:
-        given = tyro.cli(_arguments(first), prog=f"imgcal {first}", args=arguments[1:])
+        given = tyro.cli(_arguments(first), prog=f"imgcal {first}", args=_each_object(first, arguments[1:]))
         with ends_at_once():  # imports take a while
             command = getattr(import_module(COMMANDS[first][0]), first.capitalize())
         return command(**vars(given))
@@ -161,6 +164,24 @@ def _understood(arguments: list[str]) -> Runnable:
         raise InputError(f"unknown command `{shortened(first)}`; {hint}")
     commands: Any = Union[tuple(Annotated[load(name), tyro.conf.subcommand(name)] for name in COMMANDS)]  # noqa: UP007
     return tyro.cli(commands, prog="imgcal", description=DESCRIPTION, args=arguments)
+
+
+def _each_object(command: str, arguments: list[str]) -> list[str]:
+    """Repeat `--object` before each of several names that follow it.
+
+    A command that reads an input has to have it before: what follows the first name of an object may be the input.
+    """
+    if command not in SEVERAL_OBJECTS or (command != "simulate" and arguments[:1] and arguments[0].startswith("-")):
+        return arguments
+    result, follows = list[str](), False
+    for argument in arguments:
+        if argument.startswith("-"):
+            follows = False
+        elif follows:
+            result.append("--object")
+        follows = follows or (bool(result) and result[-1] == "--object" and not argument.startswith("-"))
+        result.append(argument)
+    return result
 
 
 def _arguments(name: str) -> Any:

@@ -54,9 +54,7 @@ def _least_fiducials(rank: int) -> int | None:
     return None if rank == 6 else 2 if rank == 5 else 1
 
 
-def has_poses(
-    seen: NDArray[np.bool_], points: Tensor, part_of: NDArray[np.int64] | None = None
-) -> NDArray[np.bool_]:
+def has_poses(seen: NDArray[np.bool_], points: Tensor, part_of: NDArray[np.int64] | None = None) -> NDArray[np.bool_]:
     """Tell in which snapshots what is `seen` (S, C, N) of an object's points (N, 3) determines its pose: (S,).
 
     With several objects (`part_of`, as in `require_poses`) one of them must be determined.

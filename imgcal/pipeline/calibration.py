@@ -124,8 +124,21 @@ class Calibration:
 
     @property
     def rig_from_object(self) -> RigidTransform:
-        """The object's pose in each snapshot: (S,)."""
+        """The object's pose in each snapshot: (S,); of several objects in each row, see `poses_by_object`."""
         return self.estimate.rig_from_object
+
+    @property
+    def poses_by_object(self) -> Mapping[str, Mapping[str, RigidTransform]]:
+        """rig_from_object by the name of the object and of the snapshot, in the frame of the object's file."""
+        rows, poses, parts = self.labelled.used, self.rig_from_object, self.obj.each
+        found: dict[str, dict[str, RigidTransform]] = {part.name: {} for part in parts}
+        for row, part, rotation, translation in zip(
+            rows, self.labelled.part_of_rows.tolist(), poses.rotation, poses.translation, strict=True
+        ):
+            origin = parts[part].origin
+            shift = translation if origin is None else translation - rotation @ origin.to(rotation)
+            found[parts[part].name][self.labelled.snapshots[row].name] = RigidTransform(rotation, shift)
+        return found
 
     @property
     def points_object(self) -> Tensor:

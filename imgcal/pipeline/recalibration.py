@@ -35,7 +35,11 @@ from imgcal.types import (
     CameraRig,
     Detections,
     MovedError,
+    RigPrior,
 )
+
+FOUND = RigPrior(focal_length=5e-4, principal_point=0.5, distortion=0.01, rotation=5e-4, position=0.5)
+"""How far a rig that was just found may be off, where labels of sticks are completed: about a pixel."""
 
 
 def calibrate(
@@ -96,6 +100,8 @@ def calibrate(
             identified = time.perf_counter()
             given = detections if sight is None else _as_given(labelled)
             fit = fit_as_timed(labelled, given, rig, obj, options, initializer)
+            if any(part.pose_rank == 5 for part in obj.each):
+                fit = _labelled_again(fit, given, rig, obj, options)
     except RefusedError as error:
         if sight is not None and labelled is not None and sight.where_blobs_fail and _by_blobs(labelled):
             # They told the pose, and failed all the same.
@@ -104,7 +110,9 @@ def calibrate(
                 return calibrate(
                     detections, rig, obj, options, initializer=initializer, progress=progress, detector=sight
                 )
-        if obj.pose_rank == 6 and not obj.parts:  # the extent of what is seen says nothing of a light, and little of a stick
+        if (
+            obj.pose_rank == 6 and not obj.parts
+        ):  # the extent of what is seen says nothing of a light, and little of a stick
             require_units(error, detections, rig, obj)
         if labelled is not None:
             require_same_moments(error, detections, labelled, rig, obj, options)
@@ -121,6 +129,22 @@ def calibrate(
 def as_one(obj: CalibrationObject | Sequence[CalibrationObject]) -> CalibrationObject:
     """One object, or several put together."""
     return obj if isinstance(obj, CalibrationObject) else CalibrationObject.of_several(obj)
+
+
+def _labelled_again(
+    fit: Calibration, given: Detections, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
+) -> Calibration:
+    """Label once more with the rig that was found, and estimate that anew from the factory calibration.
+
+    A camera shows little of a stick: a marker whose neighbour is hidden has a label only where the rig is known.
+    """
+    if fit.labelled.identity == "coded" or fit.moved or fit.unsynchronized is not None:
+        return fit
+    with contextlib.suppress(RefusedError):
+        again = associate(given, replace(fit.estimate.rig, prior=FOUND), obj, options)
+        if int((again.detections.fiducial >= 0).sum()) > int((fit.labelled.detections.fiducial >= 0).sum()):
+            return fit_as_timed(again, given, rig, obj, options)
+    return fit
 
 
 def fit_as_timed(
@@ -216,9 +240,9 @@ def late_cameras(
     """
     asked = suspects(counts, rig.camera_names, moved)
     if obj.parts and asked and labelled is not None:
-        moments = labelled.moments
-        where = {name: snapshot for name, snapshot in moved}
-        asked = {c: where.get(rig.camera_names[c], int(moments[min(row, len(moments) - 1)])) for c, row in asked.items()}
+        where, moments = dict(moved), labelled.moments.tolist()
+        moments += moments[-1:]
+        asked = {c: where.get(rig.camera_names[c], moments[row]) for c, row in asked.items()}
         detections, obj = _of_part(detections, obj, int(np.bincount(labelled.part_of_rows).argmax()))
 
     def others(blobs: Detections) -> tuple[list[int], RigidTransform]:

@@ -52,6 +52,7 @@ class CalibrationObject:
     modes: Tensor | None = None  # (K, N, 3) mm: shapes of which it has as much as a standard normal says; None = rigid
     labels: tuple[int, ...] = ()  # what tables call the fiducials; empty = by their rows
     parts: tuple[CalibrationObject, ...] = ()  # several objects in one capture, see `of_several`; empty = one object
+    origin: Tensor | None = None  # (3,) mm in the frame of the object's file: the origin of `points`; None = the same
 
     def __repr__(self) -> str:
         """Say what it is: `CalibrationObject('cube8': 8 fiducials)`; points, radii and tolerances are attributes."""
@@ -127,7 +128,7 @@ class CalibrationObject:
             number = sum(other.name == obj.name for other in objects[: len(names)]) + 1
             names.append(obj.name if number == 1 else f"{obj.name}-{number}")
         parts = tuple(
-            replace(obj, name=name, points=(points := obj.points.double()) - points.mean(0))
+            replace(obj, name=name, points=(points := obj.points.double()) - points.mean(0), origin=points.mean(0))
             for obj, name in zip(objects, names, strict=True)
         )
         has_radius = any(part.radius is not None for part in parts)
@@ -188,8 +189,12 @@ class CalibrationObject:
         return len(self.points)
 
     @property
-    def rows(self) -> int | tuple[int, ...]:
-        """What tables call the fiducials: so many rows, or numbers of their own."""
+    def rows(self) -> int | tuple[int, ...] | tuple[tuple[str, int], ...]:
+        """What tables call the fiducials: so many rows, or numbers of their own; of several, with the object's name."""
+        if self.parts:
+            return tuple(
+                (part.name, label) for part in self.parts for label in part.labels or range(part.num_fiducials)
+            )
         return self.labels or self.num_fiducials
 
     @cached_property
