@@ -37,7 +37,7 @@ class Simulate:
     """
 
     rig: str  #: factory rig: file, or the name of a shipped one (O10, O6, U7, T4, room10)
-    object: Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
+    object: tuple[str, ...]
     """object: file, or the name of a shipped one (asymmetric8, cube8, cube27, sphere64, wand4; printed boards: charuco,
     aprilgrid, checkerboard, circles); several, each of which moves by itself: --object A B"""
     out: Path  #: folder to write; must not hold a capture yet
@@ -142,7 +142,7 @@ class Calibrate:
     """
 
     input: Annotated[Path, tyro.conf.Positional]  #: capture folder or detections file
-    object: Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
+    object: tuple[str, ...]
     """object: file, or the name of a shipped one; several, any of which may be in view: INPUT --object A B"""
     out: Path  #: folder to write
     rig: str | None = None  #: factory rig: file, or the name of a shipped one
@@ -237,7 +237,7 @@ class Score:
 
     input: Annotated[Path, tyro.conf.Positional]  #: capture folder or detections file
     rig: str  #: rig file, or the name of a shipped rig
-    object: Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
+    object: tuple[str, ...]
     """object file, or the name of a shipped object; several, any of which may be in view: INPUT --object A B"""
     snapshots: str | None = None  #: A:B, numbers in file order from 0, B excluded
     videos_differ: bool = False  #: accept videos whose lengths or time stamps differ: frames go together by number

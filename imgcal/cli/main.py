@@ -152,7 +152,7 @@ def _understood(arguments: list[str]) -> Runnable:
         print(f"imgcal {imgcal.__version__}")
         raise SystemExit(DONE)
     if first in COMMANDS:
-        given = tyro.cli(_arguments(first), prog=f"imgcal {first}", args=_each_object(first, arguments[1:]))
+        given = tyro.cli(_arguments(first), prog=f"imgcal {first}", args=_objects_last(first, arguments[1:]))
         with ends_at_once():  # imports take a while
             command = getattr(import_module(COMMANDS[first][0]), first.capitalize())
         return command(**vars(given))
@@ -166,22 +166,25 @@ def _understood(arguments: list[str]) -> Runnable:
     return tyro.cli(commands, prog="imgcal", description=DESCRIPTION, args=arguments)
 
 
-def _each_object(command: str, arguments: list[str]) -> list[str]:
-    """Repeat `--object` before each of several names that follow it.
+def _objects_last(command: str, arguments: list[str]) -> list[str]:
+    """Move the names of objects to the end, where nothing else can be taken for one more.
 
-    A command that reads an input has to have it before: what follows the first name of an object may be the input.
+    Several may follow `--object` where the input stands first. Elsewhere what follows the first name is the input.
     """
-    if command not in SEVERAL_OBJECTS or (command != "simulate" and arguments[:1] and arguments[0].startswith("-")):
+    several = command == "simulate" or not arguments[:1] or not arguments[0].startswith("-")
+    if command not in SEVERAL_OBJECTS:
         return arguments
-    result, follows = list[str](), False
+    others, names, most = list[str](), list[str](), 0
     for argument in arguments:
-        if argument.startswith("-"):
-            follows = False
-        elif follows:
-            result.append("--object")
-        follows = follows or (bool(result) and result[-1] == "--object" and not argument.startswith("-"))
-        result.append(argument)
-    return result
+        if argument == "--object":
+            most = len(arguments) if several else 1
+        elif most and not argument.startswith("-"):
+            names.append(argument)
+            most -= 1
+        else:
+            others.append(argument)
+            most = 0
+    return [*others, "--object", *names] if names else arguments
 
 
 def _arguments(name: str) -> Any:

@@ -160,8 +160,13 @@ def _joined(parts: Sequence[Spots]) -> Spots:
     if len(parts) == 1:
         return parts[0]
     smears = [part.smear for part in parts if part.smear is not None]
-    names = ("uv", "shape", "intensity", "visible", "depth")
-    spots = Spots(**{name: torch.cat([getattr(part, name) for part in parts], 1) for name in names})
+    spots = Spots(
+        uv=torch.cat([part.uv for part in parts], 1),
+        shape=torch.cat([part.shape for part in parts], 1),
+        intensity=torch.cat([part.intensity for part in parts], 1),
+        visible=torch.cat([part.visible for part in parts], 1),
+        depth=torch.cat([part.depth for part in parts], 1),
+    )
     if not smears:
         return spots
     return replace(

@@ -1,7 +1,7 @@
-"""Sticks and several objects, without labels: what is calibrated, refused and wrong, in simulation and on a real stream.
+"""Sticks and several objects without labels, simulated and real: what is calibrated, refused and wrong.
 
-Run as `python -m scripts.benchmarks.targets simulated` and `python -m scripts.benchmarks.targets real`; the second needs
-IMGCAL_CAPTURES. A quarter of the markers is hidden, and every camera has three false blobs.
+Run as `python -m scripts.benchmarks.targets simulated`, and with `real`, which needs IMGCAL_CAPTURES. A quarter of the
+markers is hidden, and every camera has three false blobs.
 """
 
 from __future__ import annotations
@@ -16,15 +16,14 @@ import numpy as np
 import torch
 import tyro
 
-from imgcal import InputError, RefusedError, calibrate, load_object, load_rig
+from imgcal import RefusedError, calibrate, load_object, load_rig
 from imgcal.estimation import camera_covariance, estimate
 from imgcal.pipeline import Calibration
 from imgcal.synthesis import PhysicalDrift, simulate_volume, true_detections
 from imgcal.types import CalibrationObject, CameraRig, Detections, MovedError, Observations
 from renderers import palette
-from scripts.benchmarks.wand_recording import CALIBRATED
+from scripts.benchmarks.wand_recording import CALIBRATED, recording
 from scripts.benchmarks.wand_recording import calibrated as whole_wand
-from scripts.benchmarks.wand_recording import recording
 from scripts.output import ROOT, command, read_json, surroundings, write_json
 
 HIDDEN, FALSE, NOISE = 0.25, 3, 0.1
@@ -48,6 +47,7 @@ SCENES: dict[str, tuple[tuple[str, ...], int]] = {
     "one object": (("body5",), 10),
 }
 MARKERS = {"two": [0, 2], "two, far apart": [0, 4], "three in a line": [0, 1, 2], "three in the other line": [1, 3, 4]}
+COMMAND = "python -m scripts.benchmarks.targets {}"
 SIMULATED = ROOT / "docs" / "benchmarks" / "targets.json"
 REAL = ROOT / "docs" / "benchmarks" / "targets_real.json"
 
@@ -89,7 +89,8 @@ def capture(
         flags=np.zeros(count, dtype=np.uint8),
     )
     columns = ("uv", "sigma", "camera", "snapshot", "fiducial", "radius", "flags")
-    table = replace(false, **{n: np.concatenate([getattr(t, n) for t in (*tables, false)]) for n in columns})
+    joined: dict[str, Any] = {n: np.concatenate([getattr(t, n) for t in (*tables, false)]) for n in columns}
+    table = replace(false, **joined)
     inside = ((table.uv > -0.5) & (table.uv < size[table.camera] - 0.5)).all(1)
     return factory, truth, table.select(rng.permutation(np.flatnonzero(inside)))
 
@@ -130,8 +131,8 @@ def outcome(scene: str, drift: float, seed: int) -> dict[str, Any]:
     started = time.process_time()
     try:
         found = calibrate(replace(blobs, fiducial=np.full(len(blobs), -1)), factory, objects)
-    except RefusedError as error:
-        return values | {"status": "refused", "reason": error.reason, "seconds": time.process_time() - started}
+    except RefusedError as refusal:
+        return values | {"status": "refused", "reason": refusal.reason, "seconds": time.process_time() - started}
     seconds, (error, scale), predicted = (
         time.process_time() - started,
         error_mm(found.rig, truth),
@@ -193,7 +194,12 @@ class Simulated:
                         continue
                     done.append(outcome(scene, drift, seed))
                     print({k: v for k, v in done[-1].items() if k != "reason"}, file=sys.stderr, flush=True)
-                    result = {"command": command(), **surroundings(), "table": table_of(done), "captures": done}
+                    result = {
+                        "command": COMMAND.format("simulated"),
+                        **surroundings(),
+                        "table": table_of(done),
+                        "captures": done,
+                    }
                     write_json(self.out, result)
 
 
@@ -212,7 +218,7 @@ class Real:
         given, whole = recording(), whole_wand()
         labels = whole.calibration.labelled.detections
         rms, median = whole.score(whole.calibration.rig)
-        result: dict[str, Any] = {"command": command(), **surroundings(), "frames": str(CALIBRATED)}
+        result: dict[str, Any] = {"command": COMMAND.format("real"), **surroundings(), "frames": str(CALIBRATED)}
         result["whole wand"] = {"rms_px": rms, "median_px": median}
         for name in self.markers:
             rows = MARKERS[name]
@@ -240,13 +246,5 @@ Commands = (
 )
 
 
-def main() -> None:
-    """Run what is asked for."""
-    try:
-        tyro.cli(Commands).run()  # type: ignore[arg-type]
-    except InputError as error:
-        sys.exit(str(error))
-
-
 if __name__ == "__main__":
-    main()
+    command(lambda: tyro.cli(Commands).run())

