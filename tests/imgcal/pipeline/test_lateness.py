@@ -82,7 +82,7 @@ def test_even_motion_is_what_a_turned_camera_shows():
     seen = torch.ones(9, 2, 5, dtype=torch.bool)
     assert float(timing_motion(first + time * velocity, seen, np.arange(9) - 1).max()) < 1e-9
     swaying = timing_motion(
-        first + 20 * torch.sin(time) * torch.tensor([1.0, 0.0]).double()[:, None, None], seen, range(9)
+        first + 20 * torch.sin(time) * torch.tensor([1.0, 0.0]).double()[:, None, None], seen, np.arange(9) - 1
     )
     assert float(swaying[0]) > 5 and float(swaying[1]) == 0
     seen[:, 1] = False
