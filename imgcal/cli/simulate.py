@@ -84,6 +84,8 @@ class Simulate(arguments.Simulate):
         save_rig(rig, out / "rig.yaml")
         if not obj.parts:
             save_object(obj, out / ("object.csv" if obj.board is None else "board.yaml"))
+        if obj.parts:
+            (out / "objects").mkdir()
         for part in obj.parts:
             save_object(part, out / "objects" / f"{part.name}.csv")
         _write_truth(truth, obj, out / "truth")

@@ -127,10 +127,7 @@ class CalibrationObject:
         for obj in objects:
             number = sum(other.name == obj.name for other in objects[: len(names)]) + 1
             names.append(obj.name if number == 1 else f"{obj.name}-{number}")
-        parts = tuple(
-            replace(obj, name=name, points=(points := obj.points.double()) - points.mean(0), origin=points.mean(0))
-            for obj, name in zip(objects, names, strict=True)
-        )
+        parts = tuple(_centred(obj, name) for obj, name in zip(objects, names, strict=True))
         has_radius = any(part.radius is not None for part in parts)
         has_tolerance = any(part.tolerance is not None for part in parts)
         return cls(
@@ -258,6 +255,14 @@ class CalibrationObject:
         identity = np.arange(len(points)).tobytes()
         rest = sorted((m for key, m in found.items() if key != identity), key=lambda m: m.residual)
         return (Symmetry(np.eye(3), np.zeros(3), np.arange(len(points)), 0.0), *rest)
+
+
+def _centred(obj: CalibrationObject, name: str) -> CalibrationObject:
+    """Move the origin of an object's points to their centroid."""
+    points = obj.points.double()
+    centroid = points.mean(0)
+    origin = centroid if obj.origin is None else centroid + obj.origin
+    return replace(obj, name=name, points=points - centroid, origin=origin)
 
 
 def _or_zero(radius: Tensor | None, points: Tensor) -> Tensor:

@@ -3,13 +3,15 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
 from imgcal.association import Associations, PipelineOptions, Tracker, associate
 from imgcal.association.options import IdentityOptions
 from imgcal.association.several import place_objects
 from imgcal.association.tracker import LearntRig
-from imgcal.types import CalibrationObject
+from imgcal.pipeline import calibrate
+from imgcal.types import CalibrationObject, MovedError
 from tests.imgcal.association.stick_scenes import BODY, PAIR, one_snapshot, several
 
 WAND = ((160.0, 0.0, 0.0), (0.0, 0.0, 0.0), (-80.0, 0.0, 20.0), (0.0, -120.0, 0.0), (0.0, -240.0, 50.0))
@@ -90,3 +92,30 @@ def test_labels_of_the_input_make_rows():
     repeated = found.repeated()
     clutter = int((true < 0).sum())
     assert len(repeated) == len(blobs) + clutter
+
+
+def test_a_rig_is_calibrated_from_two_objects_and_has_a_pose_of_each():
+    rig, obj, blobs, _ = several([BODY, WAND], 6)
+    result = calibrate(blobs, rig, obj.parts)
+    assert float(result.rms) < 0.12
+    assert 0.7 < float(result.chi2_per_dof) < 1.3
+    poses = result.poses_by_object
+    assert list(poses) == ["object0", "object1"]
+    assert sum(map(len, poses.values())) == len(result.labelled.used) >= 9
+    row = result.labelled.used[0]
+    name, part = result.labelled.snapshots[row].name, obj.parts[result.labelled.snapshots[row].part]
+    assert part.origin is not None
+    there = poses[part.name][name].apply((part.points + part.origin).mean(0, keepdim=True))
+    assert torch.allclose(there[0], result.rig_from_object.translation[0], atol=1e-6)
+
+
+def test_a_camera_that_moves_is_named_where_objects_share_its_snapshots():
+    rig, obj, blobs, true = several([BODY, WAND], 12, false=0)
+    moved = (blobs.camera == 2) & (blobs.snapshot >= 6)
+    uv = np.where(moved[:, None], blobs.uv + 12.0, blobs.uv)
+    labelled = replace(blobs, uv=uv, fiducial=true)
+    with pytest.raises(MovedError, match="cam03 moved before snapshot 00006"):
+        calibrate(labelled, rig, obj.parts)
+    since = calibrate(labelled, rig, obj.parts, PipelineOptions(after_last_move=True))
+    assert set(since.labelled.moments[since.labelled.used]) == set(range(6, 12))
+    assert [move.camera for move in since.moved] == ["cam03"]
