@@ -117,6 +117,8 @@ class RecentSnapshots:
     def relinearize(self, result: MeasurementUpdate) -> None:
         """Take the same snapshots, and any number before them, as they are where they lead together."""
         brought, before, seen = result.brought, result.before, self._seen
+        while len(seen) > len(brought):  # beyond the filter's horizon
+            seen.popleft()
         self._begin(brought.rig, brought.object_offset)
         origin = torch.from_numpy(self._at.copy())
         information = before.information
