@@ -27,6 +27,14 @@ class LastSighting:
     information: Tensor  # (K, K) of that value
 
 
+@dataclass(frozen=True)
+class Remainder:
+    """What is known without snapshots that are forgotten, or learnt again."""
+
+    first: RigBelief
+    away: dict[int, LastSighting]  # cameras that no snapshot shows any more
+
+
 @dataclass
 class Horizon:
     """How many snapshots count, and what is known without them.
@@ -34,8 +42,8 @@ class Horizon:
     Examples:
         >>> import imgcal
         >>> prior = RigBelief.of_prior(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"))
-        >>> Horizon(5, prior).most, Horizon(80, prior).most
-        (5, 90)
+        >>> Horizon(1, prior).most, Horizon(3, prior).most, Horizon(80, prior).most
+        (1, 4, 101)
     """
 
     snapshots: int
@@ -45,14 +53,14 @@ class Horizon:
     @property
     def most(self) -> int:
         """Snapshots that are kept at most: forgetting costs time, so that several are forgotten at once."""
-        return self.snapshots + self.snapshots // 8
+        return 1 if self.snapshots == 1 else self.snapshots + 1 + self.snapshots // 4
 
     def free(self, prior: RigBelief, cameras: Collection[int]) -> None:
         """Believe another prior, in which some cameras have moved: their last values hold no more."""
         self.prior = prior
         self.away = {camera: last for camera, last in self.away.items() if camera not in cameras}
 
-    def without(self, belief: RigBelief, forgotten: Tensor, kept: Tensor, first: RigBelief) -> RigBelief:
+    def without(self, belief: RigBelief, forgotten: Tensor, kept: Tensor, first: RigBelief) -> Remainder:
         """What is known without any snapshot.
 
         Args:
@@ -62,10 +70,10 @@ class Horizon:
             first: what was known before all of them; of it the object counts, which has not been forgotten.
         """
         present = set(kept.nonzero().flatten().tolist())
-        self.away = {camera: last for camera, last in self.away.items() if camera not in present}
+        away = {camera: last for camera, last in self.away.items() if camera not in present}
         for camera in (forgotten & ~kept).nonzero().flatten().tolist():
-            self.away[camera] = self._last_sighting(belief, camera, tuple(sorted(present)))
-        return self._with_object(self._with_away(), first)
+            away[camera] = self._last_sighting(belief, camera, tuple(sorted(present)))
+        return Remainder(self._with_object(self._with_away(away), first), away)
 
     def _last_sighting(self, belief: RigBelief, camera: int, others: tuple[int, ...]) -> LastSighting:
         relative, wide = self._relative(camera, others), self.prior.unit.numel()
@@ -83,17 +91,17 @@ class Horizon:
             relative[:EXTRINSICS, other, :EXTRINSICS] = -unit[other, :EXTRINSICS].diag() / len(others)
         return relative.flatten(1)
 
-    def _with_away(self) -> RigBelief:
+    def _with_away(self, away: dict[int, LastSighting]) -> RigBelief:
         """The prior, and cameras that are away as they were seen last."""
         prior, width = self.prior, self.prior.unit.shape[1]
-        if not self.away:
+        if not away:
             return prior
         information, wide = prior.information.clone(), prior.unit.numel()
         weighted = prior.object_offset.new_zeros(len(information))
-        for camera in self.away:  # the prior has part in what was known of them
+        for camera in away:  # the prior has part in what was known of them
             own = slice(camera * width, (camera + 1) * width)
             information[own], information[:, own] = 0.0, 0.0
-        for camera, last in self.away.items():
+        for camera, last in away.items():
             relative = self._relative(camera, last.others)
             information[:wide, :wide] += relative.mT @ last.information @ relative
             weighted[:wide] += relative.mT @ last.information @ last.value

@@ -94,6 +94,11 @@ class RecentSnapshots:
     def __len__(self) -> int:
         return len(self._seen)
 
+    def clear(self) -> None:
+        """Forget all snapshots."""
+        self._seen.clear()
+        self._bases, self._aged = [], True
+
     def append(self, result: MeasurementUpdate, observations: Observations, seconds: float) -> None:
         """Take a snapshot that has just been absorbed.
 

@@ -110,10 +110,17 @@ class RigFilter:
         self, observations: Observations, rig_from_object: RigidTransform, seconds: float = 0.0
     ) -> MeasurementUpdate:
         """Do the work of `update`, and leave it to the caller to `relinearize` where that is `due`."""
+        horizon, alone = self.horizon, None
+        if horizon is not None and horizon.snapshots == 1 and self._early:
+            alone = horizon.without(self.belief, shown(self._early), observations.seen[0].any(-1), self._first)
         passed = max(seconds, 0.0) if self.count and self.horizon is None else 0.0
         self._span, self._waited = self._span + passed, self._waited + passed
         due = self._waited if self._waited >= LEAST_SECONDS else 0.0
-        result = absorb(age_belief(self.belief, due, self.walk), observations, rig_from_object, self.options)
+        belief = age_belief(self.belief, due, self.walk) if alone is None else alone.first
+        start = None if alone is None else self.belief
+        result = absorb(belief, observations, rig_from_object, self.options, start)
+        if alone is not None and horizon is not None:
+            self._first, horizon.away, self._early = alone.first, alone.away, []
         self.belief, self._waited, self.count = result.belief, self._waited - due, self.count + 1
         still = self._span <= YOUNG_SECONDS or not any(vars(self.rate).values())  # a steady rig stands still for ever
         self._young = self._young and (self.horizon is not None or (len(self._early) < MEMORY and still))
@@ -149,18 +156,16 @@ class RigFilter:
         Returns:
             What they teach; `rig_from_object` and `residual` are those of the last one.
         """
-        if self.horizon is not None and len(self._early) > self.horizon.most:
-            self._forget(self.horizon)
-        result = absorb(self._first, *stack_snapshots(self._early), self.options)
+        horizon, start = self.horizon, None
+        if horizon is not None:
+            start, gone = self.belief, self._early[: -horizon.snapshots]
+            if len(self._early) > horizon.most:
+                self._early = self._early[-horizon.snapshots :]
+                left = horizon.without(self.belief, shown(gone), shown(self._early), self._first)
+                self._first, horizon.away = left.first, left.away
+        result = absorb(self._first, *stack_snapshots(self._early), self.options, start)
         self.belief, self._waited = age_belief(result.belief, self._span, self.walk), 0.0
         return replace(result.of_last(), belief=self.belief)
-
-    def _forget(self, horizon: Horizon) -> None:
-        """Drop the snapshots beyond the horizon, and what was known before them."""
-        seen = torch.cat([observations.seen for observations, _ in self._early]).any(-1)  # (S, C)
-        forgotten, kept = seen[: -horizon.snapshots].any(0), seen[-horizon.snapshots :].any(0)
-        self._first = horizon.without(self.belief, forgotten, kept, self._first)
-        self._early = self._early[-horizon.snapshots :]
 
     def restart(
         self, first: RigBelief, snapshots: Sequence[tuple[Observations, RigidTransform]], new: int = 0
@@ -184,3 +189,8 @@ class RigFilter:
     def suppose(self, first: RigBelief, belief: RigBelief) -> None:
         """Hold other beliefs: before the first snapshots that are kept, and now."""
         self._first, self.belief, self._waited = first, belief, 0.0
+
+
+def shown(snapshots: Sequence[tuple[Observations, RigidTransform]]) -> Tensor:
+    """Tell which cameras see the object in some snapshots: (C,) bool."""
+    return torch.cat([observations.seen for observations, _ in snapshots]).any(0).any(-1)

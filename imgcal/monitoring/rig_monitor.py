@@ -156,6 +156,8 @@ class RigMonitor:
             self._suspect = None
             return self._follow_beside_quarantine(observations, rig_from_object, seconds)
         self._suspect = None
+        if self.filter.horizon is not None and self.filter.horizon.snapshots == 1:
+            self._recent.clear()
         self._recent.append(result, observations, seconds)
         if self._pending is not None:
             self._pending.add(result, seconds)

@@ -63,6 +63,7 @@ class RigKeeper:
         detection: DetectionOptions = DetectionOptions(),
         detector: DetectorName | Proposer = "classical",
         drift: DriftRate | None = None,
+        horizon: int | None = None,
         tests: Sequence[SequentialTest] | None = None,
     ) -> None:
         """Start from a factory calibration.
@@ -74,10 +75,15 @@ class RigKeeper:
             detection: how blobs are found.
             detector: who finds the fiducials in frames, as for `calibrate`.
             drift: how fast values wander; None = as the rig says.
+            horizon: number of latest snapshots that the rig is known by, beside its factory calibration; None = all
+                that ever came, each worth less as the rig may have wandered. More know it better and follow it more
+                slowly. Of two and more, one and up to a quarter more count at times. A camera that none of them shows keeps its last values.
             tests: what else watches each snapshot; None = `default_tests`.
         """
+        if horizon is not None and horizon < 1:
+            raise InputError(f"horizon: found {horizon}, expected at least 1 snapshot")
         self.options = _for_keeping(options)
-        self._memory = KeeperMemory.of(rig, obj, drift, self.options)
+        self._memory = KeeperMemory.of(rig, obj, drift, self.options, horizon)
         self.tests = tuple(default_tests(rig.num_cameras) if tests is None else tests)
         clocks = (test for test in self.tests if isinstance(test, ClockOffsets))
         self._clock = next(clocks, ClockOffsets(rig.num_cameras))
@@ -356,7 +362,7 @@ class RigKeeper:
             memory = KeeperMemory.restored(found["values"], _for_keeping(options))
             keeper = cls(
                 memory.prior, memory.obj, options, detection=detection, detector=detector, drift=memory.drift,
-                tests=tests,
+                horizon=memory.horizon, tests=tests,
             )  # fmt: skip
             keeper._memory = memory
             keeper._labelling.restored(found["labelling"])

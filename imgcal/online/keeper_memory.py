@@ -52,6 +52,7 @@ class KeeperMemory:
     factory: CameraRig
     obj: CalibrationObject  # as its file says
     drift: DriftRate | None
+    horizon: int | None  # latest snapshots that count; None = all
     prior: CameraRig  # what the filter began with
     monitor: RigMonitor
     noise: NoiseLevel
@@ -76,16 +77,21 @@ class KeeperMemory:
 
     @classmethod
     def of(
-        cls, rig: CameraRig, obj: CalibrationObject, drift: DriftRate | None, options: PipelineOptions
+        cls,
+        rig: CameraRig,
+        obj: CalibrationObject,
+        drift: DriftRate | None,
+        options: PipelineOptions,
+        horizon: int | None = None,
     ) -> KeeperMemory:
-        """Begin with a factory calibration."""
+        """Begin with a factory calibration; what snapshots taught a calibration lies beyond any horizon."""
         obj.require_rigid("for a running rig")
         rig = rig.to(torch.float64)
-        calibration, rig = calibration_of(rig), replace(rig, posterior=None)
+        calibration, rig = None if horizon is not None else calibration_of(rig), replace(rig, posterior=None)
         start = None if calibration is None else (belief_of(calibration, obj), calibration.snapshots)
-        monitor = RigMonitor(RigFilter(rig, obj, drift, options.estimation, start=start))
+        monitor = RigMonitor(RigFilter(rig, obj, drift, options.estimation, start=start, horizon=horizon))
         memory = cls(
-            options=options, factory=rig, obj=obj, drift=drift, prior=rig, monitor=monitor,
+            options=options, factory=rig, obj=obj, drift=drift, horizon=horizon, prior=rig, monitor=monitor,
             noise=NoiseLevel(rig, obj, options), sightings=Sightings(rig.camera_names),
             relearning=Relearning(rig.camera_names), drift_watch=DriftWatch(rig.camera_names),
             doubts=ObjectDoubts(obj.num_fiducials), search=Search(rig.num_cameras),
@@ -98,7 +104,7 @@ class KeeperMemory:
 
     def begin_anew(self) -> None:
         """Forget everything but the factory calibration."""
-        fresh = KeeperMemory.of(self.prior, self.obj, self.drift, self.options)
+        fresh = KeeperMemory.of(self.prior, self.obj, self.drift, self.options, self.horizon)
         for name in ("monitor", "doubts", "search", "relearning", "drift_watch", "looks", "off", "in_vain"):
             setattr(self, name, getattr(fresh, name))
         self.noise.restart()
@@ -180,7 +186,7 @@ class KeeperMemory:
         for rig in (found["prior"], found["factory"]):
             check_rig(rig)
         check_object(found["obj"])
-        fresh = cls.of(found["prior"], found["obj"], found["drift"], options)
+        fresh = cls.of(found["prior"], found["obj"], found["drift"], options, found["horizon"])
         expected = fresh.values()
         if set(found) != set(expected):
             raise ValueError("other values than are written here")

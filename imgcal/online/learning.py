@@ -98,7 +98,8 @@ def ask_clocks(memory: KeeperMemory) -> bool:
 
 def _relearn(memory: KeeperMemory, found: MonitorUpdate) -> MonitorUpdate:
     """Learn the first snapshots again, with the noise that they have shown."""
-    monitor = RigMonitor(RigFilter(memory.prior, memory.obj, memory.drift, memory.options.estimation))
+    estimation, horizon = memory.options.estimation, memory.horizon
+    monitor = RigMonitor(RigFilter(memory.prior, memory.obj, memory.drift, estimation, horizon=horizon))
     for blobs, pose in memory.noise.first:
         found = monitor.update(memory.observed(blobs), pose)
     memory.monitor = monitor

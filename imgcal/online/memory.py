@@ -26,6 +26,7 @@ MODULES = frozenset(
         "monitoring.snapshot_information",
         "monitoring.cusum",
         "monitoring.drift_pace",
+        "monitoring.horizon",
         "monitoring.quarantine",
         "estimation.map_estimate",
         "monitoring.noise_correlation",
