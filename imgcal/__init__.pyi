@@ -5,7 +5,7 @@ from .estimation import Estimate, EstimationOptions, PredictedError, WorkingVolu
 from .formats import load_rig
 from .geometry import Projection, RigidTransform
 from .io import load_detections, load_object, open_capture, save_detections, save_rig
-from .online import Event, Recalibrator, RigKeeper, RigState
+from .online import Event, RigKeeper, RigState
 from .pipeline import Calibration, calibrate, score
 from .types import CalibrationObject, CameraRig, Detections, Observations, RigPrior
 
@@ -25,7 +25,6 @@ __all__ = [
     "PipelineOptions",
     "PredictedError",
     "Projection",
-    "Recalibrator",
     "RefusedError",
     "RigKeeper",
     "RigPrior",

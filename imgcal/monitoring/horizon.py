@@ -118,6 +118,4 @@ class Horizon:
         information[:wide, :wide] = cameras.information[:wide, :wide]
         covariance = torch.cholesky_inverse(first.factor)[wide:, wide:]
         information[wide:, wide:] = torch.cholesky_inverse(cholesky_factor(covariance))
-        return replace(
-            cameras, obj=first.obj, object_offset=first.object_offset, factor=cholesky_factor(information)
-        )
+        return replace(cameras, obj=first.obj, object_offset=first.object_offset, factor=cholesky_factor(information))

@@ -77,7 +77,8 @@ class RigKeeper:
             drift: how fast values wander; None = as the rig says.
             horizon: number of latest snapshots that the rig is known by, beside its factory calibration; None = all
                 that ever came, each worth less as the rig may have wandered. More know it better and follow it more
-                slowly. Of two and more, one and up to a quarter more count at times. A camera that none of them shows keeps its last values.
+                slowly. Of two and more, one and up to a quarter more count at times. A camera that none of them shows
+                keeps its last values.
             tests: what else watches each snapshot; None = `default_tests`.
         """
         if horizon is not None and horizon < 1:
@@ -271,7 +272,7 @@ class RigKeeper:
         astray = frozenset() if labelled is None else labelled.astray - memory.monitor.quarantine.cameras
         look = Look(time, number, state.detections, state.predicted, astray, frozenset(silent))
         events += memory.sightings.take(state.rig, look)
-        events += memory.relearning.learnt(memory.belief, frozenset(memory.monitor.open), time, number)
+        events += memory.relearning.learnt(memory.belief, frozenset(memory.monitor.open), memory.settled, time, number)
         if found is not None:
             unsettled = frozenset(memory.relearning.events) | frozenset(memory.sightings.lost) | frozenset(memory.off)
             events += memory.drift_watch.take(memory.belief, unsettled, time, number)

@@ -144,6 +144,11 @@ class KeeperMemory:
         return Surroundings(self.belief, (self.prior.prior or RigPrior()).std(self.prior), self.obj_now, self.options)
 
     @property
+    def settled(self) -> frozenset[int]:
+        """Cameras that every snapshot within the horizon shows where they stand now; none without a horizon."""
+        return frozenset() if self.horizon is None else frozenset(np.flatnonzero(self.looks >= self.horizon).tolist())
+
+    @property
     def most_usual(self) -> float:
         """How far off most cameras may be, px."""
         if len(self.usual) < LEAST_USUAL:

@@ -48,7 +48,6 @@ MODULES = frozenset(
         "online.relearning",
         "online.search",
         "online.sightings",
-        "online.window",
         "types.calibration_object",
         "types.observations",
         "types.rig",
