@@ -7,7 +7,6 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import ClassVar
 
 from torch import Tensor
 
@@ -69,24 +68,6 @@ class RigMonitor:
         (0, {})
     """
 
-    STATE: ClassVar = {
-        "filter": ("filter", RigFilter),
-        "open_changes": ("open", dict[int, Change]),
-        "undecided": ("undecided", dict[int, int]),
-        "quarantine": ("quarantine", Quarantine),
-        "shaking": ("shaking", ShakeLevel),
-        "known_since": ("known_since", int),
-        "diagnosis": ("_diagnosis", Diagnosis),
-        "misfit": ("_misfit", Misfit),
-        "noise": ("noise", NoiseCorrelation),
-        "recent": ("_recent", RecentSnapshots),
-        "drifting": ("_drifting", DriftLearning),
-        "pending": ("_pending", PendingChange | None),
-        "prior": ("_prior", RigBelief),
-        "moved_early": ("_moved_early", set[int]),
-        "suspect": ("_suspect", int | None),
-    }
-
     def __init__(self, rig_filter: RigFilter) -> None:
         """Watch over a filter, which is to be updated by this monitor alone from now on."""
         self.filter = rig_filter
@@ -104,11 +85,6 @@ class RigMonitor:
         self._prior = rig_filter.belief
         self._moved_early: set[int] = set()  # cameras of which the factory knows nothing more
         self._suspect: int | None = None  # the camera without which the last snapshot would not have been refused
-
-    def resume(self) -> None:
-        """Put together what has been read: the latest snapshots may have led to the very belief of the filter."""
-        if self._recent.follows(self.filter.belief):
-            self._recent.follow(self.filter.belief)
 
     def update(
         self,

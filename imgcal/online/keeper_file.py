@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +11,10 @@ from imgcal.errors import InputError
 from imgcal.io import object_text, rig_text, write_text
 from imgcal.messages import shortened
 from imgcal.online.events import iso_time, snapshot_name
-from imgcal.online.state_document import StateReader, StateWriter
+from imgcal.online.memory import Frozen, Thawed
 from imgcal.types import CalibrationObject, CameraRig
 
-FORMAT = "imgcal-keeper/6"
+FORMAT = "imgcal-keeper/5"
 """Another number whenever what is remembered is laid out anew: nobody can go on from a state of another version."""
 MOST_BYTES = 2**28
 
@@ -31,8 +30,7 @@ class KeeperFile:
     rig: CameraRig
     factory: CameraRig
     obj: CalibrationObject
-    state: dict[str, Any]  # plain values, which refer to ...
-    arrays: StateWriter  # ... these
+    memory: Frozen
     progress: dict[str, Any] | None = None  # of whoever saves it
 
     def text(self) -> str:
@@ -48,9 +46,8 @@ class KeeperFile:
             "factory": rig_text(self.factory).splitlines(),
             "object": object_text(self.obj).splitlines(),
         }
-        state = _canonical({**self.state, "arrays": self.arrays.plain_arrays()})
-        start = json.dumps({**readable, "sha256": _digest(state)}, indent=1, ensure_ascii=False)[:-2]
-        return f'{start},\n "state": {state}\n}}\n'
+        memory = json.dumps(self.memory.plain(), allow_nan=False)
+        return f'{json.dumps(readable, indent=1, ensure_ascii=False)[:-2]},\n "memory": {memory}\n}}\n'
 
     def write(self, path: str | Path) -> None:
         """Replace the file in one step.
@@ -61,16 +58,8 @@ class KeeperFile:
         write_text(path, self.text())
 
 
-def _canonical(state: dict[str, Any]) -> str:
-    return json.dumps(state, allow_nan=False)
-
-
-def _digest(state: str) -> str:
-    return hashlib.sha256(state.encode()).hexdigest()
-
-
-def read_state(path: str | Path) -> tuple[dict[str, Any], StateReader]:
-    """Read what a keeper remembers: plain values, and who makes of them what they were.
+def read_memory(path: str | Path) -> dict[str, Any]:
+    """Read what a keeper remembers.
 
     Raises:
         InputError: one line with the file, what was found and what was expected.
@@ -96,17 +85,15 @@ def read_state(path: str | Path) -> tuple[dict[str, Any], StateReader]:
         )
     if found != FORMAT:
         raise InputError(f'{path}: found format {shortened(repr(found))}, expected "{FORMAT}"')
-    state = values.get("state")
-    if not isinstance(state, dict) or not isinstance(state.get("arrays"), list):
-        raise InputError(f"{path}: found no state, expected that of a rig that is kept calibrated")
     try:
-        if _digest(_canonical(state)) != values.get("sha256"):
-            raise ValueError("its sha256 is another")
-        return state, StateReader(state["arrays"])
+        memory = Thawed(values.get("memory")).value
     except (ValueError, RecursionError) as error:
         raise unusable(path, error) from error
+    if not isinstance(memory, dict):
+        raise InputError(f"{path}: found no memory, expected that of a rig that is kept calibrated")
+    return memory
 
 
 def unusable(path: str | Path, error: Exception) -> InputError:
     """Say that a file was changed since it was written."""
-    return InputError(f"{path}: found a state that was not written here ({shortened(str(error))})")
+    return InputError(f"{path}: found a memory that was not written here ({shortened(str(error))})")
