@@ -30,7 +30,7 @@ def pytest_configure(config: pytest.Config) -> None:
     """Run slow tests in CI, and where paths are given; workers have the option from the process that started them."""
     whole = config.args_source is pytest.Config.ArgsSource.TESTPATHS
     if not hasattr(config, "workerinput") and (os.environ.get("CI") or not whole):
-        config.option.slow = True
+        os.environ["IMGCAL_SLOW_TESTS"] = "1"  # workers inherit the environment, and not what is set among the options
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -43,7 +43,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     named = any("test_benchmark" in argument for argument in config.args)
     wanted = {
         "benchmark": config.getoption("--benchmarks") or named,
-        "slow": config.getoption("--slow"),
+        "slow": config.getoption("--slow") or "IMGCAL_SLOW_TESTS" in os.environ,
     }
     counts = {}
     for marker in (marker for marker, run in wanted.items() if not run):

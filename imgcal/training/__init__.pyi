@@ -3,8 +3,8 @@ from .engine import Run, finished, prepare, progress, train, train_step
 from .experiment import Experiment
 from .experiment_file import KINDS, changed, load_experiment, save_experiment
 from .frame_dataset import CARD, HELD_OUT, TRAIN, FrameDataset, adaptation, load_frames, load_splits
-from .harvest import harvest
 from .infrared_task import InfraredExperiment, InfraredTask
+from .labelled_crops import harvest
 from .measurer_task import MeasurerExperiment, MeasurerTask
 from .rigs import RigExperiment, RigTask, experiment_of
 from .state import TrainingState, load_state, save_state

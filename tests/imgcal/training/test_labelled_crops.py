@@ -9,7 +9,7 @@ from imgcal.errors import RefusedError
 from imgcal.io import data_path, open_capture
 from imgcal.training import harvest
 from imgcal.training.frame_dataset import FrameDataset
-from imgcal.training.harvest import split
+from imgcal.training.labelled_crops import split
 
 
 @pytest.fixture(scope="module")
