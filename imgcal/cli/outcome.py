@@ -179,7 +179,7 @@ def print_outcome(result: dict[str, Any], found: Findings, out: Path, report: bo
         f"identity {result['identity']}, {result['snapshots_used']} snapshots used, "
         f"{result['snapshots_rejected']} rejected"
     )
-    if result.get("lights"):
+    if result["lights"]:
         lights = result["lights"]
         shares = [camera["found"] for camera in lights["held_out"].values()]
         print(

@@ -17,6 +17,7 @@ RESULT = {
     "scale": {"note": "scale rests on the object file alone"},
     "unsynchronized": None,
     "board_bend": None,
+    "lights": None,
     "doubtful": [],
     "repeats": {"note": "3 blobs are listed twice"},
     "identity": "unique",
