@@ -70,7 +70,7 @@ def unsynchronized_evidence(
         What is comparable with `MeasurementUpdate.evidence` of the same snapshots.
 
     Raises:
-        RefusedError: the other cameras, or one of these, do not determine poses.
+        RefusedError: the other cameras do not determine poses.
     """
     result = absorb(before, drop_cameras(observations, cameras), rig_from_object, options)
     return result.evidence + _evidence_of_own_poses(observations, cameras, options, result)
@@ -88,10 +88,9 @@ def _evidence_of_own_poses(
         result: the same snapshots without these cameras, absorbed.
 
     Raises:
-        RefusedError: the other cameras, or one of these, do not determine poses.
+        RefusedError: the other cameras do not determine poses.
     """
     poses, evidence = result.rig_from_object, 0.0
-    spread = torch.tensor(ELSEWHERE, dtype=torch.float64)
     others = _pose_information(result.belief, drop_cameras(observations, cameras), poses)
     every = _pose_information(result.belief, observations, poses)
     evidence += 0.5 * float((torch.logdet(every) - torch.logdet(others)).sum())  # `absorb` leaves out what all share
@@ -101,16 +100,46 @@ def _evidence_of_own_poses(
         rows = alone.seen[:, camera].any(-1).nonzero()[:, 0]
         if not len(rows):
             continue
-        alone = alone.of_snapshots(rows)
-        there = poses[rows]
-        own = absorb(result.belief, alone, there, options)
-        information = _pose_information(own.belief, alone, own.rig_from_object)
-        turn = vector_from_rotation(own.rig_from_object.rotation @ there.rotation.mT)
-        way = torch.cat((turn, own.rig_from_object.translation - there.translation), -1)
-        scatter = spread.square().diag() + torch.linalg.inv(information)  # of the pose about that of the others
-        squared = (way * torch.linalg.solve(scatter, way[..., None])[..., 0]).sum(-1)
-        evidence += own.evidence - 0.5 * float((torch.logdet(scatter) + torch.logdet(information) + squared).sum())
+        sure = _are_determined(_pose_information(result.belief, alone.of_snapshots(rows), poses[rows]))
+        for part, evidence_of in ((rows[sure], _evidence_of_sure_poses), (rows[~sure], _evidence_of_few_labels)):
+            if len(part):
+                evidence += evidence_of(alone.of_snapshots(part), options, result.belief, poses[part])
     return evidence
+
+
+def _are_determined(information: Tensor) -> Tensor:
+    """Tell which poses, of information (S, 6, 6), are known better than from those of the other cameras: (S,)."""
+    spread = torch.tensor(ELSEWHERE, dtype=torch.float64)
+    return torch.linalg.eigvalsh(spread[:, None] * information * spread)[:, 0] > 1
+
+
+def _evidence_of_sure_poses(
+    alone: Observations, options: EstimationOptions, belief: RigBelief, there: RigidTransform
+) -> float:
+    """Log probability of what one camera sees (S, C, N), poses (S,) being fitted that lie about `there`."""
+    own = absorb(belief, alone, there, options)
+    information = _pose_information(own.belief, alone, own.rig_from_object)
+    turn = vector_from_rotation(own.rig_from_object.rotation @ there.rotation.mT)
+    way = torch.cat((turn, own.rig_from_object.translation - there.translation), -1)
+    spread = torch.tensor(ELSEWHERE, dtype=torch.float64)
+    scatter = spread.square().diag() + torch.linalg.inv(information)  # of the pose about that of the others
+    squared = (way * torch.linalg.solve(scatter, way[..., None])[..., 0]).sum(-1)
+    return own.evidence - 0.5 * float((torch.logdet(scatter) + torch.logdet(information) + squared).sum())
+
+
+def _evidence_of_few_labels(
+    alone: Observations, options: EstimationOptions, belief: RigBelief, there: RigidTransform
+) -> float:
+    """The same where the camera sees too few fiducials for a pose: linearized at `there`, the camera fixed."""
+    image, jacobian = _weighted_jacobian(belief, alone, there)
+    weight = torch.where(alone.seen, 1 / alone.sigma, 0.0)[..., None]
+    residual = torch.nan_to_num((alone.uv - image) * weight)
+    precision = torch.tensor(ELSEWHERE, dtype=torch.float64).pow(-2).diag()
+    information = torch.einsum("scnij,scnik->sjk", jacobian, jacobian) + precision
+    pull = torch.einsum("scnij,scni->sj", jacobian, residual)
+    fitted = (pull * torch.linalg.solve(information, pull[..., None])[..., 0]).sum()
+    occam = (torch.logdet(information) - torch.logdet(precision)).sum()
+    return -0.5 * float(residual.square().sum() - fitted + occam)
 
 
 def drop_cameras(observations: Observations, cameras: Collection[int]) -> Observations:
@@ -122,6 +151,14 @@ def drop_cameras(observations: Observations, cameras: Collection[int]) -> Observ
 
 def _pose_information(belief: RigBelief, observations: Observations, rig_from_object: RigidTransform) -> Tensor:
     """Information (S, 6, 6) of snapshots about the object's poses, as left rotation and translation (rad, mm)."""
+    _, jacobian = _weighted_jacobian(belief, observations, rig_from_object)
+    return torch.einsum("scnij,scnik->sjk", jacobian, jacobian)
+
+
+def _weighted_jacobian(
+    belief: RigBelief, observations: Observations, rig_from_object: RigidTransform
+) -> tuple[Tensor, Tensor]:
+    """Images (S, C, N, 2) of the fiducials; their derivatives (S, C, N, 2, 6) by the poses over the blobs' sigmas."""
     nudge = torch.tensor(NUDGE, dtype=torch.float64).diag()
     turned, shifted = rotation_from_vector(nudge[:, :3]), nudge[:, 3:]
 
@@ -136,5 +173,4 @@ def _pose_information(belief: RigBelief, observations: Observations, rig_from_ob
         for k in range(len(NUDGE))
     ]
     weight = torch.where(observations.seen, 1 / observations.sigma, 0.0)[..., None, None]
-    jacobian = torch.nan_to_num(torch.stack(columns, -1)) * weight  # (S, C, N, 2, 6)
-    return torch.einsum("scnij,scnik->sjk", jacobian, jacobian)
+    return start, torch.nan_to_num(torch.stack(columns, -1)) * weight

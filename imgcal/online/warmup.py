@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from imgcal.association import align_camera, associate_lights
 from imgcal.detection import detect
 from imgcal.errors import RefusedError
 from imgcal.geometry import lens_width
@@ -28,7 +29,7 @@ from imgcal.synthesis import (
     simulate_truth,
     true_detections,
 )
-from imgcal.types import CalibrationObject, CameraRig, Observations
+from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior
 from renderers import SensorModel, palette
 
 RIG, OBJECT, SIZE = "T4", "asymmetric8", (512, 272)
@@ -72,6 +73,7 @@ def _warm_up(rig: CameraRig) -> None:
         calibrate(true_detections(simulate_truth(rig, obj, MANY, generator, DRIFT, POSES)), rig, obj)
     _of_a_plane(rig, generator)
     _of_bloomed_lamps()
+    _of_unknown_markers(rig, generator)
     _of_many_snapshots(truth, rig, obj)
     seen = torch.ones(truth.uv.shape[:-1], dtype=torch.bool)
     for uv in (truth.uv, truth.uv.float()):  # of `imgcal render`, and of the networks
@@ -132,6 +134,23 @@ def _of_many_snapshots(truth: Truth, rig: CameraRig, obj: CalibrationObject) -> 
     with _whatever_comes():
         for _ in range(A_SECOND):
             recent.append(follows.follow(there, truth.rig_from_object[:1]), there, 0.0)
+
+
+def _of_unknown_markers(rig: CameraRig, generator: torch.Generator) -> None:
+    """Markers whose arrangement is unknown are found by their rays, in a capture and in a running rig."""
+    markers = load_object("lights")
+    labelled = true_detections(simulate_truth(rig, load_object(OBJECT), MANY, generator, DRIFT, POSES))
+    seen = replace(labelled, fiducial=np.full(len(labelled), -1))
+    with _whatever_comes():
+        calibrate(seen, rig, markers)
+    with _whatever_comes():
+        score(seen, rig, markers)
+    found = associate_lights(seen, rig, np.ones(rig.num_cameras))
+    align_camera(seen, rig, RigPrior().std(rig), rig, 0, found)  # a capture in which one camera shows few of them
+    with RigKeeper(rig, markers) as keeper:
+        for number in range(MANY):
+            with _whatever_comes():
+                keeper.update(seen.of_snapshots(number, number + 1), number / 60)
 
 
 def _of_bloomed_lamps() -> None:
