@@ -87,9 +87,15 @@ class KeeperMemory:
         options: PipelineOptions,
         horizon: int | None = None,
     ) -> KeeperMemory:
-        """Begin with a factory calibration; what snapshots taught a calibration lies beyond any horizon."""
+        """Begin with a factory calibration; what snapshots taught a calibration lies beyond any horizon.
+
+        Raises:
+            InputError: the rig or the object cannot be, or the object's fiducials lie on one line.
+        """
         if not isinstance(obj, UnknownLights):
             obj.require_rigid("for a running rig")
+        check_rig(rig)
+        check_object(obj)
         rig = rig.to(torch.float64)
         calibration, rig = None if horizon is not None else calibration_of(rig), replace(rig, posterior=None)
         start = None if calibration is None else (belief_of(calibration, obj), calibration.snapshots)
