@@ -5,7 +5,7 @@ from .estimation import Estimate, EstimationOptions, PredictedError, WorkingVolu
 from .formats import load_rig
 from .geometry import Projection, RigidTransform
 from .io import load_detections, load_object, open_capture, save_detections, save_object, save_rig
-from .online import Event, Recalibrator, RigKeeper, RigState
+from .online import Event, RigKeeper, RigState
 from .pipeline import Calibration, calibrate, calibrate_from_scratch, score
 from .types import CalibrationObject, CameraRig, Detections, DriftRate, Observations, RigPrior
 
@@ -26,7 +26,6 @@ __all__ = [
     "PipelineOptions",
     "PredictedError",
     "Projection",
-    "Recalibrator",
     "RefusedError",
     "RigKeeper",
     "RigPrior",

@@ -5,8 +5,8 @@ the residuals better. All other unknowns, the cameras' values and the poses, are
 eliminated from the normal equations, so that no estimate has to be made again for any of the candidates. Residuals are
 clipped, as Huber's loss clips them: a few wrong labels cannot make up a step.
 
-`imgcal.online.breaks` tests the same idea in another way. A capture is asked once, after the fact, for steps as small
-as all of it can show: here the whole rig is free, lenses included.
+A capture is asked once, after the fact, for steps as small as all of it can show: all values of the rig are
+free, those of the lenses included.
 """
 
 from __future__ import annotations

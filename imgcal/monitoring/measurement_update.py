@@ -32,6 +32,7 @@ def absorb(
     observations: Observations,
     rig_from_object: RigidTransform,
     options: EstimationOptions = EstimationOptions(),
+    start: RigBelief | None = None,
 ) -> MeasurementUpdate:
     """Learn from labelled snapshots of a rig that stood still while they were taken.
 
@@ -40,6 +41,7 @@ def absorb(
         observations: (S, C, N) of the object that the belief is about.
         rig_from_object: (S,) first guess of the object's poses; (S, N) of lights, see `UnknownLights`.
         options: how to minimize.
+        start: a belief about the same rig and object where the search begins, which saves steps; None = `belief`.
 
     Raises:
         RefusedError: the observations do not determine the object's pose, or no minimum was found.
@@ -70,6 +72,7 @@ def absorb(
         (belief.arrays, unit.numpy(), belief.object_offset.numpy(), constants.own_std, belief.information.numpy()),
         (rotation, centre),
         (*loss, options.max_iterations, options.tolerance, SLACK, DAMPED, STALLED, MOST_DAMPING),
+        None if start is None else (start.arrays, start.object_offset.numpy()),
     )
     if found.status:
         raise RefusedError(f"estimation: {WHY_NOT[found.status]}")

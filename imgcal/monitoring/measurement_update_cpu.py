@@ -75,6 +75,7 @@ def absorb(
     known: tuple[RigArrays, Array, Array, Array, Array],
     poses: tuple[Array, Array],
     options: tuple[int, float, int, float, float, float, float, float],
+    start: tuple[RigArrays, Array] | None = None,
 ) -> Minimum:
     """Find what is most probable after some snapshots.
 
@@ -87,14 +88,16 @@ def absorb(
         poses: first guess, rotation (S, 3, 3) and centre (S, 3); of lights (S, N, 3).
         options: code and threshold of the loss, iterations at most, tolerance, by how much the cost may rise,
             the damping up to which a small step shows the minimum, that once a step has failed, and the greatest one.
+        start: first guess of the rig and of the object's offset (M,); None = what is known.
     """
     uv = seen[0]
     rig, unit, own, own_std, information = known
     (count, cameras, _, fiducials), free = uv.shape, unit.shape[1]
     size = len(own)
     wide, freedom = cameras * free + size, 6 if poses[1].ndim == 2 else 3 * fiducials
-    rigs = tuple(np.stack((part, part)) for part in rig.parts)
-    states = (np.zeros((cameras, free)), *(np.stack((part, part)) for part in (*poses, own)))
+    first_rig, first_own = (rig, own) if start is None else start
+    rigs = tuple(np.stack((part, part)) for part in first_rig.parts)
+    states = (np.zeros((cameras, free)), *(np.stack((part, part)) for part in (*poses, first_own)))
     blocks = (
         np.empty((2, count, cameras, free, free)), np.empty((2, count, 1, freedom, wide)),
         np.empty((2, count, 1, freedom, freedom)), np.empty((2, count, size, wide)),

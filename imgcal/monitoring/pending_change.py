@@ -51,11 +51,12 @@ class PendingChange:
     count: int  # snapshots
     seconds: float
     kinds: dict[int, str | None]  # of the cameras that changed; None = not decided
+    most: int = DECIDE_AFTER[-1]  # snapshots after which the kinds are decided
 
     @property
     def overdue(self) -> bool:
         """Tell whether more snapshots are not worth waiting for."""
-        return self.count >= DECIDE_AFTER[-1] or self.seconds > YOUNG_SECONDS
+        return self.count >= self.most or self.seconds > YOUNG_SECONDS
 
     def distance(self, belief: RigBelief) -> Tensor:
         """Error (D,) in the chart of what was believed at some time.

@@ -94,6 +94,11 @@ class RecentSnapshots:
     def __len__(self) -> int:
         return len(self._seen)
 
+    def clear(self) -> None:
+        """Forget all snapshots."""
+        self._seen.clear()
+        self._bases, self._aged = [], True
+
     def append(self, result: MeasurementUpdate, observations: Observations, seconds: float) -> None:
         """Take a snapshot that has just been absorbed.
 
@@ -117,6 +122,8 @@ class RecentSnapshots:
     def relinearize(self, result: MeasurementUpdate) -> None:
         """Take the same snapshots, and any number before them, as they are where they lead together."""
         brought, before, seen = result.brought, result.before, self._seen
+        while len(seen) > len(brought):  # beyond the filter's horizon
+            seen.popleft()
         self._begin(brought.rig, brought.object_offset)
         origin = torch.from_numpy(self._at.copy())
         information = before.information

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from imgcal.estimation import EstimationOptions
 from imgcal.geometry import RigidTransform
+from imgcal.monitoring.horizon import Horizon
 from imgcal.monitoring.measurement_update import absorb, stack_snapshots
 from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, age_belief
 from imgcal.types import CalibrationObject, CameraRig, DriftRate, Observations
@@ -50,6 +51,7 @@ class RigFilter:
         options: EstimationOptions = EstimationOptions(),
         prior_std: Tensor | None = None,
         start: tuple[RigBelief, int] | None = None,
+        horizon: int | None = None,
     ) -> None:
         """Begin with the factory calibration.
 
@@ -60,12 +62,15 @@ class RigFilter:
             options: how to minimize.
             prior_std: (C, K) how far the factory values may be off; None = as the rig says.
             start: what a calibration has found, and from how many snapshots; None = nothing.
+            horizon: number of latest snapshots that count beside the factory calibration; None = all. With a horizon
+                the rig is taken to stand still within it, and is not believed to wander.
         """
         self.rate, self.options = rate or rig.drift_rate or DriftRate(), options
         self.calibrated = start is not None  # it began with what a calibration has found
         self.belief, self.count = start or (RigBelief.of_prior(rig, obj, prior_std), 0)  # and snapshots absorbed
         self._young = start is None  # the first snapshots are still kept
         self.pace = torch.ones_like(self.belief.unit)  # (C, K) times the rate at which values are believed to wander
+        self.horizon = None if horizon is None else Horizon(horizon, self.belief)
         self._first = self.belief
         self._early: list[tuple[Observations, RigidTransform]] = []
         self._span = self._waited = 0.0  # s, since the first snapshot; of it, what the belief has not aged by
@@ -105,13 +110,20 @@ class RigFilter:
         self, observations: Observations, rig_from_object: RigidTransform, seconds: float = 0.0
     ) -> MeasurementUpdate:
         """Do the work of `update`, and leave it to the caller to `relinearize` where that is `due`."""
-        passed = max(seconds, 0.0) if self.count else 0.0
+        horizon, alone = self.horizon, None
+        if horizon is not None and horizon.snapshots == 1 and self._early:
+            alone = horizon.without(self.belief, shown(self._early), observations.seen[0].any(-1), self._first)
+        passed = max(seconds, 0.0) if self.count and self.horizon is None else 0.0
         self._span, self._waited = self._span + passed, self._waited + passed
         due = self._waited if self._waited >= LEAST_SECONDS else 0.0
-        result = absorb(age_belief(self.belief, due, self.walk), observations, rig_from_object, self.options)
+        belief = age_belief(self.belief, due, self.walk) if alone is None else alone.first
+        start = None if alone is None else self.belief
+        result = absorb(belief, observations, rig_from_object, self.options, start)
+        if alone is not None and horizon is not None:
+            self._first, horizon.away, self._early = alone.first, alone.away, []
         self.belief, self._waited, self.count = result.belief, self._waited - due, self.count + 1
         still = self._span <= YOUNG_SECONDS or not any(vars(self.rate).values())  # a steady rig stands still for ever
-        self._young = self._young and len(self._early) < MEMORY and still
+        self._young = self._young and (self.horizon is not None or (len(self._early) < MEMORY and still))
         if self._young:
             self._early.append((observations, result.rig_from_object))
         else:
@@ -127,12 +139,31 @@ class RigFilter:
 
     @property
     def due(self) -> bool:
-        """Tell whether the first snapshots are to be absorbed together now."""
-        return len(self._early) in TOGETHER
+        """Tell whether the snapshots that are kept are to be absorbed together now."""
+        count, horizon = len(self._early), self.horizon
+        if horizon is not None and count > horizon.snapshots:
+            return count > horizon.most
+        return count in TOGETHER
+
+    def learnt_since(self, number: int) -> int:
+        """How many snapshots what is known rests on, of those from the one of a number on."""
+        count = self.count - number
+        return count if self.horizon is None else min(count, self.horizon.snapshots)
 
     def relinearize(self) -> MeasurementUpdate:
-        """Absorb the first snapshots anew, all together; `rig_from_object` and `residual` are those of the last one."""
-        result = absorb(self._first, *stack_snapshots(self._early), self.options)
+        """Absorb the snapshots that are kept anew, all together, but those beyond the horizon.
+
+        Returns:
+            What they teach; `rig_from_object` and `residual` are those of the last one.
+        """
+        horizon, start = self.horizon, None
+        if horizon is not None:
+            start, gone = self.belief, self._early[: -horizon.snapshots]
+            if len(self._early) > horizon.most:
+                self._early = self._early[-horizon.snapshots :]
+                left = horizon.without(self.belief, shown(gone), shown(self._early), self._first)
+                self._first, horizon.away = left.first, left.away
+        result = absorb(self._first, *stack_snapshots(self._early), self.options, start)
         self.belief, self._waited = age_belief(result.belief, self._span, self.walk), 0.0
         return replace(result.of_last(), belief=self.belief)
 
@@ -158,3 +189,8 @@ class RigFilter:
     def suppose(self, first: RigBelief, belief: RigBelief) -> None:
         """Hold other beliefs: before the first snapshots that are kept, and now."""
         self._first, self.belief, self._waited = first, belief, 0.0
+
+
+def shown(snapshots: Sequence[tuple[Observations, RigidTransform]]) -> Tensor:
+    """Tell which cameras see the object in some snapshots: (C,) bool."""
+    return torch.cat([observations.seen for observations, _ in snapshots]).any(0).any(-1)

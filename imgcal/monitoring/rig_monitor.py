@@ -137,7 +137,7 @@ class RigMonitor:
 
     def _is_new(self, age: int = 0) -> bool:
         """Tell whether hardly anything was known of the rig before the latest `age` snapshots."""
-        return self.filter.count - age - self.known_since < FEW_SNAPSHOTS
+        return self.filter.learnt_since(self.known_since) - age < FEW_SNAPSHOTS
 
     def _follow(self, observations: Observations, rig_from_object: RigidTransform, seconds: float) -> MonitorUpdate:
         """Learn from a snapshot, and test whether something has changed before it.
@@ -156,6 +156,8 @@ class RigMonitor:
             self._suspect = None
             return self._follow_beside_quarantine(observations, rig_from_object, seconds)
         self._suspect = None
+        if self.filter.horizon is not None and self.filter.horizon.snapshots == 1:
+            self._recent.clear()
         self._recent.append(result, observations, seconds)
         if self._pending is not None:
             self._pending.add(result, seconds)
@@ -175,9 +177,7 @@ class RigMonitor:
             if (anew := self._diagnose_first_misfit(result)) is not None:
                 return replace(anew, changes=tuple(changes))
             if self._pending is not None:
-                self._pending = PendingChange.of(
-                    result, self._pending.before, self._pending.seconds, self._pending.kinds
-                )
+                self._begin_pending(result, self._pending.before, self._pending.seconds, self._pending.kinds)
         self._drifting.update(self.filter, self._recent, seconds, quiet=self._pending is None and alarm is None)
         if self._pending is not None and self._pending.due:
             changes += self._decide_kinds(self._pending.overdue)
@@ -274,8 +274,7 @@ class RigMonitor:
         """Put together a case of cameras that seem to have moved before the latest `age` snapshots."""
         kept = len(self._recent)
         everything = self.filter.count - self.known_since == kept
-        moved = dict.fromkeys(sorted(self._moved_early))
-        beginning = free_cameras(self._prior, moved, JUMPS[-1]) if everything else None
+        beginning = self._anywhere(self._moved_early) if everything else None
         snapshots, pauses = self._recent.snapshots(kept), self._recent.pauses(kept)
         return Case(
             before, snapshots, pauses, age, self.filter.options, cameras,
@@ -334,13 +333,13 @@ class RigMonitor:
         Raises:
             RefusedError: see `absorb`; the monitor stays as it was.
         """
-        forget, nan = self._is_new(case.count), math.nan
+        forget, nan, horizon = self._is_new(case.count), math.nan, self.filter.horizon
         early = self._moved_early | free.keys()
-        if forget:
-            before = free_cameras(self._prior, dict.fromkeys(sorted(early)), JUMPS[-1])
-        else:
-            before = free_cameras(case.before, free, jump)
+        before = self._anywhere(early) if forget else free_cameras(case.before, free, jump)
         result = self._restart(before, case.latest, case.pauses[-case.count :])
+        if horizon is not None:
+            self._moved_early = early
+            horizon.free(self._anywhere(early), free)
         number, new = self.filter.count - case.count, dict[int, Change]()
         for camera, kind in free.items():
             if forget or (kind is None and camera not in self.open):
@@ -351,8 +350,20 @@ class RigMonitor:
             self.open, self._pending, self._suspect = {}, None, None
         else:
             self.open |= new
-            self._pending = PendingChange.of(result, case.before, seconds, dict(free))
+            self._begin_pending(result, case.before, seconds, dict(free))
         return MonitorUpdate(result, tuple(new.values()))
+
+    def _anywhere(self, cameras: Collection[int]) -> RigBelief:
+        """What the factory says of a rig in which some cameras may be anywhere."""
+        return free_cameras(self._prior, dict.fromkeys(sorted(cameras)), JUMPS[-1])
+
+    def _begin_pending(
+        self, result: MeasurementUpdate, before: RigBelief, seconds: float, kinds: dict[int, str | None]
+    ) -> None:
+        """Wait until the kinds of changes can be decided; beyond the horizon nothing more comes to decide them by."""
+        self._pending = PendingChange.of(result, before, seconds, kinds)
+        if self.filter.horizon is not None:
+            self._pending.most = min(self._pending.most, self.filter.horizon.snapshots)
 
     def _restart(
         self, before: RigBelief, snapshots: Sequence[Snapshot], pauses: Sequence[float], new: bool = False
@@ -376,7 +387,7 @@ class RigMonitor:
     def _diagnose_misfit(self, age: int) -> MonitorUpdate | None:
         """Learn the object anew where the latest snapshots fit worse because it has changed."""
         age = min(age, len(self._recent))
-        if self.filter.count - age - self.known_since < OBJECT_SNAPSHOTS:
+        if self.filter.learnt_since(self.known_since) - age < OBJECT_SNAPSHOTS:
             return None
         with contextlib.suppress(RefusedError):  # nothing was known of the rig
             before = self._recent.belief_before(age)

@@ -5,7 +5,6 @@ from .image_quality import ImageQuality
 from .keeper import RigKeeper
 from .keeper_file import KeeperFile
 from .object_pose import ObjectPose
-from .recalibrator import Recalibrator
 from .rig_state import CameraHealth, RigState
 from .sequential_test import SequentialTest
 from .warmup import warm_up, warm_up_fits
@@ -21,7 +20,6 @@ __all__ = [
     "ImageQuality",
     "KeeperFile",
     "ObjectPose",
-    "Recalibrator",
     "RigKeeper",
     "RigState",
     "SequentialTest",

@@ -5,19 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imgcal.association import PipelineOptions, distances_to_nearest, mutual_nearest, to_observations, track
-from imgcal.estimation import estimate
+from imgcal.association import PipelineOptions, distances_to_nearest, mutual_nearest, track
 from imgcal.geometry import RigidTransform
 from imgcal.types import CalibrationObject, CameraRig, Detections
 
 TOO_NEAR = 0.6
 """Distance (px) between two predictions below which nearness does not tell which is which."""
-MOST_APART = 5.0
-"""Times the median distance that a blob may be from its fiducial, once the pose has been fitted with the last rig."""
 MARGIN = 0.03
 """Of the image's size, from its border: a fiducial predicted farther out may as well be out of view."""
 LEAST_EXPLAINED = 1 / 3
@@ -47,30 +43,6 @@ def near_prediction(blobs: Detections, predicted: NDArray[np.float64]) -> NDArra
         named = np.flatnonzero((found >= 0) & ~crowded)
         labels[rows[found[named]]] = named
     return labels
-
-
-def without_strays(
-    blobs: Detections, rig: CameraRig, obj: CalibrationObject, pose: RigidTransform, options: PipelineOptions
-) -> tuple[Detections, RigidTransform]:
-    """Fit the pose with a rig that is known, and drop labels that are off: two markers in one, a reflection beside one.
-
-    Args:
-        blobs: of one snapshot, labelled.
-        rig: from the snapshot before.
-        obj: the calibration object.
-        pose: rig_from_object of the snapshot before.
-        options: how far blobs may be off at all.
-    """
-    seen = to_observations(blobs, rig, obj)
-    even = replace(seen, sigma=torch.full_like(seen.sigma, options.identity_error))
-    held = torch.zeros(rig.num_cameras, rig.num_parameters, dtype=seen.uv.dtype)
-    robust = replace(options.estimation, loss="cauchy")
-    fit = estimate(even, rig, obj, pose.reshape(1), prior_std=held, options=robust)
-    distance = fit.residual[0].norm(dim=-1)  # (C, N)
-    usual = distance[seen.seen[0]].median() if bool(seen.seen.any()) else torch.inf
-    stray = (distance > options.identity_error + MOST_APART * usual).numpy()
-    fiducial = np.where(stray[blobs.camera, blobs.fiducial], -1, blobs.fiducial)
-    return replace(blobs, fiducial=fiducial), fit.rig_from_object[0]
 
 
 def spare_blobs(blobs: Detections, cameras: int) -> NDArray[np.int64]:

@@ -63,6 +63,7 @@ class RigKeeper:
         detection: DetectionOptions = DetectionOptions(),
         detector: DetectorName | Proposer = "classical",
         drift: DriftRate | None = None,
+        horizon: int | None = None,
         tests: Sequence[SequentialTest] | None = None,
     ) -> None:
         """Start from a factory calibration.
@@ -74,12 +75,20 @@ class RigKeeper:
             detection: how blobs are found.
             detector: who finds the fiducials in frames, as for `calibrate`.
             drift: how fast values wander; None = as the rig says.
+            horizon: number of latest snapshots that the rig is known by, beside its factory calibration; None = all
+                that ever came, each worth less as the rig may have wandered. More know it better and follow it more
+                slowly. Of two and more, one and up to a quarter more count at times. A camera that none of them shows
+                keeps its last values.
             tests: what else watches each snapshot; None = `default_tests`.
         """
         if obj.pose_rank == 3 and not isinstance(obj, UnknownLights):
             obj = UnknownLights.of() if obj.unknown_markers else UnknownLights.of_light(obj)
+        if horizon is not None and horizon < 1:
+            raise InputError(f"horizon: found {horizon}, expected at least 1 snapshot")
+        if horizon is not None and isinstance(obj, UnknownLights):
+            raise InputError("horizon: a rig known by unknown lights learns from all snapshots; leave the horizon out")
         self.options = _for_keeping(options)
-        self._memory = KeeperMemory.of(rig, obj, drift, self.options)
+        self._memory = KeeperMemory.of(rig, obj, drift, self.options, horizon)
         usual = () if isinstance(obj, UnknownLights) else default_tests(rig.num_cameras)  # all of them ask for a body
         self.tests = tuple(usual if tests is None else tests)
         clocks = (test for test in self.tests if isinstance(test, ClockOffsets))
@@ -269,7 +278,7 @@ class RigKeeper:
         astray = frozenset() if labelled is None else labelled.astray - memory.monitor.quarantine.cameras
         look = Look(time, number, state.detections, state.predicted, astray, frozenset(silent))
         events += memory.sightings.take(state.rig, look)
-        events += memory.relearning.learnt(memory.belief, frozenset(memory.monitor.open), time, number)
+        events += memory.relearning.learnt(memory.belief, frozenset(memory.monitor.open), memory.settled, time, number)
         if found is not None:
             unsettled = frozenset(memory.relearning.events) | frozenset(memory.sightings.lost) | frozenset(memory.off)
             events += memory.drift_watch.take(memory.belief, unsettled, time, number)
@@ -362,7 +371,7 @@ class RigKeeper:
             memory = KeeperMemory.restored(found["values"], _for_keeping(options))
             keeper = cls(
                 memory.prior, memory.obj, options, detection=detection, detector=detector, drift=memory.drift,
-                tests=tests,
+                horizon=memory.horizon, tests=tests,
             )  # fmt: skip
             keeper._memory = memory
             keeper._labelling.restored(found["labelling"])

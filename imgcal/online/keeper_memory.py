@@ -54,6 +54,7 @@ class KeeperMemory:
     factory: CameraRig
     obj: CalibrationObject  # as its file says
     drift: DriftRate | None
+    horizon: int | None  # latest snapshots that count; None = all
     prior: CameraRig  # what the filter began with
     monitor: RigMonitor
     noise: NoiseLevel
@@ -79,17 +80,28 @@ class KeeperMemory:
 
     @classmethod
     def of(
-        cls, rig: CameraRig, obj: CalibrationObject, drift: DriftRate | None, options: PipelineOptions
+        cls,
+        rig: CameraRig,
+        obj: CalibrationObject,
+        drift: DriftRate | None,
+        options: PipelineOptions,
+        horizon: int | None = None,
     ) -> KeeperMemory:
-        """Begin with a factory calibration."""
+        """Begin with a factory calibration; what snapshots taught a calibration lies beyond any horizon.
+
+        Raises:
+            InputError: the rig or the object cannot be, or the object's fiducials lie on one line.
+        """
         if not isinstance(obj, UnknownLights):
             obj.require_rigid("for a running rig")
+        check_rig(rig)
+        check_object(obj)
         rig = rig.to(torch.float64)
-        calibration, rig = calibration_of(rig), replace(rig, posterior=None)
+        calibration, rig = None if horizon is not None else calibration_of(rig), replace(rig, posterior=None)
         start = None if calibration is None else (belief_of(calibration, obj), calibration.snapshots)
-        monitor = RigMonitor(RigFilter(rig, obj, drift, options.estimation, start=start))
+        monitor = RigMonitor(RigFilter(rig, obj, drift, options.estimation, start=start, horizon=horizon))
         memory = cls(
-            options=options, factory=rig, obj=obj, drift=drift, prior=rig, monitor=monitor,
+            options=options, factory=rig, obj=obj, drift=drift, horizon=horizon, prior=rig, monitor=monitor,
             noise=NoiseLevel(rig, obj, options), sightings=Sightings(rig.camera_names),
             relearning=Relearning(rig.camera_names), drift_watch=DriftWatch(rig.camera_names),
             doubts=ObjectDoubts(obj.num_fiducials), search=Search(rig.num_cameras),
@@ -104,7 +116,7 @@ class KeeperMemory:
 
     def begin_anew(self) -> None:
         """Forget everything but the factory calibration."""
-        fresh = KeeperMemory.of(self.prior, self.obj, self.drift, self.options)
+        fresh = KeeperMemory.of(self.prior, self.obj, self.drift, self.options, self.horizon)
         for name in ("monitor", "doubts", "search", "relearning", "drift_watch", "looks", "off", "in_vain"):
             setattr(self, name, getattr(fresh, name))
         self.noise.restart()
@@ -142,6 +154,11 @@ class KeeperMemory:
         if not self.monitor.filter.count:
             return None
         return Surroundings(self.belief, (self.prior.prior or RigPrior()).std(self.prior), self.obj_now, self.options)
+
+    @property
+    def settled(self) -> frozenset[int]:
+        """Cameras that every snapshot within the horizon shows where they stand now; none without a horizon."""
+        return frozenset() if self.horizon is None else frozenset(np.flatnonzero(self.looks >= self.horizon).tolist())
 
     @property
     def most_usual(self) -> float:
@@ -186,7 +203,7 @@ class KeeperMemory:
         for rig in (found["prior"], found["factory"]):
             check_rig(rig)
         check_object(found["obj"])
-        fresh = cls.of(found["prior"], found["obj"], found["drift"], options)
+        fresh = cls.of(found["prior"], found["obj"], found["drift"], options, found["horizon"])
         expected = fresh.values()
         if set(found) != set(expected):
             raise ValueError("other values than are written here")

@@ -52,7 +52,7 @@ class Labelling:
         detection: DetectionOptions,
         detector: DetectorName | Proposer,
     ) -> None:
-        """Start with the factory calibration; arguments as of `Recalibrator`."""
+        """Start with the factory calibration; arguments as of `RigKeeper`."""
         self.rig, self.obj, self.options, self.detection = rig, obj, options, detection
         self.follows = False  # the last snapshot says where the object is now
         self.slips = obj.num_fiducials > MOST_FOLLOWED and bool(lattice_shifts(obj))
@@ -76,7 +76,7 @@ class Labelling:
             name: of the snapshot.
 
         Raises:
-            InputError: see `Recalibrator.update`.
+            InputError: see `RigKeeper.update`.
         """
         if isinstance(source, Detections):
             if len(source.snapshot_names) != 1:

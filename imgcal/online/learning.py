@@ -52,6 +52,9 @@ def learnt_from(memory: KeeperMemory, checked: Checked) -> MonitorUpdate:
             found = replace(found, update=of_object.update, object_change=of_object.object_change)
     memory.looks += observations.seen[0].any(-1).numpy()
     memory.looks[[change.camera for change in found.changes]] = 0
+    if (horizon := monitor.filter.horizon) is not None:
+        memory.looks[list(horizon.away)] = 0
+        np.minimum(memory.looks, horizon.snapshots, out=memory.looks)
     seen = np.unique(checked.given.camera[checked.given.fiducial >= 0])
     waits = {camera: since for camera, since in memory.off.items() if camera not in seen}  # for the next that it shows
     memory.off, memory.learnt, memory.in_vain = waits | off, time, 0
@@ -98,7 +101,8 @@ def ask_clocks(memory: KeeperMemory) -> bool:
 
 def _relearn(memory: KeeperMemory, found: MonitorUpdate) -> MonitorUpdate:
     """Learn the first snapshots again, with the noise that they have shown."""
-    monitor = RigMonitor(RigFilter(memory.prior, memory.obj, memory.drift, memory.options.estimation))
+    estimation, horizon = memory.options.estimation, memory.horizon
+    monitor = RigMonitor(RigFilter(memory.prior, memory.obj, memory.drift, estimation, horizon=horizon))
     for blobs, pose in memory.noise.first:
         found = monitor.update(memory.observed(blobs), pose)
     memory.monitor = monitor

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from imgcal.association import PipelineOptions, SnapshotIdentity
+from imgcal.association import Associations, PipelineOptions, SnapshotIdentity
 from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
 from imgcal.monitoring import MeasurementUpdate, shared_shifts
 from imgcal.online.labelling import NEAR
-from imgcal.online.window import Kept, stacked
 from imgcal.pipeline import fit_labelled
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
 
@@ -41,7 +41,7 @@ class NoiseLevel:
 
     def restart(self) -> None:
         """Ask first snapshots again."""
-        self._early: list[Kept] = []
+        self._early: list[tuple[Detections, SnapshotIdentity]] = []  # of one snapshot each
         self._asking = True
         self._ratios: deque[NDArray[np.float64]] = deque(maxlen=EVERY)  # (C, N)
         self.first: list[tuple[Detections, RigidTransform]] = []  # snapshots that showed another noise, and poses
@@ -66,7 +66,7 @@ class NoiseLevel:
             self._asking = steady and count == len(self._early) + 1 and count <= ASKED[-1]
             if self._asking:
                 identity = SnapshotIdentity(f"{count}", "by_tracking", NEAR, 1, result.rig_from_object[0])
-                self._early.append(Kept(blobs, identity))
+                self._early.append((blobs, identity))
                 again = count in ASKED and self._asked()
                 if count == ASKED[-1]:
                     self._asking = False
@@ -79,7 +79,7 @@ class NoiseLevel:
     def _asked(self) -> bool:
         """Ask the first snapshots together how large the noise is."""
         try:
-            fit = fit_labelled(stacked(tuple(self._early), self._rig), self._rig, self._obj, self._options)
+            fit = fit_labelled(stack_labelled(self._early), self._rig, self._obj, self._options)
         except RefusedError:
             return False
         before, now = self.additive, np.full(len(self.additive), fit.additive_noise)
@@ -90,11 +90,11 @@ class NoiseLevel:
         if len(poses.translation) != len(self._early):
             self.additive = before
             return False
-        self.first = [(kept.blobs, poses[number : number + 1]) for number, kept in enumerate(self._early)]
+        self.first = [(blobs, poses[number : number + 1]) for number, (blobs, _) in enumerate(self._early)]
         return True
 
     def _differs(self, additive: float) -> bool:
-        sigma = float(np.median(self._early[-1].blobs.sigma))
+        sigma = float(np.median(self._early[-1][0].sigma))
         before, now = math.hypot(sigma, float(np.median(self.additive))), math.hypot(sigma, additive)
         return max(before, now) > OTHER * min(before, now)
 
@@ -132,3 +132,16 @@ class NoiseLevel:
         self.additive = self.additive.copy()
         self.additive[some] = np.where(other, np.sqrt(np.maximum(variance * ratio - own, 0.0)), before)
         self._ratios.clear()
+
+
+def stack_labelled(snapshots: Sequence[tuple[Detections, SnapshotIdentity]]) -> Associations:
+    """Put labelled snapshots into one table."""
+    tables, identities = zip(*snapshots, strict=True)
+    columns: dict[str, NDArray[np.generic]] = {
+        name: np.concatenate([getattr(table, name) for table in tables])
+        for name in ("uv", "sigma", "camera", "fiducial", "radius", "flags")
+    }
+    number = np.repeat(np.arange(len(tables)), [len(table) for table in tables])
+    names, cameras = tuple(identity.name for identity in identities), tables[0].camera_names
+    table = Detections(**columns, snapshot=number, camera_names=cameras, snapshot_names=names)  # type: ignore[arg-type]
+    return Associations(table, identities)

@@ -61,19 +61,30 @@ class Relearning:
             self.before[change.camera] = relative_std(before)[change.camera]
         return event
 
-    def learnt(self, belief: RigBelief, still_open: frozenset[int], time: float, number: int) -> list[Event]:
-        """Say which cameras are known again as well as before."""
+    def learnt(
+        self, belief: RigBelief, still_open: frozenset[int], settled: frozenset[int], time: float, number: int
+    ) -> list[Event]:
+        """Say which cameras are known again as well as before.
+
+        Args:
+            belief: what is known now.
+            still_open: cameras of which it is not decided how they moved.
+            settled: cameras of which no more can become known: all that counts was seen since they moved.
+            time: s since the epoch.
+            number: of the update.
+        """
         waiting = [camera for camera in self.events if camera not in still_open]
         if not waiting or number % EVERY:
             return []
         std, told = relative_std(belief), []
         for camera in waiting:
             part = slice(0, EXTRINSICS_AND_PINHOLE)
-            if bool((std[camera, part] <= RELEARNT * self.before[camera][part]).all()):
+            known = std[camera, part] <= RELEARNT * self.before[camera][part]
+            if camera in settled or bool(known.all()):
                 event = self.events.pop(camera)
                 del self.before[camera]
                 sigma = sigma_of(std[camera], event.change)
-                known = "" if sigma is None else f" to +- {sigma:.2g} {event.unit}"
+                how_well = "" if sigma is None else f" to +- {sigma:.2g} {event.unit}"
                 told.append(
                     replace(
                         event,
@@ -81,7 +92,7 @@ class Relearning:
                         snapshot=number,
                         kind="relearnt",
                         sigma=sigma,
-                        message=f"{event.message}; known again{known}",
+                        message=f"{event.message}; known again{how_well}",
                     )
                 )
         return told

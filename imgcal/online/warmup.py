@@ -16,7 +16,6 @@ from imgcal.geometry import lens_width
 from imgcal.io import load_object, load_rig
 from imgcal.monitoring import RecentSnapshots, RigFilter
 from imgcal.online.keeper import RigKeeper
-from imgcal.online.recalibrator import Recalibrator
 from imgcal.pipeline import calibrate, score
 from imgcal.synthesis import (
     FrameModel,
@@ -109,10 +108,6 @@ def _from_frames(
         for number, shot in enumerate((shots[0], *shots)):
             with _whatever_comes():
                 keeper.update(shot, float(number))
-    with Recalibrator(rig, obj, window=2) as recalibrator:
-        for shot in (shots[0], *shots):
-            with _whatever_comes():
-                recalibrator.update(shot)
 
 
 def _of_a_plane(rig: CameraRig, generator: torch.Generator) -> None:

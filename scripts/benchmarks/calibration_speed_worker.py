@@ -10,12 +10,14 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterator
+from itertools import count
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from imgcal import Detections, PipelineOptions, Recalibrator, calibrate, load_object, load_rig
+import imgcal
+from imgcal import Detections, PipelineOptions, calibrate, load_object, load_rig
 
 
 class Case:
@@ -26,14 +28,13 @@ class Case:
         given = json.loads((folder / f"{name}.json").read_text())
         rig, obj = load_rig(given["rig"]), load_object(given["object"])
         with np.load(folder / f"{name}.npz") as columns:
-            count = int(columns["snapshot"].max()) + 1
-            names = tuple(f"{s:05d}" for s in range(count))
+            snapshots = int(columns["snapshot"].max()) + 1
+            names = tuple(f"{s:05d}" for s in range(snapshots))
             blobs = Detections(**columns, camera_names=rig.camera_names, snapshot_names=names)
         self._call: Callable[[], object]
         if given["window"]:
-            stream = _there_and_back([blobs.of_snapshots(s, s + 1) for s in range(count)])
-            live = Recalibrator(rig, obj, PipelineOptions(blind_cameras=True), window=given["window"])
-            self._call = lambda: live.update(next(stream))
+            stream = _there_and_back([blobs.of_snapshots(s, s + 1) for s in range(snapshots)])
+            self._call = _follow(rig, obj, given["window"], stream)
         else:
             self._call = lambda: calibrate(blobs, rig, obj)
         for _ in range(3 + 2 * given["window"]):  # compilation; the window is full
@@ -47,6 +48,17 @@ class Case:
             self._call()
             taken.append(1e3 * (time.process_time() - began))
         return taken
+
+
+def _follow(
+    rig: imgcal.CameraRig, obj: imgcal.CalibrationObject, window: int, stream: Iterator[Detections]
+) -> Callable[[], object]:
+    """An update of a running rig that is known by its last snapshots; other checkouts may have no horizon."""
+    if hasattr(imgcal, "Recalibrator"):
+        live = imgcal.Recalibrator(rig, obj, PipelineOptions(blind_cameras=True), window=window)
+        return lambda: live.update(next(stream))
+    keeper, moments = imgcal.RigKeeper(rig, obj, horizon=window), count()
+    return lambda: keeper.update(next(stream), next(moments) / 60)
 
 
 def _there_and_back(parts: list[Detections]) -> Iterator[Detections]:

@@ -6,7 +6,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -17,11 +17,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imgcal.errors import RefusedError
 from imgcal.estimation import estimate
 from imgcal.geometry import RigidTransform, rotation_from_vector, vector_from_rotation
 from imgcal.io import load_object, load_rig
-from imgcal.online import Recalibrator
+from imgcal.online import RigKeeper
 from imgcal.synthesis import FrameModel, PhysicalDrift, Truth, simulate_frames, simulate_truth
 from imgcal.types import CalibrationObject, CameraRig, Observations
 from renderers import ClutterModel
@@ -33,6 +32,8 @@ from scripts.benchmarks.peers.rig_task import RigAnswer, RigTask
 from scripts.output import markdown
 from scripts.timing import side_by_side, timing_of
 
+RATE, LATER = 60.0, 1e6
+"""Snapshots a second, and when those that are counted begin, s: after all others."""
 OURS, QUICK, EXACT = "imgcal", "OpenCV, 1 threshold", "OpenCV, 10 thresholds"
 SCIPY = f"{EXACT}, then SciPy for the rig"
 RADIUS = (6.0, 24.0)  # px, of markers of 6 mm, generously
@@ -61,15 +62,15 @@ def measure(effort: Effort) -> dict[str, Any]:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     stream = make_stream(effort.pick(20, 3))
-    with ThreadPoolExecutor(os.cpu_count()) as pool, Recalibrator(stream.factory, stream.obj) as live:
+    with ThreadPoolExecutor(os.cpu_count()) as pool, RigKeeper(stream.factory, stream.obj, horizon=1) as keeper:
         methods: dict[str, Callable[[int], Outcome]] = {
-            OURS: Ours(stream, live).update,
+            OURS: Ours(stream, keeper).update,
             QUICK: Classical(stream, pool, 1, joint=False).update,
             EXACT: Classical(stream, pool, 10, joint=False).update,
             SCIPY: Classical(stream, pool, 10, joint=True).update,
         }
         compared = _compared(stream, methods, effort.pick(20.0, 1.0), effort.pick(JUDGED, 2))
-        endurance = _endurance(stream, live, effort.pick(10_000, 30), effort.pick(1_000, 30))
+        endurance = _endurance(stream, keeper, effort.pick(10_000, 30), effort.pick(1_000, 30))
     return {
         "cores": os.cpu_count(),
         "versions": versions("opencv-contrib-python-headless", "scipy"),
@@ -139,14 +140,14 @@ class Ours:
     """imgcal in the running state."""
 
     stream: Stream
-    live: Recalibrator
+    keeper: RigKeeper
+    moments: Iterator[int] = field(default_factory=count)
 
     def update(self, snapshot: int) -> Outcome:
-        try:
-            result = self.live.update(self.stream.frames[snapshot])
-        except RefusedError:
+        state = self.keeper.update(self.stream.frames[snapshot], next(self.moments) / RATE)
+        if state.refused is not None:
             return Outcome(None)
-        return Outcome(result.rig, float(result.rms))
+        return Outcome(state.rig, float(np.sqrt(2 * np.nanmean(np.square(state.residual)))))
 
 
 class Classical:
@@ -255,16 +256,13 @@ def _compared(
     return rows
 
 
-def _endurance(stream: Stream, live: Recalibrator, snapshots: int, every: int) -> dict[str, Any]:
+def _endurance(stream: Stream, keeper: RigKeeper, snapshots: int, every: int) -> dict[str, Any]:
     """Run many snapshots in a row, and look at the memory now and then."""
     order, seconds, memory, refused = stream.order(), [], [_resident()], 0
     for number in range(snapshots):
         frames = stream.frames[next(order)]
         begin = time.perf_counter()
-        try:
-            live.update(frames)
-        except RefusedError:
-            refused += 1
+        refused += keeper.update(frames, LATER + number / RATE).refused is not None
         seconds.append(time.perf_counter() - begin)
         if (number + 1) % every == 0:
             memory.append(_resident())

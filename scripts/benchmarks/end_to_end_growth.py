@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from imgcal.association import Associations, PipelineOptions, SnapshotIdentity, relocalize, track
 from imgcal.detection import DetectionOptions, detect_snapshot
 from imgcal.io import load_object, load_rig
-from imgcal.online import Recalibrator
+from imgcal.online import RigKeeper
 from imgcal.pipeline import calibrate, fit_labelled
 from imgcal.synthesis import FrameModel, PhysicalDrift, Truth, simulate_frames, simulate_truth, true_detections
 from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
@@ -134,11 +135,12 @@ def of_one_snapshot(scene: Scene, seconds: float, stages: Sequence[str] = AXES["
     blank = replace(scene.detections, fiducial=np.full(len(scene.detections), -1))
     told = replace(blank, sigma=np.hypot(blank.sigma, PipelineOptions().identity_error))
     labelled = Associations(scene.detections, (SnapshotIdentity("0", "by_tracking", "", 1, pose),))
-    with Recalibrator(rig, obj) as live:
+    moments = count()
+    with RigKeeper(rig, obj, horizon=1) as keeper:
         cases: dict[str, Callable[[], object]] = {
             COLD: lambda: relocalize(told, rig, obj, std),
             KNOWN: lambda: track(told, rig, obj, std, pose),
-            RUNNING: lambda: live.update(blank),
+            RUNNING: lambda: keeper.update(blank, next(moments) / 60),
             LABELLED: lambda: fit_labelled(labelled, rig, obj),
             OPENCV: lambda: cameras_by_opencv(scene),
         }
@@ -196,10 +198,11 @@ def of_frames(width: int, height: int, seconds: float) -> dict[str, float]:
     quick, exact = (opencv_live.detector((6.0 * scale, 24.0 * scale), number) for number in (1, 10))
     usual = DetectionOptions()
     options = replace(usual, max_radius=usual.radius_limit * max(scale, 1.0))
-    with Recalibrator(rig, obj, detection=options) as live, ThreadPoolExecutor(1) as pool:
+    moments = count()
+    with RigKeeper(rig, obj, detection=options, horizon=1) as keeper, ThreadPoolExecutor(1) as pool:
         cases: dict[str, Callable[[], object]] = {
             DETECTION: lambda: detect_snapshot(frames, options, pool=pool),
-            FRAMES: lambda: live.update(frames),
+            FRAMES: lambda: keeper.update(frames, next(moments) / 60),
             QUICK: lambda: [quick.detect(frame) for frame in frames.values()],
             EXACT: lambda: [exact.detect(frame) for frame in frames.values()],
         }

@@ -3,7 +3,7 @@
 Run as `python -m scripts.benchmarks.rig_over_time --out docs/benchmarks/rig_over_time.json`. Three questions: after 1,
 10, 100 and 1,000 snapshots of a steady rig, how far are the filter's standard deviations and values from those of the
 batch estimate from all of them; over many runs, steady and drifting, are its errors as large as it says; and how long
-does `RigKeeper.update` take from blobs, beside `Recalibrator.update` in the same run.
+does `RigKeeper.update` take from blobs, with everything that ever came and with the last snapshots only.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -152,19 +153,18 @@ def normalized_errors(options: Options, rate: DriftRate) -> dict[str, list[float
 
 
 def times(options: Options) -> dict[str, dict[str, float]]:
-    """CPU time (ms) of updates from the blobs of O10, the two in turns."""
+    """CPU time (ms) of updates from the blobs of O10, with several horizons in turns."""
     factory, obj = imgcal.load_rig("O10"), imgcal.load_object("asymmetric8")
     stream = Stream(factory, obj, 1, Conditions(noise=0.07, hidden=0.0, clutter=0.0))
     shots: list[tuple[float, Detections]] = list(stream.snapshots(options.updates + 100))
-    taken: dict[str, list[float]] = {"RigKeeper": [], "Recalibrator": []}
-    with imgcal.RigKeeper(factory, obj) as keeper, imgcal.Recalibrator(factory, obj) as live:
+    horizons = {"everything": None, "horizon 1": 1, "horizon 5": 5, "horizon 20": 20}
+    taken: dict[str, list[float]] = {name: [] for name in horizons}
+    with ExitStack() as stack:
+        keepers = {n: stack.enter_context(imgcal.RigKeeper(factory, obj, horizon=h)) for n, h in horizons.items()}
         for number, (seconds, blobs) in enumerate(shots):
-            for name in taken:
+            for name, keeper in keepers.items():
                 begin = time.thread_time()
-                if name == "RigKeeper":
-                    keeper.update(blobs, seconds)
-                else:
-                    live.update(blobs)
+                keeper.update(blobs, seconds)
                 if number >= 100:
                     taken[name].append(1e3 * (time.thread_time() - begin))
     return {

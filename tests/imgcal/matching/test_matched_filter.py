@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal import InputError, Recalibrator, RefusedError, calibrate
+from imgcal import InputError, RefusedError, RigKeeper, calibrate
 from imgcal.association import Snapshot
 from imgcal.detection import DetectionOptions, detect_snapshot, to_detections
 from imgcal.geometry import geodesic_angle
@@ -66,12 +66,12 @@ def test_blobs_come_first_where_they_decide():
 
 def test_a_running_rig_looks_too():
     rig, obj, _, shots = dim_frames(snapshots=2, seed=2)
-    with Recalibrator(rig, obj, window=2, detector="auto") as live:
-        for shot in shots:
-            result = live.update(shot)
-    assert dict(result.detectors) == {"matched": 2}
+    with RigKeeper(rig, obj) as blobs_alone, RigKeeper(rig, obj, detector="auto") as keeper:
+        for number, shot in enumerate(shots):
+            assert blobs_alone.update(shot, number / 60).refused is not None
+            assert keeper.update(shot, number / 60).refused is None
     with pytest.raises(InputError, match="detector"):
-        Recalibrator(rig, obj, detector="eye")
+        RigKeeper(rig, obj, detector="eye")
 
 
 def test_of_a_cube_every_turn_is_the_same_pose():

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from imgcal.association.options import PipelineOptions
-from imgcal.online.following import TOO_NEAR, astray, found_again, near_prediction, spare_blobs, widened, without_strays
+from imgcal.online.following import TOO_NEAR, astray, found_again, near_prediction, spare_blobs, widened
 from tests.imgcal.streams import Stream
 
 CAMERA = 3
@@ -53,16 +53,6 @@ def test_fiducials_that_all_but_coincide_get_no_label(stream) -> None:
     doubtful = (blobs.camera == 2) & np.isin(truth, (4, 5))
     assert (found[doubtful] == -1).all()
     np.testing.assert_array_equal(found[~doubtful], truth[~doubtful])
-
-
-def test_a_label_that_is_off_is_dropped_and_no_other(stream) -> None:
-    blobs = labelled(stream, 1)
-    wrong = np.flatnonzero((blobs.camera == 1) & (blobs.fiducial == 2))
-    blobs.uv[wrong] += [6.0, -5.0]
-    kept, pose = without_strays(blobs, stream.true, stream.obj, stream.poses[0], PipelineOptions())
-    assert set(np.flatnonzero(kept.fiducial != blobs.fiducial)) == set(wrong) and (kept.fiducial[wrong] == -1).all()
-    points = stream.obj.points
-    assert (pose.apply(points) - stream.poses[1].apply(points)).norm(dim=-1).max() < 0.5
 
 
 def test_blobs_without_a_label_are_counted_by_camera(stream) -> None:

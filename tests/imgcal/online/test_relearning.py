@@ -25,9 +25,9 @@ def test_a_camera_is_known_again_when_it_is_known_as_well_as_before() -> None:
     variance = torch.zeros(4, 15, dtype=torch.float64)
     variance[1, :3] = 0.05**2
     wide = widened(known, variance)
-    assert relearning.learnt(wide, frozenset(), 1.3, 12) == []
-    assert relearning.learnt(known, frozenset({1}), 1.3, 12) == []
-    (learnt,) = relearning.learnt(known, frozenset(), 1.4, 16)
+    assert relearning.learnt(wide, frozenset(), frozenset(), 1.3, 12) == []
+    assert relearning.learnt(known, frozenset({1}), frozenset(), 1.3, 12) == []
+    (learnt,) = relearning.learnt(known, frozenset(), frozenset(), 1.4, 16)
     assert (learnt.kind, learnt.camera, learnt.since, learnt.snapshot) == ("relearnt", "cam02", 1.0, 16)
     assert learnt.sigma == pytest.approx(sigma_of(relative_std(known)[1], "rotation"))
     assert relearning.events == {}

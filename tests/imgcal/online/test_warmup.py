@@ -41,7 +41,7 @@ print(json.dumps(sorted({f.py_func.__qualname__ for f in ours if not f.nopython_
 """
 
 USE = """
-from imgcal import Recalibrator, load_detections, load_object, load_rig
+from imgcal import RigKeeper, load_detections, load_object, load_rig
 from imgcal.cli.main import main
 from imgcal.io import open_capture
 
@@ -57,9 +57,9 @@ cube = ["--rig", "O6", "--object", "cube8"]
 assert main(["simulate", *cube, "--out", out + "/deep", "--snapshots", "2", *deep]) == 0
 assert main(["calibrate", out + "/deep", *cube, "--out", out + "/cube", "--polarity", "dark"]) == 0
 rig, obj = load_rig(given[1]), load_object(given[3])
-with Recalibrator(rig, obj, window=2) as recalibrator:
-    for _, frames in open_capture(sample, rig).snapshots():
-        recalibrator.update(frames)
+with RigKeeper(rig, obj, horizon=2) as keeper:
+    for number, (_, frames) in enumerate(open_capture(sample, rig).snapshots()):
+        keeper.update(frames, number / 60)
 print(json.dumps(Compiled.names))
 """
 

@@ -8,7 +8,6 @@ import torch
 
 from imgcal.errors import RefusedError
 from imgcal.io import load_object, load_rig
-from imgcal.online.recalibrator import Recalibrator
 from imgcal.pipeline import calibrate, score
 from imgcal.synthesis import simulate_truth, simulate_volume, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
@@ -134,16 +133,6 @@ def test_of_a_symmetric_object_nobody_says_which_fiducial_is_off() -> None:
     rig, obj, table = jumping_cube(moved(1, (0.5, 0, 0)))
     with pytest.raises(RefusedError, match="turned into itself"):
         calibrate(table, rig, obj)
-
-
-def test_a_running_rig_remembers_that_its_object_is_bent() -> None:
-    rig, obj, _, _, table = capture("O10", 4, moved(1, (1.0, 0, 0)))
-    with Recalibrator(rig, obj) as live:
-        for s in range(4):
-            one = replace(table.of_snapshots(s, s + 1), snapshot_names=("now",))
-            result = live.update(replace(one, fiducial=np.full(len(one), -1)))
-            assert [d.fiducial for d in result.displaced] == [1], s
-            assert result.rms < 0.06
 
 
 def test_tolerated_displacements_are_not_named() -> None:

@@ -58,7 +58,7 @@ def test_observations_with_a_sigma_that_cannot_be_are_named(scene):
 def test_rigs_that_cannot_be_are_refused(change, scene):
     rig, obj, detections = scene
     broken = replace(rig, **change(rig))
-    for use in (lambda: imgcal.calibrate(detections, broken, obj), lambda: imgcal.Recalibrator(broken, obj)):
+    for use in (lambda: imgcal.calibrate(detections, broken, obj), lambda: imgcal.RigKeeper(broken, obj)):
         with pytest.raises(InputError, match="camera cam01"):
             use()
 
