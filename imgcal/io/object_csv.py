@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -63,6 +64,15 @@ def load_object(path: str | Path) -> CalibrationObject:
             raise InputError(f"{path}: no such file, expected that of a printed board")
         return board_from_yaml(path.read_bytes(), path)
     return _read(find_file(path, "objects", ".csv"))
+
+
+def load_objects(paths: Sequence[str | Path]) -> CalibrationObject:
+    """Read one calibration object, or several that are in view of one capture (`CalibrationObject.of_several`).
+
+    Raises:
+        InputError: as `load_object`; or one that cannot be among several.
+    """
+    return CalibrationObject.of_several([load_object(path) for path in paths])
 
 
 def object_from_text(text: str, where: str, name: str = "object") -> CalibrationObject:

@@ -25,7 +25,7 @@ def test_rig_is_found(scene: Scene, result: imgcal.Calibration) -> None:
     assert triangulation_error(scene.factory, scene) > 4
     assert triangulation_error(result.rig, scene) < 2
     assert 0.9 < float(result.chi2_per_dof) < 1.1
-    assert result.moments == (24, 24)
+    assert result.labelled.moment_counts == (24, 24)
     assert result.scale.source == "cameras"
 
 
@@ -63,7 +63,7 @@ def test_score(scene: Scene, result: imgcal.Calibration) -> None:
     good, poor = (imgcal.score(scene.detections, rig, LIGHTS) for rig in (result.rig, scene.factory))
     assert float(good.distances.median()) < 0.15
     assert float(poor.distances.median()) > 4
-    assert good.moments == (24, 24)
+    assert good.labelled.moment_counts == (24, 24)
 
 
 def test_blobs_of_nothing_are_refused(scene: Scene) -> None:
