@@ -1,7 +1,7 @@
-"""Sticks and several objects without labels, simulated and real: what is calibrated, refused and wrong.
+"""Sticks and several objects without labels, simulated: what is calibrated, refused and wrong.
 
-Run as `python -m scripts.benchmarks.targets simulated`, and with `real`, which needs IMGCAL_CAPTURES. A quarter of the
-markers is hidden, and every camera has three false blobs.
+Run as `python -m scripts.benchmarks.targets`. A quarter of the markers is hidden, and every camera has three false
+blobs. Sticks of a real recording: `python -m scripts.benchmarks.lights stream`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,10 +20,8 @@ from imgcal import RefusedError, calibrate, load_object, load_rig
 from imgcal.estimation import camera_covariance, estimate
 from imgcal.pipeline import Calibration
 from imgcal.synthesis import PhysicalDrift, simulate_volume, true_detections
-from imgcal.types import CalibrationObject, CameraRig, Detections, MovedError, Observations
+from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
 from renderers import palette
-from scripts.benchmarks.wand_recording import CALIBRATED, recording
-from scripts.benchmarks.wand_recording import calibrated as whole_wand
 from scripts.output import ROOT, command, read_json, surroundings, write_json
 
 HIDDEN, FALSE, NOISE = 0.25, 3, 0.1
@@ -46,10 +44,8 @@ SCENES: dict[str, tuple[tuple[str, ...], int]] = {
     "object and stick": (("body5", "stick3"), 10),
     "one object": (("body5",), 10),
 }
-MARKERS = {"two": [0, 2], "two, far apart": [0, 4], "three in a line": [0, 1, 2], "three in the other line": [1, 3, 4]}
-COMMAND = "python -m scripts.benchmarks.targets {}"
-SIMULATED = ROOT / "docs" / "benchmarks" / "targets.json"
-REAL = ROOT / "docs" / "benchmarks" / "targets_real.json"
+COMMAND = "python -m scripts.benchmarks.targets"
+RESULT = ROOT / "docs" / "benchmarks" / "targets.json"
 
 
 def named_object(name: str) -> CalibrationObject:
@@ -182,7 +178,7 @@ class Simulated:
     drifts: tuple[float, ...] = (0.3, 1.0, 2.0)  #: times half a degree, 2 mm, 1 % and 5 px
     scenes: tuple[str, ...] = tuple(SCENES)  #: which
     first: int = 0  #: first seed
-    out: Path = SIMULATED  #: result; captures that it holds already stay
+    out: Path = RESULT  #: result; captures that it holds already stay
 
     def run(self) -> None:
         """Run, and write after each capture."""
@@ -195,7 +191,7 @@ class Simulated:
                     done.append(outcome(scene, drift, seed))
                     print({k: v for k, v in done[-1].items() if k != "reason"}, file=sys.stderr, flush=True)
                     result = {
-                        "command": COMMAND.format("simulated"),
+                        "command": COMMAND,
                         **surroundings(),
                         "table": table_of(done),
                         "captures": done,
@@ -203,48 +199,5 @@ class Simulated:
                     write_json(self.out, result)
 
 
-@dataclass(frozen=True)
-class Real:
-    """Calibrate the first half of the recorded wand from two or three of its markers; score it with the whole wand."""
-
-    markers: tuple[Literal["two", "two, far apart", "three in a line", "three in the other line"], ...] = (
-        "two",
-        "three in a line",
-    )  #: which of its markers
-    out: Path = REAL  #: result
-
-    def run(self) -> None:
-        """Run, and write."""
-        given, whole = recording(), whole_wand()
-        labels = whole.calibration.labelled.detections
-        rms, median = whole.score(whole.calibration.rig)
-        result: dict[str, Any] = {"command": COMMAND.format("real"), **surroundings(), "frames": str(CALIBRATED)}
-        result["whole wand"] = {"rms_px": rms, "median_px": median}
-        for name in self.markers:
-            rows = MARKERS[name]
-            points = given.obj.points[rows]
-            stick = CalibrationObject(points, given.obj.colours[rows], name="stick")
-            # Blobs of the other markers are left out: their distances are nearly those of the stick.
-            blobs = labels.select(np.isin(labels.fiducial, rows) | (labels.fiducial < 0))
-            blobs = replace(blobs, fiducial=np.full(len(blobs), -1), flags=np.zeros(len(blobs), dtype=np.uint8))
-            try:
-                found = calibrate(blobs, given.factory, stick)
-            except RefusedError as error:
-                moved = isinstance(error, MovedError)
-                result[name] = {"status": "refused", "reason": error.reason, "said_to_move": moved}
-            else:
-                rms, median = whole.score(found.rig)
-                used = len(found.labelled.used)
-                result[name] = {"status": "ok", "rms_px": rms, "median_px": median, "snapshots": used}
-            print(name, result[name], file=sys.stderr, flush=True)
-            write_json(self.out, result)
-
-
-Commands = (
-    Annotated[Simulated, tyro.conf.subcommand("simulated", prefix_name=False)]
-    | Annotated[Real, tyro.conf.subcommand("real", prefix_name=False)]
-)
-
-
 if __name__ == "__main__":
-    command(lambda: tyro.cli(Commands).run())
+    command(lambda: tyro.cli(Simulated, description=__doc__).run())

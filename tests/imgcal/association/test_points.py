@@ -27,7 +27,7 @@ def test_labels_among_false_blobs_are_right(points, snapshots):
         rows = kept & (blobs.snapshot == snapshot)
         same, turned = labels[rows] == true[rows], labels[rows] == len(points) - 1 - true[rows]
         assert same.all() or (len(obj.symmetries) > 1 and turned.all())
-    assert float(result.rms) < 0.17
+    assert float(result.rms) < 0.12
 
 
 def test_two_lights_are_no_single_light():
