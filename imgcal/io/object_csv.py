@@ -54,9 +54,9 @@ def load_object(path: str | Path) -> CalibrationObject:
         (torch.Size([8, 3]), None)
     """
     path = Path(path)
-    if str(path) == LIGHTS and not path.exists():
+    if str(path) == LIGHTS and not path.is_file():
         return CalibrationObject.unknown(LIGHTS)
-    if not path.exists() and str(path) in shipped_names("objects", ".yaml"):
+    if not path.is_file() and str(path) in shipped_names("objects", ".yaml"):
         path = data_path("objects", f"{path}.yaml")
     if path.suffix.lower() in BOARD_SUFFIXES:
         check_regular(path)

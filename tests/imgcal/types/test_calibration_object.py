@@ -146,10 +146,10 @@ def test_several_objects_keep_their_shapes_and_get_different_names() -> None:
     assert CalibrationObject.of_several([wand]) is wand
 
 
-@pytest.mark.parametrize("other", ["charuco", "scale"])
+@pytest.mark.parametrize("other", ["charuco", "lights", "scale"])
 def test_what_cannot_be_among_several_is_named(other: str) -> None:
     wand = load_object("wand4")
-    wrong = load_object("charuco") if other == "charuco" else replace(wand, scale_tolerance=0.01)
+    wrong = replace(wand, scale_tolerance=0.01) if other == "scale" else load_object(other)
     with pytest.raises(InputError, match="among several objects"):
         CalibrationObject.of_several([wand, wrong])
     with pytest.raises(InputError, match="found 2, expected a single one for a running rig"):
