@@ -207,7 +207,13 @@ class Calibration:
 
     @property
     def untimed(self) -> tuple[str, ...]:
-        """Cameras whose frames may be of other moments than the others' without a trace: too little motion."""
+        """Cameras whose frames may be of other moments than the others' without a trace: too little motion.
+
+        None of several unknown markers: snapshots that took no part have judged every camera, and no marker can be
+        followed from one snapshot to the next.
+        """
+        if self.lights is not None and len(self.labelled.used) > self.labelled.moment_counts[0]:
+            return ()
         seen = self.observations.seen
         moved = timing_motion(self.observations.uv, seen, self.labelled.before_rows)
         shown = seen.any(0).any(-1)
