@@ -100,7 +100,7 @@ def conflicts(obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[
 
     Labellings without a common blob conflict entirely.
     """
-    common = max(int(_common(first, second).sum()), 1)
+    common = max(int(common_blobs(first, second).sum()), 1)
     return min(1 - int(agreed.sum()) / common for agreed in _agreed(obj, first, second))
 
 
@@ -109,7 +109,7 @@ def differ(obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[np.
 
     They are when a third of all common blobs, or of one camera's (three at least), are called differently.
     """
-    common = _common(first, second)
+    common = common_blobs(first, second)
     if not common.any():
         return True
     return all(
@@ -128,7 +128,7 @@ def _onto(points: NDArray[np.float64], images: NDArray[np.float64], tolerance: f
     return np.where(distance <= tolerance, index, -1)
 
 
-def _common(first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.int64]:
+def common_blobs(first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.int64]:
     """Number of blobs that both labellings name, for each camera: (C,)."""
     named = np.zeros((2, len(first), max(first.max(), second.max()) + 2), dtype=bool)
     cameras = np.arange(len(first))[:, None]

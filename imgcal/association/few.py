@@ -83,7 +83,8 @@ def compare_all(scene: Scene, options: IdentityOptions) -> Identity:
         return Identity(none, pose, rig, "refused", 0, margin, f"{refusal}; {advice}")
     status: Status = "ambiguous" if order > 1 else "unique"
     reason = f"fits to {off[best]:.2g} px, log odds against the next best labelling {margin:.0f}"
-    return Identity(scene.blobs.to_rows(labels[best]), pose, rig, status, order, margin, reason, 1.0)
+    rows = scene.blobs.to_rows(labels[best])
+    return Identity(rows, pose, rig, status, order, margin, reason, 1.0, evidence=float(weight[best]))
 
 
 def _compare(scene: Scene) -> _Compared:

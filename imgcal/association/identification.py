@@ -9,7 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imgcal.association.ambiguities import Ambiguity, differ, displacement, lattice_shifts, near_turns, relabelled
+from imgcal.association.ambiguities import (
+    Ambiguity,
+    common_blobs,
+    differ,
+    displacement,
+    lattice_shifts,
+    near_turns,
+    relabelled,
+)
 from imgcal.association.assignment import spacing
 from imgcal.association.blobs import PatternPrior, gather, pattern_prior
 from imgcal.association.few import compare_all, few
@@ -22,6 +30,7 @@ from imgcal.association.hypotheses import (
 from imgcal.association.points import identify_points
 from imgcal.association.result import Identity, IdentityOptions, Status
 from imgcal.association.search import VERIFIED, Search
+from imgcal.association.stick_poses import fit_sticks
 from imgcal.association.verify import (
     STAGES,
     Fits,
@@ -49,6 +58,8 @@ MOST_STEPS = 6  # from one labelling to a better one of the moved object
 APPROXIMATE = 0.02  # rad, what poses from three points are off by, even for a perfect camera
 EXCLUDED = 60.0  # margin of a labelling in one camera, above which the rig need not be asked
 LEAST_ALONE = 6  # labels from which one camera can be fitted by itself
+STICK_SHARE = 0.5  # of the share that others must explain: a marker whose neighbour is hidden has no label at first
+MOST_SHARED = 0.2  # share of a labelling's blobs that another one may use, for both to be in view
 # Explained part near a known pose, below which it is asked whether another pose explains more: an object shifted by its
 # own edge still explains half.
 CONVINCING = 0.6
@@ -102,8 +113,8 @@ def track(
     pose_known: bool = True,
 ) -> Identity:
     """Label the blobs of one snapshot near a pose; arguments as in `identify`, `pose_known` = it is no mere guess."""
-    if obj.pose_rank < 6:
-        return identify_points(detections, rig, obj, std, options)
+    if obj.pose_rank < 6:  # where it was says little: it takes no pattern to be shifted onto something else
+        return relocalize(detections, rig, obj, std, options)
     scene = Scene(gather(detections, rig), obj, rig, std)
     if scene.blobs.uv[..., 0].size * obj.num_fiducials > MOST_PAIRS:
         return _refused(scene, _too_many(scene))
@@ -130,9 +141,14 @@ def relocalize(
     options: IdentityOptions = IdentityOptions(),
 ) -> Identity:
     """Label the blobs of one snapshot with no pose known; arguments as in `identify`."""
-    if obj.pose_rank < 6:
+    if obj.pose_rank == 3:
         return identify_points(detections, rig, obj, std, options)
     scene = Scene(gather(detections, rig), obj, rig, std)
+    if obj.pose_rank == 5:
+        sticks = fit_sticks(scene, options.seed)
+        if sticks is None:
+            return _refused(scene, "no markers at the object's distances from each other, on which cameras agree")
+        return replace(_decide(scene, sticks, options, known_pose=False), hypotheses=1)
     cameras = np.flatnonzero(scene.blobs.count >= 4)
     if len(cameras) == 0:
         return _refused(
@@ -174,31 +190,43 @@ def _best(scene: Scene, fits: Fits, count: int) -> Fits:
 
 def _decide(scene: Scene, fits: Fits, options: IdentityOptions, known_pose: bool) -> Identity:
     """Accept the best labelling or say why not."""
-    odds = (options.label_odds, options.least_label_odds)
+    odds, least_share = (options.label_odds, options.least_label_odds), options.least_share
+    if scene.obj.pose_rank < 6:
+        least_share *= STICK_SHARE
     best = settle_labels(scene, _best(scene, fits, 1))
     chosen = certain(scene, best, *odds)
-    share, refusal, margin = _share(scene, chosen), None, -np.inf
-    if share >= options.least_share:
+    share, refusal, margin, rival = _share(scene, chosen, options), None, -np.inf, None
+    if share >= least_share:
         settled, margin = _against_motions(scene, best, known_pose)
-        margin = min(margin, _margin(scene, settled, fits))
+        mine = fits
+        if options.others_in_view:
+            beside = _beside(settled, fits)
+            mine = fits.select(np.flatnonzero(~beside))
+            if beside.any():
+                rival = _nearly_as_good(scene, settled, fits.select(np.flatnonzero(beside)), options.least_margin)
+        margin = min(margin, _margin(scene, settled, mine))
         if settled is not best:
             chosen = certain(scene, settled, *odds)
-            share = _share(scene, chosen)
+            share = _share(scene, chosen, options)
         if margin < options.least_margin:
             refusal = (
                 f"another labelling explains the blobs nearly as well, or chance does: margin {margin:.1f}, expected "
                 f"{options.least_margin:.0f}; show more of the object, to more cameras"
             )
-    if share < options.least_share:
-        refusal = _too_little(scene.obj.name, _share(scene, best), share, options.least_share)
+    if share < least_share:
+        refusal = _too_little(scene.obj.name, _share(scene, best, options), share, least_share)
+    elif options.others_in_view and refusal is None and scene.rig.num_cameras > 1 and _cameras(chosen) < 2:
+        refusal = "only one camera sees it, and other objects may be in view"
     rig, pose = rig_and_pose(scene, chosen, 0)
     if refusal is not None:
-        undecided = share >= options.least_share
-        return replace(_refused(scene, refusal), rig_from_object=pose, rig=rig, margin=margin, undecided=undecided)
+        undecided = share >= least_share
+        undecided_at = replace(_refused(scene, refusal), rig_from_object=pose, rig=rig, margin=margin)
+        return replace(undecided_at, undecided=undecided)
     order = 1 if known_pose else len(scene.obj.symmetries)
     status: Status = "by_tracking" if known_pose else "ambiguous" if order > 1 else "unique"
     reason = f"explains {100 * share:.0f} % of what could be seen, margin {margin:.0f}"
-    return Identity(scene.blobs.to_rows(chosen.labels[0]), pose, rig, status, order, margin, reason, share)
+    labels, strength = scene.blobs.to_rows(chosen.labels[0]), float(evidence(scene, chosen)[0])
+    return Identity(labels, pose, rig, status, order, margin, reason, share, evidence=strength, rival=rival)
 
 
 def _too_little(name: str, fitted: float, certain_share: float, least: float) -> str:
@@ -216,9 +244,36 @@ def _too_little(name: str, fitted: float, certain_share: float, least: float) ->
     )
 
 
-def _share(scene: Scene, fits: Fits) -> float:
-    """Labelled part of what could be seen: in each camera, the smaller of blobs and fiducials."""
-    return float((fits.labels >= 0).sum() / max(np.minimum(scene.blobs.count, scene.obj.num_fiducials).sum(), 1))
+def _share(scene: Scene, fits: Fits, options: IdentityOptions) -> float:
+    """Labelled part of what could be seen: in each camera, the smaller of blobs and fiducials.
+
+    Of sticks, and where other objects may be in view, only fiducials that the fit has in the image could be seen.
+    """
+    fiducials: NDArray[np.int64] | int = scene.obj.num_fiducials
+    if options.others_in_view or scene.obj.pose_rank < 6:
+        uv, size = predictions(fits), scene.rig.image_size.numpy()[:, None]
+        fiducials = ((uv > 0) & (uv < size)).all(-1).sum(1)
+    return float((fits.labels >= 0).sum() / max(np.minimum(scene.blobs.count, fiducials).sum(), 1))
+
+
+def _cameras(fits: Fits) -> int:
+    """Number of cameras in which a labelling has labels."""
+    return int((fits.labels[0] >= 0).any(1).sum())
+
+
+def _beside(best: Fits, others: Fits) -> NDArray[np.bool_]:
+    """Tell which labellings (K,) are of other blobs than the best one: they may be another object."""
+    shared = np.array([common_blobs(best.labels[0], labels).sum() for labels in others.labels])
+    return shared <= MOST_SHARED * np.maximum((others.labels >= 0).sum((1, 2)), 1)
+
+
+def _nearly_as_good(scene: Scene, best: Fits, others: Fits, least: float) -> NDArray[np.int64] | None:
+    """Labels (M,) of the best of other labellings; None where it is worse by `least` log odds."""
+    strength = evidence(scene, others)
+    row = int(strength.argmax())
+    if strength[row] <= max(0.0, float(evidence(scene, best)[0]) - least):
+        return None
+    return scene.blobs.to_rows(others.labels[row])
 
 
 def _margin(scene: Scene, best: Fits, others: Fits) -> float:

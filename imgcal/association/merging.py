@@ -42,7 +42,7 @@ def drop_merged(labelled: Associations, poses: RigidTransform, rig: CameraRig, o
     image = rig.expand(len(points)).project(points, obj.radius)
     rows = np.flatnonzero((detections.fiducial >= 0) & np.isin(detections.snapshot, used))
     snapshot, camera = np.searchsorted(used, detections.snapshot[rows]), detections.camera[rows]
-    hidden = image.visible.numpy().copy()
+    hidden = image.visible.numpy() & labelled.columns(obj)
     hidden[snapshot, camera, detections.fiducial[rows]] = False
     doubtful = np.flatnonzero(hidden[snapshot, camera].any(-1))
     where = snapshot[doubtful], camera[doubtful]

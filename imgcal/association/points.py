@@ -1,8 +1,8 @@
-"""Identity of a single light and of markers on one line: no pattern tells them, but cameras that agree on places do.
+"""Identity of a single light: no pattern tells it, but cameras that agree on a place do.
 
 Any two blobs of different cameras that may be one point give a place. It counts by the evidence of all cameras: a blob
-near its image against a false one there, no blob against a hidden marker. Places at the object's distances from each
-other make a stick. What is chosen must beat the best different choice by the odds that every identity must have.
+near its image against a false one there, no blob against a hidden marker. What is chosen must beat the best different
+choice by the odds that every identity must have.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.association.blobs import PaddedBlobs, gather
-from imgcal.association.result import Identity, IdentityOptions, Status
+from imgcal.association.result import Identity, IdentityOptions
 from imgcal.geometry import RigidTransform
 from imgcal.types import CalibrationObject, CameraRig, Detections
 
@@ -29,8 +29,6 @@ LEAST_CAMERAS = 3
 """That must agree on a place: two rays that happen to meet are no witness of each other."""
 MOST_PLACES, MOST_PAIRS = 60, 20000
 """That are looked at: the best of them."""
-SURE_ENDS = 3.0
-"""Times that the other end of an uneven stick must fit its distances worse."""
 ROUNDS = 3
 """Of choosing blobs near a place and placing it anew."""
 
@@ -80,7 +78,7 @@ class _Places:
 def identify_points(
     detections: Detections, rig: CameraRig, obj: CalibrationObject, std: Tensor, options: IdentityOptions
 ) -> Identity:
-    """Label the blobs of one snapshot of an object that is a point or a line; arguments as in `identify`."""
+    """Label the blobs of one snapshot of an object that is a single point; arguments as in `identify`."""
     views = _views(detections, rig, std)
     nothing = np.full(views.blobs.rows, -1, dtype=np.int64)
 
@@ -90,25 +88,17 @@ def identify_points(
     places = _places(views).best(MOST_PLACES)
     if not len(places.at):
         return refused(f"no place on which {LEAST_CAMERAS} cameras agree")
-    points = obj.points.double().numpy()
-    found = (
-        _lights(places, options.least_margin)
-        if obj.pose_rank == 3
-        else _sticks(places, points, views, len(obj.symmetries) > 1)
-    )
-    if found is None:
-        return refused("no places at the object's distances from each other")
-    rows, margin, turns = found
+    margin = _margin(places, options.least_margin)
     if margin < options.least_margin:
         return refused(f"another place explains the blobs nearly as well: log odds {margin:.3g}", undecided=True)
-    labels = np.stack([places.chosen[row] for row in rows], axis=1)  # (C, N)
-    labels = _certain(views, places.at[list(rows)], labels)
-    if int(((labels >= 0).sum(0) >= 2).sum()) < len(rows):
+    labels = _certain(views, places.at[:1], places.chosen[:1].T)  # (C, 1)
+    if int((labels >= 0).sum()) < 2:
         return refused(f"no place on which {LEAST_CAMERAS} cameras agree")
-    pose = _pose(points, places.at[list(rows)])
-    status: Status = "unique" if turns == 1 else "ambiguous"
-    reason = f"{int((labels >= 0).any(1).sum())} cameras agree"
-    return Identity(views.blobs.to_rows(labels), pose, rig, status, turns, margin, reason, explained=1.0)
+    shift = torch.from_numpy(places.at[0]) - obj.points[0].double()
+    pose = RigidTransform(torch.eye(3, dtype=torch.float64), shift)
+    reason = f"{int((labels >= 0).sum())} cameras agree"
+    rows, strength = views.blobs.to_rows(labels), float(places.odds[0])
+    return Identity(rows, pose, rig, "unique", 1, margin, reason, explained=1.0, evidence=strength)
 
 
 def _views(detections: Detections, rig: CameraRig, std: Tensor) -> _Views:
@@ -180,52 +170,14 @@ def _placed(views: _Views, rays: Array, at: Array, chosen: NDArray[np.int64]) ->
     return np.linalg.solve(total + 1e-9 * np.maximum(trace, 1e-12) * np.eye(3), pulled[..., None])[..., 0]
 
 
-def _lights(places: _Places, least: float) -> tuple[tuple[int, ...], float, int]:
-    """The best place, and by how much it beats the best of other blobs."""
+def _margin(places: _Places, least: float) -> float:
+    """By how much the best place beats the best of other blobs, log odds."""
     shared = ((places.chosen == places.chosen[0]) & (places.chosen[0] >= 0)).sum(1)
     # The same point with another blob of a camera or two is settled camera by camera: see `_certain`.
     rivals = places.odds[shared < 2]
     rival = max(float(rivals.max(initial=0.0)), 0.0)
     # A second place that is as sure as a light must be is a light, too: which of them is meant cannot be told.
-    return (0,), float(places.odds[0]) - rival if rival < least else 0.0, 1
-
-
-def _sticks(
-    places: _Places, points: Array, views: _Views, symmetric: bool
-) -> tuple[tuple[int, ...], float, int] | None:
-    """The best places at the object's distances, and by how much they beat the best others."""
-    distance = np.linalg.norm(places.at[:, None] - places.at, axis=-1)
-    wanted = np.linalg.norm(points[:, None] - points, axis=-1)
-    away = np.linalg.norm(places.at[:, None] - views.position, axis=-1).mean(1)
-    slack = REACH * away * float(np.median(views.error / views.focal[:, 0]))
-    partial: list[tuple[tuple[int, ...], float]] = [((row,), float(places.odds[row])) for row in range(len(places.at))]
-    for n in range(1, len(points)):
-        longer = []
-        for rows, odds in partial:
-            last = list(rows)
-            fits = (np.abs(distance[last] - wanted[:n, n, None]) < slack[None] + slack[last][:, None]).all(0)
-            taken = ((places.chosen[:, None] == places.chosen[last][None]) & (places.chosen[:, None] >= 0)).any((1, 2))
-            longer += [((*rows, int(k)), odds + float(places.odds[k])) for k in np.flatnonzero(fits & ~taken)]
-        partial = sorted(longer, key=lambda found: -found[1])[: 50 * MOST_PLACES]
-    if not partial:
-        return None
-    first, odds = partial[0]
-    same = [rows for rows, _ in partial if set(rows) == set(first)]
-    rivals = [other for rows, other in partial if len(set(rows) & set(first)) < len(first)]
-    margin = odds - max(rivals, default=0.0)
-    if symmetric or len(same) == 1:
-        return first, margin, 2 if symmetric else 1
-    # Cameras that are off change all of a stick's distances alike: their relations tell its ends.
-    misfit = [_misfit(distance[np.ix_(rows, rows)], wanted) for rows in same]
-    order = np.argsort(misfit)
-    sure = misfit[order[1]] > SURE_ENDS * misfit[order[0]]
-    return same[order[0]], margin if sure else 0.0, 1
-
-
-def _misfit(distance: Array, wanted: Array) -> float:
-    """How far distances are from being in the wanted relations, mm."""
-    scale = (distance * wanted).sum() / np.square(distance).sum()
-    return float(np.abs(scale * distance - wanted).max())
+    return float(places.odds[0]) - rival if rival < least else 0.0
 
 
 def _certain(views: _Views, at: Array, labels: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -234,17 +186,3 @@ def _certain(views: _Views, at: Array, labels: NDArray[np.int64]) -> NDArray[np.
     squared = np.square(uv[:, :, None] - views.blobs.ideal).sum(-1) / views.error[:, None] ** 2  # (N, C, M)
     near = (squared < REACH**2).sum(-1).T
     return np.where(near == 1, labels, -1)
-
-
-def _pose(points: Array, at: Array) -> RigidTransform:
-    """Lay the object onto its places; a stick by the shortest turn."""
-    rotation = np.eye(3)
-    if len(points) > 1:
-        far = int(np.linalg.norm(points - points[0], axis=1).argmax())
-        a, b = points[far] - points[0], at[far] - at[0]
-        a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
-        middle = a + b if np.linalg.norm(a + b) > 1e-6 else np.cross(a, np.eye(3)[int(np.abs(a).argmin())])
-        middle = middle / np.linalg.norm(middle)
-        rotation = 2 * np.outer(middle, middle) - np.eye(3)  # half a turn that takes a to b
-    shift = at.mean(0) - rotation @ points.mean(0)
-    return RigidTransform(torch.from_numpy(rotation), torch.from_numpy(shift))

@@ -30,6 +30,8 @@ class Identity:
     explained: float = 0.0  # labelled part of what could be seen: in each camera, the smaller of blobs and fiducials
     hypotheses: int = 0  # that were tried where no pose was known
     undecided: bool = False  # refused because a different labelling explains the blobs nearly as well
+    evidence: float = 0.0  # natural logarithm of the odds against all blobs being clutter
+    rival: NDArray[np.int64] | None = None  # (M,) labels of another labelling that is nearly as good, of other blobs
 
     @property
     def accepted(self) -> bool:
@@ -50,3 +52,6 @@ class IdentityOptions:
     rounds: int = 24  # of hypotheses before giving up
     most_hypotheses: int = 6_000_000  # the same in hypotheses: a large object has many a round
     seed: int = 0  # of the random choice of blob triples
+    others_in_view: bool = False
+    """Other objects may be in view, the same object once more among them: a labelling of other blobs is no rival, but
+    reported (`Identity.rival`), and cameras that do not see the object have nothing to explain."""

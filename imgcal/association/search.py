@@ -60,19 +60,19 @@ class Search:
         votes = vote(scene.blobs, predicted, tolerance, gate)
         best = np.argsort(-votes.count.sum(1), kind="stable")[: 4 * VERIFIED]
         labels = match(scene.blobs, predicted[best], votes.shift[best], 1.25 * tolerance)
-        best, labels = _different(scene.obj, best, labels)
+        best, labels = distinct(scene.obj, best, labels)
         return refine(scene, start(scene, poses.select(best), labels))
 
 
-def _different(
-    obj: CalibrationObject, rows: NDArray[np.int64], labels: NDArray[np.int64]
+def distinct(
+    obj: CalibrationObject, rows: NDArray[np.int64], labels: NDArray[np.int64], most: int = VERIFIED
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Keep the fullest of labellings (K, C, N) that differ in most labels, `VERIFIED` at most."""
+    """Keep the fullest of labellings (K, C, N) that differ in most labels, so many at most."""
     order = np.argsort(-(labels >= 0).sum((1, 2)), kind="stable")
     kept: list[int] = []
     for k in order:
         if all(conflicts(obj, labels[other], labels[k]) > 0.5 for other in kept):
             kept.append(int(k))
-        if len(kept) == VERIFIED:
+        if len(kept) == most:
             break
     return rows[kept], labels[kept]

@@ -47,6 +47,66 @@ class Associations:
         return [i for i, snapshot in enumerate(self.snapshots) if snapshot.status != "refused"]
 
     @property
+    def moments(self) -> NDArray[np.int64]:
+        """Number of the input's snapshot that each row is of, ascending: (S,).
+
+        With one object, rows are snapshots. With several objects or unknown markers, a row is one of them in a
+        snapshot, and a snapshot in which there are none is one row that was refused.
+        """
+        return np.array([row if s.moment < 0 else s.moment for row, s in enumerate(self.snapshots)], dtype=np.int64)
+
+    @property
+    def moment_counts(self) -> tuple[int, int]:
+        """Number of the input's snapshots of which some row is used, and of all."""
+        moments = self.moments
+        return len(np.unique(moments[self.used])), len(np.unique(moments))
+
+    @property
+    def part_of_rows(self) -> NDArray[np.int64]:
+        """Number of the object that each of the used rows shows: (U,)."""
+        return np.array([self.snapshots[row].part for row in self.used], dtype=np.int64)
+
+    def columns(self, obj: CalibrationObject) -> NDArray[np.bool_]:
+        """Mark the fiducials that each used row may show: (U, 1, N)."""
+        return (obj.part_of == self.part_of_rows[:, None])[:, None]
+
+    @property
+    def before_rows(self) -> NDArray[np.int64]:
+        """Of each used row, the used row of the same object one snapshot earlier, -1 = there is none: (U,).
+
+        Of several unknown markers nobody knows which one is which in another snapshot.
+        """
+        keys = list(zip(self.moments[self.used].tolist(), self.part_of_rows.tolist(), strict=True))
+        count = Counter(keys)
+        rows = {key: row for row, key in enumerate(keys) if count[key] == 1}
+        before = [rows.get((moment - 1, part), -1) if count[moment, part] == 1 else -1 for moment, part in keys]
+        return np.array(before, dtype=np.int64)
+
+    def by_moment(self) -> Detections:
+        """The detections numbered by the input's snapshots instead of by rows."""
+        if all(snapshot.moment < 0 for snapshot in self.snapshots):
+            return self.detections
+        moments = self.moments
+        names = dict(zip(moments.tolist(), self.detections.snapshot_names, strict=True))
+        return replace(
+            self.detections, snapshot=moments[self.detections.snapshot], snapshot_names=tuple(names.values())
+        )
+
+    def repeated(self) -> Detections:
+        """The detections in which blobs without a label belong to every row of their snapshot."""
+        detections, moments = self.detections, self.moments
+        count = np.bincount(moments)
+        left = np.flatnonzero((detections.fiducial < 0) & (count[moments] > 1)[detections.snapshot])
+        if not len(left):
+            return detections
+        rows = np.split(np.arange(len(moments)), np.cumsum(count)[:-1])
+        where = [np.setdiff1d(rows[moments[s]], s) for s in detections.snapshot[left]]
+        more = np.repeat(left, [len(part) for part in where])
+        table = detections.select(np.concatenate((np.arange(len(detections)), more)))
+        table.snapshot[len(detections) :] = np.concatenate([*where, np.empty(0, dtype=np.int64)])
+        return table
+
+    @property
     def identity(self) -> str:
         """How identity was decided as a whole: as the least certain snapshot was.
 
@@ -92,6 +152,13 @@ def associate(
         >>> found.identity, bool((found.detections.fiducial == seen.fiducial).all())
         ('unique', True)
     """
+    if obj.parts:
+        from imgcal.association.several import associate_several  # it builds on this module
+
+        labelled = associate_several(detections, rig, obj, options, progress)
+        if not labelled.used:
+            raise RefusedError(f"identity: {_why(labelled.snapshots)}")
+        return labelled
     count = len(detections.snapshot_names)
     if obj.pose_rank < 6:
         sight = None  # it looks for patterns, and these objects have none

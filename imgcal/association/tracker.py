@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from imgcal.association.identification import identify
 from imgcal.association.options import PipelineOptions
@@ -35,24 +36,93 @@ class SnapshotIdentity:
     alternatives: int
     rig_from_object: RigidTransform | None
     found_by: str = "classical"  # blobs, or the name of the proposer
+    moment: int = -1  # number of the snapshot of the input, where several objects share one; -1 = its own number
+    part: int = 0  # which of several objects
+
+
+class LearntRig:
+    """What accepted snapshots say about the rig; shared by the trackers of several objects."""
+
+    def __init__(self, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions, remembered: int) -> None:
+        self.factory, self.obj, self.options, self.remembered = rig, obj, options, remembered
+        self.rig = rig
+        self.prior_std = (rig.prior or RigPrior()).std(rig)
+        self.accepted: dict[str, tuple[Detections, NDArray[np.int64], RigidTransform]] = {}  # by name
+
+    def remember(self, name: str, blobs: Detections, labels: NDArray[np.int64], pose: RigidTransform) -> None:
+        """Refit the rig after 1, 2, 4, 8, ... accepted snapshots."""
+        known = name in self.accepted
+        if not known and len(self.accepted) >= self.remembered:
+            return
+        self.accepted[name] = blobs, labels, pose
+        count = len(self.accepted)
+        # One that was tried again replaces what it said: it is no further witness.
+        if known or count & (count - 1):
+            return
+        accepted, obj = self.accepted.values(), self.obj
+        parts = [to_observations(replace(b, fiducial=given), self.factory, obj) for b, given, _ in accepted]
+        sigma = (torch.cat([p.sigma for p in parts]).square() + self.options.identity_error**2).sqrt()
+        observations = Observations(torch.cat([p.uv for p in parts]), sigma, torch.cat([p.seen for p in parts]))
+        poses = RigidTransform.stack([p for _, _, p in accepted])
+        part_of = obj.part_of if obj.parts else None
+        posed = torch.from_numpy(has_poses(observations.seen.numpy(), obj.points, part_of))
+        if not bool(posed.any()):
+            return
+        observations, poses = observations.of_snapshots(posed), poses[posed]
+        fit = estimate(observations, self.factory, obj, poses, options=self.options.estimation)
+        if bool(fit.converged):
+            prior = (self.factory.prior or RigPrior()).std(self.factory)
+            self.rig, self.prior_std = fit.rig, torch.minimum(2 * flat_std(fit), prior)
 
 
 class Tracker:
     """Carries what earlier snapshots say, the pose and the rig, to the next one."""
 
     def __init__(
-        self, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions, remembered: int = MOST_REMEMBERED
+        self,
+        rig: CameraRig,
+        obj: CalibrationObject,
+        options: PipelineOptions,
+        remembered: int = MOST_REMEMBERED,
+        learnt: LearntRig | None = None,
+        first: int = 0,
     ) -> None:
+        """Begin with what is known before.
+
+        Args:
+            rig: the factory calibration.
+            obj: the object that is followed.
+            options: how sure to be.
+            remembered: snapshots that take part in refits of the rig.
+            learnt: what trackers of other objects share; None = this is the only one.
+            first: number of the object's first fiducial among those of all objects.
+        """
         check_rig(rig)
         check_object(obj)
-        self.factory, self.obj, self.options, self.remembered = rig, obj, options, remembered
-        self.rig = rig
-        self.prior_std = (rig.prior or RigPrior()).std(rig)
+        self.obj, self.options, self.first = obj, options, first
+        self.learnt = learnt or LearntRig(rig, obj, options, remembered)
         self.pose = None if options.start_pose is None else _checked_pose(options.start_pose, rig)
         self.alternatives = 0  # that the accepted snapshots leave open, 0 = none was accepted yet
         self.in_vain = 0  # hypotheses that were tried since something was accepted
         self.looks_in_vain = 0  # snapshots in which a proposer found nothing, less those in which it did
-        self.accepted: dict[str, tuple[Detections, NDArray[np.int64], RigidTransform]] = {}  # by name
+
+    @property
+    def rig(self) -> CameraRig:
+        """The rig as the accepted snapshots have it."""
+        return self.learnt.rig
+
+    @rig.setter
+    def rig(self, rig: CameraRig) -> None:
+        self.learnt.rig = rig
+
+    @property
+    def prior_std(self) -> Tensor:
+        """How far it may be off: (C, K)."""
+        return self.learnt.prior_std
+
+    @prior_std.setter
+    def prior_std(self, prior_std: Tensor) -> None:
+        self.learnt.prior_std = prior_std
 
     def accept(self, name: str, labels: NDArray[np.int64]) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
         """Take over the labels that came with a snapshot."""
@@ -129,14 +199,20 @@ class Tracker:
         return ("ambiguous" if self.alternatives > 1 else "by_tracking"), max(self.alternatives, 1)
 
     def _identify(self, blobs: Detections) -> Identity:
+        return self._taken_over(self.propose(blobs))
+
+    def propose(self, blobs: Detections) -> Identity:
+        """Label the blobs of one snapshot, without drawing conclusions from it."""
         error = np.hypot(self.options.identity_error, self._tolerance_px(blobs))
         blobs = replace(blobs, sigma=np.hypot(blobs.sigma, error))
         known = [] if self.pose is None else [self.pose]
         # Many captures are taken with the object at the origin of the rig's frame; it costs little to look there first.
         guesses = [] if known else [RigidTransform.identity(dtype=self.rig.focal_length.dtype)]
-        return self._taken_over(
-            identify(blobs, self.rig, self.obj, self.prior_std, known, self.options.identity, guesses)
-        )
+        return identify(blobs, self.rig, self.obj, self.prior_std, known, self.options.identity, guesses)
+
+    def conclude(self, proposed: Identity, blobs: Detections, name: str) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
+        """Draw the conclusions from what `propose` found in these blobs."""
+        return self._concluded(self._taken_over(proposed), blobs, name)
 
     def _taken_over(self, found: Identity) -> Identity:
         """See a decision in the light of those before."""
@@ -170,29 +246,10 @@ class Tracker:
         return tolerance * float(np.median(extents)) / obj.size if extents else 0.0
 
     def _remember(self, name: str, blobs: Detections, labels: NDArray[np.int64], pose: RigidTransform) -> None:
-        """Keep the pose; refit the rig after 1, 2, 4, 8, ... accepted snapshots."""
+        """Keep the pose, and let the rig learn from it."""
         self.pose = pose
-        known = name in self.accepted
-        if not known and len(self.accepted) >= self.remembered:
-            return
-        self.accepted[name] = blobs, labels, pose
-        count = len(self.accepted)
-        # One that was tried again replaces what it said: it is no further witness.
-        if known or count & (count - 1):
-            return
-        accepted = self.accepted.values()
-        parts = [to_observations(replace(b, fiducial=given), self.factory, self.obj) for b, given, _ in accepted]
-        sigma = (torch.cat([p.sigma for p in parts]).square() + self.options.identity_error**2).sqrt()
-        observations = Observations(torch.cat([p.uv for p in parts]), sigma, torch.cat([p.seen for p in parts]))
-        poses = RigidTransform.stack([p for _, _, p in accepted])
-        posed = torch.from_numpy(has_poses(observations.seen.numpy(), self.obj.points))
-        if not bool(posed.any()):
-            return
-        observations, poses = observations.of_snapshots(posed), poses[posed]
-        fit = estimate(observations, self.factory, self.obj, poses, options=self.options.estimation)
-        if bool(fit.converged):
-            prior = (self.factory.prior or RigPrior()).std(self.factory)
-            self.rig, self.prior_std = fit.rig, torch.minimum(2 * flat_std(fit), prior)
+        labels = np.where(labels >= 0, labels + self.first, -1)
+        self.learnt.remember(name if self.first == 0 else f"{name} {self.first}", blobs, labels, pose)
 
 
 def _checked_pose(pose: RigidTransform, rig: CameraRig) -> RigidTransform:

@@ -32,6 +32,8 @@ LEAST_SIZE_SPREAD = 0.05
 """Relative standard deviation of a blob's radius within its camera, at least: depth, tilt and exposure vary."""
 MOST_SIZE_MISFIT = 36.0
 """Of one blob: a single odd radius decides no more than this."""
+KNOWN_PLACE = 5.0
+"""Standard deviation (px) of a prediction from which on a single marker of a stick needs no other beside it."""
 UNDECIDED = 2 * np.log(1e3)
 """Two pairings whose squared normalized innovations differ by less cannot be told apart."""
 
@@ -145,12 +147,15 @@ def certain(scene: Scene, fits: Fits, odds: float, least_odds: float) -> Fits:
     # Two or three labels of one camera can support each other in the wrong place: most of what it sees must fit.
     # In a lattice, half of them can, a step away.
     most = 0.7 if lattice_shifts(scene.obj) else 0.5
-    enough = np.maximum(3, most * np.minimum(scene.blobs.count, scene.obj.num_fiducials))
+    whole, stick = np.minimum(scene.blobs.count, scene.obj.num_fiducials), scene.obj.pose_rank == 5
+    enough = np.maximum(2 if stick else 3, most * whole)
     for _ in range(4):
         found = _found(fits)
         log_odds = _log_density(found) + surroundings
         good = (found.own < GATE) & (log_odds > demanded) & ~contested(fits.labels, found, UNDECIDED)
-        good &= (good.sum(-1) >= enough)[..., None]
+        # What a stick shows of itself is little; where the rig knows the place without it, one label is enough.
+        known = stick & (found.log_det < 2 * np.log(KNOWN_PLACE**2))
+        good &= (good.sum(-1) >= enough)[..., None] | known
         if np.array_equal(good, fits.labels >= 0):
             break
         fits = fit(scene, replace(fits, labels=np.where(good, fits.labels, -1)))

@@ -37,9 +37,10 @@ class Simulate:
     """
 
     rig: str  #: factory rig: file, or the name of a shipped one (O10, O6, U7, T4, room10)
-    object: str
+    object: tuple[str, ...]
     """object: file, or the name of a shipped one (asymmetric8, cube8, cube27, sphere64, wand4; printed boards: charuco,
-    aprilgrid, checkerboard, circles); lights = a body with markers of which nothing is known (--lights)"""
+    aprilgrid, checkerboard, circles); several, each of which moves by itself: --object A B; lights = a body with
+    markers of which nothing is known (--lights)"""
     out: Path  #: folder to write; must not hold a capture yet
     lights: int = 15  #: number of markers on the body, with --object lights
     snapshots: int = 10  #: number of poses of the object
@@ -139,12 +140,14 @@ class Calibrate:
     in OUT moves to OUT/previous. OUT changes when all is written; any other failure leaves it as it was.
     Examples: imgcal calibrate my_capture --rig factory.yaml --object object.csv --out result
     imgcal calibrate my_capture --cameras cameras.yaml --object wand4 --out result
+    imgcal calibrate my_capture --rig factory.yaml --object pointer.csv reference.csv --out result
     """
 
     input: Annotated[Path, tyro.conf.Positional]  #: capture folder, detections file, or a shipped sample (sample:O10)
-    object: str
-    """object: file, or the name of a shipped one; lights = every blob may be a marker of its own, and nothing is known
-    of them: the scale then rests on the factory positions of the cameras"""
+    object: tuple[str, ...]
+    """object: file, or the name of a shipped one; several, any of which may be in view: INPUT --object A B; lights =
+    every blob may be a marker of its own, and nothing is known of them: the scale then rests on the factory positions
+    of the cameras"""
     out: Path  #: folder to write
     rig: str | None = None  #: factory rig: file, or the name of a shipped one
     cameras: Path | None = None
@@ -245,7 +248,9 @@ class Score:
 
     input: Annotated[Path, tyro.conf.Positional]  #: capture folder, detections file, or a shipped sample (sample:O10)
     rig: str  #: rig file, or the name of a shipped rig
-    object: str  #: object file, or the name of a shipped object; lights = every blob may be a marker of its own
+    object: tuple[str, ...]
+    """object file, or the name of a shipped object; several, any of which may be in view: INPUT --object A B; lights =
+    every blob may be a marker of its own"""
     snapshots: str | None = None  #: A:B, numbers in file order from 0, B excluded
     videos_differ: bool = False  #: accept videos whose lengths or time stamps differ: frames go together by number
     detection: Annotated[DetectionOptions, tyro.conf.arg(name="")] = field(default_factory=DetectionOptions)

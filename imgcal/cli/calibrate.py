@@ -37,7 +37,7 @@ from imgcal.io import (
     Capture,
     RigCovariance,
     keep_previous,
-    load_object,
+    load_objects,
     open_input,
     publishing,
     save_detections,
@@ -123,7 +123,7 @@ class Calibrate(arguments.Calibrate):
             else:
                 posterior = replace(outcome.posterior(), time=time.time())
                 save_rig(outcome.rig, out / RIG, covariance, self.full_covariance, posterior)
-                if outcome.shape:
+                if outcome.shape and not obj.parts:
                     save_object(replace(outcome.object, board=None), out / "object.csv")
                 elif outcome.bend is not None:
                     save_object(outcome.object, out / "board.yaml")
@@ -136,7 +136,7 @@ class Calibrate(arguments.Calibrate):
                 write_report(content, out / "report.html")
             write_text(out / "result.json", json.dumps(result, indent=2) + "\n")
             if self.labelled is not None and not isinstance(outcome, RefusedError):
-                save_detections(outcome.labelled_detections, self.labelled)
+                save_detections(outcome.labelled_detections, self.labelled, obj)
         if isinstance(outcome, RefusedError):
             if earlier:
                 print(f"note: the earlier calibration in {self.out} is now in {self.out / PREVIOUS}", file=sys.stderr)
@@ -180,8 +180,9 @@ class Calibrate(arguments.Calibrate):
 
     def _inputs(self) -> list[tuple[str, Path]]:
         """What is read, with the names of the options."""
-        given = {"--rig": self.rig, "--cameras": self.cameras, "--object": self.object, "INPUT": self.input}
-        return [(option, Path(path)) for option, path in given.items() if path is not None]
+        given = {"--rig": self.rig, "--cameras": self.cameras, "INPUT": self.input}
+        named = [(option, Path(path)) for option, path in given.items() if path is not None]
+        return [*named, *(("--object", Path(path)) for path in self.object)]
 
     def _rig(self) -> CameraRig:
         """What is known of the cameras."""
@@ -200,17 +201,24 @@ class Calibrate(arguments.Calibrate):
 
     def _object(self) -> CalibrationObject:
         """The object with its tolerances."""
-        obj = load_object(self.object)
+        obj = load_objects(self.object)
         if not limits.TOLERANCE.low <= self.object_tolerance <= limits.TOLERANCE.high:
             raise InputError(f"--object-tolerance: found {self.object_tolerance}, expected {limits.TOLERANCE}")
         if not 0 <= self.object_scale_tolerance < 1:
             raise InputError(
                 f"--object-scale-tolerance: found {self.object_scale_tolerance}, expected a share from 0 to 1"
             )
-        tolerance = obj.tolerance
-        if tolerance is None and self.object_tolerance > 0:
-            tolerance = torch.full_like(obj.points[:, 0], self.object_tolerance)
-        return replace(obj, tolerance=tolerance, scale_tolerance=self.object_scale_tolerance)
+        parts = [
+            replace(
+                part,
+                tolerance=torch.full_like(part.points[:, 0], self.object_tolerance)
+                if part.tolerance is None and self.object_tolerance > 0
+                else part.tolerance,
+                scale_tolerance=self.object_scale_tolerance,
+            )
+            for part in obj.each
+        ]
+        return CalibrationObject.of_several(parts)
 
     def _require_frames(self, source: Capture | Detections, rig: CameraRig) -> None:
         """A camera whose folder is missing is not one that saw nothing."""

@@ -10,17 +10,23 @@ from imgcal.pipeline import DOUBTFUL, Calibration, Tally
 from imgcal.types import CameraRig, Detections
 
 
-def counts_by_camera(counts: Tally, camera: int) -> dict[str, int]:
+def counts_by_camera(calibration: Calibration, camera: int) -> dict[str, int]:
     """Count over all snapshots."""
-    return _counts(counts, np.s_[:, camera])
+    blobs = int((calibration.labelled_detections.camera == camera).sum())
+    return {"blobs": blobs, **_counts(calibration.tally, np.s_[:, camera])}
 
 
 def counts_by_snapshot(calibration: Calibration) -> dict[str, dict[str, int]]:
     """Count over all cameras: snapshot name -> numbers."""
-    found: dict[str, dict[str, int]] = {}
-    for s, snapshot in enumerate(calibration.labelled.snapshots):
-        counts, before = _counts(calibration.tally, np.s_[s]), found.get(snapshot.name)  # markers share their moment
-        found[snapshot.name] = counts if before is None else {key: counts[key] + before[key] for key in counts}
+    detections = calibration.labelled_detections
+    blobs = np.bincount(detections.snapshot, minlength=len(detections.snapshot_names)).tolist()
+    found = {
+        name: {"blobs": count, "labelled": 0, "outliers": 0}
+        for name, count in zip(detections.snapshot_names, blobs, strict=True)
+    }
+    for row, snapshot in enumerate(calibration.labelled.snapshots):  # several rows may be of one snapshot
+        for key, count in _counts(calibration.tally, np.s_[row]).items():
+            found[snapshot.name][key] += count
     return found
 
 
@@ -44,4 +50,4 @@ def doubtful_cameras(calibration: Calibration) -> list[str]:
 
 
 def _counts(counts: Tally, part: Any) -> dict[str, int]:
-    return {name: int(getattr(counts, name)[part].sum()) for name in ("blobs", "labelled", "outliers")}
+    return {name: int(getattr(counts, name)[part].sum()) for name in ("labelled", "outliers")}

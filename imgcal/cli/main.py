@@ -23,6 +23,9 @@ from imgcal.errors import InputError, RefusedError
 from imgcal.extras import advice
 from imgcal.messages import one_line, quoted, shortened
 
+SEVERAL_OBJECTS = ("simulate", "calibrate", "score")
+"""Commands whose `--object` may be several."""
+
 DONE, UNUSABLE, REFUSED, INTERRUPTED = 0, 2, 3, 130
 
 DEBUG, VERSION = "--debug", "--version"
@@ -153,7 +156,7 @@ def _understood(arguments: list[str]) -> Runnable:
         print(f"imgcal {imgcal.__version__}")
         raise SystemExit(DONE)
     if first in COMMANDS:
-        given = tyro.cli(_arguments(first), prog=f"imgcal {first}", args=arguments[1:])
+        given = tyro.cli(_arguments(first), prog=f"imgcal {first}", args=_objects_last(first, arguments[1:]))
         with ends_at_once():  # imports take a while
             command = getattr(import_module(COMMANDS[first][0]), first.capitalize())
         return command(**vars(given))
@@ -165,6 +168,27 @@ def _understood(arguments: list[str]) -> Runnable:
         raise InputError(f"unknown command `{shortened(first)}`; {hint}")
     commands: Any = Union[tuple(Annotated[load(name), tyro.conf.subcommand(name)] for name in COMMANDS)]  # noqa: UP007
     return tyro.cli(commands, prog="imgcal", description=DESCRIPTION, args=arguments)
+
+
+def _objects_last(command: str, arguments: list[str]) -> list[str]:
+    """Move the names of objects to the end, where nothing else can be taken for one more.
+
+    Several may follow `--object` where the input stands first. Elsewhere what follows the first name is the input.
+    """
+    several = command == "simulate" or not arguments[:1] or not arguments[0].startswith("-")
+    if command not in SEVERAL_OBJECTS:
+        return arguments
+    others, names, most = list[str](), list[str](), 0
+    for argument in arguments:
+        if argument == "--object":
+            most = len(arguments) if several else 1
+        elif most and not argument.startswith("-"):
+            names.append(argument)
+            most -= 1
+        else:
+            others.append(argument)
+            most = 0
+    return [*others, "--object", *names] if names else arguments
 
 
 def _arguments(name: str) -> Any:

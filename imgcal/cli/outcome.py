@@ -7,17 +7,20 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import imgcal
 from imgcal.cli.counts import blobs_by_camera, counts_by_camera, counts_by_snapshot
 from imgcal.cli.findings import UNKNOWN, Findings
 from imgcal.errors import RefusedError
 from imgcal.pipeline import Calibration, rms_length
-from imgcal.types import CameraRig, Detections, MovedError
+from imgcal.types import CalibrationObject, CameraRig, Detections, MovedError
 
 
 def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, Any]:
     """Put a calibration into the form that scripts read."""
-    used, snapshots = calibration.labelled.used, calibration.labelled.snapshots
+    labelled, snapshots = calibration.labelled, calibration.labelled.snapshots
+    used, total = labelled.moment_counts
     seen = calibration.observations.seen
     per_camera = {}
     for camera, name in enumerate(calibration.rig.camera_names):
@@ -26,9 +29,12 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
             "points": points,
             "rms_px_before": rms_length(calibration.before.residual[:, camera], seen[:, camera]),
             "rms_px_after": rms_length(calibration.residual[:, camera], seen[:, camera]),
-            **counts_by_camera(calibration.tally, camera),
+            **counts_by_camera(calibration, camera),
         }
-    alternatives = max(snapshots[s].alternatives for s in used)
+    alternatives, names = (
+        max(snapshots[s].alternatives for s in labelled.used),
+        {snapshots[s].name for s in labelled.used},
+    )
     return {
         "version": imgcal.__version__,
         "status": "ok",
@@ -44,21 +50,18 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         "model_error_px": calibration.additive_noise,
         "outliers": calibration.outliers,
         "prior_too_narrow": dict(calibration.prior_scale),
-        "snapshots_used": calibration.moments[0],
-        "snapshots_rejected": calibration.moments[1] - calibration.moments[0],
+        "snapshots_used": used,
+        "snapshots_rejected": total - used,
         "lights": _lights_summary(calibration),
-        "rejected": {s.name: s.reason for s in snapshots if s.status == "refused"},
+        "rejected": {s.name: s.reason for s in snapshots if s.name not in names},
         "late": [vars(late) for late in calibration.late],
         "doubtful": [camera.as_values() for camera in calibration.doubtful],
         "unsynchronized": None if calibration.unsynchronized is None else calibration.unsynchronized.values,
         "per_camera": per_camera,
         "per_snapshot": counts_by_snapshot(calibration),
-        "object": [
-            {"fiducial": offset.fiducial, "offset_mm": offset.distance, "sigma_mm": offset.sigma}
-            for offset in calibration.shape
-        ],
-        "object_displaced": [offset.fiducial for offset in calibration.displaced],
-        "object_lost": list(calibration.lost),
+        "object": _object_summary(calibration),
+        "object_displaced": [_named(calibration.obj, offset.fiducial) for offset in calibration.displaced],
+        "object_lost": [_named(calibration.obj, fiducial) for fiducial in calibration.lost],
         "object_scale_sigma": calibration.scale_sigma,
         "object_bent_sigma": calibration.bent_sigma,
         "board_bend": None if calibration.bend is None else vars(calibration.bend) | {"note": str(calibration.bend)},
@@ -96,6 +99,32 @@ def _lights_summary(calibration: Calibration) -> dict[str, Any] | None:
         "starts": lights.starts,
         "note": lights.note,
     }
+
+
+def _object_summary(calibration: Calibration) -> list[dict[str, Any]]:
+    """Say where fiducials are; with several objects, of each, with the number of snapshots in which it was seen."""
+    obj, columns = calibration.obj, calibration.obj.part_of
+    first = np.searchsorted(columns, np.arange(len(obj.each)))
+    offsets: list[list[dict[str, Any]]] = [[] for _ in obj.each]
+    for offset in calibration.shape:
+        part = int(columns[offset.fiducial])
+        values = {"fiducial": int(offset.fiducial - first[part]), "offset_mm": offset.distance}
+        offsets[part].append(values | {"sigma_mm": offset.sigma})
+    if not obj.parts:
+        return offsets[0]
+    seen = np.bincount(calibration.labelled.part_of_rows, minlength=len(obj.parts)).tolist()
+    return [
+        {"name": part.name, "snapshots_used": count, "fiducials": found}
+        for part, count, found in zip(obj.parts, seen, offsets, strict=True)
+    ]
+
+
+def _named(obj: CalibrationObject, fiducial: int) -> int | str:
+    """What people call a fiducial: its row; with several objects, also that of its object."""
+    if not obj.parts:
+        return fiducial
+    part = int(obj.part_of[fiducial])
+    return f"{obj.parts[part].name} {fiducial - int(np.searchsorted(obj.part_of, part))}"
 
 
 def _guess_summary(calibration: Calibration) -> dict[str, Any] | None:
@@ -164,6 +193,16 @@ def predicted_line(predicted: dict[str, Any]) -> str:
     return words if worst is None else f"{words}, worst camera {predicted['worst_camera']} {worst:.2g} px"
 
 
+def _offsets(result: dict[str, Any]) -> list[dict[str, Any]]:
+    """Offsets of fiducials, of several objects with the object's name in front."""
+    found = []
+    for entry in result["object"]:
+        if "name" not in entry:
+            found.append(entry)
+        found += [each | {"fiducial": f"{entry['name']} {each['fiducial']}"} for each in entry.get("fiducials", ())]
+    return found
+
+
 def print_outcome(result: dict[str, Any], found: Findings, out: Path, report: bool) -> None:
     """Say on the terminal what was found, and where it is written; notes go to standard error."""
     guess = result["first_guess"]
@@ -198,7 +237,7 @@ def print_outcome(result: dict[str, Any], found: Findings, out: Path, report: bo
     for kind, factor in result["prior_too_narrow"].items():
         kind = kind.replace("_", " ")
         print(f"note: {kind} drifted {factor:.1f} times as far as the rig's prior allows: widened", file=sys.stderr)
-    for offset in result["object"]:
+    for offset in _offsets(result):
         if offset["fiducial"] in result["object_displaced"]:
             print(
                 f"note: fiducial {offset['fiducial']} of the object is {offset['offset_mm']:.3g} +- "
@@ -214,7 +253,10 @@ def print_outcome(result: dict[str, Any], found: Findings, out: Path, report: bo
     if result["board_bend"]:
         print(result["board_bend"]["note"])
     print(f"rig     {out / 'rig.yaml'}")
-    if result["object"]:
+    several = [entry for entry in result["object"] if "name" in entry]
+    for entry in several:
+        print(f"object  {entry['name']} seen in {entry['snapshots_used']} snapshots")
+    if result["object"] and not several:
         print(f"object  {out / 'object.csv'}")
     elif result["board_bend"]:
         print(f"board   {out / 'board.yaml'}")

@@ -10,7 +10,7 @@ import torch
 
 from imgcal.cli import arguments
 from imgcal.cli.common import open_rig, progress, read_detections
-from imgcal.io import load_object, open_input
+from imgcal.io import load_objects, open_input
 from imgcal.pipeline import RigScore, rms_length, score, unit_doubt
 from imgcal.types import CameraRig
 
@@ -20,7 +20,7 @@ class Score(arguments.Score):
 
     def run(self) -> None:
         """Score and print."""
-        rig, obj = open_rig(self.rig), load_object(self.object)
+        rig, obj = open_rig(self.rig), load_objects(self.object)
         source = open_input(self.input, rig, obj.rows, self.videos_differ)
         detections, _ = read_detections(source, self.snapshots, self.detection, board=obj.board)
 
@@ -44,7 +44,7 @@ def summary(scored: RigScore, rig: CameraRig) -> dict[str, object]:
             "points": int(seen.sum()),
             "outliers": int(outlier.sum()),
         }
-    used, total = scored.moments
+    used, total = scored.labelled.moment_counts
     return {
         "median_px": float(scored.distances.median()),
         "p95_px": float(torch.quantile(scored.distances, 0.95)),

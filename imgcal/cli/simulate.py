@@ -13,7 +13,7 @@ from imgcal.cli.common import check_folder, open_rig, progress
 from imgcal.errors import InputError
 from imgcal.geometry import vector_from_rotation
 from imgcal.io import (
-    load_object,
+    load_objects,
     publishing,
     save_capture_settings,
     save_detections,
@@ -30,6 +30,7 @@ from imgcal.synthesis import (
     PoseRange,
     RelativeDrift,
     Truth,
+    join_truths,
     place_markers,
     render_board,
     simulate_board,
@@ -40,7 +41,7 @@ from imgcal.synthesis import (
 )
 from imgcal.types import FIDUCIAL_RADIUS, CalibrationObject, CameraRig, limits
 
-WRITTEN = ("capture.yaml", "rig.yaml", "object.csv", "board.yaml", "truth", "frames")
+WRITTEN = ("capture.yaml", "rig.yaml", "object.csv", "objects", "board.yaml", "truth", "frames")
 
 MOST_SNAPSHOTS = 100_000
 
@@ -69,7 +70,7 @@ class Simulate(arguments.Simulate):
         check_folder(self.out)
         if any((self.out / name).exists() for name in ("frames", "truth")):
             raise InputError(f"{self.out}: found a capture there already, expected a new folder")
-        rig, obj = open_rig(self.rig), load_object(self.object)
+        rig, obj = open_rig(self.rig), load_objects(self.object)
         generator = torch.Generator().manual_seed(self.seed)
         are_known = not obj.unknown_markers
         if not are_known:
@@ -77,8 +78,7 @@ class Simulate(arguments.Simulate):
         truth = self._truth(rig, obj, generator)
         with publishing(self.out, WRITTEN, mark="frames") as out:
             self._write(truth, rig, obj, generator, out)
-            name = "object.csv" if obj.board is None else "board.yaml"
-            save_object(obj, out / name if are_known else out / "truth" / name)
+            _write_object(obj, out if are_known else out / "truth")
         print(f"{self.snapshots} snapshots of {rig.num_cameras} cameras written to {self.out}", file=sys.stderr)
 
     def _write(
@@ -88,7 +88,7 @@ class Simulate(arguments.Simulate):
             out, self.sensor.bit_depth if obj.board is None else 8, note=f"simulated, seed {self.seed}"
         )
         save_rig(rig, out / "rig.yaml")
-        _write_truth(truth, out / "truth")
+        _write_truth(truth, obj, out / "truth")
         if obj.board is not None:
             for snapshot in progress(range(self.snapshots), self.snapshots, "rendering frames"):
                 pose = truth.rig_from_object[snapshot]
@@ -109,20 +109,30 @@ class Simulate(arguments.Simulate):
         write_text(out / "truth" / "seen.csv", "\n".join([*rows, ""]))
 
     def _truth(self, rig: CameraRig, obj: CalibrationObject, generator: torch.Generator) -> Truth:
-        """Disturb the rig and place the object."""
+        """Disturb the rig once, and place each object."""
+        truths: list[Truth] = []
+        for part in obj.each:
+            truths.append(
+                self._truth_of(truths[0].rig if truths else rig, part, generator, None if truths else self._drift())
+            )
+        return join_truths(truths)
+
+    def _truth_of(
+        self, rig: CameraRig, obj: CalibrationObject, generator: torch.Generator, drift: Drift | None
+    ) -> Truth:
         if obj.board is not None:
             if self.poses is not None or self.exposure_ms > 0 or self.difficulty is not None:
                 raise InputError("--poses, --exposure-ms, --difficulty: expected an object with markers, found a board")
-            return simulate_board(rig, obj, self.snapshots, generator, self._drift())
+            return simulate_board(rig, obj, self.snapshots, generator, drift)
         poses = self.poses or ("hemisphere" if rig.volume is None and rig.working_distance is not None else "volume")
         if self.exposure_ms > 0 and poses != "hand-held":
             raise InputError(f"--exposure-ms: found {self.exposure_ms:g}, expected --poses hand-held with it")
         if poses == "hemisphere":
-            return simulate_truth(rig, obj, self.snapshots, generator, self._drift(), self._pose_range())
+            return simulate_truth(rig, obj, self.snapshots, generator, drift, self._pose_range())
         if self._pose_range() != PoseRange():
             raise InputError("--theta-deg, --phi-deg, --alpha-deg: expected only with --poses hemisphere")
         hand = self.hand if poses == "hand-held" else None
-        return simulate_volume(rig, obj, self.snapshots, generator, self._drift(), hand=hand)
+        return simulate_volume(rig, obj, self.snapshots, generator, drift, hand=hand)
 
     def _drift(self) -> Drift | None:
         kind = self.drift or ("physical" if self.kappa is None else "relative")
@@ -136,10 +146,23 @@ class Simulate(arguments.Simulate):
         return PoseRange(self.theta_deg, self.phi_deg, self.alpha_deg)
 
 
-def _write_truth(truth: Truth, folder: Path) -> None:
+def _write_object(obj: CalibrationObject, folder: Path) -> None:
+    """Write the object's file; of several objects, one each in a folder of their own."""
+    if not obj.parts:
+        save_object(obj, folder / ("object.csv" if obj.board is None else "board.yaml"))
+        return
+    (folder / "objects").mkdir()
+    for part in obj.parts:
+        save_object(part, folder / "objects" / f"{part.name}.csv")
+
+
+def _write_truth(truth: Truth, obj: CalibrationObject, folder: Path) -> None:
     folder.mkdir()
     save_rig(replace(truth.rig, name=f"{truth.rig.name} drifted", prior=None), folder / "rig.yaml")
-    save_detections(true_detections(truth), folder / "detections.csv")
-    poses = torch.cat((vector_from_rotation(truth.rig_from_object.rotation), truth.rig_from_object.translation), dim=-1)
-    rows = [f"{s:05d}," + ",".join(repr(value) for value in row) for s, row in enumerate(poses.tolist())]
-    write_text(folder / "rig_from_object.csv", "\n".join(["snapshot,rx,ry,rz,tx,ty,tz", *rows]) + "\n")
+    save_detections(true_detections(truth), folder / "detections.csv", obj)
+    rows = ["snapshot,rx,ry,rz,tx,ty,tz" + (",object" if obj.parts else "")]
+    for one, part in zip(truth.parts or (truth,), obj.each, strict=True):
+        where, end = one.rig_from_object, f",{part.name}" if obj.parts else ""
+        poses = torch.cat((vector_from_rotation(where.rotation), where.translation), dim=-1)
+        rows += [f"{s:05d}," + ",".join(map(repr, row)) + end for s, row in enumerate(poses.tolist())]
+    write_text(folder / "rig_from_object.csv", "\n".join(rows) + "\n")

@@ -52,11 +52,26 @@ class Problem:
     object_prior_std: Tensor | None = None  # (B, M) prior standard deviation of the object's parameters; None = exact
     modes: Tensor | None = None  # (K, N, 3) mm, about the centroid, by one prior standard deviation; see `modes.py`
     mode_offset: Tensor | None = None  # (K,) how much of each `points` have, whitened; None = nothing
+    part_of: Tensor | None = None  # (N,) object to which each fiducial belongs, where there are several; None = one
 
     @property
-    def pose_rank(self) -> int:
-        """How many of its pose's 6 numbers the object shows; see `imgcal.geometry.pose_rank`."""
-        return pose_rank(self.points)
+    def pose_freedom(self) -> Tensor:
+        """How many numbers the observations show of all poses of a rig together: (B,)."""
+        ranks = torch.tensor([pose_rank(points) for points in self.points_of_parts()], device=self.uv.device)
+        if self.part_of is None:
+            return self.uv.shape[1] * ranks.expand(len(self.uv))
+        return ranks[self.part_of_rows()].sum(-1)
+
+    def points_of_parts(self) -> list[Tensor]:
+        """Fiducials (N_k, 3) of each object."""
+        if self.part_of is None:
+            return [self.points]
+        return [self.points[self.part_of == part] for part in range(int(self.part_of.max()) + 1)]
+
+    def part_of_rows(self) -> Tensor:
+        """Object that each row shows, where there are several: (B, S); the first one where it shows nothing."""
+        assert self.part_of is not None
+        return self.part_of[(self.root_weight > 0).any(2).int().argmax(-1)]
 
     def select(self, rows: Tensor) -> Problem:
         """Keep the given rigs, (R,) indices."""
@@ -175,8 +190,9 @@ def linearize(problem: Problem, state: State, loss: Callable[[Tensor], tuple[Ten
     over_cameras = products[..., k:, k:].sum(2)
     eye = torch.eye(k, dtype=rows.dtype, device=rows.device)
     pose = over_cameras[..., :POSE_PARAMETERS, :POSE_PARAMETERS]
-    turns = free_turns(problem.points)
+    turns = torch.stack([free_turns(points) for points in problem.points_of_parts()])
     if bool(turns.any()):
+        turns = turns[0] if problem.part_of is None else turns[problem.part_of_rows()]
         pose = pose.clone()
         pose[..., :3, :3] += state.rotation @ turns @ state.rotation.mT
     own = None

@@ -4,6 +4,7 @@ Three tuples of arrays go in and out: what is `given` (points of the object and 
 observations and the roots of their weights, the factory rig, the prior, that of the object), the `state`, and the
 `blocks` of the normal equations. Layouts: `lm_cpu._Blocks`; what fits each camera and what each snapshot is summed up
 before it is written. The object's own parameters stand behind the coupled ones, and have a border of their own.
+Where several objects were in view, the points have a fourth column: the number of the object; each row shows one.
 
 Where a camera shakes, all that it sees in a snapshot is shifted alike, by nobody knows how much: the most probable
 shift is taken out of the residuals, and what it might have been instead out of the normal equations (Schur complement).
@@ -80,12 +81,15 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold, shake):
     kind, free = uv.dtype, 10 + lens_kernels.width_of(lenses, distortion0)
     wide = free + 6
     turns = np.empty((3, 3), dtype=kind)
-    lacking = kernels.fill_free_turns(points, turns)
+    several = points.shape[1] > 3
+    lacking = 0 if several else kernels.fill_free_turns(points, turns)
     for s in range(snapshots):
         for i in range(6):
             pose_gradient[s, i] = 0
             for j in range(6):
                 pose[s, i, j] = 0
+        if several:
+            lacking = _fill_turns_of_row(points, root_weight[s], turns)
         if lacking:
             _fix_turns(rotation[s], turns, pose[s])
     rows = np.zeros((2, wide), dtype=kind)
@@ -221,6 +225,23 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold, shake):
                 products, gradient, c, s, free, camera, coupling, pose, camera_gradient, pose_gradient, cameras_first
             )
     return cost
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _fill_turns_of_row(points, root_weight, turns):
+    """Do what `fill_free_turns` does for the object that a row shows by its weights (C, N)."""
+    cameras, fiducials = root_weight.shape
+    shown = 0
+    for n in range(fiducials - 1, -1, -1):
+        for c in range(cameras):
+            if root_weight[c, n] > 0:
+                shown = n
+    first, last = shown, shown
+    while first > 0 and points[first - 1, 3] == points[shown, 3]:
+        first -= 1
+    while last + 1 < fiducials and points[last + 1, 3] == points[shown, 3]:
+        last += 1
+    return kernels.fill_free_turns(points[first : last + 1], turns)
 
 
 @njit(cache=True, fastmath=kernels.FAST)

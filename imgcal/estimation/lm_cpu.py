@@ -192,6 +192,8 @@ def _parts(state: State) -> tuple[Tensor, ...]:
 def shared_given(problem: Problem) -> tuple[np.ndarray | None, ...]:
     """What `linearization_cpu` is given of all rigs alike."""
     points, squared = problem.points, problem.radius_squared
+    if problem.part_of is not None:
+        points = torch.cat((points, problem.part_of[:, None].to(points)), 1)
     given = _arrays((points, points.new_zeros(len(points)) if squared is None else squared))
     return (*given, lens_codes(problem.factory.lens_model, *problem.factory.distortion.shape[-2:]))
 

@@ -246,7 +246,7 @@ def make_estimate(
     plain = state is solution.state and state.offset.device.type == "cpu"  # no gradient to carry
     rigs, poses = (lm_cpu.rig_at if plain else rig_at)(problem, state.offset), pose_at(problem, state)
     residual = torch.where(seen.unsqueeze(-2), solution.equations.residual, 0.0).mT
-    dof = 2 * seen.flatten(1).sum(1) - problem.pose_rank * seen.shape[1]
+    dof = 2 * seen.flatten(1).sum(1) - problem.pose_freedom
     return Estimate(
         rig=rigs.reshape(*batch),
         rig_from_object=poses.reshape(*batch, seen.shape[1]),
@@ -295,6 +295,7 @@ def make_problem(
     modes = None if obj.modes is None else obj.modes.to(uv) - obj.modes.to(uv).mean(1, keepdim=True)
     return Problem(
         modes=modes,
+        part_of=torch.from_numpy(obj.part_of).to(uv.device) if obj.parts else None,
         object_prior_std=None if obj.exact or obj.pose_rank < 6 else object_prior_std(obj).to(uv).expand(count, -1),
         uv=torch.where(seen[..., None], uv, 0.0).mT.contiguous(),
         root_weight=torch.where(seen, 1 / torch.where(seen, sigma, 1.0), 0.0),
@@ -310,7 +311,8 @@ def make_problem(
 
 def object_prior_std(obj: CalibrationObject) -> Tensor:
     """Prior standard deviation of the object's own parameters, in the order of `State`: (M,)."""
-    return torch.cat((obj.granted.repeat_interleave(3), obj.points.new_tensor([obj.scale_tolerance])))
+    granted = torch.cat([part.granted * (part.pose_rank == 6) for part in obj.parts]) if obj.parts else obj.granted
+    return torch.cat((granted.repeat_interleave(3), obj.points.new_tensor([obj.scale_tolerance])))
 
 
 def initial_state(problem: Problem, rig_from_object: RigidTransform, initial_rig: CameraRig | None) -> State:

@@ -29,6 +29,7 @@ from imgcal.estimation.linearization import (
 from imgcal.estimation.map_estimate import Estimate, equations_at
 from imgcal.estimation.modes import direction_evidence
 from imgcal.estimation.robust_losses import NamedLoss, RobustKernel
+from imgcal.geometry import pose_rank
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -154,7 +155,8 @@ class ScaleEvidence:
 
 def object_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> ShapeEvidence | ScaleEvidence | None:
     """Ask a fit of one rig (B = 1) about the object that it took; None where rig and poses are undetermined."""
-    if problem.object_prior_std is None and (len(problem.points) > MOST_FIDUCIALS or problem.pose_rank < 6):
+    solid = all(pose_rank(points) == 6 for points in problem.points_of_parts())
+    if problem.object_prior_std is None and (len(problem.points) > MOST_FIDUCIALS or not solid):
         return scale_evidence(problem, solution, loss)
     return shape_evidence(problem, solution, loss)
 
@@ -208,7 +210,7 @@ def shape_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> Sha
         points=points.cpu().double().numpy(),
         tolerance=tolerance,
         chi2=2 * cost,
-        freedom=2 * int((problem.root_weight > 0).sum()) - problem.pose_rank * problem.uv.shape[1],
+        freedom=2 * int((problem.root_weight > 0).sum()) - int(problem.pose_freedom),
     )
 
 
@@ -313,7 +315,7 @@ def offsets(estimate: Estimate, points: Array) -> tuple[FiducialOffset, ...]:
     """Compare the estimated fiducials with their places `points` (N, 3) mm, fiducial by fiducial.
 
     A rigid motion of the object is no displacement: the object is first laid onto its places so that as many fiducials
-    as possible are where they belong.
+    as possible are where they belong; each of several objects by itself.
 
     Source: S-transformation (Baarda 1973) with weights that follow the displacements, as in deformation analysis.
     """
@@ -321,12 +323,16 @@ def offsets(estimate: Estimate, points: Array) -> tuple[FiducialOffset, ...]:
         estimate.points_object.detach().double().numpy(),
         object_covariance(estimate, curved=False).double().numpy(),
     )
-    moved, centred = (found - points).ravel(), points - points.mean(0)
-    motions = np.zeros((len(points), 3, 6))  # displacement by a rotation about the centroid and a translation
-    motions[:, :, 3:] = np.eye(3)
+    moved, part_of = (found - points).ravel(), estimate.problem.part_of
+    number = np.zeros(len(points), dtype=int) if part_of is None else part_of.numpy()
+    centred = points - np.stack([points[number == part].mean(0) for part in range(number.max() + 1)])[number]
+    # Displacement of each object by a rotation about its centroid and a translation.
+    motions = np.zeros((len(points), 3, number.max() + 1, 6))
+    rows = np.arange(len(points))
+    motions[rows, :, number, 3:] = np.eye(3)
     for axis in range(3):
-        motions[:, :, axis] = np.cross(np.eye(3)[axis], centred)
-    rigid = motions.reshape(-1, 6)
+        motions[rows, :, number, axis] = np.cross(np.eye(3)[axis], centred)
+    rigid = motions.reshape(len(moved), -1)
     own = np.sqrt(covariance.diagonal().reshape(-1, 3).sum(1))
     least = NARROW * np.sqrt(np.square(centred).sum(1).mean()) + own
     left = moved.reshape(-1, 3)

@@ -147,6 +147,7 @@ def _minimize_on_rotations(form: _QuadraticForm, rotation: Tensor, iterations: i
     generators = _generators(rotation)
     trace = form.matrix.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None, None]
     damping = 1e-6 * trace * torch.eye(3, dtype=rotation.dtype, device=rotation.device)
+    damping = torch.where(trace > 0, damping, torch.eye(3, dtype=rotation.dtype, device=rotation.device))  # one light
     for _ in range(iterations):
         tangent = torch.einsum("gij,pmjk->pmikg", generators, rotation).flatten(-3, -2)  # (P, M, 9, 3)
         # One product for the tangents and the rotation of all starts: (9, 9) @ (9, 4 M).
@@ -178,6 +179,8 @@ def _minimize_each(matrix, vector, rotation, iterations):
         trace = 0.0
         for i in range(9):
             trace += matrix[p, i, i] / 9
+        if trace <= 0:
+            continue  # a single light has no rotation
         for m in range(rotation.shape[1]):
             now = rotation[p, m]
             for _ in range(iterations):

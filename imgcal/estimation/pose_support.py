@@ -27,18 +27,23 @@ class UndeterminedPosesError(RefusedError):
         self.rows = tuple(rows)
 
 
-def require_poses(seen: NDArray[np.bool_], points: Tensor) -> None:
+def require_poses(seen: NDArray[np.bool_], points: Tensor, part_of: NDArray[np.int64] | None = None) -> None:
     """Make sure that what is `seen` (S, C, N) of an object's points (N, 3) shows its pose in every snapshot.
 
     That is more than a line; of a stick two points, of a light the one, each in two cameras.
 
+    Args:
+        seen: labels.
+        points: of the object, or of several.
+        part_of: (N,) the object to which each point belongs, where there are several; a row shows one of them.
+
     Raises:
         UndeterminedPosesError: it is not; says in which.
     """
-    posed = has_poses(seen, points)
+    posed = has_poses(seen, points, part_of)
     if not posed.all():
-        least = _least_fiducials(pose_rank(points))
         rows = np.flatnonzero(~posed).tolist()
+        least = None if part_of is not None else _least_fiducials(pose_rank(points))
         if least is None:
             raise UndeterminedPosesError(rows)
         raise UndeterminedPosesError(rows, TOO_FEW.format("1 fiducial" if least == 1 else f"{least} fiducials"))
@@ -49,8 +54,14 @@ def _least_fiducials(rank: int) -> int | None:
     return None if rank == 6 else 2 if rank == 5 else 1
 
 
-def has_poses(seen: NDArray[np.bool_], points: Tensor) -> NDArray[np.bool_]:
-    """Tell in which snapshots what is `seen` (S, C, N) of an object's points (N, 3) determines its pose: (S,)."""
+def has_poses(seen: NDArray[np.bool_], points: Tensor, part_of: NDArray[np.int64] | None = None) -> NDArray[np.bool_]:
+    """Tell in which snapshots what is `seen` (S, C, N) of an object's points (N, 3) determines its pose: (S,).
+
+    With several objects (`part_of`, as in `require_poses`) one of them must be determined.
+    """
+    if part_of is not None:
+        columns = [np.flatnonzero(part_of == part) for part in range(int(part_of.max()) + 1)]
+        return np.any([has_poses(seen[..., own], points[own]) for own in columns], axis=0)
     least = _least_fiducials(pose_rank(points))
     if least is not None:
         enough: NDArray[np.bool_] = (seen.sum(1) >= 2).sum(1) >= least

@@ -118,7 +118,7 @@ class _Fit:
     @cached_property
     def additive_noise(self) -> float:
         """What the residuals hold beyond the blobs' own sigma, px; see `_additive_noise`."""
-        taken = self.problem.pose_rank * len(self.seen) + float((1 - self.remaining).sum())
+        taken = float(self.problem.pose_freedom) + float((1 - self.remaining).sum())
         return _additive_noise(self.squared[self.seen], self.variance[self.seen], taken)
 
     @property

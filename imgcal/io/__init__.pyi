@@ -7,7 +7,7 @@ from .json_text import read_json
 from .key_table import Key, keys_of
 from .metrics import read_metrics
 from .names import MODEL, find_file, is_file_name, model_file, model_name, natural_key, nearest, title_of
-from .object_csv import load_object, object_from_text, object_text, save_object
+from .object_csv import load_object, load_objects, object_from_text, object_text, save_object
 from .own_folder import holding
 from .posterior_file import read_posterior, write_posterior
 from .publication import PREVIOUS, keep_previous, publishing
@@ -53,6 +53,7 @@ __all__ = [
     "load_cameras",
     "load_detections",
     "load_object",
+    "load_objects",
     "load_rig",
     "load_rig_covariance",
     "looks_like",

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from imgcal.errors import InputError
 from imgcal.io.atomic import write_text
-from imgcal.io.detections_csv import load_detections
+from imgcal.io.detections_csv import Fiducials, load_detections
 from imgcal.io.frames import IMAGE_SUFFIXES, TIFF_SUFFIXES, VIDEO_SUFFIXES, Frame, Video, count_frames, read_frame
 from imgcal.io.names import is_file_name, natural_key, nearest
 from imgcal.io.publication import is_unfinished
@@ -185,7 +185,7 @@ def open_capture(folder: str | Path, rig: CameraRig | None = None, videos_differ
 def open_input(
     path: str | Path,
     rig: CameraRig | None = None,
-    fiducials: int | Sequence[int] | None = None,
+    fiducials: Fiducials | None = None,
     videos_differ: bool = False,
 ) -> Capture | Detections:
     """Open what a user gives to a command: a capture folder, a detections file, or a sample by its name (`sample:O10`).

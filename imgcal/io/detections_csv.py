@@ -1,8 +1,8 @@
 """Detections: CSV or CSV.gz with the header `snapshot,camera,u,v`.
 
 Optional columns: `sigma` (pixels; without it `DEFAULT_SIGMA` holds for every blob), `fiducial` (row of the object
-file, or what its own column `fiducial` calls it; empty = unlabelled), `radius` (pixels, empty = unknown) and `flags`
-(sum of `BlobFlag` bits).
+file, or what its own column `fiducial` calls it; empty = unlabelled), `object` (the name of the object to which
+the fiducial belongs, where there are several), `radius` (pixels, empty = unknown) and `flags` (sum of `BlobFlag` bits).
 
 Convention: a snapshot or camera without any blob has no row, so a file does not know of it; cameras come back when the
 file is read with its rig.
@@ -25,10 +25,13 @@ from imgcal.io.atomic import replacing
 from imgcal.io.csv_file import Chunk, fail_row, read_chunks
 from imgcal.io.names import is_file_name, nearest
 from imgcal.messages import listed, shortened
-from imgcal.types import BlobFlag, CameraRig, Detections, limits
+from imgcal.types import BlobFlag, CalibrationObject, CameraRig, Detections, limits
 
 REQUIRED = ("snapshot", "camera", "u", "v")
-OPTIONAL = ("sigma", "fiducial", "radius", "flags")
+OPTIONAL = ("sigma", "fiducial", "object", "radius", "flags")
+
+Fiducials = int | Sequence[int] | Sequence[tuple[str, int]]
+"""What tables call the points of an object: so many rows, or numbers; with several objects, the object and a number."""
 
 DEFAULT_SIGMA = 0.1
 """Pixels, one standard deviation of each axis, for files without the column `sigma`."""
@@ -36,16 +39,14 @@ DEFAULT_SIGMA = 0.1
 MARGIN = 5.0  # pixels outside the image that are still taken: centres of cut discs, rounding
 
 
-def load_detections(
-    path: str | Path, rig: CameraRig | None = None, fiducials: int | Sequence[int] | None = None
-) -> Detections:
+def load_detections(path: str | Path, rig: CameraRig | None = None, fiducials: Fiducials | None = None) -> Detections:
     r"""Read detections; a million rows take a few seconds.
 
     Args:
         path: CSV file, with or without gzip compression.
         rig: gives the cameras and their order, and the image sizes that are checked; None = cameras in file order.
         fiducials: number of points of the object, the limit of the column `fiducial`; or what that calls them, in the
-            order of the object; None = not checked.
+            order of the object; None = not checked. It is `CalibrationObject.rows`.
 
     Returns:
         Detections; snapshots in file order, which is the order in which their names first appear.
@@ -93,12 +94,13 @@ def load_detections(
     )
 
 
-def save_detections(detections: Detections, path: str | Path) -> None:
+def save_detections(detections: Detections, path: str | Path, obj: CalibrationObject | None = None) -> None:
     """Write detections in one step, compressed when the name ends in .gz; equal detections give equal bytes.
 
     Args:
         detections: blobs; numbers are written in their shortest exact form.
         path: the file to write.
+        obj: several objects whose fiducials the labels are (`CalibrationObject.of_several`): adds the column `object`.
 
     Raises:
         InputError: the file cannot be written, or a name could not be read again.
@@ -126,7 +128,11 @@ def save_detections(detections: Detections, path: str | Path) -> None:
         "radius": (repr(v) if k else "" for v, k in zip(detections.radius.tolist(), known.tolist(), strict=True)),
         "flags": map(str, detections.flags.tolist()),
     }
-    if labelled.any():
+    if labelled.any() and obj is not None and obj.parts:
+        called = list(obj.rows) if not isinstance(obj.rows, int) else []
+        columns["object"] = (called[v][0] if v >= 0 else "" for v in detections.fiducial.tolist())
+        columns["fiducial"] = (str(called[v][1]) if v >= 0 else "" for v in detections.fiducial.tolist())
+    elif labelled.any():
         columns["fiducial"] = (str(v) if v >= 0 else "" for v in detections.fiducial.tolist())
     with replacing(path) as file:
         # No time stamp and no file name inside: equal content gives equal bytes.
@@ -161,7 +167,7 @@ def _indices(chunk: Chunk, column: str, known: dict[str, int], allowed: tuple[st
     return np.fromiter(map(known.__getitem__, names), dtype=np.int64, count=len(names))
 
 
-def _numbers(chunk: Chunk, fiducials: int | Sequence[int] | None) -> dict[str, NDArray[np.float64]]:
+def _numbers(chunk: Chunk, fiducials: Fiducials | None) -> dict[str, NDArray[np.float64]]:
     """Convert the numeric columns; absent ones get their defaults."""
     count = len(chunk)
     result = {axis: chunk.numbers(axis, limits.PIXEL, f"a finite pixel coordinate, {limits.PIXEL}") for axis in "uv"}
@@ -171,7 +177,11 @@ def _numbers(chunk: Chunk, fiducials: int | Sequence[int] | None) -> dict[str, N
     result["fiducial"] = np.full(count, -1.0)
     if "fiducial" in chunk.columns:
         filled = _filled(chunk, "fiducial", "-1")
-        if isinstance(fiducials, Sequence):
+        if isinstance(fiducials, Sequence) and isinstance(fiducials[0], tuple):
+            result["fiducial"] = _rows_of_several(filled, [key for key in fiducials if isinstance(key, tuple)])
+        elif len({name for name in chunk.columns.get("object", ()) if name}) > 1:
+            chunk.fail(0, "object: found labels of several objects, expected those of one; name all of them")
+        elif isinstance(fiducials, Sequence):
             result["fiducial"] = _rows_of(filled, fiducials)
         else:
             last = limits.MOST_FIDUCIALS if fiducials is None else fiducials - 1
@@ -189,7 +199,24 @@ def _numbers(chunk: Chunk, fiducials: int | Sequence[int] | None) -> dict[str, N
     return result
 
 
-def _rows_of(chunk: Chunk, labels: Sequence[int]) -> NDArray[np.float64]:
+def _rows_of_several(chunk: Chunk, keys: Sequence[tuple[str, int]]) -> NDArray[np.float64]:
+    """Replace objects and their fiducials by rows among all fiducials."""
+    plausible = limits.Range(-1, 2**31 - 1, "")
+    named = chunk.numbers("fiducial", plausible, "a number of the object's fiducials", whole=True).astype(int).tolist()
+    objects = [name.strip() for name in chunk.columns.get("object", ("",) * len(chunk))]
+    row = {key: number for number, key in enumerate(keys)}
+    known = list(dict.fromkeys(name for name, _ in keys))
+    rows = [-1 if label == -1 else row.get((name, label), -2) for name, label in zip(objects, named, strict=True)]
+    if -2 in rows:
+        bad = rows.index(-2)
+        if objects[bad] not in known:
+            found = f"found {shortened(objects[bad])!r}" if "object" in chunk.columns else "found no such column"
+            chunk.fail(bad, f"object: {found}, expected the object of each labelled blob: {listed(known)}")
+        chunk.fail(bad, f"fiducial: found {named[bad]}, expected a fiducial of object {objects[bad]}")
+    return np.array(rows, dtype=np.float64)
+
+
+def _rows_of(chunk: Chunk, labels: Sequence[Any]) -> NDArray[np.float64]:
     """Replace what a table calls the fiducials by their rows in the object."""
     plausible = limits.Range(-1, 2**31 - 1, "")
     named = chunk.numbers("fiducial", plausible, "a number of the object's column `fiducial`", whole=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -53,9 +54,9 @@ def load_object(path: str | Path) -> CalibrationObject:
         (torch.Size([8, 3]), None)
     """
     path = Path(path)
-    if str(path) == LIGHTS and not path.exists():
+    if str(path) == LIGHTS and not path.is_file():
         return CalibrationObject.unknown(LIGHTS)
-    if not path.exists() and str(path) in shipped_names("objects", ".yaml"):
+    if not path.is_file() and str(path) in shipped_names("objects", ".yaml"):
         path = data_path("objects", f"{path}.yaml")
     if path.suffix.lower() in BOARD_SUFFIXES:
         check_regular(path)
@@ -63,6 +64,15 @@ def load_object(path: str | Path) -> CalibrationObject:
             raise InputError(f"{path}: no such file, expected that of a printed board")
         return board_from_yaml(path.read_bytes(), path)
     return _read(find_file(path, "objects", ".csv"))
+
+
+def load_objects(paths: Sequence[str | Path]) -> CalibrationObject:
+    """Read one calibration object, or several that are in view of one capture (`CalibrationObject.of_several`).
+
+    Raises:
+        InputError: as `load_object`; or one that cannot be among several.
+    """
+    return CalibrationObject.of_several([load_object(path) for path in paths])
 
 
 def object_from_text(text: str, where: str, name: str = "object") -> CalibrationObject:

@@ -32,7 +32,7 @@ def arrange(labelled: Associations, rig: CameraRig, obj: CalibrationObject) -> A
     """
     observations, poses = observations_of(labelled, rig, obj)
     try:
-        require_poses(observations.seen.numpy(), obj.points)
+        require_poses(observations.seen.numpy(), obj.points, obj.part_of if obj.parts else None)
     except UndeterminedPosesError as error:
         return arrange(without_snapshots(labelled, error.rows), rig, obj)
     if poses is None:

@@ -24,7 +24,7 @@ from imgcal.monitoring import posterior_of
 from imgcal.pipeline.doubtful import DoubtfulCamera, doubtful_at_end
 from imgcal.pipeline.initialization import Initialization
 from imgcal.pipeline.lateness import LEAST_BETTER, LateCamera, timing_motion
-from imgcal.pipeline.lights import FoundLights, count_moments
+from imgcal.pipeline.lights import FoundLights
 from imgcal.pipeline.object_checks import CERTAIN, displaced, lost_fiducials
 from imgcal.pipeline.repeats import Repeats
 from imgcal.pipeline.scale import KnownDistance, Scale, scale_of
@@ -106,7 +106,7 @@ class Calibration:
     def __repr__(self) -> str:
         """Say what was found: the rig, its error before and after, how the fiducials were identified."""
         before, after = float(self.before.rms), float(self.rms)
-        used = "{} of {} snapshots".format(*self.moments)
+        used = "{} of {} snapshots".format(*self.labelled.moment_counts)
         return (
             f"{type(self).__name__}({self.rig!r}, RMS {before:.4g} -> {after:.2g} px, chi2/dof "
             f"{float(self.chi2_per_dof):.2f}, identity {self.identity}, {used})"
@@ -127,8 +127,21 @@ class Calibration:
 
     @property
     def rig_from_object(self) -> RigidTransform:
-        """The object's pose in each snapshot: (S,)."""
+        """The object's pose in each snapshot: (S,); of several objects in each row, see `poses_by_object`."""
         return self.estimate.rig_from_object
+
+    @property
+    def poses_by_object(self) -> Mapping[str, Mapping[str, RigidTransform]]:
+        """rig_from_object by the name of the object and of the snapshot, in the frame of the object's file."""
+        rows, poses, parts = self.labelled.used, self.rig_from_object, self.obj.each
+        found: dict[str, dict[str, RigidTransform]] = {part.name: {} for part in parts}
+        for row, part, rotation, translation in zip(
+            rows, self.labelled.part_of_rows.tolist(), poses.rotation, poses.translation, strict=True
+        ):
+            origin = parts[part].origin
+            shift = translation if origin is None else translation - rotation @ origin.to(rotation)
+            found[parts[part].name][self.labelled.snapshots[row].name] = RigidTransform(rotation, shift)
+        return found
 
     @property
     def points_object(self) -> Tensor:
@@ -190,13 +203,19 @@ class Calibration:
         """Fiducials that were hardly found where the others were."""
         points = self.rig_from_object.apply(self.points_object)
         visible = self.rig.expand(len(points)).project(points, self.obj.radius).visible
-        return lost_fiducials(self.observations.seen.numpy(), visible.numpy())
+        return lost_fiducials(self.observations.seen.numpy(), visible.numpy() & self.labelled.columns(self.obj))
 
     @property
     def untimed(self) -> tuple[str, ...]:
-        """Cameras whose frames may be of other moments than the others' without a trace: too little motion."""
+        """Cameras whose frames may be of other moments than the others' without a trace: too little motion.
+
+        None of several unknown markers: snapshots that took no part have judged every camera, and no marker can be
+        followed from one snapshot to the next.
+        """
+        if self.lights is not None and len(self.labelled.used) > self.labelled.moment_counts[0]:
+            return ()
         seen = self.observations.seen
-        moved = timing_motion(self.observations.uv, seen, self.labelled.used)
+        moved = timing_motion(self.observations.uv, seen, self.labelled.before_rows)
         shown = seen.any(0).any(-1)
         names = zip(self.rig.camera_names, moved.tolist(), shown.tolist(), strict=True)
         return tuple(name for name, motion, is_shown in names if is_shown and motion < LEAST_BETTER)
@@ -227,12 +246,9 @@ class Calibration:
         outlier[outlier] = ~self.observations.seen.numpy()[s[outlier], c[outlier], n[outlier]]
         marked = detections.flags | np.where(outlier, int(BlobFlag.OUTLIER), 0).astype(np.uint8)
         found = replace(detections, flags=marked)
-        return found if self.lights is None else self.lights.to_moments(found)
-
-    @cached_property
-    def moments(self) -> tuple[int, int]:
-        """Number of snapshots used and of all; of unknown markers those of which some marker is used."""
-        return count_moments(self.labelled, self.lights)
+        if self.lights is not None:
+            return self.lights.to_moments(found)
+        return replace(self.labelled, detections=found).by_moment()
 
     @cached_property
     def predicted_error(self) -> PredictedError:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -122,8 +123,9 @@ def _fields_each(uv: Tensor, seen: Tensor, image_size: Tensor) -> Tensor:
 def _places(calibration: Calibration, reached: Tensor, count: int = 3) -> tuple[Place, ...]:
     """Choose, one after the other, where the object would reach most fields that nothing has reached yet."""
     rig, poses = calibration.rig, calibration.rig_from_object
-    fiducials = calibration.obj.num_fiducials
-    chosen = torch.linspace(0, fiducials - 1, min(fiducials, MOST_POINTS)).long()
+    of_largest = np.flatnonzero(calibration.obj.part_of == np.bincount(calibration.obj.part_of).argmax())
+    fiducials = len(of_largest)
+    chosen = int(of_largest[0]) + torch.linspace(0, fiducials - 1, min(fiducials, MOST_POINTS)).long()
     body = calibration.points_object[chosen].double()
     centres = poses.apply(body).mean(1)  # (S, 3)
     middle = centres.mean(0)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.association import track
@@ -61,7 +62,7 @@ class LateCamera:
         )
 
 
-def timing_motion(uv: Tensor, seen: Tensor, used: Sequence[int]) -> Tensor:
+def timing_motion(uv: Tensor, seen: Tensor, before: NDArray[np.int64]) -> Tensor:
     """How far images would be off if a camera were late by one snapshot, and turned to make up for it: (C,) pixels.
 
     A steady motion shifts all images of a late camera alike, as a turn of the camera does; only changes of the motion
@@ -70,12 +71,13 @@ def timing_motion(uv: Tensor, seen: Tensor, used: Sequence[int]) -> Tensor:
     Args:
         uv: (S, C, N, 2) pixels.
         seen: (S, C, N) bool.
-        used: numbers of the S snapshots.
+        before: (S,) number of the same object one snapshot earlier, -1 = there is none.
     """
-    both = seen[1:] & seen[:-1]
-    both[torch.tensor(used).diff() != 1] = False
-    shift = torch.where(both[..., None], uv[1:] - uv[:-1], 0.0).sum(2) / both.sum(2).clamp_min(1)[..., None]
-    known = both.any(2)  # (S - 1, C)
+    rows = torch.from_numpy(np.flatnonzero(before >= 0))
+    earlier = torch.from_numpy(before)[rows]
+    both = seen[rows] & seen[earlier]
+    shift = torch.where(both[..., None], uv[rows] - uv[earlier], 0.0).sum(2) / both.sum(2).clamp_min(1)[..., None]
+    known = both.any(2)  # (pairs, C)
     count = known.sum(0).clamp_min(1)
     mean = (shift * known[..., None]).sum(0) / count[:, None]
     return ((shift - mean).square().sum(-1) * known).sum(0).div(count).sqrt()

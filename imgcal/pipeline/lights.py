@@ -161,25 +161,30 @@ def find_lights(
     return FoundLights(rows_of_lights(found, moving, verified), detections, blob, background, agreement, starts)
 
 
-def count_moments(labelled: Associations, lights: FoundLights | None) -> tuple[int, int]:
-    """Count snapshots used and all; of unknown markers, whose rows share snapshots, those of which a row is used."""
-    snapshots, used = labelled.snapshots, labelled.used
-    if lights is None:
-        return len(used), len(snapshots)
-    return len({snapshots[row].name for row in used}), len(lights.detections.snapshot_names)
-
-
 def rows_of_lights(lights: Lights, detections: Detections, rig: CameraRig) -> Associations:
-    """Make a snapshot of each marker at each moment; it has the name of the moment, and only the marker's blobs."""
-    row, camera = np.nonzero(lights.row >= 0)
-    blobs = detections.select(lights.row[row, camera])
-    names = tuple(detections.snapshot_names[moment] for moment in lights.moment)
-    blobs = replace(blobs, snapshot=row, fiducial=np.zeros(len(row), dtype=np.int64), snapshot_names=names)
-    places = torch.from_numpy(lights.point).to(rig.focal_length)
+    """Make a row of each marker at each moment; it has the name of the moment, and only the marker's blobs.
+
+    A moment without any marker is a row that was refused.
+    """
+    empty = np.setdiff1d(np.arange(len(detections.snapshot_names)), lights.moment)
+    moments = np.concatenate((lights.moment, empty))
+    order = np.argsort(moments, kind="stable")
+    number = np.empty(len(order), dtype=np.int64)
+    number[order] = np.arange(len(order))
+    marker, camera = np.nonzero(lights.row >= 0)
+    blobs = detections.select(lights.row[marker, camera])
+    names = tuple(detections.snapshot_names[moment] for moment in moments[order])
+    labels = np.zeros(len(marker), dtype=np.int64)
+    blobs = replace(blobs, snapshot=number[marker], fiducial=labels, snapshot_names=names)
+    places, cameras = torch.from_numpy(lights.point).to(rig.focal_length), lights.cameras.tolist()
     still = torch.eye(3, dtype=places.dtype)
     snapshots = tuple(
-        SnapshotIdentity(name, "unique", f"{cameras} cameras agree", 1, RigidTransform(still, place))
-        for name, cameras, place in zip(names, lights.cameras.tolist(), places, strict=True)
+        SnapshotIdentity(
+            name, "unique", f"{cameras[k]} cameras agree", 1, RigidTransform(still, places[k]), moment=moment
+        )
+        if k < len(places)
+        else SnapshotIdentity(name, "refused", NO_MARKER, 0, None, moment=moment)
+        for name, k, moment in zip(names, order.tolist(), moments[order].tolist(), strict=True)
     )
     return Associations(blobs, snapshots)
 
@@ -215,6 +220,8 @@ def _verified_rig(detections: Detections, rig: CameraRig, obj: CalibrationObject
     raise RefusedError(_why(best, rig))
 
 
+NO_MARKER = "no moving blobs of three cameras agree on a place"
+"""Why a moment has no marker."""
 NOTHING = (
     "unknown markers: no blobs of three cameras agree on places: the rig is farther off than its prior says, or the "
     "markers are too many or too few"

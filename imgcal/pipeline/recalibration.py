@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -35,13 +36,17 @@ from imgcal.types import (
     CameraRig,
     Detections,
     MovedError,
+    RigPrior,
 )
+
+FOUND = RigPrior(focal_length=5e-4, principal_point=0.5, distortion=0.01, rotation=5e-4, position=0.5)
+"""How far a rig that was just found may be off, where labels of sticks are completed: about a pixel."""
 
 
 def calibrate(
     source: Detections | Frames,
     rig: CameraRig,
-    obj: CalibrationObject,
+    obj: CalibrationObject | Sequence[CalibrationObject],
     options: PipelineOptions = PipelineOptions(),
     *,
     detection: DetectionOptions = DetectionOptions(),
@@ -55,7 +60,7 @@ def calibrate(
     Args:
         source: blobs, labelled or not, or frames in memory (see `imgcal.detect`).
         rig: the factory calibration, without batch axes.
-        obj: the calibration object.
+        obj: the calibration object; or several, any of which may be in view of any snapshot.
         options: how sure the result must be.
         detection: how blobs are found in frames.
         initializer: network whose first guess the estimate starts from (`load_initializer`).
@@ -80,6 +85,7 @@ def calibrate(
         >>> result.identity, result.rig.camera_names == factory.camera_names
         ('coded', True)
     """
+    obj = as_one(obj)
     started, rig, options = time.perf_counter(), rig.to(torch.float64), options.of_object(obj)
     source = source if isinstance(source, Detections) else checked_frames(source, rig)
     blobs = settle_turns(blobs_of(source, rig, obj, detection, measurer), rig, obj)
@@ -90,6 +96,8 @@ def calibrate(
     sight = sight_of(detector, source, detection, measurer)
     if obj.unknown_markers:
         return _of_lights(detections, repeats, rig, obj, options, found - started)
+    if obj.parts and (sight is not None or initializer is not None):
+        obj.require_rigid("for detectors and networks that look for a pattern")
     labelled: Associations | None = None
     try:
         with require_solvable():
@@ -97,6 +105,8 @@ def calibrate(
             identified = time.perf_counter()
             given = detections if sight is None else _as_given(labelled)
             fit = fit_as_timed(labelled, given, rig, obj, options, initializer)
+            if any(part.pose_rank == 5 for part in obj.each):
+                fit = _labelled_again(fit, given, rig, obj, options)
     except RefusedError as error:
         if sight is not None and labelled is not None and sight.where_blobs_fail and _by_blobs(labelled):
             # They told the pose, and failed all the same.
@@ -105,7 +115,8 @@ def calibrate(
                 return calibrate(
                     detections, rig, obj, options, initializer=initializer, progress=progress, detector=sight
                 )
-        if obj.pose_rank == 6:  # the extent of what is seen says nothing of a light, and little of a stick
+        # The extent of what is seen says nothing of a light, and little of a stick.
+        if obj.pose_rank == 6 and not obj.parts:
             require_units(error, detections, rig, obj)
         if labelled is not None:
             require_same_moments(error, detections, labelled, rig, obj, options)
@@ -115,7 +126,7 @@ def calibrate(
         "identity": identified - found,
         "estimation": time.perf_counter() - identified,
     }
-    late = late_cameras(detections, fit.tally, rig, obj, options)
+    late = late_cameras(detections, fit.tally, rig, obj, options, labelled=fit.labelled)
     return replace(fit, labelled=name_repeats(fit.labelled, repeats), seconds=seconds, late=late, repeats=repeats)
 
 
@@ -139,6 +150,27 @@ def _of_lights(
         "estimation": time.perf_counter() - identified,
     }
     return replace(fit, lights=lights, seconds=seconds, repeats=repeats)
+
+
+def as_one(obj: CalibrationObject | Sequence[CalibrationObject]) -> CalibrationObject:
+    """One object, or several put together."""
+    return obj if isinstance(obj, CalibrationObject) else CalibrationObject.of_several(obj)
+
+
+def _labelled_again(
+    fit: Calibration, given: Detections, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
+) -> Calibration:
+    """Label once more with the rig that was found, and estimate that anew from the factory calibration.
+
+    A camera shows little of a stick: a marker whose neighbour is hidden has a label only where the rig is known.
+    """
+    if fit.labelled.identity == "coded" or fit.moved or fit.unsynchronized is not None:
+        return fit
+    with contextlib.suppress(RefusedError):
+        again = associate(given, replace(fit.estimate.rig, prior=FOUND), obj, options)
+        if int((again.detections.fiducial >= 0).sum()) > int((fit.labelled.detections.fiducial >= 0).sum()):
+            return fit_as_timed(again, given, rig, obj, options)
+    return fit
 
 
 def fit_as_timed(
@@ -204,7 +236,7 @@ def require_same_moments(
     counts = tally(arranged.labelled, labels, arranged.poses, rig, obj)
     moves = error.moved if isinstance(error, MovedError) else ()
     moved = tuple((move.camera, detections.snapshot_names.index(move.snapshot)) for move in moves)
-    for slipped in late_cameras(detections, counts, rig, obj, options, moved):
+    for slipped in late_cameras(detections, counts, rig, obj, options, moved, arranged.labelled):
         raise RefusedError(
             str(slipped),
             python="give the frames of each moment, or leave the camera out (rig.select)",
@@ -219,6 +251,7 @@ def late_cameras(
     obj: CalibrationObject,
     options: PipelineOptions,
     moved: tuple[tuple[str, int], ...] = (),
+    labelled: Associations | None = None,
 ) -> tuple[LateCamera, ...]:
     """Find cameras that do not agree with the others because their frames are of other moments.
 
@@ -229,15 +262,28 @@ def late_cameras(
         obj: the calibration object.
         options: how sure a result must be.
         moved: cameras that are said to have moved, and the number of the snapshot from which on.
+        labelled: rows that `counts` are of, where several objects were in view; the one seen most often is asked.
     """
+    asked = suspects(counts, rig.camera_names, moved)
+    if obj.parts and asked and labelled is not None:
+        where, moments = dict(moved), labelled.moments.tolist()
+        moments += moments[-1:]
+        asked = {c: where.get(rig.camera_names[c], moments[row]) for c, row in asked.items()}
+        detections, obj = _of_part(detections, obj, int(np.bincount(labelled.part_of_rows).argmax()))
 
     def others(blobs: Detections) -> tuple[list[int], RigidTransform]:
         fit = fit_labelled(associate(blobs, rig, obj, options), rig, obj, replace(options, blind_cameras=True))
         return fit.labelled.used, fit.rig_from_object
 
-    asked = suspects(counts, rig.camera_names, moved)
     found = (late_camera(detections, rig, obj, camera, around, others) for camera, around in asked.items())
     return tuple(late for late in found if late is not None)
+
+
+def _of_part(detections: Detections, obj: CalibrationObject, part: int) -> tuple[Detections, CalibrationObject]:
+    """Keep the labels of one of several objects: the rest is clutter."""
+    first = int(np.searchsorted(obj.part_of, part))
+    own = (detections.fiducial >= 0) & (obj.part_of[detections.fiducial] == part)
+    return replace(detections, fiducial=np.where(own, detections.fiducial - first, -1)), obj.parts[part]
 
 
 def _as_given(labelled: Associations) -> Detections:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -12,7 +13,8 @@ from imgcal.detection import DetectionOptions
 from imgcal.errors import RefusedError
 from imgcal.estimation import estimate
 from imgcal.pipeline.board_turns import settle_turns
-from imgcal.pipeline.lights import FoundLights, count_moments, find_lights
+from imgcal.pipeline.lights import FoundLights, find_lights
+from imgcal.pipeline.recalibration import as_one
 from imgcal.pipeline.sources import Frames, blobs_of
 from imgcal.pipeline.units import require_solvable, require_units
 from imgcal.types import CalibrationObject, CameraRig, Detections
@@ -44,11 +46,6 @@ class RigScore:
     lights: FoundLights | None = None  # of unknown markers: S is one marker at one moment each
 
     @property
-    def moments(self) -> tuple[int, int]:
-        """Number of snapshots used and of all; of unknown markers those of which some marker is used."""
-        return count_moments(self.labelled, self.lights)
-
-    @property
     def distances(self) -> Tensor:
         """Length of each residual: (M,) pixels."""
         return self.residual.norm(dim=-1)[self.seen]
@@ -78,7 +75,7 @@ class RigScore:
 def score(
     source: Detections | Frames,
     rig: CameraRig,
-    obj: CalibrationObject,
+    obj: CalibrationObject | Sequence[CalibrationObject],
     options: PipelineOptions = PipelineOptions(),
     progress: Progress | None = None,
     *,
@@ -89,7 +86,7 @@ def score(
     Args:
         source: blobs, labelled or not, or frames in memory (see `imgcal.detect`).
         rig: the rig to be scored; its prior is used for identity only.
-        obj: the calibration object.
+        obj: the calibration object; or several, any of which may be in view of any snapshot.
         options: how sure identity must be.
         progress: wraps the loop over snapshots.
         detection: how blobs are found in frames.
@@ -109,6 +106,7 @@ def score(
         >>> float(imgcal.score(blobs, factory, obj).distances.mean()) > 5
         True
     """
+    obj = as_one(obj)
     rig, options = rig.to(torch.float64), options.of_object(obj)
     detections = settle_turns(blobs_of(source, rig, obj, detection), rig, obj)
     if obj.unknown_markers:
@@ -119,7 +117,8 @@ def score(
         with require_solvable():
             return _scored(associate(detections, rig, obj, options, progress), rig, obj, options)
     except RefusedError as error:
-        require_units(error, detections, rig, obj)
+        if obj.pose_rank == 6 and not obj.parts:  # as in `calibrate`
+            require_units(error, detections, rig, obj)
         raise
 
 

@@ -72,8 +72,7 @@ def steady_part(
     if not found:
         return SteadyPart(arranged, fits=fits)
     labelled, moved = arranged.labelled, list(found)
-    total, first = len(labelled.snapshots), 0
-    names = [snapshot.name for snapshot in labelled.snapshots]
+    total, first, names = len(detections.snapshot_names), 0, detections.snapshot_names
     for _ in range(MOST_MOVES):
         first = max(names.index(move.snapshot) for move in found if move.snapshot is not None)
         explained = _are_explained(found, detections, first, rig, obj, options)
@@ -82,7 +81,7 @@ def steady_part(
         part = associate(detections.of_snapshots(first, total), rig, obj, options)
         found = moves_of(part, rig, obj, options)
         if not found:
-            return SteadyPart(arrange(_with_earlier(part, labelled, first), rig, obj), tuple(moved))
+            return SteadyPart(arrange(_with_earlier(part, labelled, names[first]), rig, obj), tuple(moved))
         moved += found
     raise MovedError(moved, total - first, total, labelled=labelled.detections)
 
@@ -116,15 +115,26 @@ def _are_explained(
     return True
 
 
-def _with_earlier(part: Associations, labelled: Associations, first: int) -> Associations:
-    """Put the snapshots before a part of a capture back, refused."""
+def _with_earlier(part: Associations, labelled: Associations, first: str) -> Associations:
+    """Put the snapshots before a part of a capture, which begins with the snapshot `first`, back, refused."""
+    rows = labelled.detections.snapshot_names.index(first)
+    moment = int(labelled.moments[rows])
     earlier = tuple(
         s if s.status == "refused" else replace(s, status="refused", reason=EARLIER, rig_from_object=None)
-        for s in labelled.snapshots[:first]
+        for s in labelled.snapshots[:rows]
     )
+    # Rows of several objects were made anew; those of unknown markers are what they were.
+    later = tuple(
+        replace(s, moment=labelled.snapshots[row].moment) if s.moment < 0 else replace(s, moment=moment + s.moment)
+        for row, s in enumerate(part.snapshots, rows)
+    )
+    late = labelled.detections.snapshot >= rows
     fiducial = np.full(len(labelled.detections), -1, dtype=np.int64)
-    fiducial[labelled.detections.snapshot >= first] = part.detections.fiducial
-    return Associations(replace(labelled.detections, fiducial=fiducial), (*earlier, *part.snapshots))
+    snapshot = labelled.detections.snapshot.copy()
+    fiducial[late], snapshot[late] = part.detections.fiducial, rows + part.detections.snapshot
+    names = (*labelled.detections.snapshot_names[:rows], *part.detections.snapshot_names)
+    table = replace(labelled.detections, fiducial=fiducial, snapshot=snapshot, snapshot_names=names)
+    return Associations(table, (*earlier, *later))
 
 
 def moves_of(
@@ -181,9 +191,8 @@ def _fit(arranged: Arranged, rig: CameraRig, obj: CalibrationObject, options: Pi
         solutions.append(minimize(problem, state, options.estimation))
         state = solutions[-1].state
         squared, used = solutions[-1].equations.residual[0].square().sum(-2), noise
-        free = max(
-            1 - (rig.num_parameters * rig.num_cameras + problem.pose_rank * len(seen)) / (2 * int(seen.sum())), 0.2
-        )
+        taken = rig.num_parameters * rig.num_cameras + float(problem.pose_freedom)
+        free = max(1 - taken / (2 * int(seen.sum())), 0.2)
         noise = own + (squared[seen].median() / (MEDIAN * free) - own[seen].median()).clamp_min(0)
     fitting = (squared <= CLIP**2 * used) & seen
     poses, fitted = pose_at(problem, state)[0], rig_at(problem, state.offset)[0]
@@ -201,24 +210,38 @@ def _labelled_afresh(
     labelled: Associations, lost: Bools, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
 ) -> Associations:
     """Label the snapshots in which cameras are `lost` (S, C) without what the others have taught; take those labels."""
-    detections = labelled.detections
-    rows = np.flatnonzero(np.isin(detections.snapshot, np.flatnonzero(lost.any(1))))
+    detections, moments = labelled.detections, labelled.moments
+    asked = np.isin(moments, moments[lost.any(1)])
+    rows = np.flatnonzero(asked[detections.snapshot])
     try:
-        again = associate(
-            replace(detections.select(rows), fiducial=np.full(len(rows), -1)), rig, obj, options
-        ).detections
+        given = labelled.by_moment() if obj.parts else detections
+        given = replace(given.select(rows), fiducial=np.full(len(rows), -1))
+        again = associate(given, rig, obj, options).detections
     except RefusedError:
         return labelled
     old, new = detections.fiducial[rows], again.fiducial
-    snapshot, here = detections.snapshot[rows], lost[detections.snapshot[rows], detections.camera[rows]]
+    snapshot = _row_of(labelled, detections.snapshot[rows], new, obj)
+    here = (snapshot >= 0) & lost[snapshot, detections.camera[rows]]
     # A symmetric object may have been labelled in another turn, which the labels of the other cameras show.
     both = (old >= 0) & (new >= 0) & ~here
     count = len(labelled.snapshots)
     same = np.bincount(snapshot[both & (old == new)], minlength=count)
     agreed = same >= np.maximum(LEAST_AGREEMENT * np.bincount(snapshot[both], minlength=count), 3)
-    fiducial = detections.fiducial.copy()
-    fiducial[rows] = np.where(here & agreed[snapshot], new, old)
-    return Associations(replace(detections, fiducial=fiducial), labelled.snapshots)
+    taken = here & agreed[snapshot]
+    fiducial, row = detections.fiducial.copy(), detections.snapshot.copy()
+    fiducial[rows], row[rows] = np.where(taken, new, old), np.where(taken, snapshot, row[rows])
+    return Associations(replace(detections, fiducial=fiducial, snapshot=row), labelled.snapshots)
+
+
+def _row_of(
+    labelled: Associations, row: NDArray[np.int64], fiducial: NDArray[np.int64], obj: CalibrationObject
+) -> NDArray[np.int64]:
+    """Number of the row (M,) to which blobs of some rows belong with other labels; -1 = that object has none."""
+    if not obj.parts:
+        return row
+    table = np.full((int(labelled.moments[-1]) + 1, len(obj.parts)), -1, dtype=np.int64)
+    table[labelled.moments[labelled.used], labelled.part_of_rows] = labelled.used
+    return np.where(fiducial >= 0, table[labelled.moments[row], obj.part_of[fiducial]], row)
 
 
 def _gone(counts: Tally, labelled: Associations, rig: CameraRig, known: set[str]) -> list[MovedCamera]:

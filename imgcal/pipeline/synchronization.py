@@ -83,7 +83,7 @@ def find_unsynchronized(
     points = fit.rig_from_object.apply(fit.points_object)
     uv = fit.rig.expand(len(points)).project_values(points, obj.radius).uv
     seen, count = observations.seen, observations.seen.sum(-1)
-    speed = _speed(uv, seen, labelled.used)
+    speed = _speed(uv, seen, labelled.before_rows)
     shift = torch.where(seen[..., None], fit.residual, 0.0).sum(2) / count.clamp_min(1)[..., None]
     inside = torch.where(seen[..., None], fit.residual - shift[:, :, None], 0.0).square().sum((-1, -2))
     known = (count >= LEAST_POINTS) & speed.isfinite() & (seen.any(-1).sum(1, keepdim=True) >= 2)
@@ -118,13 +118,17 @@ def _verdict(
     return Unsynchronized(share, still, low, high, after**0.5)
 
 
-def _speed(uv: Tensor, seen: Tensor, used: list[int]) -> Tensor:
-    """How far the points that an image shows move from snapshot to snapshot, RMS: (S, C) pixels, nan = unknown."""
-    near = torch.tensor(used).diff() == 1
-    step = torch.where(near[:, None, None, None], uv[1:] - uv[:-1], torch.nan).square().sum(-1)
-    edge = torch.full_like(uv[:1, ..., 0], torch.nan)
-    squared = torch.stack((torch.cat((edge, step)), torch.cat((step, edge)))).nanmean(0)
-    return (torch.where(seen, squared, 0.0).sum(-1) / seen.sum(-1)).sqrt()
+def _speed(uv: Tensor, seen: Tensor, before: NDArray[np.int64]) -> Tensor:
+    """How far the points that an image shows move from snapshot to snapshot, RMS: (S, C) pixels, nan = unknown.
+
+    `before`: see `Associations.before_rows`.
+    """
+    rows = torch.from_numpy(np.flatnonzero(before >= 0))
+    earlier = torch.from_numpy(before)[rows]
+    step = (uv[rows] - uv[earlier]).square().sum(-1)
+    squared = uv.new_full((2, *uv.shape[:-1]), torch.nan)
+    squared[0, rows], squared[1, earlier] = step, step
+    return (torch.where(seen, squared.nanmean(0), 0.0).sum(-1) / seen.sum(-1)).sqrt()
 
 
 def _with_sigma(labelled: Associations, added: NDArray[np.float64]) -> Detections:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,6 +80,7 @@ def tally(
         obj: N fiducials.
         rig: as estimated; None = not yet, and what has no label counts as being elsewhere.
     """
+    labelled = replace(labelled, detections=labelled.repeated())
     detections, used = labelled.detections, labelled.used
     shape = (len(labelled.snapshots), factory.num_cameras)
 
@@ -91,7 +92,8 @@ def tally(
     projection = factory.expand(len(used)).project_values(points, obj.radius)
     size = factory.image_size.numpy()[:, None]
     uv = projection.uv.numpy()
-    inside = ((uv > MARGIN * size) & (uv < (1 - MARGIN) * size)).all(-1) & projection.visible.numpy()
+    visible = projection.visible.numpy() & labelled.columns(obj)
+    inside = ((uv > MARGIN * size) & (uv < (1 - MARGIN) * size)).all(-1) & visible
     fitting, expected = np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=np.int64)
     fitting[used], expected[used] = kept.sum(-1), inside.sum(-1)
     usable = count(detections.usable)
@@ -115,7 +117,7 @@ def _placed(labelled: Associations, poses: RigidTransform, rig: CameraRig, obj: 
     detections, used = labelled.detections, labelled.used
     points = poses.apply(obj.points.to(rig.focal_length))
     image = rig.expand(len(points)).project_values(points, obj.radius)
-    places, open_ = image.uv.numpy(), image.visible.numpy().copy()
+    places, open_ = image.uv.numpy(), image.visible.numpy() & labelled.columns(obj)
     row = np.full(len(labelled.snapshots), -1)
     row[used] = np.arange(len(used))
     snapshot = row[detections.snapshot]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from operator import itemgetter
 
@@ -39,6 +39,7 @@ class Truth:
     uv: Tensor  # (S, C, N, 2) pixels, exact image points
     visible: Tensor | None = None  # (S, C, N) bool, where a camera does not see everything; None = all is seen
     motion: Motion | None = None  # None = the object rests
+    parts: tuple[Truth, ...] = ()  # of several objects, that of each; the poses above are those of the first then
 
 
 @dataclass(frozen=True)
@@ -108,27 +109,69 @@ def simulate_shots(
 ) -> Iterator[Shot]:
     """Render one snapshot after another, with the truth about what is hidden."""
     rig, difficulty = truth.rig, model.difficulty
-    radius = torch.full_like(obj.points[:, 0], model.marker_radius) if obj.radius is None else obj.radius
+    each = list(zip(truth.parts, obj.parts, strict=True)) if truth.parts else [(truth, obj)]
     for pose in range(len(truth.uv)):
-        points = truth.rig_from_object[pose].apply(obj.points)
-        projection = rig.project(points, obj.radius)
-        markers = Spots(
-            uv=projection.uv,
-            shape=sphere_images(rig, points, radius),
-            intensity=torch.ones_like(projection.depth),
-            visible=projection.visible,
-            depth=projection.depth,
-        )
+        markers = _joined([_markers(one, part, model, pose, generator) for one, part in each])
         sensor, clutter = model.sensor, model.clutter
         if difficulty is not None:
-            smear = difficulty.smear(rig, truth.rig_from_object[pose], obj.points, obj.radius, generator)
-            markers = difficulty.disguise(replace(markers, smear=smear), generator)
+            markers = difficulty.disguise(markers, generator)
             sensor, clutter = difficulty.sensor(sensor, generator), difficulty.clutter
-        if model.exposure_ms > 0 and truth.motion is not None:
-            path = _way(truth, pose, obj) * (1e-3 * model.exposure_ms / truth.motion.seconds)
-            defocus = torch.zeros_like(projection.depth) if markers.smear is None else markers.smear.defocus
+        ways = [_way(one, pose, part) / one.motion.seconds for one, part in each if one.motion is not None]
+        if model.exposure_ms > 0 and len(ways) == len(each):
+            defocus = torch.zeros_like(markers.depth) if markers.smear is None else markers.smear.defocus
+            path = torch.cat(ways, 1) * (1e-3 * model.exposure_ms)
             markers = replace(markers, smear=Smear(path, defocus))
         yield _shot(markers, rig, sensor, clutter, generator)
+
+
+def join_truths(truths: Sequence[Truth]) -> Truth:
+    """Put objects that move by themselves before one rig into one capture."""
+    if len(truths) == 1:
+        return truths[0]
+    visible = None
+    if any(truth.visible is not None for truth in truths):
+        shown = [torch.ones(t.uv.shape[:-1], dtype=torch.bool) if t.visible is None else t.visible for t in truths]
+        visible = torch.cat(shown, 2)
+    first = truths[0]
+    return replace(first, uv=torch.cat([t.uv for t in truths], 2), visible=visible, motion=None, parts=tuple(truths))
+
+
+def _markers(truth: Truth, obj: CalibrationObject, model: FrameModel, pose: int, generator: torch.Generator) -> Spots:
+    """Markers of one object."""
+    rig, difficulty = truth.rig, model.difficulty
+    radius = torch.full_like(obj.points[:, 0], model.marker_radius) if obj.radius is None else obj.radius
+    points = truth.rig_from_object[pose].apply(obj.points)
+    projection = rig.project(points, obj.radius)
+    smear = None
+    if difficulty is not None:
+        smear = difficulty.smear(rig, truth.rig_from_object[pose], obj.points, obj.radius, generator)
+    return Spots(
+        uv=projection.uv,
+        shape=sphere_images(rig, points, radius),
+        intensity=torch.ones_like(projection.depth),
+        visible=projection.visible,
+        depth=projection.depth,
+        smear=smear,
+    )
+
+
+def _joined(parts: Sequence[Spots]) -> Spots:
+    """Markers of several objects."""
+    if len(parts) == 1:
+        return parts[0]
+    smears = [part.smear for part in parts if part.smear is not None]
+    spots = Spots(
+        uv=torch.cat([part.uv for part in parts], 1),
+        shape=torch.cat([part.shape for part in parts], 1),
+        intensity=torch.cat([part.intensity for part in parts], 1),
+        visible=torch.cat([part.visible for part in parts], 1),
+        depth=torch.cat([part.depth for part in parts], 1),
+    )
+    if not smears:
+        return spots
+    return replace(
+        spots, smear=Smear(torch.cat([s.path for s in smears], 1), torch.cat([s.defocus for s in smears], 1))
+    )
 
 
 def true_detections(truth: Truth) -> Detections:

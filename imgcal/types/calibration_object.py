@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -54,11 +55,15 @@ class CalibrationObject:
     modes: Tensor | None = None  # (K, N, 3) mm: shapes of which it has as much as a standard normal says; None = rigid
     labels: tuple[int, ...] = ()  # what tables call the fiducials; empty = by their rows
     unknown_markers: bool = False  # every blob may be one of these points, any number at a moment: see `unknown`
+    parts: tuple[CalibrationObject, ...] = ()  # several objects in one capture, see `of_several`; empty = one object
+    origin: Tensor | None = None  # (3,) mm in the frame of the object's file: the origin of `points`; None = the same
 
     def __repr__(self) -> str:
         """Say what it is: `CalibrationObject('cube8': 8 fiducials)`; points, radii and tolerances are attributes."""
         if self.unknown_markers:
             return f"CalibrationObject({self.name!r}: unknown markers)"
+        if self.parts:
+            return f"CalibrationObject({', '.join(map(repr, self.parts))})"
         exact = "" if self.tolerance is None else ", with tolerances"
         return f"CalibrationObject({self.name!r}: {len(self.points)} fiducials{exact})"
 
@@ -100,6 +105,68 @@ class CalibrationObject:
         """
         return cls(torch.zeros(1, 3).double(), torch.ones(1, 3).double(), name=name, unknown_markers=True)
 
+    @classmethod
+    def of_several(cls, objects: Sequence[CalibrationObject]) -> CalibrationObject:
+        """Put the fiducials of several objects into one set, for captures in which any of them may be visible.
+
+        Each object keeps its own pose: an image of the set in one pose means nothing. A snapshot becomes one row for
+        each object, and a row sees only the columns of its own object.
+
+        Args:
+            objects: at least one; two of the same name get a number. A single one is returned as it is.
+
+        Returns:
+            All fiducials in the order of the objects, those of each about its own centroid; `parts` holds the objects
+            with these coordinates.
+
+        Raises:
+            InputError: a printed board, unknown markers, or an object whose scale has a tolerance, among several.
+
+        Examples:
+            >>> import imgcal
+            >>> wand, cube = imgcal.load_object("wand4"), imgcal.load_object("cube8")
+            >>> both = CalibrationObject.of_several([wand, cube, cube])
+            >>> both.num_fiducials, [part.name for part in both.parts]
+            (20, ['wand4', 'cube8', 'cube8-2'])
+        """
+        if len(objects) == 1:
+            return objects[0]
+        if not objects:
+            raise InputError("objects: found none, expected at least one")
+        for obj in objects:
+            found = (
+                "a printed board" if obj.board is not None else
+                "a scale tolerance" if obj.scale_tolerance else
+                "unknown markers" if obj.unknown_markers else ""
+            )  # fmt: skip
+            if found:
+                raise InputError(f"object {obj.name}: found {found}, expected none among several objects")
+        names: list[str] = []
+        for obj in objects:
+            number = sum(other.name == obj.name for other in objects[: len(names)]) + 1
+            names.append(obj.name if number == 1 else f"{obj.name}-{number}")
+        parts = tuple(_centred(obj, name) for obj, name in zip(objects, names, strict=True))
+        has_radius = any(part.radius is not None for part in parts)
+        has_tolerance = any(part.tolerance is not None for part in parts)
+        return cls(
+            torch.cat([part.points for part in parts]),
+            torch.cat([part.colours for part in parts]),
+            torch.cat([_or_zero(part.radius, part.points) for part in parts]) if has_radius else None,
+            " + ".join(names),
+            tolerance=torch.cat([part.granted for part in parts]) if has_tolerance else None,
+            parts=parts,
+        )
+
+    @property
+    def each(self) -> tuple[CalibrationObject, ...]:
+        """The objects that there are: `parts`, or the object itself."""
+        return self.parts or (self,)
+
+    @cached_property
+    def part_of(self) -> NDArray[np.int64]:
+        """Number of the object to which each fiducial belongs: (N,); zero of a single object."""
+        return np.repeat(np.arange(len(self.each)), [len(part.points) for part in self.each])
+
     @property
     def exact(self) -> bool:
         """Tell whether the fiducials are where the object says, without any tolerance."""
@@ -114,6 +181,8 @@ class CalibrationObject:
         Raises:
             InputError: its fiducials lie on one line, or there is only one.
         """
+        if self.parts:
+            raise InputError(f"objects: found {len(self.parts)}, expected a single one {use}")
         if self.pose_rank < 6:
             found = "one fiducial" if len(self.points) == 1 else f"{len(self.points)} fiducials on one line"
             raise InputError(f"object {self.name}: found {found}, expected some that are not on one line {use}")
@@ -126,7 +195,8 @@ class CalibrationObject:
     def taken_as_exact(self) -> CalibrationObject:
         """Return the object without its tolerances and modes."""
         soft = self.modes is not None or not self.exact
-        return replace(self, tolerance=None, scale_tolerance=0.0, modes=None) if soft else self
+        parts = tuple(part.taken_as_exact() for part in self.parts)
+        return replace(self, tolerance=None, scale_tolerance=0.0, modes=None, parts=parts) if soft else self
 
     @property
     def num_fiducials(self) -> int:
@@ -134,10 +204,17 @@ class CalibrationObject:
         return len(self.points)
 
     @property
-    def rows(self) -> int | tuple[int, ...]:
-        """What tables call the fiducials: so many rows, or numbers of their own. Unknown markers have any."""
+    def rows(self) -> int | tuple[int, ...] | tuple[tuple[str, int], ...]:
+        """What tables call the fiducials: so many rows, or numbers of their own; of several, with the object's name.
+
+        Unknown markers have any number.
+        """
         if self.unknown_markers:
             return ANY_LABEL
+        if self.parts:
+            return tuple(
+                (part.name, label) for part in self.parts for label in part.labels or range(part.num_fiducials)
+            )
         return self.labels or self.num_fiducials
 
     @cached_property
@@ -147,8 +224,11 @@ class CalibrationObject:
 
     @cached_property
     def pose_rank(self) -> int:
-        """How many of its pose's 6 numbers it shows: 3 of a light, 5 of fiducials on one line, else 6."""
-        return pose_rank(self.points)
+        """How many of its pose's 6 numbers it shows: 3 of a light, 5 of fiducials on one line, else 6.
+
+        Of several objects, that of the one that shows most.
+        """
+        return max(part.pose_rank for part in self.parts) if self.parts else pose_rank(self.points)
 
     @cached_property
     def planar(self) -> bool:
@@ -169,11 +249,14 @@ class CalibrationObject:
         """Find rotations about the centroid that map every fiducial to within `tolerance` (mm) of one of its radius.
 
         Returns:
-            Self-motions in order of residual, the identity first; `permutation` has no -1.
+            Self-motions in order of residual, the identity first; `permutation` has no -1. Of several objects only the
+            identity: ask each.
 
         Source: every symmetry of a finite set fixes its centroid and is determined by the images of two points that are
         not in line with it.
         """
+        if self.parts:
+            return (Symmetry(np.eye(3), np.zeros(3), np.arange(self.num_fiducials), 0.0),)
         points = (self.points - self.points.mean(0)).double().cpu().numpy()
         radius = np.zeros(len(points)) if self.radius is None else self.radius.double().cpu().numpy()
         rotations = _turns_to_try(points, self.pose_rank, tolerance)
@@ -195,6 +278,19 @@ class CalibrationObject:
         identity = np.arange(len(points)).tobytes()
         rest = sorted((m for key, m in found.items() if key != identity), key=lambda m: m.residual)
         return (Symmetry(np.eye(3), np.zeros(3), np.arange(len(points)), 0.0), *rest)
+
+
+def _centred(obj: CalibrationObject, name: str) -> CalibrationObject:
+    """Move the origin of an object's points to their centroid."""
+    points = obj.points.double()
+    centroid = points.mean(0)
+    origin = centroid if obj.origin is None else centroid + obj.origin
+    return replace(obj, name=name, points=points - centroid, origin=origin)
+
+
+def _or_zero(radius: Tensor | None, points: Tensor) -> Tensor:
+    """Radii (N,) mm of fiducials; zero of points."""
+    return torch.zeros_like(points[:, 0]) if radius is None else radius.to(points)
 
 
 def _turns_to_try(points: NDArray[np.float64], rank: int, tolerance: float) -> NDArray[np.float64]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -24,8 +24,9 @@ import imgcal
 from imgcal import CalibrationObject, CameraRig, Detections, Observations, RefusedError, RigPrior, estimate
 from imgcal.estimation import relative_covariance, relative_difference
 from imgcal.geometry import RigidTransform
+from imgcal.messages import listed
 from imgcal.synthesis import PhysicalDrift, simulate_volume
-from scripts.benchmarks.wand_recording import calibrated, recording
+from scripts.benchmarks.wand_recording import CALIBRATED, calibrated, recording
 from scripts.output import ROOT, WORK, command, make_folder, read_json, surroundings, write_json
 
 RESULT, DONE = ROOT / "docs" / "benchmarks" / "lights.json", WORK / "lights.jsonl"
@@ -38,6 +39,8 @@ MOMENTS = {5: 60, 15: 40, 40: 24, 100: 12}
 WRONG_MM, WRONG_TIMES = 2.0, 5.0
 """A rig is wrong whose median error is larger than this, and than so many times what it claims."""
 POINTS = 300
+PAIRS, LINES = ((0, 2), (0, 4)), ((0, 1, 2), (1, 3, 4))
+"""Markers of the recorded wand: two of them, and its two lines of three."""
 
 
 @dataclass(frozen=True)
@@ -201,15 +204,43 @@ def stream() -> dict[str, Any]:
     """The recorded wand: fitted without labels on the first half, scored on the second with the whole wand."""
     reference, given = calibrated(), recording()
     labelled = reference.calibration.labelled_detections
-    captures = {"all as unknown markers": given.chosen(range(0, 2400, 8))}
+    cases: dict[str, tuple[Detections, CalibrationObject]] = {}
     for marker in range(given.obj.num_fiducials):
-        captures[f"marker {marker} alone"] = labelled.select(labelled.fiducial == marker)
+        cases[f"marker {marker} as an unknown one"] = only(labelled, [marker]), LIGHTS
+    for marker in range(given.obj.num_fiducials):
+        cases[f"marker {marker} as a light"] = only(labelled, [marker]), part_of(given.obj, [marker])
+    for first, second in PAIRS:
+        cases[f"markers {first} and {second}"] = only(labelled, [first, second]), part_of(given.obj, [first, second])
+    for line in LINES:
+        cases[f"markers {listed(map(str, line))} in a line"] = only(labelled, line), part_of(given.obj, line)
+    cases["all as unknown markers"] = given.chosen(CALIBRATED), LIGHTS
     rows: dict[str, Any] = {"whole wand known": {"held_out_px": reference.score(reference.calibration.rig)[0]}}
-    for name, blobs in captures.items():
-        found = imgcal.calibrate(replace(blobs, flags=np.zeros_like(blobs.flags)), given.factory, LIGHTS)
-        rms, median = reference.score(found.rig)
-        rows[name] = {"markers": len(found.labelled.used), "held_out_px": rms, "median_px": median}
+    for name, (blobs, obj) in cases.items():
+        try:
+            found = imgcal.calibrate(blobs, given.factory, obj)
+        except RefusedError as error:
+            rows[name] = {"status": "refused", "reason": error.reason}
+        else:
+            rms, median = reference.score(found.rig)
+            used = found.labelled.moment_counts[0]
+            rows[name] = {"status": "ok", "snapshots": used, "held_out_px": rms, "median_px": median}
+        print(name, rows[name], flush=True)
     return rows
+
+
+def only(labelled: Detections, markers: Sequence[int]) -> Detections:
+    """Leave the blobs of some markers, and all that belong to none, without their labels.
+
+    Those of the other markers are left out, for their distances are nearly those of these.
+    """
+    blobs = labelled.select(np.isin(labelled.fiducial, [*markers, -1]))
+    return replace(blobs, fiducial=np.full(len(blobs), -1), flags=np.zeros_like(blobs.flags))
+
+
+def part_of(obj: CalibrationObject, markers: Sequence[int]) -> CalibrationObject:
+    """Make an object of some markers of another one."""
+    rows = list(markers)
+    return CalibrationObject(obj.points[rows], obj.colours[rows], name="stick" if len(rows) > 1 else "light")
 
 
 def tables(rows: list[dict[str, Any]]) -> dict[str, Any]:

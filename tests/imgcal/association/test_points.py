@@ -1,51 +1,20 @@
-"""A light and sticks among false blobs, without labels: nothing is labelled wrongly, and what cannot be is refused."""
+"""A light among false blobs, without labels: nothing is labelled wrongly, and what cannot be is refused."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from imgcal.association import identify
 from imgcal.errors import RefusedError
-from imgcal.io import load_rig
 from imgcal.pipeline import calibrate
-from imgcal.synthesis import simulate_volume, true_detections
-from imgcal.synthesis.rigs import PhysicalDrift
 from imgcal.types import CalibrationObject, RigPrior
+from tests.imgcal.association.stick_scenes import PAIR, capture
 
 LIGHT = ((0.0, 0.0, 0.0),)
-PAIR = ((-250.0, 0.0, 0.0), (250.0, 0.0, 0.0))
-TRIPLE = ((-250.0, 0.0, 0.0), (-80.0, 0.0, 0.0), (250.0, 0.0, 0.0))
 
 
-def capture(points, snapshots, seed=1, false=3):
-    """Blobs in random order of a drifted room10: a quarter of the markers hidden, false blobs in every camera."""
-    rig, rng = load_rig("room10"), np.random.default_rng(seed)
-    obj = CalibrationObject(torch.tensor(points, dtype=torch.float64), torch.ones(len(points), 3))
-    truth = simulate_volume(rig, obj, snapshots, torch.Generator().manual_seed(seed), PhysicalDrift())
-    table = true_detections(truth)
-    table = replace(table, sigma=np.full(len(table), 0.1))
-    table = table.select(rng.random(len(table)) > 0.25)
-    table.uv[:] += 0.1 * rng.standard_normal(table.uv.shape)
-    camera = np.tile(np.repeat(np.arange(rig.num_cameras), false), snapshots)
-    count = len(camera)
-    added = {
-        "uv": rng.random((count, 2)) * rig.image_size.numpy()[camera],
-        "sigma": np.full(count, 0.1),
-        "camera": camera,
-        "snapshot": np.repeat(np.arange(snapshots), false * rig.num_cameras),
-        "fiducial": np.full(count, -1),
-        "radius": np.full(count, np.nan),
-        "flags": np.zeros(count, dtype=table.flags.dtype),
-    }
-    columns = {name: np.concatenate((getattr(table, name), value)) for name, value in added.items()}
-    table = replace(table, **columns)
-    table = table.select(np.lexsort((rng.random(len(table)), table.camera, table.snapshot)))
-    return rig, obj, replace(table, fiducial=np.full(len(table), -1)), table.fiducial
-
-
-@pytest.mark.parametrize(("points", "snapshots"), [(LIGHT, 40), (PAIR, 20)])
+@pytest.mark.parametrize(("points", "snapshots"), [(LIGHT, 40), (PAIR, 12)])
 def test_labels_among_false_blobs_are_right(points, snapshots):
     rig, obj, blobs, true = capture(points, snapshots)
     result = calibrate(blobs, rig, obj)

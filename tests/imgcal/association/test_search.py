@@ -7,7 +7,7 @@ import pytest
 
 from imgcal.association.ambiguities import conflicts
 from imgcal.association.hypotheses import fiducial_triples
-from imgcal.association.search import PLANAR_EFFORT, VERIFIED, Search, _different
+from imgcal.association.search import PLANAR_EFFORT, VERIFIED, Search, distinct
 from imgcal.association.verify import evidence
 from imgcal.io import load_object
 from tests.imgcal.association.scenes import make_object, scene_of, take
@@ -68,7 +68,7 @@ def test_a_round_without_poses_finds_nothing(o10) -> None:
     assert search_of(replace(scene, blobs=replace(scene.blobs, ideal=elsewhere)), [0]).round(1, random) is None
 
 
-def test_different_labellings_are_kept_the_fullest_first() -> None:
+def testdistinct_labellings_are_kept_the_fullest_first() -> None:
     cube = load_object("cube8")
     full = np.tile(np.arange(8), (2, 1))
     fewer = np.where(np.arange(8) < 6, full, -1)
@@ -76,6 +76,6 @@ def test_different_labellings_are_kept_the_fullest_first() -> None:
     random = np.random.default_rng(0)
     other, third = (full[:, random.permutation(8)] for _ in range(2))
     assert min(conflicts(cube, *pair) for pair in ((full, other), (full, third), (other, third))) > 0.5
-    rows, labels = _different(cube, np.array([40, 41, 42, 43, 44]), np.stack((fewer, full, turned, other, third)))
+    rows, labels = distinct(cube, np.array([40, 41, 42, 43, 44]), np.stack((fewer, full, turned, other, third)))
     assert rows.tolist() == [41, 43] and len(rows) == VERIFIED
     np.testing.assert_array_equal(labels, np.stack((full, other)))

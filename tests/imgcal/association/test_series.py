@@ -151,4 +151,4 @@ def test_a_snapshot_that_is_tried_again_teaches_the_rig_once(seen, o10, asymmetr
     (kept,) = made
     first, again = kept.tried[:4], kept.tried[4:]
     assert first == list(seen.snapshot_names) and again == [seen.snapshot_names[1]] and labelled.used == [0, 1, 2, 3]
-    assert len(kept.accepted) == 4
+    assert len(kept.learnt.accepted) == 4

@@ -34,7 +34,7 @@ def test_too_few_fiducials_teach_nothing(seen, o10, asymmetric8):
     tracker = Tracker(o10, asymmetric8, PipelineOptions(least_fiducials=9))
     snapshot, _ = tracker.decide(unlabelled(seen, 0), "first")
     assert snapshot.status == "refused" and "too few fiducials" in snapshot.reason
-    assert tracker.pose is None and not tracker.accepted
+    assert tracker.pose is None and not tracker.learnt.accepted
 
 
 def test_snapshots_that_show_a_line_alone_teach_the_rig_nothing():

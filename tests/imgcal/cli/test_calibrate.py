@@ -402,3 +402,29 @@ def test_a_matched_filter_looks_at_the_frames_and_needs_them(workplace, tmp_path
     capsys.readouterr()
     assert calibrate(workplace, blobs, tmp_path / "other", "--detector", "matched") == 2
     assert "expected a capture with frames" in one_line(capsys)
+
+
+def test_several_objects_from_simulation_to_result(tmp_path, capsys):
+    capture, out = tmp_path / "capture", tmp_path / "out"
+    simulated = ["simulate", "--rig", "T4", "--object", "wand4", "asymmetric8", "--out", str(capture)]
+    assert main([*simulated, "--snapshots", "3", "--seed", "4"]) == 0
+    objects = [str(capture / "objects" / f"{name}.csv") for name in ("wand4", "asymmetric8")]
+    table, labelled = capture / "truth" / "detections.csv", tmp_path / "labelled.csv"
+    assert table.read_text().splitlines()[0].endswith("object,fiducial")
+    options = ["--rig", str(capture / "rig.yaml"), "--object", *objects]
+    assert main(["calibrate", str(table), *options, "--out", str(out), "--labelled", str(labelled)]) == 0
+    result = json.loads((out / "result.json").read_text())
+    assert [entry["name"] for entry in result["object"]] == ["wand4", "asymmetric8"]
+    assert all(entry["snapshots_used"] == 3 for entry in result["object"])
+    assert result["snapshots_used"] == 3 and result["snapshots_rejected"] == 0 and not result["rejected"]
+    blobs = 3 * 4 * 12
+    assert sum(camera["blobs"] for camera in result["per_camera"].values()) == blobs
+    assert sum(snapshot["blobs"] for snapshot in result["per_snapshot"].values()) == blobs
+    assert result["rms_px_after"] < 0.01 < result["rms_px_before"]
+    assert len(labelled.read_text().splitlines()) == blobs + 1
+    assert (out / "report.html").is_file()
+    capsys.readouterr()
+    assert main(["score", str(table), "--rig", str(out / "rig.yaml"), "--object", *objects]) == 0
+    assert json.loads(capsys.readouterr().out)["snapshots_used"] == 3
+    assert main(["calibrate", str(capture), *options, "--detector", "matched", "--out", str(tmp_path / "no")]) == 2
+    assert "found 2, expected a single one for detectors" in one_line(capsys)

@@ -147,3 +147,18 @@ def test_an_interruption_during_start_up_is_one_line(slow, arguments, tmp_path):
 def test_a_mistyped_command_line_is_answered_briefly(arguments, expected, capsys):
     assert main(arguments) == 2
     assert one_line(capsys) == f"imgcal: {expected}"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "objects"),
+    [
+        ("calibrate in --object a b --rig r --out o", ("a", "b")),
+        ("calibrate in --rig r --out o --object a b c", ("a", "b", "c")),
+        ("calibrate in --rig r --out o --object a --object b", ("a", "b")),
+        ("calibrate --rig r --out o --object a in", ("a",)),
+        ("simulate --rig r --object a b --out o", ("a", "b")),
+        ("score in --rig r --object a", ("a",)),
+    ],
+)
+def test_an_object_may_be_several(arguments, objects):
+    assert module.parse(arguments.split()).object == objects

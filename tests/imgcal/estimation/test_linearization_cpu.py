@@ -6,10 +6,22 @@ from functools import partial
 import pytest
 import torch
 
-from imgcal.estimation import linearize, lm_cpu, rig_at
+import imgcal
+from imgcal.estimation import (
+    estimate,
+    has_poses,
+    initial_pose,
+    initial_state,
+    linearize,
+    lm_cpu,
+    make_problem,
+    rig_at,
+)
 from imgcal.estimation.levenberg_marquardt import taken
 from imgcal.estimation.linearization import retract
 from imgcal.estimation.robust_losses import LOSSES, NamedLoss
+from imgcal.synthesis import simulate_truth
+from imgcal.types import CalibrationObject, Observations
 from tests.imgcal.estimation.test_lm_cpu import CASES, seen_only
 
 
@@ -88,3 +100,31 @@ def test_a_small_step_changes_the_cost_as_the_gradient_says(simulate) -> None:
     )
     expected = (at.camera_gradient * camera).sum((1, 2)) + (at.pose_gradient * pose).sum((1, 2))
     torch.testing.assert_close(0.5 * (ahead - behind), expected, rtol=1e-4, atol=0)
+
+
+def test_rows_of_several_objects_have_the_free_turns_of_their_own() -> None:
+    rig = imgcal.load_rig("T4")
+    points = torch.tensor([[-100.0, 0.0, 0.0], [100.0, 0.0, 0.0]], dtype=torch.float64)
+    stick = CalibrationObject(points, torch.ones(2, 3), name="stick")
+    light = CalibrationObject(torch.zeros(1, 3, dtype=torch.float64), torch.ones(1, 3), name="light")
+    obj = CalibrationObject.of_several([imgcal.load_object("wand4"), stick, light])
+    generator = torch.Generator().manual_seed(0)
+    truth = simulate_truth(rig, obj, 4, generator, None)
+    seen = torch.zeros(4, rig.num_cameras, obj.num_fiducials, dtype=torch.bool)
+    for row, part in enumerate((0, 1, 2, 1)):
+        seen[row, :, torch.from_numpy(obj.part_of == part)] = True
+    noisy = truth.uv + 0.1 * torch.randn(truth.uv.shape, generator=generator, dtype=truth.uv.dtype)
+    observations = Observations(noisy, torch.full(seen.shape, 0.1, dtype=torch.float64), seen)
+    problem = make_problem(observations, rig, obj, None)
+    state = initial_state(problem, initial_pose(observations, rig, obj), None)
+    assert problem.pose_freedom.tolist() == [6 + 5 + 3 + 5]
+    compiled = lm_cpu.linearize(problem, state, "squared", 1.0)
+    tensors = linearize(problem, state, LOSSES["squared"])
+    torch.testing.assert_close(compiled.pose, tensors.pose)
+    assert float(torch.linalg.eigvalsh(compiled.pose).min()) > 1e-3
+    fit = estimate(observations, rig, obj)
+    assert bool(fit.converged)
+    assert float(fit.rms) < 0.12
+    assert has_poses(seen.numpy(), obj.points, obj.part_of).all()
+    seen[1] = False
+    assert has_poses(seen.numpy(), obj.points, obj.part_of).tolist() == [True, False, True, True]

@@ -11,7 +11,9 @@ from imgcal.errors import InputError
 from imgcal.io import csv_file
 from imgcal.io.csv_file import CHUNK, Chunk
 from imgcal.io.detections_csv import DEFAULT_SIGMA, load_detections, save_detections
+from imgcal.io.object_csv import load_object
 from imgcal.io.rig_yaml import load_rig
+from imgcal.types.calibration_object import CalibrationObject
 from imgcal.types.observations import Detections
 
 COLUMNS = ("uv", "sigma", "camera", "snapshot", "fiducial", "radius", "flags")
@@ -183,3 +185,23 @@ def test_names_that_could_not_be_read_again_are_not_written(
     with pytest.raises(InputError, match=r"new\.csv: not written: found"):
         save_detections(detections, tmp_path / "new.csv")
     assert not (tmp_path / "new.csv").exists()
+
+
+def test_labels_of_several_objects_name_their_object(tmp_path: Path) -> None:
+    both = CalibrationObject.of_several([load_object("wand4"), replace(load_object("wand4"), labels=(7, 8, 9, 11))])
+    path = tmp_path / "blobs.csv"
+    path.write_text("snapshot,camera,u,v,object,fiducial\n0,a,1,2,wand4,3\n0,a,3,4,wand4-2,9\n0,a,5,6,,\n")
+    found = load_detections(path, fiducials=both.rows)
+    assert found.fiducial.tolist() == [3, 6, -1]
+    save_detections(found, tmp_path / "again.csv", both)
+    assert load_detections(tmp_path / "again.csv", fiducials=both.rows).fiducial.tolist() == [3, 6, -1]
+    for rows, message in (
+        ("0,a,1,2,cube8,3", "object: found 'cube8', expected the object of each labelled blob: wand4, wand4-2"),
+        ("0,a,1,2,wand4-2,3", "fiducial: found 3, expected a fiducial of object wand4-2"),
+    ):
+        path.write_text(f"snapshot,camera,u,v,object,fiducial\n{rows}\n")
+        with pytest.raises(InputError, match=message):
+            load_detections(path, fiducials=both.rows)
+    path.write_text("snapshot,camera,u,v,object,fiducial\n0,a,1,2,one,3\n0,a,3,4,two,3\n")
+    with pytest.raises(InputError, match="labels of several objects"):
+        load_detections(path, fiducials=4)

@@ -85,6 +85,13 @@ def test_bad_files_give_one_clear_line(text: str, message: str, tmp_path: Path) 
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("name", ["lights", "charuco", "cube8"])
+def test_a_folder_of_the_same_name_is_no_object(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).mkdir()
+    assert load_object(name).name == name
+
+
 def test_unknown_name_offers_the_nearest() -> None:
     with pytest.raises(InputError, match=r"cube9: no such file.*nearest: cube8"):
         load_object("cube9")

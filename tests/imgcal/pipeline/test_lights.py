@@ -8,6 +8,8 @@ import torch
 
 import imgcal
 from imgcal import InputError, RefusedError
+from imgcal.association import associate
+from imgcal.pipeline.steadiness import _with_earlier
 from scripts.benchmarks.lights import LIGHTS, Scene, simulate, triangulation_error
 
 
@@ -25,8 +27,36 @@ def test_rig_is_found(scene: Scene, result: imgcal.Calibration) -> None:
     assert triangulation_error(scene.factory, scene) > 4
     assert triangulation_error(result.rig, scene) < 2
     assert 0.9 < float(result.chi2_per_dof) < 1.1
-    assert result.moments == (24, 24)
+    assert result.labelled.moment_counts == (24, 24)
     assert result.scale.source == "cameras"
+
+
+def test_rows_know_their_moment(result: imgcal.Calibration) -> None:
+    labelled = result.labelled
+    assert (np.diff(labelled.moments) >= 0).all()
+    names = np.array(labelled.detections.snapshot_names).astype(int)
+    assert (names == labelled.moments).all()
+    assert (labelled.before_rows == -1).all()  # of twelve markers, which one was which before is not known
+    assert result.untimed == ()
+    assert labelled.by_moment().snapshot_names == tuple(f"{moment:05d}" for moment in range(24))
+
+
+def test_a_moment_without_a_marker_is_a_row_that_was_refused(scene: Scene, result: imgcal.Calibration) -> None:
+    fewer = scene.detections.select(scene.detections.snapshot != 5)
+    found = imgcal.calibrate(fewer, result.rig, LIGHTS).labelled
+    assert found.moment_counts == (23, 24)
+    (empty,) = np.flatnonzero(found.moments == 5)
+    assert (found.snapshots[empty].name, found.snapshots[empty].status) == ("00005", "refused")
+    assert "three cameras" in found.snapshots[empty].reason
+
+
+def test_after_a_move_rows_keep_their_moments(scene: Scene, result: imgcal.Calibration) -> None:
+    labelled = result.labelled
+    first = labelled.detections.snapshot_names.index("00010")
+    later = labelled.detections.of_snapshots(first, len(labelled.snapshots))
+    whole = _with_earlier(associate(later, scene.factory, LIGHTS), labelled, "00010")
+    assert (whole.moments == labelled.moments).all()
+    assert set(whole.moments[whole.used]) == set(range(10, 24))
 
 
 def test_labels_hold_at_their_moment(scene: Scene, result: imgcal.Calibration) -> None:
@@ -63,7 +93,7 @@ def test_score(scene: Scene, result: imgcal.Calibration) -> None:
     good, poor = (imgcal.score(scene.detections, rig, LIGHTS) for rig in (result.rig, scene.factory))
     assert float(good.distances.median()) < 0.15
     assert float(poor.distances.median()) > 4
-    assert good.moments == (24, 24)
+    assert good.labelled.moment_counts == (24, 24)
 
 
 def test_blobs_of_nothing_are_refused(scene: Scene) -> None:

@@ -1,5 +1,6 @@
 """`CalibrationObject`: symmetry groups of known bodies, near symmetries, bad input."""
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -128,3 +129,28 @@ def test_sticks_are_refused_where_they_are_not_supported_yet():
         imgcal.RigKeeper(imgcal.load_rig("T4"), obj)
     with pytest.raises(InputError, match="without a factory calibration"):
         calibrate_from_scratch({}, imgcal.load_rig("T4"), obj)
+
+
+def test_several_objects_keep_their_shapes_and_get_different_names() -> None:
+    wand, cube = load_object("wand4"), load_object("cube8")
+    both = CalibrationObject.of_several([wand, cube, cube])
+    assert [part.name for part in both.parts] == ["wand4", "cube8", "cube8-2"]
+    assert both.part_of.tolist() == [0] * 4 + [1] * 8 + [2] * 8
+    assert both.pose_rank == 6
+    assert len(both.symmetries) == 1
+    for part, own in zip(both.parts, (wand, cube, cube), strict=True):
+        assert part.origin is not None
+        torch.testing.assert_close(part.points + part.origin, own.points)
+        torch.testing.assert_close(part.points.mean(0), torch.zeros(3, dtype=torch.float64))
+    assert both.rows[4] == ("cube8", 0)
+    assert CalibrationObject.of_several([wand]) is wand
+
+
+@pytest.mark.parametrize("other", ["charuco", "lights", "scale"])
+def test_what_cannot_be_among_several_is_named(other: str) -> None:
+    wand = load_object("wand4")
+    wrong = replace(wand, scale_tolerance=0.01) if other == "scale" else load_object(other)
+    with pytest.raises(InputError, match="among several objects"):
+        CalibrationObject.of_several([wand, wrong])
+    with pytest.raises(InputError, match="found 2, expected a single one for a running rig"):
+        CalibrationObject.of_several([wand, wand]).require_rigid("for a running rig")

@@ -1,0 +1,271 @@
+"""Several known objects in one capture: which blob is which fiducial of which object, snapshot by snapshot.
+
+Each object is looked for by itself, on the blobs that no other object has taken. The one with the most evidence goes
+first. Objects of the same make are looked for one after the other; which of them is which does not matter to the rig.
+What two objects explain nearly as well is left out, and so is an object whose place could be another one that nothing
+else explains.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from imgcal.association.options import PipelineOptions
+from imgcal.association.result import Identity
+from imgcal.association.series import NOT_TRIED, Associations, Patience, Progress
+from imgcal.association.tracker import MOST_REMEMBERED, LearntRig, SnapshotIdentity, Tracker
+from imgcal.errors import InputError
+from imgcal.types import CalibrationObject, CameraRig, Detections
+
+CLAIMED = 0.5
+"""Share of a rival's blobs that other objects must have, for it to be one of them."""
+AROUND = 3.0
+"""Pixels around the images of an object that was found, within which blobs are its own."""
+
+Bools = NDArray[np.bool_]
+Row = tuple[SnapshotIdentity, NDArray[np.int64]]  # labels are of all blobs of the snapshot, counted over all objects
+
+
+def associate_several(
+    detections: Detections,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    options: PipelineOptions,
+    progress: Progress | None = None,
+) -> Associations:
+    """Do what `associate` does for several objects: a row of the result is an object found in a snapshot.
+
+    Args:
+        detections: blobs of all snapshots, cameras as in the rig; snapshots that come with labels keep them.
+        rig: the factory calibration.
+        obj: several objects, see `CalibrationObject.of_several`.
+        options: how sure each row must be.
+        progress: wraps the loop over snapshots.
+
+    Raises:
+        InputError: the options give a pose of the first snapshot, and do not say of which object.
+    """
+    if options.start_pose is not None:
+        raise InputError("start pose: found one beside several objects, expected a single object with it")
+    options = replace(options, identity=replace(options.identity, others_in_view=True))
+    learnt = LearntRig(rig, obj, options, MOST_REMEMBERED * len(obj.parts))
+    first = np.searchsorted(obj.part_of, np.arange(len(obj.parts)))
+    trackers = [
+        Tracker(rig, part, options, learnt=learnt, first=int(row)) for part, row in zip(obj.parts, first, strict=True)
+    ]
+    scene = _Capture(detections, trackers, obj)
+    count = len(detections.snapshot_names)
+    order: Iterable[int] = range(count)
+    scene.decide(progress(order, count) if progress else order, count)
+    incomplete = [s for s in range(count) if not scene.coded[s] and len(scene.found[s]) < len(trackers)]
+    if len(incomplete) < count:  # what the others have taught may help
+        for tracker in trackers:
+            tracker.in_vain = 0
+        scene.decide(incomplete, len(incomplete))
+    return scene.associations()
+
+
+class _Capture:
+    """What was decided so far about the snapshots of a capture."""
+
+    def __init__(self, detections: Detections, trackers: Sequence[Tracker], obj: CalibrationObject) -> None:
+        self.detections, self.trackers, self.obj = detections, trackers, obj
+        count = len(detections.snapshot_names)
+        usable = np.flatnonzero(detections.usable)
+        order = usable[np.argsort(detections.snapshot[usable], kind="stable")]
+        self.rows = np.split(order, np.searchsorted(detections.snapshot[order], np.arange(1, count)))[:count]
+        self.coded = np.zeros(count, dtype=bool)
+        self.coded[detections.snapshot[detections.fiducial >= 0]] = True
+        self.found: dict[int, list[Row]] = {s: [] for s in range(count)}  # accepted rows by snapshot
+        self.reasons = [""] * count
+
+    def decide(self, order: Iterable[int], count: int) -> None:
+        """Decide about each snapshot, as long as there is hope; of two decisions the one with more objects stays."""
+        patience = [Patience(count) for _ in self.trackers]
+        for number, s in enumerate(order):
+            found: list[Row] = []
+            reason, name = NOT_TRIED, self.detections.snapshot_names[s]
+            if self.coded[s]:
+                found, reason = self._given(s)
+            else:
+                hopeful = [p for p, t in enumerate(self.trackers) if patience[p].tries(number, t.in_vain)]
+                if hopeful:
+                    found, reason = place_objects(self.trackers, hopeful, self.detections.select(self.rows[s]), name, s)
+            if len(found) > len(self.found[s]) or not self.reasons[s]:
+                self.found[s], self.reasons[s] = found, reason
+
+    def _given(self, s: int) -> tuple[list[Row], str]:
+        """Take the labels that came with a snapshot."""
+        name, given, found, reason = self.detections.snapshot_names[s], self.detections.fiducial[self.rows[s]], [], ""
+        for part, tracker in enumerate(self.trackers):
+            own = np.where((given >= 0) & (self.obj.part_of[given] == part), given, -1)
+            if (own >= 0).any():
+                snapshot, _ = tracker.accept(name, own)
+                reason = reason or snapshot.reason
+                if snapshot.status != "refused":
+                    found.append((replace(snapshot, moment=s, part=part), own))
+        return found, reason
+
+    def associations(self) -> Associations:
+        """Number blobs by rows; those without a label go with the first row of their snapshot."""
+        detections, snapshots, names = self.detections, list[SnapshotIdentity](), list[str]()
+        row_of = np.zeros(len(detections), dtype=np.int64)
+        fiducial = np.full(len(detections), -1, dtype=np.int64)
+        begin = np.zeros(len(self.found) + 1, dtype=np.int64)
+        for s, found in self.found.items():
+            begin[s] = len(snapshots)
+            name = detections.snapshot_names[s]
+            if not found:
+                snapshots.append(SnapshotIdentity(name, "refused", self.reasons[s], 0, None, moment=s))
+            for snapshot, labels in found:
+                mine = self.rows[s][labels >= 0]
+                fiducial[mine], row_of[mine] = labels[labels >= 0], len(snapshots) - begin[s]
+                snapshots.append(snapshot)
+            names += [name] * max(len(found), 1)
+        table = replace(
+            detections, fiducial=fiducial, snapshot=begin[detections.snapshot] + row_of, snapshot_names=tuple(names)
+        )
+        return Associations(table, tuple(snapshots))
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """An object that was found."""
+
+    tracker: int
+    identity: Identity  # its labels are of all blobs of the snapshot
+    own: Bools  # (M,) blobs that belong to it, labelled or not
+
+
+def place_objects(
+    trackers: Sequence[Tracker], asked: Sequence[int], blobs: Detections, name: str, moment: int
+) -> tuple[list[Row], str]:
+    """Find out which objects are in view of one snapshot, and label their blobs.
+
+    Args:
+        trackers: one for each object, with what they have learnt.
+        asked: numbers of the objects to look for.
+        blobs: usable blobs of the snapshot.
+        name: of the snapshot.
+        moment: its number.
+
+    Returns:
+        The rows that were accepted, and why others were not.
+    """
+    placed, reason = _placed(trackers, asked, blobs)
+    found: list[Row] = []
+    for part, identity in placed:
+        tracker = trackers[part]
+        snapshot, labels = tracker.conclude(identity, blobs, name)
+        if snapshot.status == "refused":
+            reason = reason or snapshot.reason
+            continue
+        found.append((replace(snapshot, moment=moment, part=part), np.where(labels >= 0, labels + tracker.first, -1)))
+    return sorted(found, key=lambda row: row[0].part), reason
+
+
+def _placed(
+    trackers: Sequence[Tracker], asked: Sequence[int], blobs: Detections
+) -> tuple[list[tuple[int, Identity]], str]:
+    """Place one object after the other, the most certain first; then leave out what is not certain after all."""
+    free, placed, left = np.ones(len(blobs), dtype=bool), list[_Placed](), list(asked)
+    proposals: dict[int, Identity] = {}
+    reason = ""
+    # A stick may be made of the markers of an object that is in view, and was not identified.
+    doubtful = any(t.obj.pose_rank == 6 and part not in left for part, t in enumerate(trackers))
+    while left:
+        solid = max(trackers[part].obj.pose_rank for part in left)
+        asked = [part for part in left if trackers[part].obj.pose_rank == solid]
+        if solid < 6 and doubtful:
+            break
+        for part in asked:
+            if part not in proposals:
+                proposals[part] = _propose(trackers[part], blobs, free)
+        accepted = [part for part in asked if proposals[part].accepted]
+        if not accepted:
+            refusal = max((proposals[part] for part in asked), key=lambda found: found.evidence)
+            reason = reason or refusal.reason
+            doubtful = doubtful or solid == 6
+            left = [part for part in left if part not in asked]
+            for part in asked:
+                trackers[part].in_vain += proposals[part].hypotheses
+            continue
+        best = max(accepted, key=lambda part: proposals[part].evidence)
+        rival = _same_blobs(best, accepted, proposals, trackers)
+        if rival is not None:
+            reason = f"{trackers[best].obj.name} and {trackers[rival].obj.name} explain the same blobs nearly as well"
+            left = [part for part in left if part not in (best, rival)]
+            free &= (proposals[best].labels < 0) & (proposals[rival].labels < 0)
+            doubtful = True
+        else:
+            own = _own_blobs(proposals[best], trackers[best], blobs)
+            placed.append(_Placed(best, proposals[best], own))
+            left.remove(best)
+            free &= ~own
+        proposals = {
+            part: found
+            for part, found in proposals.items()
+            if part in left and found.accepted and not (~free & (found.labels >= 0)).any()
+        }
+    kept = [(one.tracker, one.identity) for one in placed if not _has_rival(one, placed)]
+    if len(kept) < len(placed):
+        reason = reason or "another place of an object explains the blobs nearly as well"
+    return kept, reason
+
+
+def _propose(tracker: Tracker, blobs: Detections, free: Bools) -> Identity:
+    """Look for an object among the free blobs; labels are of all blobs."""
+    rows = np.flatnonzero(free)
+    found = tracker.propose(blobs.select(rows))
+
+    def spread(labels: NDArray[np.int64]) -> NDArray[np.int64]:
+        every = np.full(len(blobs), -1, dtype=np.int64)
+        every[rows] = labels
+        return every
+
+    rival = None if found.rival is None else spread(found.rival)
+    return replace(found, labels=spread(found.labels), rival=rival)
+
+
+def _same_blobs(
+    best: int, accepted: Sequence[int], proposals: dict[int, Identity], trackers: Sequence[Tracker]
+) -> int | None:
+    """Name another object that explains the blobs of the best one nearly as well; None = none does.
+
+    Objects of the same make do not count: which of them it is does not matter.
+    """
+    mine, least = proposals[best], trackers[best].options.identity.least_margin
+    for part in accepted:
+        other = proposals[part]
+        both = (mine.labels >= 0) & (other.labels >= 0)
+        alike = trackers[part].obj.points.shape == trackers[best].obj.points.shape and torch.equal(
+            trackers[part].obj.points, trackers[best].obj.points
+        )
+        if part != best and both.any() and not alike and other.evidence > mine.evidence - least:
+            return part
+    return None
+
+
+def _own_blobs(identity: Identity, tracker: Tracker, blobs: Detections) -> Bools:
+    """Mark the blobs (M,) that belong to an object: its labels, and what else lies where its fiducials are seen."""
+    own: Bools = identity.labels >= 0
+    if identity.rig is None or identity.rig_from_object is None:
+        return own
+    uv = identity.rig.project(identity.rig_from_object.apply(tracker.obj.points), tracker.obj.radius).uv.numpy()
+    away = np.linalg.norm(uv[blobs.camera] - blobs.uv[:, None], axis=-1).min(1)
+    return own | (away < AROUND)
+
+
+def _has_rival(one: _Placed, placed: Sequence[_Placed]) -> bool:
+    """Tell whether an object might as well be where nothing else is."""
+    rival = one.identity.rival
+    if rival is None:
+        return False
+    others = np.any([other.own for other in placed if other is not one] or [np.zeros_like(one.own)], axis=0)
+    named = rival >= 0
+    return int((named & others).sum()) < CLAIMED * int(named.sum())
