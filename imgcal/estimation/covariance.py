@@ -117,16 +117,13 @@ def joint_information(estimate: Estimate) -> Tensor:
         RefusedError: the information is singular.
     """
     problem, equations = estimate.problem, estimate.solution.equations
+    if estimate.inflation is not None:
+        equations = _weakened_equations(estimate, estimate.inflation)
     reduced = factorize(equations, cameras_first=False).reduced
     if bool(reduced.failed.any()):
         raise RefusedError(UNDETERMINED)
     information = (reduced.kept @ reduced.kept.mT)[0]
     prior = torch.eye(len(information), dtype=information.dtype)
-    if estimate.inflation is not None:
-        factor = torch.full_like(information[0], estimate.mean_inflation)
-        offset = estimate.solution.state.offset[0]
-        factor[: offset.numel()] = estimate.inflation.repeat_interleave(offset.shape[1])
-        information = prior + (information - prior) / factor[:, None] / factor
     if estimate.modes is not None:
         # Woodbury: modes, known only so well, take from what is known of the cameras that follow them.
         follow = information.new_zeros(len(estimate.modes.offset), len(information))
@@ -140,6 +137,20 @@ def joint_information(estimate: Estimate) -> Tensor:
     whole = prior.clone()
     whole[:wide, :wide] = torch.block_diag(*by_step) if cameras else prior
     return whole.mT @ information @ whole
+
+
+def _weakened_equations(estimate: Estimate, inflation: Tensor) -> NormalEquations:
+    """Normal equations in which the labels of each camera have standard deviations larger by a factor (C,).
+
+    The labels are weakened before poses are eliminated: a change of cameras, object and poses together that no image
+    shows, as that of the scale, is then shown by none. Factors on the information once poses are eliminated would give
+    such a change information, as soon as cameras have different ones.
+    """
+    problem, solution = estimate.problem, estimate.solution
+    distance = solution.equations.residual.square().sum(-2).sqrt() * problem.root_weight  # (1, S, C, N)
+    robust = (HUBER / distance.clamp_min(HUBER)).sqrt()  # the root of the loss's weight
+    weaker = replace(problem, root_weight=problem.root_weight * robust / inflation[:, None])
+    return equations_at(weaker, solution.state, NamedLoss("squared"))
 
 
 def _with_least_std(estimate: Estimate, least: float) -> Estimate:

@@ -7,6 +7,7 @@ explain are the answer. Most cameras stand still, and they are what the others a
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -27,9 +28,10 @@ from imgcal.estimation.change_points import (
     least_significant,
     likeliest_step,
 )
+from imgcal.estimation.correlation import correlation_time
 from imgcal.estimation.linearization import Problem, State, points_at, pose_at, rig_at
-from imgcal.estimation.map_estimate import minimize
-from imgcal.estimation.robust_losses import huber
+from imgcal.estimation.map_estimate import equations_at, minimize
+from imgcal.estimation.robust_losses import NamedLoss, huber
 from imgcal.types import Kind, MovedCamera
 
 ERROR = 1e-5
@@ -47,6 +49,11 @@ MOST_UNEXPLAINED = 0.5
 """Of what does not fit in a camera that stands still, the part that may be left where it has several places."""
 LEAST_LEAD = 0.8
 """Of the clearest camera's statistic: another one that explains as much may be the one that moved."""
+
+EPISODE, LEAST_EPISODE = 2.0, 3
+"""Correlation times that a passing error may last, and the snapshots that it may last at least where errors last."""
+LEAST_LABELS = 2
+"""Labels of a camera from which the shift of its image in a snapshot counts."""
 
 KINDS: dict[Kind, tuple[slice, float]] = {
     "rotation": (slice(0, 3), 180 / np.pi),
@@ -121,6 +128,37 @@ class Places:
         own = [self._squared(place, [place]) for place in self.places_of(camera)]
         labels = [(self.problem.root_weight[0][:, place] > 0).sum() for place in self.places_of(camera)]
         return float(sum(part.clamp_max(CLIP**2).sum() for part in own) - 2 * sum(labels))
+
+    def without(self, place: int, rows: NDArray[np.int64]) -> Places:
+        """Leave out the labels that one of the places has in some snapshots; the estimate stays."""
+        root_weight = self.problem.root_weight.clone()
+        root_weight[:, rows, place] = 0
+        return replace(self, problem=replace(self.problem, root_weight=root_weight))
+
+    def episode(self, camera: int) -> int:
+        """Successive snapshots of a camera that a passing error may last; 0 = errors do not last.
+
+        The shift that the labels of an image share shows how long errors last. All cameras together count as well: one
+        that sees little is taken to be like the others.
+        """
+        shifts = self._shifts()
+        own = float(correlation_time(shifts[:, [camera]])[0])
+        known = np.isfinite(shifts[..., 0]).sum(0)
+        spread = np.sqrt(np.nansum(np.square(shifts), axis=(0, 2)) / np.maximum(2 * known, 1))
+        whitened = shifts / np.maximum(spread, 1e-12)[:, None]
+        time = max(own, float(correlation_time(whitened[:, None])[0]))
+        return 0 if time <= 1 else max(math.ceil(EPISODE * time), LEAST_EPISODE)
+
+    def _shifts(self) -> Array:
+        """Weighted mean residual of each camera of the rig: (S, C, 2) px, NaN where there are too few labels."""
+        weight = self.problem.root_weight[0].square().numpy()  # (S, V, N)
+        residual = equations_at(self.problem, self.state, NamedLoss("squared")).residual[0].numpy()
+        mean = np.einsum("svn,svin->svi", weight, residual) / np.maximum(weight.sum(-1), 1e-30)[..., None]
+        shifts = np.full((len(mean), max(self.camera) + 1, 2), np.nan)
+        for place, camera in enumerate(self.camera):
+            known = (weight[:, place] > 0).sum(-1) >= LEAST_LABELS
+            shifts[known, camera] = mean[known, place]
+        return shifts
 
     def _squared(self, place: int, labels: list[int]) -> Tensor:
         """Squared whitened residuals (S, N) of the labels of some places of a camera, if it stood at one of them."""
@@ -218,6 +256,7 @@ def find_moves(
                 and divided.shift(step.camera, new) >= LEAST_MOVE * left**0.5
                 and (change := divided.change(step.camera, new, left)).is_physical
                 and change.is_certain
+                and _outlasts_an_episode(places, divided, step.camera, least_significant(candidates, ERROR) * left)
             ):
                 doubts[new] = _doubts(places, step)
                 places, noise = divided, left
@@ -245,6 +284,34 @@ def _located(places: Places, step: Step, options: EstimationOptions) -> Places |
         step = replace(step, row=row)
         divided = places.divided(step, options)
     return divided
+
+
+def _outlasts_an_episode(places: Places, divided: Places, camera: int, least: float) -> bool:
+    """Tell whether a step is significant without the episode that speaks most for it, on either side.
+
+    An error that passes is no motion: a target at the edge of an image, or behind an arm, may seem to be off by pixels
+    for some snapshots.
+
+    Args:
+        places: before the camera's time was divided.
+        divided: afterwards, the new place being the last.
+        camera: number of the place that was divided.
+        least: statistic from which a step is significant.
+    """
+    new = len(divided.camera) - 1
+    length, row = divided.episode(divided.camera[new]), divided.first[new]
+    if not length:
+        return True
+    shown = np.flatnonzero(places.seen[:, camera])
+    saved = divided.costs(camera) - divided.costs(new)
+    for rows, gain in ((shown[shown < row], -saved), (shown[shown >= row], saved)):
+        if len(rows) <= length:
+            return False
+        first = int(np.convolve(gain[rows], np.ones(length), "valid").argmax())
+        rest = places.without(camera, rows[first : first + length])
+        if rest.blocks.statistics([camera], np.array([row]))[0, 0] < least:
+            return False
+    return True
 
 
 def _doubts(places: Places, step: Step) -> set[int]:

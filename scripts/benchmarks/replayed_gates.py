@@ -122,14 +122,15 @@ def _calibration_nees(calibration: Any, stream: ReplayedStream) -> float:
         return float(distance(keeper.belief, stream.place.truth).median() / VALUES)
 
 
-def items(snapshots: int = LONG) -> Iterator[Item]:
-    """Items without end: two bumps for each quiet one of so many snapshots."""
+def items(snapshots: int = LONG, bumped: int | None = None) -> Iterator[Item]:
+    """Items without end: quiet ones of so many snapshots, the first `bumped` (None = all) with two bumps each."""
     kinds, number = tuple(BUMPS), 0
     while True:
         place = PLACES[number % len(PLACES)]
         yield Item(place, number, snapshots=snapshots)
-        yield Item(place, 100_000 + 2 * number, kinds[2 * number % len(kinds)])
-        yield Item(place, 100_001 + 2 * number, kinds[(2 * number + 1) % len(kinds)])
+        if bumped is None or number < bumped:
+            yield Item(place, 100_000 + 2 * number, kinds[2 * number % len(kinds)])
+            yield Item(place, 100_001 + 2 * number, kinds[(2 * number + 1) % len(kinds)])
         number += 1
 
 
@@ -223,6 +224,7 @@ class Options:
     minutes: float = 60.0  #: begin no item later than this; the next run goes on
     count: int = 10_000  #: items at most
     snapshots: int = LONG  #: of an item without a bump
+    bumped: int | None = None  #: of the items without a bump, those that are followed by two with one; default: all
     cores: int = 1
     fresh: bool = False  #: calibrate the recording and take its residuals again, though they are kept
     out: Path = RESULT
@@ -239,7 +241,8 @@ def main() -> None:
     kept = Kept(WORK / "replayed_gates", "\n".join(Path(str(name)).read_text("utf-8") for name in modules))
     until = time.monotonic() + 60 * options.minutes
     some = takewhile(
-        lambda pair: pair[0] < options.count and time.monotonic() < until, enumerate(items(options.snapshots))
+        lambda pair: pair[0] < options.count and time.monotonic() < until,
+        enumerate(items(options.snapshots, options.bumped)),
     )
     with workers(None, options.cores, kept) as mapped:
         rows = []

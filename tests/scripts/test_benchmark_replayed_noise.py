@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 import imgcal
 from imgcal.synthesis import arranged_rig
 from scripts.benchmarks.replayed_noise import BRIDGED, LEAST_RUN, Replay, Series, series_of, statistics
-from scripts.benchmarks.replayed_stream import REPLAYED, Disturbances, Place, ReplayedStream
+from scripts.benchmarks.replayed_stream import REPLAYED, Disturbances, Place, ReplayedStream, calibrated_stream
 from scripts.benchmarks.rig_streams import Bump
 
 CALM = Disturbances(wrong=0.0, people_every=math.inf, away_every=math.inf, merged=0.0)
@@ -144,3 +144,11 @@ def test_wrong_blobs_are_wrong_for_one_snapshot(place):
         assert ((off < 1e-6) | ((off > 2.9) & (off < 30.1))).all()
     images = 300 * 4
     assert 0.02 * images < len(set(wrong)) < 0.08 * images
+
+
+@pytest.mark.usefixtures("captures")
+@pytest.mark.parametrize(("place", "seed"), [("ring8", 3), ("room10", 2)])
+def test_recorded_errors_that_pass_are_no_motion_of_a_camera(place, seed):
+    """Both were refused: "cam01 moved before snapshot 64", "cam10 or cam05 moved before snapshot 1560"."""
+    _, calibration = calibrated_stream(place, seed, 10)
+    assert calibration.moved == ()

@@ -13,6 +13,7 @@ from imgcal.estimation import (
     camera_covariance,
     camera_std,
     estimate,
+    joint_information,
     object_covariance,
     pose_covariance,
     relative_covariance,
@@ -229,3 +230,51 @@ def test_undetermined_pose_is_refused(simulate) -> None:
     for function in (camera_covariance, pose_covariance):
         with pytest.raises(RefusedError, match="every snapshot"):
             function(found)
+
+
+@pytest.mark.parametrize("inflation", [(1.0, 1.0, 1.0, 1.0), (1.5, 1.5, 1.5, 1.5), (1.0, 1.4, 1.9, 1.2)])
+def test_no_inflation_teaches_the_common_scale_of_rig_and_object(simulate, inflation: tuple[float, ...]) -> None:
+    """A rig and an object that are larger together show the same images: only their priors know the scale."""
+    case = simulate(snapshots=40, cameras=4, scale_tolerance=0.01, tolerance=0.3)
+    found = estimate(case.observations, case.factory, case.obj, prior_std=case.prior_std)
+    found = replace(found, inflation=torch.tensor(inflation, dtype=torch.float64))
+    larger = torch.zeros(4, 15, dtype=torch.float64)
+    larger[:, 3:6] = found.rig.positions
+    assert found.solution.state.object_offset is not None
+    own = found.solution.state.object_offset[0].clone()  # displaced fiducials are displaced by more, and ...
+    own[-1] += 1 / 0.01
+    step = torch.cat((larger.flatten(), own))
+    known = float((larger / case.prior_std).square().sum()) + float(own.square().sum())
+    assert float(step @ joint_information(found) @ step) == pytest.approx(known, rel=1e-3)
+
+
+def test_inflation_weakens_what_the_images_show_and_not_the_prior(simulate) -> None:
+    case = simulate(snapshots=20, cameras=4)
+    case.observations.seen[:, 3] = False
+    found = estimate(case.observations, case.factory, case.obj, prior_std=case.prior_std)
+    plain, wider = (
+        torch.linalg.inv(joint_information(replace(found, inflation=factor))).diagonal().sqrt().view(4, 15)
+        for factor in (None, torch.full((4,), 2.0, dtype=torch.float64))
+    )
+    assert (wider[:3, 6:8] > 1.8 * plain[:3, 6:8]).all()
+    torch.testing.assert_close(wider[3], plain[3], rtol=1e-6, atol=0)  # saw nothing: what its prior knows
+
+
+def test_inflation_of_one_camera_leaves_the_others_their_precision(simulate) -> None:
+    case = simulate(snapshots=20, cameras=4)
+    found = estimate(case.observations, case.factory, case.obj, prior_std=case.prior_std)
+    plain, wider = (
+        torch.linalg.inv(joint_information(replace(found, inflation=factor))).diagonal().sqrt().view(4, 15)
+        for factor in (None, torch.tensor([3.0, 1.0, 1.0, 1.0], dtype=torch.float64))
+    )
+    assert (wider[0, 6:8] > 2.0 * plain[0, 6:8]).all()
+    assert (wider[1:, 6:8] < 1.2 * plain[1:, 6:8]).all()
+
+
+def test_a_label_that_the_loss_holds_off_counts_as_little_in_the_inflated_information(simulate) -> None:
+    """A factor of one on every camera is no factor, outliers or not."""
+    case = simulate(snapshots=20, cameras=4)
+    case.observations.uv[::3, 1, 2] += 2.0
+    found = estimate(case.observations, case.factory, case.obj, prior_std=case.prior_std)
+    ones = replace(found, inflation=torch.ones(4, dtype=torch.float64))
+    torch.testing.assert_close(joint_information(ones), joint_information(found), rtol=1e-6, atol=1e-6)

@@ -1,12 +1,15 @@
 """A camera with two places: where they part, how far they are apart, and whether a motion explains it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
 
 from imgcal.association.series import associate, observations_of
 from imgcal.estimation import EstimationOptions, estimate
 from imgcal.estimation.change_points import Step
-from imgcal.estimation.moves import Change, Places, find_moves
+from imgcal.estimation.moves import Change, Places, _outlasts_an_episode, find_moves
 from scripts.benchmarks import camera_faults as faults
 
 CAMERA, FIRST, COUNT = 3, 15, 30
@@ -42,6 +45,60 @@ def test_the_moment_is_found_from_a_wrong_start(bumped):
     (move,) = find_moves(places.problem, places.state, rig.camera_names, NAMES, OPTIONS)
     assert (move.camera, move.snapshot, move.kind) == ("cam04", str(FIRST), "rotation")
     assert abs(move.size - 0.1) < 4 * move.sigma
+
+
+def lasting(uv: torch.Tensor, size: float, seed: int = 3) -> torch.Tensor:
+    """Observations (S, C, N, 2) px whose images are shifted by errors that last some two snapshots."""
+    draw, memory = np.random.default_rng(seed), 0.5
+    shift = size * draw.standard_normal((len(uv), uv.shape[1], 1, 2))
+    for row in range(1, len(shift)):
+        shift[row] = memory * shift[row - 1] + (1 - memory**2) ** 0.5 * shift[row]
+    return uv + torch.from_numpy(shift)
+
+
+def stepping(first: int, size: float) -> tuple[Places, Places, float]:
+    """Give a camera that is turned by 0.05 degrees in 60 snapshots two places; errors that last have some size (px).
+
+    Returns:
+        Before and after, and the statistic of the step.
+    """
+    rig, wand, truth = faults.wand_in_a_room(60, 1)
+    truth = faults.changed_from(truth, wand, CAMERA, first, lambda r: faults.turned(r, CAMERA, 0.05))
+    observations, _ = observations_of(associate(faults.blobs(truth, 1, labelled=True), rig, wand), rig, wand)
+    sigma = torch.full_like(observations.sigma, 0.06)
+    fit = estimate(replace(observations, uv=lasting(observations.uv, size), sigma=sigma), rig, wand)
+    places = Places(fit.problem, fit.solution.state, tuple(range(10)), (0,) * 10)
+    statistic = float(places.blocks.statistics([CAMERA], np.array([first]))[0, 0])
+    return places, places.divided(Step(CAMERA, first, statistic, np.zeros(10)), OPTIONS), statistic
+
+
+@pytest.mark.parametrize("first", [6, 54])
+def test_a_step_must_be_significant_without_its_best_episode(first):
+    places, divided, statistic = stepping(first, 0.06)
+    assert 3 <= divided.episode(CAMERA) < 6
+    assert not _outlasts_an_episode(places, divided, CAMERA, 0.8 * statistic)
+    assert _outlasts_an_episode(places, divided, CAMERA, 0.1 * statistic)
+
+
+def test_a_step_in_the_middle_does_not_rest_on_an_episode():
+    places, divided, statistic = stepping(30, 0.06)
+    assert _outlasts_an_episode(places, divided, CAMERA, 0.6 * statistic)
+
+
+def test_what_is_no_longer_than_an_episode_is_no_step():
+    places, divided, _ = stepping(3, 0.06)
+    assert not _outlasts_an_episode(places, divided, CAMERA, 0.0)
+
+
+def test_where_errors_do_not_last_every_snapshot_counts():
+    places, divided, statistic = stepping(3, 0.0)
+    assert _outlasts_an_episode(places, divided, CAMERA, statistic)
+
+
+def test_errors_that_do_not_last_have_no_episode(bumped):
+    places, _ = bumped
+    divided = places.divided(Step(CAMERA, FIRST, 0.0, np.zeros(10)), OPTIONS)
+    assert [divided.episode(camera) for camera in range(10)] == [0] * 10
 
 
 def test_a_change_is_told_by_the_kind_that_explains_it():
