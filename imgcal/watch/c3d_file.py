@@ -88,7 +88,7 @@ class C3DFile:
             self._counts, self._data_at = counts, data_at
             raise
         finally:
-            self._file = open(self._path, "r+b")
+            self._file = open(self._path, "r+b")  # noqa: SIM115  # open until close
 
     def append(self, points: NDArray[np.float64], error: NDArray[np.float64], cameras: NDArray[np.int64]) -> None:
         """Add frames.

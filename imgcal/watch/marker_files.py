@@ -23,7 +23,7 @@ NEAR_WHOLE = 5e-4  # relative: a rate that is so near a whole number is that
 WRITE_EVERY = 1.0  # s
 LONGEST_GAP = 100_000  # frames
 MOST_LIGHTS = 255
-"""Columns of lights in a file; of more lights one after the other, the column is used again that was left longest ago."""
+"""Columns of lights in a file; if there are more lights, the column that was left longest ago is used again."""
 
 Frame = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]  # points (N, 3), error (N,), cameras (N,)
 
@@ -161,7 +161,7 @@ def _camera_bits(seen: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 def marker_labels(obj: CalibrationObject) -> tuple[str, ...]:
-    """What the markers are called: by their names, else `M` and the number that tables have; the first of lights `L1`."""
+    """Name the markers as the object does, else `M` and the number that tables have; the first of lights `L1`."""
     if obj.unknown_markers:
         return ("L1",)
     return obj.fiducial_names or tuple(f"M{label}" for label in obj.labels or range(obj.num_fiducials))

@@ -74,7 +74,7 @@ class TRCFile:
             self._counts = counts
             raise
         finally:
-            self._file = open(self._path, "r+b")
+            self._file = open(self._path, "r+b")  # noqa: SIM115  # open until close
 
     @property
     def _count(self) -> str:
