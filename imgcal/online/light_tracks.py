@@ -24,8 +24,9 @@ ERROR, ACCELERATION = 10.0, 50_000.0
 """Millimetres, and mm/s^2, by which a light may be elsewhere than where its velocity takes it."""
 FASTEST = 5000.0
 """Speed (mm/s) of a light whose velocity is not known."""
-NEIGHBOUR = 500.0
-"""Millimetres from a light whose velocity is known within which another one is taken to move likewise at first."""
+NEIGHBOUR, DIFFERENCE = 500.0, 2000.0
+"""Millimetres from a light whose velocity is known within which another one is taken to move likewise at first, and by
+how much (mm/s) it may move otherwise."""
 
 
 @dataclass
@@ -110,6 +111,7 @@ class LightTracks:
             away = np.linalg.norm(self.place[unknown, None] - self.place[others], axis=-1)
             near = away.min(1) < NEIGHBOUR
             velocity[unknown[near]] = self.velocity[others[away.argmin(1)[near]]]
+            reach[unknown] = np.minimum(reach[unknown] + DIFFERENCE * since[unknown], NEAR)
         elif len(unknown) and len(points):
             velocity[unknown] = self._common_velocity(points, unknown, since)
         alone = unknown[~np.isfinite(velocity[unknown, 0])]
