@@ -154,6 +154,7 @@ def _understood(arguments: list[str]) -> Runnable:
         raise SystemExit(DONE)
     if first in COMMANDS:
         given = tyro.cli(_arguments(first), prog=f"imgcal {first}", args=arguments[1:])
+        _check_values(given, arguments[1:])
         with ends_at_once():  # imports take a while
             command = getattr(import_module(COMMANDS[first][0]), first.capitalize())
         return command(**vars(given))
@@ -165,6 +166,18 @@ def _understood(arguments: list[str]) -> Runnable:
         raise InputError(f"unknown command `{shortened(first)}`; {hint}")
     commands: Any = Union[tuple(Annotated[load(name), tyro.conf.subcommand(name)] for name in COMMANDS)]  # noqa: UP007
     return tyro.cli(commands, prog="imgcal", description=DESCRIPTION, args=arguments)
+
+
+def _check_values(given: Any, arguments: list[str]) -> None:
+    """Refuse options of several values that were given without any: they would have no effect.
+
+    Raises:
+        InputError: names the first of them.
+    """
+    for entry in fields(given):
+        option = f"--{entry.name.replace('_', '-')}"
+        if entry.default == () and getattr(given, entry.name) == () and option in arguments:
+            raise InputError(f"{option}: found no value, expected one or more")
 
 
 def _arguments(name: str) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import signal
 import sys
@@ -333,6 +334,8 @@ def _check_poses(names: tuple[str, ...], obj: CalibrationObject, out: Path) -> N
             raise InputError(f"--poses: {shortened(name)}: found a folder, expected a file")
         if is_file and not (path.parent.is_dir() or out.resolve().is_relative_to(path.parent.resolve())):
             raise InputError(f"--poses: {shortened(name)}: found no folder {path.parent}, expected one")
+        if is_file and path.parent.is_dir() and not os.access(path.parent, os.W_OK):
+            raise InputError(f"--poses: {shortened(name)}: no permission to write to {path.parent}")
 
 
 def _is_table(name: str) -> bool:

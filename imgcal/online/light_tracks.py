@@ -43,7 +43,7 @@ class LightTracks:
 
     place: Array  # (N, 3) mm, where each light was last; nan = no light has the number
     velocity: Array  # (N, 3) mm/s; nan = not known
-    time: Array  # (N,) s, when it was seen last
+    time: Array  # (N,) s, when it was seen last; -inf = no light has had the number
     shift: Array  # (C, 2) px by which a camera sees lights elsewhere than where the others say that they are
     shift_at: Array  # (C, 2) px, where such lights should have been when that was first seen
     astray: Array  # (C,) s, since when no shift of its image makes lights of what a camera sees; nan = it does not
@@ -53,7 +53,7 @@ class LightTracks:
     def of(cls, lights: int, cameras: int) -> LightTracks:
         """Begin with nothing seen."""
         return cls(
-            np.full((lights, 3), np.nan), np.full((lights, 3), np.nan), np.zeros(lights), np.zeros((cameras, 2)),
+            np.full((lights, 3), np.nan), np.full((lights, 3), np.nan), np.full(lights, -np.inf), np.zeros((cameras, 2)),
             np.zeros((cameras, 2)), np.full(cameras, np.nan), np.full((cameras, MOST_STILL, 4), np.nan),
         )  # fmt: skip
 

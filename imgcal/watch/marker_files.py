@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -48,8 +47,6 @@ class MarkerFile:
             raise InputError(f"{path}: exists, expected a new file: a file of markers is one trial")
         if not path.parent.is_dir():
             raise InputError(f"{path}: cannot be written: no folder {path.parent}")
-        if not os.access(path.parent, os.W_OK):
-            raise InputError(f"{path}: cannot be written: no permission to write to {path.parent}")
         self._path, self._labels = path, marker_labels(obj)
         self._tracks = LightTracks.of(MOST_LIGHTS, rig.num_cameras) if obj.unknown_markers else None
         centres = rig.cam_from_rig.inverse().translation

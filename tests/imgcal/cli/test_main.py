@@ -147,3 +147,10 @@ def test_an_interruption_during_start_up_is_one_line(slow, arguments, tmp_path):
 def test_a_mistyped_command_line_is_answered_briefly(arguments, expected, capsys):
     assert main(arguments) == 2
     assert one_line(capsys) == f"imgcal: {expected}"
+
+
+@pytest.mark.parametrize("option", ["--poses", "--topic"])
+def test_an_option_without_its_value_is_told(option, tmp_path, capsys):
+    given = ["watch", "blobs.csv", "--rig", "T4", "--object", "cube8", "--out", str(tmp_path / "out"), option]
+    assert main(given) == 2
+    assert capsys.readouterr().err == f"imgcal: {option}: found no value, expected one or more\n"

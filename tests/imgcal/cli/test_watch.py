@@ -454,3 +454,37 @@ def test_a_wrong_output_beside_a_right_one_leaves_nothing(blobs, tmp_path, capsy
     save_detections(blobs.of_snapshots(0, 2), "blobs.csv")
     assert watch("blobs.csv", "out", "--poses", "a.csv", "nowhere/b.csv") == 2
     assert "found no folder nowhere" in capsys.readouterr().err and [p.name for p in Path().iterdir()] == ["blobs.csv"]
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("tcp://", "tcp://: expected tcp://HOST:PORT"),
+        ("tcp://127.0.0.1:99999", "tcp://127.0.0.1:99999: expected tcp://HOST:PORT"),
+        ("ipc:///nowhere/at/all", "ipc:///nowhere/at/all"),
+        ("igtl://x:99999", "igtl://x:99999: expected igtl://[HOST:]PORT"),
+        ("table.csv", "table.csv: found 'a,b', expected a new file or the columns of poses"),
+        ("file/poses.c3d", "found no folder file"),
+    ],
+)
+def test_an_output_of_poses_that_cannot_be_is_one_line(blobs, tmp_path, capsys, monkeypatch, name, said):
+    monkeypatch.chdir(tmp_path)
+    save_detections(blobs.of_snapshots(0, 2), "blobs.csv")
+    Path("table.csv").write_text("a,b\n1,2\n")
+    Path("file").write_text("no folder")
+    before = {path.name: path.read_bytes() for path in Path().iterdir()}
+    assert watch("blobs.csv", "out", "--poses", name, "poses.csv") == 2
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1 and "internal" not in error
+    assert {path.name: path.read_bytes() for path in Path().iterdir()} == before
+
+
+def test_a_folder_that_is_not_ours_to_write_to_is_told_before_anything_is_written(blobs, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    save_detections(blobs.of_snapshots(0, 2), "blobs.csv")
+    Path("locked").mkdir()
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "locked")
+    for name in ("locked/poses.c3d", "locked/poses.csv"):
+        assert watch("blobs.csv", "out", "--poses", name) == 2
+        assert f"--poses: {name}: no permission to write to locked" in capsys.readouterr().err
+    assert not Path("out").exists() and not list(Path("locked").iterdir())

@@ -39,6 +39,11 @@ def test_lights_that_go_together_keep_their_numbers_from_the_first_step_on() -> 
         assert found.tolist() == shown.tolist(), frame
 
 
+def test_numbers_that_no_light_had_come_first() -> None:
+    tracks, here = LightTracks.of(lights=3, cameras=1), np.array([[0.0, 0.0, 500.0]])
+    assert [tracks.number_lights(here, time).tolist() for time in (0.0, 2.0, 4.0, 6.0)] == [[0], [1], [2], [0]]
+
+
 def test_a_hidden_light_that_may_be_one_of_two_comes_back_as_another_one() -> None:
     tracks = LightTracks.of(lights=8, cameras=1)
     pair = np.array([[0.0, 0.0, 900.0], [60.0, 0.0, 900.0]])
