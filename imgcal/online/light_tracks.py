@@ -52,9 +52,10 @@ class LightTracks:
     @classmethod
     def of(cls, lights: int, cameras: int) -> LightTracks:
         """Begin with nothing seen."""
+        nothing = np.full((lights, 3), np.nan)
         return cls(
-            np.full((lights, 3), np.nan), np.full((lights, 3), np.nan), np.full(lights, -np.inf), np.zeros((cameras, 2)),
-            np.zeros((cameras, 2)), np.full(cameras, np.nan), np.full((cameras, MOST_STILL, 4), np.nan),
+            nothing, nothing.copy(), np.full(lights, -np.inf), np.zeros((cameras, 2)), np.zeros((cameras, 2)),
+            np.full(cameras, np.nan), np.full((cameras, MOST_STILL, 4), np.nan),
         )  # fmt: skip
 
     def number_lights(self, points: Array, time: float) -> NDArray[np.int64]:
@@ -79,8 +80,8 @@ class LightTracks:
             seen[light], seen[:, known] = np.inf, np.inf
         # One that was hidden is known again where no other light may be it, and it no other one.
         may_be = np.isfinite(distance) & hidden & (number < 0)[:, None]
-        light, known = np.nonzero(may_be & (may_be.sum(0) == 1) & (may_be.sum(1) == 1)[:, None])
-        number[light] = known
+        which, again = np.nonzero(may_be & (may_be.sum(0) == 1) & (may_be.sum(1) == 1)[:, None])
+        number[which] = again
         left = np.flatnonzero(~np.isin(np.arange(len(self.place)), number))
         left = left[np.lexsort((left, self.time[left], np.isfinite(self.place[left, 0])))]  # hidden ones last
         self.place[left[: (number < 0).sum()]] = np.nan
