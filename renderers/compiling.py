@@ -41,6 +41,8 @@ def njit(**options: Any) -> Callable[[Function], Function]:
     options = {"cache": True, "no_cfunc_wrapper": True} | options
 
     def decorate(function: Function) -> Function:
+        if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]  # for coverage and debuggers
+            return function
         _RESTING.ours.add(function)
         # Numba chooses the folder when it decorates. Only then: what others compile is theirs to keep.
         before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, cache_folder()  # type: ignore[attr-defined]

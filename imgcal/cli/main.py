@@ -156,7 +156,9 @@ def _understood(arguments: list[str]) -> Runnable:
         print(f"imgcal {imgcal.__version__}")
         raise SystemExit(DONE)
     if first in COMMANDS:
-        given = tyro.cli(_arguments(first), prog=f"imgcal {first}", args=_objects_last(first, arguments[1:]))
+        options = _objects_last(first, arguments[1:])
+        given = tyro.cli(_arguments(first), prog=f"imgcal {first}", args=options)
+        _check_values(given, options)
         with ends_at_once():  # imports take a while
             command = getattr(import_module(COMMANDS[first][0]), first.capitalize())
         return command(**vars(given))
@@ -189,6 +191,18 @@ def _objects_last(command: str, arguments: list[str]) -> list[str]:
             others.append(argument)
             most = 0
     return [*others, "--object", *names] if names else arguments
+
+
+def _check_values(given: Any, arguments: list[str]) -> None:
+    """Refuse options of several values that were given without any: they would have no effect.
+
+    Raises:
+        InputError: names the first of them.
+    """
+    for entry in fields(given):
+        option = f"--{entry.name.replace('_', '-')}"
+        if entry.default == () and getattr(given, entry.name) == () and option in arguments:
+            raise InputError(f"{option}: found no value, expected one or more")
 
 
 def _arguments(name: str) -> Any:

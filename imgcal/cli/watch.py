@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import signal
 import sys
@@ -58,7 +59,8 @@ from imgcal.watch import (
 )
 from imgcal.watch import Watch as Loop
 
-MARKER_SUFFIXES = (".c3d", ".trc")
+MARKER_SUFFIXES, TABLE_SUFFIXES = (".c3d", ".trc"), (".csv", ".jsonl")
+POSE_OUTPUTS = "FILE.csv, FILE.jsonl, FILE.c3d, FILE.trc, tcp://HOST:PORT or igtl://[HOST:]PORT"
 USUAL_RATE = 30.0  # snapshots a second of a table of blobs
 
 # What kind of input an option is for.
@@ -78,6 +80,7 @@ class Watch(arguments.Watch):
         """Watch until the end."""
         rig, obj = open_rig(self.rig), load_object(self.object)
         check_folder(self.out)
+        _check_poses(self.poses, obj, self.out)
         with holding(self.out) as folder:
             self._watch(rig, obj, folder)
 
@@ -96,7 +99,10 @@ class Watch(arguments.Watch):
             keeper, restored = self._keeper(folder, rig, obj)
             stack.enter_context(keeper)
             stack.enter_context(intake).opened()  # before anything is written
-            poses = [stack.enter_context(Poses(name, _pose_sink(name, rig, obj))) for name in self.poses]
+            poses = [
+                stack.enter_context(Poses(name, _pose_sink(name, rig, obj)))
+                for name in sorted(self.poses, key=_is_table)
+            ]
             page = None
             if self.serve is not None:
                 from imgcal.live_page import LivePage, parse_address  # brings a server along, which is not in the core
@@ -306,11 +312,42 @@ def metrics_address(text: str) -> tuple[str, int]:
     return host.strip("[]") or "127.0.0.1", int(port)
 
 
+def _check_poses(names: tuple[str, ...], obj: CalibrationObject, out: Path) -> None:
+    """Refuse outputs of poses that cannot be, before anything is written.
+
+    Raises:
+        InputError: names the first of them, and what it could be.
+    """
+    for number, name in enumerate(names):
+        path, (scheme, separator, _) = Path(name), name.partition("://")
+        is_file, suffix = not separator, path.suffix.lower()
+        if name in names[:number]:
+            raise InputError(f"--poses: found {shortened(name)} twice, expected each output once")
+        if not is_file and scheme not in ("tcp", "ipc", "igtl"):
+            raise InputError(f"--poses: found {shortened(name)!r}, expected {POSE_OUTPUTS}")
+        if is_file and suffix not in (*MARKER_SUFFIXES, *TABLE_SUFFIXES):
+            raise InputError(f"--poses: found {shortened(name)!r}, expected {POSE_OUTPUTS}")
+        if obj.pose_rank == 3 and not (is_file and suffix in MARKER_SUFFIXES):
+            found = f"found {shortened(name)!r} with {shortened(obj.name or 'a light')}, which has no pose"
+            raise InputError(f"--poses: {found}, expected FILE.c3d or FILE.trc: points")
+        if is_file and path.is_dir():
+            raise InputError(f"--poses: {shortened(name)}: found a folder, expected a file")
+        if is_file and not (path.parent.is_dir() or out.resolve().is_relative_to(path.parent.resolve())):
+            raise InputError(f"--poses: {shortened(name)}: found no folder {path.parent}, expected one")
+        if is_file and path.parent.is_dir() and not os.access(path.parent, os.W_OK):
+            raise InputError(f"--poses: {shortened(name)}: no permission to write to {path.parent}")
+
+
+def _is_table(name: str) -> bool:
+    """Whether opening this output makes a file; those come last, when all others are known to work."""
+    return "://" not in name and Path(name).suffix.lower() in TABLE_SUFFIXES
+
+
 def _pose_sink(name: str, rig: CameraRig, obj: CalibrationObject) -> PoseSink:
     """Open what poses are to go to, by its name.
 
     Raises:
-        InputError: it cannot be opened, or is no name of any.
+        InputError: it cannot be opened.
     """
     scheme, separator, _ = name.partition("://")
     if not separator and Path(name).suffix.lower() in MARKER_SUFFIXES:
@@ -319,9 +356,6 @@ def _pose_sink(name: str, rig: CameraRig, obj: CalibrationObject) -> PoseSink:
         return PoseFile(Path(name))
     if scheme == "igtl":
         return OpenIGTLink(*listening_address(name))
-    if scheme not in ("tcp", "ipc"):
-        expected = "FILE.csv, FILE.jsonl, FILE.c3d, FILE.trc, tcp://HOST:PORT or igtl://[HOST:]PORT"
-        raise InputError(f"--poses: found {shortened(name)!r}, expected {expected}")
     if missing("zmq"):
         raise InputError(f"--poses: {shortened(name)} {advice('zmq')}")
     return PosePublisher(name)

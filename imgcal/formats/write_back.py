@@ -17,7 +17,7 @@ from imgcal.formats.fitting import Fit, fitted_like
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
 from imgcal.formats.limits import LIMIT
 from imgcal.formats.patching import Change, TextFile, patched_bytes
-from imgcal.formats.registry import format_named, read_foreign_rig
+from imgcal.formats.registry import format_named, is_foreign, read_foreign_rig
 from imgcal.formats.source import SUFFIXES, Source
 from imgcal.formats.units import millimetres
 from imgcal.formats.values import named
@@ -65,10 +65,13 @@ def written_back(
         limit: pixels that a lens may be off, anywhere in its image, in the model of the file.
 
     Raises:
-        InputError: one line: the files cannot be read, have other cameras, or cannot be followed.
+        InputError: one line: the files cannot be read or are our own, have other cameras, or cannot be followed.
         RefusedError: the file's lens model comes not near enough.
     """
     where = ", ".join(map(str, original))
+    for path in original:
+        if path.is_file() and not is_foreign(path):
+            raise InputError(f"{path}: found a rig file of imgcal, expected the calibration of another tool")
     old = read_foreign_rig(original, name, original_rig)
     title = format_named(old.format).title
     try:

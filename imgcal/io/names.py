@@ -71,13 +71,14 @@ def model_name(path: Path) -> str:
     return title_of(path.absolute().parent if path.name == MODEL else path)
 
 
-def find_file(path: str | Path, kind: str, suffix: str) -> Path:
+def find_file(path: str | Path, kind: str, suffix: str, other: str | None = None) -> Path:
     """Find a file by its path or, when there is none, by the bare name of a shipped one.
 
     Args:
         path: a path, a name such as "O10", or that of a sample capture, such as "sample:O10", for the file in it.
         kind: the folder of the shipped data, "rigs" or "objects".
         suffix: of the shipped files.
+        other: a name that is known, and no file.
 
     Raises:
         InputError: neither exists.
@@ -92,6 +93,6 @@ def find_file(path: str | Path, kind: str, suffix: str) -> Path:
     check_regular(path)
     some = difflib.get_close_matches(path.stem, shipped, n=MOST_NAMES, cutoff=0.3) or shipped[:MOST_NAMES]
     names = shipped if len(shipped) <= MOST_NAMES else [*some, f"... {len(shipped)} in all"]
-    raise InputError(
-        f"{path}: no such file, nor one of the shipped {kind} ({', '.join(names)}){nearest(path.stem, shipped)}"
-    )
+    near = nearest(path.stem, [*shipped, *([other] if other else [])])
+    nor = f"nor {other}, nor" if other else "nor"
+    raise InputError(f"{path}: no such file, {nor} one of the shipped {kind} ({', '.join(names)}){near}")

@@ -63,7 +63,7 @@ def load_object(path: str | Path) -> CalibrationObject:
         if not path.is_file():
             raise InputError(f"{path}: no such file, expected that of a printed board")
         return board_from_yaml(path.read_bytes(), path)
-    return _read(find_file(path, "objects", ".csv"))
+    return _read(find_file(path, "objects", ".csv", other=LIGHTS))
 
 
 def load_objects(paths: Sequence[str | Path]) -> CalibrationObject:

@@ -4,6 +4,8 @@ from .foreign_object import ForeignObject
 from .image_quality import ImageQuality
 from .keeper import RigKeeper
 from .keeper_file import KeeperFile
+from .light_points import LightPoints
+from .light_tracks import LightTracks
 from .object_pose import ObjectPose
 from .rig_state import CameraHealth, RigState
 from .sequential_test import SequentialTest
@@ -19,6 +21,8 @@ __all__ = [
     "ForeignObject",
     "ImageQuality",
     "KeeperFile",
+    "LightPoints",
+    "LightTracks",
     "ObjectPose",
     "RigKeeper",
     "RigState",

@@ -290,7 +290,8 @@ class RigKeeper:
         sentence = sentence_of(health, memory.monitor.filter.count)
         if memory.lights is not None and memory.monitor.filter.count:
             sentence += f"; their scale is known to +- {100 * memory.belief.scale_std():.2g} %, by no light"
-        return replace(state, cameras=health, events=tuple(events), sentence=sentence)
+        lights = None if labelled is None else labelled.checked.lights
+        return replace(state, cameras=health, events=tuple(events), sentence=sentence, lights=lights)
 
     def accept_as_factory(self) -> Event:
         """Make the present rig the factory calibration that motion is told against; what is known stays known.

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from imgcal.association import PipelineOptions, find_merged, to_observations
 from imgcal.estimation import EstimationOptions, fit_pose
 from imgcal.geometry import RigidTransform, kernels
+from imgcal.online.light_points import FoundLights
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
 from renderers.compiling import njit
 
@@ -45,6 +46,7 @@ class Checked:
     off: NDArray[np.bool_]  # (C,) the labels agree with each other, and lie elsewhere
     usual: float  # px, how far off the image of a camera is: the median of all cameras
     labels: int
+    lights: FoundLights | None = None  # all that were found, not only those with numbers; None = an object is known
 
 
 def check_labels(

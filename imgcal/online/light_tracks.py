@@ -20,6 +20,13 @@ LONGEST = 0.5
 """Seconds for which a light that is hidden keeps its number."""
 NEAR = 100.0
 """Millimetres, at most, from where a light should be, within which it keeps its number."""
+ERROR, ACCELERATION = 10.0, 50_000.0
+"""Millimetres, and mm/s^2, by which a light may be elsewhere than where its velocity takes it."""
+FASTEST = 5000.0
+"""Speed (mm/s) of a light whose velocity is not known."""
+NEIGHBOUR, DIFFERENCE = 500.0, 2000.0
+"""Millimetres from a light whose velocity is known within which another one is taken to move likewise at first, and by
+how much (mm/s) it may move otherwise."""
 
 
 @dataclass
@@ -35,8 +42,8 @@ class LightTracks:
     """
 
     place: Array  # (N, 3) mm, where each light was last; nan = no light has the number
-    velocity: Array  # (N, 3) mm/s
-    time: Array  # (N,) s, when it was seen last
+    velocity: Array  # (N, 3) mm/s; nan = not known
+    time: Array  # (N,) s, when it was seen last; -inf = no light has had the number
     shift: Array  # (C, 2) px by which a camera sees lights elsewhere than where the others say that they are
     shift_at: Array  # (C, 2) px, where such lights should have been when that was first seen
     astray: Array  # (C,) s, since when no shift of its image makes lights of what a camera sees; nan = it does not
@@ -45,30 +52,40 @@ class LightTracks:
     @classmethod
     def of(cls, lights: int, cameras: int) -> LightTracks:
         """Begin with nothing seen."""
+        nothing = np.full((lights, 3), np.nan)
         return cls(
-            np.full((lights, 3), np.nan), np.zeros((lights, 3)), np.zeros(lights), np.zeros((cameras, 2)),
-            np.zeros((cameras, 2)), np.full(cameras, np.nan), np.full((cameras, MOST_STILL, 4), np.nan),
+            nothing, nothing.copy(), np.full(lights, -np.inf), np.zeros((cameras, 2)), np.zeros((cameras, 2)),
+            np.full(cameras, np.nan), np.full((cameras, MOST_STILL, 4), np.nan),
         )  # fmt: skip
 
     def number_lights(self, points: Array, time: float) -> NDArray[np.int64]:
-        """Give each light (L, 3) mm the number that it had, or a free one: (L,); -1 where there are too many."""
+        """Give each light (L, 3) mm the number that it had, or a free one: (L,); -1 where there are too many.
+
+        Free are first those that no light ever had, then those that were left longest ago.
+        """
         since = time - self.time
         self.place[(since > LONGEST) | (since < 0)] = np.nan
-        expected = self.place + self.velocity * since[:, None]
+        velocity, reach = self._expected_velocity(points, since)
+        expected = self.place + velocity * since[:, None]
         distance = np.linalg.norm(points[:, None] - expected, axis=-1)
-        distance = np.where(np.isfinite(distance), distance, np.inf)
+        distance = np.where(distance < reach, distance, np.inf)  # nor where there is no light
         number = np.full(len(points), -1, dtype=np.int64)
-        for _ in range(min(distance.shape)):
-            light, known = np.unravel_index(int(distance.argmin()), distance.shape)
-            if not distance[light, known] < NEAR:
+        hidden = self.time < self.time[np.isfinite(self.place[:, 0])].max(initial=-np.inf)
+        seen = np.where(hidden, np.inf, distance)
+        for _ in range(min(seen.shape)):
+            light, known = np.unravel_index(int(seen.argmin()), seen.shape)
+            if not np.isfinite(seen[light, known]):
                 break
             number[light] = known
-            distance[light], distance[:, known] = np.inf, np.inf
-        left = np.flatnonzero(~np.isin(np.arange(len(self.place)), number))  # free ones first, then those long hidden
-        hidden = np.isfinite(self.place[left, 0])
-        left = left[np.lexsort((np.where(hidden, self.time[left], 0.0), hidden))]
+            seen[light], seen[:, known] = np.inf, np.inf
+        # One that was hidden is known again where no other light may be it, and it no other one.
+        may_be = np.isfinite(distance) & hidden & (number < 0)[:, None]
+        which, again = np.nonzero(may_be & (may_be.sum(0) == 1) & (may_be.sum(1) == 1)[:, None])
+        number[which] = again
+        left = np.flatnonzero(~np.isin(np.arange(len(self.place)), number))
+        left = left[np.lexsort((left, self.time[left], np.isfinite(self.place[left, 0])))]  # hidden ones last
         self.place[left[: (number < 0).sum()]] = np.nan
-        free = iter(sorted(left[: (number < 0).sum()].tolist()))
+        free = iter(left[: (number < 0).sum()].tolist())
         for unnumbered in np.flatnonzero(number < 0).tolist():
             number[unnumbered] = next(free, -1)
         kept = number >= 0
@@ -76,9 +93,45 @@ class LightTracks:
         passed = since[mine, None]
         was = np.isfinite(self.place[mine]) & (passed > 0)
         went = (there - self.place[mine]) / np.where(was, passed, 1.0)
-        self.velocity[mine] = np.where(was, went, 0.0)
+        self.velocity[mine] = np.where(was, went, np.nan)
         self.place[mine], self.time[mine] = there, time
         return number
+
+    def _expected_velocity(self, points: Array, since: Array) -> tuple[Array, Array]:
+        """Velocity (N, 3) mm/s of each light, and how far (N,) mm from where that takes it the light may be.
+
+        A light that has been seen once goes as its nearest neighbour does; where nothing is known of any, as lets most
+        of the lights go on together.
+        """
+        alive = np.isfinite(self.place[:, 0])
+        known = alive & np.isfinite(self.velocity[:, 0])
+        velocity, reach = self.velocity.copy(), np.minimum(ERROR + ACCELERATION / 2 * since**2, NEAR)
+        unknown = np.flatnonzero(alive & ~known)
+        if known.any() and len(unknown):
+            others = np.flatnonzero(known)
+            away = np.linalg.norm(self.place[unknown, None] - self.place[others], axis=-1)
+            near = away.min(1) < NEIGHBOUR
+            velocity[unknown[near]] = self.velocity[others[away.argmin(1)[near]]]
+            reach[unknown] = np.minimum(reach[unknown] + DIFFERENCE * since[unknown], NEAR)
+        elif len(unknown) and len(points):
+            velocity[unknown] = self._common_velocity(points, unknown, since)
+        alone = unknown[~np.isfinite(velocity[unknown, 0])]
+        velocity[alone] = 0.0
+        reach[alone] = np.minimum(ERROR + FASTEST * since[alone], NEAR)
+        return velocity, reach
+
+    def _common_velocity(self, points: Array, rows: NDArray[np.int64], since: Array) -> Array:
+        """Velocity (3,) mm/s with which most of some lights are where lights are now; nan = none brings two there."""
+        passed = since[rows].max()
+        shift = (points[:, None] - self.place[rows]).reshape(-1, 3)
+        shift = shift[np.linalg.norm(shift, axis=1) < ERROR + FASTEST * passed]
+        if not len(shift) or passed <= 0:
+            return np.full(3, np.nan)
+        moved = self.place[rows] + shift[:, None]  # (T, R, 3)
+        there = np.linalg.norm(moved[:, :, None] - points, axis=-1).min(2) < ERROR
+        count = there.sum(1)
+        best = int(np.lexsort((np.linalg.norm(shift, axis=1), -count))[0])
+        return shift[best] / passed if count[best] >= 2 else np.full(3, np.nan)
 
     def mark_still(self, camera: NDArray[np.int64], uv: Array, lit: NDArray[np.bool_], time: float) -> None:
         """Follow blobs (M,) that may never move; a light that three cameras agree on (`lit`) is none of them."""

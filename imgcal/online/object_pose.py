@@ -99,7 +99,7 @@ def object_pose(
         (coupling.transpose(0, 1).flatten(1), torch.einsum("mri,mrk->ik", weighted, by_object)), dim=1
     )  # (6, D)
     follows = torch.cholesky_solve(across, factor)  # how the pose follows the rig, with the other sign
-    follows[:, : count * width] += _common_motion(belief, rig_from_object, trusted)
+    follows[:, : count * width] += common_motion(belief, rig_from_object, trusted)
     half = torch.linalg.solve_triangular(belief.factor, follows.mT, upper=False)
     covariance = torch.cholesky_inverse(factor) + half.mT @ half
     seen = np.zeros((count, len(belief.points_object)), dtype=bool)
@@ -127,7 +127,7 @@ def _jacobians(
     return torch.cat((turned, by_point), -1), by_error, by_object
 
 
-def _common_motion(belief: RigBelief, pose: RigidTransform, trusted: NDArray[np.bool_]) -> Tensor:
+def common_motion(belief: RigBelief, pose: RigidTransform, trusted: NDArray[np.bool_]) -> Tensor:
     """Motion of the pose (6, K C) that goes with errors of the rig as far as its cameras share them."""
     motion = Gauge(torch.from_numpy(trusted).double()).averaging(belief.rig).unflatten(1, (-1, EXTRINSICS))
     by_error = torch.zeros(POSE, *belief.unit.shape, dtype=torch.float64)

@@ -15,6 +15,7 @@ from imgcal.estimation import Gauge
 from imgcal.geometry import RigidTransform
 from imgcal.monitoring import RigBelief
 from imgcal.online.events import Event
+from imgcal.online.light_points import FoundLights, LightPoints, light_points
 from imgcal.online.object_pose import ObjectPose, object_pose
 from imgcal.types import CameraRig, Detections
 
@@ -60,6 +61,7 @@ class RigState:
     clock_offset_sigma: NDArray[np.float64]  # (C,) s, one standard deviation
     noise: NDArray[np.float64]  # (C,) pixels, that blobs have beyond what they say of themselves
     shake: NDArray[np.float64]  # (C,) pixels, by which all that a camera sees is shifted alike, each time otherwise
+    lights: FoundLights | None = None  # which blobs show the same light; None = an object is known, or none was found
 
     @property
     def rig(self) -> CameraRig:
@@ -73,6 +75,14 @@ class RigState:
             return None
         trusted = np.array([health not in UNTRUSTED for health in self.cameras.values()])
         return object_pose(self.belief, self.rig_from_object, self.detections, self.noise, self.shake, trusted)
+
+    @cached_property
+    def light_points(self) -> LightPoints | None:
+        """Where the lights are that were found in this snapshot; None = there are none, or an object is known."""
+        if self.lights is None:
+            return None
+        trusted = np.array([health not in UNTRUSTED for health in self.cameras.values()])
+        return light_points(self.belief, self.lights, self.noise, self.shake, trusted)
 
     @cached_property
     def gauge(self) -> Gauge:

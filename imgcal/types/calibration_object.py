@@ -179,10 +179,13 @@ class CalibrationObject:
             use: what the object is for, in words.
 
         Raises:
-            InputError: its fiducials lie on one line, or there is only one.
+            InputError: its fiducials lie on one line, there is only one, or nothing is known of them.
         """
         if self.parts:
             raise InputError(f"objects: found {len(self.parts)}, expected a single one {use}")
+        if self.unknown_markers:
+            found = "found markers of which nothing is known, expected the file of an object"
+            raise InputError(f"object {self.name}: {found} {use}")
         if self.pose_rank < 6:
             found = "one fiducial" if len(self.points) == 1 else f"{len(self.points)} fiducials on one line"
             raise InputError(f"object {self.name}: found {found}, expected some that are not on one line {use}")

@@ -13,6 +13,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from imgcal.errors import InputError
+from imgcal.io import write_bytes
+
 BLOCK = 512  # bytes
 PARAMETERS_AT = 2  # block of the parameters, counted from 1
 INTEL = 84
@@ -41,22 +44,51 @@ class C3DFile:
         Raises:
             OSError: it cannot be made.
         """
-        self.frames, self._scale = 0, max(reach, 1.0) / 32_000
-        self._points = len(labels)
-        parameters, self._counts = _parameters(labels, rate, self._scale)
-        blocks = -(-len(parameters) // BLOCK)
-        self._data_at = PARAMETERS_AT + blocks
-        self._set_in = self._counts["POINT:DATA_START"]
-        content = bytearray(BLOCK) + parameters.ljust(blocks * BLOCK, b"\0")
-        content[BLOCK : BLOCK + 4] = bytes((1, 80, blocks, INTEL))
-        struct.pack_into("<BB", content, 0, PARAMETERS_AT, 80)
-        struct.pack_into("<HHHHH", content, 2, self._points, 0, 1, 0, 0)
-        struct.pack_into("<fHHf", content, 12, -self._scale, self._data_at, 0, rate)
-        struct.pack_into("<H", content, BLOCK + self._set_in, self._data_at)
+        self.frames, self._rate, self._scale = 0, rate, max(reach, 1.0) / 32_000
+        self._path, self._points = path, len(labels)
+        content = self._begin(labels)
         flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
         self._file = os.fdopen(os.open(path, flags, 0o644), "r+b")
         self._file.write(content)
         self._file.flush()
+
+    def _begin(self, labels: Sequence[str]) -> bytes:
+        """Make what stands before the frames, and note where its counts stand."""
+        parameters, self._counts = _parameters(labels, self._rate, self._scale, self.frames)
+        blocks = -(-len(parameters) // BLOCK)
+        self._data_at = PARAMETERS_AT + blocks
+        content = bytearray(BLOCK) + parameters.ljust(blocks * BLOCK, b"\0")
+        content[BLOCK : BLOCK + 4] = bytes((1, 80, blocks, INTEL))
+        struct.pack_into("<BB", content, 0, PARAMETERS_AT, 80)
+        struct.pack_into("<HHHHH", content, 2, len(labels), 0, 1, self.frames, 0)
+        struct.pack_into("<fHHf", content, 12, -self._scale, self._data_at, 0, self._rate)
+        struct.pack_into("<H", content, BLOCK + self._counts["POINT:DATA_START"], self._data_at)
+        return bytes(content)
+
+    def widen(self, labels: Sequence[str]) -> None:
+        """Make room for more points, which are missing in all frames until now, in one step.
+
+        Args:
+            labels: of the points that there are, and of further ones.
+
+        Raises:
+            InputError: the file cannot be written anew; it is as it was.
+        """
+        self._file.seek((self._data_at - 1) * BLOCK)
+        given = self._file.read(self.frames * self._points * 16)
+        rows = np.zeros((self.frames, len(labels), 4), "<f4")
+        rows[..., 3] = INVALID
+        rows[:, : self._points] = np.frombuffer(given, "<f4").reshape(self.frames, self._points, 4)
+        counts, data_at = self._counts, self._data_at
+        self._file.close()
+        try:
+            write_bytes(self._path, self._begin(labels) + rows.tobytes())
+            self._points = len(labels)
+        except InputError:
+            self._counts, self._data_at = counts, data_at
+            raise
+        finally:
+            self._file = open(self._path, "r+b")  # noqa: SIM115  # open until close
 
     def append(self, points: NDArray[np.float64], error: NDArray[np.float64], cameras: NDArray[np.int64]) -> None:
         """Add frames.
@@ -95,7 +127,7 @@ class C3DFile:
             self._file.close()
 
 
-def _parameters(labels: Sequence[str], rate: float, scale: float) -> tuple[bytes, dict[str, int]]:
+def _parameters(labels: Sequence[str], rate: float, scale: float, frames: int) -> tuple[bytes, dict[str, int]]:
     """The section of parameters, and where in it the values of each begin."""
     groups: dict[str, dict[str, tuple[int, tuple[int, ...], bytes]]] = {
         "POINT": {
@@ -103,13 +135,17 @@ def _parameters(labels: Sequence[str], rate: float, scale: float) -> tuple[bytes
             "SCALE": _real(-scale),
             "RATE": _real(rate),
             "DATA_START": _whole(0),
-            "FRAMES": _whole(0),
+            "FRAMES": _whole(frames),
             "UNITS": _text("mm"),
             **_labels("LABELS", labels),
             **_labels("DESCRIPTIONS", labels),  # some readers want them
         },
         "ANALOG": {"USED": _whole(0), "GEN_SCALE": _real(1.0), "RATE": _real(0.0)},
-        "TRIAL": {"ACTUAL_START_FIELD": _whole(1, 0), "ACTUAL_END_FIELD": _whole(0, 0), "CAMERA_RATE": _real(rate)},
+        "TRIAL": {
+            "ACTUAL_START_FIELD": _whole(1, 0),
+            "ACTUAL_END_FIELD": _whole(frames, 0),
+            "CAMERA_RATE": _real(rate),
+        },
         "MANUFACTURER": {"COMPANY": _text("imgcal"), "SOFTWARE": _text("imgcal")},
     }
     section, places, last = bytearray(4), {}, 0

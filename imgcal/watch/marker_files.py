@@ -1,4 +1,4 @@
-"""Markers in a file for biomechanics: the object's fiducials, frame by frame, in C3D or TRC."""
+"""Markers in a file for biomechanics: the object's fiducials, or lights, frame by frame, in C3D or TRC."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.errors import InputError
+from imgcal.online import LightPoints, LightTracks
 from imgcal.types import CalibrationObject, CameraRig
 from imgcal.watch.c3d_file import MASKED_CAMERAS, C3DFile
 from imgcal.watch.poses import PoseRecord
@@ -20,15 +21,20 @@ TO_FIND_RATE = 32
 NEAR_WHOLE = 5e-4  # relative: a rate that is so near a whole number is that
 WRITE_EVERY = 1.0  # s
 LONGEST_GAP = 100_000  # frames
+MOST_LIGHTS = 255
+"""Columns of lights in a file; if there are more lights, the column that was left longest ago is used again."""
 
 Frame = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]  # points (N, 3), error (N,), cameras (N,)
 
 
 class MarkerFile:
-    """Writes the fiducials of every snapshot to a new file, evenly spaced in time.
+    """Writes the fiducials, or the lights, of every snapshot to a new file, evenly spaced in time.
 
     Both formats have one rate for the whole file. It is the usual rate of the first snapshots; what is missing
     in between becomes frames without any marker. A marker that no camera saw is missing in its frame.
+
+    Lights (`imgcal.load_object("lights")`) are called L1, L2, ... in the order in which they appear. One that is hidden
+    for less than half a second keeps its column; later, it comes back as another one.
     """
 
     def __init__(self, path: Path, rig: CameraRig, obj: CalibrationObject) -> None:
@@ -42,10 +48,12 @@ class MarkerFile:
         if not path.parent.is_dir():
             raise InputError(f"{path}: cannot be written: no folder {path.parent}")
         self._path, self._labels = path, marker_labels(obj)
+        self._tracks = LightTracks.of(MOST_LIGHTS, rig.num_cameras) if obj.unknown_markers else None
         centres = rig.cam_from_rig.inverse().translation
         self._reach = 2 * float(centres.abs().max()) + 1000.0
         self._first: list[tuple[float, Frame]] = []  # snapshots before the rate is known, with their times
         self._file: C3DFile | TRCFile | None = None
+        self._width = 0  # columns that the file has
         self._rate, self._latest, self._written = 0.0, 0.0, time.monotonic()
         self._waiting: list[Frame] = []
 
@@ -78,6 +86,7 @@ class MarkerFile:
             self._file = C3DFile(self._path, self._labels, self._rate, self._reach)
         else:
             self._file = TRCFile(self._path, self._labels, self._rate)
+        self._width = len(self._labels)
         self._latest = self._first[0][0] - 1.0 / self._rate
         for moment, frame in self._first:
             self._add(moment, frame)
@@ -97,28 +106,61 @@ class MarkerFile:
         waiting, self._waiting = self._waiting, []
         self._written = time.monotonic()
         if waiting and self._file is not None:
-            points, error, cameras = (np.stack(part) for part in zip(*waiting, strict=True))
+            if len(self._labels) > self._width:
+                self._file.widen(self._labels)
+                self._width = len(self._labels)
+            wide = [self._widened(frame) for frame in waiting]
+            points, error, cameras = (np.stack(part) for part in zip(*wide, strict=True))
             self._file.append(points, error, cameras)
 
     def _frame(self, record: PoseRecord) -> Frame:
-        """The fiducials that were seen."""
+        """The markers that were seen."""
+        if record.lights is not None:
+            return self._lights(record.time, record.lights)
         points, error, cameras = self._nothing()
         if record.pose is None or record.pose.seen is None:
             return points, error, cameras
         found, std = (values.numpy() for values in record.pose.points_rig())
-        seen = record.pose.seen
-        where = seen.any(0)
+        where = record.pose.seen.any(0)
         points[where], error[where] = found[where], std[where]
-        bits = 2 ** np.arange(min(len(seen), MASKED_CAMERAS))
-        return points, error, (seen[: len(bits)] * bits[:, None]).sum(0)
+        return points, error, _camera_bits(record.pose.seen)
+
+    def _lights(self, moment: float, lights: LightPoints) -> Frame:
+        """Lights in their columns; one that is the only one that there can be is in the first."""
+        if self._tracks is None:
+            column = np.arange(min(len(lights), 1))
+        else:
+            column = self._tracks.number_lights(lights.point, moment)
+            count = max(len(self._labels), int(column.max(initial=-1)) + 1)
+            self._labels = tuple(f"L{number}" for number in range(1, count + 1))
+        points, error, cameras = self._nothing()
+        rows = np.flatnonzero(column >= 0)
+        column = column[rows]
+        points[column], error[column] = lights.point[rows], lights.error[rows]
+        cameras[column] = _camera_bits(lights.seen)[rows]
+        return points, error, cameras
 
     def _nothing(self) -> Frame:
         count = len(self._labels)
         return np.full((count, 3), np.nan), np.zeros(count), np.zeros(count, dtype=np.int64)
 
+    def _widened(self, frame: Frame) -> Frame:
+        """A frame with all columns that there are by now."""
+        missing = self._width - len(frame[0])
+        filled = np.pad(frame[0], ((0, missing), (0, 0)), constant_values=np.nan)
+        return filled, np.pad(frame[1], (0, missing)), np.pad(frame[2], (0, missing))
+
+
+def _camera_bits(seen: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Which of the first cameras saw each marker, of (C, N): (N,)."""
+    bits = 2 ** np.arange(min(len(seen), MASKED_CAMERAS))
+    return np.asarray((seen[: len(bits)] * bits[:, None]).sum(0))
+
 
 def marker_labels(obj: CalibrationObject) -> tuple[str, ...]:
-    """What the fiducials are called in files of markers: by their names, else `M` and the number that tables have."""
+    """Name the markers as the object does, else `M` and the number that tables have; the first of lights `L1`."""
+    if obj.unknown_markers:
+        return ("L1",)
     return obj.fiducial_names or tuple(f"M{label}" for label in obj.labels or range(obj.num_fiducials))
 
 

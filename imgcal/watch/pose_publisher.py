@@ -5,6 +5,7 @@ from __future__ import annotations
 from imgcal.errors import InputError
 from imgcal.messages import shortened
 from imgcal.watch.poses import PoseRecord
+from imgcal.watch.zeromq import ADDRESS
 
 QUEUED = 1000  # messages kept for a subscriber that is slow
 
@@ -20,6 +21,9 @@ class PosePublisher:
         """
         import zmq  # not in the core
 
+        found = ADDRESS.fullmatch(address)
+        if found is None or int(found[1] or 0) >= 2**16:  # ZeroMQ would take the port modulo 65536
+            raise InputError(f"{shortened(address)}: expected tcp://HOST:PORT or ipc://PATH to publish at")
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.PUB)
         self._socket.setsockopt(zmq.LINGER, 0)

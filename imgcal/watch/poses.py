@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import Any, Literal, Protocol
 
 from imgcal.geometry import vector_from_rotation
-from imgcal.online import ObjectPose, RigState
+from imgcal.online import LightPoints, ObjectPose, RigState
 
 PoseStatus = Literal["ok", "degraded", "no_object"]
 MOST_WAITING = 128
@@ -40,12 +40,16 @@ class PoseRecord:
     status: PoseStatus
     message: str  # why there is no pose; otherwise the state of the rig in a sentence
     not_ok: int = 0  # cameras that are not calibrated
+    lights: LightPoints | None = None  # where no object is known, and lights were found
 
     @classmethod
     def of(cls, state: RigState) -> PoseRecord:
         """Take it out of what is known after a snapshot."""
-        pose = state.object_pose
+        pose, lights = state.object_pose, state.light_points
         not_ok = sum(health != "ok" for health in state.cameras.values())
+        if lights is not None and len(lights):
+            status: PoseStatus = "degraded" if not_ok else "ok"
+            return cls(state.time, state.snapshot, None, status, state.sentence, not_ok, lights)
         if pose is None:
             why = state.refused or "the object is not seen well enough"
             return cls(state.time, state.snapshot, None, "no_object", why, not_ok)

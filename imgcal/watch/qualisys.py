@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import math
 import re
 import select
 import socket
@@ -38,7 +39,10 @@ MARKER = np.dtype([("x", "<i4"), ("y", "<i4"), ("width", "<u2"), ("height", "<u2
 UNITS = 64  # of a pixel, where the image is a part of the sensor
 LEAST_UNITS = 8.0  # and where it is all of it
 BEFORE_NOW = 5.0
-"""Seconds that time stamps may be from what the clock says after a new connection; more, and they began anew."""
+"""Seconds that time stamps may be from what the clock says after a new connection, or leap ahead of it; more, and they
+began anew."""
+LEAST_STEP = 0.006
+"""Seconds between the last frame and one whose time stamps begin anew: they are no single snapshot."""
 
 
 class _Lost(Exception):
@@ -56,20 +60,28 @@ class _Camera:
 
 @dataclass
 class _Clock:
-    """Seconds since 1970 of time stamps that begin anywhere."""
+    """Seconds since 1970 of time stamps that begin anywhere, and begin anew with each measurement.
+
+    A time stamp goes on from the last one unless it is earlier, or leaps ahead of the clock. A first one is now, and
+    always later than all before.
+    """
 
     now: Callable[[], float]
     began: float | None = None  # s, of a time stamp of zero
     fresh: bool = True  # the connection is new
+    last: float = -math.inf  # s, what was given last
+    heard: float = 0.0  # s, when that was by the clock
 
     def seconds(self, stamp: int) -> float:
-        """Of a time stamp in microseconds; the first one is now."""
-        passed = stamp * 1e-6
-        if self.fresh and (self.began is None or abs(self.began + passed - self.now()) > BEFORE_NOW):
-            self.began = self.now() - passed
-        self.fresh = False
-        assert self.began is not None
-        return self.began + passed
+        """Of a time stamp in microseconds."""
+        passed, now = stamp * 1e-6, self.now()
+        time = math.nan if self.began is None else self.began + passed
+        goes_on = time >= self.last and (time - self.last) - (now - self.heard) <= BEFORE_NOW
+        if not goes_on or (self.fresh and abs(time - now) > BEFORE_NOW):
+            time = max(now, self.last + LEAST_STEP)
+            self.began = time - passed
+        self.fresh, self.last, self.heard = False, time, now
+        return time
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from imgcal.errors import InputError
+from imgcal.io import write_text
+
+HEADER_LINES = 6
 WIDTH = 10  # characters of the number of frames, which is written again and again
 
 
@@ -29,22 +33,48 @@ class TRCFile:
         Raises:
             OSError: it cannot be made.
         """
-        self.frames, self._rate = 0, rate
-        names = [label.replace("\t", " ") for label in labels]
-        head = (
-            f"PathFileType\t4\t(X/Y/Z)\t{path.name}\n"
-            "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames\n"
-        )
-        first = f"{rate:.6f}\t{rate:.6f}\t"
-        second = f"\t{len(names)}\tmm\t{rate:.6f}\t1\t"
-        self._counts = (len((head + first).encode()), len((head + first + " " * WIDTH + second).encode()))
-        axes = "\t".join(f"X{n}\tY{n}\tZ{n}" for n in range(1, len(names) + 1))
-        text = f"{head}{first}{self._count}{second}{self._count}\nFrame#\tTime\t"
-        text += "\t\t\t".join(names) + f"\t\t\n\t\t{axes}\n\n"
+        self.frames, self._rate, self._path, self._points = 0, rate, path, len(labels)
+        text = self._begin(labels)
         flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
         self._file = os.fdopen(os.open(path, flags, 0o644), "r+b")
         self._file.write(text.encode())
         self._file.flush()
+
+    def _begin(self, labels: Sequence[str]) -> str:
+        """Make the lines before the frames, and note where their counts stand."""
+        names = [label.replace("\t", " ") for label in labels]
+        head = (
+            f"PathFileType\t4\t(X/Y/Z)\t{self._path.name}\n"
+            "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames\n"
+        )
+        first = f"{self._rate:.6f}\t{self._rate:.6f}\t"
+        second = f"\t{len(names)}\tmm\t{self._rate:.6f}\t1\t"
+        self._counts = (len((head + first).encode()), len((head + first + " " * WIDTH + second).encode()))
+        axes = "\t".join(f"X{n}\tY{n}\tZ{n}" for n in range(1, len(names) + 1))
+        text = f"{head}{first}{self._count}{second}{self._count}\nFrame#\tTime\t"
+        return text + "\t\t\t".join(names) + f"\t\t\n\t\t{axes}\n\n"
+
+    def widen(self, labels: Sequence[str]) -> None:
+        """Make room for more points, which are missing in all frames until now, in one step.
+
+        Args:
+            labels: of the points that there are, and of further ones.
+
+        Raises:
+            InputError: the file cannot be written anew; it is as it was.
+        """
+        self._file.seek(0)
+        rows = self._file.read().decode().split("\n")[HEADER_LINES:-1]
+        counts, empty = self._counts, "\t" * 3 * (len(labels) - self._points)
+        self._file.close()
+        try:
+            write_text(self._path, self._begin(labels) + "".join(f"{row}{empty}\n" for row in rows))
+            self._points = len(labels)
+        except InputError:
+            self._counts = counts
+            raise
+        finally:
+            self._file = open(self._path, "r+b")  # noqa: SIM115  # open until close
 
     @property
     def _count(self) -> str:

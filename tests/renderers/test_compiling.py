@@ -208,3 +208,11 @@ def test_one_process_at_a_time_saves(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     assert thrice(1.5) == 4.5
     assert len(held) == 1
+
+
+def test_without_compilation_everything_can_be_imported():
+    """NUMBA_DISABLE_JIT=1, as coverage and debuggers set it; compiled functions that are called say so."""
+    code = "import imgcal, imgcal.online, imgcal.watch, imgcal.cli.main; print(imgcal.load_rig('T4').num_cameras)"
+    environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert done.stdout.strip() == "4", done.stderr[-500:]

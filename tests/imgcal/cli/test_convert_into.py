@@ -94,3 +94,13 @@ def test_a_calibration_that_holds_the_distortion_goes_back_where_another_is_refu
     for more in (["--into", original, "--out", tmp_path / "x.xcp"], ["--to", "kalibr", "--out", tmp_path / "x.yaml"]):
         code, _, err = run(capsys, held, "--hold-distortion", *more)
         assert code == 2 and "--hold-distortion: only for a rig file of ours" in err
+
+
+def test_into_without_a_file_or_into_a_rig_file_of_ours_is_told(tmp_path, capsys):
+    rig = tmp_path / "rig.yaml"
+    save_rig(load_rig("T4"), rig)
+    assert main(["convert", str(rig), "--into", "--out", str(tmp_path / "new")]) == 2
+    assert "--into: found no value, expected one or more" in capsys.readouterr().err
+    assert main(["convert", str(rig), "--into", str(rig), "--out", str(tmp_path / "new.yaml")]) == 2
+    said = f"imgcal: {rig}: found a rig file of imgcal, expected the calibration of another tool\n"
+    assert capsys.readouterr().err == said and not (tmp_path / "new.yaml").exists()

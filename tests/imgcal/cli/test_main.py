@@ -162,3 +162,10 @@ def test_a_mistyped_command_line_is_answered_briefly(arguments, expected, capsys
 )
 def test_an_object_may_be_several(arguments, objects):
     assert module.parse(arguments.split()).object == objects
+
+
+@pytest.mark.parametrize("option", ["--poses", "--topic"])
+def test_an_option_without_its_value_is_told(option, tmp_path, capsys):
+    given = ["watch", "blobs.csv", "--rig", "T4", "--object", "cube8", "--out", str(tmp_path / "out"), option]
+    assert main(given) == 2
+    assert capsys.readouterr().err == f"imgcal: {option}: found no value, expected one or more\n"

@@ -15,13 +15,16 @@ import torch
 from imgcal.cli.main import main
 from imgcal.cli.watch import metrics_address
 from imgcal.errors import InputError
+from imgcal.geometry import RigidTransform
 from imgcal.io import load_object, load_rig, save_detections, save_object, save_rig
 from imgcal.io.frames import write_frame
 from imgcal.online import RigKeeper
+from imgcal.synthesis import Truth, simulate_volume, true_detections
 from imgcal.types.observations import Detections
 from imgcal.types.rig import CameraRig, DriftRate, RigPrior
 from imgcal.watch import Progress
 from tests.imgcal.streams import Stream
+from tests.imgcal.watch.test_marker_files import points_of
 
 SNAPSHOTS, BUMPED_AT = 60, 30
 
@@ -363,6 +366,125 @@ def test_poses_of_a_recording_go_into_files(blobs, tmp_path, capsys):
     assert [entry["time"] for entry in found] == [number / 60 for number in range(5)] == [float(r[0]) for r in rows[1:]]
     assert {entry["status"] for entry in found} == {"ok"} and "not written" not in capsys.readouterr().out
     more = ("--rate", "60", "--fresh", "--poses")
-    for name, said in (("x.txt", "expected a name that ends in"), ("ftp://x", "--poses: found 'ftp://x'")):
+    for name, said in (("x.txt", "--poses: found 'x.txt', expected FILE.csv"), ("ftp://x", "--poses: found 'ftp://x'")):
         assert watch(tmp_path / "blobs.csv", tmp_path / "out", *more, name) == 2
         assert said in capsys.readouterr().err
+
+
+def light_blobs(snapshots):
+    """Four markers that move evenly through a room of ten cameras, blobs without labels; where they are (S, 4, 3)."""
+    rig, wand = load_rig("room10"), load_object("wand4")
+    start = simulate_volume(rig, wand, 1, torch.Generator().manual_seed(4), None)
+    steps = torch.arange(snapshots)[:, None] * torch.tensor([8.0, 5.0, -3.0]).double()
+    poses = RigidTransform(
+        start.rig_from_object.rotation.expand(snapshots, 3, 3), start.rig_from_object.translation + steps
+    )
+    points = poses.apply(wand.points)
+    image = rig.to(torch.float64).expand(snapshots).project(points)
+    truth = true_detections(Truth(rig, poses, image.uv, image.visible))
+    noise = 0.05 * np.random.default_rng(0).normal(size=truth.uv.shape)
+    return replace(truth, uv=truth.uv + noise, sigma=np.full(len(truth), 0.05)), points.numpy()
+
+
+@pytest.mark.parametrize("suffix", [".c3d", ".trc"])
+def test_lights_become_points_in_a_file(tmp_path, capsys, suffix):
+    """The third is hidden for three snapshots, the second for a second, the last one comes later."""
+    blobs, truth = light_blobs(120)
+    second, third = (blobs.snapshot >= 20) & (blobs.snapshot < 80), (blobs.snapshot >= 40) & (blobs.snapshot < 43)
+    gone = (
+        (blobs.fiducial == 1) & second | (blobs.fiducial == 2) & third | (blobs.fiducial == 3) & (blobs.snapshot < 60)
+    )
+    kept = blobs.select(~gone)
+    save_detections(replace(kept, fiducial=np.full(len(kept), -1)), tmp_path / "lights.csv")
+    path, prior = tmp_path / f"trial{suffix}", RigPrior(2e-4, 0.3, 1e-4, 1e-4, 0.3)
+    save_rig(replace(load_rig("room10"), prior=prior), tmp_path / "rig.yaml")  # as good as calibrated
+    given = (
+        str(tmp_path / "lights.csv"),
+        "--rig",
+        str(tmp_path / "rig.yaml"),
+        "--object",
+        "lights",
+        "--out",
+        str(tmp_path / "out"),
+    )
+    assert main(["watch", *given, "--rate", "60", "--poses", str(path)]) == 0
+    assert "not written" not in capsys.readouterr().out
+    rate, points = points_of(path)
+    assert rate == 60.0 and points.shape == (120, 5, 3)
+    there = np.full((120, 5, 3), np.nan)
+    order = np.linalg.norm(points[0, :3, None] - truth[0, :3], axis=-1).argmin(1)  # which light has which column
+    for column, light in enumerate(order):
+        there[:, column] = truth[:, light]
+    column = {light: column for column, light in enumerate(order)}
+    there[20:, column[1]], there[40:43, column[2]] = np.nan, np.nan
+    there[60:, 3], there[80:, 4] = truth[60:, 3], truth[80:, 1]  # back after a second: another light
+    assert (np.isnan(points) == np.isnan(there)).all()
+    seen = ~np.isnan(there)
+    assert np.sqrt(np.square(points[seen] - there[seen]).mean()) < 0.3
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["poses.csv"], "--poses: found 'poses.csv' with lights, which has no pose, expected FILE.c3d or FILE.trc"),
+        (["igtl://0"], "--poses: found 'igtl://0' with lights, which has no pose"),
+        (["a.c3d", "a.c3d"], "--poses: found a.c3d twice"),
+        (["a.c4d"], "--poses: found 'a.c4d', expected FILE.csv"),
+        (["nowhere/a.c3d"], "--poses: nowhere/a.c3d: found no folder nowhere"),
+        (["folder.c3d"], "--poses: folder.c3d: found a folder, expected a file"),
+        (["old.c3d"], "old.c3d: exists, expected a new file"),
+    ],
+)
+def test_what_lights_cannot_be_written_to_is_one_line_and_leaves_nothing(tmp_path, capsys, monkeypatch, given, said):
+    monkeypatch.chdir(tmp_path)
+    blobs, _ = light_blobs(2)
+    save_detections(blobs, "lights.csv")
+    Path("folder.c3d").mkdir()
+    Path("old.c3d").write_text("somebody's")
+    before = sorted(Path().iterdir())
+    command = ["watch", "lights.csv", "--rig", "room10", "--object", "lights", "--out", "out", "--poses", *given]
+    assert main(command) == 2
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1
+    assert sorted(Path().iterdir()) == before and Path("old.c3d").read_text() == "somebody's"
+
+
+def test_a_wrong_output_beside_a_right_one_leaves_nothing(blobs, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    save_detections(blobs.of_snapshots(0, 2), "blobs.csv")
+    assert watch("blobs.csv", "out", "--poses", "a.csv", "nowhere/b.csv") == 2
+    assert "found no folder nowhere" in capsys.readouterr().err and [p.name for p in Path().iterdir()] == ["blobs.csv"]
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("tcp://", "tcp://: expected tcp://HOST:PORT"),
+        ("tcp://127.0.0.1:99999", "tcp://127.0.0.1:99999: expected tcp://HOST:PORT"),
+        ("ipc:///nowhere/at/all", "ipc:///nowhere/at/all"),
+        ("igtl://x:99999", "igtl://x:99999: expected igtl://[HOST:]PORT"),
+        ("table.csv", "table.csv: found 'a,b', expected a new file or the columns of poses"),
+        ("file/poses.c3d", "found no folder file"),
+    ],
+)
+def test_an_output_of_poses_that_cannot_be_is_one_line(blobs, tmp_path, capsys, monkeypatch, name, said):
+    monkeypatch.chdir(tmp_path)
+    save_detections(blobs.of_snapshots(0, 2), "blobs.csv")
+    Path("table.csv").write_text("a,b\n1,2\n")
+    Path("file").write_text("no folder")
+    before = {path.name: path.read_bytes() for path in Path().iterdir()}
+    assert watch("blobs.csv", "out", "--poses", name, "poses.csv") == 2
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1 and "internal" not in error
+    assert {path.name: path.read_bytes() for path in Path().iterdir()} == before
+
+
+def test_a_folder_that_is_not_ours_to_write_to_is_told_before_anything_is_written(blobs, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    save_detections(blobs.of_snapshots(0, 2), "blobs.csv")
+    Path("locked").mkdir()
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "locked")
+    for name in ("locked/poses.c3d", "locked/poses.csv"):
+        assert watch("blobs.csv", "out", "--poses", name) == 2
+        assert f"--poses: {name}: no permission to write to locked" in capsys.readouterr().err
+    assert not Path("out").exists() and not list(Path("locked").iterdir())

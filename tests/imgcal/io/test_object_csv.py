@@ -118,3 +118,9 @@ def test_names_that_could_not_be_read_again_are_not_written(name: str, tmp_path:
     with pytest.raises(InputError, match=r"o\.csv: not written: found the name"):
         save_object(named("p", "q", "r", name), tmp_path / "o.csv")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["light", "Lights", "ligths"])
+def test_a_slip_in_the_name_of_unknown_markers_is_told(name):
+    with pytest.raises(InputError, match=rf"^{name}: no such file, nor lights, nor .*, nearest: lights$"):
+        load_object(name)

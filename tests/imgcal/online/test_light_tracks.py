@@ -22,10 +22,37 @@ def test_a_number_is_free_again_once_its_light_is_gone() -> None:
     assert tracks.number_lights(here, 0.0).tolist() == [0]
     assert tracks.number_lights(elsewhere[:1], 0.1).tolist() == [1]  # the first may come back to where it was
     assert tracks.number_lights(here, 0.2).tolist() == [0]
-    assert tracks.number_lights(elsewhere[1:], 0.3 + LONGEST).tolist() == [0]
-    assert tracks.number_lights(elsewhere, 0.4 + LONGEST).tolist() == [1, 0]
-    assert tracks.number_lights(np.concatenate((here, elsewhere)), 0.5 + LONGEST).tolist() == [-1, 1, 0]
+    assert tracks.number_lights(elsewhere[1:], 0.3 + LONGEST).tolist() == [1]  # was left longest ago
+    assert tracks.number_lights(elsewhere, 0.4 + LONGEST).tolist() == [0, 1]
+    assert tracks.number_lights(np.concatenate((here, elsewhere)), 0.5 + LONGEST).tolist() == [-1, 0, 1]
     assert tracks.number_lights(np.empty((0, 3)), 2.0).tolist() == []
+
+
+def test_lights_that_go_together_keep_their_numbers_from_the_first_step_on() -> None:
+    """Four lights 80 mm apart, which go 60 mm a frame along their line; a fifth appears beside them, one is hidden."""
+    tracks, row = LightTracks.of(lights=16, cameras=1), np.arange(5)[:, None] * np.array([80.0, 0.0, 0.0])
+    step, order = np.array([60.0, 5.0, 0.0]), np.random.default_rng(2)
+    for frame in range(12):
+        shown = [0, 1, 2, 3] if frame < 5 else [0, 1, 2, 3, 4] if frame != 8 else [0, 1, 3, 4]
+        shown = order.permutation(shown) if frame else np.array(shown)
+        found = tracks.number_lights(row[shown] + frame * step, frame / 60)
+        assert found.tolist() == shown.tolist(), frame
+
+
+def test_numbers_that_no_light_had_come_first() -> None:
+    tracks, here = LightTracks.of(lights=3, cameras=1), np.array([[0.0, 0.0, 500.0]])
+    assert [tracks.number_lights(here, time).tolist() for time in (0.0, 2.0, 4.0, 6.0)] == [[0], [1], [2], [0]]
+
+
+def test_a_hidden_light_that_may_be_one_of_two_comes_back_as_another_one() -> None:
+    tracks = LightTracks.of(lights=8, cameras=1)
+    pair = np.array([[0.0, 0.0, 900.0], [60.0, 0.0, 900.0]])
+    for frame in range(4):
+        assert tracks.number_lights(pair, frame / 60).tolist() == [0, 1]
+    far = np.array([[2000.0, 0.0, 900.0]])
+    assert tracks.number_lights(far, 4 / 60).tolist() == [2]
+    # Three frames later either of the two may be there.
+    assert tracks.number_lights(np.concatenate((far, pair[1:] - [30.0, 0.0, 0.0])), 7 / 60).tolist() == [2, 3]
 
 
 def test_blobs_that_never_move_are_known_after_a_while() -> None:

@@ -30,7 +30,12 @@ def test_a_subscriber_gets_poses_and_one_that_never_reads_holds_up_nobody(tmp_pa
         sink.close()
 
 
-@pytest.mark.parametrize("address", ["tcp://nowhere", "tcp://256.0.0.1:1", "udp://127.0.0.1:1"])
+@pytest.mark.parametrize("address", ["tcp://nowhere", "tcp://127.0.0.1:70000", "udp://127.0.0.1:1"])
 def test_addresses_that_are_none(address):
-    with pytest.raises(InputError, match="cannot be published at"):
+    with pytest.raises(InputError, match="expected tcp://HOST:PORT or ipc://PATH"):
         PosePublisher(address)
+
+
+def test_an_address_that_cannot_be_published_at():
+    with pytest.raises(InputError, match="cannot be published at"):
+        PosePublisher("tcp://256.0.0.1:1")

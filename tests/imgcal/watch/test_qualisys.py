@@ -203,6 +203,44 @@ def test_time_stamps_become_times_that_go_on_after_a_reconnection():
     assert np.round(np.array(times[::10]) - 1.7e9, 3).tolist() == [0.0, 0.01, 2.0, 60.1]
 
 
+@pytest.mark.parametrize(
+    ("stamps", "steps", "expected"),
+    [
+        ([60.0, 60.01, 0.0, 0.01], [0.0, 0.01, 3.0, 0.01], [0.0, 0.01, 3.01, 3.02]),
+        ([2.0, 2.01, 0.0, 0.01], [0.0, 0.01, 0.5, 0.01], [0.0, 0.01, 0.51, 0.52]),
+        ([1.0, 9.0, 9.01, 17.0], [0.0, 8.0, 0.01, 0.01], [0.0, 8.0, 8.01, 8.02]),
+        ([1.0, 1.01, 1e9, 1.03, 1.04], [0.0, 0.01, 0.01, 0.01, 0.01], [0.0, 0.01, 0.02, 0.03, 0.04]),
+    ],
+    ids=["a new measurement", "a new measurement soon", "a leap ahead", "a damaged time stamp"],
+)
+@pytest.mark.parametrize("reconnects", [False, True])
+def test_time_never_goes_back_or_leaps_ahead(stamps, steps, expected, reconnects):
+    """QTM begins to count anew with each measurement, with or without a new connection."""
+    frames = [frame(n, MARKERS, stamp=round(1e6 * stamp)) for n, stamp in enumerate(stamps)]
+    cut = 2 if reconnects else len(frames)
+    streams = [part for part in (b"".join(frames[:cut]), b"".join(frames[cut:])) if part]
+    moments = iter(1.7e9 + np.cumsum(steps))
+    with Qtm(PARAMETERS, *streams) as server:
+        found = read(
+            replace(source(server), clock=lambda: next(moments)), lambda some: len(exposures(some)) == 10 * len(frames)
+        )
+    times = [item.time - 1.7e9 for item in exposures(found)[::10]]
+    assert times == pytest.approx(expected, abs=1e-3)
+
+
+def test_a_stream_that_runs_ahead_of_the_clock_goes_on_after_a_reconnection():
+    """A recording that is played at twice its speed: its times are ahead of the clock by more than is allowed."""
+    first = b"".join(frame(n, MARKERS, stamp=2_000_000 * n) for n in range(10))
+    second = b"".join(frame(n, MARKERS, stamp=2_000_000 * n) for n in range(12, 14))
+    moments = iter([*np.arange(10.0), 12.0, 13.0])
+    with Qtm(PARAMETERS, first, second) as server:
+        found = read(
+            replace(source(server), clock=lambda: 1.7e9 + next(moments)), lambda some: len(exposures(some)) == 120
+        )
+    times = np.array([item.time - 1.7e9 for item in exposures(found)[::10]])
+    assert (np.diff(times) > 5e-3).all() and times[9] == pytest.approx(18.0) and times[10] < 19.0
+
+
 @pytest.mark.parametrize("address", ["qtm://", "qtm://host:0", "qtm://host:70000", "tcp://host:1"])
 def test_addresses_that_are_none(address):
     with pytest.raises(InputError, match="expected an address qtm://HOST"):

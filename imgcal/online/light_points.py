@@ -1,0 +1,114 @@
+"""Where the lights of a snapshot are, and how surely: `LightPoints`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.estimation import pixel_jacobian, step_by_error
+from imgcal.geometry import RigidTransform, cross_matrix
+from imgcal.monitoring import RigBelief
+from imgcal.online.object_pose import common_motion
+from imgcal.types import Detections
+
+Array = NDArray[np.float64]
+
+STEPS = 3
+"""Of Gauss and Newton, from a place that is right to a pixel."""
+
+
+@dataclass(frozen=True)
+class FoundLights:
+    """Which blobs of a snapshot show the same light."""
+
+    blobs: Detections  # of the snapshot
+    light: NDArray[np.int64]  # (M,) number of the light that each of them shows, -1 = none
+    point: Array  # (L, 3) mm, about where each light is
+
+
+@dataclass(frozen=True)
+class LightPoints:
+    """Lights of one snapshot as points in the rig's frame.
+
+    Errors are against the cameras: a motion of the whole rig with all that it sees is not among them, nor is the rig's
+    scale, which no light shows.
+    """
+
+    point: Array  # (L, 3) mm
+    error: Array  # (L,) mm, RMS error that is to be expected
+    seen: NDArray[np.bool_]  # (C, L), which camera saw which light
+
+    def __len__(self) -> int:
+        return len(self.point)
+
+
+def light_points(
+    belief: RigBelief,
+    found: FoundLights,
+    noise: Array,
+    shake: Array,
+    trusted: NDArray[np.bool_],
+) -> LightPoints:
+    """Triangulate the lights of a snapshot with the rig as it is known after it.
+
+    Args:
+        belief: about the rig.
+        found: which blobs show which light.
+        noise: (C,) px that blobs have beyond what they say of themselves.
+        shake: (C,) px by which all that a camera sees is shifted alike.
+        trusted: (C,) bool, cameras whose blobs count; they also define what stands still.
+
+    Returns:
+        The lights that two of these cameras see, in the order of `found`.
+    """
+    rig, blobs, count = belief.rig, found.blobs, len(found.point)
+    if trusted.sum() < 2:
+        return LightPoints(np.empty((0, 3)), np.empty(0), np.empty((rig.num_cameras, 0), dtype=bool))
+    rows = np.flatnonzero((found.light >= 0) & trusted[blobs.camera])
+    camera, light = torch.from_numpy(blobs.camera[rows]).long(), torch.from_numpy(found.light[rows]).long()
+    seen = np.zeros((rig.num_cameras, count), dtype=bool)
+    seen[blobs.camera[rows], found.light[rows]] = True
+    variance = (
+        np.square(blobs.sigma[rows]) + np.square(noise)[blobs.camera[rows]] + np.square(shake)[blobs.camera[rows]]
+    )
+    weight, uv = torch.from_numpy(1 / variance).double(), torch.from_numpy(blobs.uv[rows]).double()
+    point = torch.from_numpy(found.point).double()
+    for _ in range(STEPS):
+        by_point, _ = _jacobians(belief, point, camera, light)
+        information = _information(by_point, weight, light, count)
+        image = rig.expand(1).project_values(point[None]).uv[0][camera, light]
+        pull = torch.einsum("mri,m,mr->mi", by_point, weight, uv - image)
+        step = torch.linalg.pinv(information) @ point.new_zeros(count, 3).index_add_(0, light, pull)[..., None]
+        point = point + step[..., 0]
+    by_point, by_error = _jacobians(belief, point, camera, light)
+    factor, failed = torch.linalg.cholesky_ex(_information(by_point, weight, light, count))
+    known = (seen.sum(0) >= 2) & (failed == 0).numpy() & factor.isfinite().all(-1).all(-1).numpy()
+    known &= point.isfinite().all(-1).numpy()
+    usable = torch.from_numpy(known)[:, None, None]
+    covariance = torch.cholesky_inverse(torch.where(usable, factor, torch.eye(3, dtype=torch.float64)))
+    coupling = torch.zeros(count, *belief.unit.shape, 3, dtype=torch.float64)
+    coupling.index_put_((light, camera), torch.einsum("mri,m,mrk->mki", by_point, weight, by_error), accumulate=True)
+    follows = torch.einsum("lij,lckj->lick", covariance, coupling).flatten(2)  # (L, 3, C K)
+    common = common_motion(belief, RigidTransform.identity(dtype=torch.float64), trusted)
+    across = (follows + common[3:] - cross_matrix(point) @ common[:3]).flatten(0, 1)
+    across = torch.cat((across, across.new_zeros(len(across), len(belief.factor) - across.shape[1])), 1)
+    half = torch.linalg.solve_triangular(belief.factor, across.mT, upper=False)
+    variance_of_point = covariance.diagonal(dim1=-2, dim2=-1).sum(-1) + half.square().sum(0).view(count, 3).sum(-1)
+    error = variance_of_point.clamp_min(0).sqrt()
+    return LightPoints(point.numpy()[known], error.numpy()[known], seen[:, known])
+
+
+def _jacobians(belief: RigBelief, point: Tensor, camera: Tensor, light: Tensor) -> tuple[Tensor, Tensor]:
+    """Derivatives of pixels by the place of their light (M, 2, 3), by errors of their camera (M, 2, K)."""
+    by_camera = pixel_jacobian(belief.rig, point)[camera, light]
+    return -by_camera[..., 3:6], by_camera @ (step_by_error(belief.rig) * belief.unit[:, None])[camera]
+
+
+def _information(by_point: Tensor, weight: Tensor, light: Tensor, count: int) -> Tensor:
+    """Inverse covariance of each light's place by its own blobs: (L, 3, 3)."""
+    parts = torch.einsum("mri,m,mrj->mij", by_point, weight, by_point)
+    return parts.new_zeros(count, 3, 3).index_add_(0, light, parts)
