@@ -199,5 +199,10 @@ class Simulated:
                     write_json(self.out, result)
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Run it from the command line."""
     command(lambda: tyro.cli(Simulated, description=__doc__).run())
+
+
+if __name__ == "__main__":
+    main()
