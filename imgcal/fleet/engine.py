@@ -215,7 +215,7 @@ def _ask(address: str) -> None:
     """Make sure that a gRPC server listens at an address: Ray would wait for one for minutes.
 
     Raises:
-        InputError: nobody does.
+        InputError: no cluster answers.
     """
     if address in ("auto", "local"):
         return
@@ -231,7 +231,7 @@ def _ask(address: str) -> None:
                 if connection.recv(4)[3:] != b"\4":
                     raise InputError(f"--address: found something that is not Ray at {address}, {expected}")
     except (OSError, OverflowError) as error:
-        raise InputError(f"--address: found nobody at {address} ({reason_of(error)}), {expected}") from error
+        raise InputError(f"--address: found no cluster at {address} ({reason_of(error)}), {expected}") from error
 
 
 def _each(items: Sequence[tuple[int, Item]], function: Callable[[Item], Result]) -> list[tuple[int, Result]]:

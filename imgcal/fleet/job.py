@@ -48,7 +48,7 @@ TRANSIENT = frozenset({"unreachable", "timed_out", "out_of_memory", "crashed"})
 """What another try may mend."""
 BLOCK = 1 << 20
 REMINDER = 5.0
-"""Seconds until somebody whose code could not be interrupted, a callback for example, is told once more."""
+"""Seconds until code that could not be interrupted, a callback for example, is interrupted again."""
 STATM = Path("/proc/self/statm")  # Linux tells there how much memory a process has
 
 
@@ -69,7 +69,7 @@ class Settings:
 
 
 class TooLongError(BaseException):
-    """The time that a capture may take is over: nobody but `processed` is to catch it."""
+    """The time limit of a capture is over. Only `processed` catches it."""
 
 
 def item_of(item: Item) -> str:
@@ -116,7 +116,7 @@ def processed(item: Item, settings: Settings, known: frozenset[str] | Any = froz
 
 
 def failed_row(item: Item, status: Status, reason: str) -> dict[str, Any]:
-    """Row of a capture whose process did not live to tell."""
+    """Row of a capture whose process died."""
     return _row_of(item) | {"status": status, "reason": reason, "seconds": 0.0, "cpu_seconds": 0.0}
 
 

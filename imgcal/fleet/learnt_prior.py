@@ -258,7 +258,7 @@ def _scored(drift: DriftInformation, model: _Model, theta: Tensor, freed: Tensor
         if bool(settled.all()):
             return theta, sigma
         theta = (theta * (1 + step).clamp(0.1, 1e3)).clamp(*BOUNDS)
-    raise RefusedError(f"fleet: the spreads did not come to rest in {STEPS} steps; found {theta.sqrt().tolist()}")
+    raise RefusedError(f"fleet: the spreads did not converge in {STEPS} steps; found {theta.sqrt().tolist()}")
 
 
 def _score_and_fisher(drift: DriftInformation, model: _Model, theta: Tensor, freed: Tensor) -> tuple[Tensor, Tensor]:

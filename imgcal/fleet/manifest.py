@@ -68,7 +68,7 @@ class Manifest:
         return max(lines - 1, 0)
 
     def check(self) -> None:
-        """Look at the first rows: what is wrong with all of them is told before anything is started.
+        """Check the first rows, so that an error common to all is reported before any work starts.
 
         Raises:
             InputError: the file cannot be read, lacks a column, or has no rows.
@@ -171,7 +171,7 @@ def _beside(url: str, path: str) -> str:
     found = Path(url).parent / path
     try:
         is_file = "/" in path or "." in path or found.exists()
-    except (OSError, ValueError):  # too long for a name, or no text: whoever opens it says so
+    except (OSError, ValueError):  # too long for a name, or no text: opening it reports the error
         is_file = True
     return str(found) if is_file else path
 

@@ -1,7 +1,7 @@
 """Work items of sweeps and campaigns: in this process, on this machine's cores or on a cluster, the same bit for bit.
 
 What comes of an item depends on the item: seeds and random numbers travel with it. It is computed by one thread
-wherever that is, and results come in the order of the items; so nobody can tell who did what.
+wherever that is, and results come in the order of the items; so the worker of an item does not matter.
 """
 
 from __future__ import annotations

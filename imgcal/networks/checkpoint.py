@@ -194,8 +194,8 @@ def _check_code(path: str | Path, spec: NetworkSpec, trusted: Collection[str]) -
     backbone = getattr(spec.network.variant(), "backbone", "")
     if is_import_path(backbone) and backbone not in trusted:
         raise InputError(
-            f"{path}: found the encoder {quoted(backbone)}, whose code would run; expected one of ours or of timm, or "
-            f"that you trust it: --trust {quoted(backbone)}, in Python load_checkpoint(..., trusted=(...,))"
+            f"{path}: found the encoder {quoted(backbone)}, whose code would run; expected one of imgcal or timm. "
+            f"If you trust it: --trust {quoted(backbone)}, in Python load_checkpoint(..., trusted=(...,))"
         )
 
 

@@ -108,7 +108,7 @@ class Images(StrictModel):
 
 
 class PooledImages(StrictModel):
-    """An image variant whose trunk is told one pooled feature an image, and no positions."""
+    """An image variant whose trunk gets one pooled feature per image and no positions."""
 
     backbone: Annotated[str, Field(max_length=200)] = "vit_tiny_patch16_224"  # any model of timm, by name
     pretrained: bool = False  # begin with published weights of timm

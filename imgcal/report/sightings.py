@@ -1,4 +1,4 @@
-"""What cameras saw that nobody can explain, and whether they stood still: sentences for the verdict."""
+"""Sentences about unexplained blobs, and about cameras that did not stand still, for the verdict."""
 
 from __future__ import annotations
 

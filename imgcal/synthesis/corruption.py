@@ -77,7 +77,7 @@ class Corrupted:
 
 
 def _hidden(uv: Tensor, seen: Tensor) -> Tensor:
-    """Take away where unseen fiducials are: nobody may learn from it."""
+    """Remove the positions of unseen fiducials, so that nothing can learn from them."""
     return torch.where(seen[..., None], uv, 0.0)
 
 
