@@ -23,7 +23,7 @@ def render_crops(
     *,
     extent: tuple[float, float] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Draw the light of crops: means over squares of the frame's pixels, and nothing else of the frame.
+    """Draw the light of crops only: means over squares of the frame's pixels.
 
     Args:
         spots: (B, N) in pixels of the frame, false ones among them; what is nearer hides what is farther.

@@ -1,4 +1,4 @@
-"""One capture of a fleet: fetched, recalibrated as `imgcal calibrate` does, and put into a row, whatever happens."""
+"""Process one capture of a fleet: fetch it, recalibrate it as `imgcal calibrate` does, and return a row in any case."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class TooLongError(BaseException):
 
 
 def item_of(item: Item) -> str:
-    """Name a row of the manifest by what it says, whatever its files hold: 32 hexadecimal digits."""
+    """Identify a row of the manifest by its cells, whatever its files hold: 32 hexadecimal digits."""
     said = json.dumps([item.capture, item.rig, item.object, item.device, item.time])
     return hashlib.blake2b(said.encode(), digest_size=16).hexdigest()
 
@@ -121,7 +121,7 @@ def failed_row(item: Item, status: Status, reason: str) -> dict[str, Any]:
 
 
 def _row_of(item: Item) -> dict[str, Any]:
-    """What a row says of its capture, whatever becomes of it."""
+    """The columns of a capture that do not depend on the outcome."""
     moment = None if item.time is None else datetime.datetime.fromtimestamp(item.time, datetime.UTC)
     return {
         "item": item_of(item), "key": "", "device": item.device, "time": moment, "capture": item.capture,
@@ -130,7 +130,7 @@ def _row_of(item: Item) -> dict[str, Any]:
 
 
 class _Unreachable(Exception):
-    """A file that could not be fetched: the network's matter, or a wrong path."""
+    """A file that could not be fetched: a network failure, or a wrong path."""
 
 
 def fetched(url: str, folder: Path) -> Path:
@@ -182,7 +182,7 @@ def _is_shipped(name: str) -> bool:
 
 
 def _stamp(url: str) -> str:
-    """Something that changes when a file does, without reading it where that can be."""
+    """A value that changes when a file does, without reading it if possible."""
     if "://" in url:
         return str(int(time.time()) // 60)  # asked for again every minute
     found = _stat(url, "a file")
@@ -190,7 +190,7 @@ def _stamp(url: str) -> str:
 
 
 def _stat(path: str, expected: str, *, folder: bool = False) -> os.stat_result:
-    """Ask for a file, or a folder: reading a device or a pipe may wait for ever.
+    """Check for a file or folder: reading a device or a pipe may block forever.
 
     Raises:
         InputError: there is none, or it is something else.

@@ -81,7 +81,7 @@ def _counted(name: str, make: Callable[[], nn.Module]) -> nn.Module:
 
 @torch.no_grad()
 def _checked_width(encoder: nn.Module, name: str, size: int) -> int:
-    """Features of an encoder's map, found by looking at one image.
+    """Number of features of an encoder's map, measured on one image.
 
     Raises:
         InputError: it takes no such image, or gives no map at a stride of 4.
@@ -105,5 +105,5 @@ def _checked_width(encoder: nn.Module, name: str, size: int) -> int:
 
 
 def _said(error: Exception) -> str:
-    """The first line of what somebody's class raised, with the name of the error."""
+    """The first line of an error raised by a foreign class, with its name."""
     return quoted(f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}")

@@ -12,7 +12,7 @@ CROWDED = 1.0
 
 
 def sightings(content: ReportContent) -> list[tuple[str, str]]:
-    """What speaks against the result, each with what helps against it."""
+    """Reasons for doubt, each with a remedy."""
     notes = [
         (
             f"During the capture {move}: only the snapshots since the last move are used.",

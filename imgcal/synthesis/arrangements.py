@@ -1,4 +1,4 @@
-"""Rigs made up: cameras in rings, domes and rows that look at a point."""
+"""Made-up rigs: cameras in rings, domes and rows that look at a point."""
 
 from __future__ import annotations
 
