@@ -190,7 +190,7 @@ def _numbers(chunk: Chunk, fiducials: int | Sequence[int] | None) -> dict[str, N
 
 
 def _rows_of(chunk: Chunk, labels: Sequence[int]) -> NDArray[np.float64]:
-    """Replace the labels of the fiducials by their rows in the object."""
+    """Replace what a table calls the fiducials by their rows in the object."""
     plausible = limits.Range(-1, 2**31 - 1, "")
     named = chunk.numbers("fiducial", plausible, "a number of the object's column `fiducial`", whole=True)
     row = {-1: -1, **{label: number for number, label in enumerate(labels)}}
