@@ -1,6 +1,6 @@
 from .clutter import Clutter, draped, sample_clutter
 from .clutter_model import NO_BLOBS, BlobRange, ClutterModel
-from .crops import CropSensor, expose_crops, render_crops
+from .crops import render_crops
 from .infrared import InfraredFrames, infrared_frames, render_blobs
 from .palette import palette
 from .reference import ellipse_reference, splat_reference
@@ -15,7 +15,6 @@ __all__ = [
     "BlobRange",
     "Clutter",
     "ClutterModel",
-    "CropSensor",
     "InfraredFrames",
     "SensorModel",
     "Smear",
@@ -24,7 +23,6 @@ __all__ = [
     "draped",
     "ellipse_reference",
     "expose",
-    "expose_crops",
     "in_crop",
     "infrared_frames",
     "is_traced",

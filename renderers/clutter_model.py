@@ -49,7 +49,7 @@ class ClutterModel:
     drape_size: tuple[float, float] = (0.05, 0.2)  # from the middle to the edges, shares of the frame's height
 
     def __post_init__(self) -> None:
-        """Refuse shares that are none."""
+        """Refuse shares outside 0 to 1."""
         low, high = self.occluded_diameter
         if not (0 <= self.occluded <= 1 and 0 <= low <= high <= 1):
             raise ValueError(f"occluded, occluded_diameter must be shares, found {self.occluded}, {low} to {high}")

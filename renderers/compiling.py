@@ -112,7 +112,7 @@ event.register("numba:compile", _RESTING)
 
 @cache
 def cache_folder() -> str:
-    """Say where compiled code is kept; empty = where numba finds a place."""
+    """The folder of compiled code; empty = numba chooses it."""
     given = numba.config.CACHE_DIR  # type: ignore[attr-defined]
     folder = Path(given) if given else _user_folder()
     try:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from operator import itemgetter
 
 import torch
@@ -15,18 +14,6 @@ LEAST_BLUR = 0.15  # px of the crop: smear is computed on two samples a pixel, w
 AT_ONCE = 2**22  # pixels of crops and blobs that are worked on together: more leave the caches, and fill the memory
 
 
-@dataclass(frozen=True)
-class CropSensor:
-    """Optics and sensor of each crop; levels and noise in grey levels of one pixel of the frame."""
-
-    background: Tensor  # (B,)
-    contrast: Tensor  # (B,) that a blob of intensity 1 adds
-    read_noise: Tensor  # (B,) standard deviation
-    gain: Tensor  # (B,) grey levels an electron: the variance of shot noise is gain times the level; 0 = none
-    slope: Tensor  # (B, 2) change of the background across the crop's width and height
-    saturation: float = 255.0  # largest grey level
-
-
 def render_crops(
     spots: Spots,
     centre: Tensor,
@@ -36,7 +23,7 @@ def render_crops(
     *,
     extent: tuple[float, float] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Draw the light of crops: means over squares of the frame's pixels, and nothing else of the frame.
+    """Draw the light of crops only: means over squares of the frame's pixels.
 
     Args:
         spots: (B, N) in pixels of the frame, false ones among them; what is nearer hides what is farther.
@@ -66,24 +53,3 @@ def render_crops(
         for i in range(0, count, step)
     ]
     return torch.cat([light for light, _ in parts]), torch.cat([seen for _, seen in parts])
-
-
-def expose_crops(light: Tensor, sensor: CropSensor, scale: float, generator: torch.Generator) -> Tensor:
-    """Turn the light of crops into grey levels; a pixel that averages s x s pixels has their noise over s.
-
-    Args:
-        light: (B, h, w) of ``render_crops``.
-        sensor: of each crop.
-        scale: Pixels of the frame a pixel of the crop.
-        generator: on the device of the light.
-    """
-    height, width = light.shape[-2:]
-    across_u, across_v = (torch.linspace(-0.5, 0.5, n, dtype=light.dtype, device=light.device) for n in (width, height))
-    ramp = sensor.slope[:, :1, None] * across_u + sensor.slope[:, 1:, None] * across_v[:, None]
-    level = sensor.background[:, None, None] + ramp + sensor.contrast[:, None, None] * light
-    level = level.clamp(0, sensor.saturation)
-    variance = level * sensor.gain[:, None, None] + sensor.read_noise[:, None, None].square() + 1 / 12
-    noise = torch.randn(level.shape, generator=generator, dtype=level.dtype, device=level.device)
-    level = level + noise * (variance.sqrt() / scale)
-    level = level.clamp(0, sensor.saturation)
-    return level.round() if scale == 1 else level

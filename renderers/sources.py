@@ -1,4 +1,4 @@
-"""What a module is made of: a digest of its source and of all modules of its package that it imports."""
+"""Digest of a module: its source, and all modules of its package that it imports."""
 
 from __future__ import annotations
 

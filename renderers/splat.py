@@ -119,7 +119,7 @@ def _add(splats: Splats, shape: tuple[int, ...], out: Tensor | None) -> Tensor:
 
 
 def _reach(size: Tensor | float) -> float:
-    """Largest size, in pixels; infinite where a graph is made, which must not depend on values of tensors."""
+    """Largest size, in pixels; infinite while tracing, since a graph must not depend on values."""
     if isinstance(size, int | float):
         return float(size)
     if torch.compiler.is_compiling():

@@ -20,7 +20,7 @@ COMMANDS = [
     if re.match(r"(imgcal|scripts/\w+|pip) ", command) and not command.startswith("imgcal: ")
 ]
 COMMANDS += re.findall(r"\| `(imgcal [^`]+)` \|", README)  # the table of jobs
-DEMO = next(command for command in COMMANDS if "data/samples/O10" in command)
+DEMO = next(command for command in COMMANDS if "sample:O10" in command)
 LONG = {
     "pip install": "a network",
     "uv pip install": "a network",
@@ -42,9 +42,8 @@ LONG = {
 
 
 @pytest.fixture
-def clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with the data of a fresh clone, to write beside."""
-    (tmp_path / "data").symlink_to(ROOT / "data")
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder: the sample is part of the package."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -55,7 +54,7 @@ def test_every_command_is_tried_here_or_known_to_take_long() -> None:
     assert not left, left
 
 
-def test_the_demo_prints_what_stands_there(clone: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_demo_prints_what_stands_there(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(shlex.split(DEMO)[1:]) == 0
     printed = [re.sub(r"[\d.]+", "#", line) for line in capsys.readouterr().out.splitlines()]
     block = next(block for block in BLOCKS if "reprojection error before" in block)
@@ -63,14 +62,14 @@ def test_the_demo_prints_what_stands_there(clone: Path, capsys: pytest.CaptureFi
     shown = shown[next(i for i, line in enumerate(shown) if line.startswith("reprojection error")) :]
     for line in shown:
         assert any(found.startswith(line.split("; #")[0]) for found in printed), line
-    files = {path.name for path in (clone / "out" / "demo").iterdir()}
+    files = {path.name for path in (folder / "out" / "demo").iterdir()}
     assert files == {"rig.yaml", "rig.posterior.safetensors", "result.json", "report.html"}
 
 
-def test_python_runs_to_its_end(clone: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_python_runs_to_its_end(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code = next(block for block in BLOCKS if "import imgcal\n" in block)
     names: dict[str, object] = {}
     exec(compile(code, "README.md", "exec"), names)
-    assert (clone / "recalibrated.yaml").is_file()
+    assert (folder / "recalibrated.yaml").is_file()
     assert "CameraRig('O10 half resolution'" in capsys.readouterr().out
     assert names["name"] == "00003"  # the running rig has seen the last snapshot

@@ -270,7 +270,7 @@ def trusted_covariance(calibration: Calibration, reference: int) -> RigCovarianc
         name = calibration.rig.parameter_names_of(camera)[parameter]
         raise RefusedError(
             f"covariance: {name} of camera {names[camera]} is known to "
-            f"{float(covariance.std[camera, parameter]):.2g} only: the blobs say next to nothing (their sigma may be "
-            "too large, or all of them at one place)"
+            f"{float(covariance.std[camera, parameter]):.2g} only: the blobs carry too little information (their "
+            "sigma is too large, or they all lie in one place)"
         )
     return covariance

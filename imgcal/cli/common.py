@@ -41,7 +41,7 @@ def open_rig(given: str) -> CameraRig:
     if rig.num_cameras == 1 and path.exists() and is_foreign(path):
         title = format_named(read_foreign_rig(path).format).title
         raise InputError(
-            f"{given}: this is a {title} of one camera: where it stands to the others is not in it; give the folder "
+            f"{given}: this is a {title} of one camera, without its place in the rig; give the folder "
             f"of all files, or make a rig of this one camera: imgcal convert {given} --out rig.yaml"
         )
     return rig
@@ -146,16 +146,6 @@ def check_folder(path: Path) -> None:
         raise InputError(f"{path}: found a file at {existing}, expected a folder to write to")
     if not os.access(existing, os.W_OK):
         raise InputError(f"{path}: no permission to write to {existing}")
-
-
-def make_folder(path: Path) -> Path:
-    """Make an output folder; a file in its place is an error."""
-    check_folder(path)
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be made: {error.strerror or error}") from error
-    return path
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""The first run of a command on a machine waits for its functions to be compiled: it says so, and has help."""
+"""Notice and speed up compilation: the first run of a command on a machine compiles its functions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NEEDED_LAST = "lm_cpu.*"  # files of the cache that show that there is nothing t
 
 @contextlib.contextmanager
 def tells_of_compiling(hint: str = HINT, helped: bool = False) -> Iterator[list[object]]:
-    """Say so on standard error when the first function is compiled.
+    """Print a notice on standard error when the first function is compiled.
 
     Args:
         hint: what to say.

@@ -56,7 +56,7 @@ class Convert(arguments.Convert):
         self._check_limit()
         self._check_held()
         if self.to == OURS:
-            raise InputError("--to: found imgcal, expected the format of what --into names")
+            raise InputError("--to: found imgcal, expected the format of the file that --into names")
         rig, _ = self._read()
         made = written_back(
             rig,
@@ -84,7 +84,7 @@ class Convert(arguments.Convert):
 
     def _check_held(self) -> None:
         if self.hold_distortion:
-            raise InputError("--hold-distortion: only for a rig file of ours (--out rig.yaml), to calibrate with")
+            raise InputError("--hold-distortion: only when writing an imgcal rig file (--out rig.yaml)")
 
     def _check_limit(self) -> None:
         if not 0 < self.fit_limit < float("inf"):
@@ -94,7 +94,7 @@ class Convert(arguments.Convert):
         to = self.to if self.to is not None else OURS if self.out.suffix in (".yaml", ".yml") else None
         if to is None:
             able = ", ".join(one.name for one in FORMATS if one.write is not None)
-            raise InputError(f"--to: not given, and {self.out.name} does not say it; expected one of imgcal, {able}")
+            raise InputError(f"--to: cannot tell the format from {self.out.name}; expected one of imgcal, {able}")
         if to != OURS:
             format_named(to)
             self._check_held()
@@ -111,7 +111,7 @@ class Convert(arguments.Convert):
         )
         if ours:
             if self.unit is not None or self.distance is not None:
-                raise InputError(f"{where}: a rig file of our own is in mm, expected neither --unit nor --distance")
+                raise InputError(f"{where}: an imgcal rig file is in mm, expected neither --unit nor --distance")
             rig = from_camera_rig(load_rig(first), load_rig_covariance(first))
             title = "imgcal rig"
         else:

@@ -114,7 +114,7 @@ def _run(paths: tuple[Path, ...], setting: Setting, baselines: bool, out: Path |
 
 
 def _suited(methods: Mapping[str, Method], rig: CameraRig) -> dict[str, Method]:
-    """Leave out, and say so, what does not know the rig's lenses."""
+    """Leave out networks that do not know the rig's lenses, and say so."""
     suited = {name: method for name, method in methods.items() if method.knows(rig)}
     if left := [name for name in methods if name not in suited]:
         lenses = ", ".join(dict.fromkeys(rig.lens_models))
@@ -123,22 +123,22 @@ def _suited(methods: Mapping[str, Method], rig: CameraRig) -> dict[str, Method]:
 
 
 def _scope(models: list[Model]) -> str:
-    """What results depend on beside rigs and conditions: the weights."""
+    """What the results depend on besides rigs and conditions: the weights."""
     return repr([(model.name, hashlib.sha256(model.path.read_bytes()).hexdigest()) for model in models])
 
 
 @contextmanager
 def _workers(setting: Setting, batches: int, kept: Kept | None, models: Sequence[Model] = ()) -> Iterator[Mapped]:
-    """Processes for what is long enough to be worth their start; on a GPU this one alone."""
+    """Worker processes, if the job is long enough to be worth starting them; on a GPU only this process."""
     cores = setting.cores
     if any(parameter.is_cuda for model in models for parameter in model.checkpoint.network.parameters()):
         if setting.address is not None or (cores or 1) > 1:
-            raise InputError("--address, --cores: found a GPU, on which one process does it all; expected --device cpu")
+            raise InputError("--address, --cores: found a GPU, which only one process uses; add --device cpu")
         yield map
         return
     if setting.address is None and cores is None and (batches < FEW or missing("ray")):
         if batches >= FEW:
-            print(f"note: on one core alone: --cores {advice('ray')}", file=sys.stderr)
+            print(f"note: running on one core: --cores {advice('ray')}", file=sys.stderr)
         cores = 1
     with workers(setting.address, cores, kept) as mapped:
         yield mapped
@@ -158,7 +158,7 @@ def _load(paths: tuple[Path, ...], setting: Setting) -> list[Model]:
 
 
 def _conditions(models: list[Model], setting: Setting) -> Conditions:
-    """What is asked for, and for the rest what the first model was trained for."""
+    """The given conditions; the rest as the first model was trained."""
     from imgcal.evaluation import Conditions
     from imgcal.synthesis import LEVELS, Corruption, PoseRange, RelativeDrift
 

@@ -42,4 +42,4 @@ class Export(arguments.Export):
             for name, said in named.items():
                 print(f"{kind:>3}: {name}: {said}")
         what = f"opset {OPSET}" if self.to == "onnx" else "the first axis may have any length"
-        print(f"{program.kind}, {what}, {len(content) / 1e6:.2f} MB, off by {off:.1e} of PyTorch's: {self.out}")
+        print(f"{program.kind}, {what}, {len(content) / 1e6:.2f} MB, differs from PyTorch by {off:.1e}: {self.out}")

@@ -69,7 +69,7 @@ class Fleet(arguments.Fleet):
             for spread in learnt.spreads:
                 camera = "" if spread.camera is None else f" of {spread.camera}"
                 print(f"{spread.kind}{camera}: spread {spread.value:.4g} +- {spread.sigma:.1g}")
-            print(f"{len(learnt.outliers)} cameras do not belong; prior {self.out / 'prior.yaml'}")
+            print(f"{len(learnt.outliers)} outlier cameras; prior {self.out / 'prior.yaml'}")
         for _, _, reason in taught:
             if reason:
                 print(f"note: no prior: {reason}", file=sys.stderr)
@@ -107,7 +107,7 @@ def _said(count: FleetCount) -> str:
 
 @contextmanager
 def _told() -> Iterator[Callable[[FleetCount], None]]:
-    """Show how far a run is: a bar on a terminal, a line a minute elsewhere."""
+    """Show the progress: a bar on a terminal, a line a minute elsewhere."""
     console = Console(file=sys.stderr)
     started = last = time.monotonic()
     if not console.is_terminal:

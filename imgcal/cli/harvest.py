@@ -61,7 +61,7 @@ class Harvest(arguments.Harvest):
                 part.save(out / name, about)
             write_text(out / CARD, self._card(rig, obj, len(detections.snapshot_names), *splits))
         said = [f"{len(part)} crops with {_seen(part)} markers" for part in splits]
-        print(f"{self.out}: {said[0]} to learn from, {said[1]} held out", file=sys.stderr)
+        print(f"{self.out}: {said[0]} for training, {said[1]} held out", file=sys.stderr)
 
     def _card(
         self, rig: CameraRig, obj: CalibrationObject, snapshots: int, train: FrameDataset, held_out: FrameDataset

@@ -1,4 +1,4 @@
-"""Ctrl-C while modules are imported: light, so that it is there before they are."""
+"""Ctrl-C during imports; this module is light, so that it is loaded first."""
 
 import contextlib
 import os

@@ -215,7 +215,7 @@ def _summary(name: str) -> Any:
 
 
 def _undrawn(box: str, first: str = "") -> str:
-    """Take the words from the box that tyro draws about a command line."""
+    """Strip the box that tyro draws around a message."""
     rows = (line.strip("│╭╮╰╯─| ") for line in box.splitlines()[1:])
     text = " ".join(row for row in rows if row.strip("-+"))
     problem, _, hint = text.partition("For full helptext, ")
@@ -238,7 +238,7 @@ def options_of(command: str) -> list[str]:
 
 
 def _in_brief(problem: str, command: str = "") -> str:
-    """Say what is wrong with a command line: the first thing, in a few words."""
+    """Describe the first problem of a command line in a few words."""
     if unknown := re.search(r"Unrecognized options: (.*?)(?: Perhaps you meant:? (.*))?$", problem):
         words, near = unknown[1].split(", "), re.search(r"--[\w.-]+", unknown[2] or "")
         options = [word for word in words if word.startswith("-")]

@@ -1,4 +1,4 @@
-"""Memory that comes and goes with every snapshot, and stays with the process."""
+"""Keep freed memory in the process, since every snapshot needs it again."""
 
 from __future__ import annotations
 

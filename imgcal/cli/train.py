@@ -54,7 +54,7 @@ class Train(arguments.Train):
 
 @contextmanager
 def _asked_to_stop() -> Iterator[Callable[[], bool]]:
-    """Turn Ctrl-C or SIGTERM into a wish that can be asked for; repeated after a while, it interrupts at once.
+    """Turn Ctrl-C or SIGTERM into a stop request; repeated after a while, it interrupts at once.
 
     After a while, because a launcher of several processes passes on the Ctrl-C that they have had already.
     """

@@ -59,22 +59,24 @@ def train_in(
         name = BAD_BATCH if error.process is None else f"{error.process}_{BAD_BATCH}"
         write_tensors(folder / name, error.batch.tensors(), "imgcal-batch/1", {"step": str(error.step - 1)})
         raise RefusedError(
-            f"{folder}: {error}; the batch is in {name}; {STATE}, if there, is from before: go on from it with "
-            "--resume after changing the experiment, or start again"
+            f"{folder}: {error}; the batch is in {name}; {STATE}, if there, is from before this step: change the "
+            "experiment and continue with --resume, or start again"
         ) from error
     except RefusedError as error:
-        raise RefusedError(f"{folder}: {error}; what is there, if anything, is from before") from error
+        raise RefusedError(
+            f"{folder}: {error}; the folder keeps what was written before this step, if anything"
+        ) from error
 
 
 class TrainingFolder(Callbacks):
-    """Writes what a training tells into a folder, and shows it on standard error."""
+    """Writes the progress of a training into a folder, and shows it on standard error."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.metrics = folder / METRICS
 
     def on_start(self, run: Run) -> None:
-        """Take the folder and open the logs; what a run would not have logged without a stop is dropped."""
+        """Take the folder and open the logs; drop rows that an uninterrupted run would not have logged."""
         with ExitStack() as stack:
             stack.enter_context(holding(self.folder))
             self._open(run)
@@ -109,7 +111,7 @@ class TrainingFolder(Callbacks):
             self._say(_summary(run))
 
     def on_step(self, run: Run, seconds: float) -> None:
-        """Move the bar; without a terminal, say a line every minute."""
+        """Move the bar; without a terminal, print a line every minute."""
         done = progress(run, seconds)
         self.bar.update(self.shown, completed=done, description=_summary(run))
         if not self.console.is_terminal and seconds - self.said >= EVERY and not finished(run, seconds):
@@ -123,7 +125,7 @@ class TrainingFolder(Callbacks):
         result.save(self.folder / RESULT)
 
     def on_end(self, run: Run) -> None:
-        """Close the logs, and say where the training stands."""
+        """Close the logs, and print the state of the training."""
         self.bar.update(self.shown, description=_summary(run))
         self.bar.stop()
         if not self.console.is_terminal:

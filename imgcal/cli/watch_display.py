@@ -25,7 +25,7 @@ LEAST_OFFSET = 5e-4  # s: smaller ones are the exposure's length
 
 
 class Display:
-    """Shows how it goes; with `rich` where somebody looks."""
+    """Shows the progress; with `rich` in a terminal."""
 
     def __init__(self, console: Console, intake: Intake, hook: Hook | None = None) -> None:
         """Prepare; nothing is shown before `of`."""

@@ -243,7 +243,7 @@ def joint_covariance(calibration: Estimate) -> Tensor:
 
     The flat one: what `camera_covariance` adds by second order is mostly that a motion of the whole rig, of which
     nothing but the prior is known, bends the parameters. That is no error, and a linear projection cannot take it out
-    again; for the rest, first order is enough (docs/benchmarks.md, "Honesty").
+    again; for the rest, first order is enough (docs/benchmarks/tables.md, "Honesty").
     """
     return camera_covariance(calibration, curved=False)
 

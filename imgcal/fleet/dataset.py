@@ -67,7 +67,7 @@ class Keys:
         return len(self.done) + len(self.new)
 
     def frozen(self) -> Keys:
-        """Copy that may travel."""
+        """Copy for other processes."""
         return Keys(np.union1d(self.done, np.fromiter(self.new, np.uint64, len(self.new))))
 
 
@@ -88,7 +88,7 @@ class Dataset:
 
     @contextlib.contextmanager
     def written(self) -> Iterator[Writer]:
-        """Add to the dataset, alone.
+        """Add to the dataset under a lock.
 
         Raises:
             InputError: the folder cannot be written, or another run is writing to it.
@@ -141,7 +141,7 @@ class Dataset:
         return keys
 
     def latest(self, columns: Sequence[str] | None = None) -> Any:
-        """Table of what is known of each row of the manifest now: where one was done again, the last result."""
+        """Table of the latest result of each row of the manifest."""
         import pyarrow as pa
 
         wanted = None if columns is None else [*dict.fromkeys(("item", *columns))]
@@ -169,7 +169,7 @@ class Writer:
     """Gathers rows and writes them, a file for each day among them."""
 
     def __init__(self, dataset: Dataset) -> None:
-        """Begin with nothing; `Dataset.written` makes one."""
+        """Start empty; `Dataset.written` makes one."""
         self.dataset = dataset
         self.written = 0
         self._rows: list[dict[str, Any]] = []

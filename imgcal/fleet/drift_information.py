@@ -1,4 +1,4 @@
-"""What one calibration after another says about drift, the prior that each was made with taken out again."""
+"""What a series of calibrations says about drift, with the prior of each removed."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def unit_of(rig: CameraRig) -> Tensor:
 
 @dataclass(frozen=True)
 class DriftInformation:
-    """What images alone say of how far devices are from their factory values: a Gaussian likelihood for each.
+    """How far devices are from their factory values by the images alone: a Gaussian likelihood for each.
 
     Directions in which they say nothing, a motion of the whole rig above all, have no information; so nothing has to
     be said about a gauge.
@@ -92,7 +92,7 @@ class DriftInformation:
 
     @classmethod
     def joined(cls, parts: Sequence[DriftInformation]) -> DriftInformation:
-        """Put devices behind one another.
+        """Concatenate devices.
 
         Raises:
             InputError: none, or of different cameras.

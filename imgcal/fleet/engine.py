@@ -1,4 +1,4 @@
-"""Work spread over the cores of this machine, or of a cluster: Ray does it, this says what and how much at a time.
+"""Distribute work over the cores of this machine or of a cluster with Ray, in batches.
 
 What is done depends on the items alone, never on who does them: seeds belong to items, and results come with them.
 """
@@ -45,7 +45,7 @@ class Done(Generic[Item, Result]):
 
 @dataclass(frozen=True)
 class Lost(Generic[Item]):
-    """An item that takes its process down, or does not end."""
+    """An item that kills its process, or does not end."""
 
     item: Item
     timed_out: bool
@@ -60,7 +60,7 @@ class _Batch(Generic[Item]):
 
 
 class Engine:
-    """A Ray cluster for the length of a block: this machine's cores, or one that runs already.
+    """A Ray cluster for the duration of a block: this machine's cores, or a running cluster.
 
     Examples:
         >>> with Engine(cores=1) as engine:  # doctest: +SKIP
@@ -69,7 +69,7 @@ class Engine:
     """
 
     def __init__(self, address: str | None = None, cores: int | None = None) -> None:
-        """Say where to run.
+        """Choose where to run.
 
         Args:
             address: of a running cluster's head; None = start processes here.
@@ -215,7 +215,7 @@ def _ask(address: str) -> None:
     """Make sure that a gRPC server listens at an address: Ray would wait for one for minutes.
 
     Raises:
-        InputError: nobody does.
+        InputError: no cluster answers.
     """
     if address in ("auto", "local"):
         return
@@ -231,7 +231,7 @@ def _ask(address: str) -> None:
                 if connection.recv(4)[3:] != b"\4":
                     raise InputError(f"--address: found something that is not Ray at {address}, {expected}")
     except (OSError, OverflowError) as error:
-        raise InputError(f"--address: found nobody at {address} ({reason_of(error)}), {expected}") from error
+        raise InputError(f"--address: found no cluster at {address} ({reason_of(error)}), {expected}") from error
 
 
 def _each(items: Sequence[tuple[int, Item]], function: Callable[[Item], Result]) -> list[tuple[int, Result]]:
@@ -244,7 +244,7 @@ def _next(source: Iterator[Sequence[Item]]) -> _Batch[Item] | None:
 
 
 def _split(batch: _Batch[Item], again: deque[_Batch[Item]], *, timed_out: bool, reason: str) -> Iterator[Lost[Item]]:
-    """Find out which item of a batch that failed it was: each goes by itself."""
+    """Find the item that made a batch fail: run each by itself."""
     if len(batch.items) > 1:
         again.extend(_Batch([item]) for item in batch.items)
     elif timed_out or batch.attempts + 1 >= ATTEMPTS:

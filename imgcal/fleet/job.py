@@ -1,4 +1,4 @@
-"""One capture of a fleet: fetched, recalibrated as `imgcal calibrate` does, and put into a row, whatever happens."""
+"""Process one capture of a fleet: fetch it, recalibrate it as `imgcal calibrate` does, and return a row in any case."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ TRANSIENT = frozenset({"unreachable", "timed_out", "out_of_memory", "crashed"})
 """What another try may mend."""
 BLOCK = 1 << 20
 REMINDER = 5.0
-"""Seconds until somebody whose code could not be interrupted, a callback for example, is told once more."""
+"""Seconds until code that could not be interrupted, a callback for example, is interrupted again."""
 STATM = Path("/proc/self/statm")  # Linux tells there how much memory a process has
 
 
@@ -69,11 +69,11 @@ class Settings:
 
 
 class TooLongError(BaseException):
-    """The time that a capture may take is over: nobody but `processed` is to catch it."""
+    """The time limit of a capture is over. Only `processed` catches it."""
 
 
 def item_of(item: Item) -> str:
-    """Name a row of the manifest by what it says, whatever its files hold: 32 hexadecimal digits."""
+    """Identify a row of the manifest by its cells, whatever its files hold: 32 hexadecimal digits."""
     said = json.dumps([item.capture, item.rig, item.object, item.device, item.time])
     return hashlib.blake2b(said.encode(), digest_size=16).hexdigest()
 
@@ -116,12 +116,12 @@ def processed(item: Item, settings: Settings, known: frozenset[str] | Any = froz
 
 
 def failed_row(item: Item, status: Status, reason: str) -> dict[str, Any]:
-    """Row of a capture whose process did not live to tell."""
+    """Row of a capture whose process died."""
     return _row_of(item) | {"status": status, "reason": reason, "seconds": 0.0, "cpu_seconds": 0.0}
 
 
 def _row_of(item: Item) -> dict[str, Any]:
-    """What a row says of its capture, whatever becomes of it."""
+    """The columns of a capture that do not depend on the outcome."""
     moment = None if item.time is None else datetime.datetime.fromtimestamp(item.time, datetime.UTC)
     return {
         "item": item_of(item), "key": "", "device": item.device, "time": moment, "capture": item.capture,
@@ -130,7 +130,7 @@ def _row_of(item: Item) -> dict[str, Any]:
 
 
 class _Unreachable(Exception):
-    """A file that could not be fetched: the network's matter, or a wrong path."""
+    """A file that could not be fetched: a network failure, or a wrong path."""
 
 
 def fetched(url: str, folder: Path) -> Path:
@@ -182,7 +182,7 @@ def _is_shipped(name: str) -> bool:
 
 
 def _stamp(url: str) -> str:
-    """Something that changes when a file does, without reading it where that can be."""
+    """A value that changes when a file does, without reading it if possible."""
     if "://" in url:
         return str(int(time.time()) // 60)  # asked for again every minute
     found = _stat(url, "a file")
@@ -190,7 +190,7 @@ def _stamp(url: str) -> str:
 
 
 def _stat(path: str, expected: str, *, folder: bool = False) -> os.stat_result:
-    """Ask for a file, or a folder: reading a device or a pipe may wait for ever.
+    """Check for a file or folder: reading a device or a pipe may block forever.
 
     Raises:
         InputError: there is none, or it is something else.

@@ -85,7 +85,7 @@ class LearntPrior:
     devices: int = 0
 
     def prior(self) -> RigPrior:
-        """What goes into a rig file; where spreads were learnt camera by camera, their mean square."""
+        """The prior for a rig file; if spreads were learned camera by camera, their mean square."""
         mean = {kind: [s.value for s in self.spreads if s.kind == kind] for kind in KINDS}
         return RigPrior(**{kind: float(np.sqrt(np.mean(np.square(values)))) for kind, values in mean.items()})
 
@@ -105,7 +105,7 @@ class _Model:
 
 @dataclass(frozen=True)
 class _Seen:
-    """How devices look from a supposed prior."""
+    """Devices as seen from a supposed prior."""
 
     place: Tensor  # (D, P) g, whose covariance is `precision` where the prior is right
     precision: Tensor  # (D, P, P) M
@@ -258,7 +258,7 @@ def _scored(drift: DriftInformation, model: _Model, theta: Tensor, freed: Tensor
         if bool(settled.all()):
             return theta, sigma
         theta = (theta * (1 + step).clamp(0.1, 1e3)).clamp(*BOUNDS)
-    raise RefusedError(f"fleet: the spreads did not come to rest in {STEPS} steps; found {theta.sqrt().tolist()}")
+    raise RefusedError(f"fleet: the spreads did not converge in {STEPS} steps; found {theta.sqrt().tolist()}")
 
 
 def _score_and_fisher(drift: DriftInformation, model: _Model, theta: Tensor, freed: Tensor) -> tuple[Tensor, Tensor]:

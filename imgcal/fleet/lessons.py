@@ -1,4 +1,4 @@
-"""What the results of a fleet teach: read from the dataset, each kind of rig by itself."""
+"""Summarize the results of a fleet, each kind of rig by itself."""
 
 from __future__ import annotations
 

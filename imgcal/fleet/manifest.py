@@ -55,7 +55,7 @@ class Manifest:
     object: str | None = None
 
     def count(self) -> int | None:
-        """Count rows where that costs next to nothing; None elsewhere."""
+        """Count rows if that is cheap; None if not."""
         import pyarrow.parquet
 
         if self.url.endswith(PARQUET):
@@ -68,7 +68,7 @@ class Manifest:
         return max(lines - 1, 0)
 
     def check(self) -> None:
-        """Look at the first rows: what is wrong with all of them is told before anything is started.
+        """Check the first rows, so that an error common to all is reported before any work starts.
 
         Raises:
             InputError: the file cannot be read, lacks a column, or has no rows.
@@ -123,7 +123,7 @@ class Manifest:
 
     @contextlib.contextmanager
     def _read(self) -> Iterator[Any]:
-        """Open the file; what Arrow has against it is an `InputError`."""
+        """Open the file; Arrow's errors become an `InputError`."""
         import pyarrow as pa
 
         with opened(self.url) as file:
@@ -171,13 +171,13 @@ def _beside(url: str, path: str) -> str:
     found = Path(url).parent / path
     try:
         is_file = "/" in path or "." in path or found.exists()
-    except (OSError, ValueError):  # too long for a name, or no text: whoever opens it says so
+    except (OSError, ValueError):  # too long for a name, or no text: opening it reports the error
         is_file = True
     return str(found) if is_file else path
 
 
 def opened(url: str) -> Any:
-    """Open a file for reading, wherever it is.
+    """Open a local or remote file for reading.
 
     Raises:
         InputError: it cannot be.
@@ -191,13 +191,13 @@ def opened(url: str) -> Any:
 
 
 def reason_of(error: BaseException) -> str:
-    """Say in a few words what went wrong."""
+    """Shorten an error to a few words."""
     text = getattr(error, "strerror", None) or str(error) or type(error).__name__
     return quoted(" ".join(str(text).split()))
 
 
 def _problem(text: str) -> str:
-    """Say in plain words what Arrow has against a table."""
+    """Put Arrow's complaint about a table into plain words."""
     for pattern, meaning in PROBLEMS:
         if match := re.search(pattern, text, re.DOTALL):
             return match.expand(meaning)

@@ -1,7 +1,7 @@
 """Work items of sweeps and campaigns: in this process, on this machine's cores or on a cluster, the same bit for bit.
 
 What comes of an item depends on the item: seeds and random numbers travel with it. It is computed by one thread
-wherever that is, and results come in the order of the items; so nobody can tell who did what.
+wherever that is, and results come in the order of the items; so the worker of an item does not matter.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Mapped(Protocol):
 
 @dataclass(frozen=True)
 class Kept:
-    """Results of items in a folder, a file each, so that work which was stopped goes on where it was.
+    """Results of items in a folder, a file each, so that stopped work can resume.
 
     An item is known by its attribute `key` or, without one, by its `repr`; results are dicts, lists, numbers, strings
     and tensors.
@@ -54,14 +54,14 @@ class Kept:
         return self.folder / f"{hashlib.blake2b(said.encode(), digest_size=16).hexdigest()}.pt"
 
     def get(self, item: Any) -> Any | None:
-        """Read what an item came to; None where it has not been done, or its file is damaged."""
+        """Read the result of an item; None if it is not done, or its file is damaged."""
         try:
             return torch.load(io.BytesIO(self.path(item).read_bytes()), weights_only=True)
         except Exception:
             return None  # it is done again
 
     def put(self, item: Any, result: Any) -> None:
-        """Keep what an item came to, in one step.
+        """Store the result of an item, in one step.
 
         Raises:
             InputError: the folder cannot be written.
@@ -75,13 +75,13 @@ class Kept:
             raise InputError(f"{self.folder}: cannot be written: {error.strerror or error}") from error
 
     def clear(self) -> None:
-        """Forget everything: the work is done, and its result lies elsewhere."""
+        """Delete everything: the work is done, and its result is stored elsewhere."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
 @lru_cache(maxsize=1)
 def _code() -> str:
-    """Digest of the package's code: a result of another state of it is none."""
+    """Digest of the package's code: results of other code are not reused."""
     digest = hashlib.blake2b(imgcal.__version__.encode(), digest_size=16)
     for path in sorted(Path(imgcal.__file__).parent.rglob("*.py")):
         digest.update(path.read_bytes())
@@ -90,7 +90,7 @@ def _code() -> str:
 
 @contextlib.contextmanager
 def workers(address: str | None = None, cores: int | None = None, kept: Kept | None = None) -> Iterator[Mapped]:
-    """Find those who do the work.
+    """Return a function that maps over items, in this process or in workers.
 
     Args:
         address: of a running Ray cluster; None = this machine.
@@ -134,7 +134,7 @@ def _here(
 
 
 def _resumed(mapped: Callable[..., Iterator[Any]], kept: Kept | None) -> Mapped:
-    """Leave out what is known, and put it back in its place."""
+    """Skip stored results, and merge them back in order."""
 
     def plainly(function: Callable[[Item], Result], items: Iterable[Item], /) -> Iterator[Result]:
         return mapped(function, items, lambda item, result: None)

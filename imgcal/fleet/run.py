@@ -79,7 +79,7 @@ def recalibrate_fleet(
 
 
 def _fresh(rows: Sequence[dict[str, Any] | None], known: Keys) -> Iterator[dict[str, Any]]:
-    """Rows that are not there yet; the same capture twice in a manifest is done once."""
+    """Rows without a result; a capture that occurs twice in a manifest is processed once."""
     for row in rows:
         if row is not None and row["key"] not in known:
             known.add([row["key"]])

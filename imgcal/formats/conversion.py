@@ -26,7 +26,7 @@ NATIVE = Holds(tuple(len(LENS_MODELS[name].coefficients) for name in (BROWN, RAT
 
 @dataclass(frozen=True)
 class Held:
-    """A rig whose lenses are such as a target can say."""
+    """A rig whose lenses a target format can express."""
 
     rig: ForeignRig
     fits: tuple[Fit, ...]  # one a camera

@@ -61,7 +61,7 @@ class ForeignCamera:
 
 
 def unplaced_camera(name: str, lens: Lens, image_size: tuple[int, int] | None) -> ForeignCamera:
-    """Make a camera of which nobody knows where it is: at the origin."""
+    """Make a camera with an unknown pose: at the origin."""
     return ForeignCamera(name, lens, image_size, np.eye(3), np.zeros(3))
 
 

@@ -59,9 +59,9 @@ class TextFile:
         try:
             self.root = locate(self.text, self.kind)
         except ValueError as error:
-            raise FormatError(f"{self.name}: where its values stand cannot be told: {error}") from error
+            raise FormatError(f"{self.name}: cannot find its values: {error}") from error
         if self.mark + self.text.encode(self.encoding) != content:
-            raise FormatError(f"{self.name}: its text cannot be encoded again as it was")
+            raise FormatError(f"{self.name}: its text does not survive decoding and encoding")
 
     def patched(self, changes: Sequence[Change], digits: int) -> bytes:
         """The file with other numbers, each in the form of the one in its place.
@@ -187,8 +187,10 @@ def like(token: str, value: float, style: Style | None = None, digits: int = 0) 
         digits: significant digits that there are to be at least.
 
     Examples:
-        >>> like("-0.046183", 0.0512345678), like("1.20E-08", -3.14159e-9), like("0", 0.25, Style(usual="1.125"))
-        ('0.051235', '-3.14E-09', '0.250')
+        >>> like("-0.046183", 0.0512345678), like("1.20E-08", -3.14159e-9)
+        ('0.051235', '-3.14E-09')
+        >>> like("0", 0.25, Style(usual="1.125"))
+        '0.250'
     """
     style = style or Style()
     _, _, point, decimals, e, *_ = _parts(token)

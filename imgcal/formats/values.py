@@ -57,7 +57,7 @@ def array(value: Any, shape: tuple[int, ...], what: str) -> Array:
 
 
 def coefficients(value: Any, what: str, counts: Sequence[int] = (0, 4, 5, 8, 12, 14)) -> tuple[float, ...]:
-    """Read distortion coefficients, of which there may be so many."""
+    """Read distortion coefficients, and check how many there are."""
     found = numbers(value, what) if value is not None else []
     if len(found) not in counts:
         wanted = ", ".join(map(str, counts))

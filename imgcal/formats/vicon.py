@@ -2,7 +2,7 @@
 
 Checked on a real calibration: the quaternion is that of OpenCV's axes (x right, y down, z forward), and a shift of the
 principal point of 0 fits best. Which axis is up differs from file to file. The distortion takes a point of the image
-to where a pinhole would have put it, with k in powers of pixels: whoever takes its numbers for OpenCV's has none.
+to where a pinhole would have put it, with k in powers of pixels: its numbers are not OpenCV's.
 Another lens model takes its place by a fit.
 """
 

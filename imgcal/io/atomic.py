@@ -39,7 +39,7 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
     finally:
-        with contextlib.suppress(OSError):  # what went wrong is told already
+        with contextlib.suppress(OSError):  # the first error is reported already
             temporary.unlink(missing_ok=True)
 
 

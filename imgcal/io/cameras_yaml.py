@@ -1,4 +1,4 @@
-"""Cameras of which nobody knows where they are: YAML, `format: imgcal-cameras/1`."""
+"""Cameras at unknown positions: YAML, `format: imgcal-cameras/1`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ CENTRE_SPREAD = 0.02
 """Principal point, one standard deviation in parts of the longer side of the image."""
 DISTORTION_SPREAD = 0.1
 ANYWHERE = (1.0, 1e6)
-"""Spread of rotations, rad, and of positions, mm, of which nothing is known."""
+"""Spread of unknown rotations, rad, and of unknown positions, mm."""
 
 Degrees = Annotated[float, Field(gt=0, lt=180, allow_inf_nan=False)]
 
@@ -67,7 +67,7 @@ class _CamerasFile(StrictModel):
 
 
 def load_cameras(path: str | Path) -> CameraRig:
-    """Read cameras of which only images and a rough focal length are known.
+    """Read cameras with known image sizes and rough focal lengths.
 
     Args:
         path: a YAML file of the format imgcal-cameras/1, or of a rig, whose places and prior are not looked at.
@@ -105,7 +105,7 @@ def load_cameras(path: str | Path) -> CameraRig:
 
 
 def unplaced(rig: CameraRig, focal_spread: float = FOCAL_SPREAD) -> CameraRig:
-    """Forget where the cameras of a rig are, and how well anything of it is known.
+    """Forget the poses of a rig's cameras, and its uncertainty.
 
     Args:
         rig: without batch axes; its lenses are kept as a start.
@@ -150,6 +150,6 @@ def save_cameras(image_size: Mapping[str, tuple[int, int]], field_of_view_deg: f
 
 
 def _starts_with(path: Path, file_format: str) -> bool:
-    """Tell whether a file calls itself one of a format; all else is for its reader to say."""
+    """Tell whether a file names a format; its reader checks the rest."""
     with path.open("rb") as file:
         return any(line.split() == [b"format:", file_format.encode()] for line in file.read(4096).splitlines())

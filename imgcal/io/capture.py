@@ -149,7 +149,7 @@ def open_capture(folder: str | Path, rig: CameraRig | None = None, videos_differ
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder, expected a capture that holds frames/<camera name>/")
     if not frames.is_dir() and is_unfinished(folder):
-        raise InputError(f"{folder}: found a capture that was not finished, expected one whose making came to its end")
+        raise InputError(f"{folder}: found a capture that was not finished, expected a complete one")
     if not frames.is_dir():
         found = listed(path.name for path in _listing(folder)) or "an empty folder"
         raise InputError(f"{folder}: found {found}, expected a capture that holds frames/<camera name>/")
@@ -188,7 +188,7 @@ def open_input(
     fiducials: Fiducials | None = None,
     videos_differ: bool = False,
 ) -> Capture | Detections:
-    """Open what a user gives to a command: a capture folder, a detections file, or a sample by its name (`sample:O10`).
+    """Open the input of a command: a capture folder, a detections file, or a sample by its name (`sample:O10`).
 
     Arguments as for `open_capture` and `load_detections`.
     """
@@ -258,7 +258,7 @@ def check_times(videos: Sequence[Video], snapshot: str) -> None:
 
 
 def _check_counts(frames: Path, files: Mapping[str, Mapping[str, tuple[Path, int]]]) -> None:
-    """Compare the lengths of the files that hold several snapshots: one frame less, and all after it are of others."""
+    """Compare the lengths of files with several snapshots: a missing frame would shift all later ones."""
     counts: dict[Path, int] = {}
     for found in files.values():
         path, _ = next(iter(found.values()), (frames, 0))

@@ -190,7 +190,7 @@ class Video:
 
 
 def grey_frame(image: NDArray[Any], where: str, tolerance: float = LOSSY_TOLERANCE) -> Frame:
-    """Take the one channel that a grey image has; what is in true colours is none.
+    """Take the one channel of a grey image; an image in true colours is rejected.
 
     Args:
         image: (H, W), (H, W, 1), (H, W, 3) or, where it is opaque, (H, W, 4); uint8 or uint16.
@@ -229,7 +229,7 @@ def _grey(image: Any, path: Path) -> Frame:
 
 
 def _content(path: Path) -> bytes:
-    """Read an image file of the kind that its name says."""
+    """Read an image file of the kind that its suffix names."""
     check_regular(path)
     if path.stat().st_size > LARGEST_IMAGE_FILE:
         raise InputError(f"{path}: found {path.stat().st_size:,} bytes, expected at most {LARGEST_IMAGE_FILE:,}")
@@ -253,7 +253,7 @@ def _require_size(path: Path, found: Size | None, expected: Size | None) -> None
 
 
 def _necessary_chunks(path: Path, content: bytes) -> bytes:
-    """Walk the chunks of a PNG: some decoders fill the missing part of a truncated one and say nothing.
+    """Walk the chunks of a PNG: some decoders silently fill the missing part of a truncated one.
 
     Returns:
         The PNG without the chunks that are not needed for its pixels: remarks, profiles, animations.

@@ -1,4 +1,4 @@
-"""What the header of an image file says, read before anything is decoded: its kind, and how large it is.
+"""Headers of image files, read before decoding: kind and size.
 
 A decoder asks for memory as the header says, and takes a file for what its first bytes say, whatever its name.
 """
@@ -70,7 +70,7 @@ def check_pixels(path: Path, size: Size, samples: int = 1) -> None:
 
 
 def tiff_pages(path: Path) -> tuple[Size, ...]:
-    """Walk the directories of a TIFF or BigTIFF: OpenCV counts only the pages before a truncation and says nothing.
+    """Walk the directories of a TIFF or BigTIFF: OpenCV silently counts only the pages before a truncation.
 
     Returns:
         Size of every page, (0, 0) where a page has none.

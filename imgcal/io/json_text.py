@@ -1,4 +1,4 @@
-"""JSON inside of other files: never deeper than an honest writer nests it."""
+"""JSON inside other files, with a limit on its depth."""
 
 from __future__ import annotations
 

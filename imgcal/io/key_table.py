@@ -19,7 +19,7 @@ from imgcal.messages import shortened
 # What a schema says of a type, and the words for it.
 NAMES = {"integer": "integer", "number": "number", "string": "text", "boolean": "true or false", "null": "null"}
 BOUNDS = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"}
-FAR = 1e6  # bounds as large as this keep out nonsense: nobody needs to read them
+FAR = 1e6  # larger bounds only reject nonsense: leave them out of the table
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What a training run has logged: metrics.jsonl, one row of plain values a line."""
+"""The log of a training run: metrics.jsonl, one row of plain values a line."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from imgcal.io.json_text import read_json
 
 
 def read_metrics(path: str | Path) -> list[dict[str, Any]]:
-    """Read metrics.jsonl up to the first line that is none, as one that a kill cut off; no file is no metrics."""
+    """Read metrics.jsonl up to the first incomplete line, as a killed process leaves one; no file gives no metrics."""
     path = Path(path)
     rows: list[dict[str, Any]] = []
     for line in path.read_text(errors="replace").splitlines() if path.is_file() else []:

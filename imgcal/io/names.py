@@ -23,7 +23,7 @@ def natural_key(name: str) -> tuple[list[str | int], str]:
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Say which known name was probably meant: `, nearest: cam01`, or nothing when none is near."""
+    """Name the known name that was probably meant: `, nearest: cam01`, or nothing if none is near."""
     names = {candidate.lower(): candidate for candidate in known}
     matches = difflib.get_close_matches(name.lower(), names, n=1)
     return f", nearest: {names[matches[0]]}" if matches else ""
@@ -36,7 +36,7 @@ def is_file_name(name: str) -> bool:
 
 
 def title_of(path: Path) -> str:
-    """Make a name of a file name, which need not be text."""
+    """Make a title from a file name, which need not be text."""
     name = "".join(c if c.isprintable() else "?" for c in path.stem)
     return name[:LONGEST_NAME]
 

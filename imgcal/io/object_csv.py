@@ -76,7 +76,7 @@ def load_objects(paths: Sequence[str | Path]) -> CalibrationObject:
 
 
 def object_from_text(text: str, where: str, name: str = "object") -> CalibrationObject:
-    """Read an object from what its file holds, the result of `object_text`.
+    """Read an object from the text of its file, the result of `object_text`.
 
     Args:
         text: the CSV.
@@ -126,7 +126,7 @@ def _read(path: Path, content: bytes | None = None) -> CalibrationObject:
 
 
 def _labels(chunk: Chunk) -> tuple[int, ...]:
-    """What detections call the points; empty where it is their rows."""
+    """Labels of the points in detections; empty if they are the rows."""
     if "fiducial" not in chunk.columns:
         return ()
     plausible = limits.Range(0, LARGEST_LABEL, "")
@@ -154,7 +154,7 @@ def save_object(obj: CalibrationObject, path: str | Path) -> None:
 
 
 def object_text(obj: CalibrationObject, where: str | Path = "object") -> str:
-    """Make what `save_object` writes; errors begin with `where`."""
+    """Make the text that `save_object` writes; errors begin with `where`."""
     if obj.board is not None:
         return board_text(obj)
     names = obj.fiducial_names

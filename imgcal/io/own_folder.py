@@ -1,4 +1,4 @@
-"""A folder that one process writes to while it works there: nobody else's files between its own."""
+"""A folder that one process owns while it works there: no other process writes between its files."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ TAKEN = {errno.EWOULDBLOCK, errno.EACCES}
 
 @contextlib.contextmanager
 def holding(folder: str | Path) -> Iterator[Path]:
-    """Make a folder if need be, and be the only one who works in it until the block ends.
+    """Make a folder if need be, and lock it until the block ends.
 
     The lock is the system's: it ends with the process, however that ends, and leaves no file. Windows and some network
-    shares have none; there nobody is kept out. Folders that were made and in which nothing came to be go again.
+    shares have none; there no process is kept out. Folders that were made and stay empty are removed.
 
     Yields:
         The folder.

@@ -1,4 +1,4 @@
-"""The posterior of a calibrated rig in a file beside it: arrays that nobody edits by hand."""
+"""The posterior of a calibrated rig in a file beside it: arrays, not meant for editing."""
 
 from __future__ import annotations
 

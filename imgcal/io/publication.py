@@ -53,7 +53,7 @@ def publishing(folder: str | Path, names: Sequence[str], mark: str) -> Iterator[
         yield stage
         _exchange(folder, stage, names, mark)
     except InputError as error:
-        # What is wrong is told of the place where the user expects the file.
+        # Report errors for the path where the user expects the file.
         raise InputError(str(error).replace(str(stage), str(folder))) from error
     finally:
         if (folder / mark).exists() or not any((stage / OLD).glob("*")):  # all of the new, or of the old, is there
@@ -64,7 +64,7 @@ def publishing(folder: str | Path, names: Sequence[str], mark: str) -> Iterator[
 
 
 def keep_previous(folder: Path, stage: Path, names: Sequence[str]) -> None:
-    """Keep the files of an earlier run, which those of the stage will replace, in the subfolder `previous`.
+    """Move the files of an earlier run that will be replaced into the subfolder `previous`.
 
     They are published before anything is replaced: wherever the power fails, they are in the folder or below it.
 
@@ -80,7 +80,7 @@ def keep_previous(folder: Path, stage: Path, names: Sequence[str]) -> None:
 
 
 def is_unfinished(folder: Path) -> bool:
-    """Tell whether a run that was to fill this folder is at it still, or was killed."""
+    """Tell whether a run that fills this folder is still at work, or was killed."""
     return any(folder.glob(f"{PREFIX}*"))
 
 
@@ -110,7 +110,7 @@ def _exchange(folder: Path, stage: Path, names: Sequence[str], mark: str) -> Non
 
 
 def _link(file: Path, target: Path) -> None:
-    """Give a file a second name; a copy where the file system knows no such thing."""
+    """Link a file; copy it if the file system has no links."""
     try:
         os.link(file, target)
     except OSError:
@@ -123,7 +123,7 @@ def _undo(moves: list[tuple[Path, Path]], stage: Path) -> None:
             if not os.path.lexists(source):  # the last one may not have happened
                 os.replace(target, source)
     except OSError as error:
-        # Its mark is not back yet: nobody takes for complete what is there.
+        # Its mark is not back yet, so the folder does not count as complete.
         kept = f"what was there before is in {stage.name}/{OLD}"
         raise InputError(f"{stage.parent}: cannot be written: {error.strerror or error}; {kept}") from error
 

@@ -1,4 +1,4 @@
-"""What a rig file (`format: imgcal-rig/1`) may hold, and how its values must fit together."""
+"""The schema of a rig file (`format: imgcal-rig/1`), and how its values must fit together."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Std(StrictModel):
 
 
 class CameraImages(StrictModel):
-    """What is known of any camera: its name, and the size of its images."""
+    """The keys that all cameras have: name and image size."""
 
     name: str
     image_size: Annotated[list[Side], _exactly(2)]
@@ -136,7 +136,7 @@ class _Prior(StrictModel):
 
 
 class _DriftRate(StrictModel):
-    """Zero is allowed: a value that does not wander."""
+    """Zero is allowed: the value does not drift."""
 
     focal_length: Annotated[float, Field(ge=0, le=limits.PRIOR_FOCAL_LENGTH.high)] = DriftRate.focal_length
     principal_point: Annotated[float, Field(ge=0, le=limits.PRIOR_PRINCIPAL_POINT.high)] = DriftRate.principal_point

@@ -73,7 +73,7 @@ def load_rig(path: str | Path) -> CameraRig:
 
 
 def rig_from_text(text: str, where: str) -> CameraRig:
-    """Read a rig from what its file holds, the result of `rig_text`; errors begin with `where`, as does its name.
+    """Read a rig from the text of its file, the result of `rig_text`; errors and its name begin with `where`.
 
     Raises:
         InputError: as `load_rig`.
@@ -131,7 +131,7 @@ def save_rig(
 def rig_text(
     rig: CameraRig, where: str | Path = "rig", covariance: RigCovariance | None = None, full: bool = False
 ) -> str:
-    """Make what `save_rig` writes; errors begin with `where`.
+    """Make the text that `save_rig` writes; errors begin with `where`.
 
     Examples:
         >>> import imgcal
@@ -164,7 +164,7 @@ def _read(path: str | Path) -> tuple[RigFile, Path]:
 
 
 def _rig_of(content: RigFile, name: str) -> CameraRig:
-    """The rig of a file; `name` is for one without."""
+    """The rig of a file; `name` is used if the file has none."""
     cameras = content.cameras
     models = named_lenses([camera.model for camera in cameras])
     width = lens_width(models)

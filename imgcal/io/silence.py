@@ -1,4 +1,4 @@
-"""Decoders that print about a bad file, and how they are kept from it: our error says it, in one line."""
+"""Silence decoders that print about a bad file: our error says it in one line."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _kept = -1  # standard error meanwhile
 
 @contextlib.contextmanager
 def silenced() -> Iterator[None]:
-    """Lead file descriptor 2 to nowhere: libpng, libjpeg and FFmpeg write there past every setting."""
+    """Redirect file descriptor 2 to nowhere: libpng, libjpeg and FFmpeg write there regardless of settings."""
     global _within, _kept
     with _lock:
         if _within == 0:

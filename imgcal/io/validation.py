@@ -1,4 +1,4 @@
-"""Records that are written in files: strict types and bounds, and one line about the first value that breaks them."""
+"""Records in files: strict types and bounds, and a one-line error about the first bad value."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class StrictRecord:
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Let a mapping stand for the record, as a file has it; its values are as strict as ever."""
+        """Accept a mapping in place of the record, as files have it, with the same strict checks."""
         schema = handler(source)
         inner: Any = schema
         while inner["type"] != "dataclass":
@@ -91,7 +91,7 @@ def _model_of(record: type[StrictRecord]) -> type[BaseModel]:
 
 
 def _summary(error: ValidationError, content: Any, model: type, entry_names: Mapping[str, str]) -> str:
-    """Put the first problem into words; a misspelt key comes before the missing key that follows from it."""
+    """Describe the first problem; a misspelt key comes before the missing key that it causes."""
     if error.error_count() > MOST_PROBLEMS:
         keys = ", ".join(_keys(model, ()))
         return f"found {error.error_count():,} values that do not belong there, expected the keys {keys}"

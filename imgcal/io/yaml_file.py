@@ -54,12 +54,12 @@ def read_yaml(path: Path, model: type[Model], file_format: str, entry_names: Map
 def record_from_yaml(
     content: bytes, where: str, model: type[Model], file_format: str, entry_names: Mapping[str, str] | None = None
 ) -> Model:
-    """Do the work of `read_yaml` on what a file holds; errors begin with `where`."""
+    """Do the work of `read_yaml` on the text of a file; errors begin with `where`."""
     return validated(_formatted(content, where, file_format), model, where, entry_names)
 
 
 def read_yaml_mapping(path: Path, file_format: str) -> dict[str, Any]:
-    """Read the plain values of a YAML file of which only the format is known.
+    """Read the plain values of a YAML file with a known `format`.
 
     Raises:
         InputError: one line with the file, what was found and what was expected.
@@ -91,7 +91,7 @@ def _has_sentence(line: str) -> bool:
 
 
 def looks_like(text: str) -> str:
-    """Say what a text that cannot be read looks like, by its first line."""
+    """Guess what an unreadable text is, by its first line."""
     first = next((line.strip() for line in text.splitlines() if line.strip()), "")
     return f"text for people (it begins `{shortened(first)}`)"
 

@@ -1,4 +1,4 @@
-"""YAML to plain values: within bounds of depth and size, without recursion, and without any type but the JSON ones.
+"""YAML to plain values: bounded in depth and size, without recursion, and with JSON types only.
 
 PyYAML's own composer recurses in C (a hundred thousand brackets end the process), and it copies what merge keys name.
 """

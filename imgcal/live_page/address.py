@@ -1,4 +1,4 @@
-"""Where the page is served: this machine alone, or any address, which then asks for a token."""
+"""The address of the page: this machine only, or any address, protected by a token."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a rig is drawn at rest: which way is up, from where it is looked at, how large its cameras are."""
+"""How a rig is drawn: which way is up, the viewpoint, the size of its cameras."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CLEAR = 0.3
 
 
 def arrangement(rig: CameraRig, volume: WorkingVolume) -> dict[str, Any]:
-    """Say how a rig is drawn.
+    """Describe how a rig is drawn.
 
     Args:
         rig: without batch axes.

@@ -25,14 +25,14 @@ Array = NDArray[np.float64]
 
 
 class Board:
-    """Takes what the loop's process sends, and says what is new for those who look on.
+    """Collects what the loop's process sends, and returns what is new for the viewers.
 
     Messages are made as bytes of server-sent events, once for all viewers. A message replaces the one before it of the
-    same key, so that nobody who reads slowly needs more than the latest of each.
+    same key, so that a slow reader needs only the latest of each.
     """
 
     def __init__(self, greeting: Mapping[str, Any]) -> None:
-        """Begin with what the loop's process said first."""
+        """Start from the greeting of the loop's process."""
         self.greeting = greeting
         self.instance = f"{time.time_ns():x}"  # another one: the server was started again
         self.notes: Notes = greeting["notes"]
@@ -84,7 +84,7 @@ class Board:
         return {"controls": stream_event("controls", self.notes.controls())}
 
     def everything(self) -> dict[str, bytes]:
-        """All that somebody needs who looks for the first time."""
+        """Everything that a new viewer needs."""
         return {key: stream_event(key.partition(":")[0], content) for key, content in self.contents().items()}
 
     def contents(self) -> dict[str, Any]:

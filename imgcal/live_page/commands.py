@@ -1,4 +1,4 @@
-"""What people ask for on the page: buttons that every page has, and some of one program's own."""
+"""Commands of the page: the buttons of every page, and those that a program adds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Connections that wait for a request: for a few seconds, and never so many that nobody else comes through."""
+"""Connections that wait for a request: for a few seconds, and few enough that others get through."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ MOST_OF_ONE_ADDRESS = 128
 
 
 class Connection(H11Protocol):
-    """HTTP of one connection. Where there are too many, the one that has waited the longest is ended."""
+    """HTTP of one connection. If there are too many, the one that has waited the longest is closed."""
 
     def __init__(self, *given: Any, **more: Any) -> None:
-        """Take what uvicorn gives."""
+        """Take uvicorn's arguments."""
         super().__init__(*given, **more)
         self.since = time.monotonic()
         self._due: asyncio.TimerHandle | None = None
@@ -39,7 +39,7 @@ class Connection(H11Protocol):
                 min((other for other in group if other.waits), key=lambda other: other.since).transport.abort()
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes; a head that comes slowly is not waited for for ever."""
+        """Take bytes; a slow header times out."""
         super().data_received(data)
         if not self.waits:
             self._forget()
@@ -53,7 +53,7 @@ class Connection(H11Protocol):
 
     @property
     def is_there(self) -> bool:
-        """Whether it has not been ended."""
+        """Whether it is still open."""
         return not self.transport.is_closing()
 
     @property

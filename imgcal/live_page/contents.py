@@ -39,7 +39,7 @@ def greeting(
     actions: Sequence[Action],
     title: str,
 ) -> dict[str, Any]:
-    """What the server is told first."""
+    """The first message to the server."""
     return {
         "address": address,
         "token": token,
@@ -77,7 +77,7 @@ def state_message(state: RigState, obj: CalibrationObject) -> dict[str, Any]:
 
 
 def event_message(event: Event) -> dict[str, Any]:
-    """One event; numbers that are none are left out."""
+    """One event; numbers that are not finite are left out."""
     return {
         name: getattr(event, name)
         for name in ("time", "snapshot", "kind", "camera", "since", "change", "size", "sigma", "unit", "message")
@@ -85,12 +85,12 @@ def event_message(event: Event) -> dict[str, Any]:
 
 
 def rig_message(state: RigState) -> dict[str, Any]:
-    """The rig and what it is compared with: pickled, to be read when it is time."""
+    """The rig and its reference, pickled, to be read when needed."""
     return {"time": float(state.time), "pickled": pickle.dumps((state.rig, state.factory))}
 
 
 def belief_message(state: RigState) -> dict[str, Any]:
-    """What the deviations and the predicted error are computed from: pickled, to be read when it is time."""
+    """The input of the deviations and the predicted error, pickled, to be read when needed."""
     pose, blobs = state.rig_from_object, state.detections
     labelled = blobs.fiducial >= 0
     turn = torch.eye(3, dtype=torch.float64) if pose is None else pose.rotation.detach().double().reshape(-1, 3, 3)[-1]

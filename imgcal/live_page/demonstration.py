@@ -28,7 +28,7 @@ AGED = PhysicalDrift(rotation_deg=0.01, position=0.1, focal_length=2e-4, princip
 """How a rig differs from its factory calibration on a good day."""
 BUMP_DEG = 0.3
 SETTLED = 20
-"""Snapshots that are learnt before a camera is bumped: with fewer before, nobody can say how it moved, only that."""
+"""Snapshots learned before a camera is bumped. With fewer, the filter can report the move but not its kind."""
 PICTURE_WIDTH = 320  # pixels
 PICTURE_SECONDS = 0.5
 
@@ -85,7 +85,7 @@ class Demonstration:
         self.keeper.__exit__(None, None, None)
 
     def run(self, rate: float, ended: threading.Event | None = None) -> None:
-        """Take `rate` snapshots a second, as far as the machine can, until told to end."""
+        """Take `rate` snapshots a second, or as many as the machine can, until stopped."""
         ended = ended or threading.Event()
         begun, count = time.monotonic(), 0
         while not ended.wait(max(0.0, begun + count / rate - time.monotonic())):
@@ -93,7 +93,7 @@ class Demonstration:
             count = max(count + 1, int((time.monotonic() - begun) * rate))  # what is late is left out
 
     def step(self, seconds: float) -> RigState | None:
-        """Do what people have asked for, and take a snapshot; None while paused."""
+        """Run the commands that are waiting, and take a snapshot; None while paused."""
         for command in self.page.commands():
             self._obey(command)
         if self._learnt >= SETTLED:

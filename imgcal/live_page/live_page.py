@@ -1,4 +1,4 @@
-"""`LivePage`: the loop's side of the page. It hands over what is new, and waits for nobody.
+"""`LivePage`: the loop's side of the page. It hands over what is new and never waits.
 
 The server is a process of its own, so that people who look on take nothing from the loop. `publish` keeps what came
 last and returns; a thread shrinks frames and passes them on, at most so often, while somebody looks. A server that
@@ -102,7 +102,7 @@ class LivePage:
             ModuleNotFoundError: the libraries of the extra `live` are not installed.
         """
         if sys.platform == "win32":
-            raise InputError("live page: not on Windows, where its server gets no open sockets; run it in WSL")
+            raise InputError("live page: not available on Windows; run it in WSL")
         if library := missing("uvicorn"):
             raise ModuleNotFoundError(f"No module named {library!r}", name=library)
         self._token = checked_token(token)
@@ -132,12 +132,12 @@ class LivePage:
 
     @property
     def url(self) -> str:
-        """What to open in a browser, with the token where one is asked for."""
+        """The address to open in a browser, with the token if one is needed."""
         return self.address.url(None if self.address.local else self._token)
 
     @property
     def notice(self) -> str:
-        """What to tell who started this."""
+        """The notice for the person who started it."""
         if self.address.local:
             return f"live page: {self.url} (this machine only)"
         return (
@@ -169,7 +169,7 @@ class LivePage:
             self._news.notify()
 
     def commands(self) -> list[Command]:
-        """What has been asked for since the last call; never waits."""
+        """The commands since the last call; never waits."""
         found = []
         with contextlib.suppress(queue.Empty):
             while True:
@@ -234,7 +234,7 @@ class LivePage:
                 self._server.wait()
 
     def _listen(self, pipe: socket.socket) -> None:
-        """Take what the server says: lines of JSON, which it has checked; until it ends."""
+        """Receive the server's lines of JSON, which it has checked, until it ends."""
         with contextlib.suppress(OSError, ValueError), pipe.makefile("r", encoding="utf-8") as lines:
             for line in lines:
                 self._heard(json.loads(line))
@@ -251,14 +251,14 @@ class LivePage:
             self._asked(content.pop("number"), Command(**content))
 
     def _asked(self, number: int, command: Command) -> None:
-        """Take a command, and answer whether it will come to the loop: one that does not is shown as done nowhere."""
+        """Take a command, and answer whether the loop will get it; a page shows only accepted commands as done."""
         taken = command.event is not None  # that is the page's own affair
         try:
             self._commands.put_nowait(command)
             taken = True
         except queue.Full:
             if not taken:
-                self._failed("commands", f"{MOST_COMMANDS} wait, and nobody fetches them")
+                self._failed("commands", f"{MOST_COMMANDS} are waiting and none is fetched")
         with self._news:
             if taken:
                 self._notes.obey(command, self._actions)
@@ -266,7 +266,7 @@ class LivePage:
             self._news.notify()
 
     def _send(self) -> None:
-        """Pass on what is new, until the page is closed; start the server again where it has ended."""
+        """Pass on what is new until the page is closed; restart the server if it has ended."""
         courier, last = _Courier(self._rig, self._obj), None
         while not self._closing:
             with self._news:
@@ -292,7 +292,7 @@ class LivePage:
             time.sleep(max(0.0, 1 / STATES_A_SECOND - (time.monotonic() - begun)))
 
     def _noted(self) -> list[dict[str, Any]]:
-        """Take the events that wait, and note them."""
+        """Record the waiting events."""
         found: list[dict[str, Any]] = []
         while self._events:
             try:
@@ -308,7 +308,7 @@ class LivePage:
         return news or self._closing or self._ended is self._pipe
 
     def _pass_on(self, messages: Iterator[Message]) -> None:
-        """Send messages; what cannot be made of one is said once, and the others are sent."""
+        """Send messages; report a failure once, and send the others."""
         assert self._pipe is not None
         for kind, make in messages:
             try:
@@ -321,7 +321,7 @@ class LivePage:
     def _failed(self, kind: str, why: str) -> None:
         if kind not in self._problems:
             self._problems.add(kind)
-            with contextlib.suppress(Exception):  # whoever is told must not end the page
+            with contextlib.suppress(Exception):  # a failing callback must not end the page
                 self._problem(f"live page: {kind}: {shortened(why)}")
 
     def _restart(self) -> None:
@@ -347,7 +347,7 @@ class _Courier:
         self._belief_seconds = BELIEF_SECONDS * max(rig.num_cameras / 10, 1.0) ** 2
 
     def messages(self, state: RigState | None, events: Sequence[dict[str, Any]]) -> Iterator[Message]:
-        """Events, a new state, and what of it is due."""
+        """Events, a new state, and the parts of it that are due."""
         now = time.monotonic()
         for event in events:
             yield "event", partial(dict, event)
@@ -362,7 +362,7 @@ class _Courier:
             yield "belief", partial(belief_message, state)
 
     def pictures(self, state: RigState, frames: Mapping[str, Frame | None]) -> Iterator[Message]:
-        """Those of the cameras that have waited the longest, as many as keep them all as new as they are to be."""
+        """Pictures of the cameras that have waited longest, as many as keep all of them fresh enough."""
         now = time.monotonic()
         share = int(np.ceil(self._cameras * PICTURES_A_SECOND / STATES_A_SECOND))
         waiting = np.flatnonzero((self._shown < state.snapshot) & (now - self._shown_at >= 0.9 / PICTURES_A_SECOND))

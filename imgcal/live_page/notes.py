@@ -1,4 +1,4 @@
-"""`Notes`: what people were told on the page and did there. The loop's side keeps them, too: servers come and go."""
+"""`Notes`: events shown on the page, and their acknowledgement. The loop keeps a copy, since the server may restart."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MOST_EVENTS = 200
 ALARMS = frozenset({"moved", "camera_lost", "dirty", "defocused", "object_bent", "object_exchanged", "clock_slip"})
 """Events that wait for somebody to acknowledge them."""
 ENDS = {"camera_back": {"camera_lost"}, "clean": {"dirty", "defocused"}}
-"""Good news, which nobody needs to acknowledge, and the alarms of the same camera that are over then."""
+"""Good news, which needs no acknowledgement, and the alarms of the same camera that it ends."""
 
 
 @dataclass
@@ -50,7 +50,7 @@ class Notes:
         self.count += 1
 
     def obey(self, command: Command, actions: Mapping[str, Action]) -> None:
-        """Note what was asked for: an event and all before it are acknowledged, or something is switched."""
+        """Apply a command: acknowledge an event and all before it, or set a switch."""
         if command.event is not None:
             for event in self.events:
                 event["open"] = event["open"] and event["number"] > command.event
@@ -60,7 +60,7 @@ class Notes:
             self.switched ^= {command.name}
 
     def controls(self) -> dict[str, Any]:
-        """What is switched, as plain values."""
+        """The switches, as plain values."""
         return {"paused": self.paused, "on": sorted(self.switched)}
 
 

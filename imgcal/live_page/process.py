@@ -1,4 +1,4 @@
-"""The server's process: what the loop sends goes to the board, what the board says to the viewers."""
+"""The server's process: messages of the loop go to the board, and news of the board to the viewers."""
 
 from __future__ import annotations
 
@@ -81,10 +81,10 @@ async def _serve(listening: socket.socket, pipe: socket.socket) -> None:
 
 
 class Guide:
-    """Computes what follows from rigs and beliefs beside the server; what comes while it computes is passed over."""
+    """Computes guidance and deviations beside the server; input that arrives meanwhile is skipped."""
 
     def __init__(self, greeting: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> None:
-        """Begin with what the loop's process said first, and what passes an object on to it."""
+        """Start from the greeting of the loop's process, with a function that sends it messages."""
         self._greeting, self._tell = greeting, tell
         self._pool = ThreadPoolExecutor(2, initializer=_of_one_thread)
         self._waiting: dict[str, dict[str, Any]] = {}
@@ -93,7 +93,7 @@ class Guide:
         self._known: Any = None  # the latest whose deviations are known, with these: of one moment
 
     def learn(self, kind: str, content: dict[str, Any], application: Application) -> None:
-        """Take a rig or a belief, and have the viewers told what follows from it."""
+        """Take a rig or a belief, and send the results to the viewers."""
         self._waiting[kind] = content
         if kind not in self._tasks or self._tasks[kind].done():
             work = self._compare if kind == "rig" else self._look
@@ -115,7 +115,7 @@ class Guide:
             await asyncio.sleep(max(GUIDANCE_SECONDS, 2 * (loop.time() - begun)))
 
     async def _computed(self, kind: str, work: Callable[[dict[str, Any]], Any]) -> Any:
-        """Compute what follows from the latest of a kind, in a thread; None = nothing can be said of it."""
+        """Compute the results of the latest input of a kind in a thread; None = there are none."""
         try:
             return await asyncio.get_running_loop().run_in_executor(self._pool, work, self._waiting.pop(kind))
         except Exception as error:  # the next one may do
@@ -151,7 +151,7 @@ class Guide:
         return WorkingVolume(*(torch.as_tensor(corner) for corner in self._greeting["volume"]))
 
     def rig_yaml(self) -> str | None:
-        """The rig as a rig file, of the latest moment of which its deviations are known; None before any snapshot."""
+        """The rig file of the latest moment with known deviations; None before any snapshot."""
         rig, std = (self._rig, None) if self._known is None else self._known
         if rig is None:
             return None

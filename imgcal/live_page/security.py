@@ -1,4 +1,4 @@
-"""Who may ask for what: this machine's own pages, or whoever has the token. Nothing here reads a file.
+"""Access control: pages of this machine, and requests with the token. Nothing here reads a file.
 
 A page of another origin may send requests to this address, also under another name that it has let point here
 (DNS rebinding). Hence: only names of this machine, or plain addresses, which cannot be rebound; only our own origin;
@@ -34,7 +34,7 @@ TOKEN_HEADER = "x-imgcal-token"
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why a request is not served."""
+    """The reason for not serving a request."""
 
     status: int
     reason: str
@@ -78,7 +78,7 @@ class Gate:
         return None
 
     def knows(self, host: str) -> bool:
-        """Tell whether a Host header names this server: by a name or address that no other site can have."""
+        """Tell whether a Host header names this server, by a name or address that no other site can have."""
         match = re.fullmatch(r"(\[[0-9a-f:.]+\]|[a-z0-9.-]+)(?::\d{1,5})?", host.lower())
         if match is None:
             return False
@@ -92,11 +92,11 @@ class Gate:
         return True
 
     def is_token(self, given: str) -> bool:
-        """Compare in a time that does not depend on what was given."""
+        """Compare in constant time."""
         return hmac.compare_digest(given.encode("utf-8", "replace"), self.token.encode())
 
     def token_of_query(self, query: str) -> bool:
-        """Tell whether an address that was opened has the token."""
+        """Tell whether a query has the token."""
         try:
             return self._matches(parse_qs(query, max_num_fields=8).get("token", []))
         except ValueError:
@@ -117,7 +117,7 @@ class Gate:
 
 
 class Allowance:
-    """So many at once, so many a second: the rest is refused."""
+    """A rate limit: so many at once, so many a second."""
 
     def __init__(self, burst: int, each_second: float) -> None:
         """Begin with all of the burst."""

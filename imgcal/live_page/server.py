@@ -31,7 +31,7 @@ Answer = tuple[int, str, bytes, dict[str, str]]  # status, type, body, further h
 
 @dataclass(eq=False)
 class Viewer:
-    """What one viewer has not been sent yet: the latest of each key, so that it cannot grow."""
+    """Messages that one viewer has not received yet: the latest of each key, so that they cannot pile up."""
 
     pending: dict[str, bytes] = field(default_factory=dict)
     news: asyncio.Event = field(default_factory=asyncio.Event)
@@ -72,12 +72,12 @@ class Application:
         self._actions = {action.name: action for action in board.greeting["actions"]}
 
     def spread(self, messages: Mapping[str, bytes]) -> None:
-        """Hand messages to all viewers; none of them is waited for."""
+        """Hand messages to all viewers without waiting."""
         for viewer in self.viewers:
             viewer.add(messages)
 
     def close(self) -> None:
-        """End what is being answered without end."""
+        """End the streams."""
         self._closing = True
         self.spread({})
 
@@ -105,7 +105,7 @@ class Application:
             await _answer(send, self._page(path) if method != "POST" else _refused(Refusal(405, "expected GET")))
 
     def _admitted(self, query: str) -> Answer:
-        """Give whoever opens the address with the token a cookie, and the address without it."""
+        """Exchange the token in the address for a cookie, and redirect to the address without it."""
         if not self.gate.token_of_query(query):
             return _refused(Refusal(401, "expected the token that was printed where imgcal was started"))
         cookie = f"{self.gate.cookie}={self.gate.token}; Path=/; HttpOnly; SameSite=Strict"
@@ -154,7 +154,7 @@ class Application:
             return _refused(Refusal(504, "the program that runs the rig has not answered yet"))
 
     async def _asked_for(self, command: Command) -> bool:
-        """Pass a command on to the loop's process, and wait for its word whether it takes it.
+        """Pass a command on to the loop's process, and wait for its answer.
 
         Raises:
             TimeoutError: there is none yet.
@@ -168,7 +168,7 @@ class Application:
         return await asyncio.wait_for(answer, ANSWER_SECONDS)
 
     def answered(self, number: int, taken: bool) -> None:
-        """Take the answer of the loop's process to a command: now it is shown as done, however late that is."""
+        """Take the answer of the loop's process to a command, and show the command as done, however late."""
         command, answer = self._asked.pop(number)
         if taken:
             self.spread(self.board.obey(command))

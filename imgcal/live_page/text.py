@@ -1,4 +1,4 @@
-"""JSON for browsers: short numbers, None for what is no number, safe inside a page."""
+"""JSON for browsers: short numbers, None for nan and infinity, safe inside a page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What passes between the loop's process and the server's: a kind, then plain values, arrays and bytes.
+"""Messages between the loop's process and the server's: a kind, then plain values, arrays and bytes.
 
 Only the loop's side writes what is unpickled; the server, which strangers talk to, answers in lines of JSON.
 """
@@ -14,7 +14,7 @@ HEADER = struct.Struct("<I")
 
 
 def framed(kind: str, content: dict[str, Any]) -> bytes:
-    """Make one message of it, its length first.
+    """Encode one message, its length first.
 
     Examples:
         >>> len(framed("state", {})) > HEADER.size

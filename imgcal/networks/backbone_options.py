@@ -1,4 +1,4 @@
-"""What may be asked of a timm model: its shape. Nothing here names a file, loads weights or runs code of others.
+"""Allowed options of a timm model: its shape. None of them names a file, loads weights or runs foreign code.
 
 An experiment may come inside a model file of unknown origin, and timm would load what some of its arguments name.
 """
@@ -51,7 +51,7 @@ def check_options(options: Mapping[str, Any]) -> None:
 
 
 def _expected(name: str, value: Any) -> str:
-    """Say what would have been right; nothing where the value is."""
+    """Describe the expected value; nothing if the value is right."""
     if name in WORDS:
         good = isinstance(value, str) and re.fullmatch(r"[a-z0-9_]{0,20}", value)
         return "" if good else "a short word"

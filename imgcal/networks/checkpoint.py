@@ -94,7 +94,7 @@ def load_network(
     *,
     trusted: Collection[str] = (),
 ) -> Network:
-    """Read a network: `load_checkpoint` without what stands beside it."""
+    """Read only the network of a checkpoint."""
     return load_checkpoint(path, rig, obj, trusted=trusted).network
 
 
@@ -138,7 +138,7 @@ def load_checkpoint(
 
 
 def read_subject(path: str | Path) -> tuple[CameraRig, CalibrationObject]:
-    """Read the rig and the object that a network was trained for, and not the network.
+    """Read the rig and the object of a checkpoint, without the network.
 
     Raises:
         InputError: not such a file, damaged, another version, or a pickle.
@@ -186,7 +186,7 @@ def _take_over(path: str | Path, network: nn.Module) -> tuple[str, ...]:
 
 
 def _check_code(path: str | Path, spec: NetworkSpec, trusted: Collection[str]) -> None:
-    """Refuse a file that would import somebody's module.
+    """Refuse a file that would import a foreign module.
 
     Raises:
         InputError: its encoder is such a class, and not among the trusted ones.
@@ -194,8 +194,8 @@ def _check_code(path: str | Path, spec: NetworkSpec, trusted: Collection[str]) -
     backbone = getattr(spec.network.variant(), "backbone", "")
     if is_import_path(backbone) and backbone not in trusted:
         raise InputError(
-            f"{path}: found the encoder {quoted(backbone)}, whose code would run; expected one of ours or of timm, or "
-            f"that you trust it: --trust {quoted(backbone)}, in Python load_checkpoint(..., trusted=(...,))"
+            f"{path}: found the encoder {quoted(backbone)}, whose code would run; expected one of imgcal or timm. "
+            f"If you trust it: --trust {quoted(backbone)}, in Python load_checkpoint(..., trusted=(...,))"
         )
 
 

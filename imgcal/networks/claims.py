@@ -1,4 +1,4 @@
-"""From evidence to claims: of all that could be a fiducial, one place at most, and no place for two fiducials."""
+"""From evidence to claims: at most one place per fiducial, and at most one fiducial per place."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ STRAY = -3.0  # log odds that a place belongs to no fiducial
 
 @dataclass(frozen=True)
 class Claims:
-    """Where each fiducial is said to be."""
+    """The claimed place of each fiducial."""
 
     place: Tensor  # (P, N, 2) crop pixels
     sigma: Tensor  # (P, N) crop pixels, one standard deviation of each axis
@@ -30,7 +30,7 @@ class Claims:
 
 
 def claim(evidence: Evidence, asked: Tensor) -> Claims:
-    """Let the fiducials of each crop share out the places that any of them puts forward.
+    """Assign the candidate places of each crop to its fiducials.
 
     Args:
         evidence: of (P, N) queries.

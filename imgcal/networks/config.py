@@ -1,4 +1,4 @@
-"""Which network: presets by name, and what may be changed in each."""
+"""Network configuration: presets by name, and the changes that each allows."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ class Images(StrictModel):
 
 
 class PooledImages(StrictModel):
-    """An image variant whose trunk is told one pooled feature an image, and no positions."""
+    """An image variant whose trunk gets one pooled feature per image and no positions."""
 
     backbone: Annotated[str, Field(max_length=200)] = "vit_tiny_patch16_224"  # any model of timm, by name
     pretrained: bool = False  # begin with published weights of timm
@@ -177,7 +177,7 @@ class NetworkConfig(StrictModel):
 
 
 class NetworkSpec(StrictModel):
-    """The blocks of an experiment that say what a network is and what it is trained for; others are kept as they are.
+    """The blocks of an experiment that define a network and its training target; other blocks are kept unchanged.
 
     `imgcal.training.Experiment` is one, with all other blocks in words.
     """
@@ -194,7 +194,7 @@ Spec = TypeVar("Spec", bound=NetworkSpec)
 
 
 def without_pretrained(spec: Spec) -> Spec:
-    """The same without published weights, which are not to be asked for where others replace them."""
+    """The same without published weights, for when other weights replace them."""
     if "pretrained" not in spec.network.change:
         return spec
     plain = spec.network.model_copy(update={"change": {**spec.network.change, "pretrained": False}})
@@ -202,7 +202,7 @@ def without_pretrained(spec: Spec) -> Spec:
 
 
 def one_of(names: Iterable[str]) -> str:
-    """Say what would have been right."""
+    """Describe the allowed choices."""
     return ", expected one of " + ", ".join(names)
 
 

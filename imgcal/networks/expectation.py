@@ -1,4 +1,4 @@
-"""What the query network is asked of captured frames: crops where a rig and poses expect the object, and queries."""
+"""Input of the query network: crops where a rig and poses expect the object, and queries."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ class Program:
     example: tuple[Tensor, ...]  # inputs
 
     def metadata(self) -> dict[str, str]:
-        """What stands in the file beside the weights."""
+        """Metadata in the file."""
         return {"imgcal": self.kind, "inputs": json.dumps(self.inputs), "outputs": json.dumps(self.outputs)}
 
 
@@ -276,7 +276,7 @@ class _Held(nn.Module):
 
 
 def _rewritten(graph: nn.Module) -> nn.Module:
-    """Say with other words what the exporter does not know, `mT`, or gets wrong, `movedim` from the back."""
+    """Rewrite what the exporter does not know (`mT`) or gets wrong (`movedim` from the back)."""
     aten = torch.ops.aten
     parts = [part for part in graph.modules() if isinstance(part, torch.fx.GraphModule)]
     for part in parts:

@@ -19,8 +19,8 @@ def make_encoder(config: Images, size: int | None) -> tuple[nn.Module, int, int]
     """Make the encoder that an experiment names.
 
     Args:
-        config: which, with its options. An import path runs the code of its module: whoever reads a configuration from
-            a file of unknown origin must refuse it before (`load_checkpoint` does).
+        config: the encoder and its options. An import path runs the code of its module: refuse it first if the
+            configuration comes from a file of unknown origin (`load_checkpoint` does).
         size: pixels, width and height of the images; None = as the encoder takes them.
 
     Returns:
@@ -32,7 +32,9 @@ def make_encoder(config: Images, size: int | None) -> tuple[nn.Module, int, int]
     name, options = config.backbone, config.options
     if name in ("cnn", "vit") or is_import_path(name):
         if config.pretrained:
-            raise InputError(f"backbone {shortened(name)}: found pretrained: true, which only models of timm know")
+            raise InputError(
+                f"backbone {shortened(name)}: found pretrained: true, but only timm models have pretrained weights"
+            )
         drawn = size or USUAL_SIZE
         if name == "cnn":
             return _counted(name, lambda: CnnEncoder(config.width, **options)), config.width, drawn
@@ -79,7 +81,7 @@ def _counted(name: str, make: Callable[[], nn.Module]) -> nn.Module:
 
 @torch.no_grad()
 def _checked_width(encoder: nn.Module, name: str, size: int) -> int:
-    """Features of an encoder's map, found by looking at one image.
+    """Number of features of an encoder's map, measured on one image.
 
     Raises:
         InputError: it takes no such image, or gives no map at a stride of 4.
@@ -103,5 +105,5 @@ def _checked_width(encoder: nn.Module, name: str, size: int) -> int:
 
 
 def _said(error: Exception) -> str:
-    """The first line of what somebody's class raised, with the name of the error."""
+    """The first line of an error raised by a foreign class, with its name."""
     return quoted(f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}")

@@ -62,7 +62,7 @@ class Queries:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the network says of every cell of every fiducial's window, and of the fiducial as a whole."""
+    """The network's output for every cell of every fiducial's window, and for each fiducial as a whole."""
 
     logits: Tensor  # (P, N, K, K) of the fiducial's cell
     offset: Tensor  # (P, N, K, K, 2) crop pixels, from the cell's middle to the marker's

@@ -32,7 +32,7 @@ Config = TypeVar("Config", bound=StrictModel)
 
 @dataclass(frozen=True)
 class InfraredCheckpoint:
-    """A query network, and what it was found to be worth."""
+    """A query network with its measured quality."""
 
     network: InfraredNetwork
     metrics: Mapping[str, Any]  # plain values
@@ -48,7 +48,7 @@ class InfraredCheckpoint:
 
 @dataclass(frozen=True)
 class MeasurerCheckpoint:
-    """A measurer, and what it was found to be worth."""
+    """A measurer with its measured quality."""
 
     network: Measurer
     metrics: Mapping[str, Any]  # plain values

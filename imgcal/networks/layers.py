@@ -75,7 +75,7 @@ def mlp(widths: Sequence[int]) -> nn.Sequential:
 
 
 def zeroed(head: nn.Sequential) -> nn.Sequential:
-    """Zero the last layer, so that an untrained head says nothing."""
+    """Zero the last layer, so that an untrained head returns zero."""
     last = head[-1]
     if not isinstance(last, nn.Linear):
         raise TypeError(f"found {type(last).__name__} at the end of a head, expected a linear layer")

@@ -24,7 +24,7 @@ SHARPEST, BLUNTEST = -8.0, 3.0  # log of the error's scale, pixels of the image
 
 @dataclass(frozen=True)
 class Located:
-    """What a locator says of I images; pixels of the image."""
+    """Output of a locator for I images, in pixels of the image."""
 
     uv: Tensor  # (I, N, 2)
     log_scale: Tensor  # (I, N) log of b, the mean absolute error of an axis, if the dot is near there

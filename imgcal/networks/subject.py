@@ -33,8 +33,8 @@ def check_says_rigs(path: str | Path, experiment: NetworkSpec) -> None:
     """
     if of_positions(experiment):
         raise InputError(
-            f"{path}: found a training of positions, whose trunk has learnt nothing; expected one of rigs, which takes "
-            "it by `training.init_from`"
+            f"{path}: found a training of positions, whose trunk is untrained; expected one of rigs, which starts "
+            "from it by `training.init_from`"
         )
 
 

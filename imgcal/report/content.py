@@ -24,7 +24,7 @@ NOT_IDENTIFIED = "identity"
 
 @dataclass(frozen=True)
 class SnapshotSummary:
-    """What became of one snapshot."""
+    """The outcome of one snapshot."""
 
     name: str
     found: int  # blobs, all cameras together
@@ -174,7 +174,7 @@ class ReportContent:
 
     @cached_property
     def undetermined(self) -> NDArray[np.bool_]:
-        """Mark values of which the data say little that the prior did not: (C, K) bool."""
+        """Mark values that the data hardly determine beyond the prior: (C, K) bool."""
         if self.std is None or self.prior_std is None:
             return np.zeros(self.shape, dtype=bool)
         return (self.std > UNDETERMINED * self.prior_std) & ~self.fixed

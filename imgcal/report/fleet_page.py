@@ -1,4 +1,4 @@
-"""What a fleet teaches, as one page: how far its cameras drift, which do not belong, what was refused and why."""
+"""The report of a fleet on one page: drift, outlier cameras, refusals and their reasons."""
 
 from __future__ import annotations
 

@@ -145,7 +145,7 @@ def _coverage(content: ReportContent) -> dict[str, object]:
 
     def words(camera: int) -> str:
         number = f"{svg.grouped(int(counts[camera]))} blobs"
-        if not labelled.any():  # of reflections nobody knows what they cover
+        if not labelled.any():  # what a reflection covers is unknown
             return f"{number}, none labelled"
         return f"{number}, {100 * charts.covered_share(content, camera):.0f} %"
 

@@ -1,4 +1,4 @@
-"""What cameras saw that nobody can explain, and whether they stood still: sentences for the verdict."""
+"""Sentences about unexplained blobs, and about cameras that did not stand still, for the verdict."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ CROWDED = 1.0
 
 
 def sightings(content: ReportContent) -> list[tuple[str, str]]:
-    """What speaks against the result, each with what helps against it."""
+    """Reasons for doubt, each with a remedy."""
     notes = [
         (
             f"During the capture {move}: only the snapshots since the last move are used.",

@@ -112,7 +112,7 @@ def _movement(content: ReportContent) -> tuple[str, ...]:
 
 
 def _reservations(content: ReportContent) -> list[tuple[str, str]]:
-    """What speaks against the result, each with what helps against it."""
+    """Reasons for doubt, each with a remedy."""
     notes = sightings(content)
     if content.chi2_per_dof > GOOD_CHI2:
         larger = math.sqrt(content.chi2_per_dof)

@@ -1,4 +1,4 @@
-"""What can be made: drifted rigs, poses, captures with known truth, faults in them, colour-coded images."""
+"""Synthetic data: drifted rigs, poses, captures with known truth, faults in them, colour-coded images."""
 
 import lazy_loader as lazy
 

@@ -1,4 +1,4 @@
-"""Rigs made up: cameras in rings, domes and rows that look at a point."""
+"""Made-up rigs: cameras in rings, domes and rows that look at a point."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def arranged_rig(
         name: None = the shape and the number of cameras.
 
     Raises:
-        InputError: no camera, or too many; a radius that is none; a camera at the target.
+        InputError: no camera or too many; a radius that is not positive; a camera at the target.
 
     Examples:
         >>> rig = arranged_rig("ring", 8, 4000.0, height=2500.0, target=(0.0, 0.0, 1000.0))

@@ -1,4 +1,4 @@
-"""What image networks look at: one square image a camera, every fiducial a soft dot in its own colour."""
+"""The input of image networks: one square image per camera, every fiducial a soft dot in its own colour."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 
 @dataclass(frozen=True)
 class Corruption(StrictRecord):
-    """How much goes wrong. Shares are of fiducials in one camera's view; each is drawn on its own.
+    """Amounts of corruption. Shares are of fiducials in one camera's view, drawn independently.
 
     It is also the block `corruption` of an experiment file.
     """
@@ -69,7 +69,7 @@ class Corruption(StrictRecord):
 
 @dataclass(frozen=True)
 class Corrupted:
-    """Corrupted views, and which of their points are what they are said to be."""
+    """Corrupted views, and which of their labels are true."""
 
     views: Views  # (B,)
     inlier: Tensor  # (B, C, N) bool: seen, and neither swapped nor false
@@ -77,7 +77,7 @@ class Corrupted:
 
 
 def _hidden(uv: Tensor, seen: Tensor) -> Tensor:
-    """Take away where unseen fiducials are: nobody may learn from it."""
+    """Remove the positions of unseen fiducials, so that nothing can learn from them."""
     return torch.where(seen[..., None], uv, 0.0)
 
 

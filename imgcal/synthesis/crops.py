@@ -84,7 +84,7 @@ def sample_scenes(rigs: int, cameras: int, fiducials: int, generator: torch.Gene
 
 
 def render_crops(scenes: Scenes, generator: torch.Generator) -> CropTruth:
-    """Look at the scenes through bad glass: every crop has its own mixture of everything that goes wrong."""
+    """Render the scenes in poor quality: every crop has its own mixture of disturbances."""
     draw = Draw(generator)
     believed = scenes.factory.project(scenes.expected.apply(scenes.points))
     truth = scenes.rig.project(scenes.rig_from_object.apply(scenes.points))

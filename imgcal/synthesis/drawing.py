@@ -10,7 +10,7 @@ from torch.nn import functional
 
 
 def host_generator(generator: torch.Generator) -> torch.Generator:
-    """Random numbers on the host that depend on where another generator stands: to ask a device would be to wait.
+    """Random numbers on the host, seeded by another generator: asking a device would block.
 
     Examples:
         >>> first, second = (host_generator(torch.Generator().manual_seed(3)) for _ in range(2))

@@ -12,7 +12,7 @@ from imgcal.io import StrictRecord
 
 @dataclass(frozen=True)
 class HandHeld(StrictRecord):
-    """How a hand carries an object: one way through all of the volume, without jerks, as fast as is said on average.
+    """How a hand carries an object: one smooth path through the whole volume at a given mean speed.
 
     The path is a cubic B-spline between places and turns that are drawn at random: it stays in a convex volume, and
     shakes of more than about one cycle in the time from place to place are as good as absent from its spectrum.

@@ -26,7 +26,7 @@ Kappa = Annotated[float, Field(ge=0, lt=1)]
 
 
 def _pair(values: Any) -> Any:
-    """Take a list for the tuple that it is in a file."""
+    """Convert a list, as files have it, to a tuple."""
     if isinstance(values, list | tuple) and len(values) != 2:
         raise ValueError(f"found {len(values)} values, expected 2")
     return tuple(values) if isinstance(values, list) else values
@@ -128,7 +128,7 @@ class RelativeDrift(StrictRecord):
 
 
 def drift_of(block: Any) -> Any:
-    """Make a drift of the block of an experiment file, in which what is not named does not drift.
+    """Make a drift from the block of an experiment file; values that are not named do not drift.
 
     Args:
         block: a mapping, or a drift, which is returned as it is.

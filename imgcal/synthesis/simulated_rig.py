@@ -1,4 +1,4 @@
-"""A rig that runs: an object carried through its volume, and what can happen to cameras meanwhile, at will."""
+"""A simulated running rig: an object carried through its volume, and faults of cameras on demand."""
 
 from __future__ import annotations
 

@@ -113,7 +113,7 @@ def simulate_volume(
 
 
 def place_markers(rig: CameraRig, count: int, generator: torch.Generator) -> CalibrationObject:
-    """Put markers on a body, anywhere within a box that fits the rig: what stands for markers that nobody measured.
+    """Put markers on a body, anywhere within a box that fits the rig: a stand-in for markers that were never measured.
 
     Args:
         rig: has a volume, or a working distance, or cameras that see the same.

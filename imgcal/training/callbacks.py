@@ -1,4 +1,4 @@
-"""What a training tells while it runs."""
+"""Callbacks of a training."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from imgcal.training.task import Batch, Result
 
 
 class Callbacks:
-    """Does nothing; override what you want to know. Of several processes, only the main one calls it.
+    """Does nothing; override what you need. With several processes, only the main one calls it.
 
     `imgcal train` writes files and shows a progress bar by one of these.
     """
@@ -20,7 +20,7 @@ class Callbacks:
         """Note that a run is built, new or as a state had it, and that the training begins."""
 
     def on_metrics(self, run: Run, row: dict[str, Any], due: bool) -> None:
-        """Take numbers of the last steps.
+        """Receive the numbers of the last steps.
 
         Args:
             run: where the training stands.
@@ -46,7 +46,7 @@ class DivergedError(RefusedError):
     """Raise where the loss or its gradient is not finite."""
 
     def __init__(self, step: int, loss: float, norm: float, batch: Batch, process: int | None) -> None:
-        """Keep what somebody needs who looks for the reason.
+        """Keep what is needed to find the reason.
 
         Args:
             step: steps taken, this one included.

@@ -1,4 +1,4 @@
-"""What the rest of a run depends on: taken from a run, and put into another one."""
+"""The state of a run: gathered from one run, and restored into another."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def state_of(run: Run) -> TrainingState:
 
 
 def restore(run: Run, state: TrainingState) -> None:
-    """Go on where a state was made.
+    """Continue from a state.
 
     Raises:
         InputError: it is that of another number of processes, or of another rig or object in a file of that name.
@@ -55,7 +55,7 @@ def restore(run: Run, state: TrainingState) -> None:
         raise InputError(f"training: found {run.accelerator.num_processes} processes, expected {expected} as before")
     for key, text in run.task.files.items():
         if values.get("files", {}).get(key, text) != text:
-            raise InputError(f"{key}: found another one in its file than the training began with, expected the same")
+            raise InputError(f"{key}: its file has changed since the training began, expected the same")
     run.plain.load_state_dict(tensors["network"])
     if run.average is not None:
         run.average.load_state_dict(tensors["average"])

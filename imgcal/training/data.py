@@ -33,7 +33,7 @@ Levels = Annotated[list[Annotated[int, Field(ge=0, lt=len(LEVELS))]], Field(max_
 
 @dataclass(frozen=True)
 class RigBatch:
-    """What a network sees, and what it should say."""
+    """The input of a network, and the answer it should give."""
 
     views: Views  # (B,)
     truth: Prediction  # (B,) float32
@@ -80,7 +80,7 @@ class Source:
         return synthesize(self.factory, self.obj, count, generator, drift=self.drift, pose_range=self.pose_range)
 
     def show(self, made: Snapshots, generator: torch.Generator) -> RigBatch:
-        """Make what the network sees of them. Images are valid until the next call."""
+        """Make the network's input. Images are valid until the next call."""
         truth = Prediction(made.rig, made.rig_from_object)
         views, size = Views(uv=made.projection.uv, seen=made.projection.visible), self.factory.image_size
         if self.levels and self.images is not None:

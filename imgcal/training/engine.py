@@ -40,7 +40,7 @@ def train(
 
     Args:
         experiment: what to train, on what, for how long.
-        callbacks: told how it goes; None = nobody is.
+        callbacks: receive the progress; None = none.
         state: go on from this one, which `Callbacks.on_checkpoint` was given.
         should_stop: asked after every step of the main process; True = make a checkpoint and return early.
 
@@ -63,7 +63,7 @@ def train(
 
 
 def _take_steps(run: Run, told: Callbacks, should_stop: Callable[[], bool]) -> None:
-    """Train until the end, or until somebody wants to stop."""
+    """Train until the end, or until a stop is requested."""
     due = run.experiment.training
     seconds, stop = run.seconds, False
     logged = (run.step, seconds)
@@ -89,7 +89,7 @@ def _take_steps(run: Run, told: Callbacks, should_stop: Callable[[], bool]) -> N
 def prepare(experiment: Experiment, state: TrainingState | None = None) -> Run:
     """Build everything a run needs: untrained, or as it was when a state was made."""
     settings = experiment.training
-    # Without a GPU, accelerate joins several processes only where it is told to stay on the CPU.
+    # Without a GPU, accelerate joins several processes only if `cpu` is set.
     accelerator = Accelerator(cpu=settings.device == "cpu" or not torch.accelerator.is_available())
     device, processes = accelerator.device, accelerator.num_processes
     batch_size = _at_once(settings, processes)
@@ -138,7 +138,7 @@ def stream_seeds(seed: int, process: int) -> tuple[int, int]:
 
 
 def _at_once(settings: TrainingConfig, processes: int) -> int:
-    """How much of a batch a process shows to its network at once."""
+    """The part of a batch that a process feeds to its network at once."""
     parts = processes * settings.accumulate
     if settings.batch_size % parts:
         of = f"the {processes} processes" + ("" if settings.accumulate == 1 else f" and {settings.accumulate} parts")
@@ -188,7 +188,7 @@ def autocast(run: Run) -> torch.autocast:
 
 
 def check_finite(run: Run) -> None:
-    """Stop when the loss or the gradient of a step since the last such look was not finite.
+    """Stop if the loss or the gradient of a step since the last check was not finite.
 
     Raises:
         DivergedError: with the batch, made again; the last checkpoint is from before.
@@ -228,7 +228,7 @@ def validation(run: Run, network: nn.Module) -> dict[str, float]:
 
 
 def validate(run: Run, told: Callbacks, extra: bool) -> None:
-    """Tell the errors of the weights as they would be the result; see `_tell`."""
+    """Report the errors of the weights that would be the result now; see `_tell`."""
     check_finite(run)
     if run.accelerator.is_main_process and (found := validation(run, run.candidate)):
         _tell(run, told, {"step": run.step, **found}, extra)
@@ -239,11 +239,11 @@ def validate(run: Run, told: Callbacks, extra: bool) -> None:
 def _keep_best(run: Run, extra: bool) -> None:
     """Remember the weights if they are the best so far; all processes must call this together, the main one decides.
 
-    An `extra` validation decides about the result alone, so that a continuation goes on as if nobody had stopped.
+    An `extra` validation only chooses the result, so that a resumed training equals an uninterrupted one.
     """
     judged, metrics = run.task.judged, run.own_metrics
     if run.accelerator.is_main_process and judged not in metrics and not extra:
-        raise InputError(f"training: patience: found no {judged} to go by, expected validation_rigs to be 1 or more")
+        raise InputError(f"training: patience: found no {judged}; set validation_rigs to 1 or more")
     error = metrics.get(judged, math.inf)
     error = error if math.isfinite(error) else math.inf  # any number is better
     if run.accelerator.num_processes > 1:
@@ -261,7 +261,7 @@ def _keep_best(run: Run, extra: bool) -> None:
 
 
 def _check_result(run: Run) -> None:
-    """Refuse to end with a network that is of no use.
+    """Refuse to end with an unusable network.
 
     Raises:
         RefusedError: the validation of what would be the result is not finite, or its weights are not.
@@ -270,15 +270,17 @@ def _check_result(run: Run) -> None:
     value = metrics.get(run.task.judged, 0.0)
     if not math.isfinite(value):
         raise RefusedError(
-            f"step {run.step}: {run.task.judged} is {value:g}, expected a number: the network is of no use"
+            f"step {run.step}: {run.task.judged} is {value:g}, expected a finite number: the training has diverged"
         )
     wrong = [name for name, tensor in network.state_dict().items() if not bool(tensor.isfinite().all())]
     if wrong:
-        raise RefusedError(f"step {run.step}: found weights that are not finite ({wrong[0]}): the network is of no use")
+        raise RefusedError(
+            f"step {run.step}: found weights that are not finite ({wrong[0]}): the training has diverged"
+        )
 
 
 def save(run: Run, told: Callbacks) -> None:
-    """Give away the state, and the network as it would be the result now; all processes must call this together."""
+    """Pass on the state, and the network that would be the result now; all processes must call this together."""
     check_finite(run)
     state = state_of(run)
     if run.accelerator.is_main_process:
@@ -294,14 +296,14 @@ def progress(run: Run, seconds: float) -> float:
 
 
 def finished(run: Run, seconds: float) -> bool:
-    """Tell whether the run came to its end, or gets no better."""
+    """Tell whether the run has ended or stopped improving."""
     patience = run.experiment.training.patience
     exhausted = run.best is not None and patience is not None and run.best.since >= patience
     return exhausted or progress(run, seconds) >= 1
 
 
 def _account(run: Run, rows: list[dict[str, Tensor]]) -> None:
-    """Keep what the log and the schedule will want to know: means over the parts of a batch."""
+    """Keep the numbers of the log and the schedule: means over the parts of a batch."""
     row = rows[0] if len(rows) == 1 else {name: torch.stack([part[name] for part in rows]).mean() for name in rows[0]}
     total = row["loss"]
     run.window.append(row)
@@ -316,7 +318,7 @@ def _account(run: Run, rows: list[dict[str, Tensor]]) -> None:
 
 
 def _agreed(run: Run, stop: bool) -> tuple[float, bool]:
-    """The main process's clock and wish to stop, so that all processes do the same."""
+    """The main process's clock and stop request, shared with all processes."""
     if run.accelerator.num_processes == 1:
         return run.seconds, stop
     mine = torch.tensor([run.seconds, float(stop)], dtype=torch.float64, device=run.accelerator.device)
@@ -325,7 +327,7 @@ def _agreed(run: Run, stop: bool) -> tuple[float, bool]:
 
 
 def _tell(run: Run, told: Callbacks, row: dict[str, Any], extra: bool) -> None:
-    """Keep plain values and pass them on. An `extra` row is not due: the run ends here, for now."""
+    """Keep plain values and pass them on. An `extra` row is written because the run ends here, for now."""
     run.latest |= row
     run.told = row if run.told.get("step") != run.step else run.told | row
     if not extra:
@@ -334,7 +336,7 @@ def _tell(run: Run, told: Callbacks, row: dict[str, Any], extra: bool) -> None:
 
 
 def _log(run: Run, told: Callbacks, logged: tuple[int, float], seconds: float, extra: bool) -> tuple[int, float]:
-    """Tell the means since the last time; returns where the next means begin."""
+    """Report the means since the last report; returns where the next means begin."""
     names = tuple(run.window[0])
     means = torch.stack([torch.stack([row[name] for row in run.window]).mean() for name in names])
     if not extra:

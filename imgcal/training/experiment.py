@@ -1,4 +1,4 @@
-"""What every experiment says: how long a training takes, with which optimizer. One file says everything about a run."""
+"""The keys that all experiments share: length, optimizer, schedule. One file describes a whole run."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class OptimizerConfig(StrictModel):
 
 
 class ScheduleConfig(StrictModel):
-    """How learning rates go: warmup and cosine to zero over the whole run, a plateau, or constant."""
+    """The schedule of the learning rates: warmup and cosine to zero over the whole run, plateau, or constant."""
 
     kind: Literal["cosine", "plateau", "constant"] = "cosine"  # of the rates; plateau: down when the loss stays
     warmup: Fraction = 0.02  # cosine: part of the run
@@ -91,7 +91,7 @@ class TrainingConfig(StrictModel):
         return (self.init_from,) if isinstance(self.init_from, str) else tuple(self.init_from or ())
 
     def validation_sizes(self, batch_size: int) -> list[int]:
-        """Split what is validated into batches of at most `batch_size`."""
+        """Split the validation into batches of at most `batch_size`."""
         count = self.validation_rigs
         return [min(batch_size, count - first) for first in range(0, count, batch_size)]
 
@@ -110,7 +110,7 @@ class Experiment(StrictModel, ABC):
 
     @abstractmethod
     def make_task(self, device: torch.device, batch_size: int, weights: torch.Generator, fresh: bool) -> Task[Any, Any]:
-        """Build the network and what it learns from.
+        """Build the network and its source of data.
 
         Args:
             device: where both shall be.

@@ -94,7 +94,7 @@ def load_frames(path: str | Path) -> FrameDataset:
 
 
 def load_splits(folder: str | Path) -> tuple[FrameDataset, FrameDataset]:
-    """Read a dataset of `imgcal harvest`: the crops to learn from, and those that were held out.
+    """Read a dataset of `imgcal harvest`: the training crops and the held-out crops.
 
     Raises:
         InputError: see `load_frames`; or crops of different sizes.

@@ -102,7 +102,7 @@ def fit_poses(
     fixed = torch.zeros(*rig.distortion.shape[:-1], rig.num_parameters, dtype=rig.distortion.dtype)
     fit = estimate(observations, rig, obj.taken_as_exact(), poses, prior_std=fixed, options=options.estimation)
     if not bool(fit.converged):
-        raise RefusedError("harvest: in some snapshot no pose of the object fits: the rig or the object is another one")
+        raise RefusedError("harvest: in some snapshot no pose of the object fits; check the rig and the object")
     return observations, fit.rig_from_object
 
 

@@ -66,7 +66,7 @@ def freeze(network: nn.Module, names: Iterable[str]) -> None:
         for parameter in groups[name]:
             parameter.requires_grad_(False)
     if not any(parameter.requires_grad for parameter in network.parameters()):
-        raise InputError(f"optimizer: freeze: found {', '.join(names)}, expected something to be left to train")
+        raise InputError(f"optimizer: freeze: found {', '.join(names)}, which leaves nothing to train")
 
 
 def learning(network: nn.Module) -> nn.Module:
@@ -145,7 +145,7 @@ class Schedule:
         return {} if self.plateau is None else self.plateau.state_dict()
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on where another schedule was; learning rates are part of the optimizer's state."""
+        """Continue another schedule; learning rates are part of the optimizer's state."""
         if self.plateau is not None:
             self.plateau.load_state_dict(state)
 
@@ -167,7 +167,7 @@ def make_average(network: Module) -> Module:
 
 @torch.no_grad()
 def update_average(average: nn.Module, network: nn.Module, step: int, decay: float) -> None:
-    """Take one step's weights into the running mean, which forgets the first, bad ones faster.
+    """Update the running mean with the weights of a step. It forgets the first, bad ones faster.
 
     The decay is min(decay, (1 + step) / (10 + step)); the step is a plain number, so that no device is waited for
     (torch.optim.swa_utils counts in a tensor).

@@ -18,7 +18,7 @@ from imgcal.training.task import Loss, Task
 
 @dataclass
 class Pending:
-    """A step whose numbers nobody has looked at."""
+    """A step whose numbers were not checked yet."""
 
     step: int  # steps taken, this one included
     generators: list[Tensor]  # states of the data's generator before each part of its batch

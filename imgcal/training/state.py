@@ -65,9 +65,7 @@ def load_state(path: str | Path, experiment: Experiment) -> TrainingState:
     difference = first_difference(saved, experiment.model_dump(mode="json") | named)
     if difference:
         key, was, now = difference
-        raise InputError(
-            f"{path}: the training so far had {key}: {was}, found {now}: a continuation must not change it"
-        )
+        raise InputError(f"{path}: {key}: found {now}, expected {was} as before; --resume cannot change it")
     parts: dict[str, dict[str, Tensor]] = {}
     for key, tensor in tensors.items():
         part, name = key.split("/", 1)

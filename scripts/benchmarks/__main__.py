@@ -1,4 +1,6 @@
-"""Run benchmarks beside their peers and rewrite docs/benchmarks.md: ``scripts/benchmark``, or ``... blobs splatting``.
+"""Run benchmarks beside their peers: ``scripts/benchmark``, or ``... blobs splatting``.
+
+Rewrites docs/benchmarks/tables.md.
 
 A benchmark is a module of this folder with three functions: ``measure(effort)`` returns plain values,
 ``tables(result)`` makes Markdown tables by the name of their markers in the page,
@@ -35,7 +37,7 @@ BENCHMARKS = {
     "networks": 2,
     "footprint": 1,
 }
-PAGE = ROOT / "docs" / "benchmarks.md"
+PAGE = ROOT / "docs" / "benchmarks" / "tables.md"
 RESULTS = ROOT / "docs" / "benchmarks"
 
 
@@ -71,8 +73,8 @@ class Options:
 
     @property
     def page(self) -> Path:
-        """The page whose tables are rewritten from all results of the folder: beside it."""
-        return self.folder.with_suffix(".md")
+        """The page of all tables, rewritten from the results beside it."""
+        return self.folder / "tables.md"
 
 
 def main(arguments: list[str]) -> int:

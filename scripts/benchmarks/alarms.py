@@ -24,7 +24,7 @@ from scripts.benchmarks.rig_streams import Conditions
 from scripts.output import ROOT, command, fill, surroundings, write_json
 
 RESULT = ROOT / "docs" / "benchmarks" / "alarms.json"
-PAGE = ROOT / "docs" / "benchmarks.md"
+PAGE = ROOT / "docs" / "benchmarks" / "tables.md"
 PLOT = ROOT / "docs" / "benchmarks" / "alarms.png"
 ITEMS = ROOT / "out" / "alarms" / "items.jsonl"
 

@@ -27,7 +27,7 @@ from scripts.benchmarks.camera_faults import blobs, object_before_a_ring
 from scripts.output import ROOT, command, fill, markdown, surroundings, write_json
 
 RESULT = ROOT / "docs" / "benchmarks" / "calibration_speed.json"
-PAGE = ROOT / "docs" / "benchmarks.md"
+PAGE = ROOT / "docs" / "benchmarks" / "tables.md"
 WORKER = Path(__file__).with_name("calibration_speed_worker.py")
 NOISE = 0.07  # px
 STREAM = 40  # snapshots of a live stream, which goes there and back

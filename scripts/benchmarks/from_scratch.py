@@ -33,7 +33,7 @@ from scripts.benchmarks.peers.rig_task import RigAnswer
 from scripts.output import ROOT, command, fill, markdown, read_json, surroundings, write_json
 
 RESULT = ROOT / "docs" / "benchmarks" / "from_scratch.json"
-PAGE = ROOT / "docs" / "benchmarks.md"
+PAGE = ROOT / "docs" / "benchmarks" / "tables.md"
 FACTORY, LABELS, BLOBS = "imgcal from the factory", "imgcal from scratch", "imgcal from scratch, blobs"
 COLMAP, OPENCV = "COLMAP incremental mapping", "OpenCV calibrateMultiview"
 SLOW = (BLOBS, OPENCV)
@@ -236,7 +236,7 @@ class Options:
     snapshots: int = 300
     peers: bool = True  #: measure COLMAP and OpenCV, too
     slow_ones: int = 1  #: OpenCV, and blobs without labels, on every so-manieth rig only
-    out: Path = RESULT  #: the table in docs/benchmarks.md is rewritten with this one alone
+    out: Path = RESULT  #: the table in docs/benchmarks/tables.md is rewritten with this one alone
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
 """Does the estimate know how wrong it is? Errors over stated sigmas, and what happens to captures that are not as said.
 
 Run as `python -m scripts.benchmarks.honesty`; `--captures 20` for a look. Writes docs/benchmarks/honesty.json and the
-tables of docs/benchmarks.md that are made from it.
+tables of docs/benchmarks/tables.md that are made from it.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ NOISE = 0.05  # px, each axis
 PRIOR = RigPrior(focal_length=0.01, principal_point=5.0, distortion=0.005, rotation=0.0087, position=2.0)
 WRONG = 3.0  # times the stated error in pixels: a result that is worse is wrong
 RESULT = ROOT / "docs" / "benchmarks" / "honesty.json"
-PAGE = ROOT / "docs" / "benchmarks.md"
+PAGE = ROOT / "docs" / "benchmarks" / "tables.md"
 OPTIONS = PipelineOptions(blind_cameras=True)
 ANYWHERE = 30.0  # mm, tolerance of a fiducial of which nothing is known
 RATIOS = ("ratio", "told")

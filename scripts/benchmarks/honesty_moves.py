@@ -24,7 +24,7 @@ from scripts.benchmarks import camera_faults as faults
 from scripts.output import ROOT, WORK, command, fill, markdown, read_json, surroundings, write_json
 
 RESULT = ROOT / "docs" / "benchmarks" / "honesty_moves.json"
-PAGE = ROOT / "docs" / "benchmarks.md"
+PAGE = ROOT / "docs" / "benchmarks" / "tables.md"
 CAMERA = 3
 SNAPSHOTS = 20  # of a capture in which something is wrong
 LENGTHS = (5, 8, 12, 20, 35, 60, 100)  # of steady ones
@@ -157,7 +157,7 @@ class Options:
     steady_captures: int = 300
     address: str | None = None  #: running Ray cluster that does the captures; none = this machine
     cores: int | None = None  #: of this machine; 1 = this process alone; none = all
-    out: Path = RESULT  #: the tables in docs/benchmarks.md are rewritten with this one alone
+    out: Path = RESULT  #: the tables in docs/benchmarks/tables.md are rewritten with this one alone
 
 
 def main() -> None:

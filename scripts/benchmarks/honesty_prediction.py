@@ -31,7 +31,7 @@ NOISE = 0.02  # px, each axis: of blobs
 HELD_OUT = 100  # points, even in the working volume, at which each calibration is judged
 GATE = (0.9, 1.1)  # of the ratios' RMS
 RESULT = ROOT / "docs" / "benchmarks" / "honesty_prediction.json"
-PAGE = ROOT / "docs" / "benchmarks.md"
+PAGE = ROOT / "docs" / "benchmarks" / "tables.md"
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ class Options:
     rigs: tuple[str, ...] = tuple(RIGS)
     address: str | None = None  #: running Ray cluster that does the rows; none = this machine
     cores: int | None = None  #: of this machine; 1 = this process alone; none = all
-    out: Path = RESULT  #: the table in docs/benchmarks.md is rewritten with this one alone
+    out: Path = RESULT  #: the table in docs/benchmarks/tables.md is rewritten with this one alone
 
 
 def main() -> None:

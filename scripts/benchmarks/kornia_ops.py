@@ -30,7 +30,7 @@ from scripts.output import ROOT, command, fill, markdown, surroundings, write_js
 from scripts.timing import side_by_side
 
 RESULT = ROOT / "docs" / "benchmarks" / "kornia_ops.json"
-PAGE = ROOT / "docs" / "benchmarks.md"
+PAGE = ROOT / "docs" / "benchmarks" / "tables.md"
 RIGS, SIZE = 64, 224
 
 Run = Callable[..., Tensor]

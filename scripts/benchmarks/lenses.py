@@ -23,7 +23,7 @@ from scripts.benchmarks.effort import Effort
 from scripts.output import ROOT, command, fill, markdown, surroundings, write_json
 
 RESULT = ROOT / "docs" / "benchmarks" / "lenses.json"
-PAGE = ROOT / "docs" / "benchmarks.md"
+PAGE = ROOT / "docs" / "benchmarks" / "tables.md"
 PRIOR = RigPrior(focal_length=0.01, principal_point=5.0, distortion=0.01, rotation=0.005, position=3.0)
 NOISE, SNAPSHOTS = 0.1, 12  # px
 LENSES = {

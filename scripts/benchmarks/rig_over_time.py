@@ -31,7 +31,7 @@ from scripts.benchmarks.rig_streams import Conditions, Stream
 from scripts.output import ROOT, command, fill, markdown, surroundings, write_json
 
 RESULT = ROOT / "docs" / "benchmarks" / "rig_over_time.json"
-PAGE = ROOT / "docs" / "benchmarks.md"
+PAGE = ROOT / "docs" / "benchmarks" / "tables.md"
 NOISE = 0.1  # px
 STEADY = DriftRate(0.0, 0.0, 0.0, 0.0, 0.0)
 WARMING = DriftRate(

@@ -1,4 +1,4 @@
-"""Plots of docs/results.md that come from the evaluated networks."""
+"""Plots of docs/results/tables.md that come from the evaluated networks."""
 
 from __future__ import annotations
 

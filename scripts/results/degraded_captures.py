@@ -5,7 +5,7 @@
 Every detector calibrates from the same degraded frames; what comes out is scored on points of the frames as they were
 captured, which had no part in the factory rig. Wrong is what is more than a pixel and more than five times as far off
 there (RMS) as `classical` on the frames as they are. What was measured before stays in the JSON: another call adds
-detectors, sets and kinds, or replaces theirs; a call that was stopped goes on. The table is in docs/results.md.
+detectors, sets and kinds, or replaces theirs; a call that was stopped goes on. The table is in docs/results/tables.md.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from scripts.results.degradations import DEGRADATIONS, Frame, Look
 from tests.captures.conftest import disturbed
 from tests.captures.sets import RealSet, cavity_two_cameras, dot_grid, nominal, three_cameras_dots
 
-JSON, PAGE = RESULTS / "degraded_captures.json", ROOT / "docs" / "results.md"
+JSON, PAGE = RESULTS / "degraded_captures.json", ROOT / "docs" / "results" / "tables.md"
 SETS = {"dots": "three-cameras-dots", "cavity": "cavity-two-cameras", "grid": "dot-grid-10x10"}
 OFF = {"dots": 9.0, "cavity": 8.0}  # px RMS that the factory rig is disturbed by; the grid's is nominal
 CALIBRATE = 8  # views of the grid; the others score

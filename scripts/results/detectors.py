@@ -2,7 +2,7 @@
 
 `tune` tries settings of the classical detector and of identity on validation captures and keeps the best for every
 difficulty; `compare` then calibrates test captures, of other seeds, with each detector, and writes the tables of
-docs/results.md. What was measured before stays in the JSON: another call adds detectors, or replaces theirs.
+docs/results/tables.md. What was measured before stays in the JSON: another call adds detectors, or replaces theirs.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from imgcal.synthesis import DIFFICULTIES, FrameModel
 from scripts.output import RESULTS, ROOT, command, fill, read_json, surroundings, write_json
 
 TUNING, COMPARISON = "detectors-tuning.json", "detectors.json"
-PAGE = ROOT / "docs" / "results.md"
+PAGE = ROOT / "docs" / "results" / "tables.md"
 TEST, VALIDATION = 0, 1  # seeds: captures that are reported, and captures on which settings are chosen
 TUNED = "classical, tuned"
 

@@ -4,7 +4,7 @@ Usage: python -m scripts.results.encoders out/runs/shipped-vit-cube8-seed{0,1,2}
 
 Every method sees the same images of the same rigs, at each of `imgcal.synthesis.LEVELS`. Runs of one preset are seeds
 of one family. Runs are added to what docs/results/encoders.json says of others on the same rigs; the table goes between
-the markers `encoders` of docs/results.md.
+the markers `encoders` of docs/results/tables.md.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from imgcal.synthesis import LEVELS, Corrupted, ImageOptions, synthesize
 from imgcal.types import CalibrationObject, CameraRig, Prediction, Views
 from scripts.output import RESULTS, command, fill, markdown, read_json, surroundings, write_json
 
-PAGE = RESULTS.parent / "results.md"
+PAGE = RESULTS / "tables.md"
 MARKER = "encoders"
 SUCCESS = 1.0  # px of RE below which a refined rig counts as found
 NEAR = 3.0  # px of the sensor below which a position counts as right

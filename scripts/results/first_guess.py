@@ -30,7 +30,7 @@ KAPPAS = (0.025, 0.05, 0.1, 0.2)
 EXCHANGED = (0.0, 0.1)  # share of labels
 SNAPSHOTS = (1, 4)
 STATUSES = ("calibrated", "refused", "wrong")
-PAGE = ROOT / "docs" / "results.md"
+PAGE = ROOT / "docs" / "results" / "tables.md"
 
 
 @dataclass(frozen=True)

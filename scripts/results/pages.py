@@ -1,4 +1,4 @@
-"""Turns results into the tables of docs/results.md, between its markers.
+"""Turns results into the tables of docs/results/tables.md, between its markers.
 
 One line is one experiment: all its training seeds together, mean and spread over them, or the words "one seed".
 """

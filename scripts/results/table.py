@@ -1,4 +1,4 @@
-"""Evaluate trained networks and rewrite docs/results.md: ``python -m scripts.results.table out/runs``.
+"""Evaluate trained networks and rewrite docs/results/tables.md: ``python -m scripts.results.table out/runs``.
 
 Reads out/runs/*/model.safetensors, as `imgcal train` writes them, and data/models. The figures of a network are kept in
 docs/results/<experiment>-seed<K>.json under the hash of its file: another call evaluates only what is new. All seeds of
@@ -46,7 +46,7 @@ class Options:
 
     runs: Annotated[Path, tyro.conf.Positional] = Path("out/runs")  #: folder of training runs
     models: Path = ROOT / "data" / "models"  #: folder of shipped networks
-    page: Path = ROOT / "docs" / "results.md"  #: page whose tables are rewritten
+    page: Path = ROOT / "docs" / "results" / "tables.md"  #: page whose tables are rewritten
     results: Path = RESULTS  #: folder of JSON results and plots
     effort: Annotated[Effort, tyro.conf.arg(name="")] = field(default_factory=Effort)
     only: tuple[str, ...] = ()  #: evaluate these experiments only; the page gets all known ones
@@ -118,7 +118,7 @@ def pictures(folder: Path) -> dict[str, str]:
     """Show the figures that there are, by the name of their markers."""
     texts = {"training": "RE over training time", "sweep": "RE against kappa and phi"}
     there = {name: (folder / f"{name}.png").is_file() for name in texts}
-    return {name: f"![{text}](results/{name}.png)" if there[name] else "Not made yet." for name, text in texts.items()}
+    return {name: f"![{text}]({name}.png)" if there[name] else "Not made yet." for name, text in texts.items()}
 
 
 def _order(experiment: RigExperiment) -> tuple[int, str]:

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from renderers import CropSensor, Smear, Spots, expose_crops, render_blobs, render_crops
+from renderers import Smear, Spots, render_blobs, render_crops
 
 
 def scene(crops, count, smeared):
@@ -39,15 +39,3 @@ def test_a_known_extent_changes_nothing():
     centre = torch.full((2, 2), 63.5)
     known, _ = render_crops(spots, centre, 4.0, (32, 32), 0.7, extent=(1.6, 3.5))
     torch.testing.assert_close(known, render_crops(spots, centre, 4.0, (32, 32), 0.7)[0], atol=2e-3, rtol=0)
-
-
-@pytest.mark.parametrize("scale", [1.0, 4.0])
-def test_noise_of_averaged_pixels(scale):
-    crops = 40
-    levels = {"background": 20.0, "contrast": 50.0, "read_noise": 3.0, "gain": 1.0}
-    sensor = CropSensor(**{name: torch.full((crops,), x) for name, x in levels.items()}, slope=torch.zeros(crops, 2))
-    light = torch.ones(crops, 32, 32)
-    level = expose_crops(light, sensor, scale, torch.Generator().manual_seed(0))
-    assert level.mean().item() == pytest.approx(70, abs=0.3)
-    assert level.std().item() == pytest.approx((70 + 9 + 1 / 12) ** 0.5 / scale, rel=0.02)
-    assert (scale == 1) == bool((level == level.round()).all())

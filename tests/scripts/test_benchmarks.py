@@ -17,8 +17,8 @@ from scripts.timing import side_by_side
 def test_a_benchmark_writes_its_result_its_plot_and_the_page(tmp_path, capsys, monkeypatch):
     folder = tmp_path / "benchmarks"
     assert suite.main(["networks", "--smoke", "--out", str(folder)]) == 0
-    assert {path.name for path in folder.iterdir()} == {"networks.json", "networks.png"}
-    page = (tmp_path / "benchmarks.md").read_text()
+    assert {path.name for path in folder.iterdir()} == {"networks.json", "networks.png", "tables.md"}
+    page = (folder / "tables.md").read_text()
     assert "| networks | " in page and "**points-O10-cube8**" in page
     assert "networks latency" in capsys.readouterr().out
 

@@ -13,7 +13,7 @@ from imgcal.networks import Checkpoint, build_network, save_checkpoint
 from imgcal.training import changed, load_experiment
 
 FOLDER = Path(__file__).parents[2] / "scripts" / "results"
-PAGE = Path(__file__).parents[2] / "docs" / "results.md"
+PAGE = Path(__file__).parents[2] / "docs" / "results" / "tables.md"
 SMALL = "network={preset: points, change: {trunk: {width: 16, heads: 2, depth: 1, later_depth: 1, passes: 2}}}"
 # Where an untrained network, which predicts the factory rig and a level object, is nearly right.
 LEVEL = "poses={theta_deg: [0, 0], phi_deg: [0, 0], alpha_deg: [269, 271]}"

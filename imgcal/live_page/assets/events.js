@@ -24,7 +24,7 @@ function drawEvents() {
   drawTimelines();
 }
 
-function drawAlarm() { // the newest that nobody has acknowledged
+function drawAlarm() { // the newest one that is not acknowledged
   const open = page.events.filter((event) => event.open), newest = open[open.length - 1];
   $("alarm").hidden = !newest;
   if (newest) say($("alarm-text"), `${["moved", "relearnt"].includes(newest.kind) ? "" : `${clock(newest.time)} `}${readable(newest)}${open.length > 1 ? ` (and ${plural(open.length - 1, "earlier alarm")})` : ""}`);

@@ -119,7 +119,7 @@ if (fixed) {
 } else {
   connect();
   setInterval(drawLink, 500);
-  document.addEventListener("visibilitychange", () => { // a page that nobody sees takes nothing from the server
+  document.addEventListener("visibilitychange", () => { // a hidden page requests nothing from the server
     if (!document.hidden) connect();
     else if (line.source) { clearTimeout(line.timer); line.source.close(); }
   });

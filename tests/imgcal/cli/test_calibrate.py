@@ -387,7 +387,7 @@ def test_blobs_that_say_next_to_nothing_are_refused(workplace, tmp_path, capsys)
     detections = load_detections(workplace.capture / "truth" / "detections.csv")
     save_detections(replace(detections, sigma=np.full(len(detections), 1e4)), tmp_path / "d.csv")
     assert calibrate(workplace, tmp_path / "d.csv", tmp_path / "out") == 3
-    assert "say next to nothing" in one_line(capsys)
+    assert "carry too little information" in one_line(capsys)
     assert json.loads((tmp_path / "out" / "result.json").read_text())["status"] == "refused"
     assert not (tmp_path / "out" / "rig.yaml").exists()
 

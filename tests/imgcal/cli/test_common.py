@@ -9,7 +9,6 @@ import torch
 
 from imgcal.cli.common import (
     check_folder,
-    make_folder,
     only_cameras,
     parse_range,
     progress,
@@ -90,11 +89,10 @@ def test_cameras_that_are_not_there_or_all_of_them_cannot_be_left_out(o10) -> No
         without_cameras(o10, o10.camera_names)
 
 
-def test_folders_are_made_and_files_in_their_place_are_told(tmp_path: Path) -> None:
-    assert make_folder(tmp_path / "a" / "b").is_dir()
+def test_a_file_in_the_place_of_a_folder_is_refused(tmp_path: Path) -> None:
     check_folder(tmp_path / "not" / "yet" / "there")
     assert not (tmp_path / "not").exists()
     (tmp_path / "file").touch()
     for path in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(InputError, match=f"found a file at {tmp_path / 'file'}"):
-            make_folder(path)
+            check_folder(path)

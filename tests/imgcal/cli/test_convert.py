@@ -48,7 +48,7 @@ def test_a_file_of_one_camera_is_named(tmp_path: Path, capsys: pytest.CaptureFix
     code = main(["score", str(tmp_path), "--rig", str(tmp_path / "ros" / "cam01.yaml"), "--object", "asymmetric8"])
     said = capsys.readouterr().err
     assert code == 2
-    assert "this is a ROS camera_info file of one camera: where it stands to the others is not in it" in said
+    assert "this is a ROS camera_info file of one camera, without its place in the rig" in said
     assert run(capsys, tmp_path / "ros" / "cam01.yaml", "--out", tmp_path / "one.yaml")[0] == 0
     assert load_rig(tmp_path / "one.yaml").num_cameras == 1
 
@@ -72,7 +72,7 @@ def test_nothing_is_guessed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--out", "x.toml"], "--to: not given, and x.toml does not say it"),
+        (["--out", "x.toml"], "--to: cannot tell the format from x.toml"),
         (["--out", "x.yaml", "--to", "calibr"], "found the format 'calibr'"),
         (["--out", "x.yaml", "--to", "motive"], "is only read"),
         (["--out", "x.yaml", "--unit", "m"], "in mm, expected neither"),

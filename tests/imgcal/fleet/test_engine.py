@@ -82,11 +82,11 @@ def test_an_address_where_nobody_is_ends_in_one_line(monkeypatch: pytest.MonkeyP
             ("head", "found head"),
             (f"127.0.0.1:{port}", "timed out"),
             (f"ray://127.0.0.1:{port}", "timed out"),
-            ("127.0.0.1:99999", "found nobody"),
+            ("127.0.0.1:99999", "found no cluster"),
         ):
             with pytest.raises(imgcal.InputError, match=f"--address: .*{expected}.*HOST:PORT"), Engine(address):
                 pass
-    with pytest.raises(imgcal.InputError, match="found nobody at "), Engine(f"127.0.0.1:{port}"):
+    with pytest.raises(imgcal.InputError, match="found no cluster at "), Engine(f"127.0.0.1:{port}"):
         pass
 
 

@@ -81,7 +81,7 @@ def test_what_does_not_fit_is_one_line(backbone, options, message):
 
 
 def test_only_models_of_timm_have_published_weights():
-    with pytest.raises(InputError, match="which only models of timm know"):
+    with pytest.raises(InputError, match="but only timm models have pretrained weights"):
         make_encoder(Images(backbone="cnn", pretrained=True), None)
 
 

@@ -39,9 +39,9 @@ def test_a_state_comes_back(experiment, tmp_path) -> None:
 def test_another_experiment_is_told_what_differs(experiment, tmp_path) -> None:
     save_state(tmp_path / "state", state_of(experiment()))
     for change, message in (
-        ("optimizer.lr=0.1", r"had optimizer\.lr: 0\.003, found 0\.1"),
-        ("training.batch_size=13", r"had training\.batch_size: 12, found 13"),
-        ("rig=O6", "had rig: T4, found O6"),
+        ("optimizer.lr=0.1", r"optimizer\.lr: found 0\.1, expected 0\.003"),
+        ("training.batch_size=13", r"training\.batch_size: found 13, expected 12"),
+        ("rig=O6", "rig: found O6, expected T4"),
     ):
         with pytest.raises(InputError, match=message):
             load_state(tmp_path / "state", experiment(change))

@@ -1,0 +1,16 @@
+"""The two short pages say what the committed results say."""
+
+import pytest
+
+from scripts.output import ROOT, replaced
+from scripts.summaries import pages
+
+PAGES = pages()
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_the_page_is_what_the_script_writes(name: str) -> None:
+    page = ROOT / name
+    text = page.read_text("utf-8")
+    assert replaced(text, PAGES[name], page) == text, f"{name}: run `python -m scripts.summaries`"
+    assert len(text.splitlines()) < 80
