@@ -8,6 +8,7 @@ from __future__ import annotations
 import bisect
 import math
 from collections import deque
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -46,6 +47,12 @@ class Cusum:
         ([[False, False], [False, True], [False, False]], [0, 1])
     """
 
+    STATE: ClassVar = {
+        "value": ("value", NDArray[np.float64]),
+        "age": ("age", NDArray[np.int64]),
+        "found": ("found", NDArray[np.int64]),
+    }
+
     def __init__(self, count: int, reference: float, run_length: float) -> None:
         """Begin with zero; see `cusum_threshold`."""
         self.reference, self.threshold = reference, cusum_threshold(reference, run_length)
@@ -76,12 +83,18 @@ class RunningMedian:
         4.0
     """
 
+    STATE: ClassVar = {"latest": ("_latest", deque[float])}
+
     def __init__(self, most: int) -> None:
         """Begin with none; `most` are kept."""
         self._latest, self._sorted = deque[float](maxlen=most), list[float]()
 
     def __len__(self) -> int:
         return len(self._latest)
+
+    def resume(self) -> None:
+        """Sort what has been read."""
+        self._sorted = sorted(self._latest)
 
     def append(self, number: float) -> None:
         """Take a number; the oldest goes where there are too many."""

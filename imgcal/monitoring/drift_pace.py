@@ -15,6 +15,7 @@ Source: Willsky and Jones, see `change_test.py`; Magill, "Optimal Adaptive Estim
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -85,6 +86,8 @@ class DriftPaces:
         >>> paces.of_parameters(15).shape, float(paces.squared.max())
         (torch.Size([4, 15]), 1.0)
     """
+
+    STATE: ClassVar = {name: (name, Tensor) for name in ("information", "pull", "squared")}
 
     def __init__(self, cameras: int) -> None:
         """Begin with what is taken for granted."""

@@ -11,6 +11,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -57,6 +58,24 @@ class _Seen:
 class RecentSnapshots:
     """A ring of the latest `KEPT_SNAPSHOTS` snapshots."""
 
+    STATE: ClassVar = {
+        "belief": ("_belief", RigBelief),
+        "walk": ("walk", Tensor),
+        "lasting": ("lasting", Tensor | float),
+        "carried": ("_carried", NDArray[np.float64]),
+        "border": ("_border", NDArray[np.float64]),
+        "weighted": ("_weighted", NDArray[np.float64]),
+        "totals": ("_totals", tuple[NDArray[np.float64], NDArray[np.float64]]),
+        "pixels": ("_pixels", Tensor),
+        "seen": ("_seen", deque[_Seen]),
+        "bases": ("_bases", list[_Base]),
+        "next": ("_next", int),
+        "aged": ("_aged", bool),
+        "rig": ("_rig", RigArrays),
+        "error": ("_at", NDArray[np.float64]),
+        "change": ("_change", Tensor),
+    }
+
     def __init__(self, belief: RigBelief, walk: Tensor, lasting: Tensor | float = MODEL_ERROR) -> None:
         """Begin with none.
 
@@ -90,6 +109,32 @@ class RecentSnapshots:
         self._at = np.zeros_like(self._weighted[0])  # ... and that error
         self._at[self._unit.size :] = object_offset.numpy()
         self._change = change_of_errors(rig, torch.from_numpy(self._unit))
+
+    def resume(self) -> None:
+        """Put together what has been read.
+
+        Raises:
+            ValueError: shapes do not belong together.
+        """
+        self._unit = self._belief.unit.numpy()
+        (cameras, free), wide = self._unit.shape, len(self._belief.factor)
+        blocks = (KEPT_SNAPSHOTS + 1, cameras, free, free)
+        expected = {
+            (KEPT_SNAPSHOTS, self._belief.pose_freedom, wide): (self._carried,),
+            (KEPT_SNAPSHOTS, wide - cameras * free, wide): (self._border,),
+            (KEPT_SNAPSHOTS, wide): (self._weighted,), blocks: self._totals, (wide,): (self._at,),
+            (cameras, free, free): (self._change,), (cameras, free): (self.walk, self._pixels),
+        }  # fmt: skip
+        bases = all(base.information.shape == (wide, wide) and base.weighted.shape == (wide,) for base in self._bases)
+        numbers = [base.number for base in self._bases]
+        snapshots = (one.observations.seen.shape[:2] == (1, cameras) for one in self._seen)
+        if not (
+            bases and all(snapshots) and len(self) <= KEPT_SNAPSHOTS and len(self) <= self._next
+            and numbers == sorted(numbers) and all(0 <= number <= self._next for number in numbers)
+            and all(tuple(array.shape) == shape for shape, arrays in expected.items() for array in arrays)
+        ):  # fmt: skip
+            raise ValueError("recent snapshots of another rig")
+        self._ring = (self._carried, self._border, self._weighted)
 
     def __len__(self) -> int:
         return len(self._seen)

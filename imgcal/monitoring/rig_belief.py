@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -57,6 +58,17 @@ class RigBelief:
     object_offset: Tensor  # (M,) in units of its prior standard deviation: what is known of it; M = 0 where it is exact
     factor: Tensor  # (D, D) lower Cholesky factor of the information; D = K C + M
     unit: Tensor  # (C, K) rad, mm, pixels, 1: of the cameras' errors
+
+    STATE: ClassVar = {
+        "rig": ("rig", CameraRig),
+        "object": ("obj", CalibrationObject),
+        "object_offset": ("object_offset", Tensor),
+        "factor": ("factor", Tensor),
+        "unit": ("unit", Tensor),
+        # What the properties make of these is rounded otherwise than what `absorb` has at hand.
+        "information": ("information", Tensor),
+        "arrays": ("arrays", RigArrays),
+    }
 
     @classmethod
     def of_prior(cls, rig: CameraRig, obj: CalibrationObject, prior_std: Tensor | None = None) -> RigBelief:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -42,6 +43,20 @@ class RigFilter:
         >>> follows.belief.std()[0, 6] < 0.1 * 0.02 * factory.focal_length[0, 0]  # the factory knew it to 2 %
         tensor(True)
     """
+
+    STATE: ClassVar = {
+        "rate": ("rate", DriftRate),
+        "calibrated": ("calibrated", bool),
+        "belief": ("belief", RigBelief),
+        "count": ("count", int),
+        "young": ("_young", bool),
+        "pace": ("pace", Tensor),
+        "horizon": ("horizon", Horizon | None),
+        "first_belief": ("_first", RigBelief),
+        "kept_snapshots": ("_early", list[tuple[Observations, RigidTransform]]),
+        "span_seconds": ("_span", float),
+        "waited_seconds": ("_waited", float),
+    }
 
     def __init__(
         self,

@@ -7,6 +7,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import ClassVar
 
 from torch import Tensor
 
@@ -67,6 +68,24 @@ class RigMonitor:
         >>> monitor.filter.count, monitor.open
         (0, {})
     """
+
+    STATE: ClassVar = {
+        "filter": ("filter", RigFilter),
+        "open_changes": ("open", dict[int, Change]),
+        "undecided": ("undecided", dict[int, int]),
+        "quarantine": ("quarantine", Quarantine),
+        "shaking": ("shaking", ShakeLevel),
+        "known_since": ("known_since", int),
+        "diagnosis": ("_diagnosis", Diagnosis),
+        "misfit": ("_misfit", Misfit),
+        "noise": ("noise", NoiseCorrelation),
+        "recent": ("_recent", RecentSnapshots),
+        "drifting": ("_drifting", DriftLearning),
+        "pending": ("_pending", PendingChange | None),
+        "prior": ("_prior", RigBelief),
+        "moved_early": ("_moved_early", set[int]),
+        "suspect": ("_suspect", int | None),
+    }
 
     def __init__(self, rig_filter: RigFilter) -> None:
         """Watch over a filter, which is to be updated by this monitor alone from now on."""

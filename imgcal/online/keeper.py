@@ -21,17 +21,17 @@ from imgcal.online.camera_health import health_of, sentence_of, take_health
 from imgcal.online.clock import ClockOffsets, apart_event
 from imgcal.online.default_tests import default_tests
 from imgcal.online.events import Event, snapshot_name
-from imgcal.online.keeper_file import KeeperFile, read_memory, unusable
+from imgcal.online.keeper_file import KeeperFile, read_state, unusable
 from imgcal.online.keeper_memory import KeeperMemory
 from imgcal.online.labelling import Labelling
 from imgcal.online.late_cameras import in_time, shifted
 from imgcal.online.learning import learnt_from
-from imgcal.online.memory import Frozen
 from imgcal.online.object_doubts import object_event
 from imgcal.online.rig_state import RigState
 from imgcal.online.sequential_test import SequentialTest
 from imgcal.online.sightings import Look
 from imgcal.online.snapshot_labels import Labelled, labelled_snapshot
+from imgcal.online.state_document import StateWriter
 from imgcal.pipeline import DetectorName, checked_frames
 from imgcal.types import CalibrationObject, CameraRig, Detections, DriftRate, UnknownLights
 
@@ -320,10 +320,11 @@ class RigKeeper:
         """
         memory = self._memory
         health = health_of(memory)
-        frozen = {
-            "values": memory.values(),
-            "labelling": self._labelling.saved(),
-            "tests": {test.name: test.saved() for test in self.tests},
+        writer = StateWriter()
+        state = {
+            "memory": writer.write(KeeperMemory, memory),
+            "labelling": writer.write(Labelling, self._labelling),
+            "tests": {test.name: writer.write_plain(test.saved()) for test in self.tests},
         }
         return KeeperFile(
             time=memory.time,
@@ -333,7 +334,8 @@ class RigKeeper:
             rig=memory.belief.rig,
             factory=memory.factory,
             obj=memory.obj,
-            memory=Frozen(frozen),
+            state=state,
+            tables=writer,
             progress=progress,
         )
 
@@ -367,19 +369,19 @@ class RigKeeper:
         Raises:
             InputError: the file is none of ours, or was changed.
         """
-        found = read_memory(path)
+        found, reader = read_state(path)
         try:
-            memory = KeeperMemory.restored(found["values"], _for_keeping(options))
+            memory = KeeperMemory.restored(reader, found["memory"], _for_keeping(options))
             keeper = cls(
                 memory.prior, memory.obj, options, detection=detection, detector=detector, drift=memory.drift,
                 horizon=memory.horizon, tests=tests,
             )  # fmt: skip
             keeper._memory = memory
-            keeper._labelling.restored(found["labelling"])
+            reader.read_object(Labelling, found["labelling"], "labelling", keeper._labelling)
             keeper._labelling.rig = keeper.factory
             for test in keeper.tests:
                 if test.name in found["tests"]:
-                    test.restored(found["tests"][test.name])
+                    test.restored(reader.read_plain(found["tests"][test.name], f"tests.{test.name}"))
         except (ValueError, KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
             raise unusable(path, error) from error
         except InputError as error:

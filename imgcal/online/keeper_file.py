@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,11 +12,11 @@ from imgcal.errors import InputError
 from imgcal.io import object_text, rig_text, write_text
 from imgcal.messages import shortened
 from imgcal.online.events import iso_time, snapshot_name
-from imgcal.online.memory import Frozen, Thawed
+from imgcal.online.state_document import StateReader, StateWriter
 from imgcal.types import CalibrationObject, CameraRig
 
-FORMAT = "imgcal-keeper/5"
-"""Another number whenever what is remembered is laid out anew: nobody can go on from a state of another version."""
+FORMAT = "imgcal-keeper/6"
+"""The number rises with every change of a key or type of `state_document`; a state of another version is not read."""
 MOST_BYTES = 2**28
 
 
@@ -30,7 +31,8 @@ class KeeperFile:
     rig: CameraRig
     factory: CameraRig
     obj: CalibrationObject
-    memory: Frozen
+    state: dict[str, Any]  # plain values, which refer to ...
+    tables: StateWriter  # ... the arrays and beliefs of this
     progress: dict[str, Any] | None = None  # of whoever saves it
 
     def text(self) -> str:
@@ -46,8 +48,9 @@ class KeeperFile:
             "factory": rig_text(self.factory).splitlines(),
             "object": object_text(self.obj).splitlines(),
         }
-        memory = json.dumps(self.memory.plain(), allow_nan=False)
-        return f'{json.dumps(readable, indent=1, ensure_ascii=False)[:-2]},\n "memory": {memory}\n}}\n'
+        state = json.dumps({**self.state, **self.tables.tables()}, allow_nan=False)
+        start = json.dumps({**readable, "sha256": _digest(state)}, indent=1, ensure_ascii=False)[:-2]
+        return f'{start},\n "state": {state}\n}}\n'
 
     def write(self, path: str | Path) -> None:
         """Replace the file in one step.
@@ -58,8 +61,12 @@ class KeeperFile:
         write_text(path, self.text())
 
 
-def read_memory(path: str | Path) -> dict[str, Any]:
-    """Read what a keeper remembers.
+def _digest(state: str) -> str:
+    return hashlib.sha256(state.encode()).hexdigest()
+
+
+def read_state(path: str | Path) -> tuple[dict[str, Any], StateReader]:
+    """Read the state of a keeper: plain values, and the reader of them.
 
     Raises:
         InputError: one line with the file, what was found and what was expected.
@@ -80,20 +87,22 @@ def read_memory(path: str | Path) -> dict[str, Any]:
     found = values.get("format") if isinstance(values, dict) else None
     if found != FORMAT and isinstance(found, str) and found.startswith(FORMAT[: FORMAT.index("/") + 1]):
         raise InputError(
-            f"{path}: found the state of another version of imgcal ({shortened(found)}), expected {FORMAT}: it "
-            'cannot be gone on with; the rig that it knew stands in it as "rig"'
+            f"{path}: State files from {'earlier' if found < FORMAT else 'later'} versions cannot be resumed: found "
+            f'{shortened(found)}, expected {FORMAT}; the last rig stands in the file as "rig"'
         )
     if found != FORMAT:
         raise InputError(f'{path}: found format {shortened(repr(found))}, expected "{FORMAT}"')
+    state = values.get("state")
+    if not isinstance(state, dict):
+        raise InputError(f"{path}: found no state, expected that of a rig that is kept calibrated")
     try:
-        memory = Thawed(values.get("memory")).value
+        if _digest(json.dumps(state)) != values.get("sha256"):
+            raise ValueError("its sha256 does not match")
+        return state, StateReader(state)
     except (ValueError, RecursionError) as error:
         raise unusable(path, error) from error
-    if not isinstance(memory, dict):
-        raise InputError(f"{path}: found no memory, expected that of a rig that is kept calibrated")
-    return memory
 
 
 def unusable(path: str | Path, error: Exception) -> InputError:
     """Say that a file was changed since it was written."""
-    return InputError(f"{path}: found a memory that was not written here ({shortened(str(error))})")
+    return InputError(f"{path}: the state was changed since it was written, or is damaged ({shortened(str(error))})")

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,13 +18,13 @@ from imgcal.online.drift_watch import DriftWatch
 from imgcal.online.events import Event
 from imgcal.online.late_cameras import POSES
 from imgcal.online.light_tracks import LightTracks
-from imgcal.online.memory import require_alike
 from imgcal.online.noise_level import NoiseLevel
 from imgcal.online.object_doubts import ObjectDoubts
 from imgcal.online.relearning import Relearning
 from imgcal.online.rig_state import CameraHealth
 from imgcal.online.search import Search, Surroundings
 from imgcal.online.sightings import Sightings
+from imgcal.online.state_document import NOT_SAVED, StateReader
 from imgcal.types import (
     CalibrationObject,
     CameraRig,
@@ -50,7 +49,7 @@ LEAST_USUAL = 8
 class KeeperMemory:
     """What is known of a rig, of its object and of what is going on; changed in place."""
 
-    options: PipelineOptions  # not saved: whoever goes on has their own
+    options: PipelineOptions = field(metadata=NOT_SAVED)  # whoever goes on has their own
     factory: CameraRig
     obj: CalibrationObject  # as its file says
     drift: DriftRate | None
@@ -188,55 +187,28 @@ class KeeperMemory:
         since = next((time for learnt, time in self.times if learnt >= number), self.time)
         return since if camera is None else self.search.since(camera, min(since, self.off.get(camera, since)))
 
-    def values(self) -> dict[str, Any]:
-        """What is saved."""
-        return {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name != "options"}
-
     @classmethod
-    def restored(cls, found: Mapping[str, Any], options: PipelineOptions) -> KeeperMemory:
-        """Take over what `values` gave, out of a file.
+    def restored(cls, reader: StateReader, plain: dict[str, Any], options: PipelineOptions) -> KeeperMemory:
+        """Take over what a file says.
+
+        Args:
+            reader: of the file.
+            plain: what it says of all that is remembered.
+            options: as for a new one.
 
         Raises:
             ValueError: it is not that, or belongs to another rig and object.
             InputError: a rig or an object in it is none.
         """
-        for rig in (found["prior"], found["factory"]):
-            check_rig(rig)
-        check_object(found["obj"])
-        fresh = cls.of(found["prior"], found["obj"], found["drift"], options, found["horizon"])
-        expected = fresh.values()
-        if set(found) != set(expected):
-            raise ValueError("other values than are written here")
-        for name, new in expected.items():
-            if found[name] is not None and new is not None and type(found[name]) is not type(new):
-                raise ValueError(f"{name}: found {type(found[name]).__name__}, expected {type(new).__name__}")
-            if type(new).__module__.startswith("imgcal.") and not isinstance(new, RigBelief):
-                require_alike(found[name], new, name)
-        require_alike(found["monitor"].filter, fresh.monitor.filter, "filter")
-        for belief in (found["monitor"].filter.belief, found["before"]):
-            _check_belief(belief, fresh)
-        if found["looks"].shape != fresh.looks.shape:
-            raise ValueError("found other cameras")
-        memory = cls(options=options, **found)
-        memory.monitor.filter.options = options.estimation
+        rig, obj = reader.read(CameraRig, plain["prior"], "prior"), reader.read(CalibrationObject, plain["obj"], "obj")
+        drift = reader.read(DriftRate | None, plain["drift"], "drift")
+        horizon = reader.read(int | None, plain["horizon"], "horizon")
+        if horizon is not None and horizon < 1:
+            raise ValueError(f"horizon: found {horizon}")
+        memory = cls.of(rig, obj, drift, options, horizon)
+        reader.read_object(cls, plain, "memory", memory)
+        beliefs = (memory.belief, memory.before)
+        alike = all(belief.rig.camera_names == rig.camera_names for belief in beliefs)
+        if not alike or memory.belief.obj.num_fiducials != obj.num_fiducials or len(memory.looks) != rig.num_cameras:
+            raise ValueError("found a belief about another rig or object")
         return memory
-
-
-def _check_belief(belief: RigBelief, fresh: KeeperMemory) -> None:
-    """Check a belief out of a file; where an exact object has changed, it is about that with its shape.
-
-    Raises:
-        ValueError: it is about another rig or object, or none.
-        InputError: its rig or object is none.
-    """
-    like = fresh.belief
-    if belief.obj.exact != fresh.obj.exact:
-        check_object(belief.obj)
-        if not fresh.obj.exact or belief.obj.num_fiducials != fresh.obj.num_fiducials:
-            raise ValueError("found a belief about another object")
-        like = RigBelief.of_prior(fresh.prior, belief.obj)
-    require_alike(belief, like, "belief")
-    require_alike(belief.rig, fresh.prior, "rig")
-    check_rig(belief.rig)
-    if not bool(belief.factor.isfinite().all() & (belief.factor.diagonal() > 0).all()):
-        raise ValueError("found a belief that is none")

@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,15 @@ class Labelling:
         'coded'
         >>> labelling.close()
     """
+
+    STATE: ClassVar = {
+        "follows": ("follows", bool),
+        "refused": ("_refused", int),
+        "pose": ("_tracker.pose", RigidTransform | None),
+        "alternatives": ("_tracker.alternatives", int),
+        "in_vain": ("_tracker.in_vain", int),
+        "looks_in_vain": ("_tracker.looks_in_vain", int),
+    }
 
     def __init__(
         self,
@@ -149,33 +158,3 @@ class Labelling:
         """Take over the object's pose in the latest snapshot: the next one is near it."""
         self._tracker.follow(pose)
         self.follows = True
-
-    def saved(self) -> dict[str, Any]:
-        """What is remembered from snapshot to snapshot."""
-        tracker = self._tracker
-        return {
-            "follows": self.follows,
-            "refused": self._refused,
-            "pose": tracker.pose,
-            "alternatives": tracker.alternatives,
-            "in_vain": tracker.in_vain,
-            "looks_in_vain": tracker.looks_in_vain,
-        }
-
-    def restored(self, values: dict[str, Any]) -> None:
-        """Take over what `saved` gave.
-
-        Raises:
-            ValueError: it is not that.
-        """
-        fresh = self.saved()
-        if values.keys() != fresh.keys() or any(
-            type(values[name]) is not type(fresh[name]) for name in fresh if name != "pose"
-        ):
-            raise ValueError("labelling: found other values than are written here")
-        pose = values["pose"]
-        if pose is not None and not (isinstance(pose, RigidTransform) and pose.rotation.shape[-2:] == (3, 3)):
-            raise ValueError("labelling: found no pose")
-        self.follows, self._refused, self._tracker.pose = values["follows"], values["refused"], pose
-        self._tracker.alternatives, self._tracker.in_vain = values["alternatives"], values["in_vain"]
-        self._tracker.looks_in_vain = values["looks_in_vain"]

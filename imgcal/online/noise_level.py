@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -28,6 +29,14 @@ FIRST, EVERY = (16, 32), 64
 
 class NoiseLevel:
     """Asks the first snapshots together, and each later one by what it leaves."""
+
+    STATE: ClassVar = {
+        "additive": ("additive", NDArray[np.float64]),
+        "early": ("_early", list[tuple[Detections, SnapshotIdentity]]),
+        "asking": ("_asking", bool),
+        "ratios": ("_ratios", deque[NDArray[np.float64]]),
+        "first": ("first", list[tuple[Detections, RigidTransform]]),
+    }
 
     def __init__(self, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions) -> None:
         """Begin with the noise that the blobs say."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import zip_longest
 from typing import TYPE_CHECKING
 
@@ -149,7 +149,8 @@ class CameraRig:
     drift_rate: DriftRate | None = None  # None = the defaults
     volume: Volume | None = None  # where it is used, in the rig frame
     lens_model: ModelNames = "brown_conrady"  # a name of `geometry.LENS_MODELS` for all cameras, or one for each
-    posterior: Callable[[], RigPosterior] | None = None  # how well a calibration knows these values, if one made them
+    posterior: Callable[[], RigPosterior] | None = field(default=None, metadata={"saved": False})
+    """How well a calibration knows these values, if one made them."""
 
     def __repr__(self) -> str:
         """Say what it is: `CameraRig('O10': 10 cameras, cam01 to cam10)`; `print` shows the values of each camera."""

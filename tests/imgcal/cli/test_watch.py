@@ -275,12 +275,16 @@ def test_the_state_of_another_version_is_told_and_nothing_is_lost(blobs, tmp_pat
     out = tmp_path / "out"
     assert watch(tmp_path / "blobs.csv", out) == 0
     state = out / "state.json"
-    state.write_text(state.read_text().replace("imgcal-keeper/5", "imgcal-keeper/1", 1))
+    state.write_text(state.read_text().replace("imgcal-keeper/6", "imgcal-keeper/5", 1))
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
     capsys.readouterr()
     assert watch(tmp_path / "blobs.csv", out) == 2
     error = capsys.readouterr().err
-    assert "another version of imgcal" in error and error.endswith("; --fresh begins anew\n") and error.count("\n") == 1
+    assert (
+        "State files from earlier versions cannot be resumed" in error
+        and error.endswith("; --fresh begins anew\n")
+        and error.count("\n") == 1
+    )
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
     assert watch(tmp_path / "blobs.csv", out, "--fresh") == 0
 

@@ -1,6 +1,6 @@
 """What a keeper remembers: begun, forgotten, and taken over from values that belong to it alone."""
 
-from dataclasses import replace
+import json
 
 import numpy as np
 import pytest
@@ -8,6 +8,7 @@ import torch
 
 import imgcal
 from imgcal.online.keeper_memory import LEAST_USUAL, KeeperMemory
+from imgcal.online.state_document import StateReader, StateWriter
 from tests.imgcal.online.memories import OPTIONS, Remembered
 
 
@@ -40,13 +41,15 @@ def test_moments_are_those_of_the_snapshots_or_since_when_it_was_in_doubt() -> N
     assert memory.since(1, 2) == 0.001
 
 
-def test_values_are_taken_over_and_those_of_another_rig_are_not() -> None:
-    memory = Remembered().learn(2)
-    again = KeeperMemory.restored(memory.values(), OPTIONS)
-    assert again.belief is memory.belief and again.count == 2
-    other = KeeperMemory.of(imgcal.load_rig("U7"), memory.obj, None, OPTIONS).values()
-    bare = replace(memory.belief, factor=torch.zeros_like(memory.belief.factor))
-    looks = np.zeros(7, dtype=np.int64)
-    for change in ({"looks": looks}, {"monitor": other["monitor"]}, {"before": bare}, {"usual": []}, {"more": 1}):
-        with pytest.raises(ValueError, match=r"found|other values"):
-            KeeperMemory.restored({**memory.values(), **change}, OPTIONS)
+def test_a_state_is_resumed_and_parts_of_another_rig_are_refused() -> None:
+    memory, writer = Remembered().learn(2), StateWriter()
+    plain = writer.write(KeeperMemory, memory)
+    other = writer.write(KeeperMemory, KeeperMemory.of(imgcal.load_rig("U7"), memory.obj, None, OPTIONS))
+    plain, other, tables = json.loads(json.dumps([plain, other, writer.tables()]))
+    again = KeeperMemory.restored(StateReader(tables), plain, OPTIONS)
+    assert torch.equal(again.belief.factor, memory.belief.factor) and again.count == 2
+    assert again.monitor.filter.options is OPTIONS.estimation
+    for change in ("looks", "monitor", "before", "usual", "more"):
+        changed = {**plain, change: [] if change in ("usual", "more") else other[change]}
+        with pytest.raises(ValueError, match="found"):
+            KeeperMemory.restored(StateReader(tables), changed, OPTIONS)
