@@ -227,8 +227,8 @@ class Watch:
     serve: str | None = None  #: [HOST:]PORT of the live page; the host is 127.0.0.1 if not given
     poses: tuple[str, ...] = ()
     """where the object's pose of each snapshot goes: FILE.csv, FILE.jsonl, tcp://HOST:PORT (ZeroMQ) or
-    igtl://[HOST:]PORT (OpenIGTLink: 3D Slicer, PLUS); its markers as 3D points: FILE.c3d, FILE.trc; several are
-    possible"""
+    igtl://[HOST:]PORT (OpenIGTLink: 3D Slicer, PLUS); its markers, or lights, as 3D points: FILE.c3d, FILE.trc;
+    several are possible"""
     hook: str | None = None
     """command to run for each event, without a shell; the event is its standard input, a line of JSON"""
     detector: str = "classical"  #: who finds the fiducials in frames, as for imgcal calibrate

@@ -34,13 +34,15 @@ class Source:
             rig: which one is meant where the files hold several.
 
         Raises:
-            InputError: a path that does not exist, or a device.
+            InputError: a path that does not exist, a device, or one that is given twice.
         """
         self.rig = rig
         self.where = quoted(", ".join(map(str, paths)))
         self.alone = False  # one file, whose faults are the user's to know
         self.files: list[Path] = []
-        for path in paths:
+        for number, path in enumerate(paths):
+            if path in paths[:number]:
+                raise InputError(f"{path}: found it twice, expected each file once")
             if path.is_dir():
                 self.files += _inside(path)
             elif path.is_file():

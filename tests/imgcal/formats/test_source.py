@@ -38,3 +38,9 @@ def test_what_is_not_there(tmp_path: Path) -> None:
         (tmp_path / str(number)).touch()
     with pytest.raises(InputError, match="1,001 files"):
         Source([tmp_path])
+
+
+def test_a_file_that_is_given_twice(tmp_path: Path) -> None:
+    path = put(tmp_path, left__yaml="a: 1") / "left.yaml"
+    with pytest.raises(InputError, match=r"left.yaml: found it twice"):
+        Source([path, path])
